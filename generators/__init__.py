@@ -1,0 +1,1 @@
+"""The material-point solver and the splits that it simulates."""

@@ -1,0 +1,97 @@
+"""Taichi's runtime: started once per process, with strict arithmetic.
+
+Strict means: no fused multiply-add, no reassociation (``fast_math=False``), float32 and
+int32 wherever a kernel does not say otherwise. Everything that makes fields starts here.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from typing import Any
+
+# Taichi greets on stdout as it is imported, which would spoil `--json`.
+os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
+
+import taichi as ti
+
+from lagbench.errors import UsageError
+
+from .solver import Device
+
+__all__ = ["available_threads", "place", "start"]
+
+_started: list[tuple[bool, int]] = []
+
+
+def available_threads() -> int:
+    """Return the number of processors that this process may use."""
+    return len(os.sched_getaffinity(0))
+
+
+def start(device: Device, *, scenarios: int = 1, threads: int | None = None) -> int:
+    """Start Taichi for a device unless it runs, and return the threads for parallel loops.
+
+    The first call in a process fixes the size of the thread pool.
+
+    Args:
+        device: where the kernels will run.
+        scenarios: scenarios advanced together.
+        threads: threads that parallel loops use; None for all of the pool.
+
+    Raises:
+        UsageError: CPU and CUDA in one process, more threads than the pool has, or several
+            scenarios on the serial device.
+    """
+    if device is Device.CPU and scenarios != 1:
+        raise UsageError(
+            "the serial device advances one scenario at a time",
+            where=f"device {device.value}",
+            expected="scenarios = 1",
+            got=scenarios,
+            fix=f"use one worker per scenario, or device {Device.PARALLEL.value}",
+        )
+    on_gpu = device is Device.CUDA
+    if not _started:
+        _initialise(on_gpu, threads or available_threads())
+    running_on_gpu, pool = _started[0]
+    if running_on_gpu != on_gpu or (threads or 1) > pool:
+        raise UsageError(
+            "Taichi runs already with another device or fewer threads",
+            where=f"device {device.value}, threads {threads}",
+            expected=f"{'CUDA' if running_on_gpu else 'CPU'} with at most {pool} threads",
+            fix="use another process",
+        )
+    return threads or pool
+
+
+def _initialise(on_gpu: bool, pool: int) -> None:
+    try:
+        ti.init(
+            arch=ti.cuda if on_gpu else ti.cpu,
+            default_fp=ti.f32,
+            default_ip=ti.i32,
+            fast_math=False,
+            cpu_max_num_threads=pool,
+            offline_cache=True,
+            enable_fallback=False,
+            log_level=ti.ERROR,
+        )
+    except RuntimeError as error:
+        raise UsageError(
+            "Taichi cannot use this device", where="cuda" if on_gpu else "cpu", got=error
+        ) from error
+    _started.append((on_gpu, pool))
+
+
+def place(*groups: tuple[tuple[int, ...], Sequence[Any]]) -> Any:  # noqa: ANN401 (Taichi is untyped)
+    """Give fields their memory: each group (shape, fields) is one array of structs.
+
+    Returns:
+        Taichi's SNode tree, whose ``destroy()`` releases the memory.
+    """
+    builder = ti.FieldsBuilder()
+    for shape, fields in groups:
+        axes = (ti.i, ti.ij, ti.ijk, ti.ijkl)[len(shape) - 1]
+        builder.dense(axes, shape).place(*fields)
+    return builder.finalize()

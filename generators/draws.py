@@ -1,0 +1,145 @@
+"""Seeded draws whose bits are the same on every machine.
+
+Two rules keep them so. Random bits come only from ``Generator.random``, the one distribution
+of NumPy that never changes for PCG64. What is done with them is + - * / sqrt, floor and
+comparison, which IEEE 754 rounds in one way only, or ``decimal``, whose ``exp`` and ``ln`` are
+correctly rounded by its specification; ``exp``, ``log`` and ``pow`` of a C library are not.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from decimal import Context, Decimal
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lagbench.errors import WorkFailedError
+
+__all__ = [
+    "QUANTUM",
+    "RandomSource",
+    "choice",
+    "direction",
+    "entropy",
+    "generator",
+    "log_uniform",
+    "normal",
+    "quantise",
+    "seed_text",
+    "uniform",
+]
+
+QUANTUM = 2.0**-20
+"""Grain of everything that enters the solver; multiples below 16 are exact in float32."""
+
+_LARGEST = 16.0
+_PRECISE = Context(prec=50)
+
+
+class RandomSource(Protocol):
+    """The part of ``numpy.random.Generator`` that draws may use."""
+
+    def random(self, size: tuple[int, ...]) -> NDArray[np.float64]:
+        """Return uniform variates on [0, 1), multiples of 2^-53."""
+
+
+def entropy(split: str, size: str, major: int, scenario: int) -> tuple[int, int, int]:
+    """Return the three integers that seed a scenario.
+
+    The first is the first eight bytes of SHA-256("split/size"), big-endian.
+
+    >>> entropy("cavity", "tiny", 1, 3)[1:]
+    (1, 3)
+    """
+    digest = hashlib.sha256(f"{split}/{size}".encode()).digest()
+    return int.from_bytes(digest[:8], "big"), major, scenario
+
+
+def generator(split: str, size: str, major: int, scenario: int) -> np.random.Generator:
+    """Return the PCG64 stream of one scenario, a function of its four names only."""
+    seeds = np.random.SeedSequence(entropy(split, size, major, scenario))
+    return np.random.Generator(np.random.PCG64(seeds))
+
+
+def seed_text(split: str, size: str, major: int, scenario: int) -> str:
+    """Return the seed as the files state it, for ``SeedSequence([...])``."""
+    return ", ".join(str(word) for word in entropy(split, size, major, scenario))
+
+
+def quantise(values: ArrayLike) -> NDArray[np.float64]:
+    """Round to the nearest multiple of 2^-20, halves to even.
+
+    Such a number below 16 in magnitude is exact in float32, so that nothing is rounded
+    again on its way into the solver. Negative zero becomes zero.
+
+    Raises:
+        WorkFailedError: a value is not finite or reaches 16.
+    """
+    given = np.asarray(values, dtype=np.float64)
+    if not np.all(np.abs(given) < _LARGEST):
+        raise WorkFailedError(
+            "a drawn value has no exact float32 form",
+            expected=f"finite, magnitude below {_LARGEST}",
+            got=float(np.max(np.abs(given))),
+            fix="check the ranges and scales of this split in datasets.yaml",
+        )
+    # A separate addition of zero, because rint keeps the sign of -0.0.
+    return np.asarray(np.rint(given / QUANTUM) * QUANTUM + 0.0, dtype=np.float64)
+
+
+def _unit(rng: RandomSource) -> float:
+    return float(rng.random((1,))[0])
+
+
+def uniform(rng: RandomSource, low: float, high: float) -> float:
+    """Draw from the uniform distribution on [low, high), a multiple of 2^-20."""
+    return float(quantise(low + (high - low) * _unit(rng)))
+
+
+def log_uniform(rng: RandomSource, low: float, high: float) -> float:
+    """Draw x with ln x uniform on [ln low, ln high).
+
+    x = low exp(u ln(high / low)), in 50 decimal digits, rounded once.
+
+    Raises:
+        WorkFailedError: ``low`` is not positive or above ``high``.
+    """
+    if not 0.0 < low <= high:
+        raise WorkFailedError("a log-uniform range is empty", expected="0 < low <= high", got=(low, high))
+    span = _PRECISE.ln(_PRECISE.divide(Decimal(high), Decimal(low)))
+    growth = _PRECISE.exp(_PRECISE.multiply(span, Decimal(_unit(rng))))
+    return float(_PRECISE.multiply(Decimal(low), growth))
+
+
+def normal(rng: RandomSource, deviation: float, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """Draw nearly normal variates of mean 0: twelve uniforms, minus six (Irwin-Hall).
+
+    Mean, variance and skewness are the normal ones, the excess kurtosis is -0.1, and nothing
+    lies beyond six deviations, which suits an initial velocity.
+    """
+    total = np.full(shape, -6.0)
+    for _ in range(12):
+        total = total + rng.random(shape)
+    return deviation * total
+
+
+def choice(rng: RandomSource, count: int) -> int:
+    """Draw an integer from 0 to ``count - 1``, each equally likely (to 2^-53)."""
+    return math.floor(_unit(rng) * count)
+
+
+def direction(rng: RandomSource) -> tuple[float, float]:
+    """Draw a unit vector, uniform over the circle, without sine or cosine.
+
+    A point of the square is taken again until it lies in the unit disc (and not at its very
+    centre), then divided by its length.
+    """
+    while True:
+        x, y = (float(2.0 * r - 1.0) for r in rng.random((2,)))
+        square = x * x + y * y
+        if 2.0**-20 <= square <= 1.0:
+            length = math.sqrt(square)
+            return x / length, y / length

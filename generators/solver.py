@@ -1,0 +1,112 @@
+"""What a solver offers, on which device it runs, and how to build one.
+
+Importing this module does not import Taichi; :func:`build` does.
+"""
+
+from __future__ import annotations
+
+import enum
+import importlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .base import ClosedBoxParameters, FreeSurfaceParameters, InitialState
+
+__all__ = ["Device", "Health", "Solver", "build"]
+
+
+class Device(enum.StrEnum):
+    """Where and how the substeps run; the bits do not depend on it.
+
+    Attributes:
+        CPU: one scenario, a whole frame of substeps in one serial kernel without atomics.
+        PARALLEL: the GPU's kernels (scenarios x particles, atomics) on Taichi's CPU threads.
+        CUDA: the same kernels on an NVIDIA GPU.
+    """
+
+    CPU = "cpu"
+    PARALLEL = "parallel"
+    CUDA = "cuda"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Health:
+    """What one scenario went through during the last advance.
+
+    Attributes:
+        finite: whether every position, velocity and J is a finite number.
+        max_speed: largest absolute velocity component of any particle or node at any
+            substep [length/s].
+        jacobian_min: smallest J of any particle at any substep [1].
+        jacobian_max: largest J of any particle at any substep [1].
+    """
+
+    finite: bool
+    max_speed: float
+    jacobian_min: float
+    jacobian_max: float
+
+
+class Solver(Protocol):
+    """Advances a batch of scenarios that share their parameters."""
+
+    @property
+    def parameters(self) -> ClosedBoxParameters | FreeSurfaceParameters:
+        """Constants that the scenarios share."""
+
+    def load(self, states: Sequence[InitialState]) -> None:
+        """Start one scenario per state; as many states as the solver has scenarios."""
+
+    def advance(self, substeps: int) -> None:
+        """Advance every scenario.
+
+        Raises:
+            WorkFailedError: a scenario left the bounds within which the solver is valid; names
+                the scenario's index, the range of substeps and the broken bound.
+        """
+
+    def position(self) -> NDArray[np.float32]:
+        """Particle positions [length], shape [scenario, particle, 2]."""
+
+    def velocity(self) -> NDArray[np.float32]:
+        """Particle velocities v_p [length/s], shape [scenario, particle, 2]."""
+
+    def displace(self, offset: NDArray[np.float32]) -> None:
+        """Add an offset to the positions [length], shape [scenario, particle, 2]; kept in the box."""
+
+    def health(self) -> list[Health]:
+        """Return what each scenario went through during the last advance."""
+
+
+_IMPLEMENTATIONS: dict[type, tuple[str, str]] = {
+    ClosedBoxParameters: (".closed_box", "ClosedBox"),
+    FreeSurfaceParameters: (".free_surface", "FreeSurface"),
+}
+
+
+def build(
+    parameters: ClosedBoxParameters | FreeSurfaceParameters,
+    *,
+    device: Device = Device.CPU,
+    scenarios: int = 1,
+    threads: int | None = None,
+) -> Solver:
+    """Compile the solver that belongs to the parameters.
+
+    Args:
+        parameters: constants of the solver; their type chooses the formulation.
+        device: where to run.
+        scenarios: scenarios advanced together; ``Device.CPU`` takes one.
+        threads: threads of ``Device.PARALLEL``; all that the process may use by default.
+
+    Raises:
+        UsageError: a device that this process cannot use, or a scenario count it cannot take.
+    """
+    module, name = _IMPLEMENTATIONS[type(parameters)]
+    package = __name__.rpartition(".")[0]
+    implementation = getattr(importlib.import_module(module, package), name)
+    return cast("Solver", implementation(parameters, device=device, scenarios=scenarios, threads=threads))

@@ -1,0 +1,115 @@
+"""Errors that say what, where, expected, got and how to fix it.
+
+Every error a user can cause is a :class:`LagbenchError`; its ``exit_code`` is what the
+command line returns. Codes: 1 checks failed, 2 usage, 3 a file the user gave is unreadable,
+4 data set missing, damaged or of another hash, 5 the work itself failed.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+from typing import ClassVar
+
+__all__ = [
+    "ChecksFailedError",
+    "DataError",
+    "LagbenchError",
+    "UnreadableFileError",
+    "UsageError",
+    "WorkFailedError",
+    "nearest",
+]
+
+
+class LagbenchError(Exception):
+    """Base of every error that lagbench raises on purpose.
+
+    Args:
+        what: what is wrong, one clause without a full stop.
+        where: file, key, variable or flag concerned.
+        expected: what would have been right.
+        got: what was found.
+        fix: what the user can do about it.
+    """
+
+    exit_code: ClassVar[int] = 1
+
+    def __init__(
+        self,
+        what: str,
+        *,
+        where: str | None = None,
+        expected: object = None,
+        got: object = None,
+        fix: str | None = None,
+    ) -> None:
+        self.what = what
+        self.where = where
+        self.expected = expected
+        self.got = got
+        self.fix = fix
+        super().__init__(self._compose())
+
+    def _compose(self) -> str:
+        parts = [self.what]
+        labelled = {"where": self.where, "expected": self.expected, "got": self.got, "fix": self.fix}
+        parts += [f"{label}: {text}" for label, text in labelled.items() if text is not None]
+        return "\n  ".join(parts)
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Rebuild with keyword arguments, so that errors cross process borders."""
+        return _rebuild, (type(self), self.what, self.where, self.expected, self.got, self.fix)
+
+
+def _rebuild(
+    kind: type[LagbenchError],
+    what: str,
+    where: str | None,
+    expected: object,
+    got: object,
+    fix: str | None,
+) -> LagbenchError:
+    return kind(what, where=where, expected=expected, got=got, fix=fix)
+
+
+class ChecksFailedError(LagbenchError):
+    """Something was checked and did not hold."""
+
+    exit_code = 1
+
+
+class UsageError(LagbenchError):
+    """A name, option or value that the caller gave does not exist or does not fit."""
+
+    exit_code = 2
+
+
+class UnreadableFileError(LagbenchError):
+    """A file that the user gave cannot be read."""
+
+    exit_code = 3
+
+
+class DataError(LagbenchError):
+    """A data set is missing, damaged, or of another hash."""
+
+    exit_code = 4
+
+
+class WorkFailedError(LagbenchError):
+    """The work itself failed: blow-up, disk full, worker lost."""
+
+    exit_code = 5
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Return a remedy that names the known word nearest to a wrong one.
+
+    >>> nearest("cavty", ["fluid", "cavity"])
+    "did you mean 'cavity'? known: cavity, fluid"
+    """
+    words = sorted(known)
+    close = difflib.get_close_matches(name, words, n=1, cutoff=0.5)
+    listing = f"known: {', '.join(words)}"
+    return f"did you mean {close[0]!r}? {listing}" if close else listing

@@ -1,0 +1,376 @@
+"""The registry: what datasets.yaml says about every split and size.
+
+A split is a family of simulated scenarios, a size one tier of it. Everything that decides
+bits (parameters, scenario ids, frame counts) is written by hand; everything that follows
+from them (hashes, statistics, twin floor) stands under ``measured`` and is written by
+``python -m lagbench.generators.record``.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+
+from .errors import UnreadableFileError, UsageError, nearest
+from .scenario_ids import parse_ids, spell_ids
+from .yamlfile import read_yaml
+
+__all__ = [
+    "Measured",
+    "Parameter",
+    "Registry",
+    "ScoreGrid",
+    "Size",
+    "Split",
+    "Task",
+    "default_path",
+    "load",
+]
+
+Number = int | float
+def _ids(value: str | int) -> tuple[int, ...]:
+    try:
+        return parse_ids(value)
+    except UsageError as error:
+        raise ValueError(f"{error.what}: {error.got}") from None
+
+
+Ids = Annotated[tuple[int, ...], BeforeValidator(_ids)]
+Interval = Annotated[tuple[float, float], Field(strict=False)]
+Hash = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+ShortHash = Annotated[str, Field(pattern=r"^[0-9a-f]{16}$")]
+SUBSETS = ("train", "valid", "test", "extra")
+HASHED_SUBSETS = ("train", "valid", "test")
+
+
+class _Strict(BaseModel):
+    """Frozen model that names the nearest known key when it meets an unknown one."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _known_keys(cls, data: Any) -> Any:  # noqa: ANN401
+        if isinstance(data, Mapping):
+            for key in data:
+                if key not in cls.model_fields:
+                    message = f"unknown key {key!r}: {nearest(str(key), cls.model_fields)}"
+                    raise ValueError(message)
+        return data
+
+
+class Parameter(_Strict):
+    """A physical or numerical parameter: value, unit and what it means."""
+
+    value: Number | bool | str | None = None
+    unit: str
+    description: str
+
+
+class ScoreGrid(_Strict):
+    """Grid on which the scorer forms fields.
+
+    ``cell_centres`` has nodes at (i + 1/2) / cells, ``nodes`` at i / cells.
+    """
+
+    cells: int = Field(gt=1)
+    placement: Literal["cell_centres", "nodes"]
+
+
+class Task(_Strict):
+    """What a model is given and what it must predict.
+
+    Attributes:
+        input_frames: frames given at the start of a test scenario.
+        horizon: frames to predict after them.
+        frames_of_interest: absolute frames at which the scorer reports.
+        score_grid: grid of the scorer's fields.
+        radius: connectivity radius for graph models [length].
+    """
+
+    input_frames: int = Field(gt=1)
+    horizon: int = Field(gt=0)
+    frames_of_interest: tuple[int, ...] = Field(strict=False)
+    score_grid: ScoreGrid
+    radius: float = Field(gt=0)
+
+
+class Measured(_Strict):
+    """What follows from the parameters: hashes, statistics of train, twin floor.
+
+    Attributes:
+        dataset_sha256: data set hash over train, valid and test.
+        subset_sha256: hash of each subset.
+        scenario_sha256: content hash of each scenario, first 16 hex digits.
+        statistics: mean and standard deviation per component over train.
+        twin_floor: position RMSE of the perturbed twin per predicted frame, mean over test [length].
+    """
+
+    dataset_sha256: Hash
+    subset_sha256: dict[str, Hash]
+    scenario_sha256: dict[int, ShortHash]
+    statistics: dict[str, Annotated[tuple[float, ...], Field(strict=False)]]
+    twin_floor: tuple[float, ...] = Field(strict=False)
+
+
+class _SizeEntry(_Strict):
+    """A size as written in datasets.yaml; :class:`Size` adds what the split says."""
+
+    subsets: dict[str, Ids]
+    frames: int | dict[int, Ids]
+    bounds: tuple[Interval, Interval] = Field(strict=False)
+    parameters: dict[str, Number | bool | str]
+    task: Task
+
+
+class Size(BaseModel):
+    """One tier of a split with all that is needed to simulate, read and score it."""
+
+    model_config = ConfigDict(frozen=True)
+
+    split: str
+    name: str
+    version: str
+    generator: str
+    subsets: dict[str, tuple[int, ...]]
+    frames: int | dict[int, tuple[int, ...]]
+    bounds: tuple[Interval, Interval]
+    parameters: dict[str, Parameter]
+    task: Task
+    measured: Measured | None = None
+
+    @property
+    def major(self) -> int:
+        """MAJOR of the version: it changes when existing bits change."""
+        return int(self.version.split(".")[0])
+
+    def value(self, name: str) -> Any:  # noqa: ANN401
+        """Return a parameter's value.
+
+        Raises:
+            UsageError: this split has no such parameter.
+        """
+        try:
+            return self.parameters[name].value
+        except KeyError:
+            raise UsageError(
+                f"no parameter {name!r}",
+                where=f"datasets.yaml, {self.split} {self.name}",
+                fix=nearest(name, self.parameters),
+            ) from None
+
+    @property
+    def particles(self) -> int:
+        """Particles in one scenario."""
+        return int(self.value("particles"))
+
+    @property
+    def grid(self) -> int:
+        """Solver cells across the unit box."""
+        return int(self.value("grid"))
+
+    @property
+    def dt(self) -> float:
+        """Length of a substep [s]: the frame interval over the substeps of a frame."""
+        return self.frame_interval / self.substeps_per_frame
+
+    @property
+    def substeps_per_frame(self) -> int:
+        """Solver steps from one recorded frame to the next."""
+        return int(self.value("substeps_per_frame"))
+
+    @property
+    def frame_interval(self) -> float:
+        """Time between recorded frames, 1 / frame rate [s]."""
+        return 1.0 / float(self.value("frame_rate"))
+
+    @property
+    def scenarios(self) -> tuple[int, ...]:
+        """All scenario ids of the size, ascending."""
+        return tuple(sorted(i for ids in self.subsets.values() for i in ids))
+
+    def subset_of(self, scenario: int) -> str:
+        """Return the subset that a scenario belongs to.
+
+        Raises:
+            UsageError: no subset has this id.
+        """
+        for subset, ids in self.subsets.items():
+            if scenario in ids:
+                return subset
+        raise UsageError(
+            f"no scenario {scenario}",
+            where=f"{self.split} {self.name}",
+            expected=", ".join(f"{subset} {spell_ids(ids)}" for subset, ids in self.subsets.items()),
+        )
+
+    def frame_count(self, scenario: int) -> int:
+        """Return how many frames a scenario records."""
+        if isinstance(self.frames, int):
+            return self.frames
+        return next(count for count, ids in self.frames.items() if scenario in ids)
+
+
+class Split(_Strict):
+    """A named data set: version, provenance, parameters and sizes."""
+
+    version: str = Field(pattern=r"^[1-9]\d*\.\d+\.\d+$")
+    title: str
+    description: str
+    citation: str
+    licence: str
+    generator: str
+    source: str
+    parameters: dict[str, Parameter]
+    sizes: dict[str, _SizeEntry]
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Split:
+        for name, size in self.sizes.items():
+            _check_parameters(name, size.parameters, self.parameters)
+            _check_subsets(name, size)
+        return self
+
+
+class Registry:
+    """All splits of one datasets.yaml and of the installed packages that add splits."""
+
+    def __init__(self, splits: Mapping[str, Split], measured: Mapping[str, Mapping[str, Measured]]) -> None:
+        self.splits = dict(splits)
+        self.measured = measured
+
+    def split(self, name: str) -> Split:
+        """Return a split by name.
+
+        Raises:
+            UsageError: there is none; the message names the nearest known one.
+        """
+        if name not in self.splits:
+            raise UsageError(f"no split {name!r}", where="--split", fix=nearest(name, self.splits))
+        return self.splits[name]
+
+    def size(self, split: str, name: str) -> Size:
+        """Return one size of a split with its merged parameters and measured values.
+
+        Raises:
+            UsageError: unknown split or size; the message names the nearest known one.
+        """
+        parent = self.split(split)
+        if name not in parent.sizes:
+            raise UsageError(
+                f"split {split!r} has no size {name!r}", where="--size", fix=nearest(name, parent.sizes)
+            )
+        entry = parent.sizes[name]
+        return Size(
+            split=split,
+            name=name,
+            version=parent.version,
+            generator=parent.generator,
+            subsets=entry.subsets,
+            frames=entry.frames,
+            bounds=entry.bounds,
+            parameters=_merge(parent.parameters, entry.parameters),
+            task=entry.task,
+            measured=self.measured.get(split, {}).get(name),
+        )
+
+
+class _File(_Strict):
+    """The whole of a datasets.yaml."""
+
+    format: Literal[1]
+    splits: dict[str, Split]
+    measured: dict[str, dict[str, Measured]] = Field(default_factory=dict)
+
+
+def default_path() -> Path:
+    """Return the registry that ships with lagbench: in the package, else beside it."""
+    here = Path(__file__).resolve().parent
+    inside = here / "datasets.yaml"
+    return inside if inside.exists() else here.parent / "datasets.yaml"
+
+
+@functools.cache
+def load(path: Path | None = None) -> Registry:
+    """Return the validated registry, splits of other installed packages included.
+
+    Args:
+        path: a datasets.yaml; ours, with those of entry points, when None.
+
+    Raises:
+        UnreadableFileError: not YAML, an unknown key or a value of the wrong type.
+    """
+    own = _read(path or default_path())
+    splits, measured = dict(own.splits), dict(own.measured)
+    if path is None:
+        for point in entry_points(group="lagbench.generators"):
+            if point.name not in splits:
+                other = _read(_registry_of(point))
+                splits |= other.splits
+                measured |= other.measured
+    return Registry(splits, measured)
+
+
+def _registry_of(point: EntryPoint) -> Path:
+    """Return the datasets.yaml that another package's split module names as REGISTRY."""
+    module = point.load()
+    if not hasattr(module, "REGISTRY"):
+        raise UsageError(
+            f"split {point.name!r} has no registry",
+            where=f"entry point {point.value}",
+            expected="a module attribute REGISTRY: the path of its datasets.yaml",
+        )
+    return Path(module.REGISTRY)
+
+
+def _read(path: Path) -> _File:
+    """Validate one datasets.yaml; say where and what is wrong with it."""
+    try:
+        return _File.model_validate(read_yaml(path))
+    except ValidationError as error:
+        lines = [f"{'.'.join(map(str, item['loc']))}: {item['msg']}" for item in error.errors()[:10]]
+        raise UnreadableFileError(
+            f"{error.error_count()} mistake(s) in the registry",
+            where=str(path),
+            got="\n    ".join(["", *lines]),
+            fix="mend the keys named above",
+        ) from None
+
+
+def _merge(split: Mapping[str, Parameter], size: Mapping[str, Number | bool | str]) -> dict[str, Parameter]:
+    """Return the split's parameters with the size's values put in."""
+    return {name: p.model_copy(update={"value": size.get(name, p.value)}) for name, p in split.items()}
+
+
+def _check_parameters(
+    size: str, given: Mapping[str, Number | bool | str], declared: Mapping[str, Parameter]
+) -> None:
+    for name in given:
+        if name not in declared:
+            message = f"size {size}: undeclared parameter {name!r}: {nearest(name, declared)}"
+            raise ValueError(message)
+    missing = [n for n, p in declared.items() if p.value is None and n not in given]
+    if missing:
+        message = f"size {size}: no value for {', '.join(missing)}"
+        raise ValueError(message)
+
+
+def _check_subsets(size: str, entry: _SizeEntry) -> None:
+    unknown = set(entry.subsets) - set(SUBSETS)
+    if unknown:
+        message = f"size {size}: {nearest(min(unknown), SUBSETS)}"
+        raise ValueError(message)
+    ids = [i for subset in entry.subsets.values() for i in subset]
+    if len(ids) != len(set(ids)):
+        message = f"size {size}: a scenario stands in two subsets"
+        raise ValueError(message)
+    if isinstance(entry.frames, dict):
+        counted = sorted(i for group in entry.frames.values() for i in group)
+        if counted != sorted(ids):
+            message = f"size {size}: frames must name every scenario once"
+            raise ValueError(message)

@@ -1,0 +1,76 @@
+"""Read YAML that strangers may have written: safe types only, bounded size, no aliases.
+
+Aliases are refused because a few hundred bytes of them can expand to gigabytes; duplicate
+keys because the second would silently replace the first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from .errors import UnreadableFileError
+
+__all__ = ["MAX_BYTES", "read_yaml"]
+
+MAX_BYTES = 4 * 2**20
+"""Largest YAML file that is read [bytes]."""
+
+try:
+    from yaml import CSafeLoader as _SafeLoader
+except ImportError:  # PyYAML built without libyaml
+    from yaml import SafeLoader as _SafeLoader  # type: ignore[assignment]
+
+
+class _StrictLoader(_SafeLoader):
+    """Safe loader that refuses aliases and duplicate keys."""
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        if self.check_event(yaml.AliasEvent):
+            event = self.peek_event()
+            raise yaml.composer.ComposerError(None, None, "aliases are not allowed", event.start_mark)
+        return super().compose_node(parent, index)
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
+        seen: set[Hashable] = set()
+        for key_node, _ in node.value:
+            key = self.construct_object(key_node, deep=True)
+            if not isinstance(key, Hashable) or key in seen:
+                message = f"key {key!r} is given twice or cannot be a key"
+                raise yaml.constructor.ConstructorError(None, None, message, key_node.start_mark)
+            seen.add(key)
+        return super().construct_mapping(node, deep=deep)
+
+
+def read_yaml(path: Path) -> Any:  # noqa: ANN401
+    """Return the plain Python value of a YAML file.
+
+    Args:
+        path: file to read, at most :data:`MAX_BYTES` long.
+
+    Raises:
+        UnreadableFileError: the file is missing, too large, no UTF-8, or no plain YAML.
+    """
+    try:
+        size = path.stat().st_size
+        if size > MAX_BYTES:
+            raise UnreadableFileError(
+                "the YAML file is too large",
+                where=str(path),
+                expected=f"at most {MAX_BYTES} bytes",
+                got=f"{size} bytes",
+            )
+        text = path.read_text(encoding="utf-8")
+        return yaml.load(text, Loader=_StrictLoader)  # noqa: S506 - a safe loader
+    except OSError as error:
+        raise UnreadableFileError("cannot read the YAML file", where=str(path), got=error) from error
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+        raise UnreadableFileError(
+            "not a plain YAML file",
+            where=str(path),
+            got=" ".join(str(error).split()),
+            fix="use plain mappings, lists, numbers and strings, in UTF-8",
+        ) from error

@@ -1,0 +1,260 @@
+"""The free-surface solver in plain NumPy float32, written from the equations of design 4.4.
+
+Independent of Taichi and of ``generators/``: it reads only parameters and initial states. Every
+operation rounds to float32 in the order in which the equation is written; sums over particles
+are 64-bit integers. Slow (two to three microseconds per particle and substep) and plain.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagbench.generators.base import FreeSurfaceParameters, InitialState, Material
+
+Float = np.float32
+Floats = NDArray[np.float32]
+Components = tuple[Floats, Floats, Floats, Floats]
+
+ONE, TWO, HALF = Float(1.0), Float(2.0), Float(0.5)
+FIXED_POINT = Float(2.0**44)
+TAYLOR = [Float(1 / 720), Float(1 / 120), Float(1 / 24), Float(1 / 6), Float(1 / 2), ONE, ONE]
+
+
+def lame(young: float, poisson: float) -> tuple[float, float]:
+    """Lame's constants in float64."""
+    return young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
+
+
+def clamp(value: Floats, low: Float, high: Float) -> Floats:
+    """Limit to [low, high]."""
+    return np.minimum(np.maximum(value, low), high)
+
+
+def exp(z: Floats) -> Floats:
+    """Degree-6 Taylor polynomial of z/16, squared four times."""
+    t = z * Float(1 / 16)
+    e = np.full_like(z, TAYLOR[0])
+    for coefficient in TAYLOR[1:]:
+        e = coefficient + t * e
+    for _ in range(4):
+        e = e * e
+    return e
+
+
+def polar(f: Components) -> tuple[Floats, Floats]:
+    """Cosine and sine of the polar rotation of gradients given by components."""
+    a, b, c, d = f
+    x, y = a + d, c - b
+    length = np.sqrt(x * x + y * y)
+    spins = length > Float(1e-6)
+    safe = np.where(spins, length, ONE)
+    return np.where(spins, x / safe, ONE), np.where(spins, y / safe, Float(0))
+
+
+@dataclass
+class Stencil:
+    """Where a particle touches the grid: lowest node, distance to it [cells], weights per axis."""
+
+    base: NDArray[np.int32]
+    distance: Floats
+    weights: tuple[Floats, Floats, Floats]
+
+    @classmethod
+    def at(cls, position: Floats, grid: int) -> Stencil:
+        """Quadratic B-spline around positions of shape [particle, 2]."""
+        scaled = position * Float(grid)
+        base = (scaled - HALF).astype(np.int32)
+        d = scaled - base.astype(Float)
+        weights = (
+            HALF * ((Float(1.5) - d) * (Float(1.5) - d)),
+            Float(0.75) - (d - ONE) * (d - ONE),
+            HALF * ((d - HALF) * (d - HALF)),
+        )
+        return cls(base, d, weights)
+
+    def nodes(self):  # type: ignore[no-untyped-def] # noqa: ANN201
+        """Yield (node i, node k, weight, offset x [cells], offset y [cells]) for the nine nodes."""
+        for i in range(3):
+            for k in range(3):
+                weight = self.weights[i][:, 0] * self.weights[k][:, 1]
+                offset = Float(i) - self.distance[:, 0], Float(k) - self.distance[:, 1]
+                yield self.base[:, 0] + i, self.base[:, 1] + k, weight, *offset
+
+
+class FreeSurfaceReference:
+    """One scenario of the free-surface solver.
+
+    Attributes:
+        position: [length], shape [particle, 2].
+        velocity: [length/s], shape [particle, 2].
+        affine: C [1/s], components (xx, xy, yx, yy) of shape [particle].
+        deformation: F [1], components like ``affine``.
+        ratio: J of liquid, Jp of snow, 1 elsewhere [1], shape [particle].
+    """
+
+    def __init__(self, parameters: FreeSurfaceParameters, state: InitialState) -> None:
+        """Start from an initial state; constants are computed in float64, then rounded once."""
+        p = self.p = parameters
+        count = len(state.position)
+        self.position = state.position.astype(Float)
+        self.velocity = state.velocity.astype(Float)
+        self.affine: Components = tuple(state.affine.reshape(count, 4).T.astype(Float))  # type: ignore[assignment]
+        ones, zeros = np.ones(count, Float), np.zeros(count, Float)
+        self.deformation: Components = (ones, zeros, zeros, ones)
+        self.ratio = ones
+        self.liquid = state.material == Material.LIQUID
+        self.snow = state.material == Material.SNOW
+        moduli = {
+            Material.LIQUID: (0.0, 0.0),
+            Material.JELLY: lame(p.jelly_modulus, p.jelly_poisson),
+            Material.SNOW: lame(p.snow_modulus, p.snow_poisson),
+            Material.ROPE: lame(p.rope_modulus, p.rope_poisson),
+        }
+        self.mu, self.la = np.array([moduli[Material(m)] for m in state.material], Float).T
+        kinematic = np.where(self.liquid, p.liquid_viscosity, np.where(self.snow, 0.0, p.elastic_damping))
+        self.viscosity = (p.density * kinematic).astype(Float)
+        self.friction = Float(state.friction)
+        volume = state.area / count
+        self.mass = Float(p.density * volume)
+        self.stress_scale = Float(4.0 * p.dt * volume * p.grid**2)
+        self.full_node = Float(p.grid**2 / p.density)
+
+    def advance(self, substeps: int) -> None:
+        """Run substeps."""
+        for _ in range(substeps):
+            stencil = Stencil.at(self.position, self.p.grid)
+            self.to_particles(stencil, *self.grid_update(self.to_grid(stencil)))
+
+    def stress(self) -> tuple[Floats, Floats, Floats]:
+        """Kirchhoff stress (xx, xy, yy)."""
+        p, (a, b, c, d) = self.p, self.deformation
+        stiff = clamp(exp(clamp(Float(p.snow_hardening) * (ONE - self.ratio), Float(-4), Float(4))),
+                      Float(p.snow_hardening_min), Float(p.snow_hardening_max))  # fmt: skip
+        factor = np.where(self.snow, stiff, ONE)
+        mu, la = self.mu * factor, self.la * factor
+        cos, sin = polar(self.deformation)
+        jacobian = a * d - b * c
+        volumetric = la * (jacobian - ONE) * jacobian
+        pressure = Float(p.liquid_modulus) * (self.ratio - ONE)
+        xx = TWO * mu * ((a - cos) * a + (b + sin) * b) + volumetric
+        xy = TWO * mu * ((a - cos) * c + (b + sin) * d)
+        yy = TWO * mu * ((c - sin) * c + (d - cos) * d) + volumetric
+        cxx, cxy, cyx, cyy = self.affine
+        return (
+            np.where(self.liquid, pressure, xx) + TWO * self.viscosity * cxx,
+            np.where(self.liquid, Float(0), xy) + self.viscosity * (cxy + cyx),
+            np.where(self.liquid, pressure, yy) + TWO * self.viscosity * cyy,
+        )
+
+    def to_grid(self, stencil: Stencil) -> NDArray[np.int64]:
+        """Sum mass, momentum (x, y) and mass times J at the nodes, shape [4, node, node]."""
+        nodes = self.p.grid + 1
+        dx = Float(1 / self.p.grid)
+        sums = np.zeros((4, nodes, nodes), np.int64)
+        xx, xy, yy = self.stress()
+        cxx, cxy, cyx, cyy = self.affine
+        m, s = self.mass, self.stress_scale
+        axx, axy, ayx, ayy = m * cxx - s * xx, m * cxy - s * xy, m * cyx - s * xy, m * cyy - s * yy
+        px, py = m * self.velocity[:, 0], m * self.velocity[:, 1]
+        jacobian = np.where(self.liquid, self.ratio, ONE)
+        for i, k, w, ox, oy in stencil.nodes():
+            x, y = ox * dx, oy * dx
+            share = w * m
+            parts = share, w * (px + (axx * x + axy * y)), w * (py + (ayx * x + ayy * y)), share * jacobian
+            for total, part in zip(sums, parts, strict=True):
+                np.add.at(total, (i, k), (part * FIXED_POINT).astype(np.int64))
+        return sums
+
+    def grid_update(self, sums: NDArray[np.int64]) -> tuple[Floats, Floats, Floats, Floats]:
+        """Return nodal velocity (x, y), relative density and J after gravity and walls."""
+        low, high = self.p.wall, self.p.grid - self.p.wall
+        mass, px, py, mj = (total.astype(Float) / FIXED_POINT for total in sums)
+        filled = sums[0] > 0
+        m = np.where(filled, mass, ONE)
+        u = np.where(filled, px / m, Float(0))
+        v = np.where(filled, py / m - Float(self.p.gravity * self.p.dt), Float(0))
+        index = np.arange(self.p.grid + 1)
+        below, above = index <= low, index >= high
+        u, v = self.wall_contact(u, v, below[:, None], above[:, None])
+        v, u = self.wall_contact(v, u, below[None, :], above[None, :])
+        density = np.where(filled, m * self.full_node, Float(0))
+        for r in (density, density.T):
+            for wall, inside, outside in ((low, low + 1, low - 1), (high, high - 1, high + 1)):
+                r[wall] = TWO * r[wall]
+                r[inside] = r[inside] + r[outside]
+                r[outside] = r[inside]
+        return u, v, density, np.where(filled, mj / m, ONE)
+
+    def wall_contact(
+        self, normal: Floats, tangential: Floats, below: NDArray[np.bool_], above: NDArray[np.bool_]
+    ) -> tuple[Floats, Floats]:
+        """Remove the outward normal velocity; Coulomb friction brakes the tangential one by its share."""
+        hits = (below & (normal < 0)) | (above & (normal > 0))
+        loss = self.friction * np.abs(normal) / np.maximum(np.abs(tangential), Float(1e-9))
+        braked = tangential * np.maximum(Float(0), ONE - loss)
+        return np.where(hits, Float(0), normal), np.where(hits, braked, tangential)
+
+    def to_particles(self, stencil: Stencil, u: Floats, v: Floats, density: Floats, jacobian: Floats) -> None:
+        """Gather velocity, gradient, density and J; move; update the constitutive state."""
+        zeros = np.zeros(len(self.position), Float)
+        vx = vy = cxx = cxy = cyx = cyy = r = smooth = zeros
+        for i, k, w, ox, oy in stencil.nodes():
+            x, y = w * u[i, k], w * v[i, k]
+            vx, vy = vx + x, vy + y
+            cxx, cxy, cyx, cyy = cxx + x * ox, cxy + x * oy, cyx + y * ox, cyy + y * oy
+            r, smooth = r + w * density[i, k], smooth + w * jacobian[i, k]
+        scale = Float(4 * self.p.grid)
+        self.affine = (scale * cxx, scale * cxy, scale * cyx, scale * cyy)
+        self.velocity = np.stack([vx, vy], 1)
+        dx = 1 / self.p.grid
+        low, high = Float((self.p.wall + 1e-3) * dx), Float((self.p.grid - self.p.wall - 1e-3) * dx)
+        self.position = clamp(self.position + Float(self.p.dt) * self.velocity, low, high)
+        self.relax_liquid(r, smooth)
+        self.deform()
+
+    def relax_liquid(self, density: Floats, smooth: Floats) -> None:
+        """J <- J (1 + dt tr C) + kappa (Jbar - J); J <- J + theta (1 / max(r, 1) - J); limits."""
+        p, old = self.p, self.ratio
+        j = old + Float(p.dt) * (self.affine[0] + self.affine[3]) * old
+        j = j + Float(p.jacobian_relaxation) * (smooth - old)
+        j = j + Float(p.density_coupling) * (ONE / np.maximum(density, ONE) - j)
+        self.ratio = np.where(self.liquid, clamp(j, Float(p.jacobian_min), Float(p.jacobian_max)), old)
+
+    def deform(self) -> None:
+        """F <- (I + dt C) F for solids; snow then yields."""
+        (a, b, c, d), (cxx, cxy, cyx, cyy), dt = self.deformation, self.affine, Float(self.p.dt)
+        trial = (
+            a + dt * (cxx * a + cxy * c),
+            b + dt * (cxx * b + cxy * d),
+            c + dt * (cyx * a + cyy * c),
+            d + dt * (cyx * b + cyy * d),
+        )
+        elastic, factor = self.yielded(trial)
+        plastic = clamp(self.ratio * factor, Float(self.p.snow_jp_min), Float(self.p.snow_jp_max))
+        self.ratio = np.where(self.snow, plastic, self.ratio)
+        self.deformation = tuple(  # type: ignore[assignment]
+            np.where(self.liquid, old, np.where(self.snow, kept, new))
+            for old, kept, new in zip(self.deformation, elastic, trial, strict=True)
+        )
+
+    def yielded(self, trial: Components) -> tuple[Components, Floats]:
+        """Clamp the principal stretches; return the elastic gradient and the factor on Jp."""
+        low, high = Float(1 - self.p.snow_compression), Float(1 + self.p.snow_stretch)
+        a, b, c, d = trial
+        cos, sin = polar(trial)
+        s0, s1 = cos * a + sin * c, cos * d - sin * b
+        off = HALF * ((cos * b + sin * d) + (cos * c - sin * a))
+        mean, half = HALF * (s0 + s1), HALF * (s0 - s1)
+        radius = np.sqrt(half * half + off * off)
+        e1, e2 = mean + radius, mean - radius
+        k1, k2 = clamp(e1, low, high), clamp(e2, low, high)
+        sheared = radius > Float(1e-12)
+        share = np.where(sheared, HALF * (k1 - k2) / np.where(sheared, radius, ONE), Float(0))
+        centre = HALF * (k1 + k2)
+        t0, t1, t2 = centre + share * half, centre - share * half, share * off
+        floor = Float(0.1)
+        factor = np.maximum(e1, floor) * np.maximum(e2, floor) / (k1 * k2)
+        return (cos * t0 - sin * t2, cos * t2 - sin * t1, sin * t0 + cos * t2, sin * t2 + cos * t1), factor
