@@ -6,12 +6,15 @@ int32 wherever a kernel does not say otherwise. Everything that makes fields sta
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
 from collections.abc import Sequence
 from typing import Any
 
-# Taichi greets on stdout as it is imported, which would spoil `--json`.
+# Taichi greets on stdout as it is imported, which would spoil `--json`, and asks the network.
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
+os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
 
 import taichi as ti
 
@@ -32,7 +35,7 @@ def available_threads() -> int:
 def start(device: Device, *, scenarios: int = 1, threads: int | None = None) -> int:
     """Start Taichi for a device unless it runs, and return the threads for parallel loops.
 
-    The first call in a process fixes the size of the thread pool.
+    The first call in a process fixes the size of the thread pool; idle threads sleep.
 
     Args:
         device: where the kernels will run.
@@ -53,7 +56,7 @@ def start(device: Device, *, scenarios: int = 1, threads: int | None = None) -> 
         )
     on_gpu = device is Device.CUDA
     if not _started:
-        _initialise(on_gpu, threads or available_threads())
+        _initialise(on_gpu, max(2, available_threads(), threads or 0))
     running_on_gpu, pool = _started[0]
     if running_on_gpu != on_gpu or (threads or 1) > pool:
         raise UsageError(
@@ -62,21 +65,23 @@ def start(device: Device, *, scenarios: int = 1, threads: int | None = None) -> 
             expected=f"{'CUDA' if running_on_gpu else 'CPU'} with at most {pool} threads",
             fix="use another process",
         )
-    return threads or pool
+    return threads or min(pool, available_threads())
 
 
 def _initialise(on_gpu: bool, pool: int) -> None:
+    greeting = io.StringIO()
     try:
-        ti.init(
-            arch=ti.cuda if on_gpu else ti.cpu,
-            default_fp=ti.f32,
-            default_ip=ti.i32,
-            fast_math=False,
-            cpu_max_num_threads=pool,
-            offline_cache=True,
-            enable_fallback=False,
-            log_level=ti.ERROR,
-        )
+        with contextlib.redirect_stdout(greeting):
+            ti.init(
+                arch=ti.cuda if on_gpu else ti.cpu,
+                default_fp=ti.f32,
+                default_ip=ti.i32,
+                fast_math=False,
+                cpu_max_num_threads=pool,
+                offline_cache=True,
+                enable_fallback=False,
+                log_level=ti.ERROR,
+            )
     except RuntimeError as error:
         raise UsageError(
             "Taichi cannot use this device", where="cuda" if on_gpu else "cpu", got=error

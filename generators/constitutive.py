@@ -3,10 +3,20 @@
 Every stress is a Kirchhoff stress tau [mass/s^2], symmetric, shape [2, 2]. Only ``+ - * /``,
 ``sqrt`` and comparisons are used, so that every processor returns the same bits.
 
+A 2 x 2 deformation gradient is a scaled rotation plus a scaled reflection,
+
+    F = [[e, -g], [g, e]] + [[h, k], [k, -h]],    q = sqrt(e^2 + g^2),    r = sqrt(h^2 + k^2).
+
+The rotation R of the polar decomposition F = R S has cosine e/q and sine g/q; the principal
+stretches are q + r and q - r (negative when F inverts); det F = q^2 - r^2. This is both
+decompositions in closed form, with one square root each and no eigenvector.
+
 Sources: Hu et al. 2018 (MLS-MPM), Stomakhin et al. 2012 (fixed corotated), 2013 (snow).
 """
 
 import taichi as ti
+
+from .transfer import Value, bounded
 
 __all__ = [
     "EXPONENT_MAX",
@@ -15,6 +25,7 @@ __all__ = [
     "exponential",
     "hardening",
     "lame",
+    "larger",
     "liquid_stress",
     "plastic_return",
     "rotation",
@@ -27,9 +38,8 @@ EXPONENT_MAX = 4.0
 STRETCH_MIN = 0.1
 """Smallest trial stretch that enters the plastic volume; an inverted particle counts as this."""
 
-_SPIN_MIN = 1e-6
-_SHEAR_MIN = 1e-12
-_INVERSE_FACTORIALS = (1.0, 1.0, 1 / 2, 1 / 6, 1 / 24, 1 / 120, 1 / 720)
+_STRETCH_EPSILON = 1e-6
+_SHEAR_EPSILON = 1e-12
 
 
 def lame(young: float, poisson: float) -> tuple[float, float]:
@@ -48,33 +58,40 @@ def lame(young: float, poisson: float) -> tuple[float, float]:
 
 
 @ti.func
+def larger(a: ti.f32, b: ti.f32) -> ti.f32:
+    """Return the larger of two numbers, b if a is not a number (one instruction, unlike max)."""
+    return ti.select(a > b, a, b)
+
+
+@ti.func
 def exponential(z: ti.f32) -> ti.f32:
     """Return exp(z): the Taylor polynomial of degree 6 in z/16, squared four times.
 
     Relative error <= 3e-6 for abs(z) <= :data:`EXPONENT_MAX` in float32.
     """
     t = z * 0.0625
-    e = _INVERSE_FACTORIALS[6]
-    for degree in ti.static(range(5, -1, -1)):
-        e = _INVERSE_FACTORIALS[degree] + t * e
+    square = t * t
+    high = (1.0 / 24.0 + t * (1.0 / 120.0)) + square * (1.0 / 720.0)
+    e = (1.0 + t) + square * ((0.5 + t * (1.0 / 6.0)) + square * high)
     for _ in ti.static(range(4)):
         e = e * e
     return e
 
 
 @ti.func
-def rotation(f: ti.math.mat2) -> ti.math.vec2:
-    """Return (cos, sin) of the rotation R nearest to F, the polar factor of F = R S.
+def rotation(f: ti.math.mat2) -> ti.math.vec3:
+    """Return (cosine, sine, q): the polar rotation R of F and the mean stretch q.
 
-    In 2D, R is the direction of (F00 + F11, F10 - F01); a vanishing vector gives R = I.
+    Where q vanishes (F a reflection, or nothing at all) R is the identity.
     """
-    x = f[0, 0] + f[1, 1]
-    y = f[1, 0] - f[0, 1]
-    length = ti.sqrt(x * x + y * y)
-    direction = ti.Vector([1.0, 0.0])
-    if length > _SPIN_MIN:
-        direction = ti.Vector([x / length, y / length])
-    return direction
+    e = 0.5 * (f[0, 0] + f[1, 1])
+    g = 0.5 * (f[1, 0] - f[0, 1])
+    q = ti.sqrt(e * e + g * g)
+    cosine, sine = 1.0, 0.0
+    if q > _STRETCH_EPSILON:
+        inverse = 1.0 / q
+        cosine, sine = e * inverse, g * inverse
+    return ti.Vector([cosine, sine, q])
 
 
 @ti.func
@@ -99,27 +116,26 @@ def liquid_stress(jacobian: ti.f32, modulus: ti.f32) -> ti.f32:
 def corotated_stress(f: ti.math.mat2, mu: ti.f32, la: ti.f32) -> ti.math.mat2:
     """Return the fixed corotated stress 2 mu (F - R) F^T + lambda (J - 1) J I.
 
-    (F - R) F^T = R (S - I) S R^T is symmetric, so three entries are computed.
+    With W = R [[h, k], [k, -h]], a symmetric matrix without trace,
+    (F - R) F^T = (q (q - 1) + r^2) I + (2 q - 1) W.
 
     Args:
         f: deformation gradient [1].
         mu: shear modulus [mass/s^2].
         la: Lame's first constant [mass/s^2].
     """
-    r = rotation(f)
-    a = f[0, 0] - r[0]
-    b = f[0, 1] + r[1]
-    c = f[1, 0] - r[1]
-    d = f[1, 1] - r[0]
-    jacobian = f[0, 0] * f[1, 1] - f[0, 1] * f[1, 0]
+    turn = rotation(f)
+    q = turn[2]
+    h = 0.5 * (f[0, 0] - f[1, 1])
+    k = 0.5 * (f[1, 0] + f[0, 1])
+    square = h * h + k * k
+    jacobian = q * q - square
     volumetric = la * (jacobian - 1.0) * jacobian
-    shear = 2.0 * mu * (a * f[1, 0] + b * f[1, 1])
-    return ti.Matrix(
-        [
-            [2.0 * mu * (a * f[0, 0] + b * f[0, 1]) + volumetric, shear],
-            [shear, 2.0 * mu * (c * f[1, 0] + d * f[1, 1]) + volumetric],
-        ]
-    )
+    mean = 2.0 * mu * (q * (q - 1.0) + square) + volumetric
+    stretch = 2.0 * mu * (2.0 * q - 1.0)
+    normal = stretch * (turn[0] * h - turn[1] * k)
+    shear = stretch * (turn[0] * k + turn[1] * h)
+    return ti.Matrix([[mean + normal, shear], [shear, mean - normal]])
 
 
 @ti.func
@@ -132,16 +148,15 @@ def hardening(plastic: ti.f32, exponent: ti.f32, low: ti.f32, high: ti.f32) -> t
         low: lower cap, at least exp(-EXPONENT_MAX) [1].
         high: upper cap, at most exp(EXPONENT_MAX) [1].
     """
-    z = ti.min(ti.max(exponent * (1.0 - plastic), -EXPONENT_MAX), EXPONENT_MAX)
-    return ti.min(ti.max(exponential(z), low), high)
+    z = bounded(exponent * (1.0 - plastic), -EXPONENT_MAX, EXPONENT_MAX)
+    return bounded(exponential(z), low, high)
 
 
 @ti.func
-def plastic_return(f: ti.math.mat2, low: ti.f32, high: ti.f32) -> tuple[ti.math.mat2, ti.f32]:
+def plastic_return(f: ti.math.mat2, low: ti.f32, high: ti.f32) -> Value:
     """Clamp the principal stretches of F to [low, high]; return (elastic F, volume ratio).
 
-    F = R S with S = [[p, q], [q, s]]; the stretches are m +- r with m = (p + s) / 2 and
-    r = sqrt(((p - s) / 2)^2 + q^2). Clamping changes m and r only, so no eigenvector is needed.
+    Clamping q + r and q - r gives new q and r, by which rotation and reflection are scaled.
     The second value is the factor on Jp: trial stretches (at least :data:`STRETCH_MIN`) over
     clamped ones.
 
@@ -150,27 +165,18 @@ def plastic_return(f: ti.math.mat2, low: ti.f32, high: ti.f32) -> tuple[ti.math.
         low: smallest elastic stretch, 1 - theta_c [1].
         high: largest elastic stretch, 1 + theta_s [1].
     """
-    t = rotation(f)
-    p = t[0] * f[0, 0] + t[1] * f[1, 0]
-    s = t[0] * f[1, 1] - t[1] * f[0, 1]
-    q = 0.5 * ((t[0] * f[0, 1] + t[1] * f[1, 1]) + (t[0] * f[1, 0] - t[1] * f[0, 0]))
-    mean = 0.5 * (p + s)
-    half = 0.5 * (p - s)
-    radius = ti.sqrt(half * half + q * q)
-    first = ti.min(ti.max(mean + radius, low), high)
-    second = ti.min(ti.max(mean - radius, low), high)
-    ratio = 0.0
-    if radius > _SHEAR_MIN:
-        ratio = 0.5 * (first - second) / radius
-    mean_kept = 0.5 * (first + second)
-    p_kept = mean_kept + ratio * half
-    s_kept = mean_kept - ratio * half
-    q_kept = ratio * q
-    trial = ti.max(mean + radius, STRETCH_MIN) * ti.max(mean - radius, STRETCH_MIN)
-    elastic = ti.Matrix(
-        [
-            [t[0] * p_kept - t[1] * q_kept, t[0] * q_kept - t[1] * s_kept],
-            [t[1] * p_kept + t[0] * q_kept, t[1] * q_kept + t[0] * s_kept],
-        ]
-    )
-    return elastic, trial / (first * second)
+    turn = rotation(f)
+    q = turn[2]
+    h = 0.5 * (f[0, 0] - f[1, 1])
+    k = 0.5 * (f[1, 0] + f[0, 1])
+    r = ti.sqrt(h * h + k * k)
+    first = bounded(q + r, low, high)
+    second = bounded(q - r, low, high)
+    shrink = 0.0
+    if r > _SHEAR_EPSILON:
+        shrink = 0.5 * (first - second) / r
+    mean = 0.5 * (first + second)
+    e, g = mean * turn[0], mean * turn[1]
+    h, k = shrink * h, shrink * k
+    trial = larger(q + r, STRETCH_MIN) * larger(q - r, STRETCH_MIN)
+    return ti.Matrix([[e + h, k - g], [k + g, e - h]]), trial / (first * second)

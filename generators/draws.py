@@ -95,7 +95,7 @@ def _unit(rng: RandomSource) -> float:
 
 
 def uniform(rng: RandomSource, low: float, high: float) -> float:
-    """Draw from the uniform distribution on [low, high), a multiple of 2^-20."""
+    """Draw from the uniform distribution on [low, high), rounded to a multiple of 2^-20."""
     return float(quantise(low + (high - low) * _unit(rng)))
 
 

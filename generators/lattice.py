@@ -12,9 +12,7 @@ from .draws import RandomSource, quantise
 __all__ = ["fill", "fill_grid"]
 
 
-def fill(
-    rng: RandomSource, count: int, *, low: float, high: float, jitter: float
-) -> NDArray[np.float64]:
+def fill(rng: RandomSource, count: int, *, low: float, high: float, jitter: float) -> NDArray[np.float64]:
     """Fill a square with any number of particles, in columns of nearly equal counts.
 
     The columns number floor(sqrt(count)), their counts differ by one at the most, and each

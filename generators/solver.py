@@ -108,5 +108,6 @@ def build(
     """
     module, name = _IMPLEMENTATIONS[type(parameters)]
     package = __name__.rpartition(".")[0]
+    importlib.import_module(".backend", package)  # before Taichi itself, which it keeps quiet
     implementation = getattr(importlib.import_module(module, package), name)
     return cast("Solver", implementation(parameters, device=device, scenarios=scenarios, threads=threads))

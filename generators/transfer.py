@@ -7,18 +7,37 @@ weight w_i w_j, where f = x/dx - base lies in [1/2, 3/2) and per axis
 
 Nodes sum 64-bit integers, q = round(scale x value): integer addition commutes, so neither the
 order of particles nor threads nor devices can change a bit of the sum.
+
+In the signatures of Taichi functions ``Template`` is a field or a compile-time constant and
+``Value`` a scalar or vector of any type, for which Taichi wants no annotation; nor does it for a
+kernel that returns ``Nothing``.
 """
 
-from __future__ import annotations
+import inspect
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import taichi as ti
 
+if TYPE_CHECKING:
+    Template: TypeAlias = Any
+    Value: TypeAlias = Any
+    Nothing: TypeAlias = None
+else:
+    Template = ti.template()
+    Value = inspect.Parameter.empty
+    Nothing = tuple[()]
+
 __all__ = [
+    "Nothing",
+    "Template",
+    "Value",
     "accumulate",
     "bounded",
     "fixed_point_scale",
     "from_fixed",
+    "largest",
     "stencil",
+    "stepped",
     "to_fixed",
 ]
 
@@ -54,7 +73,7 @@ def power_of_two_above(value: float) -> float:
 
 
 @ti.func
-def stencil(position, inv_dx):
+def stencil(position: ti.math.vec2, inv_dx: ti.f32) -> Value:
     """Return the base node, the offset f from it in cells, and the weights [node, axis]."""
     scaled = position * inv_dx
     base = ti.cast(scaled - 0.5, ti.i32)
@@ -65,7 +84,7 @@ def stencil(position, inv_dx):
 
 
 @ti.func
-def to_fixed(scaled):
+def to_fixed(scaled: Value) -> Value:
     """Round a float32 below 2^51 to the nearest 64-bit integer, ties to even.
 
     NaN and larger values give some integer, never a trap: the float's bits are only read.
@@ -75,31 +94,47 @@ def to_fixed(scaled):
 
 
 @ti.func
-def from_fixed(total, inverse_scale):
+def from_fixed(total: Value, inverse_scale: ti.f32) -> Value:
     """Return a sum of :func:`to_fixed` as float32, rounded once."""
     return ti.cast(total, ti.f32) * inverse_scale
 
 
 @ti.func
-def accumulate(sums: ti.template(), index, scaled, atomic: ti.template()):
-    """Add a vector of scaled contributions to one node's fixed-point sums.
+def accumulate(sums: Template, node: ti.math.ivec3, scaled: ti.math.vec4, atomic: Template) -> None:
+    """Add scaled contributions to one node's fixed-point sums.
 
     Args:
-        sums: vector field of int64.
-        index: [scenario, node_x, node_y].
+        sums: vector field of int64, shape [scenario, node_x, node_y].
+        node: its index.
         scaled: contributions, already times their scales.
         atomic: whether other threads may add to the same node.
     """
-    for c in ti.static(range(sums.n)):
-        # Even in serial code `+=` is an atomic, which costs five times as much.
-        if ti.static(atomic):
-            ti.atomic_add(sums[index][c], to_fixed(scaled[c]))
-        else:
-            sums[index][c] = sums[index][c] + to_fixed(scaled[c])
+    # Even in serial code `+=` is an atomic, which costs five times as much.
+    if ti.static(atomic):
+        ti.atomic_add(sums[node], to_fixed(scaled))
+    else:
+        sums[node] = sums[node] + to_fixed(scaled)
 
 
 @ti.func
-def bounded(value, low, high):
+def stepped(value: Value, step: Value, count: Template) -> Value:
+    """Return value + count step, for a count of -1, 0 or 1."""
+    result = value
+    if ti.static(count > 0):
+        result = value + step
+    if ti.static(count < 0):
+        result = value - step
+    return result
+
+
+@ti.func
+def bounded(value: Value, low: ti.f32, high: ti.f32) -> Value:
     """Return the value kept in [low, high]; NaN becomes low."""
     raised = ti.select(value > low, value, low)
     return ti.select(raised < high, raised, high)
+
+
+@ti.func
+def largest(value: Value, so_far: Value) -> Value:
+    """Return the larger one; a value that is NaN wins, so that it is seen."""
+    return ti.select(value <= so_far, so_far, value)

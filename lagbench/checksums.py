@@ -8,8 +8,7 @@ content hash of a scenario is built from its values alone, in two levels::
                                           parameters, variables: {name: variable}})
 
 so that variables can be hashed side by side while frames arrive, and a damaged one can be
-named. Values are little-endian, in C order, with -0.0 as 0.0 and every NaN as the quiet NaN
-without sign and payload; strings are UTF-8, joined by NUL. docs/format.md has the whole.
+named. Values are little-endian, in C order, with one zero and one NaN; docs/format.md has it all.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -123,9 +122,7 @@ def dtype_name(dtype: object) -> str:
         return "string"
     if resolved.kind in "iuf":
         return str(resolved.name)
-    raise DataError(
-        "a type cannot be hashed", expected="integers, floats or strings", got=str(resolved)
-    )
+    raise DataError("a type cannot be hashed", expected="integers, floats or strings", got=str(resolved))
 
 
 class VariableHasher:
@@ -156,9 +153,9 @@ class VariableHasher:
         array = np.asarray(values)
         if dtype_name(array.dtype) != self.dtype:
             raise self._wrong("values have another type", self.dtype, array.dtype)
+        if array.size > self._missing:
+            raise self._wrong("too many values", f"at most {self._missing} more", array.size)
         self._missing -= array.size
-        if self._missing < 0:
-            raise self._wrong("too many values", "as many as the shape holds", f"{-self._missing} more")
         if self.dtype == "string":
             self._update_strings(array)
         else:
@@ -200,11 +197,11 @@ def _canonical(block: NDArray[np.generic]) -> NDArray[np.generic]:
     # The bits of -0.0 are the smallest integer of their width, and a minimum passes NaN on: two
     # fast reductions find both, and integers keep subnormals where a library flushes them to zero.
     negative_zero = np.iinfo(bits.dtype).min
-    if bits.min() > negative_zero and not np.isnan(block.min()):  # type: ignore[call-overload]
+    if bits.min() > negative_zero and not np.isnan(block.min()):
         return block
     clean = bits.copy()
     clean[bits == negative_zero] = 0
-    clean[np.isnan(block)] = np.full(1, np.nan, block.dtype).view(bits.dtype)[0]  # type: ignore[call-overload]
+    clean[np.isnan(block)] = np.full(1, np.nan, block.dtype).view(bits.dtype)[0]
     return clean
 
 
@@ -249,7 +246,7 @@ class ContentHasher:
         return hashlib.sha256(canonical_json(whole)).hexdigest()
 
 
-def content_hash(variables: Mapping[str, Variable], identity: Mapping[str, object]) -> str:
+def content_hash(variables: Mapping[Any, Variable], identity: Mapping[str, object]) -> str:
     """Return the content hash of variables held in memory.
 
     Args:

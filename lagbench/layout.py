@@ -7,6 +7,7 @@ subsets. Nothing here touches the disk.
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -48,6 +49,23 @@ class ScenarioKey:
     def major(self) -> int:
         """MAJOR of the version: it changes when existing bits change."""
         return major_of(self.version)
+
+    def identity(self, seed: str, parameters: Mapping[str, object]) -> dict[str, object]:
+        """Return what enters the content hash beside the variables.
+
+        Args:
+            seed: how the random numbers were seeded.
+            parameters: physical parameters by name.
+        """
+        return {
+            "split": self.split,
+            "size": self.size,
+            "major": self.major,
+            "scenario": self.scenario,
+            "subset": self.subset,
+            "seed": seed,
+            "parameters": dict(parameters),
+        }
 
 
 def major_of(version: str) -> int:

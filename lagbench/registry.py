@@ -9,6 +9,7 @@ from them (hashes, statistics, twin floor) stands under ``measured`` and is writ
 from __future__ import annotations
 
 import functools
+import os
 from collections.abc import Mapping
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -33,6 +34,8 @@ __all__ = [
 ]
 
 Number = int | float
+
+
 def _ids(value: str | int) -> tuple[int, ...]:
     try:
         return parse_ids(value)
@@ -44,6 +47,9 @@ Ids = Annotated[tuple[int, ...], BeforeValidator(_ids)]
 Interval = Annotated[tuple[float, float], Field(strict=False)]
 Hash = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 ShortHash = Annotated[str, Field(pattern=r"^[0-9a-f]{16}$")]
+REGISTRY_VARIABLE = "LAGBENCH_REGISTRY"
+"""Environment variable that names a datasets.yaml to use instead of ours."""
+
 SUBSETS = ("train", "valid", "test", "extra")
 HASHED_SUBSETS = ("train", "valid", "test")
 
@@ -295,16 +301,24 @@ def default_path() -> Path:
     return inside if inside.exists() else here.parent / "datasets.yaml"
 
 
-@functools.cache
 def load(path: Path | None = None) -> Registry:
     """Return the validated registry, splits of other installed packages included.
 
     Args:
-        path: a datasets.yaml; ours, with those of entry points, when None.
+        path: a datasets.yaml; else the one that ``LAGBENCH_REGISTRY`` names; else ours, with
+            those of entry points.
 
     Raises:
         UnreadableFileError: not YAML, an unknown key or a value of the wrong type.
     """
+    given = path or os.environ.get(REGISTRY_VARIABLE)
+    file = Path(given) if given else default_path()
+    return _load(Path(given) if given else None, file.stat().st_mtime_ns if file.exists() else 0)
+
+
+@functools.cache
+def _load(path: Path | None, modified: int) -> Registry:
+    """Load a file once per modification time."""
     own = _read(path or default_path())
     splits, measured = dict(own.splits), dict(own.measured)
     if path is None:

@@ -10,17 +10,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
-
 from lagbench.generators.base import FreeSurfaceParameters, InitialState, Material
+from numpy.typing import NDArray
 
 Float = np.float32
 Floats = NDArray[np.float32]
 Components = tuple[Floats, Floats, Floats, Floats]
 
 ONE, TWO, HALF = Float(1.0), Float(2.0), Float(0.5)
-FIXED_POINT = Float(2.0**44)
-TAYLOR = [Float(1 / 720), Float(1 / 120), Float(1 / 24), Float(1 / 6), Float(1 / 2), ONE, ONE]
+WEIGHT_SCALE = 2.0**50
 
 
 def lame(young: float, poisson: float) -> tuple[float, float]:
@@ -33,25 +31,42 @@ def clamp(value: Floats, low: Float, high: Float) -> Floats:
     return np.minimum(np.maximum(value, low), high)
 
 
+def fixed(value: Floats, scale: float) -> NDArray[np.int64]:
+    """Round to the nearest multiple of 1/scale, ties to even, as an integer."""
+    return np.rint(value.astype(np.float64) * scale).astype(np.int64)
+
+
 def exp(z: Floats) -> Floats:
     """Degree-6 Taylor polynomial of z/16, squared four times."""
     t = z * Float(1 / 16)
-    e = np.full_like(z, TAYLOR[0])
-    for coefficient in TAYLOR[1:]:
-        e = coefficient + t * e
+    tt = t * t
+    high = (Float(1 / 24) + t * Float(1 / 120)) + tt * Float(1 / 720)
+    e = (ONE + t) + tt * ((HALF + t * Float(1 / 6)) + tt * high)
     for _ in range(4):
         e = e * e
     return e
 
 
-def polar(f: Components) -> tuple[Floats, Floats]:
-    """Cosine and sine of the polar rotation of gradients given by components."""
-    a, b, c, d = f
-    x, y = a + d, c - b
-    length = np.sqrt(x * x + y * y)
-    spins = length > Float(1e-6)
-    safe = np.where(spins, length, ONE)
-    return np.where(spins, x / safe, ONE), np.where(spins, y / safe, Float(0))
+@dataclass
+class Split:
+    """F = q R + [[h, k], [k, -h]], with the rotation R = [[cos, -sin], [sin, cos]]."""
+
+    q: Floats
+    cos: Floats
+    sin: Floats
+    h: Floats
+    k: Floats
+
+    @classmethod
+    def of(cls, f: Components) -> Split:
+        """Divide gradients into a scaled rotation and a scaled reflection."""
+        a, b, c, d = f
+        e, g = HALF * (a + d), HALF * (c - b)
+        q = np.sqrt(e * e + g * g)
+        turns = q > Float(1e-6)
+        inverse = ONE / np.where(turns, q, ONE)
+        cos, sin = np.where(turns, e * inverse, ONE), np.where(turns, g * inverse, Float(0))
+        return cls(q, cos, sin, HALF * (a - d), HALF * (c + b))
 
 
 @dataclass
@@ -117,10 +132,10 @@ class FreeSurfaceReference:
         kinematic = np.where(self.liquid, p.liquid_viscosity, np.where(self.snow, 0.0, p.elastic_damping))
         self.viscosity = (p.density * kinematic).astype(Float)
         self.friction = Float(state.friction)
-        volume = state.area / count
-        self.mass = Float(p.density * volume)
-        self.stress_scale = Float(4.0 * p.dt * volume * p.grid**2)
-        self.full_node = Float(p.grid**2 / p.density)
+        self.node_share = Float(state.area / count * p.grid**2)
+        # Velocities up to 64 cells per substep, in 62 bits less those of the particle count.
+        bits = min(50, 62 - (count - 1).bit_length())
+        self.velocity_scale = 2.0 ** (bits - int(np.ceil(np.log2(64 / (p.grid * p.dt)))))
 
     def advance(self, substeps: int) -> None:
         """Run substeps."""
@@ -130,18 +145,18 @@ class FreeSurfaceReference:
 
     def stress(self) -> tuple[Floats, Floats, Floats]:
         """Kirchhoff stress (xx, xy, yy)."""
-        p, (a, b, c, d) = self.p, self.deformation
-        stiff = clamp(exp(clamp(Float(p.snow_hardening) * (ONE - self.ratio), Float(-4), Float(4))),
-                      Float(p.snow_hardening_min), Float(p.snow_hardening_max))  # fmt: skip
+        p, f = self.p, Split.of(self.deformation)
+        exponent = clamp(Float(p.snow_hardening) * (ONE - self.ratio), Float(-4), Float(4))
+        stiff = clamp(exp(exponent), Float(p.snow_hardening_min), Float(p.snow_hardening_max))
         factor = np.where(self.snow, stiff, ONE)
         mu, la = self.mu * factor, self.la * factor
-        cos, sin = polar(self.deformation)
-        jacobian = a * d - b * c
-        volumetric = la * (jacobian - ONE) * jacobian
+        square = f.h * f.h + f.k * f.k
+        jacobian = f.q * f.q - square
+        mean = TWO * mu * (f.q * (f.q - ONE) + square) + la * (jacobian - ONE) * jacobian
+        stretch = TWO * mu * (TWO * f.q - ONE)
+        normal, xy = stretch * (f.cos * f.h - f.sin * f.k), stretch * (f.cos * f.k + f.sin * f.h)
+        xx, yy = mean + normal, mean - normal
         pressure = Float(p.liquid_modulus) * (self.ratio - ONE)
-        xx = TWO * mu * ((a - cos) * a + (b + sin) * b) + volumetric
-        xy = TWO * mu * ((a - cos) * c + (b + sin) * d)
-        yy = TWO * mu * ((c - sin) * c + (d - cos) * d) + volumetric
         cxx, cxy, cyx, cyy = self.affine
         return (
             np.where(self.liquid, pressure, xx) + TWO * self.viscosity * cxx,
@@ -150,43 +165,52 @@ class FreeSurfaceReference:
         )
 
     def to_grid(self, stencil: Stencil) -> NDArray[np.int64]:
-        """Sum mass, momentum (x, y) and mass times J at the nodes, shape [4, node, node]."""
+        """Sum weighted velocity (x, y), weights and weighted J at the nodes, shape [4, node, node].
+
+        All particles of a scenario weigh the same, so that their mass cancels.
+        """
         nodes = self.p.grid + 1
         dx = Float(1 / self.p.grid)
         sums = np.zeros((4, nodes, nodes), np.int64)
         xx, xy, yy = self.stress()
         cxx, cxy, cyx, cyy = self.affine
-        m, s = self.mass, self.stress_scale
-        axx, axy, ayx, ayy = m * cxx - s * xx, m * cxy - s * xy, m * cyx - s * xy, m * cyy - s * yy
-        px, py = m * self.velocity[:, 0], m * self.velocity[:, 1]
+        s = Float(4 * self.p.dt * self.p.grid / self.p.density)
+        slopes_x = cxx * dx - s * xx, cyx * dx - s * xy
+        slopes_y = cxy * dx - s * xy, cyy * dx - s * yy
+        x, y = (stencil.distance - ONE).T
         jacobian = np.where(self.liquid, self.ratio, ONE)
-        for i, k, w, ox, oy in stencil.nodes():
-            x, y = ox * dx, oy * dx
-            share = w * m
-            parts = share, w * (px + (axx * x + axy * y)), w * (py + (ayx * x + ayy * y)), share * jacobian
-            for total, part in zip(sums, parts, strict=True):
-                np.add.at(total, (i, k), (part * FIXED_POINT).astype(np.int64))
+        for component in range(2):
+            a, b = slopes_x[component], slopes_y[component]
+            centre = self.velocity[:, component] - x * a - y * b
+            for (i, k), (node_i, node_k, w, _, _) in zip(np.ndindex(3, 3), stencil.nodes(), strict=True):
+                value = w * ((centre + Float(i - 1) * a) + Float(k - 1) * b)
+                np.add.at(sums[component], (node_i, node_k), fixed(value, self.velocity_scale))
+        for node_i, node_k, w, _, _ in stencil.nodes():
+            np.add.at(sums[2], (node_i, node_k), fixed(w, WEIGHT_SCALE))
+            np.add.at(sums[3], (node_i, node_k), fixed(w * jacobian, WEIGHT_SCALE))
         return sums
 
     def grid_update(self, sums: NDArray[np.int64]) -> tuple[Floats, Floats, Floats, Floats]:
         """Return nodal velocity (x, y), relative density and J after gravity and walls."""
         low, high = self.p.wall, self.p.grid - self.p.wall
-        mass, px, py, mj = (total.astype(Float) / FIXED_POINT for total in sums)
-        filled = sums[0] > 0
-        m = np.where(filled, mass, ONE)
-        u = np.where(filled, px / m, Float(0))
-        v = np.where(filled, py / m - Float(self.p.gravity * self.p.dt), Float(0))
+        filled = sums[2] > 0
+        n, mj = (sums[c].astype(Float) / Float(WEIGHT_SCALE) for c in (2, 3))
+        px, py = (sums[c].astype(Float) / Float(self.velocity_scale) for c in (0, 1))
+        n = np.where(filled, n, ONE)
+        u = np.where(filled, px / n, Float(0))
+        v = np.where(filled, py / n - Float(self.p.gravity * self.p.dt), Float(0))
         index = np.arange(self.p.grid + 1)
         below, above = index <= low, index >= high
         u, v = self.wall_contact(u, v, below[:, None], above[:, None])
         v, u = self.wall_contact(v, u, below[None, :], above[None, :])
-        density = np.where(filled, m * self.full_node, Float(0))
-        for r in (density, density.T):
+        mirrored = sums[2].copy()
+        for count in (mirrored, mirrored.T):
             for wall, inside, outside in ((low, low + 1, low - 1), (high, high - 1, high + 1)):
-                r[wall] = TWO * r[wall]
-                r[inside] = r[inside] + r[outside]
-                r[outside] = r[inside]
-        return u, v, density, np.where(filled, mj / m, ONE)
+                count[wall] *= 2
+                count[inside] += count[outside]
+                count[outside] = count[inside]
+        density = mirrored.astype(Float) / Float(WEIGHT_SCALE) * self.node_share
+        return u, v, density, np.where(filled, mj / n, ONE)
 
     def wall_contact(
         self, normal: Floats, tangential: Floats, below: NDArray[np.bool_], above: NDArray[np.bool_]
@@ -243,18 +267,13 @@ class FreeSurfaceReference:
     def yielded(self, trial: Components) -> tuple[Components, Floats]:
         """Clamp the principal stretches; return the elastic gradient and the factor on Jp."""
         low, high = Float(1 - self.p.snow_compression), Float(1 + self.p.snow_stretch)
-        a, b, c, d = trial
-        cos, sin = polar(trial)
-        s0, s1 = cos * a + sin * c, cos * d - sin * b
-        off = HALF * ((cos * b + sin * d) + (cos * c - sin * a))
-        mean, half = HALF * (s0 + s1), HALF * (s0 - s1)
-        radius = np.sqrt(half * half + off * off)
-        e1, e2 = mean + radius, mean - radius
-        k1, k2 = clamp(e1, low, high), clamp(e2, low, high)
-        sheared = radius > Float(1e-12)
-        share = np.where(sheared, HALF * (k1 - k2) / np.where(sheared, radius, ONE), Float(0))
-        centre = HALF * (k1 + k2)
-        t0, t1, t2 = centre + share * half, centre - share * half, share * off
+        f = Split.of(trial)
+        r = np.sqrt(f.h * f.h + f.k * f.k)
+        first, second = clamp(f.q + r, low, high), clamp(f.q - r, low, high)
+        sheared = r > Float(1e-12)
+        shrink = np.where(sheared, HALF * (first - second) / np.where(sheared, r, ONE), Float(0))
+        mean = HALF * (first + second)
+        e, g, h, k = mean * f.cos, mean * f.sin, shrink * f.h, shrink * f.k
         floor = Float(0.1)
-        factor = np.maximum(e1, floor) * np.maximum(e2, floor) / (k1 * k2)
-        return (cos * t0 - sin * t2, cos * t2 - sin * t1, sin * t0 + cos * t2, sin * t2 + cos * t1), factor
+        factor = np.maximum(f.q + r, floor) * np.maximum(f.q - r, floor) / (first * second)
+        return (e + h, k - g, k + g, e - h), factor

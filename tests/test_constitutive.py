@@ -5,11 +5,10 @@ import math
 import numpy as np
 import pytest
 import taichi as ti
-from numpy.typing import NDArray
-from scipy.linalg import polar
-
 from lagbench.generators import backend, constitutive
 from lagbench.generators.solver import Device
+from numpy.typing import NDArray
+from scipy.linalg import polar
 
 COUNT = 4096
 MU, LAMBDA = constitutive.lame(30.0, 0.3)
@@ -123,7 +122,7 @@ def test_rotation_of_nothing_is_the_identity() -> None:
 
 
 def test_corotated_stress_is_the_derivative_of_its_energy() -> None:
-    """tau = (d psi / dF) F^T, with psi differentiated by central differences."""
+    """Tau = (d psi / dF) F^T, with psi differentiated by central differences."""
     f = deformations(0.3)[:64]
     stress = corotated(f)
     step = 1e-6
@@ -177,7 +176,9 @@ def test_plastic_return_leaves_elastic_states_alone() -> None:
 
 def test_inverted_snow_stays_finite() -> None:
     """Even a collapsed or inverted gradient gives a positive, finite volume ratio."""
-    f = np.array([np.zeros((2, 2)), -np.eye(2), [[1.0, 0.0], [0.0, -1.0]], [[0.0, 1.0], [1.0, 0.0]]], np.float32)
+    f = np.array(
+        [np.zeros((2, 2)), -np.eye(2), [[1.0, 0.0], [0.0, -1.0]], [[0.0, 1.0], [1.0, 0.0]]], np.float32
+    )
     elastic, ratio = np.empty_like(f), np.empty(4, np.float32)
     evaluate_plastic(f, elastic, ratio)
     assert np.isfinite(elastic).all()
@@ -198,6 +199,6 @@ def test_lame_constants(young: float, poisson: float, expected: tuple[float, flo
 
 
 def test_wave_speed_from_lame_constants() -> None:
-    """lambda + 2 mu equals E (1 - nu) / ((1 + nu)(1 - 2 nu)), the P-wave modulus."""
+    """Lambda + 2 mu equals E (1 - nu) / ((1 + nu)(1 - 2 nu)), the P-wave modulus."""
     mu, la = constitutive.lame(100.0, 0.3)
     assert math.isclose(la + 2.0 * mu, 100.0 * 0.7 / (1.3 * 0.4))

@@ -1,1 +1,16 @@
-"""The command line."""
+"""The command line: each command is a thin shell over the function of its name.
+
+Commands import what they need inside their bodies, so that ``lagbench --help`` loads typer
+and rich only.
+"""
+
+from __future__ import annotations
+
+__all__ = ["main"]
+
+
+def main() -> None:
+    """Run the command line; the entry point ``lagbench``."""
+    from .app import app
+
+    app()

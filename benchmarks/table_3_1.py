@@ -1,0 +1,250 @@
+"""Regenerate Table 3.1 and Fig. 3.1 of the thesis: solver time over the quality factor q.
+
+    python benchmarks/table_3_1.py --rows 1-4 --device cpu --output docs/figures
+
+writes table_3_1_DEVICE.md and table_3_1_DEVICE.png and prints the table. The rows take particles,
+grid and substeps per frame from the thesis; a block of liquid, four particles per cell, falls and
+spreads (free-surface solver). Times are the best of the repeats, in milliseconds: processor time on
+the CPU, so that other processes do not count, wall time on a GPU.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from lagbench.generators import solver
+from lagbench.generators.base import FreeSurfaceParameters, InitialState, Material
+
+_LIQUID_MODULUS = 30.0
+_COURANT = 0.4
+_PER_CELL = 4
+
+FIXED = 20
+"""Substeps in a run that measures the time of one substep."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """One row of Table 3.1 as the thesis prints it (times on its GPU, in milliseconds)."""
+
+    q: int
+    particles: int
+    grid: int
+    substeps: int
+    substep_ms: float
+    frame_ms: float
+
+
+THESIS = tuple(
+    Row(q=q, particles=n, grid=grid, substeps=substeps, substep_ms=substep, frame_ms=frame)
+    for q, n, grid, substeps, substep, frame in (
+        (1, 16_384, 128, 20, 0.06, 1.17),
+        (2, 65_536, 256, 20, 0.14, 5.33),
+        (3, 147_456, 384, 40, 0.51, 41.46),
+        (4, 262_144, 512, 40, 0.73, 73.66),
+        (5, 589_824, 768, 80, 0.85, 136.09),
+        (6, 819_024, 896, 80, 1.14, 180.05),
+        (7, 1_024_576, 1024, 120, 1.60, 238.69),
+        (8, 1_048_576, 1024, 160, 2.25, 361.89),
+        (9, 1_324_104, 1152, 180, 3.08, 562.43),
+    )
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measurement:
+    """Our times for one row, in milliseconds."""
+
+    row: Row
+    substep_ms: float
+    frame_ms: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Exponents:
+    """Slopes of log time over log size.
+
+    Attributes:
+        frame_q2: of t/frame against q^2 (Eq. 3.2).
+        frame_particles: of t/frame against particles.
+        substep_particles: of t/substep against particles.
+    """
+
+    frame_q2: float
+    frame_particles: float
+    substep_particles: float
+
+
+def block(row: Row) -> tuple[FreeSurfaceParameters, InitialState]:
+    """Return a square block of liquid above the floor, at rest."""
+    parameters = FreeSurfaceParameters(
+        particles=row.particles,
+        grid=row.grid,
+        dt=_COURANT / (row.grid * _LIQUID_MODULUS**0.5),
+        wall=3,
+        gravity=2.5,
+        density=1.0,
+        liquid_modulus=_LIQUID_MODULUS,
+        liquid_viscosity=1e-3,
+        jacobian_relaxation=0.2,
+        density_coupling=0.01,
+        jacobian_min=0.5,
+        jacobian_max=1.0,
+    )
+    columns = math.ceil(math.sqrt(row.particles))
+    index = np.arange(row.particles)
+    side = (row.particles / _PER_CELL) ** 0.5 / row.grid
+    corner = np.array([0.5 - side / 2.0, 0.2])
+    cell = np.stack([index // columns, index % columns], axis=-1) + 0.5
+    state = InitialState(
+        position=np.rint((corner + side * cell / columns) * 2.0**20) / 2.0**20,
+        velocity=np.zeros((row.particles, 2)),
+        affine=np.zeros((row.particles, 2, 2)),
+        material=np.full(row.particles, Material.LIQUID, dtype=np.int8),
+        area=side**2,
+    )
+    return parameters, state
+
+
+def start(row: Row, device: solver.Device) -> solver.Solver:
+    """Build the solver of a row, load the block and compile."""
+    parameters, state = block(row)
+    running = solver.build(parameters, device=device, threads=1 if device is solver.Device.CPU else None)
+    running.load([state])
+    running.advance(2)
+    return running
+
+
+def best_ms(
+    running: solver.Solver, substeps: int, repeats: int, clock: Callable[[], float] = time.process_time
+) -> float:
+    """Return the shortest time of advancing by some substeps [ms], positions fetched."""
+    times = []
+    for _ in range(repeats):
+        begin = clock()
+        running.advance(substeps)
+        running.position()
+        times.append(clock() - begin)
+    return 1e3 * min(times)
+
+
+def measure(row: Row, *, device: solver.Device, repeats: int) -> Measurement:
+    """Time one row: substeps in runs of a fixed number, and frames of its own substeps."""
+    running = start(row, device)
+    clock = time.process_time if device is solver.Device.CPU else time.perf_counter
+    return Measurement(
+        row=row,
+        substep_ms=best_ms(running, FIXED, repeats, clock) / FIXED,
+        frame_ms=best_ms(running, row.substeps, repeats, clock),
+    )
+
+
+def exponents(sizes: Sequence[Row], substep_ms: Sequence[float], frame_ms: Sequence[float]) -> Exponents:
+    """Fit straight lines to the logarithms (Eq. 3.1)."""
+    squares = [row.q**2 for row in sizes]
+    particles = [row.particles for row in sizes]
+    return Exponents(
+        frame_q2=_slope(squares, frame_ms),
+        frame_particles=_slope(particles, frame_ms),
+        substep_particles=_slope(particles, substep_ms),
+    )
+
+
+def _slope(x: Sequence[float], y: Sequence[float]) -> float:
+    return float(np.polyfit(np.log10(x), np.log10(y), 1)[0]) if len(x) > 1 else float("nan")
+
+
+def of_thesis(rows: Sequence[Row] = THESIS) -> Exponents:
+    """Return the exponents of the thesis's own times."""
+    return exponents(rows, [row.substep_ms for row in rows], [row.frame_ms for row in rows])
+
+
+def of_measured(found: Sequence[Measurement]) -> Exponents:
+    """Return the exponents of our times."""
+    return exponents([m.row for m in found], [m.substep_ms for m in found], [m.frame_ms for m in found])
+
+
+def markdown(found: Sequence[Measurement], device: str) -> str:
+    """Return Table 3.1 with our times beside the thesis's, and the exponents below it."""
+    lines = [
+        f"Times in milliseconds; ours on {device}, the thesis's on its GPU.",
+        "",
+        "| q | q^2 | particles | grid | substeps | t/substep | t/frame | fps "
+        "| thesis t/substep | thesis t/frame | thesis / ours |",
+        "|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|",
+    ]
+    for m in found:
+        r = m.row
+        lines.append(
+            f"| {r.q} | {r.q**2} | {r.particles:,} | {r.grid} x {r.grid} | {r.substeps} | {m.substep_ms:.3g} "
+            f"| {m.frame_ms:.4g} | {1e3 / m.frame_ms:.4g} | {r.substep_ms} | {r.frame_ms} "
+            f"| {r.frame_ms / m.frame_ms:.3g} |"
+        )
+    lines += ["", "| exponent of | ours | thesis, same rows | thesis, all rows |", "|---|--:|--:|--:|"]
+    sets = (of_measured(found), of_thesis([m.row for m in found]), of_thesis())
+    for name, words in (
+        ("frame_q2", "t/frame against q^2"),
+        ("frame_particles", "t/frame against particles"),
+        ("substep_particles", "t/substep against particles"),
+    ):
+        lines.append(f"| {words} | " + " | ".join(f"{getattr(e, name):.2f}" for e in sets) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def draw(found: Sequence[Measurement], device: str, path: Path) -> None:
+    """Draw Fig. 3.1: (a) log-log with fitted lines, (b) linear with second-degree fits."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10.0, 4.2), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    series = (
+        (f"ours, {device}", "C0", [(m.row.q**2, m.frame_ms) for m in found]),
+        ("thesis, GPU", "C3", [(row.q**2, row.frame_ms) for row in THESIS]),
+    )
+    for name, colour, points in series:
+        x, y = np.array(points, dtype=float).T
+        slope, offset = np.polyfit(np.log10(x), np.log10(y), 1)
+        line = np.linspace(x.min(), x.max(), 200)
+        left.loglog(x, y, "o", color=colour)
+        left.loglog(line, 10**offset * line**slope, color=colour, label=f"{name}: slope {slope:.2f}")
+        right.plot(x, y, "o", color=colour)
+        right.plot(line, np.polyval(np.polyfit(x, y, 2), line), color=colour, label=name)
+    for axes, title in ((left, "(a) log-log"), (right, "(b) second-degree fit")):
+        axes.set(xlabel="q^2", ylabel="t/frame [ms]", title=title)
+        axes.grid(alpha=0.3)
+        axes.legend()
+    figure.savefig(path, dpi=150)
+
+
+def main() -> int:
+    """Measure the rows that were asked for, write table and figure."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--rows", default="1-4", help="first and last q, such as 1-4")
+    parser.add_argument(
+        "--device", type=solver.Device, default=solver.Device.CPU, choices=list(solver.Device)
+    )
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--output", type=Path, default=Path("docs/figures"))
+    given = parser.parse_args()
+    first, _, last = given.rows.partition("-")
+    rows = [row for row in THESIS if int(first) <= row.q <= int(last or first)]
+    found = [measure(row, device=given.device, repeats=given.repeats) for row in rows]
+    table = markdown(found, given.device.value)
+    given.output.mkdir(parents=True, exist_ok=True)
+    (given.output / f"table_3_1_{given.device.value}.md").write_text(table, encoding="utf-8")
+    draw(found, given.device.value, given.output / f"table_3_1_{given.device.value}.png")
+    print(table)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

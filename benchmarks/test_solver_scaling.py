@@ -1,0 +1,65 @@
+"""Solver time over the quality factor q: fixed substeps, and the schedule of Table 3.1.
+
+q = 1 to 4 on one CPU core; ``LAGBENCH_BENCH_DEVICE=cuda`` runs q = 1 to 9 on an NVIDIA GPU.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+import table_3_1
+from pytest_benchmark.fixture import BenchmarkFixture
+from timing import best_seconds
+
+from lagbench.generators.solver import Device
+
+DEVICE = Device(os.environ.get("LAGBENCH_BENCH_DEVICE", "cpu"))
+LAST = 9 if DEVICE is Device.CUDA else 4
+ROWS = table_3_1.THESIS[:LAST]
+CPU_EXPONENT = 1.05
+GPU_SPEED_UP = 10.0
+
+
+@pytest.fixture(scope="module")
+def found() -> list[table_3_1.Measurement]:
+    """Collect the measurements of all rows."""
+    return []
+
+
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: f"q{row.q}")
+def test_row(benchmark: BenchmarkFixture, row: table_3_1.Row, found: list[table_3_1.Measurement]) -> None:
+    """Time frames of the row's own substeps, and substeps in runs of 20."""
+    rounds: list[table_3_1.Measurement] = []
+    best_seconds(benchmark, lambda: rounds.append(table_3_1.measure(row, device=DEVICE, repeats=3)), rounds=1)
+    measured = rounds[0]
+    found.append(measured)
+    benchmark.extra_info.update(
+        particles=row.particles,
+        substep_ms=measured.substep_ms,
+        frame_ms=measured.frame_ms,
+        nanoseconds_per_particle_substep=1e6 * measured.substep_ms / row.particles,
+        thesis_over_ours=row.frame_ms / measured.frame_ms,
+    )
+    if DEVICE is Device.CUDA:
+        assert row.frame_ms / measured.frame_ms >= GPU_SPEED_UP
+
+
+def test_exponents(found: list[table_3_1.Measurement], tmp_path: Path) -> None:
+    """A busy core scales linearly: t/substep against particles at most to the power 1.05."""
+    if len(found) < 2:
+        pytest.skip("needs the rows of this module in the same run")
+    print("\n" + table_3_1.markdown(found, DEVICE.value))
+    table_3_1.draw(found, DEVICE.value, tmp_path / "figure_3_1.png")
+    print(f"Fig. 3.1: {tmp_path / 'figure_3_1.png'}")
+    if DEVICE is Device.CPU:
+        assert table_3_1.of_measured(found).substep_particles <= CPU_EXPONENT
+
+
+def test_the_thesis_exponents_follow_from_its_table() -> None:
+    """Its text gives 1.41 for t/frame against q^2; against particles 1.35, per substep 0.83."""
+    thesis = table_3_1.of_thesis()
+    assert thesis.frame_q2 == pytest.approx(1.41, abs=0.01)
+    assert thesis.frame_particles == pytest.approx(1.35, abs=0.01)
+    assert thesis.substep_particles == pytest.approx(0.83, abs=0.01)

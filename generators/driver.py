@@ -1,0 +1,183 @@
+"""What every solver does around its kernels: load, advance, check, read out.
+
+A solver is the kernels of one formulation (fields of a batch of scenarios, and one substep)
+inside a :class:`Driver`, which knows the bounds within which they are valid.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Generic, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagbench.errors import UsageError, WorkFailedError
+
+from . import backend
+from .base import ClosedBoxParameters, FreeSurfaceParameters, InitialState
+from .solver import Device, Health
+
+__all__ = ["Driver", "Kernels", "stack"]
+
+Parameters = TypeVar("Parameters", ClosedBoxParameters, FreeSurfaceParameters)
+
+
+class _Field(Protocol):
+    """The part of a Taichi field that a driver uses."""
+
+    def from_numpy(self, array: NDArray[np.float32]) -> None: ...
+
+    def to_numpy(self) -> NDArray[np.float32]: ...
+
+
+class Kernels(Protocol):
+    """What a driver asks of the kernels of a formulation.
+
+    Attributes:
+        x: particle positions [length].
+        least: smallest coordinate of a particle.
+        most: largest coordinate of a particle.
+        speed_bound: the CFL bound dx/dt [length/s].
+    """
+
+    x: _Field
+    least: float
+    most: float
+    speed_bound: float
+
+    def run_serially(self, substeps: int) -> None:
+        """Advance scenario 0 by many substeps in one thread."""
+
+    def run_in_parallel(self) -> None:
+        """Advance every scenario by one substep."""
+
+    def restart_extremes(self) -> None:
+        """Start an advance: the extremes are those of the present state."""
+
+
+class Driver(ABC, Generic[Parameters]):
+    """A solver around kernels; see :class:`.Solver` for what callers may expect.
+
+    Args:
+        parameters: constants that the scenarios share.
+        device: where to run.
+        scenarios: scenarios advanced together.
+        threads: threads of ``Device.PARALLEL``; all that the process may use by default.
+    """
+
+    def __init__(
+        self,
+        parameters: Parameters,
+        *,
+        device: Device = Device.CPU,
+        scenarios: int = 1,
+        threads: int | None = None,
+    ) -> None:
+        """Start Taichi and take the memory; kernels compile when they first run."""
+        self.parameters: Parameters = parameters
+        self.device = device
+        self.scenarios = scenarios
+        threads = backend.start(device, scenarios=scenarios, threads=threads)
+        self._kernels = self._compile(device is not Device.CPU, threads)
+        self._substeps = 0
+
+    @abstractmethod
+    def _compile(self, atomic: bool, threads: int) -> Kernels:  # noqa: FBT001
+        """Make the kernels and their fields."""
+
+    @abstractmethod
+    def _start(self, states: Sequence[InitialState]) -> None:
+        """Fill all fields but the positions."""
+
+    @abstractmethod
+    def health(self) -> list[Health]:
+        """Return what each scenario went through during the last advance."""
+
+    @abstractmethod
+    def _broken(self, index: int, health: Health) -> list[str]:
+        """Return the bounds of this formulation that a scenario has left."""
+
+    def load(self, states: Sequence[InitialState]) -> None:
+        """Start one scenario per state.
+
+        Raises:
+            UsageError: another number of states or particles than the solver was built for.
+            WorkFailedError: a state outside the bounds within which the solver is valid.
+        """
+        if len(states) != self.scenarios:
+            raise UsageError("wrong number of scenarios", expected=self.scenarios, got=len(states))
+        for index, state in enumerate(states):
+            self._check_state(index, state)
+        self._kernels.x.from_numpy(self._kept(stack(states, "position")))
+        self._start(states)
+        self._substeps = 0
+        self._kernels.restart_extremes()
+
+    def advance(self, substeps: int) -> None:
+        """Advance every scenario.
+
+        Raises:
+            WorkFailedError: a scenario left the bounds within which the solver is valid.
+        """
+        if substeps == 0:
+            return
+        self._kernels.restart_extremes()
+        if self.device is Device.CPU:
+            self._kernels.run_serially(substeps)
+        else:
+            for _ in range(substeps):
+                self._kernels.run_in_parallel()
+        self._substeps += substeps
+        for index, health in enumerate(self.health()):
+            self._check_health(index, health, substeps)
+
+    def position(self) -> NDArray[np.float32]:
+        """Particle positions [length], shape [scenario, particle, 2]."""
+        return np.asarray(self._kernels.x.to_numpy())
+
+    def displace(self, offset: NDArray[np.float32]) -> None:
+        """Add an offset to the positions [length], shape [scenario, particle, 2]; kept in the box."""
+        self._kernels.x.from_numpy(self._kept(self.position() + offset.astype(np.float32)))
+
+    def _kept(self, position: NDArray[np.float32]) -> NDArray[np.float32]:
+        return np.clip(position, np.float32(self._kernels.least), np.float32(self._kernels.most))
+
+    def _check_state(self, index: int, state: InitialState) -> None:
+        shape = (self.parameters.particles, 2)
+        if state.position.shape != shape:
+            raise UsageError(
+                "wrong shape of positions",
+                where=f"scenario {index}",
+                expected=shape,
+                got=state.position.shape,
+            )
+        fastest = self._kernels.speed_bound
+        speed = np.abs(state.velocity).max()
+        stretch = np.abs(state.affine).max() * self.parameters.dt
+        if not (np.isfinite(state.position).all() and speed <= fastest and stretch <= 2.0):
+            raise WorkFailedError(
+                "the initial state is outside the solver's bounds",
+                where=f"scenario {index}",
+                expected=f"finite, abs(v) <= dx/dt = {fastest:.6g}, abs(C) dt <= 2",
+                got=f"abs(v) = {speed:.6g}, abs(C) dt = {stretch:.6g}",
+            )
+
+    def _check_health(self, index: int, health: Health, substeps: int) -> None:
+        fastest = self._kernels.speed_bound
+        broken = [] if health.finite else ["every number is finite"]
+        if not health.max_speed <= fastest:
+            broken.append(f"CFL: abs(v) <= dx/dt = {fastest:.6g}")
+        broken += self._broken(index, health)
+        if broken:
+            raise WorkFailedError(
+                "the simulation blew up",
+                where=f"scenario {index}, substeps {self._substeps - substeps} to {self._substeps}",
+                expected="; ".join(broken),
+                got=health,
+                fix="use a smaller dt or smaller velocities",
+            )
+
+
+def stack(states: Sequence[InitialState], name: str) -> NDArray[np.float32]:
+    """Return an array of every state as float32, shape [scenario, ...]."""
+    return np.stack([getattr(state, name) for state in states]).astype(np.float32)

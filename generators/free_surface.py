@@ -1,0 +1,161 @@
+"""Liquid, jelly, snow and rope with a free surface: fluid and multimaterial (design 4.4).
+
+The equations stand in :mod:`.particle_stress`, the stresses in :mod:`.constitutive`. The walls
+lie on node ``wall`` and its mirror image; the fluid slides along them or is braked by friction.
+
+Valid while no particle crosses more than a cell per substep, max abs(v) dt <= dx (checked), and
+while sound does not either: keep every value of :func:`courant` below 0.8. Explodes beyond.
+Settings that work over thousands of frames are those of the splits.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import constitutive
+from .base import FreeSurfaceParameters, InitialState, Material
+from .driver import Driver, stack
+from .particle_stress import ParticleStress
+from .solver import Health
+
+__all__ = ["Energy", "FreeSurface", "courant"]
+
+Array = NDArray[np.float64]
+
+_LARGEST = 1e30
+"""Extremes beyond this stand for what is not a number."""
+
+
+def courant(parameters: FreeSurfaceParameters) -> dict[Material, float]:
+    """Return the acoustic Courant number c dt / dx of each material at rest [1].
+
+    c^2 is K/rho in liquid and (lambda + 2 mu)/rho in solids, for snow at its hardest.
+    """
+    p = parameters
+    solids = {
+        Material.JELLY: (constitutive.lame(p.jelly_modulus, p.jelly_poisson), 1.0),
+        Material.SNOW: (constitutive.lame(p.snow_modulus, p.snow_poisson), p.snow_hardening_max),
+        Material.ROPE: (constitutive.lame(p.rope_modulus, p.rope_poisson), 1.0),
+    }
+    moduli = {material: factor * (la + 2.0 * mu) for material, ((mu, la), factor) in solids.items()}
+    moduli[Material.LIQUID] = p.liquid_modulus
+    return {
+        material: float(np.sqrt(modulus / p.density)) * p.dt * p.grid for material, modulus in moduli.items()
+    }
+
+
+@dataclass(frozen=True, kw_only=True)
+class Energy:
+    """Energy of each scenario [mass length^2/s^2], arrays of shape [scenario].
+
+    Attributes:
+        kinetic: sum m (abs(v)^2 + dx^2/4 abs(C)^2) / 2; the second part is what APIC carries.
+        gravitational: sum m g (y - y_floor).
+        elastic: sum V psi: K (J - 1 - ln J) in liquid, mu abs(F - R)^2 + lambda/2 (J - 1)^2,
+            times the hardening, in solids.
+    """
+
+    kinetic: Array
+    gravitational: Array
+    elastic: Array
+
+    @property
+    def total(self) -> Array:
+        """Sum of the three."""
+        return self.kinetic + self.gravitational + self.elastic
+
+
+class FreeSurface(Driver[FreeSurfaceParameters]):
+    """Solver for scenarios that share :class:`FreeSurfaceParameters`; see :class:`.Solver`."""
+
+    _kernels: ParticleStress
+
+    def _compile(self, atomic: bool, threads: int) -> ParticleStress:  # noqa: FBT001
+        return ParticleStress(self.parameters, scenarios=self.scenarios, atomic=atomic, threads=threads)
+
+    def _start(self, states: Sequence[InitialState]) -> None:
+        p, k = self.parameters, self._kernels
+        k.v.from_numpy(stack(states, "velocity"))
+        k.c.from_numpy(stack(states, "affine"))
+        self._material = stack(states, "material").astype(np.int32)
+        k.material.from_numpy(self._material)
+        k.ratio.fill(1.0)
+        shape = (self.scenarios, p.particles, 2, 2)
+        k.f.from_numpy(np.broadcast_to(np.eye(2, dtype=np.float32), shape).copy())
+        self._volume = np.array([state.area / p.particles for state in states])
+        k.fill.from_numpy((self._volume * p.grid**2).astype(np.float32))
+        k.friction.from_numpy(np.array([state.friction for state in states], np.float32))
+
+    def velocity(self) -> NDArray[np.float32]:
+        """Particle velocities v_p [length/s], shape [scenario, particle, 2]."""
+        return np.asarray(self._kernels.v.to_numpy())
+
+    def affine(self) -> NDArray[np.float32]:
+        """APIC matrices C = grad v [1/s], shape [scenario, particle, 2, 2]."""
+        return np.asarray(self._kernels.c.to_numpy())
+
+    def deformation(self) -> NDArray[np.float32]:
+        """Deformation gradients F, elastic in snow, I in liquid [1], shape [scenario, particle, 2, 2]."""
+        return np.asarray(self._kernels.f.to_numpy())
+
+    def volume_ratio(self) -> NDArray[np.float32]:
+        """J of liquid, plastic Jp of snow, 1 in other solids [1], shape [scenario, particle]."""
+        return np.asarray(self._kernels.ratio.to_numpy())
+
+    def jacobian(self) -> NDArray[np.float32]:
+        """J of liquid, det F of solids (elastic in snow) [1], shape [scenario, particle]."""
+        f = self.deformation()
+        determinant = f[..., 0, 0] * f[..., 1, 1] - f[..., 0, 1] * f[..., 1, 0]
+        return np.where(self._material == Material.LIQUID, self.volume_ratio(), determinant)
+
+    def energy(self) -> Energy:
+        """Return the energy of each scenario, in float64 from the particles."""
+        p = self.parameters
+        height = self.position()[..., 1].astype(np.float64) - self._kernels.least
+        square = (self.velocity().astype(np.float64) ** 2).sum(axis=-1)
+        spin = (self.affine().astype(np.float64) ** 2).sum(axis=(-2, -1)) / (4.0 * p.grid**2)
+        mass = p.density * self._volume
+        return Energy(
+            kinetic=0.5 * mass * (square + spin).sum(axis=-1),
+            gravitational=p.gravity * mass * height.sum(axis=-1),
+            elastic=self._volume * self._elastic_density().sum(axis=-1),
+        )
+
+    def _elastic_density(self) -> Array:
+        """Return psi [mass/s^2], shape [scenario, particle]."""
+        p, k = self.parameters, self._kernels
+        f, ratio = self.deformation().astype(np.float64), self.volume_ratio().astype(np.float64)
+        a, b, c, d = f[..., 0, 0], f[..., 0, 1], f[..., 1, 0], f[..., 1, 1]
+        # abs(F - R)^2 = abs(F)^2 - 2 tr(R^T F) + 2, and tr(R^T F) is twice the mean stretch.
+        shear = a * a + b * b + c * c + d * d - 2.0 * np.hypot(a + d, c - b) + 2.0
+        bulk = 0.5 * (a * d - b * c - 1.0) ** 2
+        factor = np.clip(np.exp(p.snow_hardening * (1.0 - ratio)), p.snow_hardening_min, p.snow_hardening_max)
+        density = p.liquid_modulus * (ratio - 1.0 - np.log(ratio))
+        for material, (mu, la) in (
+            (Material.JELLY, k.jelly),
+            (Material.ROPE, k.rope),
+            (Material.SNOW, k.snow),
+        ):
+            psi = (mu * shear + la * bulk) * (factor if material is Material.SNOW else 1.0)
+            density = np.where(self._material == material, psi, density)
+        return np.asarray(density)
+
+    def health(self) -> list[Health]:
+        """Return what each scenario went through during the last advance."""
+        extremes = self._kernels.extremes.to_numpy()
+        return [
+            Health(
+                finite=bool(np.isfinite(seen).all() and np.abs(seen).max() < _LARGEST),
+                max_speed=float(seen[:, 0].max()),
+                jacobian_min=float(seen[:, 1].min()),
+                jacobian_max=float(seen[:, 2].max()),
+            )
+            for seen in extremes
+        ]
+
+    def _broken(self, index: int, health: Health) -> list[str]:
+        reach = self._kernels.extremes.to_numpy()[index, :, 3].max()
+        bound = self._kernels.reach_bound
+        return [] if reach <= bound else [f"fixed-point sums: abs(v) + abs(A o) = {reach:.6g} <= {bound:.6g}"]

@@ -1,0 +1,360 @@
+"""One substep of weakly compressible flow whose stress acts at the nodes.
+
+The walls lie half-way between nodes; beyond each is one layer of ghost nodes, the mirror images
+of the outermost interior nodes. Per substep, for particles of equal mass m, positions x_p, grid
+spacing dx and weights w_ip:
+
+1. P2G: n_i = sum w,  (n J)_i = sum w J_p,  (n v)_i = sum w (v_p + C_p (x_i - x_p)).
+2. Fold: ghosts give what they received to their mirror images, normal momentum reversed,
+   tangential momentum n (2 u_wall - v) at a no-slip wall and n v at a free-slip wall. Then
+   v = (n v)/n,  Jbar = (n J)/n,  relative density r = n m / (rho dx^2); ghosts mirror them.
+3. Forces: a = (E/rho) grad Jbar + nu lap v,  v <- v + dt a; ghosts mirror v and a.
+4. G2P: v* = sum w v,  a* = sum w a,  r = max(sum w r, 1/2),  grad q = (4/dx^2) sum w q (x_i - x_p),
+   C = grad v, shift s = -beta dx^2 grad(r)/r, each component within 0.1 dx,
+   v_p <- (v_p + dt a*) + lambda (v* - v_p - dt a*) + C s
+   x_p <- x_p + dt v* + s, kept in the box
+   J_p <- J_p (1 + dt tr C) + kappa (Jbar - J_p) + theta (1/r - Jbar).
+
+The mass of a particle cancels everywhere but in r, so nodes count particles, n, and no sum is
+tiny. Sums are integers (:mod:`.transfer`): no order of particles or threads changes a bit.
+
+Valid while max abs(v) dt <= dx, which also bounds every fixed-point sum, and while J stays in
+(0, 8]. Settings that reproduce Ghia, Ghia & Shin (1982) are those of the split ``cavity``.
+"""
+
+import taichi as ti
+
+from . import backend
+from .base import ClosedBoxParameters
+from .transfer import (
+    Nothing,
+    Template,
+    Value,
+    accumulate,
+    bounded,
+    fixed_point_scale,
+    from_fixed,
+    largest,
+    stencil,
+    stepped,
+)
+from .walls import Walls
+
+__all__ = ["JACOBIAN_BOUND", "NodalStress"]
+
+JACOBIAN_BOUND = 8.0
+"""Largest J that the sums have room for [1]."""
+
+_INSET = 1e-3
+"""Distance that particles keep from a wall [cells]."""
+
+_REACH = 8.0
+"""Bound of abs(v_p + C (x_i - x_p)) over the largest nodal speed [1].
+
+abs(C_ab) <= (4/dx^2) max abs(v) sum w abs(x_i - x_p) <= 2 max abs(v) / dx, and a node lies within
+1.5 dx per axis: at most 1 + 2 x 2 x 1.5 = 7.
+"""
+
+
+@ti.data_oriented
+class NodalStress:
+    """Fields of a batch of scenarios and the kernels that advance them.
+
+    Args:
+        parameters: constants that the scenarios share.
+        scenarios: scenarios advanced together.
+        atomic: whether several threads run the phases.
+        threads: threads of the parallel loops on a CPU.
+
+    Attributes:
+        x: particle positions [length].
+        carried: what P2G spreads: v_x, v_y, 1, J.
+        slope_x: d/dx of the nodal (v_x, v_y, r, Jbar) at the particles.
+        slope_y: d/dy of the same.
+        extremes: largest abs(v_x), abs(v_y), J and -J of each particle since the advance began.
+        peak: largest absolute velocity component of each node since then.
+        moved: nodal v_x, v_y, r, Jbar after the forces of the last substep.
+        total: sum over time of the nodal velocities.
+        spread: nu dt / dx^2, shape [scenario].
+        fill: m / (rho dx^2), shape [scenario].
+        speed_bound: the CFL bound dx/dt [length/s].
+        least: smallest coordinate of a particle.
+        most: largest coordinate of a particle.
+    """
+
+    def __init__(
+        self, parameters: ClosedBoxParameters, *, scenarios: int, atomic: bool, threads: int
+    ) -> None:
+        """Round the constants and take the memory."""
+        self.parameters = parameters
+        self.scenarios = scenarios
+        self.atomic = atomic
+        self.threads = threads
+        self.walls = Walls(grid=parameters.grid, wall=parameters.wall, no_slip=parameters.no_slip)
+        self._set_constants()
+        self._make_fields()
+
+    def _set_constants(self) -> None:
+        p = self.parameters
+        dx = 1.0 / p.grid
+        self.inv_dx = float(p.grid)
+        self.dt = p.dt
+        self.least = (p.wall + 0.5 + _INSET) * dx
+        self.most = (p.grid - p.wall - 0.5 - _INSET) * dx
+        self.speed_bound = dx / p.dt
+        self.velocity_scale = fixed_point_scale(p.particles, _REACH * self.speed_bound)
+        self.count_scale = fixed_point_scale(p.particles, JACOBIAN_BOUND)
+        self.velocity_unit, self.count_unit = 1.0 / self.velocity_scale, 1.0 / self.count_scale
+        self.cell_scale = self.velocity_scale * dx
+        self.pressure = p.dt * p.modulus / (p.density * 2.0 * dx)
+        self.gradient = 4.0 * self.inv_dx
+        self.shift = -p.shift * dx * dx
+        self.shift_bound = 0.1 * dx
+
+    def _make_fields(self) -> None:
+        p = self.parameters
+        self.x = ti.Vector.field(2, ti.f32)
+        self.carried = ti.Vector.field(4, ti.f32)
+        self.slope_x = ti.Vector.field(4, ti.f32)
+        self.slope_y = ti.Vector.field(4, ti.f32)
+        self.extremes = ti.Vector.field(4, ti.f32)
+        self.sums = ti.Vector.field(4, ti.i64)  # n v_x, n v_y, n, n J
+        self.node = ti.Vector.field(4, ti.f32)
+        self.moved = ti.Vector.field(4, ti.f32)
+        self.gain = ti.Vector.field(2, ti.f32)
+        self.peak = ti.field(ti.f32)
+        self.total = ti.Vector.field(2, ti.f64)
+        self.spread = ti.field(ti.f32)
+        self.fill = ti.field(ti.f32)
+        particles = (self.scenarios, p.particles)
+        nodes = (self.scenarios, p.grid + 1, p.grid + 1)
+        self._tree = backend.place(
+            (particles, [self.x, self.carried, self.slope_x, self.slope_y]),
+            (particles, [self.extremes]),
+            (nodes, [self.sums]),
+            (nodes, [self.node]),
+            (nodes, [self.moved]),
+            (nodes, [self.gain]),
+            (nodes, [self.peak]),
+            (nodes, [self.total]),
+            ((self.scenarios,), [self.walls.speed, self.spread, self.fill]),
+        )
+
+    # The phases: each function is one phase at one particle or node.
+
+    @ti.func
+    def clear(self, s: ti.i32, i: ti.i32, j: ti.i32) -> None:
+        """Set a node's sums to zero."""
+        self.sums[s, i, j] = ti.Vector([0, 0, 0, 0], ti.i64)
+
+    @ti.func
+    def p2g(self, s: ti.i32, p: ti.i32) -> None:
+        """Spread n v, n and n J, from the middle node to its neighbours, dx away."""
+        base, f, weight = stencil(self.x[s, p], self.inv_dx)
+        scale = ti.Vector([self.velocity_scale, self.velocity_scale, self.count_scale, self.count_scale])
+        c_x = self.cell_scale * ti.Vector([self.slope_x[s, p][0], self.slope_x[s, p][1], 0.0, 0.0])
+        c_y = self.cell_scale * ti.Vector([self.slope_y[s, p][0], self.slope_y[s, p][1], 0.0, 0.0])
+        middle = scale * self.carried[s, p] - (f[0] - 1.0) * c_x - (f[1] - 1.0) * c_y
+        for i, j in ti.static(ti.ndrange(3, 3)):
+            value = stepped(stepped(middle, c_x, i - 1), c_y, j - 1)
+            node = ti.Vector([s, base[0] + i, base[1] + j])
+            accumulate(self.sums, node, (weight[i, 0] * weight[j, 1]) * value, self.atomic)
+
+    @ti.func
+    def received(self, s: ti.i32, i: ti.i32, j: ti.i32) -> Value:
+        """Return a node's sums and its mirror images' ones, and the momentum that moving walls add."""
+        total = self.sums[s, i, j]
+        drag = ti.Vector([0.0, 0.0])
+        x_ghost, y_ghost = self.walls.beyond(i), self.walls.beyond(j)
+        if x_ghost != i:
+            image = self.sums[s, x_ghost, j]
+            total += ti.Vector([-1, self.walls.tangential, 1, 1]) * image
+            drag[1] += self.walls.doubled_speed(s, 0, x_ghost) * from_fixed(image[2], self.count_unit)
+        if y_ghost != j:
+            image = self.sums[s, i, y_ghost]
+            total += ti.Vector([self.walls.tangential, -1, 1, 1]) * image
+            drag[0] += self.walls.doubled_speed(s, 2, y_ghost) * from_fixed(image[2], self.count_unit)
+        if x_ghost != i and y_ghost != j:
+            image = self.sums[s, x_ghost, y_ghost]
+            total += ti.Vector([-self.walls.tangential, -self.walls.tangential, 1, 1]) * image
+            drag[0] += self.walls.doubled_speed(s, 2, y_ghost) * from_fixed(image[2], self.count_unit)
+            drag[1] += self.walls.doubled_speed(s, 0, x_ghost) * from_fixed(image[2], self.count_unit)
+        return total, drag
+
+    @ti.func
+    def fold(self, s: ti.i32, i: ti.i32, j: ti.i32) -> None:
+        """Turn the sums of an interior node into v, r and Jbar."""
+        total, drag = self.received(s, i, j)
+        state = ti.Vector([0.0, 0.0, 0.0, 1.0])
+        if total[2] > 0:
+            count = from_fixed(total[2], self.count_unit)
+            state[0] = (from_fixed(total[0], self.velocity_unit) + drag[0]) / count
+            state[1] = (from_fixed(total[1], self.velocity_unit) + drag[1]) / count
+            state[2] = count * self.fill[s]
+            state[3] = from_fixed(total[3], self.count_unit) / count
+        self.node[s, i, j] = state
+
+    @ti.func
+    def mirror(self, state: Template, s: ti.i32, k: ti.i32) -> None:
+        """Fill the k-th ghost node of (v, r, Jbar): r and Jbar even, v odd about the wall's."""
+        i, j = self.walls.ring(k)
+        image = state[s, self.walls.source(i), self.walls.source(j)]
+        sign, add = self.walls.reflection(i, j), self.walls.drive(s, i, j)
+        state[s, i, j] = ti.Vector(
+            [sign[0] * image[0] + add[0], sign[1] * image[1] + add[1], image[2], image[3]]
+        )
+
+    @ti.func
+    def mirror_gain(self, s: ti.i32, k: ti.i32) -> None:
+        """Fill the k-th ghost node of dt a: as the velocity by walls at rest."""
+        i, j = self.walls.ring(k)
+        self.gain[s, i, j] = (
+            self.walls.reflection(i, j) * self.gain[s, self.walls.source(i), self.walls.source(j)]
+        )
+
+    @ti.func
+    def force(self, s: ti.i32, i: ti.i32, j: ti.i32) -> None:
+        """Add dt a = dt (E/rho) grad Jbar + dt nu lap v; gradients weighted 1/8, 3/4, 1/8 across."""
+        east, west = self.node[s, i + 1, j], self.node[s, i - 1, j]
+        north, south = self.node[s, i, j + 1], self.node[s, i, j - 1]
+        rising = self.node[s, i + 1, j + 1][3] - self.node[s, i - 1, j - 1][3]
+        falling = self.node[s, i + 1, j - 1][3] - self.node[s, i - 1, j + 1][3]
+        grad_x = 0.75 * (east[3] - west[3]) + 0.125 * (rising + falling)
+        grad_y = 0.75 * (north[3] - south[3]) + 0.125 * (rising - falling)
+        here = self.node[s, i, j]
+        laplacian = ((east + west) + (north + south)) - 4.0 * here
+        gain_x = self.pressure * grad_x + self.spread[s] * laplacian[0]
+        gain_y = self.pressure * grad_y + self.spread[s] * laplacian[1]
+        v_x, v_y = here[0] + gain_x, here[1] + gain_y
+        self.gain[s, i, j] = ti.Vector([gain_x, gain_y])
+        self.moved[s, i, j] = ti.Vector([v_x, v_y, here[2], here[3]])
+        self.peak[s, i, j] = largest(ti.abs(v_x), largest(ti.abs(v_y), self.peak[s, i, j]))
+
+    @ti.func
+    def g2p(self, s: ti.i32, p: ti.i32) -> None:
+        """Interpolate (v, r, Jbar), their slopes and dt a; update the particle."""
+        base, f, weight = stencil(self.x[s, p], self.inv_dx)
+        here, gain = ti.Vector([0.0, 0.0, 0.0, 0.0]), ti.Vector([0.0, 0.0])
+        slope_x, slope_y = here, here
+        for i, j in ti.static(ti.ndrange(3, 3)):
+            w = weight[i, 0] * weight[j, 1]
+            share = w * self.moved[s, base[0] + i, base[1] + j]
+            gain += w * self.gain[s, base[0] + i, base[1] + j]
+            here += share
+            slope_x = stepped(slope_x, share, i - 1)
+            slope_y = stepped(slope_y, share, j - 1)
+        slope_x = self.gradient * (slope_x - (f[0] - 1.0) * here)
+        slope_y = self.gradient * (slope_y - (f[1] - 1.0) * here)
+        self.slope_x[s, p], self.slope_y[s, p] = slope_x, slope_y
+        self.update(s, p, here, slope_x, slope_y, gain)
+
+    @ti.func
+    def update(
+        self,
+        s: ti.i32,
+        p: ti.i32,
+        here: ti.math.vec4,
+        slope_x: ti.math.vec4,
+        slope_y: ti.math.vec4,
+        gain: ti.math.vec2,
+    ) -> None:
+        """Relax v_p and J_p towards the grid, move and shift x_p."""
+        volume = 1.0 / largest(here[2], 0.5)
+        push = self.shift * volume * ti.Vector([slope_x[2], slope_y[2]])
+        push = bounded(push, -self.shift_bound, self.shift_bound)
+        grid_v = ti.Vector([here[0], here[1]])
+        v = ti.Vector([self.carried[s, p][0], self.carried[s, p][1]]) + gain
+        v = v + self.parameters.velocity_relaxation * (grid_v - v)
+        v = v + (
+            push[0] * ti.Vector([slope_x[0], slope_x[1]]) + push[1] * ti.Vector([slope_y[0], slope_y[1]])
+        )
+        self.x[s, p] = bounded(self.x[s, p] + (self.dt * grid_v + push), self.least, self.most)
+        jacobian = self.carried[s, p][3]
+        jacobian = (
+            jacobian
+            + self.dt * (slope_x[0] + slope_y[1]) * jacobian
+            + self.parameters.jacobian_relaxation * (here[3] - jacobian)
+            + self.parameters.density_coupling * (volume - here[3])
+        )
+        self.carried[s, p] = ti.Vector([v[0], v[1], 1.0, jacobian])
+        reached = ti.Vector([ti.abs(v[0]), ti.abs(v[1]), jacobian, -jacobian])
+        self.extremes[s, p] = largest(reached, self.extremes[s, p])
+
+    @ti.func
+    def sum_velocity(self, s: ti.i32, i: ti.i32, j: ti.i32) -> None:
+        """Add a node's velocity to its sum over time, outside the path of the bits."""
+        v = ti.Vector([self.moved[s, i, j][0], self.moved[s, i, j][1]])
+        self.total[s, i, j] = self.total[s, i, j] + ti.cast(v, ti.f64)
+
+    # The drivers: the same phases in the same order.
+
+    @ti.kernel
+    def run_serially(self, substeps: ti.i32, average: ti.i32) -> Nothing:
+        """Advance scenario 0 by many substeps in one thread."""
+        ti.loop_config(serialize=True)
+        for _ in range(substeps):
+            for i in range(self.walls.ghost[0], self.walls.ghost[1] + 1):
+                for j in range(self.walls.ghost[0], self.walls.ghost[1] + 1):
+                    self.clear(0, i, j)
+            for p in range(self.parameters.particles):
+                self.p2g(0, p)
+            for i in range(self.walls.edge[0], self.walls.edge[1] + 1):
+                for j in range(self.walls.edge[0], self.walls.edge[1] + 1):
+                    self.fold(0, i, j)
+            for k in range(self.walls.ring_size):
+                self.mirror(self.node, 0, k)
+            for i in range(self.walls.edge[0], self.walls.edge[1] + 1):
+                for j in range(self.walls.edge[0], self.walls.edge[1] + 1):
+                    self.force(0, i, j)
+            for k in range(self.walls.ring_size):
+                self.mirror(self.moved, 0, k)
+                self.mirror_gain(0, k)
+            if average:
+                for i in range(self.walls.ghost[0], self.walls.ghost[1] + 1):
+                    for j in range(self.walls.ghost[0], self.walls.ghost[1] + 1):
+                        self.sum_velocity(0, i, j)
+            for p in range(self.parameters.particles):
+                self.g2p(0, p)
+
+    @ti.kernel
+    def run_in_parallel(self) -> Nothing:
+        """Advance every scenario by one substep: one launch per phase."""
+        all_nodes = ti.static((self.walls.ghost[0], self.walls.ghost[1] + 1))
+        interior = ti.static((self.walls.edge[0], self.walls.edge[1] + 1))
+        ti.loop_config(parallelize=self.threads)
+        for s, i, j in ti.ndrange(self.scenarios, all_nodes, all_nodes):
+            self.clear(s, i, j)
+        ti.loop_config(parallelize=self.threads)
+        for s, p in ti.ndrange(self.scenarios, self.parameters.particles):
+            self.p2g(s, p)
+        ti.loop_config(parallelize=self.threads)
+        for s, i, j in ti.ndrange(self.scenarios, interior, interior):
+            self.fold(s, i, j)
+        ti.loop_config(parallelize=self.threads)
+        for s, k in ti.ndrange(self.scenarios, self.walls.ring_size):
+            self.mirror(self.node, s, k)
+        ti.loop_config(parallelize=self.threads)
+        for s, i, j in ti.ndrange(self.scenarios, interior, interior):
+            self.force(s, i, j)
+        ti.loop_config(parallelize=self.threads)
+        for s, k in ti.ndrange(self.scenarios, self.walls.ring_size):
+            self.mirror(self.moved, s, k)
+            self.mirror_gain(s, k)
+        ti.loop_config(parallelize=self.threads)
+        for s, p in ti.ndrange(self.scenarios, self.parameters.particles):
+            self.g2p(s, p)
+
+    @ti.kernel
+    def restart_extremes(self) -> Nothing:
+        """Start an advance: the extremes are those of the present state."""
+        for s, p in self.extremes:
+            now = self.carried[s, p]
+            self.extremes[s, p] = ti.Vector([ti.abs(now[0]), ti.abs(now[1]), now[3], -now[3]])
+        for s, i, j in self.peak:
+            self.peak[s, i, j] = 0.0
+
+    @ti.kernel
+    def add_to_mean(self) -> Nothing:
+        """Add the nodal velocities of the last substep to their sums over time."""
+        for s, i, j in self.moved:
+            self.sum_velocity(s, i, j)

@@ -1,0 +1,102 @@
+"""Ghost nodes of a closed box: which node mirrors which, and with what sign.
+
+A wall lies half-way between an outermost interior node (``edge``) and the ghost node beyond it
+(``ghost``). A vector's normal component is odd about the wall; its tangential component is odd
+about the wall's own velocity where the wall holds the fluid, even where it lets it slide. A ghost
+in a corner mirrors across both walls.
+"""
+
+import taichi as ti
+
+from .transfer import Template, Value
+
+__all__ = ["Walls"]
+
+
+@ti.data_oriented
+class Walls:
+    """The four walls of every scenario.
+
+    Args:
+        grid: cells across the unit box.
+        wall: index of the ghost nodes outside the low walls.
+        no_slip: whether the walls hold the fluid.
+
+    Attributes:
+        ghost: low and high index of the ghost nodes.
+        edge: low and high index of the interior nodes.
+        ring_size: number of ghost nodes around one scenario.
+        tangential: sign with which a wall mirrors a tangential component.
+        speed: tangential velocity of each wall [length/s], order of ``WALLS``; shape [scenario].
+    """
+
+    def __init__(self, *, grid: int, wall: int, no_slip: bool) -> None:
+        """Set the indices; the field ``speed`` is the caller's to place."""
+        self.ghost = (wall, grid - wall)
+        self.edge = (wall + 1, grid - wall - 1)
+        self.span = grid - 2 * wall
+        self.ring_size = 4 * self.span
+        self.tangential = -1 if no_slip else 1
+        self.speed = ti.Vector.field(4, ti.f32)
+
+    @ti.func
+    def beyond(self, i: ti.i32) -> ti.i32:
+        """Return the ghost index next to an outermost interior index, others as they are."""
+        ghost = i
+        if i == self.edge[0]:
+            ghost = self.ghost[0]
+        if i == self.edge[1]:
+            ghost = self.ghost[1]
+        return ghost
+
+    @ti.func
+    def doubled_speed(self, s: ti.i32, first: Template, ghost: ti.i32) -> ti.f32:
+        """Return 2 u_wall of the wall before a ghost node; ``first`` is the low wall of the pair."""
+        speed = self.speed[s][first]
+        if ghost == self.ghost[1]:
+            speed = self.speed[s][first + 1]
+        return 2.0 * speed
+
+    @ti.func
+    def source(self, i: ti.i32) -> ti.i32:
+        """Return the interior index that a ghost index mirrors, an interior index itself."""
+        return ti.min(ti.max(i, self.edge[0]), self.edge[1])
+
+    @ti.func
+    def ring(self, k: ti.i32) -> Value:
+        """Return the k-th ghost node: left, right, bottom, top."""
+        side, along = k // self.span, k % self.span
+        low, high = self.ghost[0], self.ghost[1]
+        i, j = low, low + along
+        if side == 1:
+            i, j = low + along, high
+        if side == 2:
+            i, j = high, high - along
+        if side == 3:
+            i, j = high - along, low
+        return i, j
+
+    @ti.func
+    def reflection(self, i: ti.i32, j: ti.i32) -> ti.math.vec2:
+        """Return the signs with which a ghost node mirrors a vector."""
+        sign = ti.Vector([1.0, 1.0])
+        if i != self.source(i):
+            sign = ti.Vector([-1.0, float(self.tangential)])
+        if j != self.source(j):
+            sign = ti.Vector([sign[0] * float(self.tangential), -sign[1]])
+        return sign
+
+    @ti.func
+    def drive(self, s: ti.i32, i: ti.i32, j: ti.i32) -> ti.math.vec2:
+        """Return what moving walls add to a ghost's velocity: half in the last cells, 0 in corners."""
+        add = ti.Vector([0.0, 0.0])
+        across_x, across_y = i != self.source(i), j != self.source(j)
+        if across_x and not across_y:
+            add[1] = self.doubled_speed(s, 0, i)
+            if j == self.edge[0] or j == self.edge[1]:
+                add[1] = 0.5 * add[1]
+        if across_y and not across_x:
+            add[0] = self.doubled_speed(s, 2, j)
+            if i == self.edge[0] or i == self.edge[1]:
+                add[0] = 0.5 * add[0]
+        return add

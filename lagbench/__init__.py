@@ -1,0 +1,51 @@
+"""Bit-reproducible particle data sets and benchmarks for neural surrogates.
+
+>>> import lagbench
+>>> lagbench.list_splits()
+('cavity', 'curl-noise', 'fluid', 'multimaterial')
+
+Importing lagbench loads nothing else; each name below loads its module on first use.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from .dataset import list_splits, load_manifest, open_split
+    from .generation import generate
+    from .verification import verify
+
+__all__ = ["__version__", "generate", "list_splits", "load_manifest", "open_split", "verify"]
+
+_HOMES = {
+    "open_split": "dataset",
+    "list_splits": "dataset",
+    "load_manifest": "dataset",
+    "generate": "generation",
+    "verify": "verification",
+}
+
+__version__: str
+
+
+def __getattr__(name: str) -> object:
+    """Load a public name from its module on first use (PEP 562)."""
+    value: object
+    if name == "__version__":
+        from importlib.metadata import version
+
+        value = version("lagbench")
+    elif name in _HOMES:
+        value = getattr(importlib.import_module(f".{_HOMES[name]}", __name__), name)
+    else:
+        message = f"module {__name__!r} has no attribute {name!r}"
+        raise AttributeError(message)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    """List the public names too that are not loaded yet."""
+    return sorted({*globals(), *__all__})

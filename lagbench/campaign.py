@@ -1,0 +1,283 @@
+"""One generation: what is there, what is simulated, what is recorded.
+
+The parent process plans, hands scenarios to workers and keeps the manifest; it never
+simulates, so that Ctrl-C reaches it at once and a crash of the solver cannot take it along.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import platform
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+
+from .atomic import remove_leftovers
+from .cards import write_cards
+from .errors import DataError, UsageError
+from .generators.batch import Job
+from .generators.simulate import Outcome, scenario_key, simulate
+from .generators.solver import Device
+from .generators.twin import twin_floors, twin_substeps
+from .inventory import State, examine, is_unchanged
+from .layout import dataset_folder, scenario_path
+from .manifest import FileEntry, Manifest, describe_file, merge, read_manifest, write_manifest
+from .plan import Estimate, check_disk, estimate
+from .pool import Event, Pool, Task
+from .progress import Meter
+from .registry import Size
+from .scenario_ids import spell_ids
+from .statistics import file_statistics, round_digits
+
+__all__ = ["Campaign"]
+
+BATCH_PARTICLES = 1 << 19
+"""Particles that a parallel device advances together at the most."""
+
+
+class Campaign:
+    """Brings a data set folder to the state that its size describes.
+
+    Args:
+        size: tier of a split.
+        root: folder that holds all data sets.
+        device: where the solver runs.
+        workers: worker processes.
+        meter: counts the work.
+
+    Attributes:
+        manifest: what the folder holds, as far as is known.
+        kept: ids whose files were there and right.
+        to_do: ids to simulate and what that takes.
+        verdict: how the hashes compare with datasets.yaml, in words.
+    """
+
+    def __init__(
+        self,
+        size: Size,
+        root: Path,
+        device: Device,
+        workers: int,
+        meter: Meter,
+    ) -> None:
+        self.size, self.root, self.device, self.workers = size, root, device, workers
+        self.manifest = self._merged(None, [])
+        self.kept: list[int] = []
+        self.to_do: Estimate = estimate(size, ())
+        self.verdict = ""
+        self._meter = meter
+
+    def survey(self, wanted: Sequence[int], *, force: bool = False) -> None:
+        """Find out what is there and what is to do; writes nothing."""
+        base = self._readable_manifest()
+        suspects = [i for i in self.size.scenarios if i in wanted or self._is_new(i, base)]
+        findings = {i: examine(self.root, self.size, i, trusted=base.entry(i)) for i in suspects}
+        good = [f for f in findings.values() if f.state is State.GOOD]
+        bad = findings.keys() - {f.scenario for f in good}
+        base = base.model_copy(update={"files": tuple(e for e in base.files if e.scenario not in bad)})
+        self.manifest = self._merged(base, [self._described(f.scenario, base) for f in good])
+        self.kept = [i for i in wanted if i not in bad and not force]
+        self.to_do = estimate(self.size, [i for i in wanted if i not in self.kept])
+
+    def run(self, wanted: Sequence[int], *, force: bool = False) -> None:
+        """Simulate what is missing or wrong; write manifest and cards; compare.
+
+        Raises:
+            WorkFailedError: no space, a scenario blew up, workers keep dying.
+            DataError: the result has other hashes than datasets.yaml.
+        """
+        folder = dataset_folder(self.root, self.size.split, self.size.name, self.size.major)
+        remove_leftovers(folder)
+        self.survey(wanted, force=force)
+        check_disk(self.root, self.to_do.bytes)
+        self._keep(self.manifest)
+        try:
+            self._simulate()
+        finally:
+            # The workers are gone by now; what they had not finished goes too.
+            remove_leftovers(folder)
+        self._record_statistics()
+        self._write_cards()
+        self.verdict = self._compare()
+
+    def missing(self) -> tuple[int, ...]:
+        """Return the ids of the size that the manifest does not hold."""
+        return tuple(i for i in self.size.scenarios if self.manifest.entry(i) is None)
+
+    def _readable_manifest(self) -> Manifest:
+        """Return the manifest on disk without entries whose file changed its length or is gone."""
+        try:
+            old = read_manifest(self.root, self.size.split, self.size.name, self.size.major)
+        except DataError:  # it is written anew from the files
+            old = None
+        if old is None:
+            return self._merged(None, [])
+        files = tuple(entry for entry in old.files if self._bytes(entry.scenario) == entry.bytes)
+        return old.model_copy(update={"files": files})
+
+    def _path(self, scenario: int) -> Path:
+        return scenario_path(self.root, scenario_key(self.size, scenario))
+
+    def _bytes(self, scenario: int) -> int | None:
+        try:
+            return self._path(scenario).stat().st_size
+        except (OSError, UsageError):  # gone, or the size no longer has this id
+            return None
+
+    def _is_new(self, scenario: int, base: Manifest) -> bool:
+        return base.entry(scenario) is None and self._bytes(scenario) is not None
+
+    def _described(self, scenario: int, base: Manifest) -> FileEntry:
+        """Return the manifest entry of a good file, the known one where nothing changed."""
+        known = base.entry(scenario)
+        if known is not None and is_unchanged(self._path(scenario), known):
+            return known
+        return describe_file(self.root, scenario_key(self.size, scenario))
+
+    def _merged(self, base: Manifest | None, files: Sequence[FileEntry]) -> Manifest:
+        return merge(
+            base,
+            files,
+            split=self.size.split,
+            size=self.size.name,
+            version=self.size.version,
+            subsets=self.size.subsets,
+            environment=_environment(self.device),
+        )
+
+    def _simulate(self) -> None:
+        """Run everything that is to do in workers, and the twins of test scenarios."""
+        twins = [i for i in self.kept if self._lacks_twin(i)]
+        tasks = [*self._tasks(), *(self._twin(i) for i in twins)]
+        if not tasks:
+            return
+        total = round(sum(task.cost for task in tasks))
+        total += sum(twin_substeps(self.size, i) for i in self.to_do.scenarios if self._is_test(i))
+        self._meter.begin("simulating", total=total, scenarios=len(self.to_do.scenarios))
+        with Pool(min(self.workers, len(tasks)), _ENVIRONMENT[self.device]) as pool:
+            for task in tasks:
+                pool.submit(task)
+            for event in pool.events():
+                self._take(event, pool)
+
+    def _tasks(self) -> list[Task]:
+        """Return one task per batch of scenarios of similar length."""
+        costs = dict(zip(self.to_do.scenarios, self.to_do.substeps, strict=True))
+        longest_first = sorted(costs, key=lambda i: (-costs[i], i))
+        width = 1 if self.device is Device.CPU else max(1, BATCH_PARTICLES // self.size.particles)
+        batches = [tuple(longest_first[k : k + width]) for k in range(0, len(longest_first), width)]
+        return [
+            Task(
+                name=f"{self.size.split} {self.size.name}, scenario {spell_ids(batch)}",
+                function=simulate,
+                arguments=(self._job(batch),),
+                cost=sum(costs[i] for i in batch),
+            )
+            for batch in batches
+        ]
+
+    def _twin(self, scenario: int) -> Task:
+        return Task(
+            name=f"{self.size.split} {self.size.name}, twin of scenario {scenario}",
+            function=twin_floors,
+            arguments=(self._job((scenario,)),),
+            cost=twin_substeps(self.size, scenario),
+        )
+
+    def _job(self, scenarios: tuple[int, ...]) -> Job:
+        return Job(size=self.size, scenarios=scenarios, root=self.root, device=self.device)
+
+    def _is_test(self, scenario: int) -> bool:
+        return self.size.subset_of(scenario) == "test"
+
+    def _lacks_twin(self, scenario: int) -> bool:
+        entry = self.manifest.entry(scenario)
+        return self._is_test(scenario) and (entry is None or not entry.twin_floor)
+
+    def _take(self, event: Event, pool: Pool) -> None:
+        """Act on news from a worker."""
+        if event.kind == "progress":
+            self._meter.count(event.value)
+        elif event.kind == "lost":
+            self._meter.count(-event.value)
+        elif event.task.function is simulate:
+            self._take_outcomes(event.value, pool)
+        else:
+            self._take_floors(event.value)
+
+    def _take_outcomes(self, outcomes: Sequence[Outcome], pool: Pool) -> None:
+        entries = [
+            describe_file(self.root, scenario_key(self.size, outcome.scenario), outcome.facts)
+            for outcome in outcomes
+        ]
+        self._keep(self._merged(self.manifest, entries))
+        self._meter.count(scenarios=len(entries))
+        for outcome in outcomes:
+            if self._is_test(outcome.scenario):
+                pool.submit(self._twin(outcome.scenario))
+
+    def _take_floors(self, floors: dict[int, tuple[float, ...]]) -> None:
+        entries = [
+            entry.model_copy(update={"twin_floor": tuple(map(round_digits, floors[entry.scenario]))})
+            for entry in self.manifest.files
+            if entry.scenario in floors
+        ]
+        self._keep(self._merged(self.manifest, entries))
+
+    def _keep(self, manifest: Manifest) -> None:
+        self.manifest = manifest
+        write_manifest(self.root, manifest)
+
+    def _record_statistics(self) -> None:
+        """Bring the statistics of train up to date and write the manifest."""
+        manifest, train = self.manifest, self.size.subsets["train"]
+        changed = not manifest.statistics or any(i in self.to_do.scenarios for i in train)
+        if "train" in manifest.subset_sha256 and changed:
+            self._meter.begin("statistics", total=1, scenarios=len(train))
+            rows = file_statistics([self._path(i) for i in train])
+            manifest = manifest.model_copy(update={"statistics": rows})
+        self._keep(manifest)
+
+    def _write_cards(self) -> None:
+        self._meter.begin("cards", total=1, scenarios=len(self.manifest.files))
+        write_cards(self.root, self.size, self.manifest)
+
+    def _compare(self) -> str:
+        """Return how the hashes compare with datasets.yaml, in words.
+
+        Raises:
+            DataError: a scenario has another hash.
+        """
+        measured = self.size.measured
+        if measured is None:
+            return "datasets.yaml holds no hash of this size yet: nothing to compare with"
+        differing = [
+            entry.scenario
+            for entry in self.manifest.files
+            if not entry.content_sha256.startswith(measured.scenario_sha256.get(entry.scenario, ""))
+        ]
+        if differing:
+            raise DataError(
+                f"{len(differing)} of {len(self.manifest.files)} scenarios have another hash",
+                where=f"{self.size.split} {self.size.name}, scenarios {spell_ids(differing)}",
+                expected="the hashes in datasets.yaml",
+                fix="see docs/determinism.md; `lagbench doctor` prints what a report needs",
+            )
+        whole = self.manifest.complete
+        return "equal to datasets.yaml" if whole else "what is there is equal to datasets.yaml"
+
+
+_ENVIRONMENT = {
+    # NumPy's and HDF5's threads would only take the cores from the other workers.
+    Device.CPU: {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
+    Device.PARALLEL: {},
+    Device.CUDA: {},
+}
+
+
+def _environment(device: Device) -> dict[str, str]:
+    """Return what the manifest says about the machine that wrote files."""
+    names = ("lagbench", "numpy", "netCDF4", "taichi")
+    libraries = {name: version(name) for name in names if importlib.util.find_spec(name)}
+    system = {"python": platform.python_version(), "machine": platform.machine(), "system": platform.system()}
+    return {**system, **libraries, "device": device.value}

@@ -1,0 +1,274 @@
+"""Data set cards: README.md with pictures, and croissant.json, beside the manifest.
+
+Both follow from the registry and the manifest alone and hold no date, so the same data set
+gets the same bytes. Pictures are drawn where matplotlib is installed.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from .atomic import write_atomically
+from .croissant import KEYWORDS, croissant_json
+from .layout import dataset_folder
+from .manifest import FileEntry, Manifest
+from .markdown import escape, table
+from .registry import Size, Split, load
+from .scenario_ids import spell_ids
+
+__all__ = ["CARD_NAME", "CROISSANT_NAME", "NOTES", "PICTURES", "dataset_card", "write_cards"]
+
+CARD_NAME, CROISSANT_NAME = "README.md", "croissant.json"
+
+PICTURES: Mapping[str, str] = {
+    "pictures/scenarios.png": "scenarios of this data set",
+    "pictures/frame.png": "one frame of a test scenario",
+}
+"""Pictures of a card, relative to it, and what they show."""
+
+NOTES: Mapping[str, str] = {
+    "multimaterial": (
+        "In the pair snow-snow everything comes to rest after about 65 frames: the rest of these scenarios "
+        "holds almost no motion, and a model that stands still looks good there."
+    ),
+    "fluid": "Scenarios differ in length: the longer ones are those that still move.",
+    "curl-noise": "Energy only decays: the higher the frequency, the faster.",
+}
+"""What a reader of one split's card must know beside its description."""
+
+VARIABLES = (
+    ("`position`", "frame, particle, space", "float32", "length", "particle positions in the unit box"),
+    ("`velocity`", "frame, particle, space", "float32", "length/s", "particle velocities of the solver"),
+    ("`material`", "particle", "int8", "1", "0 liquid, 1 jelly, 2 snow, 3 rope"),
+    ("`particle_mass`", "", "float64", "density x area", "mass of one particle"),
+    (
+        "`wall_velocity`",
+        "frame, wall, space",
+        "float32",
+        "length/s",
+        "closed box: walls left, right, bottom, top",
+    ),
+    ("`time`", "frame", "float64", "s", "time since frame 0"),
+)
+
+
+def write_cards(root: Path, size: Size, manifest: Manifest) -> list[Path]:
+    """Write README.md, croissant.json and, with matplotlib, the pictures; return their paths.
+
+    Each file appears whole or not at all.
+
+    Args:
+        root: folder that holds all data sets.
+        size: tier of the split.
+        manifest: what the folder of the data set holds.
+
+    Raises:
+        DataError: a scenario file that is drawn is damaged.
+        WorkFailedError: the operating system refused.
+    """
+    folder = dataset_folder(root, size.split, size.name, size.major)
+    split = load().split(size.split)
+    pictures = _draw(root, size, manifest, folder) if importlib.util.find_spec("matplotlib") else []
+    card = dataset_card(size, split, manifest, pictures=pictures)
+    write_atomically(folder / CARD_NAME, card.encode())
+    write_atomically(folder / CROISSANT_NAME, croissant_json(size, split, manifest).encode())
+    return [folder / name for name in (CARD_NAME, CROISSANT_NAME, *pictures)]
+
+
+def _draw(root: Path, size: Size, manifest: Manifest, folder: Path) -> list[str]:
+    """Draw the pictures of the card; return their names."""
+    from .plots import contact_sheet, plot_frame
+
+    if not manifest.files:
+        return []
+    sheet, single = PICTURES
+    contact_sheet(size.split, size.name, folder / sheet, root=root)
+    shown = next((e for e in manifest.files if e.subset == "test"), manifest.files[0])
+    frame = min(size.task.frames_of_interest[-1], shown.frames - 1)
+    plot_frame(folder / shown.path, frame, folder / single)
+    return [sheet, single]
+
+
+def dataset_card(size: Size, split: Split, manifest: Manifest, *, pictures: list[str]) -> str:
+    """Return the card of a data set as Markdown with a YAML head.
+
+    Args:
+        size: tier of the split.
+        split: the split itself.
+        manifest: what the folder holds.
+        pictures: names of the pictures to show, from :data:`PICTURES`.
+    """
+    parts = [
+        _head(size, split, manifest),
+        f"# {escape(split.title)} · {size.split} {size.name}",
+        escape(split.description),
+        *([escape(NOTES[size.split])] if size.split in NOTES else []),
+        *(f"![{PICTURES[name]}]({name})" for name in pictures),
+        "## In short",
+        _facts(size, manifest),
+        "## Subsets",
+        _subsets(size, manifest),
+        "## Reading",
+        _reading(size),
+        "## Task",
+        _task(size, manifest),
+        *_statistics(manifest),
+        "## Parameters",
+        _parameters(size),
+        "## Regenerate and verify",
+        _commands(size, manifest),
+        "## Scenarios",
+        _scenarios(manifest),
+        "## Licence and citation",
+        f"{escape(split.licence)}. {escape(split.citation)}.",
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _head(size: Size, split: Split, manifest: Manifest) -> str:
+    """Return the YAML head; JSON strings and lists are YAML."""
+    count = len(manifest.files)
+    lines = {
+        "pretty_name": f"{split.title} ({size.split} {size.name})",
+        "license": split.licence.lower(),
+        "tags": list(KEYWORDS),
+        "size_categories": ["n<1K" if count < 1000 else "1K<n<10K"],
+        "version": manifest.version,
+    }
+    body = [f"{key}: {json.dumps(value, ensure_ascii=False)}" for key, value in lines.items()]
+    return "\n".join(["---", *body, "---"])
+
+
+def _facts(size: Size, manifest: Manifest) -> str:
+    frames = sorted({entry.frames for entry in manifest.files})
+    rows = [
+        ("version", manifest.version),
+        ("complete", manifest.complete),
+        (
+            "data set hash",
+            f"`{manifest.dataset_sha256}`" if manifest.dataset_sha256 else "none before it is complete",
+        ),
+        ("identity", manifest.identity),
+        ("scenarios", len(manifest.files)),
+        (
+            "frames per scenario",
+            " to ".join(str(f) for f in dict.fromkeys((frames[0], frames[-1]))) if frames else "0",
+        ),
+        ("frames together", sum(entry.frames for entry in manifest.files)),
+        ("particles", size.particles),
+        ("frame interval", f"{size.frame_interval:.6g} s"),
+        ("substep", f"{size.dt:.6g} s, {size.substeps_per_frame} per frame"),
+        ("box", " x ".join(f"[{low:.9g}, {high:.9g}]" for low, high in size.bounds)),
+        ("bytes", sum(entry.bytes for entry in manifest.files)),
+    ]
+    return table(("", ""), rows)
+
+
+def _subsets(size: Size, manifest: Manifest) -> str:
+    rows = []
+    for subset, ids in size.subsets.items():
+        there = [entry for entry in manifest.files if entry.subset == subset]
+        digest = manifest.subset_sha256.get(subset)
+        rows.append(
+            (
+                subset,
+                spell_ids(ids),
+                f"{len(there)} of {len(ids)}",
+                sum(entry.frames for entry in there),
+                sum(entry.bytes for entry in there),
+                f"`{digest}`" if digest else "incomplete",
+            )
+        )
+    return table(("subset", "ids", "scenarios", "frames", "bytes", "hash"), rows)
+
+
+def _reading(size: Size) -> str:
+    code = (
+        "```python\n"
+        "import lagbench\n\n"
+        f'data = lagbench.open_split("{size.split}", subset="train", size="{size.name}")\n'
+        'position = data["position"]  # (scenario, frame, particle, space), read when computed\n'
+        "```"
+    )
+    plain = (
+        "One netCDF4 file per scenario, which `xarray.open_dataset` reads without lagbench. "
+        "Lengths are in units of the unit box, time in seconds. Frame 0 is the state when recording starts."
+    )
+    return f"{plain}\n\n{code}\n\n{table(('variable', 'dimensions', 'type', 'unit', 'meaning'), VARIABLES)}"
+
+
+def _task(size: Size, manifest: Manifest) -> str:
+    task = size.task
+    grid = f"{task.score_grid.cells} cells a side, {task.score_grid.placement.replace('_', ' ')}"
+    rows = [
+        ("input frames", str(task.input_frames)),
+        ("frames to predict", str(task.horizon)),
+        ("frames of interest", ", ".join(map(str, task.frames_of_interest))),
+        ("score grid", grid),
+        ("radius for graph models", f"{task.radius:g}"),
+        *_twin_floor(manifest),
+    ]
+    return table(("", ""), rows)
+
+
+def _twin_floor(manifest: Manifest) -> Iterator[tuple[str, str]]:
+    """Yield how far a twin that starts 2^-20 away drifts, where that was measured."""
+    floors = [entry.twin_floor for entry in manifest.files if entry.twin_floor]
+    if floors:
+        first, last = (sum(floor[i] for floor in floors) / len(floors) for i in (0, -1))
+        text = f"position RMSE {first:.3g} at the first predicted frame, {last:.3g} at the last"
+        yield ("twin that starts 2^-20 away", text)
+
+
+def _statistics(manifest: Manifest) -> Iterator[str]:
+    """Yield the statistics of train where there are any."""
+    if manifest.statistics:
+        yield "## Statistics of train"
+        yield "With the frame as unit of time: velocity is x(f) - x(f-1), acceleration its difference."
+        yield table(
+            ("", "x", "y"), [(name.replace("_", " "), *row) for name, row in manifest.statistics.items()]
+        )
+
+
+def _parameters(size: Size) -> str:
+    rows = [(f"`{name}`", _plain(p.value), p.unit, p.description) for name, p in size.parameters.items()]
+    return table(("parameter", "value", "unit", "meaning"), rows)
+
+
+def _plain(value: object) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _commands(size: Size, manifest: Manifest) -> str:
+    options = f"--split {size.split} --size {size.name}"
+    promise = (
+        "The files hold the same bits on every x86-64 Linux machine, with any number of workers."
+        if manifest.identity == "bitwise"
+        else "Some files come from a device that does not promise equal bits: they agree to a tolerance."
+    )
+    return (
+        f"{promise}\n\n"
+        "```sh\n"
+        "pip install 'lagbench[generate]'\n"
+        f"lagbench generate {options}\n"
+        f"lagbench verify {options}                 # re-hash every file\n"
+        f"lagbench verify {options} --regenerate 2  # simulate two scenarios again and compare\n"
+        "```"
+    )
+
+
+def _scenarios(manifest: Manifest) -> str:
+    names = sorted({name for entry in manifest.files for name in entry.facts})
+    rows = [_scenario_row(entry, names) for entry in manifest.files]
+    listing = table(
+        ("id", "file", "frames", *(name.replace("_", " ") for name in names), "content hash"), rows
+    )
+    return f"<details><summary>{len(rows)} files</summary>\n\n{listing}\n\n</details>"
+
+
+def _scenario_row(entry: FileEntry, names: list[str]) -> tuple[object, ...]:
+    facts = [f"{entry.facts[name]:.6g}" if name in entry.facts else "" for name in names]
+    return (entry.scenario, f"`{entry.path}`", entry.frames, *facts, f"`{entry.content_sha256}`")

@@ -1,0 +1,112 @@
+"""Commands that draw: plot, animate."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from .options import JsonFlag, QuietFlag, RootOption, SizeOption
+from .output import print_json, say
+
+__all__ = ["animate", "plot"]
+
+SourceArgument = Annotated[
+    str | None, typer.Argument(metavar="[SPLIT | FILE]", help="Split, or a scenario file.")
+]
+SplitNameOption = Annotated[str | None, typer.Option("--split", metavar="NAME", help="The same as SPLIT.")]
+ScenarioOption = Annotated[
+    int | None, typer.Option("--scenario", metavar="ID", help="Scenario; the first of test by default.")
+]
+OutputOption = Annotated[
+    Path | None, typer.Option("--output", "-o", metavar="FILE", help="File to write; named after the data.")
+]
+
+
+def _source(name: str | None, split: str | None, size: str, scenario: int | None, root: Path | None) -> Path:
+    """Return the scenario file that a user means by its path or by split, size and id."""
+    from lagbench.layout import ScenarioKey, resolve_root, scenario_path
+    from lagbench.registry import load
+
+    from .options import chosen
+
+    if name is not None and name.endswith(".nc"):
+        return Path(name)
+    tier = load().size(chosen(name, split), size)
+    wanted = tier.subsets["test"][0] if scenario is None else scenario
+    subset = tier.subset_of(wanted)
+    key = ScenarioKey(split=tier.split, size=size, version=tier.version, scenario=wanted, subset=subset)
+    return scenario_path(resolve_root(root), key)
+
+
+def _default_name(source: Path, ending: str) -> Path:
+    """Return a file name in this folder: split-size-scenario where the path tells them."""
+    parts = source.absolute().parts
+    named = len(parts) > 5 and parts[-3].startswith("v")
+    words = (parts[-5], parts[-4], source.stem) if named else (source.stem,)
+    return Path("-".join(words) + ending)
+
+
+def _done(path: Path, *, as_json: bool, quiet: bool) -> None:
+    if as_json:
+        print_json({"output": path})
+    else:
+        say(str(path), quiet=quiet)
+
+
+def plot(
+    name: SourceArgument = None,
+    split: SplitNameOption = None,
+    size: SizeOption = "full",
+    scenario: ScenarioOption = None,
+    frame: Annotated[int, typer.Option("--frame", help="Frame number; negative ones from the end.")] = -1,
+    kind: Annotated[
+        str, typer.Option("--kind", help="all, speed, material, vorticity or streamlines.")
+    ] = "all",
+    output: OutputOption = None,
+    root: RootOption = None,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
+) -> None:
+    """Draw one frame of a scenario: particles, vorticity, streamlines."""
+    from lagbench.plots import plot_frame
+
+    source = _source(name, split, size, scenario, root)
+    target = output or _default_name(source, f"-frame{frame}.png")
+    _done(plot_frame(source, frame, target, kind=kind), as_json=as_json, quiet=quiet)
+
+
+def animate(
+    name: SourceArgument = None,
+    second: Annotated[
+        str | None, typer.Argument(metavar="[FILE]", help="Second scenario file, drawn beside the first.")
+    ] = None,
+    split: SplitNameOption = None,
+    size: SizeOption = "full",
+    scenario: ScenarioOption = None,
+    beside: Annotated[
+        int | None, typer.Option("--beside", metavar="ID", help="Second scenario of the split.")
+    ] = None,
+    kind: Annotated[
+        str | None, typer.Option("--kind", help="speed, material, vorticity or streamlines.")
+    ] = None,
+    fps: Annotated[float, typer.Option("--fps", help="Frames shown per second.")] = 30.0,
+    every: Annotated[int, typer.Option("--every", help="Show every n-th frame.", min=1)] = 1,
+    output: OutputOption = None,
+    root: RootOption = None,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
+) -> None:
+    """Turn a scenario into an MP4 or GIF film; two scenarios stand side by side."""
+    from lagbench.animation import animate as run
+
+    source = _source(name, split, size, scenario, root)
+    other = Path(second) if second else None
+    if beside is not None:
+        other = _source(name, split, size, beside, root)
+    target = output or _default_name(source, ".mp4")
+    path = run(
+        source, target, beside=other, kind=kind, frames_per_second=fps, every=every, quiet=quiet or as_json
+    )
+    _done(path, as_json=as_json, quiet=quiet)

@@ -1,0 +1,77 @@
+"""What commands print: JSON for machines, tables and sentences for people."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+import typer
+
+__all__ = ["print_json", "print_table", "say", "spell_bytes", "spell_seconds"]
+
+
+def say(text: str, *, quiet: bool = False) -> None:
+    """Print a line on stdout unless the user asked for silence."""
+    if not quiet:
+        typer.echo(text)
+
+
+def print_json(value: object) -> None:
+    """Print a value, a dataclass too, as one JSON object on stdout."""
+    typer.echo(json.dumps(_plain(value), indent=2, sort_keys=True, allow_nan=False))
+
+
+def _plain(value: object) -> object:
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple, set, frozenset)):
+        return [_plain(item) for item in value]
+    return str(value) if isinstance(value, Path) else value
+
+
+def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    """Print a table on stdout; only its last column wraps, numbers stand on the right."""
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    cells = [[str(cell) for cell in row] for row in rows]
+    table = Table(title=title or None, box=SIMPLE_HEAD, title_justify="left", pad_edge=False)
+    for number, column in enumerate(columns, start=1):
+        numeric = all(row[number - 1][:1] in "0123456789-" for row in cells)
+        table.add_column(column, justify="right" if numeric else "left", no_wrap=number < len(columns))
+    for row in cells:
+        table.add_row(*(Text(cell) for cell in row))
+    console = Console()
+    # In a file or a pipe the width is fixed, so that the output is the same everywhere.
+    (console if console.is_terminal else Console(width=120)).print(table)
+
+
+def spell_bytes(count: float) -> str:
+    """Return a number of bytes with a decimal unit.
+
+    >>> spell_bytes(4_720_000_000)
+    '4.7 GB'
+    """
+    for unit in ("B", "kB", "MB", "GB"):
+        if count < 1000 or unit == "GB":
+            break
+        count /= 1000
+    return f"{count:.0f} {unit}" if count >= 100 or unit == "B" else f"{count:.1f} {unit}"
+
+
+def spell_seconds(seconds: float) -> str:
+    """Return a duration in the units that people use.
+
+    >>> spell_seconds(4000)
+    '67 min'
+    """
+    if seconds < 100:
+        return f"{max(seconds, 1):.0f} s"
+    minutes = seconds / 60
+    return f"{minutes:.0f} min" if minutes < 100 else f"{minutes / 60:.1f} h"

@@ -1,0 +1,167 @@
+"""Open a generated data set as one lazy xarray.Dataset."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from . import registry
+from .errors import DataError, UsageError, nearest
+from .layout import ScenarioKey, dataset_folder, resolve_root, scenario_path
+from .scenario_ids import spell_ids
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from .manifest import Manifest
+
+__all__ = ["list_splits", "load_manifest", "open_split"]
+
+CHUNK_BYTES = 4 << 20
+"""Dask reads position and velocity in chunks of about this size [bytes]."""
+
+PADDING = -1
+"""Material of particles that a scenario does not have."""
+
+
+def list_splits() -> tuple[str, ...]:
+    """Return the names of all splits in the registry, sorted."""
+    return tuple(sorted(registry.load().splits))
+
+
+def load_manifest(split: str, *, size: str = "full", root: str | Path | None = None) -> Manifest:
+    """Return the manifest of a generated data set.
+
+    Args:
+        split: name of the split.
+        size: name of the size.
+        root: folder of all data sets, see :func:`lagbench.layout.resolve_root`.
+
+    Raises:
+        UsageError: unknown split or size.
+        DataError: nothing is generated, or the manifest is damaged.
+    """
+    from .manifest import read_manifest
+
+    entry = registry.load().size(split, size)
+    folder = resolve_root(root)
+    manifest = read_manifest(folder, split, size, entry.major)
+    if manifest is None:
+        raise DataError(
+            "the data set has no manifest",
+            where=str(dataset_folder(folder, split, size, entry.major)),
+            fix=f"lagbench generate --split {split} --size {size}",
+        )
+    return manifest
+
+
+def open_split(
+    split: str,
+    *,
+    subset: str = "test",
+    size: str = "full",
+    root: str | Path | None = None,
+) -> xr.Dataset:
+    """Open one subset of a generated data set; arrays are read when computed.
+
+    Args:
+        split: name of the split.
+        subset: train, valid, test or, for multimaterial, extra.
+        size: name of the size.
+        root: folder of all data sets, see :func:`lagbench.layout.resolve_root`.
+
+    Returns:
+        ``position`` and ``velocity`` with dims (scenario, frame, particle, space) as dask
+        arrays, ``material`` (scenario, particle), ``particle_mass`` (scenario), in a closed box
+        ``wall_velocity`` (scenario, frame, wall, space), and ``frame_count`` and
+        ``particle_count`` (scenario). Coordinate ``scenario`` holds the ids. Scenarios with
+        fewer frames or particles than the largest are padded with NaN, material with -1.
+
+    Raises:
+        UsageError: unknown split, size or subset.
+        DataError: scenarios are missing, damaged, or of another version.
+    """
+    import xarray as xr
+
+    entry = registry.load().size(split, size)
+    if subset not in entry.subsets:
+        where = f"{split} {size}"
+        raise UsageError(f"no subset {subset!r}", where=where, fix=nearest(subset, entry.subsets))
+    ids = entry.subsets[subset]
+    keys = [
+        ScenarioKey(split=split, size=size, version=entry.version, scenario=i, subset=subset) for i in ids
+    ]
+    folder = resolve_root(root)
+    _require(folder, keys)
+    scenarios = [_open_scenario(scenario_path(folder, key), key) for key in keys]
+    return _join(scenarios, xr.Variable("scenario", list(ids), {"long_name": "scenario id", "units": "1"}))
+
+
+def _require(root: Path, keys: list[ScenarioKey]) -> None:
+    """Say which scenarios are missing and the command that makes them."""
+    missing = [key.scenario for key in keys if not scenario_path(root, key).is_file()]
+    if missing:
+        key = keys[0]
+        options = f"--split {key.split} --size {key.size} --subset {key.subset} --root {root}"
+        raise DataError(
+            f"{len(missing)} of {len(keys)} scenarios are not generated",
+            where=str(scenario_path(root, key).parent),
+            got=f"missing: {spell_ids(missing)}",
+            fix=f"lagbench generate {options}",
+        )
+
+
+def _open_scenario(path: Path, key: ScenarioKey) -> xr.Dataset:
+    """Open one file lazily and check that it is the scenario that its path says."""
+    import xarray as xr
+
+    try:
+        stored = xr.open_dataset(path, engine="netcdf4", cache=False)
+        frame_bytes = stored["position"].dtype.itemsize * stored.sizes["particle"] * stored.sizes["space"]
+        scenario = stored.chunk(frame=max(1, CHUNK_BYTES // frame_bytes), particle=-1, space=-1)
+        scenario.set_close(stored.close)
+        found = {name: scenario.attrs[name] for name in ("split", "size", "scenario", "version")}
+    except Exception as error:  # HDF5 on damaged bytes raises nearly any type
+        raise DataError(
+            "a scenario file is damaged or not one of lagbench",
+            where=str(path),
+            got=f"{type(error).__name__}: {error}",
+            fix=f"lagbench generate --split {key.split} --size {key.size}",
+        ) from error
+    same_major = str(found["version"]).split(".")[0] == str(key.major)
+    if not same_major or (found["split"], found["size"], int(found["scenario"])) != (
+        key.split,
+        key.size,
+        key.scenario,
+    ):
+        raise DataError("a scenario file is another scenario", where=str(path), expected=key, got=found)
+    return scenario
+
+
+def _join(scenarios: list[xr.Dataset], ids: xr.Variable) -> xr.Dataset:
+    """Stack scenarios of unequal lengths along a new first dimension."""
+    import xarray as xr
+
+    frames = [scenario.sizes["frame"] for scenario in scenarios]
+    particles = [scenario.sizes["particle"] for scenario in scenarios]
+    longest = scenarios[frames.index(max(frames))]
+    fullest = scenarios[particles.index(max(particles))]
+    labels = {"frame": longest["frame"], "particle": fullest["particle"]}
+    padded = [
+        scenario.drop_vars("time").reindex(labels, fill_value={"material": PADDING}) for scenario in scenarios
+    ]
+    joined = xr.concat(
+        padded, dim=ids, data_vars="all", coords="minimal", join="exact", combine_attrs="drop_conflicts"
+    )
+    joined = joined.assign_coords(scenario=ids, time=longest["time"].compute())
+    joined["frame_count"] = ("scenario", frames, {"long_name": "recorded frames", "units": "1"})
+    joined["particle_count"] = ("scenario", particles, {"long_name": "particles", "units": "1"})
+    for variable in joined.variables.values():
+        variable.attrs.pop("content_sha256", None)
+
+    def close() -> None:
+        for scenario in scenarios:
+            scenario.close()
+
+    joined.set_close(close)
+    return joined

@@ -1,0 +1,167 @@
+"""Generate a data set: simulate what is missing, crash-safe, resumable, on all cores.
+
+A scenario's file appears whole or not at all, and the manifest is brought up to date after
+each, so that an interrupted generation goes on where it stopped and ends with the same bytes
+as an uninterrupted one.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from .campaign import Campaign
+from .errors import UsageError, nearest
+from .layout import dataset_folder, resolve_root
+from .locking import dataset_lock
+from .overview import available_cores
+from .plan import Scenarios, Selection, free_bytes, select
+from .progress import Meter, Progress
+from .registry import Registry, load
+
+if TYPE_CHECKING:
+    from .generators.solver import Device
+
+__all__ = ["GenerationResult", "Progress", "generate", "parse_device"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class GenerationResult:
+    """What a generation did, or would do.
+
+    Attributes:
+        split: name of the split.
+        size: name of the size.
+        version: semantic version.
+        root: folder of all data sets.
+        folder: folder of this one.
+        device: where the solver ran.
+        workers: worker processes.
+        simulated: ids that were (dry run: would be) simulated.
+        kept: ids whose files were there and right.
+        missing: ids of the size that are still not there.
+        bytes_needed: disk space of ``simulated`` before compression [bytes].
+        bytes_free: free disk space before the start [bytes].
+        seconds_expected: expected time [s], for orientation.
+        seconds: time that it took [s].
+        complete: whether train, valid and test are all there.
+        dataset_sha256: data set hash, once complete.
+        verdict: how the hashes compare with datasets.yaml, in words.
+        dry_run: whether nothing was done.
+    """
+
+    split: str
+    size: str
+    version: str
+    root: Path
+    folder: Path
+    device: str
+    workers: int
+    simulated: tuple[int, ...]
+    kept: tuple[int, ...]
+    missing: tuple[int, ...]
+    bytes_needed: int
+    bytes_free: int
+    seconds_expected: float
+    seconds: float = 0.0
+    complete: bool = False
+    dataset_sha256: str | None = None
+    verdict: str = ""
+    dry_run: bool = False
+
+
+def generate(
+    split: str,
+    size: str = "full",
+    *,
+    subset: Selection = None,
+    scenarios: Scenarios = None,
+    root: str | Path | None = None,
+    workers: int | None = None,
+    device: str = "cpu",
+    force: bool = False,
+    dry_run: bool = False,
+    progress: Callable[[Progress], None] | None = None,
+    on_wait: Callable[[str], None] | None = None,
+    registry: Registry | None = None,
+) -> GenerationResult:
+    """Simulate the scenarios of a split that are not on disk yet, and check their hashes.
+
+    Args:
+        split: name of the split.
+        size: name of the size.
+        subset: some subsets only.
+        scenarios: some ids only, as numbers or as text such as "0,3-5".
+        root: folder of all data sets; else ``LAGBENCH_ROOT``, else the user data folder.
+        workers: worker processes; one per core, or one for the parallel devices.
+        device: "cpu", "parallel" or "cuda"; the bits do not depend on it.
+        force: simulate anew what is there and right.
+        dry_run: only say what it would take.
+        progress: called as the work advances.
+        on_wait: called with the holder in words when another process holds the lock.
+        registry: where splits are described; ours when None.
+
+    Raises:
+        UsageError: unknown split, size, subset, scenario or device, or Taichi is not installed.
+        WorkFailedError: disk full or not writable, a scenario blew up, workers keep dying.
+        DataError: the result has other hashes than datasets.yaml.
+    """
+    started = time.monotonic()
+    tier = (registry or load()).size(split, size)
+    wanted = select(tier, subset=subset, scenarios=scenarios)
+    target, folder = parse_device(device), resolve_root(root)
+    cores = workers or (available_cores() if target.value == "cpu" else 1)
+    free = free_bytes(folder)
+    campaign = Campaign(tier, folder, target, cores, Meter(progress))
+    if dry_run:
+        campaign.survey(wanted, force=force)
+    else:
+        _require_taichi()
+        with dataset_lock(folder, split, size, tier.major, on_wait=on_wait):
+            campaign.run(wanted, force=force)
+    return GenerationResult(
+        split=split,
+        size=size,
+        version=tier.version,
+        root=folder,
+        folder=dataset_folder(folder, split, size, tier.major),
+        device=device,
+        workers=cores,
+        simulated=campaign.to_do.scenarios,
+        kept=tuple(campaign.kept),
+        missing=campaign.missing(),
+        bytes_needed=campaign.to_do.bytes,
+        bytes_free=free,
+        seconds_expected=campaign.to_do.seconds(cores),
+        seconds=time.monotonic() - started,
+        complete=campaign.manifest.complete,
+        dataset_sha256=campaign.manifest.dataset_sha256,
+        verdict=campaign.verdict,
+        dry_run=dry_run,
+    )
+
+
+def parse_device(name: str) -> Device:
+    """Return a device by name.
+
+    Raises:
+        UsageError: there is none; the message names the nearest.
+    """
+    from .generators.solver import Device
+
+    names = [device.value for device in Device]
+    if name not in names:
+        raise UsageError(f"no device {name!r}", where="--device", fix=nearest(name, names))
+    return Device(name)
+
+
+def _require_taichi() -> None:
+    """Refuse before anything is written; the workers import Taichi, this process never does."""
+    if importlib.util.find_spec("taichi") is None:
+        raise UsageError(
+            "taichi is not installed", where="lagbench generate", fix="pip install 'lagbench[generate]'"
+        )

@@ -1,0 +1,100 @@
+"""The one table of metrics: name, formula, unit, direction.
+
+Scorer, board, docs and plots read it. Another package adds metrics by an entry point in the
+group ``lagbench.metrics`` that names a :class:`Metric` or a sequence of them; ours are
+registered the same way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from importlib.metadata import EntryPoint, entry_points
+from types import MappingProxyType
+
+from lagbench.errors import UsageError, nearest
+
+from . import bodies, continuity, distributions, energy, momentum, pointwise, transport, vorticity
+from .metric import Metric
+
+__all__ = ["FAMILIES", "GROUP", "METRICS", "available", "select"]
+
+GROUP = "lagbench.metrics"
+"""Entry-point group that adds metrics."""
+
+FAMILIES: Mapping[str, Sequence[Metric]] = MappingProxyType(
+    {
+        "pointwise": pointwise.METRICS,
+        "vorticity": vorticity.METRICS,
+        "distributions": distributions.METRICS,
+        "energy": energy.METRICS,
+        "momentum": momentum.METRICS,
+        "continuity": continuity.METRICS,
+        "bodies": bodies.METRICS,
+        "transport": transport.METRICS,
+    }
+)
+"""Our metrics by family, in the order in which they are shown."""
+
+METRICS: Mapping[str, Metric] = MappingProxyType(
+    {metric.name: metric for family in FAMILIES.values() for metric in family}
+)
+"""Our metrics by name."""
+
+
+def available() -> dict[str, Metric]:
+    """Return all metrics by name, those of other installed packages last.
+
+    Raises:
+        UsageError: an entry point is no metric, or takes a name that another has.
+    """
+    known = dict(METRICS)
+    for point in sorted(entry_points(group=GROUP), key=lambda point: point.name):
+        for metric in _load(point):
+            if known.setdefault(metric.name, metric) is not metric:
+                raise UsageError(
+                    f"two metrics are named {metric.name!r}",
+                    where=f"entry point {point.name} = {point.value}",
+                    fix="rename one, or uninstall its package",
+                )
+    return known
+
+
+def _load(point: EntryPoint) -> Sequence[Metric]:
+    loaded = point.load()
+    found = (loaded,) if isinstance(loaded, Metric) else tuple(loaded)
+    for metric in found:
+        if not isinstance(metric, Metric):
+            raise UsageError(
+                "an entry point holds something that is no metric",
+                where=f"entry point {point.name} = {point.value}",
+                expected="a lagbench.metrics.Metric or a sequence of them",
+                got=type(metric).__name__,
+            )
+    return found
+
+
+def select(
+    names: Iterable[str] | None = None,
+    *,
+    extras: Collection[str] = (),
+    known: Mapping[str, Metric] | None = None,
+) -> tuple[Metric, ...]:
+    """Return metrics and those whose statistics they follow from, in the table's order.
+
+    Args:
+        names: metrics wanted; by default all that need no extra.
+        extras: extras whose metrics are wanted too.
+        known: table to choose from, :func:`available` by default.
+
+    Raises:
+        UsageError: an unknown name; the message names the nearest known one.
+    """
+    table = available() if known is None else known
+    if names is None:
+        names = [m.name for m in table.values() if m.extra is None or m.extra in extras]
+    wanted: set[str] = set()
+    for name in names:
+        if name not in table:
+            raise UsageError(f"no metric {name!r}", fix=nearest(name, table))
+        wanted |= {name, *table[name].of}
+    return tuple(metric for name, metric in table.items() if name in wanted)

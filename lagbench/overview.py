@@ -1,0 +1,84 @@
+"""What one size of a split is, costs and has on this machine; nothing is read but names."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from .cards import PICTURES
+from .layout import dataset_folder
+from .plan import estimate
+from .registry import Size
+
+__all__ = ["Overview", "available_cores", "overview"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Overview:
+    """What tables say about one size of a split.
+
+    Attributes:
+        split: name of the split.
+        size: name of the size.
+        version: semantic version.
+        scenarios: number of scenarios by subset.
+        particles: particles in one scenario.
+        frames: recorded frames of all scenarios.
+        bytes: disk space before compression [bytes].
+        seconds: time to generate on all cores of this machine [s], for orientation.
+        present: scenario files that are there, by subset; `lagbench verify` checks them.
+        folder: where they are, or would be.
+        picture: picture of the data set once it is generated.
+        dataset_sha256: data set hash as datasets.yaml has it.
+    """
+
+    split: str
+    size: str
+    version: str
+    scenarios: dict[str, int]
+    particles: int
+    frames: int
+    bytes: int
+    seconds: float
+    present: dict[str, int]
+    folder: Path
+    picture: Path | None
+    dataset_sha256: str | None
+
+    @property
+    def state(self) -> str:
+        """Whether it is on this machine: "yes", "no" or how much of it."""
+        there, wanted = sum(self.present.values()), sum(self.scenarios.values())
+        if there == wanted:
+            return "yes"
+        return f"{there} of {wanted}" if there else "no"
+
+
+def available_cores() -> int:
+    """Return the number of processors that this process may use."""
+    return len(os.sched_getaffinity(0))
+
+
+def overview(size: Size, root: Path) -> Overview:
+    """Return what a size is, costs, and has below a root folder."""
+    folder = dataset_folder(root, size.split, size.name, size.major)
+    expected = estimate(size, size.scenarios)
+    return Overview(
+        split=size.split,
+        size=size.name,
+        version=size.version,
+        scenarios={subset: len(ids) for subset, ids in size.subsets.items()},
+        particles=size.particles,
+        frames=expected.frames,
+        bytes=expected.bytes,
+        seconds=expected.seconds(available_cores()),
+        present={subset: _present(folder / subset, ids) for subset, ids in size.subsets.items()},
+        folder=folder,
+        picture=next((folder / name for name in PICTURES if (folder / name).is_file()), None),
+        dataset_sha256=size.measured.dataset_sha256 if size.measured else None,
+    )
+
+
+def _present(folder: Path, ids: tuple[int, ...]) -> int:
+    return sum((folder / f"{scenario:04d}.nc").is_file() for scenario in ids)

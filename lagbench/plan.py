@@ -1,0 +1,137 @@
+"""What a generation will simulate, and the bytes and time that it takes.
+
+Nothing here writes; drawing the initial states tells how many substeps lie ahead.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from .errors import UsageError, WorkFailedError, nearest
+from .registry import Size
+from .scenario_ids import parse_ids, spell_ids
+
+__all__ = ["Estimate", "check_disk", "estimate", "free_bytes", "scenario_bytes", "select"]
+
+SECONDS_PER_PARTICLE_SUBSTEP = 45e-9
+"""Orientation for one core [s]; docs/performance.md has measurements."""
+
+BYTES_PER_PARTICLE = 2 * 2 * 4
+"""Position and velocity in one frame, two float32 each, before compression [bytes]."""
+
+BYTES_BESIDE_FRAMES = 64 * 1024
+"""Header, constants and chunk index of a file, generously [bytes]."""
+
+Selection = str | Sequence[str] | None
+Scenarios = str | Iterable[int] | None
+
+
+def _names(subset: Selection) -> tuple[str, ...]:
+    if subset is None:
+        return ()
+    return tuple(subset.replace(" ", "").split(",")) if isinstance(subset, str) else tuple(subset)
+
+
+def select(size: Size, *, subset: Selection = None, scenarios: Scenarios = None) -> tuple[int, ...]:
+    """Return the scenario ids that a user means, ascending.
+
+    Args:
+        size: tier of a split.
+        subset: one or several subsets, as a list or separated by commas; all when None.
+        scenarios: ids, or a text such as "0,3-5"; all of the subsets when None.
+
+    Raises:
+        UsageError: no such subset, or an id that the subsets do not hold.
+    """
+    names = _names(subset) or tuple(size.subsets)
+    for name in names:
+        if name not in size.subsets:
+            raise UsageError(
+                f"{size.split} {size.name} has no subset {name!r}",
+                where="--subset",
+                fix=nearest(name, size.subsets),
+            )
+    held = {i for name in names for i in size.subsets[name]}
+    if scenarios is None:
+        return tuple(sorted(held))
+    wanted = parse_ids(scenarios) if isinstance(scenarios, str) else tuple(scenarios)
+    strangers = [i for i in wanted if i not in held]
+    if strangers or not wanted:
+        raise UsageError(
+            f"no scenario {spell_ids(strangers) or 'at all'} in {', '.join(names)}",
+            where=f"--scenarios, {size.split} {size.name}",
+            expected="; ".join(f"{name} {spell_ids(size.subsets[name])}" for name in names),
+            got=spell_ids(wanted),
+        )
+    return tuple(sorted(set(wanted)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """What simulating some scenarios takes.
+
+    Attributes:
+        scenarios: their ids, ascending.
+        substeps: substeps of each, in the same order.
+        frames: frames that they record together.
+        bytes: disk space, before compression [bytes]; files come out a little smaller.
+        core_seconds: time on one core [s], for orientation.
+    """
+
+    scenarios: tuple[int, ...]
+    substeps: tuple[int, ...]
+    frames: int
+    bytes: int
+    core_seconds: float
+
+    def seconds(self, workers: int) -> float:
+        """Return the time with some workers [s]: shared evenly, but never below the longest."""
+        if not self.substeps:
+            return 0.0
+        longest = self.core_seconds * max(self.substeps) / sum(self.substeps)
+        return max(self.core_seconds / workers, longest)
+
+
+def scenario_bytes(size: Size, scenario: int) -> int:
+    """Return the most bytes that a scenario's file takes, in sum over a data set."""
+    return size.frame_count(scenario) * size.particles * BYTES_PER_PARTICLE + BYTES_BESIDE_FRAMES
+
+
+def estimate(size: Size, scenarios: Sequence[int]) -> Estimate:
+    """Return what simulating these scenarios takes."""
+    from .generators.batch import substeps_of
+
+    substeps = tuple(substeps_of(size, i) for i in scenarios)
+    return Estimate(
+        scenarios=tuple(scenarios),
+        substeps=substeps,
+        frames=sum(size.frame_count(i) for i in scenarios),
+        bytes=sum(scenario_bytes(size, i) for i in scenarios),
+        core_seconds=sum(substeps) * size.particles * SECONDS_PER_PARTICLE_SUBSTEP,
+    )
+
+
+def free_bytes(root: Path) -> int:
+    """Return the free space of the file system that holds, or would hold, a folder [bytes]."""
+    existing = next(folder for folder in (root, *root.parents) if folder.exists())
+    return shutil.disk_usage(existing).free
+
+
+def check_disk(root: Path, needed: int) -> None:
+    """Refuse to start what cannot fit.
+
+    Raises:
+        WorkFailedError: fewer bytes are free than needed.
+    """
+    free = free_bytes(root)
+    if free < needed:
+        raise WorkFailedError(
+            "not enough disk space",
+            where=str(root),
+            expected=f"{needed} bytes free",
+            got=f"{free} bytes free",
+            fix="free disk space, name another folder with --root, or fewer scenarios with --scenarios",
+        )

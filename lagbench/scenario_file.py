@@ -1,0 +1,255 @@
+"""Open scenario files: header, arrays read when asked for, and their content hash.
+
+Whatever is wrong with a file becomes a DataError that names it and, where one can be told,
+the variable.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .checksums import ContentHasher, plain
+from .errors import DataError, LagbenchError
+from .layout import ScenarioKey
+
+if TYPE_CHECKING:
+    import netCDF4
+
+__all__ = ["ScenarioFile", "ScenarioHeader", "check_scenario", "read_scenario", "rehash"]
+
+BLOCK_BYTES = 1 << 20
+"""Files are streamed in pieces of about this size [bytes]."""
+
+DEFLATE_RATIO = 1032
+"""No zlib stream unpacks to more than this many times its length."""
+
+_REPAIR = "lagbench generate writes what is missing or damaged anew"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScenarioHeader:
+    """What a scenario file says about itself.
+
+    Attributes:
+        key: what names the scenario.
+        seed: how the random numbers were seeded.
+        parameters: physical parameters by name, those that enter the content hash.
+        content_sha256: content hash as stored; see :func:`rehash` for the true one.
+        variable_sha256: stored hash of each variable.
+        frames: recorded frames.
+        particles: particles in every frame.
+        device: device that simulated.
+        generator: dotted path of the split's module.
+        lagbench_version: version that wrote the file.
+    """
+
+    key: ScenarioKey
+    seed: str
+    parameters: Mapping[str, object]
+    content_sha256: str
+    variable_sha256: Mapping[str, str]
+    frames: int
+    particles: int
+    device: str
+    generator: str
+    lagbench_version: str
+
+
+class ScenarioFile:
+    """An open scenario file: its header, and arrays that are read when asked for.
+
+    Use it as a context manager. Every method raises DataError naming file and variable where
+    the file is damaged.
+
+    Attributes:
+        path: path of the file.
+        header: what the file says about itself.
+    """
+
+    def __init__(self, path: Path, file: netCDF4.Dataset) -> None:
+        self.path = path
+        self._file = file
+        with _damage(path):
+            _check_lengths(path, file)
+            self.header = _header(file)
+
+    def __enter__(self) -> Self:
+        """Return the file itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the file."""
+        self.close()
+
+    def close(self) -> None:
+        """Close the file; a second call does nothing."""
+        if self._file.isopen():
+            self._file.close()
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        """Names of all variables, sorted."""
+        with _damage(self.path):
+            return tuple(sorted(self._file.variables))
+
+    def read(self, name: str, frames: slice | int = slice(None)) -> NDArray[Any]:
+        """Return a variable, or some of its frames (entries along the first dimension).
+
+        Raises:
+            DataError: no such variable, or the file is damaged.
+        """
+        with _damage(self.path, name):
+            variable = self._file.variables[name]
+            return np.asarray(variable[frames] if variable.ndim else variable[...])
+
+    def blocks(self, name: str) -> Iterator[NDArray[Any]]:
+        """Yield a variable in order, in pieces of at most about 1 MiB.
+
+        Raises:
+            DataError: no such variable, or the file is damaged.
+        """
+        with _damage(self.path, name):
+            shape = self._file.variables[name].shape
+            item = np.dtype(np.float64).itemsize * int(np.prod(shape[1:], dtype=np.int64))
+        step = max(1, BLOCK_BYTES // max(1, item))
+        starts = range(0, shape[0], step) if shape else range(1)
+        for start in starts:
+            yield self.read(name, slice(start, start + step))
+
+    def computed_hasher(self) -> ContentHasher:
+        """Return a hasher that has read the whole file."""
+        header = self.header
+        hasher = ContentHasher(header.key.identity(header.seed, header.parameters))
+        for name in self.variables:
+            with _damage(self.path, name):
+                variable = self._file.variables[name]
+                hasher.declare(name, variable.dtype, variable.dimensions, variable.shape)
+                for block in self.blocks(name):
+                    hasher.update(name, block)
+        return hasher
+
+
+def read_scenario(path: Path) -> ScenarioFile:
+    """Open a scenario file.
+
+    Raises:
+        DataError: the file is missing, truncated, damaged, or no scenario file.
+    """
+    import netCDF4
+
+    if not path.is_file():
+        raise DataError("a scenario file is missing", where=str(path), fix=_REPAIR)
+    with _damage(path), ExitStack() as stack:
+        file = netCDF4.Dataset(path, "r")
+        stack.callback(file.close)
+        file.set_auto_maskandscale(False)
+        file.set_auto_chartostring(False)
+        opened = ScenarioFile(path, file)
+        stack.pop_all()
+    return opened
+
+
+def rehash(path: Path) -> str:
+    """Return the content hash computed from a file's values.
+
+    Raises:
+        DataError: the file is missing or damaged; the message names file and variable.
+    """
+    with read_scenario(path) as file:
+        return file.computed_hasher().hexdigest()
+
+
+def check_scenario(path: Path, expected: str | None = None) -> str:
+    """Recompute a file's content hash and compare it with the stored and the expected one.
+
+    Args:
+        path: scenario file.
+        expected: content hash from a manifest or datasets.yaml, whole or its first digits.
+
+    Returns:
+        The content hash.
+
+    Raises:
+        DataError: the file is missing or damaged, or its hash is another; the message names
+            file and, where one can be told, variable.
+    """
+    with read_scenario(path) as file:
+        stored = file.header
+        hasher = file.computed_hasher()
+    for name, digest in hasher.digests().items():
+        if stored.variable_sha256.get(name) != digest:
+            where = f"{path}, variable {name!r}"
+            raise _mismatch("values differ from their hash", where, stored.variable_sha256.get(name), digest)
+    content = hasher.hexdigest()
+    if content != stored.content_sha256:
+        where = f"{path}, attributes"
+        raise _mismatch("attributes differ from their hash", where, stored.content_sha256, content)
+    if expected is not None and not content.startswith(expected):
+        raise _mismatch("the file has another content hash", str(path), expected, content)
+    return content
+
+
+def _mismatch(what: str, where: str, expected: str | None, got: str) -> DataError:
+    return DataError(what, where=where, expected=expected or "a stored hash", got=got, fix=_REPAIR)
+
+
+def _check_lengths(path: Path, file: netCDF4.Dataset) -> None:
+    """Refuse lengths that no file of this size can hold, before memory is asked for them."""
+    largest = DEFLATE_RATIO * path.stat().st_size
+    for name, variable in file.variables.items():
+        held = variable.size * (1 if variable.dtype is str else variable.dtype.itemsize)
+        if held > largest:
+            raise DataError(
+                "a variable is larger than its file can hold",
+                where=f"{path}, variable {name!r}",
+                expected=f"at most {largest} bytes",
+                got=f"shape {variable.shape}",
+                fix=_REPAIR,
+            )
+
+
+def _header(file: netCDF4.Dataset) -> ScenarioHeader:
+    names = str(file.hashed_parameters).split()
+    return ScenarioHeader(
+        key=ScenarioKey(
+            split=str(file.split),
+            size=str(file.size),
+            version=str(file.version),
+            scenario=int(file.scenario),
+            subset=str(file.subset),
+        ),
+        seed=str(file.seed),
+        parameters={name: plain(file.getncattr(name)) for name in names},
+        content_sha256=str(file.content_sha256),
+        variable_sha256={n: str(getattr(v, "content_sha256", "")) for n, v in file.variables.items()},
+        frames=file.dimensions["frame"].size,
+        particles=file.dimensions["particle"].size,
+        device=str(file.device),
+        generator=str(file.generator),
+        lagbench_version=str(file.lagbench_version),
+    )
+
+
+@contextmanager
+def _damage(path: Path, variable: str | None = None) -> Iterator[None]:
+    """Turn whatever HDF5 raises on damaged bytes into a DataError naming the place."""
+    try:
+        yield
+    except LagbenchError as error:
+        if str(path) in (error.where or ""):
+            raise
+        raise _damaged(path, variable, error.what) from error
+    except Exception as error:  # no list of types holds: damage surfaces as nearly any of them
+        raise _damaged(path, variable, f"{type(error).__name__}: {error}") from error
+
+
+def _damaged(path: Path, variable: str | None, got: str) -> DataError:
+    where = str(path) if variable is None else f"{path}, variable {variable!r}"
+    return DataError("a scenario file is damaged or not one of lagbench", where=where, got=got, fix=_REPAIR)

@@ -1,0 +1,292 @@
+"""Verify a data set: hash the files again, compare with datasets.yaml, simulate some anew.
+
+The manifest is a claim of whoever wrote it; datasets.yaml comes with lagbench. So files are
+held against datasets.yaml, and against the manifest only where datasets.yaml has no hash yet.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from .checksums import HASHED_SUBSETS, dataset_hash, subset_hash
+from .errors import DataError
+from .generators.batch import Job
+from .generators.simulate import simulate
+from .generators.solver import Device
+from .inventory import Finding, State, examine, extra_files, recorded_hash
+from .layout import dataset_folder, resolve_root
+from .manifest import Manifest, read_manifest
+from .overview import available_cores
+from .plan import Scenarios, Selection, estimate, select
+from .pool import Pool, Task
+from .progress import Meter, Progress
+from .registry import Registry, Size, load
+from .scenario_ids import spell_ids
+
+__all__ = ["SubsetReport", "VerificationResult", "verify"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SubsetReport:
+    """What was found of one subset.
+
+    Attributes:
+        name: name of the subset.
+        present: scenarios that are there and right.
+        missing: ids that are not there.
+        wrong: ids whose file is damaged or has another hash.
+        extra: files in the subset's folder that belong to no scenario.
+        verdict: how its hash compares with datasets.yaml, in words.
+    """
+
+    name: str
+    present: int
+    missing: tuple[int, ...]
+    wrong: tuple[int, ...]
+    extra: tuple[str, ...]
+    verdict: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class VerificationResult:
+    """What a verification found.
+
+    Attributes:
+        split: name of the split.
+        size: name of the size.
+        folder: folder of the data set.
+        subsets: a report on each subset looked at.
+        identity: "bitwise", or "tolerance" where a device wrote files that does not keep the
+            promise of equal bits; "unknown" without a manifest.
+        dataset_sha256: data set hash of the files, where all of them are there and right.
+        regenerated: id to "identical", "different" or "nothing to compare with".
+        problems: what is wrong, each naming file and, where it can be told, variable.
+        warnings: what a reader should know although it is no fault.
+        must_be_complete: whether a missing scenario is a fault.
+        verdict: how the data set hash compares with datasets.yaml, in words.
+    """
+
+    split: str
+    size: str
+    folder: Path
+    subsets: tuple[SubsetReport, ...]
+    identity: str
+    dataset_sha256: str | None
+    regenerated: Mapping[int, str]
+    problems: tuple[str, ...]
+    warnings: tuple[str, ...]
+    must_be_complete: bool
+    verdict: str
+
+    @property
+    def complete(self) -> bool:
+        """Whether nothing that was looked at is missing."""
+        return not any(report.missing for report in self.subsets)
+
+    def check(self) -> None:
+        """Raise unless everything that has to hold does.
+
+        Raises:
+            DataError: a file is damaged or of another hash, a scenario simulated anew differs,
+                nothing is there, or something is missing that must not be.
+        """
+        fix = f"lagbench generate --split {self.split} --size {self.size}"
+        if self.problems:
+            listing = "\n  ".join(self.problems)
+            raise DataError(f"{len(self.problems)} problems\n  {listing}", where=str(self.folder), fix=fix)
+        if not any(report.present for report in self.subsets):
+            raise DataError("nothing is generated", where=str(self.folder), fix=fix)
+        if self.must_be_complete and not self.complete:
+            missing = ", ".join(f"{r.name} {spell_ids(r.missing)}" for r in self.subsets if r.missing)
+            where, got = str(self.folder), f"missing: {missing}"
+            raise DataError("the data set is incomplete", where=where, got=got, fix=fix)
+
+
+def verify(
+    split: str,
+    size: str = "full",
+    *,
+    root: str | Path | None = None,
+    subset: Selection = None,
+    scenarios: Scenarios = None,
+    regenerate: int = 0,
+    complete: bool = False,
+    workers: int | None = None,
+    progress: Callable[[Progress], None] | None = None,
+    registry: Registry | None = None,
+) -> VerificationResult:
+    """Compare the files of a data set with datasets.yaml; call ``check()`` on the result.
+
+    Args:
+        split: name of the split.
+        size: name of the size.
+        root: folder of all data sets; else ``LAGBENCH_ROOT``, else the user data folder.
+        subset: some subsets only.
+        scenarios: some ids only.
+        regenerate: how many scenarios to simulate anew, evenly spaced, first and last included.
+        complete: whether a missing scenario is a fault.
+        workers: worker processes for ``regenerate``; one per core when None.
+        progress: called as the work advances.
+        registry: where splits are described; ours when None.
+
+    Raises:
+        UsageError: unknown split, size, subset or scenario.
+        WorkFailedError: simulating anew failed.
+    """
+    tier = (registry or load()).size(split, size)
+    ids, folder = select(tier, subset=subset, scenarios=scenarios), resolve_root(root)
+    meter = Meter(progress)
+    findings = _examine_all(folder, tier, ids, meter)
+    manifest, warnings = _manifest(folder, tier)
+    anew = _regenerate(tier, evenly_spaced(ids, regenerate), workers or available_cores(), meter)
+    regenerated = {i: _likeness(tier, findings[i], content) for i, content in anew.items()}
+    problems = [f.problem for f in findings.values() if f.problem]
+    problems += [f"scenario {i} differs when simulated anew" for i in anew if regenerated[i] == DIFFERENT]
+    reports = _reports(folder, tier, ids, findings)
+    whole, verdict = _whole(tier, findings)
+    return VerificationResult(
+        split=split,
+        size=size,
+        folder=dataset_folder(folder, split, size, tier.major),
+        subsets=reports,
+        identity=manifest.identity if manifest else "unknown",
+        dataset_sha256=whole,
+        regenerated=regenerated,
+        problems=tuple(problems),
+        warnings=(*warnings, *_gaps(reports), *_unlike(tier, manifest, findings)),
+        must_be_complete=complete,
+        verdict=verdict,
+    )
+
+
+IDENTICAL = "identical"
+DIFFERENT = "different"
+INCOMPARABLE = "nothing to compare with"
+
+
+def evenly_spaced(ids: Sequence[int], count: int) -> tuple[int, ...]:
+    """Return some of the ids, evenly spaced, the first and the last included.
+
+    >>> evenly_spaced(range(60), 3)
+    (0, 30, 59)
+    """
+    count = min(count, len(ids))
+    if count < 2:
+        return tuple(ids[:count])
+    last = len(ids) - 1
+    return tuple(ids[(2 * k * last + count - 1) // (2 * (count - 1))] for k in range(count))
+
+
+def _examine_all(root: Path, size: Size, ids: Sequence[int], meter: Meter) -> dict[int, Finding]:
+    meter.begin("hashing", total=len(ids), scenarios=len(ids))
+    findings = {}
+    for scenario in ids:
+        findings[scenario] = examine(root, size, scenario)
+        meter.count(1, scenarios=1)
+    return findings
+
+
+def _manifest(root: Path, size: Size) -> tuple[Manifest | None, list[str]]:
+    try:
+        manifest = read_manifest(root, size.split, size.name, size.major)
+    except DataError as error:
+        return None, [str(error)]
+    if manifest is None:
+        return None, ["there is no manifest: lagbench generate writes it"]
+    if manifest.identity == "tolerance":
+        return manifest, ["identity: tolerance - a device wrote these files that does not keep equal bits"]
+    return manifest, []
+
+
+def _regenerate(size: Size, ids: Sequence[int], workers: int, meter: Meter) -> dict[int, str]:
+    """Simulate scenarios into a folder that vanishes; return their content hashes."""
+    if not ids:
+        return {}
+    substeps = estimate(size, ids).substeps
+    meter.begin("simulating anew", total=sum(substeps), scenarios=len(ids))
+    hashes: dict[int, str] = {}
+    with tempfile.TemporaryDirectory(prefix="lagbench-") as folder, Pool(min(workers, len(ids))) as pool:
+        for scenario, cost in zip(ids, substeps, strict=True):
+            job = Job(size=size, scenarios=(scenario,), root=Path(folder), device=Device.CPU)
+            name = f"{size.split} {size.name}, scenario {scenario}"
+            pool.submit(Task(name=name, function=simulate, arguments=(job,), cost=cost))
+        for event in pool.events():
+            if event.kind == "done":
+                hashes |= {outcome.scenario: outcome.content_sha256 for outcome in event.value}
+                meter.count(scenarios=1)
+            else:
+                meter.count(event.value if event.kind == "progress" else -event.value)
+    return {scenario: hashes[scenario] for scenario in ids}
+
+
+def _likeness(size: Size, finding: Finding, content: str) -> str:
+    """Compare a scenario simulated anew with its file, else with datasets.yaml."""
+    known = finding.content_sha256 or recorded_hash(size, finding.scenario)
+    if known is None:
+        return INCOMPARABLE
+    return IDENTICAL if content.startswith(known) else DIFFERENT
+
+
+def _reports(
+    root: Path, size: Size, ids: Sequence[int], findings: Mapping[int, Finding]
+) -> tuple[SubsetReport, ...]:
+    extra = extra_files(root, size)
+    reports = []
+    for name, members in size.subsets.items():
+        held = {i: findings[i] for i in members if i in findings}
+        if held:
+            by_state = {state: tuple(i for i, f in held.items() if f.state is state) for state in State}
+            reports.append(
+                SubsetReport(
+                    name=name,
+                    present=len(by_state[State.GOOD]),
+                    missing=by_state[State.MISSING],
+                    wrong=by_state[State.WRONG],
+                    extra=tuple(extra.get(name, ())),
+                    verdict=_subset_verdict(size, name, findings),
+                )
+            )
+    return tuple(reports)
+
+
+def _subset_digest(size: Size, name: str, findings: Mapping[int, Finding]) -> str | None:
+    """Return the hash of a subset; None unless every scenario of it is there and right."""
+    hashes = {i: findings[i].content_sha256 for i in size.subsets[name] if i in findings}
+    known = {i: content for i, content in hashes.items() if content is not None}
+    return subset_hash(known) if len(known) == len(size.subsets[name]) else None
+
+
+def _subset_verdict(size: Size, name: str, findings: Mapping[int, Finding]) -> str:
+    recorded = size.measured.subset_sha256.get(name) if size.measured else None
+    return _verdict(_subset_digest(size, name, findings), recorded)
+
+
+def _whole(size: Size, findings: Mapping[int, Finding]) -> tuple[str | None, str]:
+    """Return the data set hash, where it can be told, and how it compares."""
+    digests = {name: _subset_digest(size, name, findings) for name in HASHED_SUBSETS}
+    known = {name: digest for name, digest in digests.items() if digest is not None}
+    whole = dataset_hash(size.split, size.name, size.major, known) if len(known) == len(digests) else None
+    return whole, _verdict(whole, size.measured.dataset_sha256 if size.measured else None)
+
+
+def _verdict(computed: str | None, recorded: str | None) -> str:
+    if recorded is None:
+        return "no hash in datasets.yaml yet"
+    if computed is None:
+        return "incomplete"
+    return "equal to datasets.yaml" if computed == recorded else "NOT that of datasets.yaml"
+
+
+def _gaps(reports: Sequence[SubsetReport]) -> list[str]:
+    gaps = [f"{r.name} lacks {spell_ids(r.missing)}" for r in reports if r.missing]
+    return gaps + [f"{r.name} has files of no scenario: {', '.join(r.extra)}" for r in reports if r.extra]
+
+
+def _unlike(size: Size, manifest: Manifest | None, findings: Mapping[int, Finding]) -> list[str]:
+    """Return the scenarios of which the manifest says another hash than the files have."""
+    entries = {entry.scenario: entry.content_sha256 for entry in manifest.files} if manifest else {}
+    unlike = [i for i, f in findings.items() if i in entries and f.content_sha256 not in (None, entries[i])]
+    return [f"the manifest has other hashes of {spell_ids(unlike)}"] if unlike else []

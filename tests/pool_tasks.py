@@ -1,0 +1,48 @@
+"""Tasks for the worker pool; workers import this module by name."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from pathlib import Path
+
+from lagbench.errors import DataError
+from lagbench.pool import Report
+
+
+def square(number: int, report: Report) -> int:
+    """Report one unit and return the square."""
+    report(1)
+    return number * number
+
+
+def die_once(marker: Path, report: Report) -> str:
+    """Kill the worker on the first call only."""
+    report(5)
+    if not marker.exists():
+        marker.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return "survived"
+
+
+def die(report: Report) -> None:
+    """Kill the worker on every call."""
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def refuse(report: Report) -> None:
+    """Raise an error of ours."""
+    raise DataError("what is wrong", where="here", expected=1, got=2, fix="mend it")
+
+
+def crash(report: Report) -> None:
+    """Raise an error of nobody's."""
+    raise ZeroDivisionError
+
+
+def sleep_long(marker: Path, report: Report) -> None:
+    """Write the worker's process id, then work for a minute, deaf to everything."""
+    marker.write_text(str(os.getpid()))
+    for _ in range(600):
+        time.sleep(0.1)

@@ -1,0 +1,176 @@
+"""The closed-box solver a second time, in NumPy: written from the equations, whole arrays at once.
+
+Strict float32 throughout; sums are int64. Walls are mirrored by slices rather than index by index.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagbench.generators.base import ClosedBoxParameters, InitialState
+
+Single = NDArray[np.float32]
+f = np.float32
+
+
+class ReferenceClosedBox:
+    """One scenario; the names are those of design 4.3."""
+
+    def __init__(self, parameters: ClosedBoxParameters, state: InitialState) -> None:
+        p = self.p = parameters
+        dx = 1.0 / p.grid
+        self.inv_dx, self.dt = f(p.grid), f(p.dt)
+        self.low, self.high = p.wall, p.grid - p.wall
+        self.bounds = f((p.wall + 0.5 + 1e-3) * dx), f((p.grid - p.wall - 0.5 - 1e-3) * dx)
+        room = 62 - int(np.ceil(np.log2(p.particles)))
+        fastest = int(np.ceil(np.log2(8.0 * dx / p.dt)))
+        self.mv_bits, self.m_bits = min(room, 50) - fastest, min(room, 50) - 3
+        self.cell_scale = f(2.0**self.mv_bits * dx)
+        self.stiffness = f(p.dt * p.modulus / (p.density * 2.0 * dx))
+        self.diffusion = f(state.viscosity * p.dt * p.grid**2)
+        self.fill = f(state.area / p.particles * p.grid**2)
+        self.gradient, self.shift, self.shift_bound = f(4.0 * p.grid), f(-p.shift * dx * dx), f(0.1 * dx)
+        self.sign = -1 if p.no_slip else 1
+        self.wall = state.wall_velocity.astype(f)
+        self.x = np.clip(state.position.astype(f), *self.bounds)
+        self.v = state.velocity.astype(f)
+        self.c = state.affine.astype(f)
+        self.j = np.ones(p.particles, f)
+
+    def step(self, count: int) -> None:
+        """Advance by some substeps."""
+        for _ in range(count):
+            sums = self.to_grid()
+            v, r, jbar = self.fold(sums)
+            self.fill_ghosts(r, even=True)
+            self.fill_ghosts(jbar, even=True)
+            self.mirror(v, moving=True)
+            a = self.acceleration(v, jbar)
+            v = v + a
+            self.mirror(v, moving=True)
+            self.mirror(a, moving=False)
+            self.to_particles(v, a, r, jbar)
+
+    def weights(self) -> tuple[NDArray[np.int32], Single, list[Single]]:
+        """Return base nodes, offsets f and the three B-spline weights per axis."""
+        scaled = self.x * self.inv_dx
+        base = (scaled - f(0.5)).astype(np.int32)
+        offset = scaled - base.astype(f)
+        outer, middle, inner = f(1.5) - offset, offset - f(1.0), offset - f(0.5)
+        return base, offset, [f(0.5) * (outer * outer), f(0.75) - middle * middle, f(0.5) * (inner * inner)]
+
+    def to_grid(self) -> NDArray[np.int64]:
+        """P2G of (m v_x, m v_y, m, m J), in units of the particle mass and fixed point."""
+        base, offset, weight = self.weights()
+        sums = np.zeros((self.p.grid + 1, self.p.grid + 1, 4), np.int64)
+        mv, m = f(2.0**self.mv_bits), f(2.0**self.m_bits)
+        east, north = self.cell_scale * self.c[:, :, 0], self.cell_scale * self.c[:, :, 1]
+        centred = offset - f(1.0)
+        middle = mv * self.v - centred[:, :1] * east - centred[:, 1:] * north
+        for i in range(3):
+            for k in range(3):
+                w = (weight[i][:, 0] * weight[k][:, 1])[:, None]
+                momentum = (middle + f(i - 1) * east) + f(k - 1) * north
+                parts = np.concatenate([w * momentum, w * m, w * (m * self.j[:, None])], axis=1)
+                node = (base[:, 0] + i, base[:, 1] + k)
+                np.add.at(sums, node, np.rint(parts.astype(np.float64)).astype(np.int64))
+        return sums
+
+    def fold(self, sums: NDArray[np.int64]) -> tuple[Single, Single, Single]:
+        """Give what ghosts received to their mirror images; return v, r, Jbar."""
+        low, high, sign = self.low, self.high, self.sign
+        total = sums.copy()
+        drag = np.zeros((*sums.shape[:2], 2), f)
+        unit = f(2.0**-self.m_bits)
+        side, level = np.array([-1, sign, 1, 1]), np.array([sign, -1, 1, 1])
+        inner = slice(low + 1, high)
+        for ghost, edge, wall in ((low, low + 1, 0), (high, high - 1, 1)):
+            lost = sums[ghost, inner]
+            total[edge, inner] += side * lost
+            drag[edge, inner, 1] += f(2.0) * self.wall[wall, 1] * (lost[:, 2].astype(f) * unit)
+            lost = sums[inner, ghost]
+            total[inner, edge] += level * lost
+            drag[inner, edge, 0] += f(2.0) * self.wall[wall + 2, 0] * (lost[:, 2].astype(f) * unit)
+        for ghost_x, x, side_wall in ((low, low + 1, 0), (high, high - 1, 1)):
+            for ghost_y, y, level_wall in ((low, low + 1, 2), (high, high - 1, 3)):
+                lost = sums[ghost_x, ghost_y]
+                total[x, y] += side * level * lost
+                mass = lost[2].astype(f) * unit
+                drag[x, y, 0] += f(2.0) * self.wall[level_wall, 0] * mass
+                drag[x, y, 1] += f(2.0) * self.wall[side_wall, 1] * mass
+        filled = total[:, :, 2] > 0
+        mass = np.where(filled, total[:, :, 2].astype(f) * unit, f(1.0))
+        momentum = total[:, :, :2].astype(f) * f(2.0**-self.mv_bits) + drag
+        v = np.where(filled[:, :, None], momentum / mass[:, :, None], f(0.0))
+        r = np.where(filled, mass * self.fill, f(0.0))
+        return v, r, np.where(filled, total[:, :, 3].astype(f) * unit / mass, f(1.0))
+
+    def fill_ghosts(self, q: Single, *, even: bool) -> None:
+        """Mirror a scalar, evenly or oddly: columns first, then whole rows with the corners."""
+        low, high, sign = self.low, self.high, f(1.0 if even else -1.0)
+        q[low], q[high] = sign * q[low + 1], sign * q[high - 1]
+        q[:, low], q[:, high] = sign * q[:, low + 1], sign * q[:, high - 1]
+
+    def mirror(self, v: Single, *, moving: bool) -> None:
+        """Mirror a vector: normal odd, tangential odd about the wall's velocity (even: free slip)."""
+        low, high, sign = self.low, self.high, f(self.sign)
+        inner = slice(low + 1, high)
+        taper = np.ones(high - low - 1, f)
+        taper[[0, -1]] = f(0.5)
+        speed = self.wall if moving else np.zeros_like(self.wall)
+        for ghost, edge, wall in ((low, low + 1, 0), (high, high - 1, 1)):
+            v[ghost, inner, 0] = -v[edge, inner, 0]
+            v[ghost, inner, 1] = sign * v[edge, inner, 1] + taper * (f(2.0) * speed[wall, 1])
+            v[inner, ghost, 0] = sign * v[inner, edge, 0] + taper * (f(2.0) * speed[wall + 2, 0])
+            v[inner, ghost, 1] = -v[inner, edge, 1]
+        for ghost_x, x in ((low, low + 1), (high, high - 1)):
+            for ghost_y, y in ((low, low + 1), (high, high - 1)):
+                v[ghost_x, ghost_y] = -sign * v[x, y]
+
+    def acceleration(self, v: Single, jbar: Single) -> Single:
+        """Return dt ((E/rho) grad Jbar + nu lap v) at interior nodes, 0 elsewhere."""
+
+        def at(q: Any, di: int, dj: int) -> Any:
+            low, high = self.low + 1, self.high
+            return q[low + di : high + di, low + dj : high + dj]
+
+        rising, falling = at(jbar, 1, 1) - at(jbar, -1, -1), at(jbar, 1, -1) - at(jbar, -1, 1)
+        x = f(0.75) * (at(jbar, 1, 0) - at(jbar, -1, 0)) + f(0.125) * (rising + falling)
+        y = f(0.75) * (at(jbar, 0, 1) - at(jbar, 0, -1)) + f(0.125) * (rising - falling)
+        laplacian = (at(v, 1, 0) + at(v, -1, 0)) + (at(v, 0, 1) + at(v, 0, -1)) - f(4.0) * at(v, 0, 0)
+        a = np.zeros_like(v)
+        at(a, 0, 0)[...] = self.stiffness * np.stack([x, y], axis=-1) + self.diffusion * laplacian
+        return a
+
+    def to_particles(self, v: Single, a: Single, r: Single, jbar: Single) -> None:
+        """G2P with relaxation, shift and the update of J."""
+        p = self.p
+        base, offset, weight = self.weights()
+        nodal = np.concatenate([v, r[:, :, None], jbar[:, :, None]], axis=2)
+        here, slope_x, slope_y = (np.zeros((p.particles, 4), f) for _ in range(3))
+        gain = np.zeros((p.particles, 2), f)
+        for i in range(3):
+            for k in range(3):
+                node = (base[:, 0] + i, base[:, 1] + k)
+                w = (weight[i][:, 0] * weight[k][:, 1])[:, None]
+                share = w * nodal[node]
+                gain += w * a[node]
+                here += share
+                slope_x += f(i - 1) * share
+                slope_y += f(k - 1) * share
+        slope_x = self.gradient * (slope_x - (offset[:, :1] - f(1.0)) * here)
+        slope_y = self.gradient * (slope_y - (offset[:, 1:] - f(1.0)) * here)
+        volume = f(1.0) / np.maximum(here[:, 2], f(0.5))
+        push = (self.shift * volume)[:, None] * np.stack([slope_x[:, 2], slope_y[:, 2]], axis=1)
+        push = np.clip(push, -self.shift_bound, self.shift_bound)
+        u = self.v + gain
+        u = u + f(p.velocity_relaxation) * (here[:, :2] - u)
+        self.v = u + (push[:, :1] * slope_x[:, :2] + push[:, 1:] * slope_y[:, :2])
+        self.x = np.clip(self.x + (self.dt * here[:, :2] + push), *self.bounds)
+        self.c = np.stack([slope_x[:, :2], slope_y[:, :2]], axis=2)
+        growth = self.dt * (slope_x[:, 0] + slope_y[:, 1]) * self.j
+        relaxed = self.j + growth + f(p.jacobian_relaxation) * (here[:, 3] - self.j)
+        self.j = relaxed + f(p.density_coupling) * (volume - here[:, 3])

@@ -1,0 +1,74 @@
+"""Scenarios of the registry, drawn once and shared by the tests of the splits."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+import importlib
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from lagbench import registry
+from lagbench.generators import draws
+from lagbench.generators.base import InitialState
+
+SPLITS = ("cavity", "curl-noise", "fluid", "multimaterial")
+SIZES = ("full", "mini", "tiny")
+EVERY = [(split, size) for split in SPLITS for size in SIZES]
+
+
+class OnlyRandom:
+    """A generator of which nothing but ``random`` can be used."""
+
+    def __init__(self, inner: np.random.Generator) -> None:
+        """Wrap a real generator."""
+        self._inner = inner
+
+    def random(self, size: tuple[int, ...]) -> NDArray[np.float64]:
+        """Pass on to the real one."""
+        return self._inner.random(size)
+
+
+def changed(size: registry.Size, **values: float) -> registry.Size:
+    """Return a size with other parameter values."""
+    new = {k: size.parameters[k].model_copy(update={"value": v}) for k, v in values.items()}
+    return size.model_copy(update={"parameters": {**size.parameters, **new}})
+
+
+def draw(size: registry.Size, scenario: int) -> InitialState:
+    """Draw a scenario of a size from its own seed."""
+    rng = OnlyRandom(draws.generator(size.split, size.name, size.major, scenario))
+    module = importlib.import_module(size.generator)
+    state: InitialState = module.initial_state(size, scenario, rng)
+    return state
+
+
+@functools.cache
+def state_of(split: str, size: str, scenario: int) -> InitialState:
+    """Draw a scenario of the registry, once."""
+    return draw(registry.load().size(split, size), scenario)
+
+
+def all_of(split: str, size: str = "full") -> list[InitialState]:
+    """Return all scenarios of a size in the order of their ids."""
+    return [state_of(split, size, i) for i in registry.load().size(split, size).scenarios]
+
+
+def digest(state: InitialState) -> str:
+    """Return a hash over everything in a state."""
+    total = hashlib.sha256()
+    for field in dataclasses.fields(state):
+        value = getattr(state, field.name)
+        total.update(value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
+    return total.hexdigest()
+
+
+def neighbours(
+    position: NDArray[np.float64], count: int, among: NDArray[np.float64] | None = None
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return distance and index of the nearest points, by SciPy's k-d tree, shape [point, count]."""
+    found = cKDTree(position if among is None else among).query(position, k=list(range(1, count + 1)))
+    return np.asarray(found[0]), np.asarray(found[1])

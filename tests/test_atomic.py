@@ -1,0 +1,55 @@
+"""Files appear whole or not at all."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from lagbench.atomic import atomic_path, remove_leftovers, write_atomically
+from lagbench.errors import DataError, WorkFailedError
+
+
+def test_a_file_appears_only_on_the_clean_exit(tmp_path: Path) -> None:
+    """Inside the block only the temporary name exists, afterwards only the target."""
+    target = tmp_path / "deep" / "file"
+    with atomic_path(target) as temporary:
+        temporary.write_text("new")
+        assert temporary.parent == target.parent
+        assert not target.exists()
+    assert target.read_text() == "new"
+    assert list(target.parent.iterdir()) == [target]
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError, DataError("what")])
+def test_an_error_keeps_the_old_file(tmp_path: Path, error: type[BaseException] | BaseException) -> None:
+    """Whatever is raised passes through; the old file stays, the temporary one goes."""
+    target = tmp_path / "file"
+    write_atomically(target, b"old")
+
+    def interrupted() -> None:
+        with atomic_path(target) as temporary:
+            temporary.write_text("half")
+            raise error
+
+    with pytest.raises((KeyboardInterrupt, ValueError, DataError)):
+        interrupted()
+    assert target.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [target]
+
+
+def test_the_system_refusing_is_told_with_path_and_remedy(tmp_path: Path) -> None:
+    """A folder that cannot be made gives exit code 5."""
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(WorkFailedError, match=r"(?s)cannot write.*in-the-way.*--root"):
+        write_atomically(tmp_path / "file" / "in-the-way", b"")
+
+
+def test_leftovers_of_killed_writers_are_removed(tmp_path: Path) -> None:
+    """Only temporary names go, in subfolders too."""
+    (tmp_path / "test").mkdir()
+    kept, left = tmp_path / "test" / "0003.nc", tmp_path / "test" / ".0004.nc.77.partial"
+    kept.touch()
+    left.touch()
+    assert remove_leftovers(tmp_path) == [left]
+    assert list((tmp_path / "test").iterdir()) == [kept]

@@ -1,0 +1,253 @@
+"""The content hash says what the values say, and nothing else."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from numpy.typing import NDArray
+
+from lagbench.checksums import (
+    ContentHasher,
+    VariableHasher,
+    canonical_json,
+    content_hash,
+    dataset_hash,
+    dtype_name,
+    file_sha256,
+    plain,
+    subset_hash,
+)
+from lagbench.errors import DataError
+
+FLOATS = hnp.arrays(
+    st.sampled_from(["<f4", "<f8"]),
+    hnp.array_shapes(min_dims=1, max_dims=3, max_side=5),
+    elements={"allow_nan": True, "allow_subnormal": True},
+)
+IDENTITY = {
+    "split": "cavity",
+    "size": "tiny",
+    "major": 1,
+    "scenario": 3,
+    "subset": "test",
+    "seed": "s",
+    "parameters": {"dt": 0.002, "grid": 16, "name": "ä"},
+}
+
+
+class Held:
+    """A variable in memory."""
+
+    def __init__(self, dims: tuple[str, ...], values: Any) -> None:
+        self.dims = dims
+        self.values = np.asarray(values)
+
+
+def digest(values: NDArray[Any], *, name: str = "position", dims: tuple[str, ...] | None = None) -> str:
+    """Return the hash of values given in one piece."""
+    values = np.asarray(values)
+    hasher = VariableHasher(name, values.dtype, dims or tuple("abcdef"[: values.ndim]), values.shape)
+    hasher.update(values)
+    return hasher.hexdigest()
+
+
+def test_variable_hash_by_hand() -> None:
+    """Header, newline and bytes as docs/format.md spells them out."""
+    header = b'{"dims":["frame"],"dtype":"float32","name":"x","shape":[2]}\n'
+    data = bytes.fromhex("0000803f00000000")  # 1.0f, and 0.0f for -0.0f
+    expected = hashlib.sha256(header + data).hexdigest()
+    assert digest(np.array([1.0, -0.0], np.float32), name="x", dims=("frame",)) == expected
+
+
+def test_strings_by_hand() -> None:
+    """Strings are UTF-8 joined by NUL, whatever type holds them."""
+    header = b'{"dims":["space"],"dtype":"string","name":"s","shape":[2]}\n'
+    expected = hashlib.sha256(header + "x\0ä".encode()).hexdigest()
+    for values in (
+        np.array(["x", "ä"]),
+        np.array(["x", "ä"], object),
+        np.array(["x", "ä"], np.dtypes.StringDType()),
+    ):
+        assert digest(values, name="s", dims=("space",)) == expected
+
+
+def test_content_hash_by_hand() -> None:
+    """The content hash is the SHA-256 of one JSON text."""
+    values = np.array([1, 2], np.int32)
+    inner = hashlib.sha256(b'{"dims":["a"],"dtype":"int32","name":"v","shape":[2]}\n' + values.tobytes())
+    text = (
+        '{"major":1,"parameters":{"dt":0.002,"grid":16,"name":"ä"},"scenario":3,"seed":"s","size":"tiny",'
+        f'"split":"cavity","subset":"test","variables":{{"v":"{inner.hexdigest()}"}}}}'
+    )
+    assert content_hash({"v": Held(("a",), values)}, IDENTITY) == hashlib.sha256(text.encode()).hexdigest()
+
+
+@given(FLOATS, st.data())
+def test_pieces_order_and_endianness_do_not_matter(values: NDArray[Any], data: st.DataObject) -> None:
+    """Any cut into pieces, memory order and byte order gives the hash of the whole."""
+    cut = data.draw(st.integers(0, values.shape[0]))
+    hasher = VariableHasher("position", values.dtype, tuple("abcdef"[: values.ndim]), values.shape)
+    hasher.update(values[:cut])
+    hasher.update(np.asfortranarray(values[cut:]).astype(values.dtype.newbyteorder(">")))
+    assert hasher.hexdigest() == digest(values)
+
+
+@given(FLOATS, st.data())
+def test_any_change_of_a_value_changes_the_hash(values: NDArray[Any], data: st.DataObject) -> None:
+    """One flipped bit matters, except the sign of zero and what a NaN carries."""
+    flat = values.reshape(-1).copy()
+    where = data.draw(st.integers(0, flat.size - 1))
+    bits = flat.view(f"<u{flat.itemsize}")
+    before = flat[where].copy()
+    bits[where] ^= bits.dtype.type(1) << bits.dtype.type(data.draw(st.integers(0, 8 * flat.itemsize - 1)))
+    same = (before == 0 and flat[where] == 0) or (np.isnan(before) and np.isnan(flat[where]))
+    assert (digest(flat.reshape(values.shape)) == digest(values)) == same
+
+
+@given(hnp.arrays("<i4", hnp.array_shapes(max_dims=2, max_side=5)), st.data())
+def test_any_change_of_an_integer_changes_the_hash(values: NDArray[Any], data: st.DataObject) -> None:
+    """The smallest integer is a value like any other, not a zero."""
+    changed = values.copy()
+    where = data.draw(st.integers(0, values.size - 1))
+    changed.reshape(-1)[where] = data.draw(st.integers(-(2**31), 2**31 - 1))
+    assert (digest(changed) == digest(values)) == np.array_equal(changed, values)
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
+def test_every_nan_is_one(dtype: Any) -> None:
+    """NaN of either sign, quiet or signalling, with any payload, hashes as the canonical one."""
+    width = np.dtype(dtype).itemsize * 8
+    quiet = np.full(4, np.nan, dtype)
+    odd = quiet.view(f"u{width // 8}").copy()
+    odd[1] |= odd.dtype.type(1 << (width - 1))
+    odd[2] |= odd.dtype.type(5)
+    exponent = np.array(np.inf, dtype).view(odd.dtype)
+    odd[3] = exponent | odd.dtype.type(1)
+    assert digest(odd.view(dtype)) == digest(quiet)
+
+
+@given(FLOATS.filter(lambda values: values.dtype == np.float32))
+def test_name_type_dims_and_shape_matter(values: NDArray[Any]) -> None:
+    """Equal bytes under another header have another hash."""
+    base = digest(values)
+    with np.errstate(all="ignore"):
+        wider = values.astype(np.float64)
+    longer = values[None]
+    others = {
+        digest(values, name="velocity"),
+        digest(values, dims=tuple("zyxwvu"[: values.ndim])),
+        digest(wider),
+        digest(longer, dims=(*"abcdef"[: values.ndim], "g")),
+        digest(values.reshape(-1).view(np.int32).reshape(values.shape)),
+    }
+    assert base not in others
+    assert len(others) == 5
+
+
+@given(st.lists(st.text(st.characters(codec="utf-8", exclude_characters="\0")), min_size=2, max_size=5))
+def test_string_borders_matter(texts: list[str]) -> None:
+    """Moving a letter from one string to the next changes the hash."""
+    moved = [texts[0] + texts[1], "", *texts[2:]]
+    same = moved == texts
+    assert (digest(np.array(moved, object)) == digest(np.array(texts, object))) == same
+
+
+@given(
+    st.dictionaries(
+        st.text("abc", min_size=1, max_size=3),
+        st.one_of(
+            st.integers(-9, 9), st.floats(allow_nan=False, allow_infinity=False), st.text("xyz", max_size=3)
+        ),
+        min_size=1,
+    ),
+    st.data(),
+)
+def test_any_change_of_a_parameter_matters(parameters: dict[str, Any], data: st.DataObject) -> None:
+    """Name and value of each parameter enter; their order does not."""
+    hashed = content_hash({}, {**IDENTITY, "parameters": parameters})
+    backwards = dict(reversed(parameters.items()))
+    assert content_hash({}, {**IDENTITY, "parameters": backwards}) == hashed
+    name = data.draw(st.sampled_from(sorted(parameters)))
+    renamed = {**parameters, name + "d": parameters[name]}
+    del renamed[name]
+    assert content_hash({}, {**IDENTITY, "parameters": renamed}) != hashed
+    assert content_hash({}, {**IDENTITY, "parameters": {**parameters, name: "other"}}) != hashed
+
+
+@pytest.mark.parametrize("key", ["split", "size", "major", "scenario", "subset", "seed"])
+def test_every_part_of_the_identity_matters(key: str) -> None:
+    """A scenario of another split, size, subset, id, seed or MAJOR is another one."""
+    assert content_hash({}, {**IDENTITY, key: 7}) != content_hash({}, IDENTITY)
+
+
+def test_variables_can_arrive_side_by_side() -> None:
+    """Frames of two variables in turn hash as one variable after the other."""
+    position = np.arange(12, dtype=np.float32).reshape(3, 2, 2)
+    hasher = ContentHasher(IDENTITY)
+    hasher.declare("velocity", np.float32, ("frame", "particle", "space"), position.shape)
+    hasher.declare("position", np.float32, ("frame", "particle", "space"), position.shape)
+    for frame in position:
+        hasher.update("position", frame)
+        hasher.update("velocity", -frame)
+    dims = ("frame", "particle", "space")
+    whole = {"position": Held(dims, position), "velocity": Held(dims, -position)}
+    assert hasher.hexdigest() == content_hash(whole, IDENTITY)
+
+
+def test_values_must_fit_what_was_declared() -> None:
+    """Too few, too many, another type: each is told with the variable's name."""
+    hasher = VariableHasher("position", np.float32, ("frame",), (2,))
+    with pytest.raises(DataError, match=r"another type.*\n.*'position'"):
+        hasher.update(np.zeros(1))
+    hasher.update(np.zeros(1, np.float32))
+    with pytest.raises(DataError, match=r"missing.*\n.*'position'"):
+        hasher.hexdigest()
+    with pytest.raises(DataError, match="too many"):
+        hasher.update(np.zeros(2, np.float32))
+    with pytest.raises(DataError, match="not a string"):
+        digest(np.array([1, None], object))
+    with pytest.raises(DataError, match="type cannot be hashed"):
+        dtype_name(np.complex64)
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), "a\0b", None, {1, 2}, [float("nan")]])
+def test_what_has_no_canonical_json_is_refused(bad: object) -> None:
+    """Values that JSON cannot hold, or would hold ambiguously, do not pass."""
+    with pytest.raises(DataError, match="cannot be hashed"):
+        canonical_json({"a": bad})
+
+
+def test_plain_values_do_not_depend_on_the_library() -> None:
+    """NumPy scalars, arrays of one element, bytes and booleans become what JSON has."""
+    given_values = [np.float32(0.5), np.array([3]), b"a", True, np.int8(-1), -0.0, [np.float64(2)]]
+    assert repr([plain(value) for value in given_values]) == repr([0.5, 3, "a", 1, -1, 0.0, [2.0]])
+
+
+def test_subset_and_dataset_hash_by_hand() -> None:
+    """Lines by id, then one JSON text; `extra` stays outside, a missing subset is an error."""
+    lines = f"0002 {'a' * 64}\n0010 {'b' * 64}\n"
+    assert subset_hash({10: "b" * 64, 2: "a" * 64}) == hashlib.sha256(lines.encode()).hexdigest()
+    subsets = {"valid": "1" * 64, "train": "0" * 64, "test": "2" * 64}
+    text = (
+        f'{{"major":1,"size":"tiny","split":"cavity","subsets":{{"test":"{"2" * 64}","train":"{"0" * 64}",'
+        f'"valid":"{"1" * 64}"}}}}'
+    )
+    expected = hashlib.sha256(text.encode()).hexdigest()
+    assert dataset_hash("cavity", "tiny", 1, subsets) == expected
+    assert dataset_hash("cavity", "tiny", 1, {**subsets, "extra": "3" * 64}) == expected
+    with pytest.raises(DataError, match="valid"):
+        dataset_hash("cavity", "tiny", 1, {"train": "0" * 64, "test": "2" * 64})
+
+
+def test_file_sha256(tmp_path: Any) -> None:
+    """The file hash is that of the bytes."""
+    path = tmp_path / "f"
+    path.write_bytes(b"abc")
+    # FIPS 180-2, appendix B.1
+    assert file_sha256(path) == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"

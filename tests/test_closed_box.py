@@ -1,0 +1,223 @@
+"""The closed-box solver's physics on small boxes, and what it says when it fails."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+from box_scenarios import ALL_LIDS, after, box, loaded, parameters, quantise, scenario, snapshot
+from numpy.typing import NDArray
+
+from lagbench.errors import UsageError, WorkFailedError
+from lagbench.generators.base import ClosedBoxParameters, InitialState
+from lagbench.generators.solver import Device
+
+NO_SLIP = parameters()
+FREE_SLIP = parameters(no_slip=False)
+
+
+def with_velocity(
+    state: InitialState, velocity: NDArray[np.float64], affine: NDArray[np.float64]
+) -> InitialState:
+    """Return a state with other velocities, rounded as states must be."""
+    return dataclasses.replace(state, velocity=quantise(velocity), affine=quantise(affine))
+
+
+def cells_of_vortex(constants: ClosedBoxParameters, state: InitialState) -> tuple[Any, Any]:
+    """Return velocity and gradient of u = sin kx cos ky, v = -cos kx sin ky, k = pi/L."""
+    low, high = box(constants)
+    k = np.pi / (high - low)
+    x, y = k * (state.position - low).T
+    velocity = np.stack([np.sin(x) * np.cos(y), -np.cos(x) * np.sin(y)], axis=1)
+    straight, across = np.cos(x) * np.cos(y), np.sin(x) * np.sin(y)
+    gradient = k * np.array([[straight, -across], [across, -straight]]).transpose(2, 0, 1)
+    return velocity, gradient
+
+
+def test_a_regular_lattice_stays_at_rest() -> None:
+    """Nine particles per cell, evenly spaced: density and J are 1 everywhere and nothing moves."""
+    constants = parameters(particles=33 * 33)
+    state = scenario(constants, jitter=0.0)
+    result = after(constants, [state], 400)
+    np.testing.assert_allclose(result["position"][0], state.position, rtol=0, atol=2e-5)
+    assert np.abs(result["velocity"]).max() < 2e-5
+    np.testing.assert_allclose(result["jacobian"], 1.0, rtol=0, atol=2e-5)
+
+
+def test_transfers_conserve_momentum() -> None:
+    """Without pressure, viscosity and shift nothing changes the momentum of a patch off the walls."""
+    constants = parameters(particles=4000, grid=40, modulus=1e-30, shift=0.0, velocity_relaxation=0.2)
+    state = scenario(constants, seed=1, speed=0.3, viscosity=0.0)
+    patch = np.abs(state.position - 0.5).max(axis=1) < 0.15
+    state = with_velocity(state, state.velocity * patch[:, None], state.affine * patch[:, None, None])
+    before = state.velocity.sum(axis=0)
+    moved = after(constants, [state], 4)["velocity"][0].astype(np.float64)
+    assert np.abs(moved - state.velocity).max() > 0.05
+    np.testing.assert_allclose(moved.sum(axis=0), before, rtol=0, atol=1e-6 * np.abs(state.velocity).sum())
+
+
+def test_a_vortex_decays_as_navier_stokes_says() -> None:
+    """The free-slip vortex sin kx cos ky is a solution with amplitude exp(-2 nu k^2 t)."""
+    constants = parameters(
+        particles=4900,
+        grid=32,
+        dt=2e-3,
+        no_slip=False,
+        velocity_relaxation=0.0,
+        density_coupling=0.002,
+        shift=0.002,
+    )
+    state = scenario(constants, seed=2, viscosity=5e-3)
+    shape, gradient = cells_of_vortex(constants, state)
+    state = with_velocity(state, 0.05 * shape, 0.05 * gradient)
+    solver = loaded(constants, [state])
+    solver.advance(2000)
+    shape = cells_of_vortex(constants, dataclasses.replace(state, position=solver.position()[0]))[0]
+    amplitude = (solver.velocity()[0] * shape).sum() / (shape**2).sum()
+    low, high = box(constants)
+    expected = 0.05 * np.exp(-2.0 * 5e-3 * (np.pi / (high - low)) ** 2 * 2000 * 2e-3)
+    assert amplitude == pytest.approx(expected, rel=0.003)
+
+
+def test_energy_falls_when_the_lid_rests() -> None:
+    """Walls at rest do no work: kinetic energy falls from every 25 substeps to the next."""
+    constants = parameters(particles=2500, grid=32, dt=2e-3)
+    state = scenario(constants, seed=3, viscosity=1e-3)
+    shape, gradient = cells_of_vortex(constants, state)
+    low, high = box(constants)
+    s, c = np.sin(np.pi * (state.position - low) / (high - low)), 0.1
+    envelope = (s[:, 0] * s[:, 1])[:, None]
+    solver = loaded(constants, [with_velocity(state, c * envelope * shape, 0.0 * gradient)])
+    energies = []
+    for _ in range(24):
+        solver.advance(25)
+        energies.append((solver.velocity().astype(np.float64) ** 2).sum())
+    assert np.all(np.diff(energies) < 0.0)
+    assert energies[-1] < 0.9 * energies[0]
+
+
+def test_jacobian_stays_near_one() -> None:
+    """Away from the lid's corners J stays within 2 % while the lid drives the flow."""
+    constants = parameters(particles=2500, grid=32, dt=2e-3)
+    solver = loaded(constants, [scenario(constants, seed=4, walls=(0.0, 0.0, 0.0, 0.1))])
+    solver.advance(2000)
+    position, jacobian = solver.position()[0], solver.jacobian()[0]
+    low, high = box(constants)
+    reach = 5.0 / constants.grid
+    corner = (position[:, 1] > high - reach) & (np.abs(position[:, 0] - 0.5) > 0.5 - low - reach)
+    assert np.abs(jacobian[~corner] - 1.0).max() < 0.02
+    health = solver.health()[0]
+    assert health.finite
+    assert health.jacobian_min <= jacobian.min() <= jacobian.max() <= health.jacobian_max
+    assert np.abs(solver.velocity()).max() <= health.max_speed <= 0.12
+
+
+def turned(state: InitialState) -> InitialState:
+    """Return the state turned by 90 degrees: (x, y) -> (1 - y, x); left, right <- top, bottom."""
+    turn = np.array([[0.0, -1.0], [1.0, 0.0]])
+    left, right, bottom, top = state.wall_velocity @ turn.T
+    return dataclasses.replace(
+        state,
+        position=(state.position - 0.5) @ turn.T + 0.5,
+        velocity=state.velocity @ turn.T,
+        affine=turn @ state.affine @ turn.T,
+        wall_velocity=np.stack([top, bottom, left, right]),
+    )
+
+
+def flipped(state: InitialState) -> InitialState:
+    """Return the mirror image x -> 1 - x: left and right change places."""
+    flip = np.diag([-1.0, 1.0])
+    left, right, bottom, top = state.wall_velocity @ flip
+    return dataclasses.replace(
+        state,
+        position=(state.position - 0.5) @ flip + 0.5,
+        velocity=state.velocity @ flip,
+        affine=flip @ state.affine @ flip,
+        wall_velocity=np.stack([right, left, bottom, top]),
+    )
+
+
+@pytest.mark.parametrize("constants", [NO_SLIP, FREE_SLIP], ids=["no slip", "free slip"])
+@pytest.mark.parametrize("change", [turned, flipped])
+def test_no_direction_is_special(constants: ClosedBoxParameters, change: Any) -> None:
+    """A turned or mirrored box, its moving walls included, evolves into the turned or mirrored result."""
+    walls = ALL_LIDS if constants.no_slip else (0.0, 0.0, 0.0, 0.0)
+    state = scenario(constants, seed=5, speed=0.2, walls=walls)
+    plain, other = (after(constants, [each], 60) for each in (state, change(state)))
+    moved = dataclasses.replace(state, position=plain["position"][0], velocity=plain["velocity"][0])
+    image = change(moved)
+    np.testing.assert_allclose(other["position"][0], image.position, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(other["velocity"][0], image.velocity, rtol=0, atol=5e-5)
+
+
+def test_displaced_particles_stay_in_the_box() -> None:
+    """Offsets are added in float32; who would leave stands just inside the wall."""
+    solver = loaded(NO_SLIP, [scenario(NO_SLIP)])
+    before = solver.position()
+    offset = np.full_like(before, 2.0**-20)
+    offset[0, 0] = 5.0
+    solver.displace(offset)
+    np.testing.assert_array_equal(solver.position()[0, 1:], before[0, 1:] + np.float32(2.0**-20))
+    high = box(NO_SLIP)[1]
+    assert high - 0.01 / NO_SLIP.grid < solver.position()[0, 0, 0] < high
+
+
+def test_sums_hold_every_particle_in_one_place() -> None:
+    """All 700 particles on one spot at nearly the largest speed: the nodes see exactly that speed."""
+    speed = 0.9 / (NO_SLIP.grid * NO_SLIP.dt)
+    state = scenario(NO_SLIP, viscosity=0.0)
+    state = with_velocity(
+        dataclasses.replace(state, position=np.full((700, 2), 0.5)),
+        np.full((700, 2), speed),
+        0.0 * state.affine,
+    )
+    nodes = after(dataclasses.replace(NO_SLIP, modulus=1e-30), [state], 1)["grid_velocity"][0]
+    np.testing.assert_allclose(nodes[7:10, 7:10], speed, rtol=1e-6)
+
+
+@pytest.mark.parametrize("device", [Device.CPU, Device.PARALLEL])
+def test_a_blow_up_is_an_error(device: Device) -> None:
+    """A substep beyond the acoustic limit ends in an error that says where, when and which bound."""
+    constants = parameters(dt=0.05)
+    state = scenario(constants, seed=6, speed=0.4, walls=ALL_LIDS)
+    solver = loaded(constants, [state], device=device)
+    with pytest.raises(WorkFailedError) as caught:
+        solver.advance(400)
+    assert caught.value.where == "scenario 0, substeps 0 to 400"
+    assert "CFL" in str(caught.value.expected)
+    low, high = box(constants)
+    assert low < solver.position().min() <= solver.position().max() < high
+
+
+def test_a_blow_up_names_the_scenario_and_leaves_the_others() -> None:
+    """Of two scenarios only the second is not finite; the solver can be loaded again."""
+    states = [scenario(NO_SLIP, seed=seed, speed=0.2) for seed in (7, 8)]
+    wild = [states[0], dataclasses.replace(states[1], viscosity=np.inf)]
+    solver = loaded(NO_SLIP, wild, device=Device.PARALLEL)
+    with pytest.raises(WorkFailedError, match="scenario 1, substeps 0 to 20"):
+        solver.advance(20)
+    assert [health.finite for health in solver.health()] == [True, False]
+    np.testing.assert_array_equal(
+        snapshot(solver)["position"][0], after(NO_SLIP, [states[0]], 20)["position"][0]
+    )
+    solver.load(states)
+    solver.advance(20)
+    assert all(health.finite for health in solver.health())
+
+
+def test_states_outside_the_bounds_are_refused() -> None:
+    """Too fast, of another size, or with walls that cannot move: refused before the first substep."""
+    state = scenario(NO_SLIP)
+    walls = np.zeros((4, 2))
+    walls[0, 0] = 0.1
+    with pytest.raises(WorkFailedError, match="abs"):
+        loaded(NO_SLIP, [dataclasses.replace(state, velocity=state.velocity + 100.0)])
+    with pytest.raises(UsageError, match="wrong shape"):
+        loaded(NO_SLIP, [dataclasses.replace(state, position=state.position[1:])])
+    with pytest.raises(UsageError, match="slide along"):
+        loaded(NO_SLIP, [dataclasses.replace(state, wall_velocity=walls)])
+    with pytest.raises(UsageError, match="slide along"):
+        loaded(FREE_SLIP, [scenario(FREE_SLIP, walls=(0.0, 0.0, 0.0, 0.1))])

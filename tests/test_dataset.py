@@ -1,0 +1,154 @@
+"""open_split gives one lazy, padded xarray.Dataset, or says what is missing."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import dask.array
+import netCDF4
+import numpy as np
+import pytest
+from scenario_factory import frames_of, make_key, write_scenario
+
+import lagbench
+from lagbench import registry
+from lagbench.dataset import list_splits, load_manifest, open_split
+from lagbench.errors import DataError, UsageError
+from lagbench.manifest import merge, write_manifest
+
+TEST_IDS = registry.load().size("cavity", "tiny").subsets["test"]
+
+
+@pytest.fixture
+def ragged(tmp_path: Path) -> Path:
+    """A root whose cavity tiny test scenarios differ in frames and particles."""
+    for place, scenario in enumerate(TEST_IDS):
+        write_scenario(tmp_path, make_key(scenario), frames=5 - place, particles=6 + place)
+    return tmp_path
+
+
+def test_ragged_scenarios_are_padded(ragged: Path) -> None:
+    """Each scenario holds its own frames and particles; what is beyond is NaN, material -1."""
+    with open_split("cavity", size="tiny", root=ragged) as data:
+        assert data["position"].dims == ("scenario", "frame", "particle", "space")
+        assert data["wall_velocity"].dims == ("scenario", "frame", "wall", "space")
+        assert tuple(data["scenario"].values) == TEST_IDS
+        for place, scenario in enumerate(TEST_IDS):
+            frames, particles = 5 - place, 6 + place
+            one = data.sel(scenario=scenario)
+            assert (int(one["frame_count"]), int(one["particle_count"])) == (frames, particles)
+            expected = np.full((5, 6 + len(TEST_IDS) - 1, 2), np.nan, np.float32)
+            expected[:frames, :particles] = frames_of(scenario, frames, particles)
+            np.testing.assert_array_equal(one["position"], expected)
+            np.testing.assert_array_equal(one["velocity"], -expected)
+            np.testing.assert_array_equal(one["material"][:particles], np.arange(particles) % 4)
+            assert (one["material"][particles:] == -1).all()
+            assert one["particle_mass"] == 1e-4 / particles
+        np.testing.assert_array_equal(data["time"], np.arange(5) * 0.1)
+
+
+def test_types_survive_the_padding(ragged: Path) -> None:
+    """Padding turns neither float32 into float64 nor int8 into float."""
+    with open_split("cavity", size="tiny", root=ragged) as data:
+        types = {
+            name: str(data[name].dtype) for name in ("position", "velocity", "wall_velocity", "material")
+        }
+        assert types == {
+            **dict.fromkeys(("position", "velocity", "wall_velocity"), "float32"),
+            "material": "int8",
+        }
+        assert (data.attrs["split"], data.attrs["size"], data.attrs["subset"]) == ("cavity", "tiny", "test")
+        assert "content_sha256" not in {*data.attrs, *data["position"].attrs}
+
+
+def test_it_is_lazy_and_bounded(tmp_path: Path) -> None:
+    """Positions are dask arrays in chunks of some megabytes, one scenario each."""
+    for scenario in TEST_IDS:
+        write_scenario(tmp_path, make_key(scenario), frames=100, particles=8192)
+    with open_split("cavity", size="tiny", root=tmp_path) as data:
+        position = data["position"].data
+        assert isinstance(position, dask.array.Array)
+        assert position.chunksize == (1, 64, 8192, 2)  # 4 MiB
+        assert float(data["position"][1, 99, 0, 0]) == frames_of(TEST_IDS[1], 100, 8192)[99, 0, 0]
+
+
+def test_missing_scenarios_name_the_command(ragged: Path) -> None:
+    """The error counts what is missing, lists the ids and gives the generate command."""
+    (ragged / "cavity/tiny/v1/test" / f"{TEST_IDS[1]:04d}.nc").unlink()
+    with pytest.raises(DataError) as caught:
+        open_split("cavity", size="tiny", root=ragged)
+    assert caught.value.exit_code == 4
+    assert f"1 of {len(TEST_IDS)} scenarios" in str(caught.value)
+    assert f"missing: {TEST_IDS[1]}" in str(caught.value)
+    assert f"lagbench generate --split cavity --size tiny --subset test --root {ragged}" in str(caught.value)
+
+
+def test_damaged_and_foreign_files_are_named(ragged: Path) -> None:
+    """A truncated file and a file of another scenario are told by path."""
+    path = ragged / "cavity/tiny/v1/test" / f"{TEST_IDS[0]:04d}.nc"
+    sound = path.read_bytes()
+    path.write_bytes(sound[: len(sound) // 2])
+    with pytest.raises(DataError, match=rf"(?s)damaged.*{path.name}"):
+        open_split("cavity", size="tiny", root=ragged)
+    path.write_bytes(sound)
+    with netCDF4.Dataset(path, "r+") as file:
+        file.scenario = 17
+    with pytest.raises(DataError, match=rf"(?s)another scenario.*{path.name}"):
+        open_split("cavity", size="tiny", root=ragged)
+
+
+@pytest.mark.parametrize(
+    ("split", "size", "subset", "hint"),
+    [
+        ("cavty", "tiny", "test", "did you mean 'cavity'"),
+        ("cavity", "tiney", "test", "did you mean 'tiny'"),
+        ("cavity", "tiny", "tset", "did you mean 'test'"),
+    ],
+)
+def test_unknown_names_offer_the_nearest(
+    tmp_path: Path, split: str, size: str, subset: str, hint: str
+) -> None:
+    """A typing error is exit code 2 and names the nearest known word."""
+    with pytest.raises(UsageError, match=hint):
+        open_split(split, size=size, subset=subset, root=tmp_path)
+
+
+def test_root_comes_from_the_environment(ragged: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without root, LAGBENCH_ROOT says where the data are."""
+    monkeypatch.setenv("LAGBENCH_ROOT", str(ragged))
+    with open_split("cavity", size="tiny") as data:
+        assert data.sizes["scenario"] == len(TEST_IDS)
+
+
+def test_load_manifest(tmp_path: Path) -> None:
+    """The manifest of a generated set is read; where there is none the command is named."""
+    with pytest.raises(DataError, match=r"(?s)no manifest.*lagbench generate --split cavity --size tiny"):
+        load_manifest("cavity", size="tiny", root=tmp_path)
+    manifest = merge(
+        None, [], split="cavity", size="tiny", version="1.0.0", subsets={"test": (3,)}, environment={}
+    )
+    write_manifest(tmp_path, manifest)
+    assert load_manifest("cavity", size="tiny", root=tmp_path) == manifest
+
+
+def test_list_splits() -> None:
+    """The four splits of the registry are listed by name."""
+    assert {"cavity", "curl-noise", "fluid", "multimaterial"} <= set(list_splits())
+
+
+def test_public_names_load_on_first_use() -> None:
+    """`import lagbench` loads none of the heavy libraries; each public name is reachable and listed."""
+    code = (
+        "import sys, lagbench\n"
+        "heavy = ('numpy', 'xarray', 'pandas', 'dask', 'netCDF4', 'h5py', 'pydantic', 'torch', 'taichi')\n"
+        "print([name for name in heavy if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+    assert set(lagbench.__all__) <= set(dir(lagbench))
+    assert lagbench.open_split is open_split
+    assert lagbench.__version__[0].isdigit()
+    with pytest.raises(AttributeError, match="opensplit"):
+        lagbench.opensplit  # noqa: B018

@@ -1,0 +1,96 @@
+"""Drivers, threads, calls and orders of particles give one and the same result, bit by bit."""
+
+from __future__ import annotations
+
+import dataclasses
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from box_scenarios import ALL_LIDS, after, loaded, parameters, scenario, snapshot
+
+from lagbench.errors import UsageError
+from lagbench.generators.solver import Device, build
+
+NO_SLIP = parameters()
+FREE_SLIP = parameters(no_slip=False, wall=1, velocity_relaxation=0.002, density_coupling=0.002, shift=0.002)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_drivers_give_the_same_bits(threads: int) -> None:
+    """Serial frames, and parallel phases with atomics over two scenarios, agree after 450 substeps."""
+    states = [
+        scenario(NO_SLIP, seed=4, speed=0.4, walls=ALL_LIDS),
+        scenario(NO_SLIP, seed=5, speed=0.4, walls=(0.0, 0.0, 0.0, 0.3), viscosity=3e-3),
+    ]
+    together = after(NO_SLIP, states, 450, device=Device.PARALLEL, threads=threads)
+    for index, state in enumerate(states):
+        for name, values in after(NO_SLIP, [state], 450).items():
+            np.testing.assert_array_equal(values[0], together[name][index], err_msg=name)
+
+
+def test_threads_lose_no_contribution() -> None:
+    """Two threads that add 20,000 particles to the same nine nodes, 100 times, lose none of them."""
+    constants = parameters(particles=20_000, modulus=1e-30)
+    state = scenario(constants)
+    crowd = dataclasses.replace(
+        state,
+        position=np.full_like(state.position, 0.5),
+        velocity=np.full_like(state.velocity, 0.25),
+    )
+    serial = after(constants, [crowd], 100)
+    threaded = after(constants, [crowd], 100, device=Device.PARALLEL, threads=2)
+    for name, values in serial.items():
+        np.testing.assert_array_equal(values, threaded[name], err_msg=name)
+
+
+def test_frames_do_not_matter() -> None:
+    """450 substeps in one call and in calls of 50 give the same bits."""
+    state = scenario(NO_SLIP, seed=6, speed=0.4, walls=ALL_LIDS)
+    at_once = after(NO_SLIP, [state], 450)
+    frames = loaded(NO_SLIP, [state])
+    for _ in range(9):
+        frames.advance(50)
+    for name, values in snapshot(frames).items():
+        np.testing.assert_array_equal(values, at_once[name], err_msg=name)
+
+
+@pytest.mark.parametrize("device", [Device.CPU, Device.PARALLEL])
+def test_the_order_of_particles_does_not_matter(device: Device) -> None:
+    """Particles in another order move in the same way, bit by bit, over 450 substeps."""
+    state = scenario(FREE_SLIP, seed=7, speed=0.4, viscosity=0.0)
+    order = np.random.default_rng(8).permutation(FREE_SLIP.particles)
+    shuffled = dataclasses.replace(
+        state, position=state.position[order], velocity=state.velocity[order], affine=state.affine[order]
+    )
+    straight, mixed = after(FREE_SLIP, [state], 450), after(FREE_SLIP, [shuffled], 450, device=device)
+    np.testing.assert_array_equal(straight.pop("grid_velocity"), mixed["grid_velocity"])
+    for name, values in straight.items():
+        np.testing.assert_array_equal(values[0][order], mixed[name][0], err_msg=name)
+
+
+def test_the_serial_driver_takes_one_scenario() -> None:
+    """More scenarios than the serial driver can hold are refused, with the way out."""
+    with pytest.raises(UsageError, match="one worker per scenario"):
+        build(NO_SLIP, device=Device.CPU, scenarios=2)
+
+
+def test_more_threads_than_the_pool_are_refused() -> None:
+    """Taichi's pool is fixed by the first solver of a process."""
+    loaded(NO_SLIP, [scenario(NO_SLIP)])
+    with pytest.raises(UsageError, match="another process"):
+        build(NO_SLIP, device=Device.PARALLEL, threads=10_000)
+
+
+def test_taichi_is_imported_late_and_quietly() -> None:
+    """Importing the solver leaves Taichi alone; building one prints nothing."""
+    script = (
+        "import sys, lagbench.generators.solver as solver\n"
+        "assert 'taichi' not in sys.modules\n"
+        "from lagbench.generators.base import ClosedBoxParameters\n"
+        f"solver.build({NO_SLIP!r})\n"
+        "assert 'taichi' in sys.modules\n"
+    )
+    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert result.stdout == ""

@@ -1,0 +1,343 @@
+"""Scenario files open anywhere, hash alike whoever wrote them, and tell when they are damaged."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import h5py
+import independent_hash
+import netCDF4
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from scenario_factory import PARAMETERS, frames_of, make_key, write_scenario
+
+from lagbench.checksums import content_hash, file_sha256
+from lagbench.errors import DataError, WorkFailedError
+from lagbench.format import (
+    MATERIALS,
+    ScenarioWriter,
+    check_scenario,
+    read_scenario,
+    rehash,
+    scenario_path,
+)
+
+KEY = make_key()
+DIMS = {
+    "frame": ("frame",),
+    "time": ("frame",),
+    "particle": ("particle",),
+    "space": ("space",),
+    "wall": ("wall",),
+    "position": ("frame", "particle", "space"),
+    "velocity": ("frame", "particle", "space"),
+    "material": ("particle",),
+    "particle_mass": (),
+    "wall_velocity": ("frame", "wall", "space"),
+}
+TYPES = {
+    **dict.fromkeys(("frame", "particle"), "int32"),
+    **dict.fromkeys(("time", "particle_mass"), "float64"),
+    **dict.fromkeys(("position", "velocity", "wall_velocity"), "float32"),
+    "material": "int8",
+}
+
+
+@pytest.fixture
+def written(tmp_path: Path) -> tuple[Path, str]:
+    """A small cavity scenario and its content hash."""
+    return write_scenario(tmp_path, KEY)
+
+
+@pytest.mark.parametrize("engine", ["netcdf4", "h5netcdf"])
+def test_xarray_opens_it_unaided(written: tuple[Path, str], engine: str) -> None:
+    """Plain open_dataset gives the dims, types and coordinates of the design, nothing decoded away."""
+    pytest.importorskip(engine if engine == "h5netcdf" else "netCDF4")
+    with xr.open_dataset(written[0], engine=engine) as scenario:
+        assert {str(name): v.dims for name, v in scenario.variables.items()} == DIMS
+        assert {name: str(scenario[name].dtype) for name in TYPES} == TYPES
+        assert set(scenario.coords) == {"frame", "time", "particle", "space", "wall"}
+        assert list(scenario["space"].values) == ["x", "y"]
+        assert list(scenario["wall"].values) == ["left", "right", "bottom", "top"]
+        np.testing.assert_array_equal(scenario["position"], frames_of(3, 4, 8))
+        np.testing.assert_array_equal(scenario["time"], np.arange(4) * 0.1)
+        np.testing.assert_array_equal(scenario["wall_velocity"][:, 3, 0], 0.125)
+        assert scenario.attrs["Conventions"] == "CF-1.11"
+        assert {name: scenario.attrs[name] for name in PARAMETERS} == PARAMETERS
+        assert scenario.attrs["reynolds_number"] == 100.0
+        assert scenario["material"].attrs["flag_meanings"].split() == list(MATERIALS)
+
+
+def test_plain_h5py_opens_it(written: tuple[Path, str]) -> None:
+    """Chunks hold one frame; the only filters are shuffle and zlib level 1."""
+    with h5py.File(written[0]) as file:
+        for name in ("position", "velocity"):
+            assert file[name].chunks == (1, 8, 2)
+            assert (file[name].compression, file[name].compression_opts, file[name].shuffle) == (
+                "gzip",
+                1,
+                True,
+            )
+        np.testing.assert_array_equal(file["velocity"][...], -frames_of(3, 4, 8))
+
+
+def test_free_surface_files_have_no_walls(tmp_path: Path) -> None:
+    """Without wall velocities there is neither a wall dimension nor a Reynolds number."""
+    path, content = write_scenario(tmp_path, KEY, walls=False)
+    with xr.open_dataset(path) as scenario:
+        assert "wall" not in scenario.dims
+        assert "reynolds_number" not in scenario.attrs
+    assert check_scenario(path) == content == independent_hash.content_hash(path)
+
+
+def test_materials_are_those_of_the_solver() -> None:
+    """The flag meanings of the files name the solver's materials in order."""
+    from lagbench.generators.base import Material
+
+    assert tuple(material.name.lower() for material in Material) == MATERIALS
+
+
+def test_independent_hash_agrees(written: tuple[Path, str]) -> None:
+    """Thirty lines written from docs/format.md find the same content hash."""
+    path, content = written
+    assert independent_hash.content_hash(path) == content == rehash(path) == check_scenario(path)
+
+
+@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    parameters=st.dictionaries(
+        st.from_regex("[a-z]{1,6}_p", fullmatch=True),
+        st.one_of(
+            st.booleans(),
+            st.integers(-(2**63), 2**63 - 1),
+            st.floats(allow_nan=False, allow_infinity=False),
+            st.text(st.characters(codec="utf-8", exclude_characters="\0"), min_size=1),
+        ),
+        max_size=4,
+    ),
+    seed=st.text(st.characters(codec="utf-8", exclude_characters="\0"), min_size=1),
+)
+def test_parameters_survive_the_file(tmp_path: Path, parameters: dict[str, Any], seed: str) -> None:
+    """What was hashed while writing is what two readers find, whatever the parameters are."""
+    path, content = write_scenario(tmp_path, KEY, parameters=parameters, seed=seed)
+    with read_scenario(path) as file:
+        assert file.header.parameters == {**parameters, "reynolds_number": 100.0}
+        assert file.header.seed == seed
+    assert rehash(path) == content == independent_hash.content_hash(path)
+
+
+def test_a_dataset_in_memory_has_the_hash_of_its_file(written: tuple[Path, str]) -> None:
+    """content_hash of xarray's variables is the file's content hash."""
+    path, content = written
+    with xr.open_dataset(path) as scenario, read_scenario(path) as file:
+        header = file.header
+        assert content_hash(scenario.variables, KEY.identity(header.seed, header.parameters)) == content
+
+
+@pytest.mark.parametrize("name", sorted(TYPES))
+def test_every_variable_is_hashed_and_named(written: tuple[Path, str], name: str) -> None:
+    """Changing one value of any variable is found, and the error names file and variable."""
+    path, content = written
+    with h5py.File(path, "r+") as file:
+        values = file[name][()]
+        file[name][...] = values + np.ones_like(values)
+    assert rehash(path) != content
+    with pytest.raises(DataError, match=rf"(?s)differ.*{path.name}, variable '{name}'"):
+        check_scenario(path)
+
+
+@pytest.mark.parametrize("name", ["dt", "wall_moving", "seed", "scenario", "subset", "hashed_parameters"])
+def test_changed_attributes_are_found(written: tuple[Path, str], name: str) -> None:
+    """Parameters and identity enter the hash; the error says that attributes differ."""
+    path, _ = written
+    with netCDF4.Dataset(path, "r+") as file:
+        file.setncattr(name, {"dt": 0.0021, "scenario": 4, "hashed_parameters": "dt"}.get(name, "other"))
+    with pytest.raises(DataError, match=rf"(?s)attributes differ.*{path.name}, attributes"):
+        check_scenario(path)
+
+
+def test_another_expected_hash_is_told(written: tuple[Path, str]) -> None:
+    """A sound file of another scenario fails only against the expected hash; 16 digits suffice."""
+    path, content = written
+    assert check_scenario(path, content[:16]) == content
+    with pytest.raises(DataError, match=r"(?s)another content hash.*expected: 0123.*got: " + content):
+        check_scenario(path, "0123456789abcdef")
+
+
+def test_flipped_byte_in_a_compressed_chunk_names_the_variable(tmp_path: Path) -> None:
+    """Damage inside packed frames is told as damage of that variable, not as a traceback of HDF5."""
+    path, _ = write_scenario(tmp_path, KEY, frames=4, particles=2000)
+    with h5py.File(path) as file:
+        offset = file["velocity"].id.get_chunk_info(2).byte_offset
+    data = bytearray(path.read_bytes())
+    data[offset + 100] ^= 1
+    path.write_bytes(data)
+    for check in (rehash, check_scenario):
+        with pytest.raises(
+            DataError, match=rf"(?s)damaged.*{path.name}, variable 'velocity'.*lagbench generate"
+        ):
+            check(path)
+
+
+def test_no_flipped_byte_escapes_as_another_error(written: tuple[Path, str]) -> None:
+    """Each of 600 flips all over the file leaves the content as it is or gives a DataError."""
+    path, content = written
+    good = path.read_bytes()
+    noticed = 0
+    for offset in range(0, len(good), len(good) // 600):
+        data = bytearray(good)
+        data[offset] ^= 0x55
+        path.write_bytes(data)
+        try:
+            found = check_scenario(path)
+        except DataError as error:
+            found = content if str(path) in str(error) else "an error without the path"
+            noticed += 1
+        assert found == content, f"byte {offset}"
+    assert noticed >= 20
+
+
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.3, 0.7, 0.999])
+def test_truncated_file(written: tuple[Path, str], share: float) -> None:
+    """A file cut anywhere is damaged."""
+    path, _ = written
+    data = path.read_bytes()
+    path.write_bytes(data[: int(share * len(data))])
+    with pytest.raises(DataError, match=rf"(?s)damaged.*{path.name}"):
+        check_scenario(path)
+
+
+def test_missing_and_foreign_files(tmp_path: Path) -> None:
+    """A missing file is told as missing; a netCDF file of somebody else as not ours."""
+    with pytest.raises(DataError, match="missing"):
+        read_scenario(tmp_path / "0000.nc")
+    other = tmp_path / "other.nc"
+    xr.Dataset({"a": ("b", [1.0])}).to_netcdf(other, engine="netcdf4")
+    with pytest.raises(DataError, match=r"(?s)not one of lagbench.*other.nc"):
+        read_scenario(other)
+
+
+def test_impossible_lengths_are_refused_before_memory_is_asked_for(tmp_path: Path) -> None:
+    """A shape of terabytes in a file of kilobytes is damage."""
+    path = tmp_path / "huge.nc"
+    with h5py.File(path, "w") as file:
+        file.create_dataset("position", (2**40,), "f4", chunks=(1024,))
+    with pytest.raises(DataError, match=r"(?s)larger than its file.*variable 'position'"):
+        read_scenario(path)
+
+
+def test_reading_parts(written: tuple[Path, str]) -> None:
+    """Method read takes frames or slices, blocks stream everything in order, unknown names are told."""
+    path, _ = written
+    truth = frames_of(3, 4, 8)
+    with read_scenario(path) as file:
+        np.testing.assert_array_equal(file.read("position", 2), truth[2])
+        np.testing.assert_array_equal(file.read("position", slice(1, 3)), truth[1:3])
+        np.testing.assert_array_equal(np.concatenate(list(file.blocks("position"))), truth)
+        assert file.read("particle_mass") == 1e-4 / 8
+        assert (file.header.frames, file.header.particles, file.header.key) == (4, 8, KEY)
+        with pytest.raises(DataError, match="variable 'density'"):
+            file.read("density")
+
+
+def test_an_error_leaves_nothing_behind(tmp_path: Path) -> None:
+    """When the body raises, neither the file nor a temporary one stays, and an old file survives."""
+    path, content = write_scenario(tmp_path, KEY)
+    frame = np.zeros((8, 2), np.float32)
+    with pytest.raises(DataError, match="wrong shape"), writer(path) as unfinished:
+        unfinished.append(frame, frame[:1])
+    assert check_scenario(path) == content
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_incomplete_files_do_not_appear(tmp_path: Path) -> None:
+    """Fewer frames than announced is an error that names the variable; no file appears."""
+    path = scenario_path(tmp_path, KEY)
+    with pytest.raises(DataError, match=r"(?s)values are missing.*'position'"), writer(path) as unfinished:
+        unfinished.append(np.zeros((8, 2), np.float32), np.zeros((8, 2), np.float32))
+    assert list(path.parent.iterdir()) == []
+
+
+def test_wrong_frames_are_refused(tmp_path: Path) -> None:
+    """Shape, type and number of frames are checked before anything is stored."""
+    frame = np.zeros((8, 2), np.float32)
+    with pytest.raises(DataError, match=r"(?s)wrong shape.*'velocity'"), writer(tmp_path / "a.nc") as file:
+        file.append(frame, frame[:4])
+    with pytest.raises(DataError, match=r"(?s)another type.*'position'"), writer(tmp_path / "b.nc") as file:
+        file.append(frame.astype(np.float64), frame)
+    with writer(tmp_path / "c.nc") as file:
+        file.append(frame, frame)
+        file.append(frame, frame)
+        with pytest.raises(DataError, match="too many values"):
+            file.append(frame, frame)
+
+
+@pytest.mark.parametrize("name", ["seed", "content_sha256", "two words", ""])
+def test_parameters_cannot_take_names_of_the_format(tmp_path: Path, name: str) -> None:
+    """A parameter that would hide an attribute of the format is refused."""
+    with pytest.raises(DataError, match="cannot be named"):
+        write_scenario(tmp_path, KEY, parameters={name: 1})
+
+
+@pytest.mark.parametrize("value", ["", [1], {"a": 1}, np.array([1, 2])])
+def test_parameters_are_numbers_and_strings(tmp_path: Path, value: object) -> None:
+    """What netCDF would give back as something else is refused."""
+    with pytest.raises(DataError, match="'depth' cannot be stored"):
+        write_scenario(tmp_path, KEY, parameters={"depth": value})
+
+
+def test_a_foreign_type_names_file_and_variable(written: tuple[Path, str]) -> None:
+    """A variable whose type no scenario file has is damage of that variable."""
+    path, _ = written
+    with netCDF4.Dataset(path, "r+") as file:
+        file.createVariable("odd", file.createCompoundType(np.dtype([("a", "i4")]), "pair"), ())
+    with pytest.raises(DataError, match=rf"(?s)damaged.*{path.name}, variable 'odd'"):
+        rehash(path)
+
+
+def test_same_scenario_same_bytes(tmp_path: Path) -> None:
+    """With one set of libraries even the packed bytes are the same: nothing depends on the clock."""
+    first, _ = write_scenario(tmp_path / "a", KEY)
+    second, _ = write_scenario(tmp_path / "b", KEY)
+    assert file_sha256(first) == file_sha256(second)
+
+
+def test_a_root_that_is_a_file_cannot_be_written(tmp_path: Path) -> None:
+    """The operating system's refusal becomes exit code 5 with the path and a remedy."""
+    (tmp_path / "cavity").write_text("in the way")
+    with pytest.raises(WorkFailedError, match=r"(?s)cannot write.*--root") as caught:
+        write_scenario(tmp_path, KEY)
+    assert caught.value.exit_code == 5
+
+
+def test_writing_needs_neither_xarray_nor_pandas() -> None:
+    """Generation workers stay small: the writer loads numpy and netCDF4 only."""
+    code = (
+        "import sys, netCDF4, lagbench.format\n"
+        "print([m for m in ('xarray', 'pandas', 'h5py', 'pydantic', 'scipy', 'dask') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def writer(path: Path) -> ScenarioWriter:
+    """Return a writer of two frames of eight particles."""
+    return ScenarioWriter(
+        path,
+        KEY,
+        particles=8,
+        frames=2,
+        frame_interval=0.1,
+        material=np.zeros(8),
+        particle_mass=1.0,
+        parameters={},
+        seed="s",
+        device="cpu",
+        generator="g",
+    )

@@ -1,0 +1,121 @@
+"""How a library packs a scenario file does not matter to its content hash."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+from typing import Any
+
+import h5py
+import independent_hash
+import netCDF4
+import xarray as xr
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from scenario_factory import make_key, write_scenario
+
+from lagbench.format import rehash
+
+KEY = make_key()
+DIMS = {
+    "frame": ("frame",),
+    "time": ("frame",),
+    "particle": ("particle",),
+    "space": ("space",),
+    "wall": ("wall",),
+    "position": ("frame", "particle", "space"),
+    "velocity": ("frame", "particle", "space"),
+    "material": ("particle",),
+    "particle_mass": (),
+    "wall_velocity": ("frame", "wall", "space"),
+}
+
+
+@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    library=st.sampled_from(["h5py", "netcdf4", "xarray"]),
+    level=st.integers(0, 9),
+    shuffle=st.booleans(),
+    chunk=st.tuples(st.integers(1, 4), st.integers(1, 8), st.integers(1, 2)),
+    order=st.randoms(use_true_random=False),
+)
+def test_packing_does_not_matter(
+    tmp_path: Path, library: str, level: int, shuffle: bool, chunk: tuple[int, int, int], order: random.Random
+) -> None:
+    """Chunks, compression, library and order of attributes leave the hash as it is."""
+    path, content = write_scenario(tmp_path, KEY)
+    other = tmp_path / f"{library}.nc"
+    REPACK[library](path, other, level, shuffle, chunk, order)
+    assert rehash(other) == content
+    assert independent_hash.content_hash(other) == content
+
+
+def repack_h5py(
+    path: Path, other: Path, level: int, shuffle: bool, chunk: tuple[int, int, int], order: random.Random
+) -> None:
+    """Copy a scenario file by h5py with other packing."""
+    with h5py.File(path) as old, h5py.File(other, "w", track_order=True) as new:
+        names = shuffled(old, order)
+        for name in names:
+            packing = {"chunks": chunk, "shuffle": shuffle} if name in ("position", "velocity") else {}
+            if packing and level:
+                packing |= {"compression": "gzip", "compression_opts": level}
+            dtype = h5py.string_dtype() if old[name].dtype.kind == "O" else old[name].dtype.newbyteorder(">")
+            new.create_dataset(name, data=old[name][()], dtype=dtype, **packing)
+            if DIMS[name] == (name,):
+                new[name].make_scale(name)
+        for name in names:
+            for axis, dim in enumerate(DIMS[name] if DIMS[name] != (name,) else ()):
+                new[name].dims[axis].attach_scale(new[dim])
+        for name in shuffled(old.attrs, order):
+            value = old.attrs[name]
+            new.attrs[name] = value.decode() if isinstance(value, bytes) else value
+
+
+def repack_netcdf4(
+    path: Path, other: Path, level: int, shuffle: bool, chunk: tuple[int, int, int], order: random.Random
+) -> None:
+    """Copy a scenario file by netCDF4 with other packing."""
+    with netCDF4.Dataset(path) as old, netCDF4.Dataset(other, "w") as new:
+        for name in shuffled(old.dimensions, order):
+            new.createDimension(name, None if name == "frame" else old.dimensions[name].size)
+        for name in shuffled(old.variables, order):
+            dtype = old[name].dtype
+            packing: dict[str, Any] = {}
+            if chunked(name):
+                packing = {"chunksizes": chunk, "shuffle": shuffle, "endian": "big"}
+                packing |= {"compression": "zlib" if level else None, "complevel": level}
+                dtype = dtype.newbyteorder(">")
+            variable = new.createVariable(name, dtype, DIMS[name], **packing)
+            variable[...] = old[name][...]
+        new.setncatts({name: old.getncattr(name) for name in shuffled(old.ncattrs(), order)})
+
+
+def repack_xarray(
+    path: Path, other: Path, level: int, shuffle: bool, chunk: tuple[int, int, int], order: random.Random
+) -> None:
+    """Copy a scenario file by xarray with other packing."""
+    with xr.open_dataset(path) as old:
+        loaded = old.load().drop_encoding()
+    loaded = loaded[shuffled(loaded.data_vars, order)]
+    loaded.attrs = {name: loaded.attrs[name] for name in shuffled(loaded.attrs, order)}
+    packing = {"chunksizes": chunk, "zlib": level > 0, "complevel": level, "shuffle": shuffle}
+    encoding: dict[str, dict[str, Any]] = {str(name): {"_FillValue": None} for name in loaded.variables}
+    for name in ("position", "velocity"):
+        encoding[name] |= packing
+    loaded.to_netcdf(other, engine="netcdf4", encoding=encoding)
+
+
+def shuffled(names: Any, order: random.Random) -> list[str]:
+    """Return names in random order, without the one that only netCDF may write."""
+    listed = [name for name in names if name != "_NCProperties"]
+    order.shuffle(listed)
+    return listed
+
+
+def chunked(name: str) -> bool:
+    """Return whether a variable is stored frame by frame."""
+    return name in ("position", "velocity")
+
+
+REPACK = {"h5py": repack_h5py, "netcdf4": repack_netcdf4, "xarray": repack_xarray}

@@ -1,0 +1,296 @@
+"""Generation: what is written, what is resumed, and that workers and devices leave no trace."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import SIZE, SPLIT
+from independent_hash import content_hash, dumps
+
+from lagbench.generation import GenerationResult, generate
+from lagbench.generators.batch import draw, substeps_of
+from lagbench.generators.draws import generator
+from lagbench.generators.twin import nudge
+from lagbench.manifest import read_manifest
+from lagbench.plan import estimate, select
+from lagbench.progress import Progress
+from lagbench.registry import Registry, load
+from lagbench.scenario_file import read_scenario
+
+
+def folder_of(root: Path) -> Path:
+    """Return the folder of the tiny data set."""
+    return root / SPLIT / SIZE / "v1"
+
+
+def contents(root: Path) -> dict[str, bytes]:
+    """Return name and bytes of every scenario file."""
+    return {path.name: path.read_bytes() for path in sorted(folder_of(root).glob("*/*.nc"))}
+
+
+def varied(path: Path, target: Path, old: str, new: str) -> Registry:
+    """Return a registry in which one text is another."""
+    text = path.read_text()
+    assert old in text
+    target.write_text(text.replace(old, new))
+    return load(target)
+
+
+def test_everything_is_there_and_hashed(generated: GenerationResult) -> None:
+    """Five files, whose data set hash follows by h5py and hashlib from the rules of the design."""
+    subsets = {}
+    for subset in ("train", "valid", "test"):
+        lines = [
+            f"{path.stem} {content_hash(path)}\n" for path in sorted((generated.folder / subset).glob("*.nc"))
+        ]
+        subsets[subset] = hashlib.sha256("".join(lines).encode()).hexdigest()
+    whole = dumps({"split": SPLIT, "size": SIZE, "major": 1, "subsets": subsets})
+    assert generated.dataset_sha256 == hashlib.sha256(whole).hexdigest()
+    assert generated.simulated == (0, 1, 2, 3, 4)
+    assert (generated.kept, generated.missing, generated.complete) == ((), (), True)
+    assert "nothing to compare with" in generated.verdict
+
+
+def test_nothing_else_is_left(generated: GenerationResult) -> None:
+    """Beside the scenarios stand manifest, cards, pictures and the lock; no temporary file."""
+    names = {
+        str(path.relative_to(generated.folder)) for path in generated.folder.rglob("*") if path.is_file()
+    }
+    scenarios = {"train/0000.nc", "train/0001.nc", "valid/0002.nc", "test/0003.nc", "test/0004.nc"}
+    cards = {"manifest.json", "README.md", "croissant.json", "pictures/frame.png", "pictures/scenarios.png"}
+    assert names == scenarios | cards | {".lock"}
+
+
+def test_a_file_holds_what_its_scenario_says(generated: GenerationResult, unmeasured: Registry) -> None:
+    """Frame 0 is the initial state drawn from the stated seed; parameters are those of the registry."""
+    size = unmeasured.size(SPLIT, SIZE)
+    with read_scenario(generated.folder / "test" / "0003.nc") as file:
+        header, first, material = file.header, file.read("position", 0), file.read("material")
+        velocity = file.read("velocity", 0)
+    state = draw(size, 3)
+    np.testing.assert_array_equal(first, state.position.astype(np.float32))
+    np.testing.assert_array_equal(velocity, state.velocity.astype(np.float32))
+    np.testing.assert_array_equal(material, state.material)
+    words = [int(word) for word in header.seed.split(", ")]
+    again = np.random.Generator(np.random.PCG64(np.random.SeedSequence(words)))
+    assert again.random() == generator(SPLIT, SIZE, 1, 3).random()
+    assert header.parameters["frequency"] == 2
+    assert header.parameters["start_substep"] == 0
+    assert header.parameters["modulus"] == size.value("modulus")
+
+
+def test_facts_of_the_manifest_follow_from_the_files(generated: GenerationResult) -> None:
+    """Energies are sums over the stored velocities; speed, CFL number and J stay in their bounds."""
+    manifest = read_manifest(generated.root, SPLIT, SIZE, 1)
+    assert manifest is not None
+    for entry in manifest.files:
+        with read_scenario(generated.folder / entry.path) as file:
+            velocity, mass = file.read("velocity").astype(np.float64), float(file.read("particle_mass"))
+        energy = 0.5 * mass * (velocity**2).sum(axis=(1, 2))
+        facts = entry.facts
+        assert facts["kinetic_energy_first"] == pytest.approx(energy[0], rel=1e-12)
+        assert facts["kinetic_energy_last"] == pytest.approx(energy[-1], rel=1e-12)
+        assert facts["kinetic_energy_mean"] == pytest.approx(energy.mean(), rel=1e-12)
+        assert facts["energy_last_over_max"] == pytest.approx(energy[-1] / energy.max(), rel=1e-12)
+        assert facts["max_speed"] >= np.abs(velocity).max()
+        assert 0.0 < facts["cfl"] < 1.0
+        assert 0.9 < facts["jacobian_min"] <= 1.0 <= facts["jacobian_max"] < 1.1
+
+
+def test_the_twin_starts_a_nudge_away(generated: GenerationResult, unmeasured: Registry) -> None:
+    """One RMSE per predicted frame; after one frame it is still near 2^-20."""
+    manifest = read_manifest(generated.root, SPLIT, SIZE, 1)
+    assert manifest is not None
+    horizon = unmeasured.size(SPLIT, SIZE).task.horizon
+    for entry in manifest.files:
+        assert len(entry.twin_floor) == (horizon if entry.subset == "test" else 0)
+        assert all(0.5 < floor * 2**20 < 2.0 for floor in entry.twin_floor[:1])
+        assert all(floor < 1e-4 for floor in entry.twin_floor)
+
+
+def test_the_nudge_has_a_stream_of_its_own(unmeasured: Registry) -> None:
+    """Every coordinate moves by exactly 2^-20, up or down as often, not as the scenario is drawn."""
+    size = unmeasured.size(SPLIT, SIZE)
+    signs = nudge(size, 3) * 2**20
+    assert set(np.unique(signs)) == {-1.0, 1.0}
+    assert abs(signs.mean()) < 0.1
+    assert not np.array_equal(signs, nudge(size, 4) * 2**20)
+    plain = generator(SPLIT, SIZE, 1, 3).random((size.particles, 2))
+    assert not np.array_equal(signs > 0, plain >= 0.5)
+
+
+def test_a_second_call_simulates_nothing(copied: Callable[[], Path], unmeasured: Registry) -> None:
+    """What is there and right stays, byte for byte, and so does the manifest."""
+    root = copied()
+    before, manifest = contents(root), (folder_of(root) / "manifest.json").read_bytes()
+    result = generate(SPLIT, SIZE, root=root, registry=unmeasured)
+    assert (result.simulated, result.kept) == ((), (0, 1, 2, 3, 4))
+    assert contents(root) == before
+    assert (folder_of(root) / "manifest.json").read_bytes() == manifest
+
+
+def test_resuming_makes_what_is_missing_or_wrong(
+    copied: Callable[[], Path], unmeasured: Registry, generated: GenerationResult
+) -> None:
+    """A removed and a damaged scenario are made anew by one worker; then all bytes are as before."""
+    root = copied()
+    before = contents(root)
+    (folder_of(root) / "test" / "0003.nc").unlink()
+    damaged = folder_of(root) / "train" / "0001.nc"
+    damaged.write_bytes(damaged.read_bytes()[:-1000])
+    leftover = folder_of(root) / "test" / ".0003.nc.99999.partial"
+    leftover.write_bytes(b"half a file")
+    result = generate(SPLIT, SIZE, root=root, workers=1, registry=unmeasured)
+    assert (result.simulated, result.kept) == ((1, 3), (0, 2, 4))
+    assert result.dataset_sha256 == generated.dataset_sha256
+    assert contents(root) == before
+    assert not leftover.exists()
+
+
+def test_parts_complete_each_other(tmp_path: Path, unmeasured: Registry, generated: GenerationResult) -> None:
+    """One subset first leaves complete: false and no data set hash; the rest gives the whole hash."""
+    part = generate(SPLIT, SIZE, subset="test", root=tmp_path, workers=1, registry=unmeasured)
+    assert (part.simulated, part.missing) == ((3, 4), (0, 1, 2))
+    assert (part.complete, part.dataset_sha256) == (False, None)
+    manifest = json.loads((folder_of(tmp_path) / "manifest.json").read_text())
+    assert manifest["complete"] is False
+    assert manifest["statistics"] == {}
+    rest = generate(SPLIT, SIZE, root=tmp_path, workers=1, registry=unmeasured)
+    assert (rest.simulated, rest.kept) == ((0, 1, 2), (3, 4))
+    assert rest.dataset_sha256 == generated.dataset_sha256
+
+
+def test_force_simulates_what_is_there(copied: Callable[[], Path], unmeasured: Registry) -> None:
+    """With force a good scenario is written again, with the same bytes."""
+    root = copied()
+    before, path = contents(root), folder_of(root) / "valid" / "0002.nc"
+    stamp = path.stat().st_mtime_ns
+    result = generate(SPLIT, SIZE, scenarios="2", root=root, workers=1, force=True, registry=unmeasured)
+    assert result.simulated == (2,)
+    assert path.stat().st_mtime_ns > stamp
+    assert contents(root) == before
+
+
+def test_files_of_other_parameters_are_made_anew(
+    copied: Callable[[], Path], unmeasured_path: Path, tmp_path: Path
+) -> None:
+    """Whoever changes a parameter of an unreleased split does not keep files of the old one."""
+    registry = varied(
+        unmeasured_path,
+        tmp_path / "own.yaml",
+        "velocity_relaxation: {value: 0.002",
+        "velocity_relaxation: {value: 0.003",
+    )
+    result = generate(SPLIT, SIZE, root=copied(), dry_run=True, registry=registry)
+    assert (result.simulated, result.kept) == ((0, 1, 2, 3, 4), ())
+
+
+def test_a_dry_run_touches_nothing(tmp_path: Path, unmeasured: Registry, generated: GenerationResult) -> None:
+    """It tells bytes (an upper bound, not by much), time and free disk, and makes no folder."""
+    result = generate(SPLIT, SIZE, root=tmp_path / "new", dry_run=True, registry=unmeasured)
+    real = sum(len(data) for data in contents(generated.root).values())
+    assert real < result.bytes_needed < 2 * real
+    assert result.bytes_free > result.bytes_needed
+    assert result.seconds_expected > 0.0
+    assert result.simulated == (0, 1, 2, 3, 4)
+    assert not (tmp_path / "new").exists()
+
+
+def test_progress_ends_at_its_total(tmp_path: Path, unmeasured: Registry) -> None:
+    """Substeps of the scenario and of its twin are counted, none twice."""
+    news: list[Progress] = []
+    generate(SPLIT, SIZE, scenarios="3", root=tmp_path, progress=news.append, registry=unmeasured)
+    size = unmeasured.size(SPLIT, SIZE)
+    simulating = [state for state in news if state.stage == "simulating"]
+    assert simulating[0].total == 2 * substeps_of(size, 3) == 2 * 25 * 12
+    assert [state.done for state in simulating] == sorted(state.done for state in simulating)
+    assert simulating[-1].done == simulating[-1].total
+    assert simulating[-1].scenarios_done == 1
+
+
+def test_batches_start_each_scenario_at_its_own_substep(tmp_path: Path, unmeasured_path: Path) -> None:
+    """Three cavities that start at 3, 6 and 30 substeps or so: one batch and single runs, equal hashes."""
+    registry = varied(
+        unmeasured_path, tmp_path / "own.yaml", "start_time_max: {value: 120.0", "start_time_max: {value: 0.4"
+    )
+    options = {"scenarios": "0-2", "registry": registry}
+    one = generate("cavity", "tiny", root=tmp_path / "cpu", workers=2, **options)  # type: ignore[arg-type]
+    generate("cavity", "tiny", root=tmp_path / "parallel", device="parallel", **options)  # type: ignore[arg-type]
+    assert len({draw(registry.size("cavity", "tiny"), i).start_substep for i in range(3)}) == 3
+    manifests = [read_manifest(tmp_path / device, "cavity", "tiny", 1) for device in ("cpu", "parallel")]
+    hashes = [[entry.content_sha256 for entry in manifest.files] for manifest in manifests if manifest]
+    assert one.simulated == (0, 1, 2)
+    assert hashes[0] == hashes[1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("split", ["curl-noise", "fluid", "multimaterial"])
+def test_parallel_driver_gives_the_same_data_set(split: str, tmp_path: Path, unmeasured: Registry) -> None:
+    """The GPU's kernels with all scenarios in one batch agree to the bit with the serial kernel."""
+    hashes = {
+        generate(split, "tiny", root=tmp_path / device, device=device, registry=unmeasured).dataset_sha256
+        for device in ("cpu", "parallel")
+    }
+    assert len(hashes) == 1
+    assert None not in hashes
+
+
+def test_selection_by_subset_and_id(unmeasured: Registry) -> None:
+    """Both narrow the choice; ids come back ascending and once."""
+    size = unmeasured.size("multimaterial", "full")
+    assert select(size, subset="valid,test") == tuple(range(48, 60))
+    assert select(size, subset=["extra"], scenarios="61,60") == (60, 61)
+    assert select(size, scenarios=[5, 3, 5]) == (3, 5)
+    assert len(select(size)) == 75
+
+
+def test_estimates_add_up(unmeasured: Registry) -> None:
+    """Bytes follow from frames and particles; time from substeps, never below the longest scenario's."""
+    size = unmeasured.size("fluid", "tiny")
+    expected = estimate(size, (0, 1))
+    assert expected.substeps == (31 * 5, 31 * 5)
+    assert expected.frames == 64
+    assert expected.bytes == 2 * (32 * 256 * 16 + 65536)
+    assert expected.seconds(1) == pytest.approx(2 * expected.seconds(2))
+    assert expected.seconds(9) == expected.seconds(2)
+
+
+WORKER = """
+import resource, sys
+from pathlib import Path
+from lagbench.generators.batch import Job
+from lagbench.generators.simulate import simulate
+from lagbench.registry import load
+size = load(Path(sys.argv[1])).size(sys.argv[2], "full")
+short = size.model_copy(update={"frames": 3, "parameters": {**size.parameters}})
+simulate(Job(size=short, scenarios=(int(sys.argv[3]),), root=Path(sys.argv[4])), lambda units: None)
+heavy = {"xarray", "pandas", "matplotlib", "torch", "dask", "scipy"} & sys.modules.keys()
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, sorted(heavy))
+"""
+
+
+@pytest.mark.parametrize(("split", "scenario"), [("curl-noise", 50), ("multimaterial", 54)])
+def test_a_worker_stays_small(split: str, scenario: int, unmeasured_path: Path, tmp_path: Path) -> None:
+    """Simulating and writing three frames of the full size takes at most 400 MB and no heavy library."""
+    command = [sys.executable, "-c", WORKER, str(unmeasured_path), split, str(scenario), str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=True)
+    kilobytes, heavy = done.stdout.splitlines()[-1].split(" ", 1)
+    assert int(kilobytes) <= 400_000
+    assert heavy == "[]"
+
+
+def test_this_process_never_loads_taichi(generated: GenerationResult) -> None:
+    """The parent only plans: Taichi lives in the workers."""
+    code = (
+        "import sys, lagbench.generation as g; "
+        f"g.generate({SPLIT!r}, {SIZE!r}, root={str(generated.root)!r}, dry_run=True); "
+        "assert not {'taichi', 'torch'} & sys.modules.keys()"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)

@@ -1,0 +1,120 @@
+"""One writer at a time; a dead one blocks nobody."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from lagbench.errors import WorkFailedError
+from lagbench.layout import dataset_folder
+from lagbench.locking import dataset_lock, read_holder
+
+HOLD = """
+import sys, time
+from pathlib import Path
+from lagbench.locking import dataset_lock
+with dataset_lock(Path(sys.argv[1]), "cavity", "tiny", 1):
+    print("held", flush=True)
+    sys.stdin.readline()
+"""
+
+
+@pytest.fixture
+def other(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
+    """Another process that holds the lock until a line reaches its input."""
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "held\n"
+        yield process
+        process.kill()
+
+
+def test_a_second_writer_is_told_who_holds_the_lock(tmp_path: Path, other: subprocess.Popen[str]) -> None:
+    """With timeout 0 the error names process, host and time at once, exit code 5."""
+    start = time.monotonic()
+    with pytest.raises(WorkFailedError) as caught, dataset_lock(tmp_path, "cavity", "tiny", 1, timeout=0):
+        pass
+    assert time.monotonic() - start < 5
+    assert caught.value.exit_code == 5
+    assert re.search(
+        rf"process {other.pid} on {re.escape(os.uname().nodename)}, since 20..-..-..T", str(caught.value)
+    )
+
+
+def test_a_second_writer_waits(tmp_path: Path, other: subprocess.Popen[str]) -> None:
+    """Without a timeout it says whom it waits for and goes on when the first one ends."""
+    told: list[str] = []
+
+    def release(holder: str) -> None:
+        told.append(holder)
+        assert other.stdin is not None
+        other.stdin.write("\n")
+        other.stdin.flush()
+
+    with dataset_lock(tmp_path, "cavity", "tiny", 1, on_wait=release):
+        holder = read_holder(dataset_folder(tmp_path, "cavity", "tiny", 1))
+        assert holder is not None
+        assert holder.pid == os.getpid()
+    assert len(told) == 1
+    assert f"process {other.pid}" in told[0]
+
+
+def test_a_killed_writer_blocks_nobody(tmp_path: Path, other: subprocess.Popen[str]) -> None:
+    """After kill -9 the holder file is stale, and the lock is free all the same."""
+    other.send_signal(signal.SIGKILL)
+    other.wait()
+    folder = dataset_folder(tmp_path, "cavity", "tiny", 1)
+    stale = read_holder(folder)
+    assert stale is not None
+    assert stale.pid == other.pid
+    with dataset_lock(tmp_path, "cavity", "tiny", 1, timeout=0):
+        pass
+    assert read_holder(folder) is None
+
+
+def test_other_data_sets_are_not_locked(tmp_path: Path, other: subprocess.Popen[str]) -> None:
+    """Another size or MAJOR version of the split can be written meanwhile."""
+    with (
+        dataset_lock(tmp_path, "cavity", "mini", 1, timeout=0),
+        dataset_lock(tmp_path, "cavity", "tiny", 2, timeout=0),
+    ):
+        assert other.poll() is None
+
+
+def test_the_lock_is_free_after_an_error(tmp_path: Path) -> None:
+    """Whatever ends the block frees the lock."""
+    with pytest.raises(KeyboardInterrupt), dataset_lock(tmp_path, "cavity", "tiny", 1):
+        raise KeyboardInterrupt
+    with dataset_lock(tmp_path, "cavity", "tiny", 1, timeout=0):
+        pass
+
+
+def test_an_unwritable_root_is_told(tmp_path: Path) -> None:
+    """A root that cannot hold folders gives exit code 5 with the remedy."""
+    (tmp_path / "cavity").write_text("in the way")
+    with (
+        pytest.raises(WorkFailedError, match=r"(?s)cannot lock.*--root"),
+        dataset_lock(tmp_path, "cavity", "tiny", 1),
+    ):
+        pass
+
+
+def test_a_damaged_holder_file_is_no_obstacle(tmp_path: Path) -> None:
+    """The holder file is information only: rubbish in it reads as nobody."""
+    folder = dataset_folder(tmp_path, "cavity", "tiny", 1)
+    folder.mkdir(parents=True)
+    for text in ("", "[1]", '{"pid": 1}', '{"pid": 1, "host": "a", "since": "b", "more": 2}', "\x00"):
+        (folder / ".lock.holder.json").write_text(text)
+        assert read_holder(folder) is None
+    with dataset_lock(tmp_path, "cavity", "tiny", 1, timeout=0):
+        pass

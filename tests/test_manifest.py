@@ -1,0 +1,152 @@
+"""The manifest tells what is there, and completes over partial generations."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from scenario_factory import make_key, write_scenario
+
+from lagbench.checksums import dataset_hash, subset_hash
+from lagbench.errors import DataError
+from lagbench.manifest import FileEntry, Manifest, describe_file, merge, read_manifest, write_manifest
+
+SUBSETS = {"train": (0, 1), "valid": (2,), "test": (3, 4), "extra": (5,)}
+STATISTICS = {"velocity_std": (0.00219, 0.00218)}
+
+
+def entry(scenario: int, content: str = "") -> FileEntry:
+    """Return a made-up entry."""
+    subset = next(name for name, ids in SUBSETS.items() if scenario in ids)
+    return FileEntry(
+        scenario=scenario,
+        subset=subset,
+        path=f"{subset}/{scenario:04d}.nc",
+        frames=4,
+        particles=8,
+        content_sha256=(content or hashlib.sha256(bytes([scenario])).hexdigest()),
+        bytes=100,
+        file_sha256="0" * 64,
+        device="cpu",
+        facts={"energy_last_over_max": 0.25},
+    )
+
+
+def merged(old: Manifest | None, ids: Iterable[int], **options: Any) -> Manifest:
+    """Return an old manifest with made-up entries merged in."""
+    return merge(
+        old,
+        [entry(i) for i in ids],
+        split="cavity",
+        size="tiny",
+        version="1.2.0",
+        subsets=SUBSETS,
+        **{"environment": {"python": "3.11"}, "statistics": None, **options},
+    )
+
+
+def test_partial_generations_complete_each_other() -> None:
+    """Two halves in any order end with the manifest of one whole run."""
+    whole = merged(None, range(5), statistics=STATISTICS)
+    half = merged(None, (4, 2))
+    assert (half.complete, half.dataset_sha256, set(half.subset_sha256)) == (False, None, {"valid"})
+    assert merged(half, (3, 0, 1), statistics=STATISTICS) == whole
+    assert whole.complete
+    assert [file.scenario for file in whole.files] == [0, 1, 2, 3, 4]
+
+
+def test_hashes_are_those_of_the_files() -> None:
+    """Subset and data set hash follow from the content hashes; extra is hashed but outside."""
+    manifest = merged(None, range(6))
+    expected = {name: subset_hash({i: entry(i).content_sha256 for i in ids}) for name, ids in SUBSETS.items()}
+    assert manifest.subset_sha256 == expected
+    assert manifest.dataset_sha256 == dataset_hash("cavity", "tiny", 1, expected)
+    assert merged(None, range(5)).dataset_sha256 == manifest.dataset_sha256
+
+
+def test_new_entries_replace_old_ones() -> None:
+    """A regenerated file counts, not the one before it; ids that the size dropped go."""
+    old = merged(None, range(6))
+    again = merge(
+        old,
+        [entry(3, "f" * 64)],
+        split="cavity",
+        size="tiny",
+        version="1.3.0",
+        subsets={name: ids for name, ids in SUBSETS.items() if name != "extra"},
+        environment={},
+    )
+    found = again.entry(3)
+    assert found is not None
+    assert found.content_sha256 == "f" * 64
+    assert again.entry(5) is None
+    assert again.dataset_sha256 != old.dataset_sha256
+
+
+def test_statistics_wait_for_train_and_stay() -> None:
+    """They are dropped while train is incomplete and kept when a later run brings none."""
+    assert merged(None, (0, 3), statistics=STATISTICS).statistics == {}
+    first = merged(None, (0, 1), statistics=STATISTICS)
+    assert first.statistics == STATISTICS
+    assert merged(first, (2, 3, 4)).statistics == STATISTICS
+
+
+def test_identity_and_environments_add_up() -> None:
+    """One device without equal bits taints the whole; equal environments are listed once."""
+    first = merged(None, (0,))
+    second = merged(first, (1,), identity="tolerance", environment={"python": "3.12"})
+    third = merged(second, (2,))
+    assert (first.identity, third.identity) == ("bitwise", "tolerance")
+    assert third.environments == ({"python": "3.11"}, {"python": "3.12"})
+
+
+def test_round_trip_and_atomic_write(tmp_path: Path) -> None:
+    """What is written is read back, as plain JSON, with no temporary file left."""
+    manifest = merged(None, range(5), statistics=STATISTICS)
+    path = write_manifest(tmp_path, manifest)
+    assert path == tmp_path / "cavity" / "tiny" / "v1" / "manifest.json"
+    assert read_manifest(tmp_path, "cavity", "tiny", 1) == manifest
+    assert list(path.parent.iterdir()) == [path]
+    assert json.loads(path.read_text())["files"][3]["facts"] == {"energy_last_over_max": 0.25}
+    assert read_manifest(tmp_path, "cavity", "tiny", 2) is None
+
+
+@pytest.mark.parametrize(
+    ("change", "key"),
+    [
+        ({"complete": "yes"}, "complete"),
+        ({"files": [{"scenario": 1}]}, "files.0.subset"),
+        ({"dataset_sha256": "12"}, "dataset_sha256"),
+        ({"colour": 1}, "colour"),
+        ({"format": 2}, "format"),
+    ],
+)
+def test_a_damaged_manifest_names_the_key(tmp_path: Path, change: dict[str, Any], key: str) -> None:
+    """Wrong types, unknown keys and formats are told with file, key and remedy."""
+    path = write_manifest(tmp_path, merged(None, range(5)))
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    with pytest.raises(DataError, match=rf"(?s)manifest is damaged.*manifest.json, key {key}.*fix"):
+        read_manifest(tmp_path, "cavity", "tiny", 1)
+
+
+def test_a_truncated_manifest_is_told(tmp_path: Path) -> None:
+    """Text that is no JSON is damage of the whole file."""
+    path = write_manifest(tmp_path, merged(None, range(5)))
+    path.write_text(path.read_text()[:-20])
+    with pytest.raises(DataError, match="whole file"):
+        read_manifest(tmp_path, "cavity", "tiny", 1)
+
+
+def test_entry_of_a_file_on_disk(tmp_path: Path) -> None:
+    """The entry holds what the file says and the hash of its bytes."""
+    key = make_key(3)
+    path, content = write_scenario(tmp_path, key)
+    found = describe_file(tmp_path, key, {"energy": 0.5})
+    assert (found.content_sha256, found.frames, found.particles) == (content, 4, 8)
+    assert (found.path, found.bytes) == ("test/0003.nc", path.stat().st_size)
+    assert found.file_sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+    assert found.facts == {"energy": 0.5}

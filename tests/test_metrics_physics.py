@@ -1,0 +1,123 @@
+"""Energy, momentum, density and divergence against closed forms and numbers worked by hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from metric_flows import Floats, lattice, pair_of, pairs_of, rollout, scenario_of, swirl
+
+from lagbench.metrics import METRICS, Score, aggregate, select, tally
+from lagbench.metrics.energy import energy_error
+
+
+def measured(name: str, *args: object, **kwargs: object) -> float:
+    """Measure a metric on the pair that the arguments describe."""
+    return METRICS[name].measure(pair_of(*args, **kwargs))  # type: ignore[arg-type]
+
+
+def scores_of(truth: Floats, prediction: Floats) -> dict[str, Score]:
+    """Return all scores of one scenario."""
+    scenario = scenario_of(truth, horizon=len(truth) - 2)
+    metrics = select()
+    pieces = tally(pairs_of(scenario, truth, prediction), metrics, scenario.setting.predicted_frames)
+    return aggregate(metrics, {0: pieces})
+
+
+def test_energy_by_hand() -> None:
+    """Two particles of mass 1/2, speeds^2 0.05 and 0.04: E = (0.05 + 0.04)/4 = 0.0225 (Eq. 5.11)."""
+    x = [[0.4, 0.4], [0.6, 0.6]]
+    u = [[0.1, 0.2], [0.0, -0.2]]
+    assert measured("energy_true", x, u, np.zeros((2, 2))) == pytest.approx(0.0225)
+    assert measured("energy_predicted", x, u, np.zeros((2, 2))) == 0.0
+
+
+def test_a_prediction_twice_as_fast_has_four_times_the_energy() -> None:
+    """E is quadratic: ratio 4, retention 4 against a steady truth's 1, error 3."""
+    x = lattice(10)
+    u = np.full_like(x, 0.01)
+    truth = np.stack([x + f * u for f in range(5)])
+    prediction = truth.copy()
+    prediction[2:] = truth[1] + 2 * np.arange(1, 4)[:, None, None] * u
+    scores = scores_of(truth, prediction)
+    assert scores["energy_ratio"].mean == pytest.approx(4.0)
+    assert scores["energy_retention"].mean == pytest.approx(4.0)
+    assert scores["energy_retention_true"].mean == pytest.approx(1.0)
+    assert scores["energy_error"].mean == pytest.approx(3.0)
+
+
+def test_energy_error_has_a_floor() -> None:
+    """E_true = 1, 0: the second frame is scaled by 1e-3, so an excess of 1e-4 there is 0.1."""
+    found = energy_error(np.array([0.5, 1e-4]), np.array([1.0, 0.0]))
+    np.testing.assert_allclose(found, [0.5, 0.1])
+
+
+def test_energy_of_a_truth_at_rest_is_undefined() -> None:
+    """No ratio, retention or error exists where the truth never moves; its frames are counted."""
+    x = np.repeat(lattice(10)[None], 5, axis=0)
+    moving = x + 0.001 * np.arange(5)[:, None, None]
+    scores = scores_of(x, moving)
+    for name in (
+        "energy_ratio",
+        "energy_retention",
+        "energy_error",
+        "momentum_error",
+        "angular_momentum_error",
+    ):
+        assert math.isnan(scores[name].mean)
+        assert scores[name].undefined == (3,)
+
+
+def test_momentum_by_hand() -> None:
+    """Truth two particles at speeds 3 and 4 apart, prediction with (0.3, 0.4) more each: 2 * 0.5 / 7."""
+    x = [[0.3, 0.5], [0.7, 0.5]]
+    u = np.array([[3.0, 0.0], [0.0, 4.0]])
+    assert measured("momentum_error", x, u, u + np.array([0.3, 0.4])) == pytest.approx(1.0 / 7.0)
+
+
+def test_angular_momentum_of_rotation() -> None:
+    """Solid-body rotation off by 10 %: L_pred - L_true = 0.1 L, and the scale is L itself."""
+    x = lattice(12)
+    u = 0.1 * np.stack([-(x[:, 1] - 0.5), x[:, 0] - 0.5], axis=1)
+    assert measured("angular_momentum_error", x, u, 1.1 * u) == pytest.approx(0.1)
+    assert measured("angular_momentum_error", x, u, -u) == pytest.approx(2.0)
+
+
+def test_a_shift_has_no_angular_momentum_about_the_centre() -> None:
+    """Added uniform motion changes momentum, not angular momentum of a symmetric body."""
+    x = lattice(12)
+    u = 0.1 * np.stack([-(x[:, 1] - 0.5), x[:, 0] - 0.5], axis=1)
+    faster = u + np.array([0.01, 0.02])
+    assert measured("angular_momentum_error", x, u, faster) == pytest.approx(0.0, abs=1e-12)
+    assert measured("momentum_error", x, u, faster) > 0.1
+
+
+def test_missing_material_shows_in_the_density() -> None:
+    """Emptying the box takes density 1 from the inside nodes: RMSE is the RMS of the truth's density."""
+    x = lattice(20)
+    pair = pair_of(x, 0 * x, 0 * x, predicted_position=x + 10.0)
+    density = pair.truth.fields.density
+    assert density[3:-3, 3:-3] == pytest.approx(1.0)
+    assert METRICS["density_rmse"].measure(pair) == pytest.approx(math.sqrt(np.mean(density**2)))
+
+
+def test_divergence_of_an_expansion() -> None:
+    """The flow 0.01 r expands at 0.02 at nodes away from the walls; the swirl does not."""
+    x = lattice(30)
+    u = 0.01 * swirl(x)
+    pair = pair_of(x, u, u + 0.01 * (x - 0.5))
+    found = pair.predicted_fields.divergence[4:-4, 4:-4]
+    assert found == pytest.approx(0.02, rel=1e-6)
+    expanding, still = (METRICS[n].measure(pair) for n in ("divergence_rms", "divergence_rms_true"))
+    assert 0.01 < expanding < 0.03
+    assert still < 0.1 * expanding
+
+
+def test_observables_of_the_truth_do_not_depend_on_the_prediction() -> None:
+    """What is shown of the truth is the same beside any prediction."""
+    truth = rollout()
+    rng = np.random.default_rng(3)
+    ours, theirs = (scores_of(truth, truth + s * rng.standard_normal(truth.shape)) for s in (0.0, 0.01))
+    for name in ("energy_true", "energy_retention_true", "divergence_rms_true"):
+        assert ours[name].mean == theirs[name].mean

@@ -1,0 +1,207 @@
+"""Vorticity errors and distributions against SciPy, closed forms and numbers worked by hand."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.stats
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from metric_flows import lattice, pair_of, swirl
+from numpy.testing import assert_allclose
+
+from lagbench.metrics import METRICS, FramePair
+from lagbench.metrics.distributions import histograms, kl, normalised, wasserstein1
+from lagbench.metrics.reductions import frames_before_fall
+from lagbench.metrics.vorticity import pearson, slope
+
+VALUES = arrays(np.float64, 40, elements=st.floats(-1e3, 1e3).map(lambda v: round(v, 3)))
+
+
+def measured(pair: FramePair, *names: str) -> list[float]:
+    """Measure metrics of one pair."""
+    return [METRICS[name].measure(pair) for name in names]
+
+
+def swirls(scale: float, noise: float = 0.0) -> FramePair:
+    """Return a pair in which the prediction turns ``scale`` times as fast, with noise."""
+    x = lattice(30)
+    u = 0.01 * swirl(x)
+    v = scale * u + noise * np.random.default_rng(1).standard_normal(u.shape)
+    return pair_of(x, u, v)
+
+
+def test_a_scaled_flow_has_closed_errors() -> None:
+    """With omega_pred = 1.2 omega: RMSE = 0.2 rms(omega), r = 1, slope of the residual 0.2."""
+    pair = swirls(1.2)
+    omega = pair.true_vorticity
+    mse, mae, r, tilt, mean = measured(
+        pair,
+        "vorticity_mse",
+        "vorticity_mae",
+        "vorticity_pearson",
+        "vorticity_residual_slope",
+        "vorticity_residual_mean",
+    )
+    assert mse == pytest.approx(0.04 * np.mean(omega**2))
+    assert mae == pytest.approx(0.2 * np.mean(np.abs(omega)))
+    assert r == pytest.approx(1.0)
+    assert tilt == pytest.approx(0.2)
+    assert mean == pytest.approx(0.2 * np.mean(omega))
+
+
+def test_added_solid_body_rotation_shows_as_residual() -> None:
+    """A prediction that also turns by Omega has residual 2 Omega wherever no wall is near."""
+    x = lattice(30)
+    u = 0.01 * swirl(x)
+    turn = 0.003 * np.stack([-(x[:, 1] - 0.5), x[:, 0] - 0.5], axis=1)
+    assert measured(pair_of(x, u, u + turn), "vorticity_residual_p50") == pytest.approx([0.006])
+
+
+def test_taylor_green_vorticity_follows_its_closed_form() -> None:
+    """Omega = 2 pi U sin(pi x) sin(pi y), damped as spline and central difference damp a wave."""
+    omega = swirls(1.0).truth.fields.vorticity[2:-2, 2:-2]
+    wave = np.sin(np.pi * (np.arange(10) + 0.5) / 10)[2:-2]
+    # with k h = pi / 10: the quadratic spline keeps (sin(kh/2) / (kh/2))^3 along each axis, which is 0.98772,
+    # the difference sin(kh) / (kh) = 0.98363; in all 0.9596
+    damping = 0.98772**2 * 0.98363
+    assert_allclose(omega, damping * 0.02 * np.pi * np.outer(wave, wave), rtol=1e-3)
+
+
+def test_correlation_and_slope_are_scipys() -> None:
+    """Eq. 5.21 is scipy.stats.pearsonr, the slope that of linregress."""
+    pair = swirls(0.7, noise=0.003)
+    x, y = pair.true_vorticity, pair.predicted_vorticity
+    r, tilt = measured(pair, "vorticity_pearson", "vorticity_residual_slope")
+    assert r == pytest.approx(scipy.stats.pearsonr(x, y).statistic, rel=1e-12)
+    assert tilt == pytest.approx(scipy.stats.linregress(x, y - x).slope, rel=1e-9)
+
+
+def test_correlation_by_hand() -> None:
+    """Of 1 2 3 and 1 3 2: covariance 1, both sums of squares 2, so r = 1/2."""
+    assert pearson(np.array([1.0, 2.0, 3.0]), np.array([1.0, 3.0, 2.0])) == pytest.approx(0.5)
+    assert slope(np.array([1.0, 2.0, 3.0]), np.array([2.0, 4.0, 6.0])) == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize("constant", [0.0, 0.1, 1e9])
+def test_a_constant_field_has_no_correlation(constant: float) -> None:
+    """Pearson is NaN where either field is constant to rounding; SciPy says the same, with a warning."""
+    x = np.linspace(-1.0, 1.0, 30)
+    y = np.full(30, constant) * (1 + 1e-16)
+    assert math.isnan(pearson(x, y))
+    assert math.isnan(pearson(y, x))
+    assert math.isnan(slope(y, x))
+    with pytest.warns(scipy.stats.ConstantInputWarning):
+        assert math.isnan(scipy.stats.pearsonr(x, y).statistic)
+
+
+def test_residual_moments_and_percentiles_are_numpys() -> None:
+    """Mean, std, greatest size and percentiles of r = predicted - true (Eq. 5.22)."""
+    pair = swirls(0.9, noise=0.002)
+    r = pair.predicted_vorticity - pair.true_vorticity
+    names = ("mean", "std", "max", "p05", "p25", "p50", "p75", "p95")
+    found = measured(pair, *(f"vorticity_residual_{name}" for name in names))
+    percentiles = [np.percentile(r, q) for q in (5, 25, 50, 75, 95)]
+    assert_allclose(found, [r.mean(), r.std(), np.abs(r).max(), *percentiles], rtol=1e-12)
+
+
+def test_at_rest_the_residual_slope_is_minus_one() -> None:
+    """A prediction at rest has r = -omega: slope -1, no correlation."""
+    tilt, r = measured(swirls(0.0), "vorticity_residual_slope", "vorticity_pearson")
+    assert tilt == pytest.approx(-1.0)
+    assert math.isnan(r)
+
+
+def test_fewer_than_sixteen_nodes_are_undefined() -> None:
+    """A blob of 4 x 4 cells with 2 x 2 differentiable nodes has no vorticity metrics, and no divergence."""
+    x = 0.3 + 0.4 * lattice(20)
+    u = 0.01 * swirl(x)
+    blob = replace(pair_of(x, u, u).scenario, area=0.16)
+    small = FramePair(blob, 2, blob.snapshot(x, x - u), blob.snapshot(x, x - 1.1 * u))
+    assert small.node_count == 4
+    names = [
+        name for name, m in METRICS.items() if m.statistic and name.startswith(("vorticity", "divergence"))
+    ]
+    assert len(names) > 10
+    assert all(math.isnan(v) for v in measured(small, *names))
+    assert not math.isnan(METRICS["density_rmse"].measure(small))
+
+
+def test_divergence_per_node_is_scipys_entropy() -> None:
+    """Eqs. 5.23-5.25: scipy.stats.entropy normalises its arguments itself."""
+    pair = swirls(0.8, noise=0.002)
+    p, q = (np.abs(w) + 1e-10 for w in (pair.true_vorticity, pair.predicted_vorticity))
+    assert measured(pair, "vorticity_kl") == pytest.approx([scipy.stats.entropy(p, q)], rel=1e-9)
+
+
+def test_divergence_by_hand() -> None:
+    """P = (1/4, 3/4), Q = (1/2, 1/2): ln(1/2)/4 + 3 ln(3/2)/4 = 0.130812."""
+    p, q = normalised(np.array([-1.0, 3.0])), normalised(np.array([2.0, -2.0]))
+    assert kl(p, q) == pytest.approx(0.130812, abs=1e-6)
+
+
+def test_histogram_divergence_is_numpys_histogram() -> None:
+    """64 bins over the truth's range, the outer ones open, half a count added to each."""
+    pair = swirls(1.3, noise=0.002)
+    for name, of in (("vorticity_kl_hist", np.asarray), ("vorticity_kl_hist_abs", np.abs)):
+        x, y = of(pair.true_vorticity), of(pair.predicted_vorticity)
+        edges = np.linspace(x.min(), x.max(), 65)
+        edges[0], edges[-1] = -np.inf, np.inf
+        p, q = (np.histogram(w, edges)[0] + 0.5 for w in (x, y))
+        assert measured(pair, name) == pytest.approx([scipy.stats.entropy(p, q)], rel=1e-9)
+
+
+def test_histograms_of_a_constant_truth_are_undefined() -> None:
+    """Where the truth has no range there are no bins."""
+    assert histograms(np.ones(20), np.arange(20.0)) is None
+    x = lattice(30)
+    assert math.isnan(measured(pair_of(x, 0 * x, 0.01 * swirl(x)), "vorticity_kl_hist")[0])
+
+
+def test_mirrored_flow_keeps_its_histogram() -> None:
+    """How much rotation there is does not change in a mirror, where it is does."""
+    values = np.array([0.1, 0.4, 0.2, 0.8, 0.3, 0.7] * 5)
+    assert kl(*histograms(values, values[::-1])) == 0.0  # type: ignore[misc]
+    assert wasserstein1(values, values[::-1]) == 0.0
+    assert kl(normalised(values), normalised(values[::-1])) > 0.1
+
+
+@settings(deadline=None)
+@given(VALUES, VALUES)
+def test_wasserstein_is_scipys(x: np.ndarray, y: np.ndarray) -> None:
+    """The mean distance of order statistics is scipy.stats.wasserstein_distance."""
+    assert wasserstein1(x, y) == pytest.approx(scipy.stats.wasserstein_distance(x, y), rel=1e-9, abs=1e-9)
+
+
+def test_wasserstein_grows_where_the_histogram_saturates() -> None:
+    """Ten and a hundred times too fast fall into the same open bins; W1 tells them apart."""
+    near, far = swirls(10.0), swirls(100.0)
+    (kl_near, w_near), (kl_far, w_far) = (
+        measured(pair, "vorticity_kl_hist", "vorticity_w1") for pair in (near, far)
+    )
+    assert kl_far < 1.2 * kl_near
+    assert w_far > 5 * w_near
+
+
+@pytest.mark.parametrize(
+    ("correlations", "frames"),
+    [
+        ([0.9, 0.85, 0.79, 0.95], 2.0),
+        ([0.9, math.nan, 0.5], 2.0),
+        ([0.8, 0.8], 2.0),
+        ([0.1], 0.0),
+        ([0.9, math.nan], 2.0),
+    ],
+)
+def test_stable_frames_by_hand(correlations: list[float], frames: float) -> None:
+    """Frames before the first value under 0.8; undefined frames pass, the threshold itself holds."""
+    assert frames_before_fall(np.array(correlations)) == frames
+
+
+def test_stable_frames_of_nothing_defined() -> None:
+    """A rollout without any defined correlation is neither stable nor unstable."""
+    assert math.isnan(frames_before_fall(np.full(4, np.nan)))

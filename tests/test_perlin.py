@@ -1,0 +1,153 @@
+"""Jets, Perlin noise and the stream function against numbers from other routes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.polynomial import Polynomial
+from numpy.typing import NDArray
+
+from lagbench.generators import curl_noise, draws, jets, perlin
+
+LOW, HIGH = 0.0375, 0.9625
+
+
+def points(count: int, low: float = 0.0, high: float = 1.0) -> NDArray[np.float64]:
+    """Return reproducible points of a square."""
+    return low + (high - low) * np.random.Generator(np.random.PCG64(5)).random((count, 2))
+
+
+def noise_by_hand(x: float, y: float, lattice: NDArray[np.float64]) -> float:
+    """Perlin noise as thesis Eqs. 5.40 and 5.41 spell it, one point at a time."""
+    i, j = min(int(x), len(lattice) - 2), min(int(y), len(lattice) - 2)
+
+    def dot(k: int, m: int) -> float:
+        slope = lattice[i + k, j + m]
+        return float(slope[0] * (x - i - k) + slope[1] * (y - j - m))
+
+    def fade(t: float) -> float:
+        return 6 * t**5 - 15 * t**4 + 10 * t**3
+
+    def lerp(t: float, a: float, b: float) -> float:
+        return a + t * (b - a)
+
+    u, w = fade(x - i), fade(y - j)
+    return lerp(u, lerp(w, dot(0, 0), dot(0, 1)), lerp(w, dot(1, 0), dot(1, 1)))
+
+
+def psi_by_hand(position: NDArray[np.float64], lattice: NDArray[np.float64], scale: float) -> float:
+    """The windowed stream function at one point, from its definition."""
+    frequency = len(lattice) - 1
+    x, y = (position - LOW) / (HIGH - LOW)
+    value = scale * (HIGH - LOW) * noise_by_hand(x * frequency, y * frequency, lattice)
+    for wall in (x, 1 - x, y, 1 - y):
+        t = 2 * frequency * wall
+        value *= (15 * t - 10 * t**3 + 3 * t**5) / 8 if t < 1 else 1.0
+    return float(value)
+
+
+def lattice_of(frequency: int) -> NDArray[np.float64]:
+    """Return the gradients of a test lattice."""
+    rng = draws.generator("curl-noise", "test", 1, frequency)
+    return np.asarray(perlin.gradients(rng, frequency))
+
+
+@given(st.lists(st.floats(-2, 2), min_size=1, max_size=6), st.floats(-2, 2), st.floats(-2, 2))
+def test_jets_differentiate_polynomials(coefficients: list[float], x: float, y: float) -> None:
+    """The Hessian of p(x y) follows from p' and p'' by hand (chain rule)."""
+    jet_x, jet_y = jets.coordinates(np.array([[x, y]]))
+    p = (jet_x * jet_y).polynomial(*coefficients)
+    exact = Polynomial(coefficients)
+    first, second = exact.deriv(1)(x * y), exact.deriv(2)(x * y)
+    expected = [
+        exact(x * y), y * first, x * first, y * y * second, first + x * y * second, x * x * second,
+    ]  # fmt: skip
+    found = [term[0] for term in (p.value, p.x, p.y, p.xx, p.xy, p.yy)]
+    assert found == pytest.approx(expected, rel=1e-9, abs=1e-9)
+
+
+def test_noise_is_zero_with_the_drawn_slope_at_every_node() -> None:
+    """Gradient noise: value 0 and gradient g at the nodes, the far corner included."""
+    lattice = lattice_of(3)
+    node = np.array([(i, j) for i in range(4) for j in range(4)], dtype=np.float64)
+    found = perlin.noise(*jets.coordinates(node), lattice)
+    np.testing.assert_allclose(found.value, 0.0, atol=1e-15)
+    np.testing.assert_allclose(np.stack([found.x, found.y], -1), lattice.reshape(-1, 2), atol=1e-14)
+
+
+def test_gradients_are_unit_vectors() -> None:
+    """Every lattice gradient has length 1 and no two are alike."""
+    lattice = lattice_of(13).reshape(-1, 2)
+    np.testing.assert_allclose(np.hypot(*lattice.T), 1.0, rtol=3e-16)
+    assert len(np.unique(lattice, axis=0)) == 14 * 14
+
+
+@given(st.floats(0.0, 5.0), st.floats(0.0, 5.0))
+def test_noise_equals_the_thesis_formula(x: float, y: float) -> None:
+    """The vectorised jet and a scalar transcription of Eqs. 5.40 and 5.41 agree."""
+    lattice = lattice_of(5)
+    found = perlin.noise(*jets.coordinates(np.array([[x, y]])), lattice)
+    assert found.value[0] == pytest.approx(noise_by_hand(x, y, lattice), abs=1e-13)
+
+
+def test_ramp_joins_one_with_two_derivatives() -> None:
+    """Bridson's ramp: 0 with slope 15/8 at 0; 1 with slope and curvature 0 from 1 on."""
+    t = np.array([[0.0, 0.0], [1.0 - 1e-9, 0.0], [1.0, 0.0], [7.0, 0.0]])
+    found = perlin.ramp(jets.coordinates(t)[0])
+    np.testing.assert_allclose(found.value, [0.0, 1.0, 1.0, 1.0], atol=1e-15)
+    np.testing.assert_allclose(found.x, [1.875, 0.0, 0.0, 0.0], atol=1e-15)
+    np.testing.assert_allclose(found.xx, [0.0, 0.0, 0.0, 0.0], atol=1e-7)
+
+
+@pytest.mark.parametrize("frequency", [1, 2, 4, 13])
+def test_flow_is_the_rotated_gradient_by_numerical_differentiation(frequency: int) -> None:
+    """Velocity: u = dpsi/dy and v = -dpsi/dx of the formula, differenced over 2e-6."""
+    lattice, scale, step = lattice_of(frequency), 0.01, 1e-6
+    position = points(60, LOW + 0.001, HIGH - 0.001)
+    psi = curl_noise.stream_function(position, lattice, low=LOW, high=HIGH, scale=scale)
+    for k, term in enumerate((psi.x, psi.y)):
+        offset = np.eye(2)[k] * step
+        numeric = [
+            (psi_by_hand(p + offset, lattice, scale) - psi_by_hand(p - offset, lattice, scale)) / (2 * step)
+            for p in position
+        ]
+        np.testing.assert_allclose(term, numeric, atol=2e-7 * frequency * scale)
+
+
+@pytest.mark.parametrize("frequency", [1, 4, 13])
+def test_hessian_by_numerical_differentiation(frequency: int) -> None:
+    """The second derivatives are the differences of the first."""
+    lattice, step = lattice_of(frequency), 1e-6
+    position = points(200, LOW + 0.001, HIGH - 0.001)
+
+    def flow(at: NDArray[np.float64]) -> jets.Jet:
+        return curl_noise.stream_function(at, lattice, low=LOW, high=HIGH, scale=0.01)
+
+    here = flow(position)
+    across, up = np.array([step, 0.0]), np.array([0.0, step])
+    right, left = flow(position + across), flow(position - across)
+    above, below = flow(position + up), flow(position - up)
+    pairs = [
+        (here.xx, right.x - left.x), (here.xy, right.y - left.y), (here.xy, above.x - below.x),
+        (here.yy, above.y - below.y),
+    ]  # fmt: skip
+    for exact, difference in pairs:
+        np.testing.assert_allclose(exact, difference / (2 * step), atol=2e-5 * frequency**2)
+
+
+@pytest.mark.parametrize("frequency", [1, 4, 13])
+def test_no_flow_crosses_the_walls(frequency: int) -> None:
+    """The normal velocity is exactly 0 on each wall; the flow along it is not."""
+    along = LOW + (HIGH - LOW) * np.arange(101) / 100
+    lattice = lattice_of(frequency)
+    for wall in (LOW, HIGH):
+        upright = np.stack([np.full(101, wall), along], -1)
+        level = np.stack([along, np.full(101, wall)], -1)
+        side = curl_noise.stream_function(upright, lattice, low=LOW, high=HIGH, scale=0.01)
+        floor = curl_noise.stream_function(level, lattice, low=LOW, high=HIGH, scale=0.01)
+        assert not side.y.any()
+        assert not floor.x.any()
+        assert np.abs(side.x).max() > 1e-4
+        assert np.abs(floor.y).max() > 1e-4

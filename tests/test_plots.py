@@ -1,0 +1,262 @@
+"""Pictures: right fields, right colours, small and deterministic files, clear refusals."""
+
+from __future__ import annotations
+
+import struct
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from numpy.typing import NDArray
+from PIL import Image
+from swirls import OMEGA, TOP_TO_THE_RIGHT, write_swirl
+
+from lagbench import extras, palette
+from lagbench.canvas import figure, pixels_of
+from lagbench.errors import DataError, UsageError
+from lagbench.panels import Panel, draw_walls, limit_of
+from lagbench.plots import KINDS, contact_sheet, describe, plot_frame
+from lagbench.recording import open_recording
+
+PNG_HEAD = b"\x89PNG\r\n\x1a\n"
+
+
+@pytest.fixture(scope="module")
+def swirl(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Write one cavity scenario whose top wall moves to the right."""
+    return write_swirl(tmp_path_factory.mktemp("root"))
+
+
+def chunks(data: bytes) -> list[bytes]:
+    """Return the types of a PNG's chunks."""
+    assert data.startswith(PNG_HEAD)
+    found, at = [], len(PNG_HEAD)
+    while at < len(data):
+        length, kind = struct.unpack_from(">I4s", data, at)
+        found.append(kind)
+        at += 12 + length
+    return found
+
+
+def pixels(path: Path) -> NDArray[np.uint8]:
+    """Return a picture as RGB bytes."""
+    with Image.open(path) as image:
+        return np.asarray(image.convert("RGB"))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_of_picture_is_small_and_has_the_same_bytes_twice(
+    swirl: Path, tmp_path: Path, kind: str
+) -> None:
+    """PNGs hold no date or software, fit a repository and repeat to the byte."""
+    first, second = (plot_frame(swirl, 2, tmp_path / name, kind=kind) for name in ("a.png", "b.png"))
+    data = first.read_bytes()
+    assert data == second.read_bytes()
+    assert len(data) < 300_000
+    assert set(chunks(data)) == {b"IHDR", b"PLTE", b"IDAT", b"IEND"}
+
+
+def test_kinds_differ(swirl: Path, tmp_path: Path) -> None:
+    """No two kinds draw the same picture."""
+    drawn = {plot_frame(swirl, 2, tmp_path / f"{kind}.png", kind=kind).read_bytes() for kind in KINDS}
+    assert len(drawn) == len(KINDS)
+
+
+def test_a_data_set_draws_what_its_file_draws(swirl: Path, tmp_path: Path) -> None:
+    """A path and the xarray.Dataset opened from it give one picture."""
+    from_file = plot_frame(swirl, -1, tmp_path / "file.png")
+    with xr.open_dataset(swirl) as data:
+        from_data = plot_frame(data, 5, tmp_path / "data.png")
+    assert from_file.read_bytes() == from_data.read_bytes()
+
+
+def test_a_data_set_of_several_scenarios_is_refused(swirl: Path, tmp_path: Path) -> None:
+    """The message says how to choose one scenario."""
+    with xr.open_dataset(swirl) as data, pytest.raises(UsageError, match="one scenario") as caught:
+        plot_frame(data.expand_dims(scenario=[0]), 0, tmp_path / "x.png")
+    assert "sel(scenario" in str(caught.value)
+
+
+def test_fields_of_solid_body_rotation(swirl: Path) -> None:
+    """The vorticity that is drawn is twice the angular velocity, per frame, at frame 0 and later."""
+    with open_recording(swirl) as recording:
+        assert recording.area == pytest.approx(np.pi * 0.4**2)
+        for frame in (0, 3):
+            fields = recording.scene(frame).fields
+            middle = fields.vorticity[4:6, 4:6]  # clear of the rim on the 10 x 10 grid
+            np.testing.assert_allclose(middle, 2.0 * OMEGA, rtol=0.02)
+
+
+def test_the_scale_of_speeds_leaves_out_the_extreme_per_cent(swirl: Path) -> None:
+    """Speeds of a disc are OMEGA r: 99 of 100 particles are within r = 0.4 sqrt(0.99)."""
+    with open_recording(swirl) as recording:
+        scene = recording.scene(1)
+        expected = OMEGA / recording.size.frame_interval * 0.4 * np.sqrt(0.99)
+        assert limit_of(Panel.SPEED, scene) == pytest.approx(expected, rel=1e-3)
+
+
+def test_a_frame_counts_from_the_end_or_is_refused(swirl: Path, tmp_path: Path) -> None:
+    """Frame -1 is the last; beyond the ends the message names the range."""
+    with open_recording(swirl) as recording:
+        assert recording.scene(-1).frame == 5
+    for frame in (6, -7):
+        with pytest.raises(UsageError, match=f"no frame {frame}") as caught:
+            plot_frame(swirl, frame, tmp_path / "x.png")
+        assert "0 to 5" in str(caught.value)
+
+
+def test_moving_walls_are_marked_and_point_where_they_slide(tmp_path: Path) -> None:
+    """The moving wall is vermilion, the others grey; reversed walls draw the mirror image."""
+    drawn = {}
+    for name, walls in (("right", TOP_TO_THE_RIGHT), ("left", -TOP_TO_THE_RIGHT)):
+        path = write_swirl(tmp_path / name, walls=walls)
+        with open_recording(path) as recording, figure(2.0, 2.0) as page:
+            draw_walls(page.add_axes((0, 0, 1, 1)), recording)
+            drawn[name] = pixels_of(page)
+    side = drawn["right"].shape[0]
+    band = int(0.025 * side)  # middle of the wall of tiny, which is 0.05 wide
+    assert tuple(drawn["right"][band, int(0.2 * side)]) == tuple(palette.rgb(palette.MOVING))
+    assert tuple(drawn["right"][-band, side // 2]) == tuple(palette.rgb(palette.WALL))
+    assert tuple(drawn["right"][side // 2, side // 2]) == tuple(palette.rgb(palette.PAPER))
+    mirrored = np.abs(drawn["right"][:, ::-1].astype(int) - drawn["left"]).mean()
+    assert mirrored < 0.2 * np.abs(drawn["right"].astype(int) - drawn["left"]).mean()
+
+
+def test_captions_say_what_sets_a_scenario_apart(swirl: Path, tmp_path: Path) -> None:
+    """Reynolds number, family or frequency stand beside split, size and id."""
+    with open_recording(swirl) as recording:
+        assert describe(recording) == "cavity tiny  ·  scenario 0  ·  Re 100"
+    splash = write_swirl(tmp_path, "fluid", 3, walls=None, parameters={"family": "splash"})
+    with open_recording(splash) as recording:
+        assert describe(recording) == "fluid tiny  ·  scenario 3  ·  family splash"
+
+
+@pytest.mark.parametrize("kind", ["vortcity", "Speed", ""])
+def test_unknown_kinds_are_refused(swirl: Path, tmp_path: Path, kind: str) -> None:
+    """The message lists the kinds there are."""
+    with pytest.raises(UsageError, match="no kind of picture") as caught:
+        plot_frame(swirl, 0, tmp_path / "x.png", kind=kind)
+    assert "vorticity" in str(caught.value)
+
+
+def test_only_png_names_are_taken(swirl: Path, tmp_path: Path) -> None:
+    """Another ending is refused before anything is written."""
+    with pytest.raises(UsageError, match="PNG"):
+        plot_frame(swirl, 0, tmp_path / "x.jpg")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_missing_file_is_a_data_error(tmp_path: Path) -> None:
+    """The path stands in the message."""
+    with pytest.raises(DataError, match="missing"):
+        plot_frame(tmp_path / "none.nc", 0, tmp_path / "x.png")
+
+
+def test_without_matplotlib_the_extra_is_named(
+    swirl: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The message holds the command that installs what is missing."""
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(UsageError, match="matplotlib is not installed") as caught:
+        plot_frame(swirl, 0, tmp_path / "x.png")
+    assert "pip install 'lagbench[plots]'" in str(caught.value)
+
+
+def test_a_broken_dependency_is_not_called_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An import that fails inside an installed module shows its own error."""
+    (tmp_path / "broken_extra.py").write_text("import no_such_module_at_all\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ModuleNotFoundError, match="no_such_module_at_all"):
+        extras.require("broken_extra", extra="plots")
+
+
+def test_sheet_of_driven_scenarios(tmp_path: Path) -> None:
+    """A sheet has a panel per scenario: more scenarios, a wider page with another picture."""
+    write_swirl(tmp_path, scenario=0)
+    one = pixels(contact_sheet("cavity", "tiny", tmp_path / "one.png", root=tmp_path, frame=2))
+    for scenario in (1, 2, 3, 4):
+        write_swirl(tmp_path, scenario=scenario)
+    path = contact_sheet("cavity", "tiny", tmp_path / "five.png", root=tmp_path, frame=2)
+    five = pixels(path)
+    assert five.shape[1] > one.shape[1]
+    again = contact_sheet("cavity", "tiny", tmp_path / "again.png", root=tmp_path, frame=2)
+    assert again.read_bytes() == path.read_bytes()
+    # each of the five panels shows the orange of its moving top wall
+    orange = (five == palette.rgb(palette.MOVING)).all(axis=-1).any(axis=0)
+    assert np.count_nonzero(np.diff(orange.astype(int)) == 1) >= 5
+
+
+def test_sheet_of_families_has_a_row_for_each(tmp_path: Path) -> None:
+    """Scenarios of one family share a row, families over time lie below each other."""
+    heights = []
+    for scenario, family in enumerate(["circle", "circle", "splash"]):
+        write_swirl(tmp_path, "fluid", scenario, walls=None, parameters={"family": family})
+        heights.append(pixels(contact_sheet("fluid", "tiny", tmp_path / "s.png", root=tmp_path)).shape[0])
+    assert heights[0] == heights[1] < heights[2]
+
+
+def test_sheet_of_materials_shows_their_colours(tmp_path: Path) -> None:
+    """Pairs of materials are coloured by material, each colour as the key has it."""
+    write_swirl(tmp_path, "multimaterial", 0, walls=None, materials=3, parameters={"pair": "made-up"})
+    image = pixels(contact_sheet("multimaterial", "tiny", tmp_path / "s.png", root=tmp_path))
+    for material, colour in enumerate(palette.MATERIAL_COLOURS):
+        assert (image == palette.rgb(colour)).all(axis=-1).any() == (material < 3)
+
+
+def test_sheet_of_nothing_names_the_command(tmp_path: Path) -> None:
+    """Without scenarios the message says how to make them; unknown names get the nearest one."""
+    with pytest.raises(DataError, match="nothing to draw") as caught:
+        contact_sheet("cavity", "tiny", tmp_path / "s.png", root=tmp_path)
+    assert "lagbench generate --split cavity --size tiny" in str(caught.value)
+    with pytest.raises(UsageError, match="did you mean 'cavity'"):
+        contact_sheet("cavty", "tiny", tmp_path / "s.png", root=tmp_path)
+
+
+def test_all_that_is_drawn_is_in_the_palette() -> None:
+    """Every level of both maps and every flat colour keeps its exact value in a file."""
+    table = {tuple(colour) for colour in palette.colours().tolist()}
+    assert palette.colours().shape == (256, 3)
+    flat = (
+        palette.PAPER,
+        palette.INK,
+        palette.MUTED,
+        palette.WALL,
+        palette.MOVING,
+        *palette.MATERIAL_COLOURS,
+    )
+    assert {tuple(palette.rgb(colour).tolist()) for colour in flat} <= table
+    for levels in (palette.speed_map(), palette.vorticity_map()):
+        drawn = (np.asarray(levels.colors)[:, :3] * 255.0).round().astype(int)
+        assert {tuple(colour) for colour in drawn.tolist()} <= table
+
+
+MACHADO = {  # Machado, Oliveira & Fernandes (2009), severity 1, linear RGB
+    "protan": [
+        [0.152286, 1.052583, -0.204868],
+        [0.114503, 0.786281, 0.099216],
+        [-0.003882, -0.048116, 1.051998],
+    ],
+    "deutan": [
+        [0.367322, 0.860646, -0.227968],
+        [0.280085, 0.672501, 0.047413],
+        [-0.011820, 0.042940, 0.968881],
+    ],
+    "tritan": [
+        [1.255528, -0.076749, -0.178779],
+        [-0.078411, 0.930809, 0.147602],
+        [0.004733, 0.691367, 0.303900],
+    ],
+}
+
+
+@pytest.mark.parametrize("vision", MACHADO)
+def test_materials_stay_apart_for_colour_blind_readers(vision: str) -> None:
+    """Simulated deficiencies leave at least 0.2 of the RGB cube's side between any two materials."""
+    srgb = np.array([palette.rgb(colour) for colour in palette.MATERIAL_COLOURS]) / 255.0
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    seen = np.clip(linear @ np.array(MACHADO[vision]).T, 0.0, 1.0)
+    back = np.where(seen <= 0.0031308, 12.92 * seen, 1.055 * seen ** (1 / 2.4) - 0.055)
+    distance = np.sqrt(((back[:, None] - back[None]) ** 2).sum(axis=-1))
+    assert distance[np.triu_indices(4, 1)].min() > 0.2

@@ -1,0 +1,152 @@
+"""The worker pool: order, errors, deaths of workers and of their parent."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pool_tasks
+import pytest
+
+from lagbench.errors import DataError, WorkFailedError
+from lagbench.pool import ATTEMPTS, Pool, Task
+
+HERE = str(Path(__file__).parent)
+
+
+def wait_until(condition: object, seconds: float = 30.0) -> None:
+    """Wait until a function returns true, or fail."""
+    end = time.monotonic() + seconds
+    while not condition():  # type: ignore[operator]
+        assert time.monotonic() < end, "waited too long"
+        time.sleep(0.02)
+
+
+def is_alive(process: int) -> bool:
+    """Tell whether a process runs; one that its parent has not yet asked about does not."""
+    try:
+        state = Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()[0]
+    except FileNotFoundError:
+        return False
+    return state != "Z"
+
+
+def test_results_come_back_costliest_first() -> None:
+    """One worker takes the tasks by falling cost and returns every result and report."""
+    tasks = [Task(name=f"{n}", function=pool_tasks.square, arguments=(n,), cost=float(n)) for n in (2, 5, 3)]
+    with Pool(1) as pool:
+        for task in tasks:
+            pool.submit(task)
+        events = [(event.kind, event.value) for event in pool.events()]
+    assert events == [
+        *(("progress", 1), ("done", 25)),
+        *(("progress", 1), ("done", 9)),
+        *(("progress", 1), ("done", 4)),
+    ]
+
+
+def test_tasks_may_be_added_while_others_run() -> None:
+    """A task submitted from within the loop runs in the same loop, in a worker that is there."""
+    with Pool(2) as pool:
+        pool.submit(Task(name="a", function=pool_tasks.square, arguments=(2,)))
+        results = []
+        for event in pool.events():
+            if event.kind == "done":
+                results.append(event.value)
+                if event.value == 4:
+                    pool.submit(Task(name="b", function=pool_tasks.square, arguments=(7,)))
+        assert results == [4, 49]
+        assert len(pool.process_ids()) == 1
+
+
+def test_a_killed_worker_costs_one_attempt(tmp_path: Path) -> None:
+    """The task of a worker killed by SIGKILL runs again in a fresh one; lost units are told."""
+    with Pool(1) as pool:
+        pool.submit(Task(name="a", function=pool_tasks.die_once, arguments=(tmp_path / "seen",)))
+        events = [(event.kind, event.value) for event in pool.events()]
+    assert events == [("progress", 5), ("lost", 5), ("progress", 5), ("done", "survived")]
+
+
+def test_a_task_that_always_kills_its_worker_is_given_up() -> None:
+    """After three deaths the error says which task and how its workers died."""
+    with Pool(1) as pool:
+        pool.submit(Task(name="cavity tiny, scenario 3", function=pool_tasks.die))
+        with pytest.raises(WorkFailedError) as caught:
+            list(pool.events())
+    text = str(caught.value)
+    assert f"died {ATTEMPTS} times" in text
+    assert "cavity tiny, scenario 3" in text
+    assert "SIGKILL" in text
+
+
+def test_errors_of_ours_arrive_whole() -> None:
+    """A LagbenchError keeps its class, exit code and all of its parts."""
+    with Pool(1) as pool:
+        pool.submit(Task(name="a", function=pool_tasks.refuse))
+        with pytest.raises(DataError) as caught:
+            list(pool.events())
+    error = caught.value
+    assert (error.what, error.where, error.expected, error.got, error.fix) == (
+        *("what is wrong", "here", 1, 2, "mend it"),
+    )
+    assert error.exit_code == 4
+
+
+def test_other_errors_bring_their_traceback() -> None:
+    """Whatever else a task raises names the line that raised it."""
+    with Pool(1) as pool:
+        pool.submit(Task(name="a", function=pool_tasks.crash))
+        with pytest.raises(WorkFailedError, match="a worker crashed") as caught:
+            list(pool.events())
+    assert "ZeroDivisionError" in str(caught.value)
+    assert "pool_tasks.py" in str(caught.value)
+
+
+def test_leaving_the_pool_kills_its_workers(tmp_path: Path) -> None:
+    """No worker outlives the with block, however busy."""
+    marker = tmp_path / "pid"
+    with Pool(1) as pool:
+        pool.submit(Task(name="a", function=pool_tasks.sleep_long, arguments=(marker,)))
+        events = pool.events()
+        pool._assign()
+        wait_until(marker.exists)
+        process = pool.process_ids()[0]
+        assert is_alive(process)
+        del events
+    assert not is_alive(process)
+
+
+SCRIPT = """
+import sys
+from pathlib import Path
+sys.path.insert(0, sys.argv[1])
+import pool_tasks
+from lagbench.pool import Pool, Task
+with Pool(1) as pool:
+    pool.submit(Task(name="a", function=getattr(pool_tasks, sys.argv[2]), arguments=(eval(sys.argv[3]),)))
+    print([event.value for event in pool.events()])
+"""
+
+
+def test_workers_die_with_their_parent(tmp_path: Path) -> None:
+    """A worker whose parent is killed by SIGKILL ends by itself, even in the midst of a task."""
+    marker = tmp_path / "pid"
+    command = [sys.executable, "-c", SCRIPT, HERE, "sleep_long", f"Path({str(marker)!r})"]
+    with subprocess.Popen(command) as parent:
+        wait_until(lambda: marker.exists() and marker.read_text() != "")
+        worker = int(marker.read_text())
+        assert is_alive(worker)
+        os.kill(parent.pid, signal.SIGKILL)
+        parent.wait()
+    wait_until(lambda: not is_alive(worker))
+
+
+def test_the_calling_script_is_not_imported_again() -> None:
+    """A script from standard input without a main guard may use a pool."""
+    command = [sys.executable, "-", HERE, "square", "6"]
+    done = subprocess.run(command, input=SCRIPT, capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout == "[1, 36]\n"

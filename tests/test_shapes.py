@@ -1,0 +1,117 @@
+"""Shapes and their particles: areas by counting, distances by hand, spread by k-d tree."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scenario_draws import neighbours
+
+from lagbench.errors import WorkFailedError
+from lagbench.generators import draws, shapes
+
+# Three overlapping unit discs in a row, and one that touches them from above.
+ROW = np.array([[-1.0, 0.0], [0.0, 0.0], [1.0, 0.0], [0.0, 1.5]])
+SHAPES: dict[str, shapes.Shape] = {
+    "rectangle": shapes.Rectangle(0.3, 0.15),
+    "rope": shapes.Rectangle(0.65, 0.05, (0.6, 0.8)),
+    "disc": shapes.Disc.of_area(0.05),
+    "blobs": shapes.Blobs.of_area(0.05, ROW),
+}
+
+
+def source(scenario: int = 0) -> np.random.Generator:
+    """Return a stream of its own for one test."""
+    stream: np.random.Generator = draws.generator("fluid", "test", 1, scenario)
+    return stream
+
+
+def cloud(half: float = 0.6, cells: int = 1501) -> NDArray[np.float64]:
+    """Return the middles of a fine grid about the origin."""
+    side = half * ((2 * np.arange(cells) + 1) / cells - 1)
+    return np.stack(np.meshgrid(side, side), -1).reshape(-1, 2)
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_area_and_reach_agree_with_counting(name: str) -> None:
+    """The points inside a fine grid give the area to 0.5 % and the bounding box to a cell."""
+    shape, grid = SHAPES[name], cloud()
+    inside = grid[shape.distance(grid) <= 0.0]
+    assert len(inside) * (1.2 / 1501) ** 2 == pytest.approx(shape.area, rel=5e-3)
+    np.testing.assert_allclose(inside.max(axis=0), shape.reach, atol=1.2 / 1501)
+    np.testing.assert_allclose(inside.min(axis=0), np.negative(shape.reach), atol=1.2 / 1501)
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_distance_is_how_far_the_shape_is(name: str) -> None:
+    """Outside, the distance is that to the nearest inside point of a fine grid."""
+    shape, grid = SHAPES[name], cloud()
+    inside = grid[shape.distance(grid) <= 0.0]
+    probes = np.random.Generator(np.random.PCG64(1)).random((300, 2)) * 1.6 - 0.8
+    found = shape.distance(probes)
+    nearest = neighbours(probes[found > 0.0], 1, among=inside)[0][:, 0]
+    np.testing.assert_allclose(found[found > 0.0], nearest, atol=1.2 / 1501 * 1.5)
+
+
+def test_rectangle_distance_by_hand() -> None:
+    """A 4 x 2 rectangle: 1 deep at the middle, 1 beyond an edge, 5 from a corner (3-4-5)."""
+    rectangle = shapes.Rectangle(4.0, 2.0)
+    at = np.array([[0.0, 0.0], [3.0, 0.5], [5.0, 5.0], [1.5, 0.0]])
+    assert rectangle.distance(at).tolist() == [-1.0, 1.0, 5.0, -0.5]
+
+
+def test_blobs_of_one_disc_are_a_disc() -> None:
+    """The counted area of a unit disc is pi to 1e-3, hence the radius sqrt(area / pi)."""
+    blob = shapes.Blobs.of_area(0.05, np.zeros((1, 2)))
+    assert blob.radius == pytest.approx(math.sqrt(0.05 / math.pi), rel=1e-3)
+    assert blob.centres == ((0.0, 0.0),)
+
+
+@pytest.mark.parametrize("count", [97, 625, 2500])
+@pytest.mark.parametrize("name", SHAPES)
+def test_seeds_lie_evenly_inside(name: str, count: int) -> None:
+    """All inside, nearest neighbours between half and 1.5 times the mean spacing."""
+    body = shapes.body_at(SHAPES[name], 0.5, 0.4)
+    position = shapes.seeds(source(), body, count)
+    assert position.shape == (count, 2)
+    assert body.distance(position).max() <= 2.0**-20
+    spacing = math.sqrt(body.shape.area / count)
+    gap = neighbours(position, 2)[0][:, 1]
+    assert gap.min() > 0.5 * spacing
+    assert gap.max() < 1.5 * spacing
+
+
+def test_seeds_have_the_centre_and_spread_of_the_body() -> None:
+    """Second moments of a 0.65 x 0.05 bar along (0.6, 0.8): length^2/12 and width^2/12."""
+    position = shapes.seeds(source(), shapes.body_at(SHAPES["rope"], 0.5, 0.5), 2500)
+    moments, axes = np.linalg.eigh(np.cov(position.T, bias=True))
+    assert moments == pytest.approx([0.05**2 / 12, 0.65**2 / 12], rel=0.03)
+    np.testing.assert_allclose(np.abs(axes[:, 1]), [0.6, 0.8], atol=0.003)
+    np.testing.assert_allclose(position.mean(axis=0), 0.5, atol=0.003)
+
+
+def test_seeds_shift_with_the_scenario() -> None:
+    """Two scenarios spread different points in the same body."""
+    body = shapes.body_at(SHAPES["disc"], 0.5, 0.5)
+    first, second = (shapes.seeds(source(k), body, 50) for k in (0, 1))
+    assert neighbours(second, 1, among=first)[0].min() > 0.0
+
+
+@given(st.integers(0, 2**30), st.sampled_from(sorted(SHAPES)))
+def test_place_keeps_within_its_region(scenario: int, name: str) -> None:
+    """The bounding box lies in the region whatever was drawn."""
+    region = ((0.05, 0.95), (0.1, 0.8))
+    body = shapes.place(source(scenario), SHAPES[name], region)
+    for centre, reach, (low, high) in zip(body.centre, body.shape.reach, region, strict=True):
+        assert low - 2.0**-20 <= centre - reach
+        assert centre + reach <= high + 2.0**-20
+
+
+def test_place_refuses_a_body_that_does_not_fit() -> None:
+    """The error says how wide the body is and what to change."""
+    with pytest.raises(WorkFailedError, match=r"(?s)up to 0\.2000.*0\.3000.*areas or lengths"):
+        shapes.place(source(), SHAPES["rectangle"], ((0.1, 0.3), (0.0, 1.0)))

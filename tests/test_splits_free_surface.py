@@ -1,0 +1,151 @@
+"""Fluid and multimaterial: bodies, their places and velocities against the design."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scenario_draws import SIZES, all_of, changed, draw, neighbours, state_of
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from lagbench import registry
+from lagbench.errors import WorkFailedError
+from lagbench.generators.base import InitialState, Material
+
+
+def test_fluid_families_follow_the_id() -> None:
+    """The id modulo 4; ids 0 and 26 are the falling rectangle and circle of Table 4.8."""
+    size = registry.load().size("fluid", "full")
+    found = [s.parameters["family"] for s in all_of("fluid")]
+    assert found == ["falling-rectangle", "thrown", "falling-circle", "splash"] * 10
+    assert (found[0], found[26]) == ("falling-rectangle", "falling-circle")
+    assert Counter(found[i] for i in size.subsets["test"]) == dict.fromkeys(found[:4], 2)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_fluid_bodies_are_within_their_ranges(size: str) -> None:
+    """Areas 0.04-0.06; velocities per family; a margin of 0.02 to every wall."""
+    (low, high), _ = registry.load().size("fluid", size).bounds
+    for state in all_of("fluid", size):
+        assert 0.04 <= state.area <= 0.06
+        assert low + 0.02 - 1e-5 <= state.position.min()
+        assert state.position.max() <= high - 0.02 + 1e-5
+        assert (state.material == Material.LIQUID).all()
+        family, velocity = state.parameters["family"], state.velocity
+        if family == "thrown":
+            assert (velocity[:, 0] >= 1.0).all()
+            assert (velocity[:, 0] <= 2.0).all()
+            assert (velocity[:, 1] >= 0.0).all()
+            assert (velocity[:, 1] <= 1.0).all()
+        elif family != "splash":
+            assert np.abs(velocity).max() <= 0.3
+            assert velocity[:, 1].max() <= 0.0
+            assert state.position[:, 1].min() >= 0.35
+        if family != "splash":
+            assert (velocity == velocity[0]).all()
+
+
+def test_fluid_bodies_cover_their_area_in_one_piece() -> None:
+    """Particles within 1.8 spacings of each other form one piece; the cells they occupy count right."""
+    for state in all_of("fluid")[:16]:
+        spacing = math.sqrt(state.area / len(state.position))
+        pairs = cKDTree(state.position).sparse_distance_matrix(cKDTree(state.position), 1.8 * spacing)
+        assert connected_components(pairs)[0] == 1
+        cells = np.unique(np.floor(state.position / (1.6 * spacing)), axis=0)
+        # Occupied cells overcount by about half the outline's: 5 to 30 % here.
+        assert 1.0 < len(cells) * (1.6 * spacing) ** 2 / state.area < 1.3
+
+
+def test_fluid_splash_has_blobs_and_noise() -> None:
+    """Neighbours share their blob's velocity; their difference is the noise, N(0, 0.5)."""
+    differences, speeds = [], []
+    for scenario in range(3, 40, 4):
+        state = state_of("fluid", "full", scenario)
+        nearest = neighbours(state.position, 2)[1][:, 1]
+        differences.append((state.velocity - state.velocity[nearest]).ravel())
+        smooth = state.velocity[neighbours(state.position, 60)[1]].mean(axis=1)
+        speeds.append(smooth - [0.0, 0.5])
+    # Variance of a difference of two: 2 x 0.25, plus a little of the blend.
+    assert np.std(np.concatenate(differences)) == pytest.approx(math.sqrt(0.5), rel=0.03)
+    assert 0.4 < np.std(np.concatenate(speeds)) < 0.8
+
+
+def test_multimaterial_pairs_follow_the_id() -> None:
+    """The id modulo 6, in the order of Table 4.8; the test subset has each once."""
+    pairs = ["liquid-snow", "rope-snow", "rope-liquid", "snow-snow", "rope-jelly", "liquid-liquid"]
+    for size in SIZES:
+        entry = registry.load().size("multimaterial", size)
+        found = {i: state_of("multimaterial", size, i).parameters["pair"] for i in entry.scenarios}
+        assert found == {i: pairs[i % 6] for i in entry.scenarios}
+        assert sorted(found[i] for i in entry.subsets["test"]) == sorted(pairs)
+
+
+def halves(state: InitialState, size: registry.Size) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Split a state's particles into its two bodies by their recorded areas."""
+    first = float(state.parameters["first_area"])
+    own = round(size.particles * first / state.area)
+    return state.position[:own], state.position[own:]
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_multimaterial_bodies_keep_apart(size: str) -> None:
+    """No particle of one body within 0.038 of the other's; both inside the margin."""
+    entry = registry.load().size("multimaterial", size)
+    (low, high), _ = entry.bounds
+    for state in all_of("multimaterial", size):
+        first, second = halves(state, entry)
+        assert neighbours(second, 1, among=first)[0].min() > 0.038
+        assert low + 0.02 - 1e-5 <= state.position.min()
+        assert state.position.max() <= high - 0.02 + 1e-5
+
+
+def test_multimaterial_shares_particles_and_areas() -> None:
+    """Materials change where the first body's share ends; a rope is 0.05 wide."""
+    entry = registry.load().size("multimaterial", "full")
+    for state in all_of("multimaterial"):
+        first, second = halves(state, entry)
+        words = str(state.parameters["pair"]).split("-")
+        expected = [Material[word.upper()] for word in words]
+        assert (state.material[: len(first)] == expected[0]).all()
+        assert (state.material[len(first) :] == expected[1]).all()
+        areas = [float(state.parameters[f"{name}_area"]) for name in ("first", "second")]
+        assert math.fsum(areas) == pytest.approx(state.area)
+        for word, area, body in zip(words, areas, (first, second), strict=True):
+            if word == "rope":
+                narrow, wide = np.linalg.eigvalsh(np.cov(body.T, bias=True))
+                assert math.sqrt(12 * narrow) == pytest.approx(0.05, rel=0.04)
+                assert 0.54 < math.sqrt(12 * wide) < 0.76
+                assert 0.55 * 0.05 <= area <= 0.75 * 0.05
+            else:
+                assert 0.045 <= area <= 0.06
+        if "jelly" in words:
+            assert state.parameters["second_shape"] == "disc"
+
+
+def test_multimaterial_friction_only_without_liquid() -> None:
+    """Coulomb friction 0.3 where no body is liquid, none otherwise, recorded either way."""
+    for state in all_of("multimaterial"):
+        dry = "liquid" not in str(state.parameters["pair"])
+        assert state.friction == state.parameters["friction"] == (0.3 if dry else 0.0)
+
+
+def test_multimaterial_bodies_move_towards_one_point() -> None:
+    """v_1 - v_2 = rate (c_2 - c_1): the common point drops out."""
+    for state in all_of("multimaterial"):
+        p = {k: float(v) for k, v in state.parameters.items() if not isinstance(v, str)}
+        for axis in ("x", "y"):
+            approach = p[f"first_velocity_{axis}"] - p[f"second_velocity_{axis}"]
+            apart = p[f"second_centre_{axis}"] - p[f"first_centre_{axis}"]
+            assert approach == pytest.approx(p["attraction"] * apart, abs=4 * 2.0**-20)
+        assert np.abs(state.velocity).max() < 1.5
+
+
+def test_multimaterial_gives_up_when_there_is_no_room() -> None:
+    """Bodies that cannot lie side by side are an error, not an endless search."""
+    size = changed(registry.load().size("multimaterial", "tiny"), area_min=0.45, area_max=0.45)
+    with pytest.raises(WorkFailedError, match=r"(?s)no room.*gap of 0\.04.*1000 attempts"):
+        draw(size, 5)

@@ -1,0 +1,92 @@
+"""B-spline weights against SciPy, and the exactness and range of the fixed-point sums."""
+
+import numpy as np
+import pytest
+import taichi as ti
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.interpolate import BSpline
+
+from lagbench.generators import backend, transfer
+from lagbench.generators.solver import Device
+
+DX = 1.0 / 32.0
+
+
+@ti.kernel
+def evaluate_stencil(x: ti.types.ndarray(), base: ti.types.ndarray(), weight: ti.types.ndarray()):  # type: ignore[no-untyped-def] # noqa: ANN201, D103
+    for p in range(x.shape[0]):
+        node, _, w = transfer.stencil(ti.Vector([x[p, 0], x[p, 1]]), 32.0)
+        for axis in ti.static(range(2)):
+            base[p, axis] = node[axis]
+            for i in ti.static(range(3)):
+                weight[p, i, axis] = w[i, axis]
+
+
+@ti.kernel
+def evaluate_fixed(value: ti.types.ndarray(), out: ti.types.ndarray()):  # type: ignore[no-untyped-def] # noqa: ANN201, D103
+    for p in range(value.shape[0]):
+        out[p] = transfer.to_fixed(value[p])
+
+
+@ti.kernel
+def evaluate_bounded(value: ti.types.ndarray(), most: ti.types.ndarray(), out: ti.types.ndarray()):  # type: ignore[no-untyped-def] # noqa: ANN201, D103
+    for p in range(value.shape[0]):
+        out[p, 0] = transfer.bounded(value[p], -1.0, 2.0)
+        out[p, 1] = transfer.largest(value[p], most[p])
+
+
+@pytest.fixture(autouse=True)
+def taichi_runtime() -> None:
+    """Start Taichi as the solver does."""
+    backend.start(Device.CPU)
+
+
+def test_weights_are_the_quadratic_b_spline() -> None:
+    """Each weight is SciPy's B-spline at the node's distance; moments are 1, 0 and dx^2/4."""
+    x = (np.random.default_rng(0).random((500, 2)) * 0.9 + 0.05).astype(np.float32)
+    base, weight = np.zeros((500, 2), np.int32), np.zeros((500, 3, 2), np.float32)
+    evaluate_stencil(x, base, weight)
+    distance = (base[:, None, :] + np.arange(3)[None, :, None]) - x[:, None, :].astype(np.float64) / DX
+    assert np.abs(distance).max() <= 1.5
+    spline = BSpline.basis_element([-1.5, -0.5, 0.5, 1.5], extrapolate=False)
+    np.testing.assert_allclose(weight, spline(distance), rtol=0, atol=2e-6)
+    np.testing.assert_allclose(weight.sum(axis=1), 1.0, rtol=0, atol=1e-6)
+    np.testing.assert_allclose((weight * distance).sum(axis=1), 0.0, rtol=0, atol=4e-6)
+    np.testing.assert_allclose((weight * distance**2).sum(axis=1), 0.25, rtol=0, atol=4e-6)
+
+
+def test_fixed_point_rounds_to_even() -> None:
+    """Integers in float32 are exact, halves go to the even neighbour, signs are symmetric."""
+    value = np.array([0.5, 1.5, 2.5, -0.5, -1.5, 3.0, -(2.0**50), 2.0**50, 1e-30, 0.75], np.float32)
+    out = np.zeros(len(value), np.int64)
+    evaluate_fixed(value, out)
+    assert out.tolist() == [0, 2, 2, 0, -2, 3, -(2**50), 2**50, 0, 1]
+
+
+def test_fixed_point_is_numpys_rint() -> None:
+    """Any float32 within the range becomes the integer that NumPy rounds to."""
+    rng = np.random.default_rng(1)
+    value = ((rng.random(20_000) - 0.5) * 2.0 ** rng.integers(-5, 51, 20_000)).astype(np.float32)
+    out = np.zeros(len(value), np.int64)
+    evaluate_fixed(value, out)
+    np.testing.assert_array_equal(out, np.rint(value.astype(np.float64)).astype(np.int64))
+
+
+def test_bounds_and_extremes_meet_nan() -> None:
+    """What is not a number becomes the lower bound as a position, and stays visible as an extreme."""
+    value = np.array([-3.0, 0.5, 7.0, np.nan, np.inf], np.float32)
+    out = np.zeros((5, 2), np.float32)
+    evaluate_bounded(value, np.ones(5, np.float32), out)
+    np.testing.assert_array_equal(out[:, 0], [-1.0, 0.5, 2.0, -1.0, 2.0])
+    np.testing.assert_array_equal(out[:, 1], [1.0, 1.0, 7.0, np.nan, np.inf])
+
+
+@given(particles=st.integers(1, 2**22), bound=st.floats(1e-6, 1e6))
+def test_sums_cannot_overflow(particles: int, bound: float) -> None:
+    """The scale is a power of two, N bounds fit in 62 bits, and one step is far below float32's."""
+    scale = transfer.fixed_point_scale(particles, bound)
+    assert np.frexp(scale)[0] == 0.5
+    assert scale * bound <= 2.0**50
+    assert scale * bound * particles <= 2.0**62
+    assert 1.0 / scale <= bound * 2.0**-38

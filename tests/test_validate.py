@@ -1,0 +1,286 @@
+"""Ghia's tables, the diagnostics, the experiment's checks and the validate command."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from lagbench.errors import UsageError
+from lagbench.generators import diagnostics, experiment, ghia, profiles, validate
+from lagbench.generators.experiment import Case, plan
+
+BOX = diagnostics.Box(low=0.0625, high=0.9375, cells=35)
+
+
+def _tabulated(reynolds: int, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return ascending abscissae and values of one profile, walls included, misprints left out."""
+    lines = ghia.centre_lines(reynolds)
+    assert lines is not None
+    points, values, lid = (ghia.Y, lines.u, 1.0) if name == "u" else (ghia.X, lines.v, 0.0)
+    known = ~np.isnan(values)
+    abscissae = np.concatenate([[0.0], np.array(points)[known][::-1], [1.0]])
+    return abscissae, np.concatenate([[0.0], values[known][::-1], [lid]])
+
+
+@pytest.mark.parametrize("name", ["u", "v"])
+@pytest.mark.parametrize("reynolds", ghia.REYNOLDS)
+def test_no_net_flow_crosses_a_centre_line(reynolds: int, name: str) -> None:
+    """Mass is conserved in a closed box: each tabulated profile integrates to nearly 0.
+
+    A wrong sign or first digit among the widely spaced points would move the integral by 0.01.
+    """
+    assert abs(CubicSpline(*_tabulated(reynolds, name)).integrate(0.0, 1.0)) < 0.004
+
+
+@pytest.mark.parametrize("name", ["u", "v"])
+@pytest.mark.parametrize("reynolds", ghia.REYNOLDS)
+def test_tabulated_profiles_are_smooth_near_the_walls(reynolds: int, name: str) -> None:
+    """Among the points 0.008 apart, each lies within 0.006 of a spline through the others."""
+    abscissae, values = _tabulated(reynolds, name)
+    crowded = [i for i in range(1, len(values) - 1) if abscissae[i + 1] - abscissae[i - 1] < 0.017]
+    assert len(crowded) >= 3
+    for i in crowded:
+        others = np.arange(len(values)) != i
+        assert abs(CubicSpline(abscissae[others], values[others])(abscissae[i]) - values[i]) < 0.006
+
+
+def test_misprints_are_left_out() -> None:
+    """The two misprints are NaN, everything else is a number, and Re 7 is not tabulated."""
+    missing = {
+        (reynolds, name, int(index))
+        for reynolds in ghia.REYNOLDS
+        for name in ("u", "v")
+        for index in np.flatnonzero(np.isnan(getattr(ghia.centre_lines(reynolds), name)))
+    }
+    assert missing == {(400, "v", ghia.X.index(0.9063)), (3200, "u", ghia.Y.index(0.4531))}
+    assert ghia.centre_lines(7.0) is None
+
+
+def test_deviation_skips_what_is_not_tabulated() -> None:
+    """Differences 3 and 4 beside a NaN: RMSE sqrt(25/2), maximum 4."""
+    found = ghia.deviation(np.array([3.0, 9.0, -4.0]), np.array([0.0, np.nan, 0.0]))
+    assert found.rmse == pytest.approx(math.sqrt(12.5))
+    assert found.maximum == 4.0
+
+
+def test_occupancy_counts_every_particle_once() -> None:
+    """One particle in each cell's middle gives all ones; one outside counts in the nearest cell."""
+    middles = np.stack(np.meshgrid(BOX.nodes, BOX.nodes, indexing="ij"), axis=-1).reshape(-1, 2)
+    assert np.all(diagnostics.occupancy(middles, BOX) == 1)
+    counts = diagnostics.occupancy(np.array([[0.0, 1.0]]), BOX)
+    assert counts[0, -1] == 1
+    assert counts.sum() == 1
+
+
+def test_lid_corners_are_five_cells_wide() -> None:
+    """Of 35 x 35 cell centres, 2 x 5 x 5 lie in the lid's corners, none in the lower half."""
+    middles = np.stack(np.meshgrid(BOX.nodes, BOX.nodes, indexing="ij"), axis=-1).reshape(-1, 2)
+    corners = middles[diagnostics.lid_corners(middles, BOX)]
+    assert len(corners) == 50
+    assert corners[:, 1].min() > 0.5
+
+
+def _nodal(u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.stack([u, v], axis=-1)
+
+
+def test_grid_rates_of_rotation_and_expansion() -> None:
+    """Rigid rotation at rate 3 has vorticity 6 and no divergence; v = 2 x expands at 4."""
+    x, y = np.meshgrid(BOX.nodes - 0.5, BOX.nodes - 0.5, indexing="ij")
+    turning = diagnostics.grid_rates(_nodal(-3.0 * y, 3.0 * x), BOX.spacing)
+    assert turning.vorticity == pytest.approx(6.0)
+    assert turning.divergence == pytest.approx(0.0, abs=1e-12)
+    expanding = diagnostics.grid_rates(_nodal(2.0 * x, 2.0 * y), BOX.spacing)
+    assert expanding.divergence == pytest.approx(4.0)
+    assert math.isnan(diagnostics.grid_rates(np.zeros((5, 5, 2)), 0.1).ratio)
+
+
+def test_energies() -> None:
+    """Two particles of mass 2 at speeds 3 and 4: E = 25; a displacement counts per frame."""
+    velocity = np.array([[3.0, 0.0], [0.0, -4.0]])
+    assert diagnostics.kinetic_energy(velocity, 2.0) == 25.0
+    assert diagnostics.displacement_energy(velocity + 1.0, np.ones((2, 2)), 2.0) == 25.0
+
+
+@pytest.mark.parametrize("cells", [34, 35])
+def test_profiles_reproduce_a_polynomial_flow(cells: int) -> None:
+    """Splines return u = 4 U x (1 - x) y^3 and v = 16 U y (1 - y) x (1 - x)(1 - 2 x), both cubic.
+
+    The middle lies on a node for 35 cells and between nodes for 34.
+    """
+    box = diagnostics.Box(low=0.06, high=0.94, cells=cells)
+    s = (box.nodes - box.low) / box.width
+    x, y = np.meshgrid(s, s, indexing="ij")
+    u, v = 4.0 * x * (1.0 - x) * y**3, 16.0 * y * (1.0 - y) * x * (1.0 - x) * (1.0 - 2.0 * x)
+    found = profiles.extract(0.2 * _nodal(u, v), box, 0.2).at_reference_points()
+    heights, abscissae = np.array(ghia.Y), np.array(ghia.X)
+    assert found.u == pytest.approx(heights**3, abs=1e-12)
+    assert found.v == pytest.approx(4.0 * abscissae * (1 - abscissae) * (1 - 2 * abscissae), abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("case", "grid", "low", "particles", "dt"),
+    [
+        (Case.CAVITY, 40, 0.0625, 8192, 2e-3),
+        (Case.CAVITY, 80, 0.05625, 32768, 1e-3),
+        (Case.CAVITY, 56, 0.0625, 16056, 2e-3 * 40 / 56),
+        (Case.CURL_NOISE, 40, 0.0375, 8096, 2e-3),
+    ],
+)
+def test_plan_scales_the_full_size(case: Case, grid: int, low: float, particles: int, dt: float) -> None:
+    """The box stays within half a cell, dt shrinks with dx, particles per cell stay."""
+    reynolds = 400.0 if case is Case.CAVITY else None
+    settings = plan(case, reynolds=reynolds, grid=grid, substeps=1)
+    box = diagnostics.box_of(experiment.solver_parameters(settings))
+    assert box.low == pytest.approx(low)
+    assert settings.particles == particles
+    assert settings.dt == pytest.approx(dt)
+    assert settings.frame_substeps == round(0.1 / dt)
+
+
+def test_cavity_state_has_the_reynolds_number() -> None:
+    """The viscosity is U L / Re, the top wall alone moves, the fluid is at rest and fills the box evenly."""
+    settings = plan(Case.CAVITY, reynolds=400.0, substeps=1, lid_speed=0.125, seed=3)
+    state = experiment.initial_state(settings)
+    assert state.viscosity == pytest.approx(0.125 * 0.875 / 400.0)
+    assert state.wall_velocity.tolist() == [[0, 0], [0, 0], [0, 0], [0.125, 0]]
+    assert not state.velocity.any()
+    assert diagnostics.occupancy(state.position, BOX).min() >= 4
+
+
+def test_curl_noise_state_is_divergence_free_and_stays_inside() -> None:
+    """The trace of C is 0 to its rounding, and no particle flows through a wall."""
+    settings = plan(Case.CURL_NOISE, substeps=1, frequency=5)
+    state = experiment.initial_state(settings)
+    trace = state.affine[:, 0, 0] + state.affine[:, 1, 1]
+    assert np.abs(trace).max() <= 2.0**-20
+    assert state.viscosity == 0.0
+    viscous = experiment.initial_state(plan(Case.CURL_NOISE, substeps=1, frequency=5, reynolds=1000.0))
+    speed = np.sqrt(np.mean(np.sum(state.velocity**2, axis=-1)))
+    assert viscous.viscosity == pytest.approx(speed * 0.925 / 1000.0)
+
+
+@pytest.mark.parametrize(
+    ("case", "settings", "words"),
+    [
+        (Case.CAVITY, {}, "Reynolds"),
+        (Case.CAVITY, {"reynolds": -1.0}, "positive"),
+        (Case.CAVITY, {"reynolds": math.nan}, "positive"),
+        (Case.CAVITY, {"reynolds": 0.5}, "too viscous"),
+        (Case.CAVITY, {"reynolds": 100.0, "grid": 8}, "grid is too small"),
+        (Case.CAVITY, {"reynolds": 100.0, "particles": 1224}, "fewer particles than cells"),
+        (Case.CAVITY, {"reynolds": 100.0, "dt": 0.1}, "sound"),
+        (Case.CAVITY, {"reynolds": 100.0, "lid_speed": 2.0}, "lid"),
+        (Case.CAVITY, {"reynolds": 100.0, "lid_off_after": 10}, "lid stops"),
+        (Case.CAVITY, {"reynolds": 100.0, "frequency": 4}, "stirring"),
+        (Case.CAVITY, {"reynolds": 100.0, "substeps": 0}, "nothing to simulate"),
+        (Case.CURL_NOISE, {"lid_speed": 0.1}, "no lid"),
+        (Case.CURL_NOISE, {"frequency": 30}, "frequency"),
+    ],
+)
+def test_plan_refuses_what_cannot_work(case: Case, settings: dict[str, Any], words: str) -> None:
+    """Every refusal is a usage error that says what is wrong and what was expected."""
+    with pytest.raises(UsageError, match=words) as caught:
+        plan(case, **{"substeps": 10, **settings})
+    assert "expected" in str(caught.value)
+
+
+def _arguments(folder: Path, *more: str) -> list[str]:
+    """Return the options of a cavity on 16 x 16 cells, 1,311 particles."""
+    base = ["--case", "cavity", "--re", "100", "--grid", "16", "--substeps", "300"]
+    return [*base, "--json", str(folder / "result.json"), *more]
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Return the folders of the same run, done twice, picture included."""
+    folders = [tmp_path_factory.mktemp("run") for _ in range(2)]
+    for folder in folders:
+        assert validate.main(_arguments(folder, "--profiles", str(folder / "profiles.png"))) == 0
+    return folders
+
+
+def test_validate_writes_the_same_file_twice(written: list[Path]) -> None:
+    """All but the timing is equal, to the byte; the picture is one."""
+    texts = []
+    for folder in written:
+        assert (folder / "profiles.png").read_bytes().startswith(b"\x89PNG")
+        found = json.loads((folder / "result.json").read_text())
+        assert found.pop("timing")["particle_substeps_per_second"] > 0.0
+        texts.append(json.dumps(found))
+    assert texts[0] == texts[1]
+
+
+def test_validate_reports_what_it_measured(written: list[Path]) -> None:
+    """Ghia's points with his values, errors that follow from them, checks, energy that grows."""
+    found = json.loads((written[0] / "result.json").read_text())
+    lines = found["centre_lines"]
+    assert [point["y"] for point in lines["u"]] == list(ghia.Y)
+    assert lines["v"][0]["ghia"] == -0.05906
+    squares = [(point["u"] - point["ghia"]) ** 2 for point in lines["u"]]
+    assert found["ghia"]["u_rmse"] == pytest.approx(math.sqrt(sum(squares) / 15))
+    assert found["empty_cells"] == 0
+    assert found["jacobian"]["min"] <= found["jacobian"]["min_outside_lid_corners"] <= 1.0
+    assert found["kinetic_energy"]["substep"] == list(range(0, 301, 20))
+    assert found["kinetic_energy"]["value"] == sorted(found["kinetic_energy"]["value"])
+    assert [check["substep"] for check in found["checks"]] == [300]
+
+
+def test_validate_stops_the_lid_where_nothing_is_tabulated(tmp_path: Path) -> None:
+    """The energy falls once the lid stops; at Re 250 there is no table, so errors are null."""
+    arguments = [*_arguments(tmp_path), "--re", "250", "--substeps", "600", "--lid-off-after", "300"]
+    assert validate.main(arguments) == 0
+    found = json.loads((tmp_path / "result.json").read_text())
+    energy = dict(zip(found["kinetic_energy"]["substep"], found["kinetic_energy"]["value"], strict=True))
+    assert energy[600] < 0.95 * energy[300]
+    assert found["largest_rise_after_lid_off"] < 0.0
+    assert found["ghia"] is None
+    assert found["centre_lines"]["u"][0]["ghia"] is None
+
+
+def test_validate_curl_noise(tmp_path: Path) -> None:
+    """Most of the energy is left after ten frames, and divergence is small against vorticity."""
+    target = tmp_path / "curl.json"
+    options = ["--case", "curl-noise", "--grid", "20", "--frequency", "2", "--substeps", "500"]
+    assert validate.main([*options, "--json", str(target)]) == 0
+    found = json.loads(target.read_text())
+    assert found["centre_lines"] is None
+    assert 0.5 < found["energy_retention"] < 1.1
+    assert found["divergence_over_vorticity"] < 0.1
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--grid", "4"], "grid is too small"),
+        (["--particles", "100"], "fewer particles than cells"),
+        (["--profiles", "curve.txt"], "not a picture format"),
+        (["--json", "/proc/none/result.json"], "cannot be written"),
+        (["--frequency", "3"], "stirring"),
+    ],
+)
+def test_validate_refuses_bad_options(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], words: str
+) -> None:
+    """Exit code 2, the reason on stderr without a traceback, no file written."""
+    assert validate.main([*_arguments(tmp_path), *options]) == 2
+    told = capsys.readouterr()
+    assert words in told.err
+    assert "Traceback" not in told.err
+    assert told.out == ""
+    assert not list(tmp_path.iterdir())
+
+
+def test_validate_refuses_words_for_numbers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The parser itself exits with 2 and names the option."""
+    with pytest.raises(SystemExit) as caught:
+        validate.main([*_arguments(tmp_path), "--re", "fast"])
+    assert caught.value.code == 2
+    assert "--re" in capsys.readouterr().err
