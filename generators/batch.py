@@ -10,6 +10,7 @@ import functools
 import importlib
 import re
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -70,9 +71,21 @@ def split_module(size: Size) -> Split:
 
 
 def draw(size: Size, scenario: int) -> InitialState:
-    """Return a scenario before its first substep."""
+    """Return a scenario before its first substep.
+
+    Raises:
+        WorkFailedError: the parameters lead to values that cannot be drawn.
+    """
     rng = generator(size.split, size.name, size.major, scenario)
-    return split_module(size).initial_state(size, scenario, rng)
+    try:
+        return split_module(size).initial_state(size, scenario, rng)
+    except WorkFailedError as error:
+        raise _placed(error, f"{size.split} {size.name}, scenario {scenario}") from error
+
+
+def _placed(error: WorkFailedError, where: str) -> WorkFailedError:
+    """Return an error that says where it happened."""
+    return WorkFailedError(error.what, where=where, expected=error.expected, got=error.got, fix=error.fix)
 
 
 def substeps_of(size: Size, scenario: int) -> int:
@@ -117,7 +130,8 @@ class Batch:
         self.solver = _solver(
             split_module(job.size).solver_parameters(job.size), job.device, len(self.states)
         )
-        self.solver.load(self.states)
+        with self._naming():
+            self.solver.load(self.states)
         self._report = report
         self._frames = frames or [job.size.frame_count(scenario) for scenario in job.scenarios]
         self._now = 0
@@ -154,10 +168,8 @@ class Batch:
         stride = max(1, STRIDE // (self.job.size.particles * len(self.states)))
         while self._now < substep:
             count = min(stride, substep - self._now)
-            try:
+            with self._naming():
                 self.solver.advance(count)
-            except WorkFailedError as error:
-                raise self._named(error) from error
             self._now += count
             self._account(count)
 
@@ -175,17 +187,17 @@ class Batch:
                 widest.jacobian_max = max(widest.jacobian_max, health.jacobian_max)
         self._report(count * running)
 
-    def _named(self, error: WorkFailedError) -> WorkFailedError:
-        """Return a solver's error with the scenario's id instead of its index."""
+    @contextmanager
+    def _naming(self) -> Iterator[None]:
+        """Put a scenario's id into errors of the solver, which knows its index only."""
         ids, size = self.job.scenarios, self.job.size
-        place = re.sub(r"scenario (\d+)", lambda index: f"scenario {ids[int(index[1])]}", error.where or "")
-        return WorkFailedError(
-            error.what,
-            where=f"{size.split} {size.name}, {place}",
-            expected=error.expected,
-            got=error.got,
-            fix=error.fix,
-        )
+        try:
+            yield
+        except WorkFailedError as error:
+            place = re.sub(
+                r"scenario (\d+)", lambda found: f"scenario {ids[int(found[1])]}", error.where or ""
+            )
+            raise _placed(error, f"{size.split} {size.name}, {place}") from error
 
 
 @functools.lru_cache(maxsize=1)

@@ -82,7 +82,7 @@ class Driver(ABC, Generic[Parameters]):
         self._substeps = 0
 
     @abstractmethod
-    def _compile(self, atomic: bool, threads: int) -> Kernels:  # noqa: FBT001
+    def _compile(self, atomic: bool, threads: int) -> Kernels:
         """Make the kernels and their fields."""
 
     @abstractmethod

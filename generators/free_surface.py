@@ -72,7 +72,7 @@ class FreeSurface(Driver[FreeSurfaceParameters]):
 
     _kernels: ParticleStress
 
-    def _compile(self, atomic: bool, threads: int) -> ParticleStress:  # noqa: FBT001
+    def _compile(self, atomic: bool, threads: int) -> ParticleStress:
         return ParticleStress(self.parameters, scenarios=self.scenarios, atomic=atomic, threads=threads)
 
     def _start(self, states: Sequence[InitialState]) -> None:

@@ -48,11 +48,11 @@ JACOBIAN_BOUND = 8.0
 _INSET = 1e-3
 """Distance that particles keep from a wall [cells]."""
 
-_REACH = 8.0
-"""Bound of abs(v_p + C (x_i - x_p)) over the largest nodal speed [1].
+_REACH = 16.0
+"""Bound of abs(v_p + C (x_i - x_p)) over the speed bound dx/dt [1].
 
-abs(C_ab) <= (4/dx^2) max abs(v) sum w abs(x_i - x_p) <= 2 max abs(v) / dx, and a node lies within
-1.5 dx per axis: at most 1 + 2 x 2 x 1.5 = 7.
+Walls move at half the bound or less, so ghosts at twice the bound or less; abs(C_ab) <= (4/dx^2)
+max abs(v) sum w abs(x_i - x_p) <= 4/dt, and a node lies within 1.5 dx per axis: 1 + 2 x 4 x 1.5 = 13.
 """
 
 
@@ -75,6 +75,7 @@ class NodalStress:
         peak: largest absolute velocity component of each node since then.
         moved: nodal v_x, v_y, r, Jbar after the forces of the last substep.
         total: sum over time of the nodal velocities.
+        averaging: whether the substeps to come count for it.
         spread: nu dt / dx^2, shape [scenario].
         fill: m / (rho dx^2), shape [scenario].
         speed_bound: the CFL bound dx/dt [length/s].
@@ -90,9 +91,14 @@ class NodalStress:
         self.scenarios = scenarios
         self.atomic = atomic
         self.threads = threads
+        self.averaging = False
         self.walls = Walls(grid=parameters.grid, wall=parameters.wall, no_slip=parameters.no_slip)
         self._set_constants()
         self._make_fields()
+
+    def release(self) -> None:
+        """Give the memory back; the fields cannot be used afterwards."""
+        self._tree.destroy()
 
     def _set_constants(self) -> None:
         p = self.parameters
@@ -288,9 +294,18 @@ class NodalStress:
 
     # The drivers: the same phases in the same order.
 
-    @ti.kernel
-    def run_serially(self, substeps: ti.i32, average: ti.i32) -> Nothing:
+    def run_serially(self, substeps: int) -> None:
         """Advance scenario 0 by many substeps in one thread."""
+        self._serial_substeps(substeps, int(self.averaging))
+
+    def run_in_parallel(self) -> None:
+        """Advance every scenario by one substep: one launch per phase."""
+        self._parallel_substep()
+        if self.averaging:
+            self._add_to_total()
+
+    @ti.kernel
+    def _serial_substeps(self, substeps: ti.i32, average: ti.i32) -> Nothing:
         ti.loop_config(serialize=True)
         for _ in range(substeps):
             for i in range(self.walls.ghost[0], self.walls.ghost[1] + 1):
@@ -317,8 +332,7 @@ class NodalStress:
                 self.g2p(0, p)
 
     @ti.kernel
-    def run_in_parallel(self) -> Nothing:
-        """Advance every scenario by one substep: one launch per phase."""
+    def _parallel_substep(self) -> Nothing:
         all_nodes = ti.static((self.walls.ghost[0], self.walls.ghost[1] + 1))
         interior = ti.static((self.walls.edge[0], self.walls.edge[1] + 1))
         ti.loop_config(parallelize=self.threads)
@@ -354,7 +368,6 @@ class NodalStress:
             self.peak[s, i, j] = 0.0
 
     @ti.kernel
-    def add_to_mean(self) -> Nothing:
-        """Add the nodal velocities of the last substep to their sums over time."""
+    def _add_to_total(self) -> Nothing:
         for s, i, j in self.moved:
             self.sum_velocity(s, i, j)

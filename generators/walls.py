@@ -64,7 +64,7 @@ class Walls:
 
     @ti.func
     def ring(self, k: ti.i32) -> Value:
-        """Return the k-th ghost node: left, right, bottom, top."""
+        """Return the k-th ghost node: once around, from the low left corner."""
         side, along = k // self.span, k % self.span
         low, high = self.ghost[0], self.ghost[1]
         i, j = low, low + along

@@ -88,7 +88,9 @@ def _check(path: Path, kind: Panel | str | None, rate: float, every: int) -> Non
             got=path,
         )
     if kind is not None and kind not in KINDS:
-        raise UsageError(f"an animation cannot show {kind!r}", where="--kind", fix=nearest(str(kind), KINDS))
+        raise UsageError(
+            f"an animation cannot show {kind!r}", where="--kind", fix=nearest(str(kind), map(str, KINDS))
+        )
     if rate <= 0 or every < 1:
         raise UsageError("an animation needs a positive rate and step", got=f"{rate} frames/s, every {every}")
 

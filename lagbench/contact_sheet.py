@@ -166,7 +166,8 @@ def _table(files: Sequence[Path], panel: Panel | None, frame: int | None) -> _Sh
         driven = bool(recording.wall_velocity.any())
         panel = panel or (Panel.STREAMLINES if driven else Panel.VORTICITY)
         if frame is None:
-            frame = recording.size.task.frames_of_interest[-1] if driven else 0
+            latest = recording.size.task.frames_of_interest[-1] if driven else 0
+            frame = min(latest, recording.frames - 1)
     scenes = []
     for path in files[: DRIVEN if driven else DECAYING]:
         with open_recording(path) as recording:

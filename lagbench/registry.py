@@ -51,7 +51,6 @@ REGISTRY_VARIABLE = "LAGBENCH_REGISTRY"
 """Environment variable that names a datasets.yaml to use instead of ours."""
 
 SUBSETS = ("train", "valid", "test", "extra")
-HASHED_SUBSETS = ("train", "valid", "test")
 
 
 class _Strict(BaseModel):

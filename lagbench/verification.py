@@ -147,6 +147,8 @@ def verify(
     problems += [f"scenario {i} differs when simulated anew" for i in anew if regenerated[i] == DIFFERENT]
     reports = _reports(folder, tier, ids, findings)
     whole, verdict = _whole(tier, findings)
+    problems += [f"{r.name}: its hash is {UNLIKE}" for r in reports if r.verdict == UNLIKE]
+    problems += [f"the data set hash is {UNLIKE}"] if verdict == UNLIKE else []
     return VerificationResult(
         split=split,
         size=size,
@@ -165,6 +167,7 @@ def verify(
 IDENTICAL = "identical"
 DIFFERENT = "different"
 INCOMPARABLE = "nothing to compare with"
+UNLIKE = "NOT that of datasets.yaml"
 
 
 def evenly_spaced(ids: Sequence[int], count: int) -> tuple[int, ...]:
@@ -277,7 +280,7 @@ def _verdict(computed: str | None, recorded: str | None) -> str:
         return "no hash in datasets.yaml yet"
     if computed is None:
         return "incomplete"
-    return "equal to datasets.yaml" if computed == recorded else "NOT that of datasets.yaml"
+    return "equal to datasets.yaml" if computed == recorded else UNLIKE
 
 
 def _gaps(reports: Sequence[SubsetReport]) -> list[str]:

@@ -5,15 +5,18 @@ Files appear whole or not at all, without dates, and memory does not grow with t
 
 from __future__ import annotations
 
+import subprocess
+import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import IO, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .atomic import atomic_path
-from .errors import WorkFailedError
+from .errors import UsageError, WorkFailedError
 from .extras import require
 from .palette import reduced
 
@@ -25,8 +28,9 @@ SUFFIXES = (".mp4", ".gif")
 Write = Callable[[NDArray[np.uint8]], None]
 """Appends one frame: RGB bytes, shape [row, column, 3]."""
 
-_X264 = ["-f", "mp4", "-crf", "20", "-preset", "veryfast", "-movflags", "+faststart"]
-_NO_DATES = ["-map_metadata", "-1", "-fflags", "+bitexact", "-flags:v", "+bitexact"]
+_CODING = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "20", "-preset", "veryfast"]
+_CONTAINER = ["-f", "mp4", "-movflags", "+faststart", "-map_metadata", "-1"]
+_NO_DATES = ["-fflags", "+bitexact", "-flags:v", "+bitexact"]
 
 
 @contextmanager
@@ -51,24 +55,47 @@ def open_video(path: Path, size: tuple[int, int], frames_per_second: float) -> I
 
 @contextmanager
 def _mp4(path: Path, size: tuple[int, int], rate: float) -> Iterator[Write]:
+    """Feed frames to ffmpeg through a pipe."""
+    width, height = size
+    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{rate:g}", "-i", "-"]
+    command = [_ffmpeg(), "-y", "-loglevel", "error", *source, *_CODING, *_CONTAINER, *_NO_DATES, str(path)]
+    with tempfile.TemporaryFile() as log:
+        # A session of its own: Ctrl-C shall reach us, not the encoder.
+        process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=log, start_new_session=True)
+        pipe = cast("IO[bytes]", process.stdin)
+        finished = False
+        try:
+            yield lambda frame: _send(pipe, frame)
+            pipe.close()
+            finished = process.wait() == 0
+        except BrokenPipeError:
+            process.wait()
+        finally:
+            process.kill()
+            process.wait()
+            with suppress(BrokenPipeError):
+                pipe.close()
+        if not finished:
+            log.seek(0)
+            said = log.read().decode(errors="replace").strip()
+            raise WorkFailedError(
+                "ffmpeg cannot encode the video", where=str(path.parent), got=said or "nothing said"
+            )
+
+
+def _send(pipe: IO[bytes], frame: NDArray[np.uint8]) -> None:
+    pipe.write(frame.tobytes())
+
+
+def _ffmpeg() -> str:
+    """Return the path of the encoder that imageio brings, or of the system's."""
     ffmpeg = require("imageio_ffmpeg", extra="plots")
-    stream = ffmpeg.write_frames(
-        str(path),
-        size,
-        fps=rate,
-        codec="libx264",
-        quality=None,
-        macro_block_size=2,
-        ffmpeg_log_level="error",
-        output_params=[*_X264, *_NO_DATES],
-    )
     try:
-        stream.send(None)
-        yield lambda frame: stream.send(np.ascontiguousarray(frame))
-    except OSError as error:
-        raise WorkFailedError("ffmpeg cannot encode the video", where=str(path.parent), got=error) from error
-    finally:
-        stream.close()
+        return str(ffmpeg.get_ffmpeg_exe())
+    except RuntimeError as error:
+        raise UsageError(
+            "no ffmpeg", got=error, fix="pip install 'lagbench[plots]', or write a .gif"
+        ) from None
 
 
 @contextmanager

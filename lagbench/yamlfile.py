@@ -14,25 +14,17 @@ import yaml
 
 from .errors import UnreadableFileError
 
-__all__ = ["MAX_BYTES", "read_yaml"]
+__all__ = ["MAX_BYTES", "MAX_DEPTH", "read_yaml"]
 
 MAX_BYTES = 4 * 2**20
 """Largest YAML file that is read [bytes]."""
 
-try:
-    from yaml import CSafeLoader as _SafeLoader
-except ImportError:  # PyYAML built without libyaml
-    from yaml import SafeLoader as _SafeLoader  # type: ignore[assignment]
+MAX_DEPTH = 32
+"""Deepest nesting of mappings and lists that is read."""
 
 
-class _StrictLoader(_SafeLoader):
-    """Safe loader that refuses aliases and duplicate keys."""
-
-    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
-        if self.check_event(yaml.AliasEvent):
-            event = self.peek_event()
-            raise yaml.composer.ComposerError(None, None, "aliases are not allowed", event.start_mark)
-        return super().compose_node(parent, index)
+class _StrictLoader(yaml.CSafeLoader):
+    """Safe loader that refuses duplicate keys."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
         seen: set[Hashable] = set()
@@ -43,6 +35,17 @@ class _StrictLoader(_SafeLoader):
                 raise yaml.constructor.ConstructorError(None, None, message, key_node.start_mark)
             seen.add(key)
         return super().construct_mapping(node, deep=deep)
+
+
+def _check_structure(text: str) -> None:
+    """Raise on the first alias and on deep nesting, before anything is built."""
+    depth = 0
+    for event in yaml.parse(text, Loader=yaml.CSafeLoader):
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if isinstance(event, yaml.AliasEvent) or depth > MAX_DEPTH:
+            what = "aliases are not allowed" if depth <= MAX_DEPTH else f"nested deeper than {MAX_DEPTH}"
+            message = f"{what} {event.start_mark}"
+            raise yaml.YAMLError(message)
 
 
 def read_yaml(path: Path) -> Any:  # noqa: ANN401
@@ -64,7 +67,8 @@ def read_yaml(path: Path) -> Any:  # noqa: ANN401
                 got=f"{size} bytes",
             )
         text = path.read_text(encoding="utf-8")
-        return yaml.load(text, Loader=_StrictLoader)  # noqa: S506 - a safe loader
+        _check_structure(text)
+        return yaml.load(text, Loader=_StrictLoader)
     except OSError as error:
         raise UnreadableFileError("cannot read the YAML file", where=str(path), got=error) from error
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:

@@ -31,7 +31,7 @@ def parameters(**changes: float | bool) -> ClosedBoxParameters:
         "density_coupling": 0.01,
         "shift": 0.01,
     }
-    return ClosedBoxParameters(**(values | changes))  # type: ignore[arg-type]
+    return ClosedBoxParameters(**(values | changes))
 
 
 def box(constants: ClosedBoxParameters) -> tuple[float, float]:

@@ -26,7 +26,7 @@ class ReferenceClosedBox:
         self.low, self.high = p.wall, p.grid - p.wall
         self.bounds = f((p.wall + 0.5 + 1e-3) * dx), f((p.grid - p.wall - 0.5 - 1e-3) * dx)
         room = 62 - int(np.ceil(np.log2(p.particles)))
-        fastest = int(np.ceil(np.log2(8.0 * dx / p.dt)))
+        fastest = int(np.ceil(np.log2(16.0 * dx / p.dt)))
         self.mv_bits, self.m_bits = min(room, 50) - fastest, min(room, 50) - 3
         self.cell_scale = f(2.0**self.mv_bits * dx)
         self.stiffness = f(p.dt * p.modulus / (p.density * 2.0 * dx))

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
-from PIL import Image
+from PIL.GifImagePlugin import GifImageFile
 from swirls import OMEGA, write_swirl
 
 from lagbench import animation, palette, video
@@ -106,7 +106,7 @@ def test_two_scenarios_side_by_side_end_with_the_shorter(swirl: Path, tmp_path: 
     """The picture is wider by a panel and a gap and has as many frames as the shorter scenario."""
     shorter = write_swirl(tmp_path, scenario=3, frames=5)
     path = animate(swirl, tmp_path / "pair.gif", beside=shorter)
-    with Image.open(path) as image:
+    with GifImageFile(path) as image:
         assert image.n_frames == 5
         assert image.size[0] == SIDE + animation.GAP + animation.SIDE
 
@@ -116,7 +116,7 @@ def test_gif_repeats_and_has_the_same_bytes_twice(swirl: Path, tmp_path: Path) -
     first = animate(swirl, tmp_path / "a.gif", every=3, frames_per_second=10)
     second = animate(swirl, tmp_path / "b.gif", every=3, frames_per_second=10)
     assert first.read_bytes() == second.read_bytes()
-    with Image.open(first) as image:
+    with GifImageFile(first) as image:
         assert (image.n_frames, image.info["loop"], image.info["duration"]) == (3, 0, 100)
         frames = []
         for number in range(3):
@@ -146,7 +146,7 @@ def test_an_error_leaves_no_file(swirl: Path, tmp_path: Path, monkeypatch: pytes
 
 def test_ffmpeg_that_fails_is_reported(swirl: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What ffmpeg refuses becomes an error of lagbench, and no file is left."""
-    monkeypatch.setattr(video, "_X264", ["-no_such_option", "1"])
+    monkeypatch.setattr(video, "_CODING", ["-no_such_option", "1"])
     with pytest.raises(WorkFailedError, match="encode"):
         animate(swirl, tmp_path / "x.mp4")
     assert not list(tmp_path.iterdir())

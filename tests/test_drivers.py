@@ -5,12 +5,14 @@ from __future__ import annotations
 import dataclasses
 import subprocess
 import sys
+from typing import cast
 
 import numpy as np
 import pytest
 from box_scenarios import ALL_LIDS, after, loaded, parameters, scenario, snapshot
 
 from lagbench.errors import UsageError
+from lagbench.generators.closed_box import ClosedBox
 from lagbench.generators.solver import Device, build
 
 NO_SLIP = parameters()
@@ -81,6 +83,18 @@ def test_more_threads_than_the_pool_are_refused() -> None:
     loaded(NO_SLIP, [scenario(NO_SLIP)])
     with pytest.raises(UsageError, match="another process"):
         build(NO_SLIP, device=Device.PARALLEL, threads=10_000)
+
+
+def test_a_closed_solver_leaves_the_others_alone() -> None:
+    """Releasing one solver's memory changes no bit of another one that goes on."""
+    state = scenario(NO_SLIP, seed=11, speed=0.4, walls=ALL_LIDS)
+    expected = after(NO_SLIP, [state], 60)
+    solver, other = loaded(NO_SLIP, [state]), build(parameters(grid=20))
+    solver.advance(30)
+    cast("ClosedBox", other).close()
+    solver.advance(30)
+    for name, values in snapshot(solver).items():
+        np.testing.assert_array_equal(values, expected[name], err_msg=name)
 
 
 def test_taichi_is_imported_late_and_quietly() -> None:

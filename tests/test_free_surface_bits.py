@@ -8,12 +8,13 @@ from typing import cast
 import numpy as np
 import pytest
 from free_surface_scenarios import Part, parameters, run, scenario, snapshot, start
+from reference_free_surface import FreeSurfaceReference
+
 from lagbench.generators import backend
 from lagbench.generators.base import InitialState, Material
 from lagbench.generators.free_surface import FreeSurface
 from lagbench.generators.shapes import Disc, Rectangle
 from lagbench.generators.solver import Device, build
-from reference_free_surface import FreeSurfaceReference
 
 CONSTANTS = parameters()
 SQUARE = Rectangle(0.2, 0.2)

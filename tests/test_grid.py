@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -22,7 +24,7 @@ def lattice(grid: Grid, per_cell: int = 2) -> Floats:
     return np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
 
 
-def fields_of(x: Floats, u: Floats, grid: Grid) -> Fields:
+def fields_of(x: NDArray[np.floating[Any]], u: Floats, grid: Grid) -> Fields:
     """Form the fields of particles that fill the unit box."""
     return gridding.fields(x, u, grid, full=grid.full_weight(x.shape[-2], 1.0))
 

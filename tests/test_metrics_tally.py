@@ -14,7 +14,19 @@ from metric_flows import SETTING, Floats, pairs_of, rollout, scenario_of
 from numpy.testing import assert_allclose
 
 from lagbench.errors import UsageError
-from lagbench.metrics import METRICS, FramePair, Tally, aggregate, measure, score, select, snapshots, tally
+from lagbench.metrics import (
+    METRICS,
+    FramePair,
+    Tally,
+    aggregate,
+    bootstrap_interval,
+    measure,
+    score,
+    select,
+    snapshots,
+    tally,
+)
+from lagbench.metrics.reductions import FirstFrames
 
 ALL = select()
 MATERIAL = np.arange(400) // 200  # half liquid, half jelly
@@ -142,6 +154,22 @@ def test_the_mean_over_frames_comes_before_that_over_scenarios() -> None:
     found = score(METRICS["vorticity_pearson"], {0: of_pearson(0.5, 0.7), 1: of_pearson(math.nan, 1.0)})
     assert found is not None
     assert found.mean == pytest.approx(0.8)
+
+
+def test_the_interval_of_a_score_is_that_of_its_scenario_values() -> None:
+    """Scenario means 0.6, 0.8 and an undefined one: the bootstrap sees the two values."""
+    values = ((0.5, 0.7), (0.8, math.nan), (math.nan, math.nan))
+    found = score(METRICS["vorticity_pearson"], {i: of_pearson(*v) for i, v in enumerate(values)})
+    assert found is not None
+    assert found.interval == bootstrap_interval([0.6, 0.8])
+    assert list(found.interval) == pytest.approx([0.6, 0.8])
+
+
+def test_a_horizon_beyond_the_series_is_undefined() -> None:
+    """The mean of the first five of three frames does not exist; of the first two it does."""
+    assert math.isnan(FirstFrames(5)(np.arange(3.0)))
+    assert FirstFrames(2)(np.arange(3.0)) == 0.5
+    assert FirstFrames(2, end=True)(np.arange(3.0)) == 1.0
 
 
 def test_a_frame_measured_twice_keeps_its_value() -> None:

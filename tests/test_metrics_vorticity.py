@@ -155,6 +155,13 @@ def test_histogram_divergence_is_numpys_histogram() -> None:
         assert measured(pair, name) == pytest.approx([scipy.stats.entropy(p, q)], rel=1e-9)
 
 
+def test_values_on_an_edge_belong_to_the_bin_above() -> None:
+    """Truth 0..64 has edges at whole numbers: one value per bin, two in the last; 3 falls into bin 3."""
+    p, q = histograms(np.arange(65.0), np.full(65, 3.0))  # type: ignore[misc]
+    assert_allclose(p * 97, [1.5] * 63 + [2.5])
+    assert_allclose(q * 97, [0.5] * 3 + [65.5] + [0.5] * 60)
+
+
 def test_histograms_of_a_constant_truth_are_undefined() -> None:
     """Where the truth has no range there are no bins."""
     assert histograms(np.ones(20), np.arange(20.0)) is None

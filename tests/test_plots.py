@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import subprocess
 import sys
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from swirls import OMEGA, TOP_TO_THE_RIGHT, write_swirl
 
 from lagbench import extras, palette
 from lagbench.canvas import figure, pixels_of
+from lagbench.dataset import open_split
 from lagbench.errors import DataError, UsageError
 from lagbench.panels import Panel, draw_walls, limit_of
 from lagbench.plots import KINDS, contact_sheet, describe, plot_frame
@@ -70,6 +72,23 @@ def test_a_data_set_draws_what_its_file_draws(swirl: Path, tmp_path: Path) -> No
     with xr.open_dataset(swirl) as data:
         from_data = plot_frame(data, 5, tmp_path / "data.png")
     assert from_file.read_bytes() == from_data.read_bytes()
+
+
+def test_a_scenario_of_an_opened_split_draws_what_its_file_draws(tmp_path: Path) -> None:
+    """Padding of the shorter of two scenarios is not drawn: its last frame is its own."""
+    for scenario, frames in ((0, 4), (1, 6)):
+        write_swirl(tmp_path, "fluid", scenario, frames=frames, walls=None, parameters={"family": "disc"})
+    split = open_split("fluid", subset="train", size="tiny", root=tmp_path)
+    from_split = plot_frame(split.sel(scenario=0), -1, tmp_path / "split.png")
+    from_file = plot_frame(tmp_path / "fluid/tiny/v1/train/0000.nc", 3, tmp_path / "file.png")
+    assert from_split.read_bytes() == from_file.read_bytes()
+
+
+def test_importing_draws_in_nothing_heavy() -> None:
+    """The modules can be imported without matplotlib, and importing them does not load it."""
+    code = "import sys, lagbench.plots, lagbench.animation, lagbench.cards; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert not {"matplotlib", "PIL", "xarray", "taichi", "torch"} & set(loaded.split())
 
 
 def test_a_data_set_of_several_scenarios_is_refused(swirl: Path, tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ DX = 1.0 / 32.0
 
 
 @ti.kernel
-def evaluate_stencil(x: ti.types.ndarray(), base: ti.types.ndarray(), weight: ti.types.ndarray()):  # type: ignore[no-untyped-def] # noqa: ANN201, D103
+def evaluate_stencil(x: ti.types.ndarray(), base: ti.types.ndarray(), weight: ti.types.ndarray()):  # type: ignore[no-untyped-def,valid-type] # noqa: ANN201, D103
     for p in range(x.shape[0]):
         node, _, w = transfer.stencil(ti.Vector([x[p, 0], x[p, 1]]), 32.0)
         for axis in ti.static(range(2)):
@@ -24,13 +24,13 @@ def evaluate_stencil(x: ti.types.ndarray(), base: ti.types.ndarray(), weight: ti
 
 
 @ti.kernel
-def evaluate_fixed(value: ti.types.ndarray(), out: ti.types.ndarray()):  # type: ignore[no-untyped-def] # noqa: ANN201, D103
+def evaluate_fixed(value: ti.types.ndarray(), out: ti.types.ndarray()):  # type: ignore[no-untyped-def,valid-type] # noqa: ANN201, D103
     for p in range(value.shape[0]):
         out[p] = transfer.to_fixed(value[p])
 
 
 @ti.kernel
-def evaluate_bounded(value: ti.types.ndarray(), most: ti.types.ndarray(), out: ti.types.ndarray()):  # type: ignore[no-untyped-def] # noqa: ANN201, D103
+def evaluate_bounded(value: ti.types.ndarray(), most: ti.types.ndarray(), out: ti.types.ndarray()):  # type: ignore[no-untyped-def,valid-type] # noqa: ANN201, D103
     for p in range(value.shape[0]):
         out[p, 0] = transfer.bounded(value[p], -1.0, 2.0)
         out[p, 1] = transfer.largest(value[p], most[p])

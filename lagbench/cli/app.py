@@ -12,6 +12,7 @@ from typer.core import TyperGroup
 from lagbench.errors import LagbenchError
 
 from . import data, draw, show, upkeep
+from . import demo as tour
 
 __all__ = ["app"]
 
@@ -77,6 +78,7 @@ def _lagbench(
     """Bit-reproducible particle data sets for neural surrogates of continuum simulators."""
 
 
+app.command("demo", epilog="Example: lagbench demo --root demo")(tour.demo)
 app.command("list", epilog="Example: lagbench list --json")(show.list_splits)
 app.command("info", epilog="Example: lagbench info cavity --size mini")(show.info)
 app.command("generate", epilog="Example: lagbench generate --split cavity --size tiny --workers 2")(

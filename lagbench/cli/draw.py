@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from .options import JsonFlag, QuietFlag, RootOption, SizeOption
+from .options import JsonFlag, QuietFlag, RootOption, SizeOption, chosen
 from .output import print_json, say
 
 __all__ = ["animate", "plot"]
@@ -28,8 +28,6 @@ def _source(name: str | None, split: str | None, size: str, scenario: int | None
     """Return the scenario file that a user means by its path or by split, size and id."""
     from lagbench.layout import ScenarioKey, resolve_root, scenario_path
     from lagbench.registry import load
-
-    from .options import chosen
 
     if name is not None and name.endswith(".nc"):
         return Path(name)
@@ -64,14 +62,22 @@ def plot(
     kind: Annotated[
         str, typer.Option("--kind", help="all, speed, material, vorticity or streamlines.")
     ] = "all",
+    sheet: Annotated[
+        bool, typer.Option("--sheet", help="Draw many scenarios of the split on one page instead.")
+    ] = False,
     output: OutputOption = None,
     root: RootOption = None,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
     """Draw one frame of a scenario: particles, vorticity, streamlines."""
-    from lagbench.plots import plot_frame
+    from lagbench.plots import contact_sheet, plot_frame
 
+    if sheet:
+        chosen_split = chosen(name, split)
+        page = output or Path(f"{chosen_split}-{size}-sheet.png")
+        _done(contact_sheet(chosen_split, size, page, root=root), as_json=as_json, quiet=quiet)
+        return
     source = _source(name, split, size, scenario, root)
     target = output or _default_name(source, f"-frame{frame}.png")
     _done(plot_frame(source, frame, target, kind=kind), as_json=as_json, quiet=quiet)
@@ -88,9 +94,7 @@ def animate(
     beside: Annotated[
         int | None, typer.Option("--beside", metavar="ID", help="Second scenario of the split.")
     ] = None,
-    kind: Annotated[
-        str | None, typer.Option("--kind", help="speed, material, vorticity or streamlines.")
-    ] = None,
+    kind: Annotated[str | None, typer.Option("--kind", help="speed, material or vorticity.")] = None,
     fps: Annotated[float, typer.Option("--fps", help="Frames shown per second.")] = 30.0,
     every: Annotated[int, typer.Option("--every", help="Show every n-th frame.", min=1)] = 1,
     output: OutputOption = None,

@@ -1,0 +1,319 @@
+"""Look at a stranger's HDF5 file without trusting it: what it holds, before values are read.
+
+HDF5 lets a file point to other files (external links, external storage, virtual data sets),
+ask for plug-ins, and claim any size. Here links are listed and never followed, data sets are
+opened only where a hard link of the root group leads, attributes only by the names that the
+format knows and up to a length. What is wrong is recorded, not raised; only a file that HDF5
+cannot read at all raises.
+"""
+
+from __future__ import annotations
+
+import math
+import stat
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from lagbench.errors import LagbenchError, UnreadableFileError
+
+from .header import OPTIONAL, REQUIRED
+
+__all__ = ["Anatomy", "Array", "Odd", "dissect", "opened", "reading"]
+
+SIGNATURE = b"\x89HDF\r\n\x1a\n"
+FOREIGN: Mapping[bytes, str] = {
+    b"CDF": "netCDF-3, the old format",
+    b"PK\x03\x04": "a zip archive, perhaps .npz",
+    b"\x93NUMPY": "a NumPy .npy file",
+    b"\x1f\x8b": "a gzip archive",
+    b"\x80": "perhaps a Python pickle",
+}
+"""First bytes to what a file is instead."""
+
+MAX_LINKS = 1000
+"""Most entries of the root group that are looked at."""
+
+MAX_ATTRIBUTE = 1 << 16
+"""Longest attribute that is read [bytes]."""
+
+MAX_COORDINATE = 20_000
+"""Most entries of a coordinate that are read; ids and frame numbers have four digits."""
+
+MAX_COORDINATE_CHUNK = 1 << 26
+"""Largest chunk of a coordinate that is read [bytes]."""
+
+VARIABLES = ("position", "scenario", "frame", "diverged_at")
+INTEGERS = ("scenario", "frame", "diverged_at")
+FILTERS = {h5py.h5z.FILTER_DEFLATE: "zlib", h5py.h5z.FILTER_SHUFFLE: "shuffle", h5py.h5z.FILTER_FLETCHER32: ""}
+LAYOUTS = {
+    h5py.h5d.COMPACT: "compact",
+    h5py.h5d.CONTIGUOUS: "contiguous",
+    h5py.h5d.CHUNKED: "chunked",
+    h5py.h5d.VIRTUAL: "virtual",
+}
+PACKING = ("scale_factor", "add_offset")
+
+_LINKS = {h5py.h5l.TYPE_SOFT: "soft link", h5py.h5l.TYPE_EXTERNAL: "external link"}
+_OBJECTS = {h5py.h5o.TYPE_GROUP: "group", h5py.h5o.TYPE_DATASET: "variable"}
+
+
+@dataclass(frozen=True)
+class Odd:
+    """An attribute that is there but cannot be used, and why."""
+
+    reason: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Array:
+    """A data set as its header describes it.
+
+    Attributes:
+        name: its name.
+        shape: lengths of its dimensions; None where asking could touch another file.
+        dims: names of its dimensions, an empty name where one has none.
+        kind: its type in words, such as "float32" or "compound".
+        layout: "contiguous", "chunked", "compact", "virtual" or "external files".
+        chunks: shape of a chunk; None where not chunked.
+        foreign_filters: filters beyond zlib, shuffle and checksum, by name.
+        packing: scale_factor and add_offset, where it has them.
+    """
+
+    name: str
+    shape: tuple[int, ...] | None
+    dims: tuple[str, ...]
+    kind: str
+    layout: str
+    chunks: tuple[int, ...] | None
+    foreign_filters: tuple[str, ...]
+    packing: Mapping[str, object]
+
+    @property
+    def self_contained(self) -> bool:
+        """Whether its values lie in this file, packed in ways that HDF5 itself unpacks."""
+        return self.shape is not None and not self.foreign_filters
+
+    @property
+    def chunk_count(self) -> int:
+        """Chunks that the shape divides into; 1 where not chunked."""
+        if self.chunks is None or self.shape is None:
+            return 1
+        return math.prod(-(-n // c) for n, c in zip(self.shape, self.chunks, strict=True))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Anatomy:
+    """A file as its headers describe it.
+
+    Attributes:
+        links: entry of the root group to what it is: "variable", "group", "soft link", ...
+        link_count: how many entries there are; ``links`` holds the first of them.
+        attributes: attribute of the format to its value, None where it is missing.
+        arrays: variable of the format to its description, where a hard link leads to one.
+        integers: coordinate to its values, where they could be read.
+    """
+
+    links: Mapping[str, str]
+    link_count: int
+    attributes: Mapping[str, object]
+    arrays: Mapping[str, Array]
+    integers: Mapping[str, tuple[int, ...]]
+
+
+@contextmanager
+def reading(path: Path, variable: str | None = None) -> Iterator[None]:
+    """Turn whatever HDF5 raises on damaged bytes into an UnreadableFileError."""
+    try:
+        yield
+    except LagbenchError:
+        raise
+    except Exception as error:  # no list of types holds: damage surfaces as nearly any of them
+        raise UnreadableFileError(
+            "HDF5 cannot read the file",
+            where=str(path) if variable is None else f"{path}, variable {variable!r}",
+            expected="an undamaged netCDF4 file",
+            got=f"{type(error).__name__}: {' '.join(str(error).split())[:300]}",
+            fix="write the file again; if it was copied or downloaded, compare its length",
+        ) from error
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[h5py.File]:
+    """Open an HDF5 file for reading; no lock, nothing but a regular file.
+
+    Raises:
+        UnreadableFileError: missing, no regular file, not HDF5, or damaged.
+    """
+    _check_file(path)
+    with reading(path):
+        file = h5py.File(path, "r", locking=False)
+    try:
+        yield file
+    finally:
+        file.close()
+
+
+def dissect(file: h5py.File, path: Path) -> Anatomy:
+    """Return what a file holds; values are read of coordinates only.
+
+    Raises:
+        UnreadableFileError: HDF5 cannot read it.
+    """
+    with reading(path):
+        root = h5py.h5g.open(file.id, b"/")
+        count = root.get_num_objs()
+        links = dict(_links(root, min(count, MAX_LINKS)))
+        names = ("lagbench_format", *REQUIRED, *OPTIONAL)
+        attributes = {name: _attribute(file["/"], name) for name in names}
+    arrays, integers = {}, {}
+    for name in VARIABLES:
+        if links.get(name) == "variable":
+            with reading(path, name):
+                dataset = file[name]
+                arrays[name] = _array(dataset, name)
+                if name in INTEGERS and _is_coordinate(arrays[name]):
+                    integers[name] = tuple(int(i) for i in dataset[...])
+    return Anatomy(
+        links=links, link_count=count, attributes=attributes, arrays=arrays, integers=integers
+    )
+
+
+def _check_file(path: Path) -> None:
+    """Refuse what is no HDF5 file by its kind and first bytes; a FIFO must not be opened."""
+    fix = "write it with lagbench.submission.write, or fill what `lagbench template` writes"
+    try:
+        if not stat.S_ISREG(path.stat().st_mode):
+            kind = "a folder" if path.is_dir() else "a device, socket or pipe"
+            raise UnreadableFileError("not a file", where=str(path), expected="a file", got=kind, fix=fix)
+        with path.open("rb") as stream:
+            head = stream.read(len(SIGNATURE))
+    except (OSError, ValueError) as error:
+        got = getattr(error, "strerror", None) or error
+        fix = "check the path and that you may read the file"
+        raise UnreadableFileError(
+            "cannot open the file", where=str(path), expected="a readable file", got=got, fix=fix
+        ) from error
+    if head != SIGNATURE:
+        got = next((what for start, what in FOREIGN.items() if head.startswith(start)), _guess(head))
+        raise UnreadableFileError(
+            "not a netCDF4 file", where=str(path), expected="netCDF4, which is HDF5", got=got, fix=fix
+        )
+
+
+def _guess(head: bytes) -> str:
+    if not head:
+        return "an empty file"
+    return "text" if head.isascii() and head.decode("ascii").isprintable() else "bytes of another format"
+
+
+def _links(root: h5py.h5g.GroupID, count: int) -> Iterator[tuple[str, str]]:
+    for index in range(count):
+        name = root.get_objname_by_idx(index)
+        kind = root.links.get_info(name).type
+        if kind == h5py.h5l.TYPE_HARD:
+            word = _OBJECTS.get(h5py.h5o.get_info(root, name).type, "named type")
+        else:
+            word = _LINKS.get(kind, "user-defined link")
+        yield name.decode("utf-8", "backslashreplace"), word
+
+
+def _attribute(owner: h5py.HLObject, name: str) -> object:
+    """Return a number or a text; None where it is missing, Odd where it is neither."""
+    if not h5py.h5a.exists(owner.id, name.encode()):
+        return None
+    attribute = h5py.h5a.open(owner.id, name.encode())
+    kind = attribute.get_type().get_class()
+    if kind not in (h5py.h5t.STRING, h5py.h5t.INTEGER, h5py.h5t.FLOAT):
+        return Odd("neither a text nor a number")
+    if attribute.get_storage_size() > MAX_ATTRIBUTE:
+        return Odd(f"{attribute.get_storage_size()} bytes")
+    if attribute.get_space().get_simple_extent_npoints() != 1:
+        return Odd("not a single value")
+    value: Any = owner.attrs[name]
+    if isinstance(value, (np.ndarray, np.generic)):
+        value = value.item()
+    if isinstance(value, bytes):
+        value = value.decode("utf-8", "backslashreplace").rstrip("\0")
+    if isinstance(value, str) and len(value) > MAX_ATTRIBUTE:
+        return Odd(f"{len(value)} characters")
+    return value if isinstance(value, (str, int, float)) else Odd("neither a text nor a number")
+
+
+def _array(dataset: h5py.Dataset, name: str) -> Array:
+    plist = dataset.id.get_create_plist()
+    layout = LAYOUTS.get(plist.get_layout(), "unknown")
+    if plist.get_external_count():
+        layout = "external files"
+    # HDF5 opens the sources of a virtual data set to tell its shape.
+    elsewhere = layout not in ("compact", "contiguous", "chunked")
+    filters = [plist.get_filter(i) for i in range(plist.get_nfilters())]
+    return Array(
+        name=name,
+        shape=None if elsewhere or dataset.id.get_space().get_simple_extent_type() != h5py.h5s.SIMPLE
+        else tuple(dataset.id.shape),
+        dims=() if elsewhere else _dims(dataset),
+        kind=_kind(dataset.id.get_type()),
+        layout=layout,
+        chunks=tuple(plist.get_chunk()) if layout == "chunked" else None,
+        foreign_filters=tuple(
+            f"{text.decode('ascii', 'replace')} ({code})" for code, _, _, text in filters if code not in FILTERS
+        ),
+        packing={n: value for n in PACKING if (value := _attribute(dataset, n)) is not None},
+    )
+
+
+def _dims(dataset: h5py.Dataset) -> tuple[str, ...]:
+    """Return the names of the dimension scales that netCDF attaches, one per dimension."""
+    rank = dataset.id.rank
+    if not h5py.h5a.exists(dataset.id, b"DIMENSION_LIST"):
+        return ("",) * rank
+    attribute = h5py.h5a.open(dataset.id, b"DIMENSION_LIST")
+    kind = attribute.get_type()
+    is_list = kind.get_class() == h5py.h5t.VLEN and kind.get_super().get_class() == h5py.h5t.REFERENCE
+    if not is_list or attribute.shape != (rank,):
+        return ("",) * rank
+    scales = dataset.attrs["DIMENSION_LIST"]
+    return tuple(_name_of(scale[0], dataset) if len(scale) else "" for scale in scales)
+
+
+def _name_of(reference: h5py.Reference, dataset: h5py.Dataset) -> str:
+    name = h5py.h5r.get_name(reference, dataset.id)
+    return (name or b"").decode("utf-8", "backslashreplace").rsplit("/", 1)[-1]
+
+
+def _kind(kind: h5py.h5t.TypeID) -> str:
+    """Return a type in words; byte order is left out, since HDF5 undoes it."""
+    if kind.get_class() == h5py.h5t.FLOAT:
+        if kind in (h5py.h5t.IEEE_F32LE, h5py.h5t.IEEE_F32BE):
+            return "float32"
+        return f"float{8 * kind.get_size()}" if kind.get_size() != 4 else "a float of 4 bytes, not IEEE"
+    if kind.get_class() == h5py.h5t.INTEGER:
+        sign = "" if kind.get_sign() == h5py.h5t.SGN_2 else "u"
+        return f"{sign}int{8 * kind.get_size()}"
+    return _CLASSES.get(kind.get_class(), "another type")
+
+
+_CLASSES = {
+    h5py.h5t.STRING: "string",
+    h5py.h5t.COMPOUND: "compound",
+    h5py.h5t.VLEN: "variable-length",
+    h5py.h5t.REFERENCE: "object reference",
+    h5py.h5t.ENUM: "enum",
+    h5py.h5t.OPAQUE: "opaque",
+    h5py.h5t.ARRAY: "array",
+    h5py.h5t.BITFIELD: "bit field",
+}
+
+
+def _is_coordinate(array: Array) -> bool:
+    """Tell whether a variable's values may be read as a short list of integers."""
+    if not array.self_contained or array.shape is None or len(array.shape) != 1:
+        return False
+    small = array.chunks is None or 8 * math.prod(array.chunks) <= MAX_COORDINATE_CHUNK
+    return small and array.shape[0] <= MAX_COORDINATE and array.kind.lstrip("u").startswith("int")

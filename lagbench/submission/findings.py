@@ -1,0 +1,208 @@
+"""What a validation found: named checks, their findings, and the exit code they mean."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from lagbench.errors import ChecksFailedError, DataError, LagbenchError, UnreadableFileError
+
+__all__ = ["CHECKS", "Finding", "Findings", "Severity", "ValidationResult", "quoted"]
+
+CHECKS = (
+    "readable",
+    "format",
+    "split",
+    "dataset",
+    "dims",
+    "scenarios",
+    "frames",
+    "particles",
+    "dtype",
+    "finite",
+    "start",
+    "in_domain",
+    "max_displacement",
+)
+"""All checks, in the order in which they are reported."""
+
+MAX_TEXT = 80
+"""Longest piece of a stranger's file that a message repeats [characters]."""
+
+
+def quoted(value: object) -> str:
+    """Return a stranger's value as one short printable line.
+
+    >>> quoted("a" + chr(27) + "[2J")
+    "'a\\\\x1b[2J'"
+    """
+    text = ascii(value[: MAX_TEXT + 1] if isinstance(value, (str, bytes)) else value)
+    return text if len(text) <= MAX_TEXT else f"{text[: MAX_TEXT - 3]}..."
+
+
+class Severity(enum.StrEnum):
+    """Whether a finding rejects a file or only flags it."""
+
+    ERROR = "error"
+    WARNING = "warning"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """One thing that is wrong with a file.
+
+    Attributes:
+        check: name of the check, one of :data:`CHECKS`.
+        severity: errors reject the file, warnings flag it.
+        what: what is wrong, one clause.
+        where: variable, attribute, scenario or frame concerned.
+        expected: what would have been right.
+        got: what was found.
+        fix: what to do about it.
+    """
+
+    check: str
+    severity: Severity
+    what: str
+    where: str
+    expected: str
+    got: str
+    fix: str
+
+    def __str__(self) -> str:
+        """Return the finding as lines for people."""
+        labelled = {"where": self.where, "expected": self.expected, "got": self.got, "fix": self.fix}
+        head = f"{self.severity} [{self.check}] {self.what}"
+        return "\n  ".join([head, *(f"{label}: {text}" for label, text in labelled.items())])
+
+
+@dataclass(frozen=True, kw_only=True)
+class ValidationResult:
+    """What the checks say about one file.
+
+    Attributes:
+        path: the file.
+        split: split that it names; None where it could not be read.
+        size: size that it names.
+        method: method that it names.
+        findings: all that is wrong, in the order of :data:`CHECKS`.
+        passed: checks that found nothing.
+        skipped: check to the reason why it could not be made.
+    """
+
+    path: Path
+    split: str | None
+    size: str | None
+    method: str | None
+    findings: tuple[Finding, ...]
+    passed: tuple[str, ...]
+    skipped: Mapping[str, str]
+
+    @property
+    def errors(self) -> tuple[Finding, ...]:
+        """Findings that reject the file."""
+        return tuple(f for f in self.findings if f.severity is Severity.ERROR)
+
+    @property
+    def warnings(self) -> tuple[Finding, ...]:
+        """Findings that flag it."""
+        return tuple(f for f in self.findings if f.severity is Severity.WARNING)
+
+    @property
+    def valid(self) -> bool:
+        """Whether nothing rejects the file."""
+        return not self.errors
+
+    @property
+    def exit_code(self) -> int:
+        """0 valid, 3 unreadable, 4 made from another data set or no data set here, else 1."""
+        return self._failure().exit_code if self.errors else 0
+
+    def check(self) -> None:
+        """Raise unless the file is valid.
+
+        Raises:
+            UnreadableFileError: the file cannot be read.
+            DataError: it was made from another data set, or the data set needed is missing.
+            ChecksFailedError: another check failed.
+        """
+        if not self.errors:
+            return
+        first = self.errors[0]
+        others = f" (and {len(self.errors) - 1} more)" if len(self.errors) > 1 else ""
+        raise self._failure()(
+            f"{self.path} is not valid: [{first.check}] {first.what}{others}",
+            where=first.where,
+            expected=first.expected,
+            got=first.got,
+            fix=first.fix,
+        )
+
+    def _failure(self) -> type[LagbenchError]:
+        failed = {f.check for f in self.errors}
+        if "readable" in failed:
+            return UnreadableFileError
+        return DataError if "dataset" in failed else ChecksFailedError
+
+
+class Findings:
+    """Findings as they are collected."""
+
+    def __init__(self) -> None:
+        self._found: list[Finding] = []
+        self._made: set[str] = set()
+        self._skipped: dict[str, str] = {}
+
+    def made(self, *checks: str) -> None:
+        """Note that checks were made."""
+        self._made.update(checks)
+
+    def skip(self, reason: str, *checks: str) -> None:
+        """Note that checks could not be made, unless they were."""
+        self._skipped.update({check: reason for check in checks if check not in self._made})
+
+    def error(self, check: str, what: str, *, where: str, expected: object, got: object, fix: str) -> None:
+        """Add a finding that rejects the file."""
+        self._add(Severity.ERROR, check, what, where, expected, got, fix)
+
+    def warning(self, check: str, what: str, *, where: str, expected: object, got: object, fix: str) -> None:
+        """Add a finding that flags the file."""
+        self._add(Severity.WARNING, check, what, where, expected, got, fix)
+
+    def failed(self, *checks: str) -> str | None:
+        """Return the first of some checks that has an error."""
+        wrong = {f.check for f in self._found if f.severity is Severity.ERROR}
+        return next((check for check in checks if check in wrong), None)
+
+    def result(
+        self, path: Path, *, split: str | None = None, size: str | None = None, method: str | None = None
+    ) -> ValidationResult:
+        """Return all that was collected."""
+        touched = {f.check for f in self._found}
+        rest = [check for check in CHECKS if check not in touched]
+        return ValidationResult(
+            path=path,
+            split=split,
+            size=size,
+            method=method,
+            findings=tuple(sorted(self._found, key=lambda f: CHECKS.index(f.check))),
+            passed=tuple(check for check in rest if check in self._made and check not in self._skipped),
+            skipped={check: self._skipped[check] for check in rest if check in self._skipped},
+        )
+
+    def _add(
+        self, severity: Severity, check: str, what: str, where: str, expected: object, got: object, fix: str
+    ) -> None:
+        self._made.add(check)
+        finding = Finding(
+            check=check,
+            severity=severity,
+            what=what,
+            where=where,
+            expected=str(expected),
+            got=str(got),
+            fix=fix,
+        )
+        self._found.append(finding)

@@ -1,0 +1,66 @@
+"""What a predictions.nc says about itself, and the names of its parts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+__all__ = ["DIMS", "FORMAT", "OPTIONAL", "REQUIRED", "SPACE", "Header"]
+
+FORMAT = 1
+"""Number of the file layout; stored as attribute ``lagbench_format``."""
+
+DIMS = ("scenario", "frame", "particle", "space")
+"""Dimensions of ``position``, in this order."""
+
+SPACE = 2
+"""Components of a position."""
+
+REQUIRED = ("split", "size", "dataset_version", "dataset_sha256", "method")
+"""Text attributes that every file has, beside ``lagbench_format``."""
+
+OPTIONAL: Mapping[str, type[str] | type[int] | type[float]] = {
+    "seconds_per_frame": float,
+    "device": str,
+    "seed": int,
+    "parameters": int,
+    "training": str,
+}
+"""Attributes that a file may have: cost, provenance and size of the model."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Header:
+    """What a predictions.nc says about itself.
+
+    Attributes:
+        split: name of the split.
+        size: name of the size.
+        dataset_version: semantic version of the split, as in "1.0.0".
+        dataset_sha256: hash of the data set that the model was given, 64 hex digits.
+        method: what made the predictions.
+        scenarios: scenario ids in the order in which they are stored.
+        frames: absolute numbers of the predicted frames.
+        particles: particles in every frame.
+        seconds_per_frame: cost of one predicted frame [s].
+        device: machine that predicted.
+        seed: seed of the training.
+        parameters: trainable parameters of the model.
+        training: what the model was trained on, in words.
+        diverged_at: scenario id to the absolute frame from which its rollout is frozen.
+    """
+
+    split: str
+    size: str
+    dataset_version: str
+    dataset_sha256: str
+    method: str
+    scenarios: tuple[int, ...]
+    frames: tuple[int, ...]
+    particles: int
+    seconds_per_frame: float | None
+    device: str | None
+    seed: int | None
+    parameters: int | None
+    training: str | None
+    diverged_at: Mapping[int, int]

@@ -1,0 +1,296 @@
+"""Generation when something goes wrong: bad input, full disks, kills, Ctrl-C, blow-ups."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from conftest import SIZE, SPLIT
+
+from lagbench.errors import DataError, UsageError, WorkFailedError
+from lagbench.generation import GenerationResult, generate
+from lagbench.generators.batch import Job
+from lagbench.generators.simulate import simulate
+from lagbench.locking import dataset_lock
+from lagbench.manifest import read_manifest
+from lagbench.registry import Registry, load
+
+
+def files(root: Path) -> list[str]:
+    """Return the names of all regular files below a folder, locks left out."""
+    return sorted(p.name for p in root.rglob("*") if p.is_file() and not p.name.startswith(".lock"))
+
+
+def partial_files(root: Path) -> list[Path]:
+    """Return the unfinished scenario files below a folder."""
+    return list(root.rglob(".*.nc.*.partial"))
+
+
+# --- bad input -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"split": "cavty"}, "did you mean 'cavity'?"),
+        ({"size": "tinny"}, "did you mean 'tiny'?"),
+        ({"subset": "trian"}, "did you mean 'train'?"),
+        ({"subset": "train", "scenarios": "3"}, "no scenario 3 in train"),
+        ({"scenarios": "0,9"}, "no scenario 9 in train, valid, test"),
+        ({"scenarios": "4-2"}, "'4-2' runs backwards"),
+        ({"scenarios": "one"}, "'one' is no id and no range"),
+        ({"device": "gpu"}, "no device 'gpu'"),
+        ({"device": "cuba"}, "did you mean 'cuda'?"),
+    ],
+)
+def test_unknown_names_and_ids(
+    options: dict[str, str], message: str, tmp_path: Path, unmeasured: Registry
+) -> None:
+    """Wrong names and ids are usage errors that say what is known, before anything is written."""
+    given = {"split": SPLIT, "size": SIZE, **options}
+    with pytest.raises(UsageError) as caught:
+        generate(**given, root=tmp_path / "new", registry=unmeasured)  # type: ignore[arg-type]
+    assert message in str(caught.value)
+    assert caught.value.exit_code == 2
+    assert not (tmp_path / "new").exists()
+
+
+# --- disks -----------------------------------------------------------------------------------
+
+
+def test_a_root_that_cannot_be_a_folder(tmp_path: Path, unmeasured: Registry) -> None:
+    """A root below a regular file cannot be written by anybody, root user included."""
+    (tmp_path / "file").write_text("no folder")
+    with pytest.raises(WorkFailedError) as caught:
+        generate(SPLIT, SIZE, root=tmp_path / "file" / "data", registry=unmeasured)
+    assert "cannot lock the data set" in str(caught.value)
+    assert "--root" in str(caught.value)
+    assert caught.value.exit_code == 5
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 320 KiB: room for one and a half scenarios."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=320k", "none", str(disk)]
+    if shutil.which("mount") is None or subprocess.run(mount, capture_output=True, check=False).returncode:
+        pytest.skip("a tmpfs cannot be mounted here: it takes root rights")
+    yield disk
+    subprocess.run(["umount", str(disk)], check=True)
+
+
+def test_a_disk_too_small_is_refused_at_once(small_disk: Path, unmeasured: Registry) -> None:
+    """The message tells bytes needed and free; nothing is written."""
+    with pytest.raises(WorkFailedError) as caught:
+        generate(SPLIT, SIZE, root=small_disk, registry=unmeasured)
+    text = str(caught.value)
+    assert "not enough disk space" in text
+    assert "bytes free" in text
+    assert caught.value.exit_code == 5
+    assert files(small_disk) == []
+
+
+def test_a_disk_that_fills_up_leaves_whole_files_only(
+    small_disk: Path, unmeasured: Registry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Somebody else takes the space in the midst: what was finished stays, the rest leaves no trace."""
+    monkeypatch.setattr("lagbench.campaign.check_disk", lambda root, needed: None)
+    with pytest.raises(WorkFailedError) as caught:
+        generate(SPLIT, SIZE, root=small_disk, workers=1, registry=unmeasured)
+    assert "free disk space" in str(caught.value)
+    assert caught.value.exit_code == 5
+    assert partial_files(small_disk) == []
+    manifest = read_manifest(small_disk, SPLIT, SIZE, 1)
+    assert manifest is not None
+    assert not manifest.complete
+    assert [name for name in files(small_disk) if name.endswith(".nc")] == [
+        Path(entry.path).name for entry in manifest.files
+    ]
+
+
+def test_a_worker_on_a_full_disk_names_the_file(tmp_path: Path, unmeasured: Registry) -> None:
+    """/dev/full answers every write with ENOSPC; the error carries the path and the remedy."""
+    if not Path("/dev/full").exists():
+        pytest.skip("this system has no /dev/full")
+    job = Job(size=unmeasured.size(SPLIT, SIZE), scenarios=(2,), root=tmp_path)
+    folder = tmp_path / SPLIT / SIZE / "v1" / "valid"
+    folder.mkdir(parents=True)
+    (folder / f".0002.nc.{os.getpid()}.partial").symlink_to("/dev/full")
+    with pytest.raises(WorkFailedError) as caught:
+        simulate(job, lambda units: None)
+    assert "0002.nc" in str(caught.value)
+    assert files(tmp_path) == []
+
+
+# --- locks -----------------------------------------------------------------------------------
+
+
+def test_two_generations_at_once(tmp_path: Path, unmeasured: Registry, generated: GenerationResult) -> None:
+    """The second waits, is told for whom, and then finds everything there."""
+    told: list[str] = []
+    results: dict[str, GenerationResult] = {}
+
+    def second() -> None:
+        results["second"] = generate(
+            SPLIT, SIZE, root=tmp_path, workers=1, registry=unmeasured, on_wait=told.append
+        )
+
+    with dataset_lock(tmp_path, SPLIT, SIZE, 1):
+        waiting = threading.Thread(target=second)
+        waiting.start()
+        while not told:
+            time.sleep(0.01)
+        shutil.copytree(generated.folder, tmp_path / SPLIT / SIZE / "v1", dirs_exist_ok=True)
+    waiting.join(timeout=60)
+    assert f"process {os.getpid()} on" in told[0]
+    assert results["second"].simulated == ()
+    assert results["second"].dataset_sha256 == generated.dataset_sha256
+
+
+# --- interruptions ---------------------------------------------------------------------------
+
+
+def start(root: Path, registry: Path, *options: str) -> subprocess.Popen[str]:
+    """Start a generation as a process group of its own, as a shell does."""
+    program = [sys.executable, "-c", "from lagbench.cli import main; main()"]
+    command = ["generate", "--split", SPLIT, "--size", SIZE, "--root", str(root), *options]
+    return subprocess.Popen(
+        [*program, *command],
+        env={**os.environ, "LAGBENCH_REGISTRY": str(registry)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        process_group=0,
+    )
+
+
+def wait_for(condition: Callable[[], object], process: subprocess.Popen[str]) -> None:
+    """Wait until a condition holds while a process runs."""
+    end = time.monotonic() + 60
+    while not condition():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < end, "waited too long"
+        time.sleep(0.005)
+
+
+def scenario_files(root: Path) -> list[str]:
+    """Return the names of the finished scenario files."""
+    return sorted(path.name for path in root.rglob("*.nc") if not path.name.startswith("."))
+
+
+def children(process: int) -> list[int]:
+    """Return the process ids of the living children."""
+    listing = Path(f"/proc/{process}/task/{process}/children")
+    return [int(word) for word in listing.read_text().split()]
+
+
+def test_control_c_is_resumable(
+    tmp_path: Path, unmeasured_path: Path, unmeasured: Registry, generated: GenerationResult
+) -> None:
+    """SIGINT to the whole group after the first file: exit 130, whole files and a manifest that says so."""
+    with start(tmp_path, unmeasured_path, "--workers", "1") as process:
+        wait_for(lambda: scenario_files(tmp_path), process)
+        os.killpg(process.pid, signal.SIGINT)
+        _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "interrupted" in errors
+    assert "Traceback" not in errors
+    assert partial_files(tmp_path) == []
+    manifest = read_manifest(tmp_path, SPLIT, SIZE, 1)
+    assert manifest is not None
+    assert manifest.complete is False
+    rest = generate(SPLIT, SIZE, root=tmp_path, workers=2, registry=unmeasured)
+    assert rest.kept != ()
+    assert rest.simulated != ()
+    assert rest.dataset_sha256 == generated.dataset_sha256
+
+
+def test_a_killed_worker_is_replaced(
+    tmp_path: Path, unmeasured_path: Path, generated: GenerationResult, unmeasured: Registry
+) -> None:
+    """SIGKILL of a worker costs time, nothing else: exit 0 and the same data set hash."""
+    with start(tmp_path, unmeasured_path, "--workers", "2") as process:
+        wait_for(lambda: partial_files(tmp_path), process)
+        os.kill(children(process.pid)[0], signal.SIGKILL)
+        output, errors = process.communicate(timeout=120)
+    assert process.returncode == 0, errors
+    assert generated.dataset_sha256 is not None
+    assert generated.dataset_sha256 in output
+    assert partial_files(tmp_path) == []
+
+
+def test_a_killed_parent_is_resumed(
+    tmp_path: Path, unmeasured_path: Path, generated: GenerationResult, unmeasured: Registry
+) -> None:
+    """SIGKILL of the parent ends its workers; the second call keeps what is whole and completes it."""
+    with start(tmp_path, unmeasured_path, "--workers", "2") as process:
+        wait_for(lambda: len(scenario_files(tmp_path)) >= 1 and partial_files(tmp_path), process)
+        workers = children(process.pid)
+        process.kill()
+        process.wait()
+    end = time.monotonic() + 30
+    while any(Path(f"/proc/{worker}").exists() for worker in workers):
+        assert time.monotonic() < end, "a worker outlived its parent"
+        time.sleep(0.02)
+    result = generate(SPLIT, SIZE, root=tmp_path, workers=1, registry=unmeasured)
+    assert result.kept != ()
+    assert result.dataset_sha256 == generated.dataset_sha256
+    assert partial_files(tmp_path) == []
+
+
+# --- blow-ups and other bits -----------------------------------------------------------------
+
+
+def test_a_blow_up_says_where(tmp_path: Path, unmeasured_path: Path) -> None:
+    """A user's own fluid, too stiff for its dt: scenario, substeps and bound are named, no file appears."""
+    text = unmeasured_path.read_text()
+    assert "modulus: {value: 5.0e-4" in text
+    own = tmp_path / "own.yaml"
+    own.write_text(text.replace("modulus: {value: 5.0e-4", "modulus: {value: 500.0"))
+    with pytest.raises(WorkFailedError, match="the simulation blew up") as caught:
+        generate(SPLIT, SIZE, scenarios="2", root=tmp_path / "data", registry=load(own))
+    error = caught.value
+    assert error.exit_code == 5
+    assert f"{SPLIT} {SIZE}, scenario 2, substeps 0 to" in str(error.where)
+    assert "abs(v) <= dx/dt" in str(error.expected)
+    assert files(tmp_path / "data") == ["manifest.json"]
+
+
+def test_a_draw_out_of_range_names_its_scenario(tmp_path: Path, unmeasured_path: Path) -> None:
+    """A scale that no float32 grain can hold stops before any worker starts."""
+    own = tmp_path / "own.yaml"
+    own.write_text(
+        unmeasured_path.read_text().replace("velocity_scale: {value: 0.0", "velocity_scale: {value: 90.0")
+    )
+    with pytest.raises(WorkFailedError, match="exact float32") as caught:
+        generate(SPLIT, SIZE, scenarios="2", root=tmp_path / "data", registry=load(own))
+    assert caught.value.where == f"{SPLIT} {SIZE}, scenario 2"
+    assert files(tmp_path / "data") == []
+
+
+def test_other_bits_than_recorded_are_an_error(
+    copied: Callable[[], Path], generated: GenerationResult, tmp_path: Path, unmeasured_path: Path
+) -> None:
+    """Against a registry with other hashes of one scenario, that scenario is made anew, and named."""
+    manifest = read_manifest(generated.root, SPLIT, SIZE, 1)
+    assert manifest is not None
+    from lagbench.generators.record import measured_values, replace_measured
+
+    values = measured_values(manifest)
+    wrong = values.model_copy(update={"scenario_sha256": {**values.scenario_sha256, 4: "0" * 16}})
+    own = tmp_path / "own.yaml"
+    own.write_text(replace_measured(unmeasured_path.read_text(), {SPLIT: {SIZE: wrong}}))
+    with pytest.raises(DataError) as caught:
+        generate(SPLIT, SIZE, root=copied(), workers=1, registry=load(own))
+    assert "1 of 5 scenarios have another hash" in str(caught.value)
+    assert "scenarios 4" in str(caught.value.where)
+    assert caught.value.exit_code == 4

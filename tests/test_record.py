@@ -1,0 +1,175 @@
+"""Recording what a data set measures, and the guard against bits that change unnoticed."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import yaml
+from conftest import SIZE, SPLIT
+
+from lagbench.errors import DataError
+from lagbench.generation import GenerationResult
+from lagbench.generators.record import main, measured_values, released_name, render, replace_measured
+from lagbench.manifest import Manifest, read_manifest
+from lagbench.registry import Measured, default_path, load
+
+RELEASED = Path(__file__).parent / "data" / "released_hashes.json"
+
+
+def manifest_of(root: Path) -> Manifest:
+    """Return the manifest of the tiny data set."""
+    manifest = read_manifest(root, SPLIT, SIZE, 1)
+    assert manifest is not None
+    return manifest
+
+
+@pytest.fixture
+def registry(unmeasured_path: Path, tmp_path: Path) -> Path:
+    """A registry of one's own that a test may write."""
+    path = tmp_path / "datasets.yaml"
+    path.write_text(unmeasured_path.read_text())
+    return path
+
+
+def run(root: Path, registry: Path, *options: str) -> int:
+    """Run the command in this process."""
+    released = registry.parent / "released.json"
+    arguments = ["--split", SPLIT, "--size", SIZE, "--root", str(root), "--registry", str(registry)]
+    return main([*arguments, "--released", str(released), *options])
+
+
+def test_what_is_recorded_is_what_was_measured(
+    generated: GenerationResult, registry: Path, unmeasured_path: Path
+) -> None:
+    """Hashes, statistics and the mean twin floor come back; what was written by hand is untouched."""
+    assert run(generated.root, registry) == 0
+    measured, manifest = load(registry).size(SPLIT, SIZE).measured, manifest_of(generated.root)
+    assert measured is not None
+    assert measured.dataset_sha256 == generated.dataset_sha256
+    assert measured.subset_sha256 == manifest.subset_sha256
+    assert measured.scenario_sha256 == {e.scenario: e.content_sha256[:16] for e in manifest.files}
+    assert measured.statistics == manifest.statistics
+    twins = [entry.twin_floor for entry in manifest.files if entry.subset == "test"]
+    assert len(measured.twin_floor) == 20
+    assert measured.twin_floor[7] == pytest.approx((twins[0][7] + twins[1][7]) / 2, rel=1e-8)
+    assert registry.read_text().startswith(unmeasured_path.read_text().rstrip("\n"))
+
+
+def test_recording_again_changes_no_byte(generated: GenerationResult, registry: Path) -> None:
+    """The same data set gives the same text; another size leaves this one alone."""
+    run(generated.root, registry)
+    first = registry.read_text()
+    assert run(generated.root, registry) == 0
+    assert registry.read_text() == first
+    released = json.loads((registry.parent / "released.json").read_text())
+    assert released == {f"{SPLIT}/{SIZE}/v1": generated.dataset_sha256}
+
+
+def test_numbers_are_floats_in_any_yaml(generated: GenerationResult) -> None:
+    """YAML 1.1 reads 1e-5 as a string: every number has a point and a signed exponent; hashes are strings."""
+    values = measured_values(manifest_of(generated.root))
+    digits = {0: "1234567890123456", 1: "12345e6789012345", 2: "0" * 16}
+    text = render({SPLIT: {SIZE: values.model_copy(update={"scenario_sha256": digits})}})
+    read = yaml.safe_load(text)["measured"][SPLIT][SIZE]
+    assert read["scenario_sha256"] == digits
+    assert all(isinstance(number, float) for number in read["twin_floor"])
+    assert all(isinstance(number, float) for row in read["statistics"].values() for number in row)
+    assert max(map(len, text.splitlines())) <= 110
+
+
+def test_changed_bits_need_another_version(
+    generated: GenerationResult, registry: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A hash of the same MAJOR that differs is refused, by the registry and by the list, unless allowed."""
+    run(generated.root, registry)
+    text = registry.read_text()
+    registry.write_text(text.replace(str(generated.dataset_sha256), "0" * 64))
+    (registry.parent / "released.json").write_text(json.dumps({f"{SPLIT}/{SIZE}/v1": "0" * 64}))
+    capsys.readouterr()
+    assert run(generated.root, registry) == 4
+    message = capsys.readouterr().err
+    assert "the bits changed and MAJOR did not" in message
+    assert "--allow-change" in message
+    assert run(generated.root, registry, "--allow-change") == 0
+    assert registry.read_text() == text
+
+
+def test_another_major_is_another_name(generated: GenerationResult, registry: Path) -> None:
+    """A new MAJOR has an entry of its own beside the old one."""
+    size = load(registry).size(SPLIT, SIZE)
+    assert released_name(size) == f"{SPLIT}/{SIZE}/v1"
+    assert released_name(size.model_copy(update={"version": "2.0.0"})) == f"{SPLIT}/{SIZE}/v2"
+
+
+def test_incomplete_or_changed_data_are_not_recorded(
+    copied: Callable[[], Path], registry: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A file that is not the manifest's, no manifest, or a part of a data set: exit code 4."""
+    root = copied()
+    folder = root / SPLIT / SIZE / "v1"
+    (folder / "test" / "0003.nc").write_bytes(b"other")
+    assert run(root, registry) == 4
+    assert "0003.nc" in capsys.readouterr().err
+    (folder / "manifest.json").unlink()
+    assert run(root, registry) == 4
+    assert "no manifest" in capsys.readouterr().err
+
+
+def test_a_part_has_no_measures(generated: GenerationResult) -> None:
+    """Statistics and floors need every scenario, and every test scenario its twin."""
+    manifest = manifest_of(generated.root)
+    without_twin = [entry.model_copy(update={"twin_floor": ()}) for entry in manifest.files]
+    for part in ({"complete": False}, {"files": tuple(without_twin)}):
+        with pytest.raises(DataError, match="incomplete"):
+            measured_values(manifest.model_copy(update=part))
+
+
+def test_it_runs_as_a_module(generated: GenerationResult, registry: Path) -> None:
+    """The command of its docstring works and prints the hash."""
+    command = [sys.executable, "-m", "lagbench.generators.record", "--split", SPLIT, "--size", SIZE]
+    done = subprocess.run(
+        [*command, "--root", str(generated.root), "--registry", str(registry)],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60,
+    )
+    assert done.stdout == f"{SPLIT} {SIZE}: {generated.dataset_sha256}\n"
+
+
+def test_measured_block_replaces_itself() -> None:
+    """Text above the marker stays, whatever stood below it."""
+    assert replace_measured("a: 1\n\nmeasured:\n  old: {}\n", {}) == replace_measured("a: 1\n", {})
+
+
+def _recorded() -> dict[str, Measured]:
+    """Return what our datasets.yaml has measured, by the names of the list of released hashes."""
+    registry = load(default_path())
+    return {
+        released_name(registry.size(split, size)): values
+        for split, sizes in registry.measured.items()
+        for size, values in sizes.items()
+    }
+
+
+def test_no_released_hash_has_changed() -> None:
+    """Bits of a split, size and MAJOR never change: datasets.yaml and the list of released hashes agree."""
+    released = json.loads(RELEASED.read_text()) if RELEASED.exists() else {}
+    recorded = {name: values.dataset_sha256 for name, values in _recorded().items()}
+    assert {name: released.get(name) for name in recorded} == recorded
+
+
+def test_every_recorded_size_is_whole() -> None:
+    """A measured size has a hash of every scenario and a floor for every predicted frame."""
+    registry = load(default_path())
+    for split, sizes in registry.measured.items():
+        for name, values in sizes.items():
+            size = registry.size(split, name)
+            assert sorted(values.scenario_sha256) == list(size.scenarios)
+            assert set(values.subset_sha256) == set(size.subsets)
+            assert len(values.twin_floor) == size.task.horizon

@@ -1,0 +1,239 @@
+"""Verification: what is right passes, and whatever is not is named."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from conftest import SIZE, SPLIT
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lagbench.errors import DataError, UsageError
+from lagbench.generation import GenerationResult
+from lagbench.generators.record import measured_values, replace_measured
+from lagbench.manifest import Manifest, read_manifest
+from lagbench.registry import Registry, load
+from lagbench.verification import evenly_spaced, verify
+
+Copy = Callable[[], Path]
+
+
+def file_of(root: Path, scenario: str = "test/0003") -> Path:
+    """Return the path of a scenario file."""
+    return root / SPLIT / SIZE / "v1" / f"{scenario}.nc"
+
+
+def manifest_of(root: Path) -> Manifest:
+    """Return the manifest of the tiny data set."""
+    manifest = read_manifest(root, SPLIT, SIZE, 1)
+    assert manifest is not None
+    return manifest
+
+
+@pytest.fixture
+def measured(generated: GenerationResult, unmeasured_path: Path, tmp_path: Path) -> Registry:
+    """A registry that holds the hashes of the generated data set."""
+    values = measured_values(manifest_of(generated.root))
+    path = tmp_path / "measured.yaml"
+    path.write_text(replace_measured(unmeasured_path.read_text(), {SPLIT: {SIZE: values}}))
+    return load(path)
+
+
+def flip(path: Path, variable: str) -> None:
+    """Flip one bit in the midst of a stored chunk of a variable."""
+    with h5py.File(path) as file:
+        chunk = file[variable].id.get_chunk_info(0)
+        place = chunk.byte_offset + chunk.size // 2
+    data = bytearray(path.read_bytes())
+    data[place] ^= 0b100
+    path.write_bytes(bytes(data))
+
+
+def test_what_was_generated_passes(generated: GenerationResult, measured: Registry) -> None:
+    """Every subset is there and equal to datasets.yaml, and so is the whole."""
+    result = verify(SPLIT, SIZE, root=generated.root, registry=measured, complete=True)
+    assert [(r.name, r.present, r.missing, r.wrong, r.extra) for r in result.subsets] == [
+        ("train", 2, (), (), ()),
+        ("valid", 1, (), (), ()),
+        ("test", 2, (), (), ()),
+    ]
+    assert {report.verdict for report in result.subsets} == {"equal to datasets.yaml"}
+    assert result.verdict == "equal to datasets.yaml"
+    assert result.dataset_sha256 == generated.dataset_sha256
+    assert (result.problems, result.warnings, result.identity) == ((), (), "bitwise")
+    result.check()
+
+
+def test_without_recorded_hashes_it_says_so(generated: GenerationResult, unmeasured: Registry) -> None:
+    """Files that agree with themselves pass; nobody claims that they equal anything."""
+    result = verify(SPLIT, SIZE, root=generated.root, registry=unmeasured)
+    assert result.verdict == "no hash in datasets.yaml yet"
+    result.check()
+
+
+def test_a_missing_file_is_a_warning_unless_all_are_wanted(copied: Copy, measured: Registry) -> None:
+    """Half a data set may be right; with complete it is a fault of exit code 4 that names the ids."""
+    root = copied()
+    file_of(root).unlink()
+    result = verify(SPLIT, SIZE, root=root, registry=measured)
+    assert result.warnings == ("test lacks 3",)
+    assert [report.verdict for report in result.subsets] == [*["equal to datasets.yaml"] * 2, "incomplete"]
+    result.check()
+    with pytest.raises(DataError) as caught:
+        verify(SPLIT, SIZE, root=root, registry=measured, complete=True).check()
+    assert "missing: test 3" in str(caught.value)
+    assert "lagbench generate --split curl-noise --size tiny" in str(caught.value)
+    assert caught.value.exit_code == 4
+
+
+def test_nothing_at_all_is_a_fault(tmp_path: Path, measured: Registry) -> None:
+    """An empty root does not pass, whatever was asked for."""
+    with pytest.raises(DataError, match="nothing is generated"):
+        verify(SPLIT, SIZE, root=tmp_path, registry=measured).check()
+
+
+@pytest.mark.parametrize("variable", ["position", "velocity", "material"])
+def test_a_flipped_bit_names_file_and_variable(variable: str, copied: Copy, measured: Registry) -> None:
+    """One bit in a compressed chunk is found, exit code 4."""
+    root = copied()
+    flip(file_of(root), variable)
+    result = verify(SPLIT, SIZE, root=root, registry=measured)
+    assert [report.wrong for report in result.subsets] == [(), (), (3,)]
+    with pytest.raises(DataError) as caught:
+        result.check()
+    assert f"0003.nc, variable '{variable}'" in str(caught.value)
+    assert caught.value.exit_code == 4
+
+
+def test_a_truncated_file_is_named(copied: Copy, measured: Registry) -> None:
+    """A file cut short by a kilobyte is damaged, not missing."""
+    root = copied()
+    path = file_of(root, "train/0000")
+    path.write_bytes(path.read_bytes()[:-1024])
+    with pytest.raises(DataError, match="damaged or not one of lagbench") as caught:
+        verify(SPLIT, SIZE, root=root, registry=measured).check()
+    assert "train/0000.nc" in str(caught.value)
+
+
+def test_a_changed_value_is_found_though_the_file_is_whole(copied: Copy, measured: Registry) -> None:
+    """A value rewritten by a library leaves a healthy file; its variable's hash tells."""
+    root = copied()
+    with h5py.File(file_of(root), "r+") as file:
+        file["velocity"][7, 11, 0] += np.float32(1e-6)
+    result = verify(SPLIT, SIZE, root=root, registry=measured)
+    assert "variable 'velocity'" in result.problems[0]
+
+
+def test_a_forger_who_mends_file_and_manifest_is_caught(
+    copied: Copy, measured: Registry, unmeasured: Registry
+) -> None:
+    """Scenario 4 renamed to 3, all hashes in file and manifest made to agree: datasets.yaml knows better."""
+    root = copied()
+    forged = file_of(root)
+    forged.write_bytes(file_of(root, "test/0004").read_bytes())
+    result = verify(SPLIT, SIZE, root=root, registry=unmeasured)
+    assert "a file holds another scenario" in result.problems[0]
+    own = measured.size(SPLIT, SIZE).measured
+    assert own is not None
+    wrong = own.model_copy(update={"scenario_sha256": {**own.scenario_sha256, 0: "f" * 16}})
+    registry = Registry(measured.splits, {SPLIT: {SIZE: wrong}})
+    result = verify(SPLIT, SIZE, root=root, scenarios="0", registry=registry)
+    assert "the file has another content hash" in result.problems[0]
+    assert "ffffffffffffffff" in result.problems[0]
+
+
+def test_the_data_set_hash_is_compared_too(generated: GenerationResult, measured: Registry) -> None:
+    """A registry whose scenario hashes hold but whose data set hash does not is told."""
+    own = measured.size(SPLIT, SIZE).measured
+    assert own is not None
+    wrong = own.model_copy(update={"dataset_sha256": "0" * 64, "subset_sha256": {"train": "1" * 64}})
+    registry = Registry(measured.splits, {SPLIT: {SIZE: wrong}})
+    result = verify(SPLIT, SIZE, root=generated.root, registry=registry)
+    assert result.verdict == "NOT that of datasets.yaml"
+    assert result.subsets[0].verdict == "NOT that of datasets.yaml"
+    with pytest.raises(DataError, match="data set hash"):
+        result.check()
+
+
+def test_strangers_and_a_lying_manifest_are_warnings(copied: Copy, measured: Registry) -> None:
+    """Files of no scenario, a manifest that says otherwise, and one marked tolerance are told."""
+    root = copied()
+    file_of(root, "test/0099").write_bytes(b"mine")
+    path = file_of(root).parents[1] / "manifest.json"
+    told = json.loads(path.read_text())
+    told["identity"] = "tolerance"
+    told["files"][0]["content_sha256"] = "a" * 64
+    path.write_text(json.dumps(told))
+    result = verify(SPLIT, SIZE, root=root, registry=measured)
+    text = "\n".join(result.warnings)
+    assert "test has files of no scenario: 0099.nc" in text
+    assert "identity: tolerance" in text
+    assert "other hashes of 0" in text
+    assert result.identity == "tolerance"
+    result.check()
+
+
+@pytest.mark.parametrize("damage", [None, "{"])
+def test_no_or_a_damaged_manifest_is_a_warning(damage: str | None, copied: Copy, measured: Registry) -> None:
+    """The files speak for themselves."""
+    root = copied()
+    path = file_of(root).parents[1] / "manifest.json"
+    path.unlink() if damage is None else path.write_text(damage)
+    result = verify(SPLIT, SIZE, root=root, registry=measured)
+    assert "manifest" in result.warnings[0]
+    result.check()
+
+
+def test_simulating_anew_is_identical(generated: GenerationResult, measured: Registry) -> None:
+    """First and last scenario, simulated by two workers, have the hashes of their files."""
+    result = verify(SPLIT, SIZE, root=generated.root, regenerate=2, workers=2, registry=measured)
+    assert result.regenerated == {0: "identical", 4: "identical"}
+    result.check()
+
+
+def test_simulating_anew_needs_no_file_but_a_hash(
+    tmp_path: Path, measured: Registry, unmeasured: Registry
+) -> None:
+    """A missing scenario is held against datasets.yaml; without a hash there is nothing to compare."""
+    options = {"root": tmp_path, "scenarios": "2", "regenerate": 1}
+    assert verify(SPLIT, SIZE, **options, registry=measured).regenerated == {2: "identical"}  # type: ignore[arg-type]
+    again = verify(SPLIT, SIZE, **options, registry=unmeasured)  # type: ignore[arg-type]
+    assert again.regenerated == {2: "nothing to compare with"}
+
+
+def test_simulating_anew_finds_other_bits(tmp_path: Path, measured: Registry) -> None:
+    """Against a wrong hash the scenario differs, exit code 4."""
+    own = measured.size(SPLIT, SIZE).measured
+    assert own is not None
+    wrong = own.model_copy(update={"scenario_sha256": {2: "0" * 16}})
+    registry = Registry(measured.splits, {SPLIT: {SIZE: wrong}})
+    result = verify(SPLIT, SIZE, root=tmp_path, scenarios="2", regenerate=1, registry=registry)
+    assert result.regenerated == {2: "different"}
+    with pytest.raises(DataError, match="scenario 2 differs when simulated anew"):
+        result.check()
+
+
+def test_unknown_names_are_usage_errors(tmp_path: Path, measured: Registry) -> None:
+    """Split, size, subset and ids are checked as generate checks them."""
+    for options in ({"subset": "trian"}, {"scenarios": "7"}):
+        with pytest.raises(UsageError):
+            verify(SPLIT, SIZE, root=tmp_path, registry=measured, **options)  # type: ignore[arg-type]
+
+
+@given(st.lists(st.integers(0, 9999), min_size=1, unique=True).map(sorted), st.integers(0, 80))
+def test_evenly_spaced_ids(ids: list[int], count: int) -> None:
+    """As many distinct ids as asked for (or all), ascending, first and last included, gaps alike."""
+    chosen = evenly_spaced(ids, count)
+    assert len(chosen) == len(set(chosen)) == min(count, len(ids))
+    assert list(chosen) == sorted(chosen)
+    if len(chosen) > 1:
+        assert (chosen[0], chosen[-1]) == (ids[0], ids[-1])
+        places = [ids.index(i) for i in chosen]
+        gaps = [b - a for a, b in itertools.pairwise(places)]
+        assert max(gaps) - min(gaps) <= 1
