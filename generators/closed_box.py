@@ -39,7 +39,7 @@ class ClosedBox(Driver[ClosedBoxParameters]):
             slope = np.zeros_like(carried)
             slope[:, :, :2] = stack(states, "affine")[:, :, :, axis]
             field.from_numpy(slope)
-        k.walls.speed.from_numpy(stack(states, "wall_velocity")[:, (0, 1, 2, 3), (1, 1, 0, 0)])
+        self.move_walls(stack(states, "wall_velocity"))
         cells = np.array([state.area / p.particles for state in states]) * p.grid**2
         k.fill.from_numpy(cells.astype(np.float32))
         spread = np.array([state.viscosity for state in states]) * p.dt * p.grid**2
@@ -47,6 +47,10 @@ class ClosedBox(Driver[ClosedBoxParameters]):
         for field in (k.node, k.moved, k.gain):
             field.fill(0.0)
         self.restart_mean()
+
+    def move_walls(self, velocity: NDArray[np.float32]) -> None:
+        """Let the walls slide with these velocities from now on [length/s], shape [scenario, 4, 2]."""
+        self._kernels.walls.speed.from_numpy(velocity[:, (0, 1, 2, 3), (1, 1, 0, 0)])
 
     def advance(self, substeps: int, *, average: bool = False) -> None:
         """Advance every scenario.

@@ -8,6 +8,7 @@ notebook or standard input may call :func:`lagbench.generate`), and unlike
 
 from __future__ import annotations
 
+import contextlib
 import heapq
 import itertools
 import json
@@ -35,6 +36,10 @@ ATTEMPTS = 3
 
 Report = Callable[[int], None]
 """What a task calls to say how many units of work it has done since it last called."""
+
+_FAREWELL = b""
+_PATIENCE = 20.0
+"""How long a worker may take to end by itself [s]."""
 
 _BOOT = (
     "import sys, json; sys.path[:] = json.loads(sys.argv[2]); "
@@ -87,7 +92,7 @@ class _Worker:
 
 @dataclass
 class Pool:
-    """A set of workers; use it as a context manager, which kills them at its end.
+    """A set of workers; use it as a context manager, which ends them.
 
     Args:
         size: workers at the most; they start when there is work for them.
@@ -108,7 +113,9 @@ class Pool:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Kill the workers; what they were doing is lost."""
+        """Let idle workers end by themselves, then kill; after an error kill at once."""
+        if error is None:
+            self._dismiss()
         self.close()
 
     def submit(self, task: Task) -> None:
@@ -140,6 +147,16 @@ class Pool:
         for worker in workers:
             worker.process.wait()
             worker.channel.close()
+
+    def _dismiss(self) -> None:
+        """Ask idle workers to end: Taichi saves what it compiled as its process exits."""
+        idle = [worker for worker in self._workers if worker.task is None]
+        for worker in idle:
+            with contextlib.suppress(OSError):  # it died while idle
+                worker.channel.send_bytes(_FAREWELL)
+        for worker in idle:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                worker.process.wait(_PATIENCE)
 
     def _assign(self) -> None:
         idle = [worker for worker in self._workers if worker.task is None]
@@ -220,8 +237,7 @@ def serve(descriptor: int) -> None:
     channel = Connection(descriptor)
     inbox: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     threading.Thread(target=_listen, args=(channel, inbox), daemon=True).start()
-    while True:
-        message = inbox.get()
+    while (message := inbox.get()) != _FAREWELL:
         try:
             reply = ("done", _run(channel, message))
         except LagbenchError as error:

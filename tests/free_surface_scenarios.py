@@ -8,12 +8,13 @@ from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
+from numpy.typing import NDArray
+
 from lagbench.generators.base import FreeSurfaceParameters, InitialState, Material
 from lagbench.generators.draws import quantise
 from lagbench.generators.free_surface import FreeSurface
 from lagbench.generators.shapes import Shape, body_at, seeds
 from lagbench.generators.solver import Device, build
-from numpy.typing import NDArray
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ def parameters(**changes: float) -> FreeSurfaceParameters:
         "jacobian_min": 0.5,
         "jacobian_max": 1.0,
     }
-    return FreeSurfaceParameters(**(values | changes))  # type: ignore[arg-type]
+    return FreeSurfaceParameters(**(values | changes))
 
 
 def scenario(

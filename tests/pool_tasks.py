@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import signal
 import time
@@ -46,3 +47,8 @@ def sleep_long(marker: Path, report: Report) -> None:
     marker.write_text(str(os.getpid()))
     for _ in range(600):
         time.sleep(0.1)
+
+
+def leave_a_note(marker: Path, report: Report) -> None:
+    """Write a file when the worker's interpreter exits by itself."""
+    atexit.register(marker.write_text, "left in peace")

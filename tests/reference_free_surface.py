@@ -7,11 +7,13 @@ are 64-bit integers. Slow (two to three microseconds per particle and substep) a
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from lagbench.generators.base import FreeSurfaceParameters, InitialState, Material
 from numpy.typing import NDArray
+
+from lagbench.generators.base import FreeSurfaceParameters, InitialState, Material
 
 Float = np.float32
 Floats = NDArray[np.float32]
@@ -44,7 +46,7 @@ def exp(z: Floats) -> Floats:
     e = (ONE + t) + tt * ((HALF + t * Float(1 / 6)) + tt * high)
     for _ in range(4):
         e = e * e
-    return e
+    return e.astype(Float)
 
 
 @dataclass
@@ -90,7 +92,7 @@ class Stencil:
         )
         return cls(base, d, weights)
 
-    def nodes(self):  # type: ignore[no-untyped-def] # noqa: ANN201
+    def nodes(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.int32], Floats, Floats, Floats]]:
         """Yield (node i, node k, weight, offset x [cells], offset y [cells]) for the nine nodes."""
         for i in range(3):
             for k in range(3):
@@ -116,7 +118,7 @@ class FreeSurfaceReference:
         count = len(state.position)
         self.position = state.position.astype(Float)
         self.velocity = state.velocity.astype(Float)
-        self.affine: Components = tuple(state.affine.reshape(count, 4).T.astype(Float))  # type: ignore[assignment]
+        self.affine: Components = tuple(state.affine.reshape(count, 4).T.astype(Float))
         ones, zeros = np.ones(count, Float), np.zeros(count, Float)
         self.deformation: Components = (ones, zeros, zeros, ones)
         self.ratio = ones
@@ -256,7 +258,7 @@ class FreeSurfaceReference:
             c + dt * (cyx * a + cyy * c),
             d + dt * (cyx * b + cyy * d),
         )
-        elastic, factor = self.yielded(trial)
+        elastic, factor = self.yielded(trial)  # type: ignore[arg-type]
         plastic = clamp(self.ratio * factor, Float(self.p.snow_jp_min), Float(self.p.snow_jp_max))
         self.ratio = np.where(self.snow, plastic, self.ratio)
         self.deformation = tuple(  # type: ignore[assignment]

@@ -1,14 +1,23 @@
+# mypy: disallow-untyped-decorators=False
 """Constitutive models against SciPy's decompositions, finite differences and closed forms."""
 
 import math
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import pytest
 import taichi as ti
-from lagbench.generators import backend, constitutive
-from lagbench.generators.solver import Device
 from numpy.typing import NDArray
 from scipy.linalg import polar
+
+from lagbench.generators import backend, constitutive
+from lagbench.generators.solver import Device
+from lagbench.generators.transfer import Nothing
+
+if TYPE_CHECKING:
+    Array: TypeAlias = Any
+else:
+    Array = ti.types.ndarray()
 
 COUNT = 4096
 MU, LAMBDA = constitutive.lame(30.0, 0.3)
@@ -22,19 +31,22 @@ def taichi_runtime() -> None:
 
 
 @ti.kernel
-def evaluate_exponential(z: ti.types.ndarray(), out: ti.types.ndarray()):  # type: ignore[no-untyped-def] # noqa: ANN201, D103
+def evaluate_exponential(z: Array, out: Array) -> Nothing:
+    """Evaluate the function of this name for every entry."""
     for i in range(z.shape[0]):
         out[i] = constitutive.exponential(z[i])
 
 
 @ti.kernel
-def evaluate_hardening(jp: ti.types.ndarray(), out: ti.types.ndarray()):  # type: ignore[no-untyped-def] # noqa: ANN201, D103
+def evaluate_hardening(jp: Array, out: Array) -> Nothing:
+    """Evaluate the function of this name for every entry."""
     for i in range(jp.shape[0]):
         out[i] = constitutive.hardening(jp[i], 10.0, 0.05, 5.0)
 
 
 @ti.kernel
-def evaluate_rotation(f: ti.types.ndarray(), out: ti.types.ndarray()):  # type: ignore[no-untyped-def] # noqa: ANN201, D103
+def evaluate_rotation(f: Array, out: Array) -> Nothing:
+    """Evaluate the function of this name for every entry."""
     for i in range(f.shape[0]):
         m = ti.Matrix([[f[i, 0, 0], f[i, 0, 1]], [f[i, 1, 0], f[i, 1, 1]]])
         r = constitutive.rotation(m)
@@ -43,7 +55,8 @@ def evaluate_rotation(f: ti.types.ndarray(), out: ti.types.ndarray()):  # type: 
 
 
 @ti.kernel
-def evaluate_corotated(f: ti.types.ndarray(), out: ti.types.ndarray()):  # type: ignore[no-untyped-def] # noqa: ANN201, D103
+def evaluate_corotated(f: Array, out: Array) -> Nothing:
+    """Evaluate the function of this name for every entry."""
     for i in range(f.shape[0]):
         m = ti.Matrix([[f[i, 0, 0], f[i, 0, 1]], [f[i, 1, 0], f[i, 1, 1]]])
         tau = constitutive.corotated_stress(m, MU, LAMBDA)
@@ -53,7 +66,8 @@ def evaluate_corotated(f: ti.types.ndarray(), out: ti.types.ndarray()):  # type:
 
 
 @ti.kernel
-def evaluate_plastic(f: ti.types.ndarray(), out: ti.types.ndarray(), ratio: ti.types.ndarray()):  # type: ignore[no-untyped-def] # noqa: ANN201, D103
+def evaluate_plastic(f: Array, out: Array, ratio: Array) -> Nothing:
+    """Evaluate the function of this name for every entry."""
     for i in range(f.shape[0]):
         m = ti.Matrix([[f[i, 0, 0], f[i, 0, 1]], [f[i, 1, 0], f[i, 1, 1]]])
         elastic, factor = constitutive.plastic_return(m, LOW, HIGH)

@@ -30,6 +30,13 @@ def falling(material: Material, friction: float = 0.0) -> InitialState:
     return scenario(CONSTANTS, *parts, seed=int(material), friction=friction, spin=4.0)
 
 
+def cornered(gap: float, high: bool) -> InitialState:
+    """One resting square of liquid that keeps a gap from two walls [cells]."""
+    near = (CONSTANTS.wall + gap) / CONSTANTS.grid + 0.1
+    centre = 1.0 - near if high else near
+    return scenario(CONSTANTS, Part(Material.LIQUID, SQUARE, (centre, centre)), spin=4.0)
+
+
 MIXED = scenario(
     CONSTANTS,
     Part(Material.LIQUID, SQUARE, (0.2, 0.35), (1.0, -2.0)),
@@ -98,13 +105,24 @@ def test_scenarios_of_these_tests_reach_walls(material: Material) -> None:
 @pytest.mark.parametrize("threads", THREADS)
 @pytest.mark.parametrize("state", CASES)
 def test_parallel_driver_gives_the_same_bits(state: InitialState, threads: int) -> None:
-    """Atomic adds from any number of threads, over the whole grid, change no bit in 1000 substeps.
-
-    The serial driver visits only nodes near particles; bodies that leave a wall and return once
-    met stale mirrored rows there.
-    """
+    """Atomic adds from any number of threads, over the whole grid, change no bit in 1000 substeps."""
     serial = run(CONSTANTS, [state], 1000)
     parallel = run(CONSTANTS, [state], 1000, device=Device.PARALLEL, threads=threads)
+    for own, other in zip(serial, parallel, strict=True):
+        np.testing.assert_array_equal(own, other)
+
+
+@pytest.mark.parametrize("high", [False, True])
+@pytest.mark.parametrize("gap", [0.6, 1.0, 1.6])
+def test_rows_beyond_a_wall_are_never_stale(gap: float, high: bool) -> None:
+    """Nodes that walls mirror are cleared even if no particle touches them.
+
+    The serial driver visits only nodes near particles. Here a first scenario fills the rows
+    beyond two walls; the second lies near these walls without touching those rows.
+    """
+    parallel = run(CONSTANTS, [cornered(gap, high)], 20, device=Device.PARALLEL, threads=1)
+    run(CONSTANTS, [cornered(0.05, high)], 5)
+    serial = run(CONSTANTS, [cornered(gap, high)], 20)
     for own, other in zip(serial, parallel, strict=True):
         np.testing.assert_array_equal(own, other)
 

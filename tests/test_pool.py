@@ -120,6 +120,16 @@ def test_leaving_the_pool_kills_its_workers(tmp_path: Path) -> None:
     assert not is_alive(process)
 
 
+def test_workers_that_are_done_exit_by_themselves(tmp_path: Path) -> None:
+    """Taichi saves compiled kernels as its process exits, so a worker without work is not killed."""
+    with Pool(1) as pool:
+        pool.submit(Task(name="a", function=pool_tasks.leave_a_note, arguments=(tmp_path / "note",)))
+        list(pool.events())
+        process = pool.process_ids()[0]
+    assert (tmp_path / "note").read_text() == "left in peace"
+    assert not is_alive(process)
+
+
 SCRIPT = """
 import sys
 from pathlib import Path

@@ -40,7 +40,8 @@ def run(root: Path, registry: Path, *options: str) -> int:
     """Run the command in this process."""
     released = registry.parent / "released.json"
     arguments = ["--split", SPLIT, "--size", SIZE, "--root", str(root), "--registry", str(registry)]
-    return main([*arguments, "--released", str(released), *options])
+    code: int = main([*arguments, "--released", str(released), *options])
+    return code
 
 
 def test_what_is_recorded_is_what_was_measured(

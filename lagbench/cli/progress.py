@@ -33,7 +33,7 @@ def progress_bar(*, quiet: bool) -> Iterator[Callable[[State], None] | None]:
         TextColumn("{task.fields[count]}"),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=Console(stderr=True)) as bar:
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("starting", total=None, count="")
 
         def draw(news: State) -> None:

@@ -10,9 +10,7 @@ cannot read at all raises.
 from __future__ import annotations
 
 import math
-import stat
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,21 +18,10 @@ from typing import Any
 import h5py
 import numpy as np
 
-from lagbench.errors import LagbenchError, UnreadableFileError
-
 from .header import OPTIONAL, REQUIRED
+from .opening import reading
 
-__all__ = ["Anatomy", "Array", "Odd", "dissect", "opened", "reading"]
-
-SIGNATURE = b"\x89HDF\r\n\x1a\n"
-FOREIGN: Mapping[bytes, str] = {
-    b"CDF": "netCDF-3, the old format",
-    b"PK\x03\x04": "a zip archive, perhaps .npz",
-    b"\x93NUMPY": "a NumPy .npy file",
-    b"\x1f\x8b": "a gzip archive",
-    b"\x80": "perhaps a Python pickle",
-}
-"""First bytes to what a file is instead."""
+__all__ = ["MAX_COORDINATE", "MAX_LINKS", "Anatomy", "Array", "Odd", "dissect"]
 
 MAX_LINKS = 1000
 """Most entries of the root group that are looked at."""
@@ -50,7 +37,11 @@ MAX_COORDINATE_CHUNK = 1 << 26
 
 VARIABLES = ("position", "scenario", "frame", "diverged_at")
 INTEGERS = ("scenario", "frame", "diverged_at")
-FILTERS = {h5py.h5z.FILTER_DEFLATE: "zlib", h5py.h5z.FILTER_SHUFFLE: "shuffle", h5py.h5z.FILTER_FLETCHER32: ""}
+FILTERS = {
+    h5py.h5z.FILTER_DEFLATE: "zlib",
+    h5py.h5z.FILTER_SHUFFLE: "shuffle",
+    h5py.h5z.FILTER_FLETCHER32: "",
+}
 LAYOUTS = {
     h5py.h5d.COMPACT: "compact",
     h5py.h5d.CONTIGUOUS: "contiguous",
@@ -126,39 +117,6 @@ class Anatomy:
     integers: Mapping[str, tuple[int, ...]]
 
 
-@contextmanager
-def reading(path: Path, variable: str | None = None) -> Iterator[None]:
-    """Turn whatever HDF5 raises on damaged bytes into an UnreadableFileError."""
-    try:
-        yield
-    except LagbenchError:
-        raise
-    except Exception as error:  # no list of types holds: damage surfaces as nearly any of them
-        raise UnreadableFileError(
-            "HDF5 cannot read the file",
-            where=str(path) if variable is None else f"{path}, variable {variable!r}",
-            expected="an undamaged netCDF4 file",
-            got=f"{type(error).__name__}: {' '.join(str(error).split())[:300]}",
-            fix="write the file again; if it was copied or downloaded, compare its length",
-        ) from error
-
-
-@contextmanager
-def opened(path: Path) -> Iterator[h5py.File]:
-    """Open an HDF5 file for reading; no lock, nothing but a regular file.
-
-    Raises:
-        UnreadableFileError: missing, no regular file, not HDF5, or damaged.
-    """
-    _check_file(path)
-    with reading(path):
-        file = h5py.File(path, "r", locking=False)
-    try:
-        yield file
-    finally:
-        file.close()
-
-
 def dissect(file: h5py.File, path: Path) -> Anatomy:
     """Return what a file holds; values are read of coordinates only.
 
@@ -179,37 +137,7 @@ def dissect(file: h5py.File, path: Path) -> Anatomy:
                 arrays[name] = _array(dataset, name)
                 if name in INTEGERS and _is_coordinate(arrays[name]):
                     integers[name] = tuple(int(i) for i in dataset[...])
-    return Anatomy(
-        links=links, link_count=count, attributes=attributes, arrays=arrays, integers=integers
-    )
-
-
-def _check_file(path: Path) -> None:
-    """Refuse what is no HDF5 file by its kind and first bytes; a FIFO must not be opened."""
-    fix = "write it with lagbench.submission.write, or fill what `lagbench template` writes"
-    try:
-        if not stat.S_ISREG(path.stat().st_mode):
-            kind = "a folder" if path.is_dir() else "a device, socket or pipe"
-            raise UnreadableFileError("not a file", where=str(path), expected="a file", got=kind, fix=fix)
-        with path.open("rb") as stream:
-            head = stream.read(len(SIGNATURE))
-    except (OSError, ValueError) as error:
-        got = getattr(error, "strerror", None) or error
-        fix = "check the path and that you may read the file"
-        raise UnreadableFileError(
-            "cannot open the file", where=str(path), expected="a readable file", got=got, fix=fix
-        ) from error
-    if head != SIGNATURE:
-        got = next((what for start, what in FOREIGN.items() if head.startswith(start)), _guess(head))
-        raise UnreadableFileError(
-            "not a netCDF4 file", where=str(path), expected="netCDF4, which is HDF5", got=got, fix=fix
-        )
-
-
-def _guess(head: bytes) -> str:
-    if not head:
-        return "an empty file"
-    return "text" if head.isascii() and head.decode("ascii").isprintable() else "bytes of another format"
+    return Anatomy(links=links, link_count=count, attributes=attributes, arrays=arrays, integers=integers)
 
 
 def _links(root: h5py.h5g.GroupID, count: int) -> Iterator[tuple[str, str]]:
@@ -255,14 +183,17 @@ def _array(dataset: h5py.Dataset, name: str) -> Array:
     filters = [plist.get_filter(i) for i in range(plist.get_nfilters())]
     return Array(
         name=name,
-        shape=None if elsewhere or dataset.id.get_space().get_simple_extent_type() != h5py.h5s.SIMPLE
+        shape=None
+        if elsewhere or dataset.id.get_space().get_simple_extent_type() != h5py.h5s.SIMPLE
         else tuple(dataset.id.shape),
         dims=() if elsewhere else _dims(dataset),
         kind=_kind(dataset.id.get_type()),
         layout=layout,
         chunks=tuple(plist.get_chunk()) if layout == "chunked" else None,
         foreign_filters=tuple(
-            f"{text.decode('ascii', 'replace')} ({code})" for code, _, _, text in filters if code not in FILTERS
+            f"{text.decode('ascii', 'replace')} ({code})"
+            for code, _, _, text in filters
+            if code not in FILTERS
         ),
         packing={n: value for n in PACKING if (value := _attribute(dataset, n)) is not None},
     )
@@ -270,7 +201,7 @@ def _array(dataset: h5py.Dataset, name: str) -> Array:
 
 def _dims(dataset: h5py.Dataset) -> tuple[str, ...]:
     """Return the names of the dimension scales that netCDF attaches, one per dimension."""
-    rank = dataset.id.rank
+    rank: int = dataset.id.rank
     if not h5py.h5a.exists(dataset.id, b"DIMENSION_LIST"):
         return ("",) * rank
     attribute = h5py.h5a.open(dataset.id, b"DIMENSION_LIST")

@@ -35,8 +35,8 @@ MAX_TEXT = 80
 def quoted(value: object) -> str:
     """Return a stranger's value as one short printable line.
 
-    >>> quoted("a" + chr(27) + "[2J")
-    "'a\\\\x1b[2J'"
+    >>> quoted("dot" * 50)
+    "'dotdotdotdotdotdotdotdotdotdotdotdotdotdotdotdotdotdotdotdotdotdotdotdotdotd..."
     """
     text = ascii(value[: MAX_TEXT + 1] if isinstance(value, (str, bytes)) else value)
     return text if len(text) <= MAX_TEXT else f"{text[: MAX_TEXT - 3]}..."

@@ -12,14 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.checksums import ContentHasher
-from lagbench.errors import ChecksFailedError, UsageError
+from lagbench.errors import UsageError
 from lagbench.scenario_ids import spell_ids
 
-from .anatomy import Anatomy, dissect, opened, reading
+from .anatomy import Anatomy, dissect
 from .findings import Findings
+from .format_checks import check_dims, check_dtype, check_format
 from .header import DIMS, OPTIONAL, REQUIRED, SPACE, Header
-from .storage import cache_of, check_storage
-from .structure import check_dims, check_dtype, check_format
+from .opening import opened, reading
+from .storage import cache_of
 
 __all__ = ["Predictions", "open_predictions"]
 
@@ -121,8 +122,8 @@ class Predictions:
 def open_predictions(path: str | Path) -> Predictions:
     """Open a predictions.nc without trusting it.
 
-    Only the shape of the file is checked here, not its agreement with a data set: that is
-    :func:`lagbench.validate`, which also guards against files that make HDF5 loop.
+    Only the layout of the file is checked here, not its agreement with a data set: that is
+    :func:`lagbench.validate`, which also guards against files that make HDF5 loop or crash.
 
     Raises:
         UnreadableFileError: missing, not netCDF4, or damaged.
@@ -132,44 +133,39 @@ def open_predictions(path: str | Path) -> Predictions:
     with ExitStack() as stack:
         file = stack.enter_context(opened(path))
         anatomy = dissect(file, path)
-        predictions = predictions_of(file, path, anatomy, stack)
-        stack.pop_all()
-    return predictions
+        out = Findings()
+        for check in (check_format, check_dims, check_dtype):
+            check(anatomy, out)
+        out.result(path).check()
+        return attach(file, path, anatomy, stack)
 
 
-def predictions_of(file: h5py.File, path: Path, anatomy: Anatomy, stack: ExitStack) -> Predictions:
-    """Return the predictions of an open file, which ``stack`` shall close.
+def attach(file: h5py.File, path: Path, anatomy: Anatomy, stack: ExitStack) -> Predictions:
+    """Return the predictions of an open file whose layout has been checked.
 
-    Raises:
-        ChecksFailedError: not laid out as docs/predictions.md says.
+    Args:
+        file: the open file.
+        path: its path.
+        anatomy: what it holds.
+        stack: closes the file; the predictions take over what it holds.
     """
-    out = Findings()
-    check_format(anatomy, out)
-    check_dims(anatomy, out)
-    check_dtype(anatomy, out)
-    out.result(path).check()
-    header = header_of(anatomy, path)
+    header = header_of(anatomy)
     with reading(path, "position"):
         position = h5py.Dataset(_open_position(file, anatomy))
-    owned = ExitStack()
-    owned.push(stack.pop_all())
-    return Predictions(path, header, position, owned)
+    return Predictions(path, header, position, stack.pop_all())
 
 
-def header_of(anatomy: Anatomy, path: Path) -> Header:
-    """Return the header of a file whose format has been checked."""
-    shape = anatomy.arrays["position"].shape
-    missing = [name for name in ("scenario", "frame") if name not in anatomy.integers]
-    if shape is None or missing:
-        raise ChecksFailedError("a coordinate cannot be read", where=str(path), got=", ".join(missing))
+def header_of(anatomy: Anatomy) -> Header:
+    """Return the header of a file whose layout has been checked."""
     scenarios = anatomy.integers["scenario"]
     marks = anatomy.integers.get("diverged_at", ())
+    labels: dict[str, Any] = {name: str(anatomy.attributes[name]) for name in REQUIRED}
+    labels |= {name: _optional(anatomy.attributes[name], kind) for name, kind in OPTIONAL.items()}
     return Header(
-        **{name: str(anatomy.attributes[name]) for name in REQUIRED},
-        **{name: _optional(anatomy.attributes[name], kind) for name, kind in OPTIONAL.items()},
+        **labels,
         scenarios=scenarios,
         frames=anatomy.integers["frame"],
-        particles=shape[2],
+        particles=(anatomy.arrays["position"].shape or ())[2],
         diverged_at={i: mark for i, mark in zip(scenarios, marks, strict=False) if mark >= 0},
     )
 

@@ -45,8 +45,10 @@ def check_storage(array: Array, out: Findings) -> bool:
 def _outside(array: Array) -> list[tuple[str, str, str]]:
     if array.shape is None:
         plain = "compact, contiguous or chunked storage in this file"
-        what = "the values lie in other files" if "file" in array.layout or array.layout == "virtual" else (
-            "there are no values"
+        what = (
+            "the values lie in other files"
+            if "file" in array.layout or array.layout == "virtual"
+            else ("there are no values")
         )
         return [(what, plain, array.layout)]
     if array.foreign_filters:

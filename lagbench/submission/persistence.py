@@ -1,0 +1,84 @@
+"""The template of a submission: the persistence prediction, which any model should beat."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from lagbench.layout import resolve_root
+from lagbench.registry import Registry, load
+
+from .truth import Truth
+from .writer import PredictionsWriter
+
+__all__ = ["TemplateResult", "template"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class TemplateResult:
+    """A template that was written.
+
+    Attributes:
+        path: the file.
+        split: name of the split.
+        size: name of the size.
+        scenarios: ids of the test scenarios.
+        frames: absolute numbers of the first and the last frame to predict.
+        particles: particles in every frame.
+        bytes: length of the file.
+    """
+
+    path: Path
+    split: str
+    size: str
+    scenarios: tuple[int, ...]
+    frames: tuple[int, int]
+    particles: int
+    bytes: int
+
+
+def template(
+    split: str,
+    size: str = "full",
+    *,
+    output: str | Path = "predictions.nc",
+    root: str | Path | None = None,
+    registry: Registry | None = None,
+) -> TemplateResult:
+    """Write a valid predictions.nc to fill: the last given frame, repeated.
+
+    Args:
+        split: name of the split.
+        size: name of the size.
+        output: file to write.
+        root: folder of all data sets, see :func:`lagbench.layout.resolve_root`.
+        registry: where splits are described; ours when None.
+
+    Raises:
+        UsageError: unknown split or size.
+        DataError: test scenarios are missing or damaged, or their data set has no recorded hash.
+        WorkFailedError: the disk is full or not writable.
+    """
+    described, folder = registry or load(), resolve_root(root)
+    entry = described.size(split, size)
+    truth = Truth(entry, folder)
+    truth.require()
+    writer = PredictionsWriter(
+        output, split=split, size=size, method="persistence", root=folder, registry=described
+    )
+    ids = tuple(sorted(entry.subsets["test"]))
+    with writer:
+        for scenario in ids:
+            writer.add(scenario, np.broadcast_to(truth.given(scenario)[-1], writer.shape))
+    task = entry.task
+    return TemplateResult(
+        path=writer.path,
+        split=split,
+        size=size,
+        scenarios=ids,
+        frames=(task.input_frames, task.input_frames + task.horizon - 1),
+        particles=entry.particles,
+        bytes=writer.path.stat().st_size,
+    )

@@ -1,0 +1,119 @@
+"""Look at a file in a child process with limits on memory and time.
+
+HDF5 is C code that parses whatever it is given. What loops, crashes or asks for too much ends
+the child; the parent says so and goes on. The child answers in JSON, so nothing that it sends
+is executed.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import pickle
+import signal
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from lagbench.registry import Registry
+
+from .findings import Finding, Severity, ValidationResult
+
+__all__ = ["CPU_SECONDS", "MEMORY", "OUT_OF_MEMORY", "WALL_SECONDS", "Request", "encode", "run_isolated"]
+
+MEMORY = 900 << 20
+"""Address space of the child [bytes]."""
+
+CPU_SECONDS = 5.0
+"""Computing time of the child for a small file [s]."""
+
+WALL_SECONDS = 9.0
+"""Time for the child and a small file, its start included [s]."""
+
+BYTES_PER_SECOND = 20e6
+"""Larger files get more time: a slow reader's speed [bytes/s]."""
+
+CHILD = "lagbench.submission.child"
+"""The child's program; -P keeps the current folder, where strangers' files may lie, off its path."""
+
+OUT_OF_MEMORY = 77
+"""Exit code of a child that needed more than :data:`MEMORY`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Request:
+    """What to validate.
+
+    Attributes:
+        path: the file.
+        root: folder of all data sets.
+        require_truth: whether a missing test subset is an error.
+        registry: where splits are described.
+    """
+
+    path: Path
+    root: Path
+    require_truth: bool
+    registry: Registry
+
+
+def run_isolated(request: Request) -> ValidationResult:
+    """Examine a file in a child process; whatever stops the child fails the check ``readable``."""
+    extra = request.path.stat().st_size / BYTES_PER_SECOND
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2"}
+    try:
+        done = subprocess.run(
+            [sys.executable, "-P", "-m", CHILD, str(int(CPU_SECONDS + extra))],
+            input=pickle.dumps(request),
+            capture_output=True,
+            timeout=WALL_SECONDS + extra,
+            env=environment,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return _stopped(request.path, f"no end after {WALL_SECONDS + extra:.0f} s")
+    if done.returncode == 0:
+        return _decode(done.stdout)
+    return _stopped(request.path, _reason(done.returncode, done.stderr))
+
+
+def _reason(code: int, messages: bytes) -> str:
+    if code == OUT_OF_MEMORY:
+        return f"more than {MEMORY >> 20} MiB of memory"
+    if code == -signal.SIGXCPU:
+        return "no end within the time allowed"
+    if code < 0:
+        return f"HDF5 crashed: {signal.strsignal(-code) or f'signal {-code}'}"
+    last = messages.decode("utf-8", "replace").strip().rsplit("\n", 1)[-1]
+    return f"the reader ended with code {code}: {last[:200]!a}"
+
+
+def _stopped(path: Path, got: str) -> ValidationResult:
+    finding = Finding(
+        check="readable",
+        severity=Severity.ERROR,
+        what="reading the file had to be stopped",
+        where=str(path),
+        expected="a file that HDF5 reads within the limits",
+        got=got,
+        fix="the file is damaged or made to do harm; write it again with lagbench.submission.write",
+    )
+    return ValidationResult(
+        path=path, split=None, size=None, method=None, findings=(finding,), passed=(), skipped={}
+    )
+
+
+def encode(result: ValidationResult) -> bytes:
+    """Return a result as the child sends it."""
+    value = dataclasses.asdict(result) | {"path": str(result.path)}
+    return json.dumps(value).encode()
+
+
+def _decode(data: bytes) -> ValidationResult:
+    value = json.loads(data)
+    findings = tuple(Finding(**{**f, "severity": Severity(f["severity"])}) for f in value["findings"])
+    return ValidationResult(
+        **{**value, "path": Path(value["path"]), "findings": findings, "passed": tuple(value["passed"])}
+    )

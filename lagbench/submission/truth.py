@@ -1,0 +1,133 @@
+"""The test scenarios that predictions are held against, read a few frames at a time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagbench.errors import DataError
+from lagbench.layout import ScenarioKey, scenario_path
+from lagbench.registry import Size
+from lagbench.scenario_file import ScenarioFile, read_scenario
+from lagbench.scenario_ids import spell_ids
+
+__all__ = ["Truth"]
+
+BLOCK = 16
+"""Frames that are read at a time."""
+
+
+class Truth:
+    """The test subset of a data set.
+
+    Args:
+        size: what the registry says of the data set.
+        root: folder of all data sets.
+    """
+
+    def __init__(self, size: Size, root: Path) -> None:
+        self.size = size
+        self.root = root
+
+    def require(self) -> None:
+        """Check that every test scenario is there.
+
+        Raises:
+            DataError: some are missing; the message has the command that makes them.
+        """
+        ids = self.size.subsets["test"]
+        missing = [i for i in ids if not self.path(i).is_file()]
+        if missing:
+            options = f"--split {self.size.split} --size {self.size.name} --subset test --root {self.root}"
+            raise DataError(
+                f"{len(missing)} of {len(ids)} test scenarios are not generated",
+                where=str(self.path(ids[0]).parent),
+                expected=f"scenarios {spell_ids(ids)}",
+                got=f"missing: {spell_ids(missing)}",
+                fix=f"lagbench generate {options}",
+            )
+
+    def path(self, scenario: int) -> Path:
+        """Return where a test scenario lies."""
+        return scenario_path(self.root, self._key(scenario))
+
+    def open(self, scenario: int) -> ScenarioFile:
+        """Open a test scenario; check that it is the one that the registry means.
+
+        Raises:
+            DataError: missing, damaged, of another version or of another hash.
+        """
+        path, key = self.path(scenario), self._key(scenario)
+        file = read_scenario(path)
+        header = file.header
+        found = (header.key.split, header.key.size, header.key.major, header.key.scenario)
+        expected = (key.split, key.size, key.major, scenario)
+        short = self._hash(scenario)
+        if found == expected and header.content_sha256.startswith(short):
+            return file
+        file.close()
+        raise DataError(
+            "a test scenario is not that of the registry",
+            where=str(path),
+            expected=f"{expected}, content hash {short or 'any'}",
+            got=f"{found}, content hash {header.content_sha256[:16]}",
+            fix=f"lagbench generate --split {key.split} --size {key.size} --subset test",
+        )
+
+    def given(self, scenario: int) -> NDArray[np.float32]:
+        """Return the frames given to a model [length], shape [frame, particle, space].
+
+        Raises:
+            DataError: see :meth:`open`; or frames or particles are missing.
+        """
+        task = self.size.task
+        with self.open(scenario) as file:
+            frames: NDArray[np.float32] = file.read("position", slice(0, task.input_frames))
+            if file.header.frames >= task.input_frames and frames.shape[1] == self.size.particles:
+                return frames
+            raise DataError(
+                "a test scenario has other frames or particles than the registry says",
+                where=str(self.path(scenario)),
+                expected=f"at least {task.input_frames} frames of {self.size.particles} particles",
+                got=frames.shape,
+            )
+
+    def largest_displacement(self, scenario: int, *, enough: float) -> float:
+        """Return the largest distance that a particle moves from one frame to the next [length].
+
+        Reading stops as soon as one of at least ``enough`` is found, which is then returned.
+
+        Args:
+            scenario: id of a test scenario.
+            enough: distance beyond which no more need be known [length].
+
+        Raises:
+            DataError: see :meth:`open`.
+        """
+        task, largest = self.size.task, 0.0
+        with self.open(scenario) as file:
+            last = min(file.header.frames, task.input_frames + task.horizon)
+            for start in range(0, last - 1, BLOCK):
+                frames = file.read("position", slice(start, min(start + BLOCK + 1, last)))
+                largest = max(largest, float(np.sqrt(np.max(_squares(frames)))))
+                if largest >= enough:
+                    break
+        return largest
+
+    def _key(self, scenario: int) -> ScenarioKey:
+        size = self.size
+        return ScenarioKey(
+            split=size.split, size=size.name, version=size.version, scenario=scenario, subset="test"
+        )
+
+    def _hash(self, scenario: int) -> str:
+        measured = self.size.measured
+        return measured.scenario_sha256.get(scenario, "") if measured else ""
+
+
+def _squares(frames: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return squared distances of particles between consecutive frames."""
+    squares: NDArray[np.float64] = np.sum(np.diff(frames.astype(np.float64), axis=0) ** 2, axis=-1)
+    return squares

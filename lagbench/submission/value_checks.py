@@ -1,0 +1,194 @@
+"""Checks on the predicted positions: finite, where they start, where they lie, how far they jump."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagbench.registry import Size
+
+from .findings import Findings
+from .guesses import guess_start
+from .reader import Predictions
+from .truth import Truth
+
+__all__ = ["JUMP", "Survey", "check_domain", "check_finite", "check_jumps", "check_start", "survey"]
+
+JUMP = 10.0
+"""A step is suspect beyond this many of the truth's largest per-frame displacement."""
+
+FILL = np.float32(9.969209968386869e36)
+"""What netCDF puts where a float32 was never written."""
+
+
+@dataclass
+class Survey:
+    """What one pass over a scenario's predictions saw.
+
+    Attributes:
+        scenario: id of the scenario.
+        values: how many values there are.
+        bad: values that are not finite, or were never written.
+        unwritten: those of them that were never written.
+        first_bad: frame, particle and component of the first of them.
+        positions: how many positions there are.
+        outside: positions outside the domain.
+        off_grid: positions outside the unit box.
+        farthest: largest distance outside the domain along an axis [length].
+        first_outside: frame and particle of the first one outside.
+        jump: largest distance of a particle between consecutive frames [length].
+        jump_at: frame and particle of it.
+    """
+
+    scenario: int
+    values: int = 0
+    bad: int = 0
+    unwritten: int = 0
+    first_bad: tuple[int, int, int] | None = None
+    positions: int = 0
+    outside: int = 0
+    off_grid: int = 0
+    farthest: float = 0.0
+    first_outside: tuple[int, int] | None = None
+    jump: float = 0.0
+    jump_at: tuple[int, int] | None = None
+    _last: NDArray[np.float32] | None = field(default=None, repr=False)
+
+    def add(self, first: int, block: NDArray[np.float32], size: Size) -> None:
+        """Take in consecutive frames.
+
+        Args:
+            first: absolute number of the first of them.
+            block: positions [length], shape [frame, particle, space].
+            size: what the registry says of the data set.
+        """
+        wrong = ~np.isfinite(block) | (block == FILL)
+        if wrong.any():
+            self._add_wrong(first, block, wrong)
+            block = np.where(wrong, np.float32(np.nan), block)
+        self.values += block.size
+        self._add_places(first, block, size)
+        self._add_steps(first, block)
+
+    def _add_wrong(self, first: int, block: NDArray[np.float32], wrong: NDArray[np.bool_]) -> None:
+        if self.first_bad is None:
+            frame, particle, axis = (int(i[0]) for i in np.nonzero(wrong))
+            self.first_bad = (first + frame, particle, axis)
+        self.bad += int(np.count_nonzero(wrong))
+        self.unwritten += int(np.count_nonzero(block == FILL))
+
+    def _add_places(self, first: int, block: NDArray[np.float32], size: Size) -> None:
+        slack = 1.0 / size.grid
+        low, high = np.array(size.bounds, np.float64).T
+        beyond = np.fmax(low - block, block - high).max(axis=-1)
+        self.positions += beyond.size
+        far = beyond > slack
+        if far.any():
+            if self.first_outside is None:
+                frame, particle = (int(i[0]) for i in np.nonzero(far))
+                self.first_outside = (first + frame, particle)
+            self.outside += int(np.count_nonzero(far))
+            self.farthest = max(self.farthest, float(beyond[far].max()))
+            self.off_grid += int(np.count_nonzero(((block < 0) | (block > 1)).any(axis=-1)))
+
+    def _add_steps(self, first: int, block: NDArray[np.float32]) -> None:
+        joined = block if self._last is None else np.concatenate([self._last, block])
+        start = first if self._last is None else first - 1
+        steps = np.diff(joined.astype(np.float64), axis=0)
+        squares = np.nan_to_num(np.sum(steps * steps, axis=-1))
+        if squares.size and squares.max() > self.jump**2:
+            frame, particle = np.unravel_index(int(squares.argmax()), squares.shape)
+            self.jump = float(np.sqrt(squares.max()))
+            self.jump_at = (start + int(frame) + 1, int(particle))
+        self._last = block[-1:]
+
+
+def survey(predictions: Predictions, size: Size) -> list[Survey]:
+    """Read all predictions of known scenarios once, in blocks, by ascending id."""
+    known = sorted(set(predictions.header.scenarios) & set(size.subsets["test"]))
+    surveys = [Survey(scenario) for scenario in known]
+    for one in surveys:
+        for first, block in predictions.blocks(one.scenario):
+            one.add(first, block, size)
+    return surveys
+
+
+def check_finite(surveys: list[Survey], out: Findings) -> None:
+    """Report values that are NaN, infinite or were never written."""
+    out.made("finite")
+    bad = [one for one in surveys if one.first_bad]
+    if not bad:
+        return
+    frame, particle, axis = bad[0].first_bad or (0, 0, 0)
+    count, unwritten = sum(one.bad for one in bad), sum(one.unwritten for one in bad)
+    fix = "freeze a diverging rollout at its last finite frame and name it in diverged_at"
+    out.error(
+        "finite",
+        f"{count} values are no numbers" if unwritten < count else f"{count} values were never written",
+        where=f"first in scenario {bad[0].scenario}, frame {frame}, particle {particle}, {'xy'[axis]}",
+        expected="finite positions everywhere",
+        got=f"{count} of {sum(one.values for one in surveys)} values in {len(bad)} scenarios"
+        + (f", {unwritten} of them netCDF's fill value" if unwritten else ""),
+        fix="write every frame of every scenario" if unwritten == count else fix,
+    )
+
+
+def check_domain(surveys: list[Survey], size: Size, out: Findings) -> None:
+    """Flag positions more than a solver cell outside the box."""
+    out.made("in_domain")
+    bad = [one for one in surveys if one.first_outside]
+    if not bad:
+        return
+    frame, particle = bad[0].first_outside or (0, 0)
+    share = sum(one.outside for one in bad) / max(1, sum(one.positions for one in surveys))
+    out.warning(
+        "in_domain",
+        f"{share:.2%} of the positions lie outside the box",
+        where=f"first in scenario {bad[0].scenario}, frame {frame}, particle {particle}",
+        expected=f"x in {size.bounds[0]}, y in {size.bounds[1]}, up to a solver cell beyond",
+        got=f"up to {max(one.farthest for one in bad):.3g} outside;"
+        f" {sum(one.off_grid for one in bad)} positions are outside the unit box and carry no grid weight",
+        fix="positions are in lengths of the unit box, the walls' places are the split's bounds",
+    )
+
+
+def check_jumps(surveys: list[Survey], truth: Truth, out: Findings) -> None:
+    """Flag particles that jump much farther in a frame than any particle of the truth."""
+    out.made("max_displacement")
+    for one in surveys:
+        limit = JUMP * truth.largest_displacement(one.scenario, enough=one.jump / JUMP)
+        if one.jump_at and one.jump > limit:
+            frame, particle = one.jump_at
+            out.warning(
+                "max_displacement",
+                "a particle jumps",
+                where=f"scenario {one.scenario}, from frame {frame - 1} to {frame}, particle {particle}",
+                expected=f"at most {limit:.3g}, {JUMP:g} times the truth's largest displacement in a frame",
+                got=f"{one.jump:.3g}",
+                fix="check the rollout for instability, and that particles keep their order",
+            )
+
+
+def check_start(predictions: Predictions, truth: Truth, out: Findings) -> None:
+    """Check that the first predicted frame follows the last given one, particle by particle."""
+    out.made("start")
+    header = predictions.header
+    for scenario in sorted(set(header.scenarios) & set(truth.size.subsets["test"])):
+        given = truth.given(scenario)[-1]
+        first = predictions.frames(scenario, header.frames[0], 1)[0]
+        with np.errstate(all="ignore"):
+            square = np.sum((first.astype(np.float64) - given) ** 2, axis=-1)
+            distance = float(np.sqrt(square.mean()))
+        limit = JUMP * truth.largest_displacement(scenario, enough=distance / JUMP)
+        if np.isfinite(distance) and distance > limit:
+            out.error(
+                "start",
+                "the first predicted frame is far from the last given one",
+                where=f"scenario {scenario}, frame {header.frames[0]}",
+                expected=f"root mean square distance at most {limit:.3g},"
+                f" {JUMP:g} times the truth's largest displacement in a frame",
+                got=f"{distance:.3g}",
+                fix=guess_start(first, given, limit),
+            )

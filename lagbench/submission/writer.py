@@ -1,0 +1,263 @@
+"""Write a predictions.nc scenario by scenario; it appears whole or not at all."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lagbench.atomic import atomic_path
+from lagbench.errors import DataError, UsageError, WorkFailedError, nearest
+from lagbench.layout import resolve_root
+from lagbench.registry import Registry, Size, load
+from lagbench.scenario_ids import spell_ids
+
+from .header import DIMS, FORMAT, OPTIONAL, SPACE
+from .task_checks import dataset_hash_of, frames_to_predict
+
+__all__ = ["Label", "PredictionsWriter"]
+
+CHUNK_CACHE = 1 << 20
+"""Chunk cache while writing [bytes]; frames are written once, in order."""
+
+NEVER = -1
+"""Value of ``diverged_at`` for a rollout that did not diverge."""
+
+Label = str | int | float
+"""Value of an optional attribute."""
+
+
+class PredictionsWriter:
+    """Write predictions one scenario at a time; use it as a context manager.
+
+    The file has a temporary name until the clean exit, where it must hold every test scenario;
+    on an error it is removed.
+
+    Args:
+        path: file to write.
+        split: name of the split.
+        size: name of the size.
+        method: what makes the predictions.
+        velocity: whether velocities are stored too (they are not scored).
+        dataset_sha256: hash of the data set that the model was given; else the recorded one.
+        root: folder of all data sets; asked only where no hash is recorded.
+        registry: where splits are described; ours when None.
+        **labels: see :meth:`label`.
+
+    Raises:
+        UsageError: unknown split, size or label.
+        DataError: the hash of the data set is not known.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        split: str,
+        size: str = "full",
+        method: str,
+        velocity: bool = False,
+        dataset_sha256: str | None = None,
+        root: str | Path | None = None,
+        registry: Registry | None = None,
+        **labels: Label,
+    ) -> None:
+        self.path = Path(path)
+        self.size = (registry or load()).size(split, size)
+        self._hash = dataset_sha256 or _known_hash(self.size, resolve_root(root))
+        self._names = ("position", "velocity") if velocity else ("position",)
+        self._rows = {scenario: row for row, scenario in enumerate(sorted(self.size.subsets["test"]))}
+        self._written: set[int] = set()
+        self._diverged = np.full(len(self._rows), NEVER, np.int32)
+        self._labels: dict[str, Label] = {"method": method}
+        self.label(**labels)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Shape of one scenario: frames to predict, particles, components."""
+        return self.size.task.horizon, self.size.particles, SPACE
+
+    def label(self, **labels: Label) -> None:
+        """Set optional attributes, at any time before the exit.
+
+        Args:
+            **labels: seconds_per_frame [s], device, seed, parameters (trainable, a number),
+                training (in words).
+
+        Raises:
+            UsageError: there is no such label, or its value is of another type.
+        """
+        for name, value in labels.items():
+            if name not in OPTIONAL:
+                raise UsageError(f"no label {name!r}", fix=nearest(name, OPTIONAL))
+            kind = OPTIONAL[name]
+            fits = isinstance(value, (int, float)) and value > 0 if kind is float else isinstance(value, kind)
+            if not fits:
+                raise UsageError(f"the label {name!r} does not fit", expected=kind.__name__, got=repr(value))
+            self._labels[name] = value
+
+    def __enter__(self) -> Self:
+        """Create the temporary file with everything but the predictions."""
+        import netCDF4
+
+        with ExitStack() as stack:
+            temporary = stack.enter_context(atomic_path(self.path))
+            try:
+                self._file = netCDF4.Dataset(temporary, "w", format="NETCDF4")
+            except OSError as error:
+                raise self._refused(error) from error
+            stack.callback(self._close)
+            self._define()
+            self._stack = stack.pop_all()
+        return self
+
+    def add(
+        self,
+        scenario: int,
+        position: ArrayLike,
+        velocity: ArrayLike | None = None,
+        *,
+        diverged_at: int | None = None,
+    ) -> None:
+        """Add the predictions of a scenario, in any order of scenarios.
+
+        Args:
+            scenario: id of a test scenario.
+            position: positions [length] at the frames to predict, shape [frame, particle, space].
+            velocity: velocities [length/s], same shape.
+            diverged_at: absolute frame from which a diverging rollout is frozen.
+
+        Raises:
+            UsageError: unknown or repeated scenario, wrong shape, or values that are not finite.
+            WorkFailedError: the disk is full.
+        """
+        if scenario not in self._rows or scenario in self._written:
+            what = "is written twice" if scenario in self._written else "is no test scenario"
+            raise UsageError(f"scenario {scenario} {what}", expected=spell_ids(self._rows))
+        arrays = [position] if velocity is None else [position, velocity]
+        if len(arrays) != len(self._names):
+            raise UsageError("velocities come for every scenario or for none", where=f"scenario {scenario}")
+        row = self._rows[scenario]
+        for name, values in zip(self._names, arrays, strict=True):
+            checked = self._checked(name, scenario, values)
+            try:
+                self._file[name][row] = checked
+            except (OSError, RuntimeError) as error:
+                raise self._refused(error) from error
+        self._diverged[row] = NEVER if diverged_at is None else diverged_at
+        self._written.add(scenario)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Finish and rename the file, or remove it when the body raised."""
+        if error is not None:
+            self._stack.__exit__(kind, error, trace)
+            return
+        with self._stack:
+            missing = sorted(set(self._rows) - self._written)
+            if missing:
+                raise UsageError(
+                    f"{len(missing)} test scenarios are missing",
+                    where=str(self.path),
+                    expected=spell_ids(self._rows),
+                    got=f"missing: {spell_ids(missing)}",
+                )
+            if (self._diverged != NEVER).any():
+                self._create("diverged_at", "i4", ("scenario",), self._diverged)
+            self._file.setncatts(self._labels)
+            try:
+                self._file.close()
+            except (OSError, RuntimeError) as failure:
+                raise self._refused(failure) from failure
+
+    def _checked(self, name: str, scenario: int, values: ArrayLike) -> NDArray[np.float32]:
+        where = f"{name} of scenario {scenario}"
+        with np.errstate(over="ignore"):
+            array = np.asarray(values).astype(np.float32)
+        if array.shape != self.shape:
+            raise UsageError("the shape is another", where=where, expected=self.shape, got=array.shape)
+        wrong = np.argwhere(~np.isfinite(array))
+        if len(wrong):
+            frame, particle, axis = (int(i) for i in wrong[0])
+            raise UsageError(
+                f"{len(wrong)} values are not finite as float32",
+                where=f"{where}, frame {frame + self.size.task.input_frames}, particle {particle}",
+                got=array[frame, particle, axis],
+                fix="freeze a diverging rollout at its last finite frame and give diverged_at",
+            )
+        return array
+
+    def _define(self) -> None:
+        size = self.size
+        lengths = (len(self._rows), *self.shape)
+        for name, length in zip(DIMS, lengths, strict=True):
+            self._file.createDimension(name, length)
+        self._create("scenario", "i4", ("scenario",), np.array(list(self._rows), np.int32))
+        self._create("frame", "i4", ("frame",), np.array(frames_to_predict(size), np.int32))
+        for name in self._names:
+            self._create(name, "f4", DIMS)
+        self._file.setncatts(
+            {
+                "Conventions": "CF-1.11",
+                "lagbench_format": np.int32(FORMAT),
+                "split": size.split,
+                "size": size.name,
+                "dataset_version": size.version,
+                "dataset_sha256": self._hash,
+            }
+        )
+
+    def _create(
+        self, name: str, dtype: str, dims: tuple[str, ...], values: NDArray[np.int32] | None = None
+    ) -> None:
+        chunked = len(dims) > 1
+        variable = self._file.createVariable(
+            name,
+            dtype,
+            dims,
+            compression="zlib" if chunked else None,
+            complevel=1,
+            shuffle=True,
+            chunksizes=(1, 1, *self.shape[1:]) if chunked else None,
+            endian="little",
+            fill_value=False,
+            chunk_cache=CHUNK_CACHE if chunked else None,
+        )
+        variable.setncatts(_ATTRIBUTES[name])
+        if values is not None:
+            variable[:] = values
+
+    def _close(self) -> None:
+        if self._file.isopen():
+            self._file.close()
+
+    def _refused(self, error: Exception) -> WorkFailedError:
+        fix = "free disk space, or name a folder that you may write to"
+        return WorkFailedError("cannot write the predictions", where=str(self.path), got=error, fix=fix)
+
+
+_ATTRIBUTES: Mapping[str, Mapping[str, str]] = {
+    "scenario": {"long_name": "scenario id", "units": "1"},
+    "frame": {"long_name": "absolute frame number", "units": "1"},
+    "position": {"long_name": "predicted particle position in lengths of the unit box", "units": "1"},
+    "velocity": {"long_name": "predicted particle velocity in box lengths per second", "units": "s-1"},
+    "diverged_at": {"long_name": "first frame of a frozen rollout, -1 where none is", "units": "1"},
+}
+
+
+def _known_hash(size: Size, root: Path) -> str:
+    known = dataset_hash_of(size, root)
+    if known is None:
+        raise DataError(
+            "the hash of the data set is not known",
+            where=f"{size.split} {size.name}",
+            expected="a hash in datasets.yaml, or a complete data set here",
+            fix=f"lagbench generate --split {size.split} --size {size.name}, or give dataset_sha256",
+        )
+    return known

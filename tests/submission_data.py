@@ -1,0 +1,109 @@
+"""A small data set, its registry and a valid predictions.nc, for tests of submissions."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from scenario_factory import frames_of, make_key, write_scenario
+
+from lagbench.checksums import dataset_hash, subset_hash
+from lagbench.registry import Registry, default_path, load
+from lagbench.submission import ValidationResult, validate, write
+
+TESTS = (3, 4, 5)
+"""Ids of the test scenarios."""
+
+GIVEN, HORIZON, PARTICLES = 3, 8, 48
+FRAMES = GIVEN + HORIZON
+VERSION = "1.2.0"
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A root folder with test scenarios, the registry that describes them, a valid submission."""
+
+    folder: Path
+    root: Path
+    registry_path: Path
+    valid: Path
+
+    @property
+    def registry(self) -> Registry:
+        """The registry."""
+        return load(self.registry_path)
+
+    def copy(self, name: str = "predictions.nc") -> Path:
+        """Return a copy of the valid submission that a test may damage."""
+        target = self.folder / name
+        shutil.copyfile(self.valid, target)
+        return target
+
+    def validate(
+        self, path: Path, *, isolated: bool = False, require_truth: bool = False
+    ) -> ValidationResult:
+        """Validate a file against this data set."""
+        return validate(
+            path, root=self.root, registry=self.registry, isolated=isolated, require_truth=require_truth
+        )
+
+
+def truth(scenario: int) -> NDArray[np.float32]:
+    """Positions of a test scenario at the frames to predict, shape [frame, particle, 2]."""
+    return frames_of(scenario, FRAMES, PARTICLES)[GIVEN:]
+
+
+def make_bench(folder: Path) -> Bench:
+    """Write the data set (test only), its registry with hashes, and the truth as predictions."""
+    folder.mkdir(parents=True, exist_ok=True)
+    root = folder / "root"
+    keys = {i: make_key(i, split="cavity", size="tiny", subset="test") for i in TESTS}
+    hashes = {i: write_scenario(root, k, frames=FRAMES, particles=PARTICLES)[1] for i, k in keys.items()}
+    registry_path = folder / "datasets.yaml"
+    registry_path.write_text(_registry(hashes))
+    valid = folder / "valid.nc"
+    write(
+        valid,
+        {i: truth(i) for i in TESTS},
+        split="cavity",
+        size="tiny",
+        method="truth",
+        registry=load(registry_path),
+        seconds_per_frame=0.25,
+        seed=7,
+    )
+    return Bench(folder, root, registry_path, valid)
+
+
+def _registry(hashes: dict[int, str]) -> str:
+    """Return our registry with a smaller cavity tiny and its hashes."""
+    file = yaml.safe_load(default_path().read_text())
+    file.pop("measured", None)
+    split = file["splits"]["cavity"]
+    split["version"] = VERSION
+    size = split["sizes"]["tiny"]
+    size["subsets"] = {"train": "0-1", "valid": 2, "test": "3-5"}
+    size["frames"] = FRAMES
+    size["parameters"]["particles"] = PARTICLES
+    size["task"] |= {"input_frames": GIVEN, "horizon": HORIZON, "frames_of_interest": [5]}
+    subsets = {"train": "0" * 64, "valid": "1" * 64, "test": subset_hash(hashes)}
+    measured = {
+        "dataset_sha256": dataset_hash("cavity", "tiny", 1, subsets),
+        "subset_sha256": subsets,
+        "scenario_sha256": {i: content[:16] for i, content in hashes.items()},
+        "statistics": {},
+        "twin_floor": [],
+    }
+    file["measured"] = {"cavity": {"tiny": measured}}
+    return yaml.dump(file, Dumper=_WithoutAliases)
+
+
+class _WithoutAliases(yaml.SafeDumper):
+    """Writes twice what stands twice; our reader refuses aliases."""
+
+    def ignore_aliases(self, data: object) -> bool:
+        return True
