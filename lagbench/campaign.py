@@ -41,7 +41,7 @@ class Campaign:
     Args:
         size: tier of a split.
         root: folder that holds all data sets.
-        device: where the solver runs.
+        device: where the solver runs; a GPU whose bits differ marks the manifest ``tolerance``.
         workers: worker processes.
         meter: counts the work.
 
@@ -257,12 +257,16 @@ class Campaign:
             if not entry.content_sha256.startswith(measured.scenario_sha256.get(entry.scenario, ""))
         ]
         if differing:
+            if self.device is Device.CUDA:
+                self._keep(self.manifest.model_copy(update={"identity": "tolerance"}))
             raise DataError(
                 f"{len(differing)} of {len(self.manifest.files)} scenarios have another hash",
                 where=f"{self.size.split} {self.size.name}, scenarios {spell_ids(differing)}",
                 expected="the hashes in datasets.yaml",
                 fix="see docs/determinism.md; `lagbench doctor` prints what a report needs",
             )
+        if self.manifest.identity == "tolerance":
+            self._keep(self.manifest.model_copy(update={"identity": "bitwise"}))
         whole = self.manifest.complete
         return "equal to datasets.yaml" if whole else "what is there is equal to datasets.yaml"
 

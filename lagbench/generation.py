@@ -123,21 +123,27 @@ def generate(
         _require_taichi()
         with dataset_lock(folder, split, size, tier.major, on_wait=on_wait):
             campaign.run(wanted, force=force)
+    seconds = time.monotonic() - started
+    return _result(campaign, bytes_free=free, seconds=seconds, dry_run=dry_run)
+
+
+def _result(campaign: Campaign, *, bytes_free: int, seconds: float, dry_run: bool) -> GenerationResult:
+    size = campaign.size
     return GenerationResult(
-        split=split,
-        size=size,
-        version=tier.version,
-        root=folder,
-        folder=dataset_folder(folder, split, size, tier.major),
-        device=device,
-        workers=cores,
+        split=size.split,
+        size=size.name,
+        version=size.version,
+        root=campaign.root,
+        folder=dataset_folder(campaign.root, size.split, size.name, size.major),
+        device=campaign.device.value,
+        workers=campaign.workers,
         simulated=campaign.to_do.scenarios,
         kept=tuple(campaign.kept),
         missing=campaign.missing(),
         bytes_needed=campaign.to_do.bytes,
-        bytes_free=free,
-        seconds_expected=campaign.to_do.seconds(cores),
-        seconds=time.monotonic() - started,
+        bytes_free=bytes_free,
+        seconds_expected=campaign.to_do.seconds(campaign.workers),
+        seconds=seconds,
         complete=campaign.manifest.complete,
         dataset_sha256=campaign.manifest.dataset_sha256,
         verdict=campaign.verdict,

@@ -33,6 +33,7 @@ class Trace:
         error: ``e(f)^2`` [length^2], shape [frame].
         overlap: ``e(f) e(f-1)`` [length^2], NaN at the first frame, shape [frame].
         motion: ``u_true(f)^2`` [length^2/frame^2], shape [frame].
+        predicted_motion: ``u_pred(f)^2`` [length^2/frame^2], shape [frame].
         shifted: ``(x_pred(f) - x_true(f+s))^2`` by shift s [length^2], NaN where frame f+s is
             not predicted yet nor given, shape [frame].
         occupancy: nodes that the prediction fills over those that the truth fills [1], shape
@@ -43,14 +44,15 @@ class Trace:
     error: Floats
     overlap: Floats
     motion: Floats
+    predicted_motion: Floats
     shifted: Mapping[int, Floats]
     occupancy: Floats
     outside: Floats
 
     def __reduce__(self) -> tuple[object, ...]:
         """Cross process borders, which a mapping proxy does not."""
-        rest = (self.occupancy, self.outside)
-        return Trace, (self.error, self.overlap, self.motion, dict(self.shifted), *rest)
+        first = (self.error, self.overlap, self.motion, self.predicted_motion)
+        return Trace, (*first, dict(self.shifted), self.occupancy, self.outside)
 
 
 class Tracer:
@@ -66,7 +68,7 @@ class Tracer:
         self._true = deque(np.asarray(scenario.given[-2:], np.float64), maxlen=max(SHIFTS))
         self._predicted: deque[Floats] = deque(maxlen=max(SHIFTS))
         self._error: Floats | None = None
-        names = ("error", "overlap", "motion", "occupancy", "outside")
+        names = ("error", "overlap", "motion", "predicted_motion", "occupancy", "outside")
         self._series = {name: np.full(frames, np.nan) for name in names}
         self._shifted = {shift: np.full(frames, np.nan) for shift in SHIFTS}
 
@@ -79,6 +81,7 @@ class Tracer:
         if self._error is not None:
             series["overlap"][i] = np.mean(error * self._error)
         series["motion"][i] = np.mean(pair.truth.velocity**2)
+        series["predicted_motion"][i] = np.mean(pair.prediction.velocity**2)
         series["occupancy"][i] = _occupancy(pair)
         series["outside"][i] = np.mean(((predicted < 0.0) | (predicted > 1.0)).any(axis=1))
         for back, earlier in enumerate(reversed(self._true), start=1):

@@ -131,8 +131,8 @@ def relative_density(position: Array, area: float, p: FreeSurfaceParameters) -> 
             n[wall] *= 2.0
             n[wall + inside] += n[wall + outside]
             n[wall + outside] = n[wall + inside]
-    gathered = sum(w * count[base[:, 0] + i, base[:, 1] + j] for i, j, w in stencil)
-    return np.asarray(gathered) * area / p.particles * p.grid**2
+    gathered = np.sum([w * count[base[:, 0] + i, base[:, 1] + j] for i, j, w in stencil], axis=0)
+    return np.asarray(gathered * area / p.particles * p.grid**2)
 
 
 def misfit(before: Array, after: Array) -> float:
@@ -216,7 +216,7 @@ def test_rope_stays_in_one_piece(scenario_id: int) -> None:
     """
     run = history("multimaterial", "full", scenario_id, 600)
     rope = run.state.material == Material.ROPE
-    neighbour = cKDTree(run.position[rope]).query(run.position[rope], k=2)[0][:, 1]
+    neighbour = np.asarray(cKDTree(run.position[rope]).query(run.position[rope], k=2)[0])[:, 1]
     assert neighbour.max() <= 2.0 * spacing(run.state)
     assert run.largest_gap <= 1.5 * longest_edge(run.state.position[rope])
 

@@ -13,7 +13,7 @@ from .output import print_json, say
 __all__ = ["animate", "plot"]
 
 SourceArgument = Annotated[
-    str | None, typer.Argument(metavar="[SPLIT | FILE]", help="Split, or a scenario file.")
+    str | None, typer.Argument(metavar="SPLIT|FILE", help="Split, or a scenario file.")
 ]
 SplitNameOption = Annotated[str | None, typer.Option("--split", metavar="NAME", help="The same as SPLIT.")]
 ScenarioOption = Annotated[
@@ -86,7 +86,7 @@ def plot(
 def animate(
     name: SourceArgument = None,
     second: Annotated[
-        str | None, typer.Argument(metavar="[FILE]", help="Second scenario file, drawn beside the first.")
+        str | None, typer.Argument(metavar="FILE", help="Second scenario file, drawn beside the first.")
     ] = None,
     split: SplitNameOption = None,
     size: SizeOption = "full",

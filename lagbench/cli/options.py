@@ -23,7 +23,7 @@ __all__ = [
     "chosen",
 ]
 
-SplitArgument = Annotated[str | None, typer.Argument(metavar="[SPLIT]", help="The same as --split.")]
+SplitArgument = Annotated[str | None, typer.Argument(metavar="SPLIT", help="The same as --split.")]
 SplitOption = Annotated[
     str | None, typer.Option("--split", metavar="NAME", help="Data set; `lagbench list` names them.")
 ]

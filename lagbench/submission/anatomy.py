@@ -72,6 +72,7 @@ class Array:
         kind: its type in words, such as "float32" or "compound".
         layout: "contiguous", "chunked", "compact", "virtual" or "external files".
         chunks: shape of a chunk; None where not chunked.
+        largest_chunk: length of the longest chunk as it is packed in the file [bytes].
         foreign_filters: filters beyond zlib, shuffle and checksum, by name.
         packing: scale_factor and add_offset, where it has them.
     """
@@ -82,6 +83,7 @@ class Array:
     kind: str
     layout: str
     chunks: tuple[int, ...] | None
+    largest_chunk: int
     foreign_filters: tuple[str, ...]
     packing: Mapping[str, object]
 
@@ -159,15 +161,18 @@ def _attribute(owner: h5py.HLObject, name: str) -> object:
     kind = attribute.get_type().get_class()
     if kind not in (h5py.h5t.STRING, h5py.h5t.INTEGER, h5py.h5t.FLOAT):
         return Odd("neither a text nor a number")
-    if attribute.get_storage_size() > MAX_ATTRIBUTE:
-        return Odd(f"{attribute.get_storage_size()} bytes")
     if attribute.get_space().get_simple_extent_npoints() != 1:
         return Odd("not a single value")
+    if attribute.get_storage_size() > MAX_ATTRIBUTE:
+        return Odd(f"{attribute.get_storage_size()} bytes")
     value: Any = owner.attrs[name]
     if isinstance(value, (np.ndarray, np.generic)):
         value = value.item()
     if isinstance(value, bytes):
-        value = value.decode("utf-8", "backslashreplace").rstrip("\0")
+        try:
+            value = value.decode("utf-8").rstrip("\0")
+        except UnicodeDecodeError:
+            return Odd("no UTF-8")
     if isinstance(value, str) and len(value) > MAX_ATTRIBUTE:
         return Odd(f"{len(value)} characters")
     return value if isinstance(value, (str, int, float)) else Odd("neither a text nor a number")
@@ -190,6 +195,7 @@ def _array(dataset: h5py.Dataset, name: str) -> Array:
         kind=_kind(dataset.id.get_type()),
         layout=layout,
         chunks=tuple(plist.get_chunk()) if layout == "chunked" else None,
+        largest_chunk=_largest_chunk(dataset) if layout == "chunked" else 0,
         foreign_filters=tuple(
             f"{text.decode('ascii', 'replace')} ({code})"
             for code, _, _, text in filters
@@ -197,6 +203,12 @@ def _array(dataset: h5py.Dataset, name: str) -> Array:
         ),
         packing={n: value for n in PACKING if (value := _attribute(dataset, n)) is not None},
     )
+
+
+def _largest_chunk(dataset: h5py.Dataset) -> int:
+    sizes: list[int] = []
+    dataset.id.chunk_iter(lambda chunk: sizes.append(chunk.size))
+    return max(sizes, default=0)
 
 
 def _dims(dataset: h5py.Dataset) -> tuple[str, ...]:

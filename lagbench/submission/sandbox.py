@@ -23,10 +23,10 @@ from .findings import Finding, Severity, ValidationResult
 
 __all__ = ["CPU_SECONDS", "MEMORY", "OUT_OF_MEMORY", "WALL_SECONDS", "Request", "encode", "run_isolated"]
 
-MEMORY = 900 << 20
+MEMORY = 768 << 20
 """Address space of the child [bytes]."""
 
-CPU_SECONDS = 5.0
+CPU_SECONDS = 3.0
 """Computing time of the child for a small file [s]."""
 
 WALL_SECONDS = 9.0

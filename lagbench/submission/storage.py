@@ -16,6 +16,8 @@ MAX_CHUNKS = 200_000
 """Most chunks of a file; each costs some microseconds to find."""
 
 ITEM = 4
+"""Length of a float32 [bytes]."""
+
 _WRITE = "write it with lagbench.submission.write, or with chunks (1, 1, particle, space)"
 
 
@@ -28,8 +30,8 @@ def cache_of(array: Array) -> tuple[int, int]:
     if array.chunks is None or array.shape is None:
         return 0, 1
     counts = [-(-n // c) for n, c in zip(array.shape, array.chunks, strict=True)]
-    rows = counts[1] if array.chunks[0] > 1 else 1
-    kept = rows * math.prod(counts[2:])
+    rows = counts[1:2] if array.chunks[0] > 1 else []
+    kept = max(1, math.prod([*rows, *counts[2:]]))
     return kept * ITEM * math.prod(array.chunks), kept
 
 
@@ -62,6 +64,11 @@ def _chunking(array: Array) -> list[tuple[str, str, str]]:
         return []
     if array.chunk_count > MAX_CHUNKS:
         return [("too many chunks", f"at most {MAX_CHUNKS}", f"{array.chunk_count} of shape {array.chunks}")]
+    whole = ITEM * math.prod(array.chunks)
+    if array.largest_chunk > 2 * whole + 1024:
+        # zlib unpacks as much as the stream says: a thousand times its length at worst.
+        got = f"{array.largest_chunk} bytes"
+        return [("a chunk is longer packed than unpacked", f"about {whole} bytes at most", got)]
     size = cache_of(array)[0]
     if size > MAX_CACHE:
         got = f"chunks {array.chunks}: {size} bytes"

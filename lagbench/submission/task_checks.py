@@ -161,10 +161,11 @@ def frames_to_predict(size: Size) -> range:
 
 def check_particles(anatomy: Anatomy, size: Size, out: Findings) -> bool:
     """Check the number of particles."""
-    if out.failed("dims") or "position" not in anatomy.arrays:
+    array = anatomy.arrays.get("position")
+    if array is None or array.shape is None or out.failed("dims"):
         out.skip("the dimensions are not known", "particles")
         return False
-    shape = anatomy.arrays["position"].shape or (0, 0, 0, 0)
+    shape = array.shape
     out.made("particles")
     if shape[2] == size.particles:
         return True

@@ -1,0 +1,191 @@
+"""Print what honest and dishonest predictions of our own splits show to the flags.
+
+Honest ones see the given frames only: both floors, decaying velocity, the last grid velocity
+field held fixed (as it is, and with a jitter of a tenth of a frame's motion), another
+scenario's motion, and two emulations of an accurate model: the truth plus integrated velocity
+errors of 2 %, smooth or white. Dishonest ones are made from the true answer: noise on top,
+one-step predictions from true frames, shifts in time, resets every few frames, interpolation
+between true frames, a moving average.
+
+    python benchmarks/flag_calibration.py --size mini --root DATA [--splits cavity,fluid]
+
+The thresholds in lagbench/flags.py lie between the extremes that this prints.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagbench.exam import Exam, load_exam
+from lagbench.flags import Evidence, evidence
+from lagbench.grid import Grid, fields
+from lagbench.layout import resolve_root
+from lagbench.metrics import FramePair, Scenario, snapshots
+from lagbench.registry import load
+from lagbench.trace import Trace, Tracer
+
+Floats = NDArray[np.float64]
+
+SPLITS = ("cavity", "curl-noise", "fluid", "multimaterial")
+COLUMNS = ("autocorrelation", "drop", "shift_gain", "growth", "steps")
+
+
+class Case:
+    """One test scenario with its whole truth in memory.
+
+    Args:
+        scenario: what metrics see.
+        positions: true positions from frame 0, shape [frame, particle, 2].
+        other: those of another test scenario with as many particles.
+    """
+
+    def __init__(self, scenario: Scenario, positions: Floats, other: Floats) -> None:
+        self.scenario, self.other = scenario, other
+        self.n, self.h = scenario.setting.input_frames, scenario.setting.horizon
+        self.all = positions[: self.n + self.h + 2]
+        self.truth = positions[self.n : self.n + self.h]
+        self.rng = np.random.Generator(np.random.PCG64(0))
+        self.step = float(np.sqrt(np.mean(np.diff(positions[: self.n + self.h], axis=0) ** 2)))
+
+    def noise(self) -> Floats:
+        """Return white noise of one frame's motion, shape of the truth."""
+        return self.step * self.rng.standard_normal(self.truth.shape)
+
+    def from_frame(self, first: int, count: int, decay: float = 1.0) -> Iterator[Floats]:
+        """Yield ``count`` frames at the velocity before absolute frame ``first``."""
+        x, u = self.all[first - 1], self.all[first - 1] - self.all[first - 2]
+        for _ in range(count):
+            u = decay * u
+            x = x + u
+            yield x
+
+    def field(self, first: int, count: int) -> Iterator[Floats]:
+        """Yield ``count`` frames carried by the grid velocity before absolute frame ``first``."""
+        x, u = self.all[first - 1], self.all[first - 1] - self.all[first - 2]
+        grid = self.scenario.setting.grid
+        velocity = fields(x, u, grid, full=self.scenario.full).velocity
+        for _ in range(count):
+            x = x + sample(velocity, x, grid)
+            yield x
+
+    def resets(self, every: int) -> Floats:
+        """Return constant velocity, started anew from the truth every few frames."""
+        starts = range(self.n, self.n + self.h, every)
+        return np.concatenate([list(self.from_frame(f, every)) for f in starts])[: self.h]
+
+
+def sample(velocity: Floats, x: Floats, grid: Grid) -> Floats:
+    """Return a field at particles, bilinear, shape [particle, 2]."""
+    s = np.clip(x * grid.cells - grid.origin, 0.0, grid.nodes - 1.001)
+    i = s.astype(int)
+    t = s - i
+    a, b = t[:, :1], t[:, 1:]
+    low = velocity[i[:, 0], i[:, 1]] * (1 - b) + velocity[i[:, 0], i[:, 1] + 1] * b
+    high = velocity[i[:, 0] + 1, i[:, 1]] * (1 - b) + velocity[i[:, 0] + 1, i[:, 1] + 1] * b
+    return np.asarray(low * (1 - a) + high * a, np.float64)
+
+
+def interpolated(case: Case, every: int) -> Floats:
+    """Return straight lines between every few true frames."""
+    held = list(range(0, case.h, every))
+    return np.stack(
+        [
+            case.truth[a] + (case.truth[min(a + every, case.h - 1)] - case.truth[a]) * (k / every)
+            for a in held
+            for k in range(every)
+        ]
+    )[: case.h]
+
+
+def walk(case: Case, *, smooth: bool) -> Floats:
+    """Return the truth plus integrated velocity errors of 2 % of its motion."""
+    error = 0.02 * case.noise()
+    if smooth:
+        error[:] = 0.02 * case.step * np.sin(6.0 * case.truth[:, :, ::-1])
+    return case.truth + np.cumsum(error, axis=0)
+
+
+HONEST: Mapping[str, Callable[[Case], Floats]] = {
+    "persistence": lambda c: np.broadcast_to(c.all[c.n - 1], c.truth.shape),
+    "constant velocity": lambda c: np.stack(list(c.from_frame(c.n, c.h))),
+    "decaying velocity": lambda c: np.stack(list(c.from_frame(c.n, c.h, 0.95))),
+    "fixed field": lambda c: np.stack(list(c.field(c.n, c.h))),
+    "fixed field, jitter": lambda c: np.stack(list(c.field(c.n, c.h))) + 0.1 * c.noise(),
+    "other scenario": lambda c: c.all[c.n - 1] + c.other[c.n : c.n + c.h] - c.other[c.n - 1],
+    "accurate, smooth": lambda c: walk(c, smooth=True),
+    "accurate, white": lambda c: walk(c, smooth=False),
+}
+DISHONEST: Mapping[str, Callable[[Case], Floats]] = {
+    "truth, noise of 0.01 steps": lambda c: c.truth + 0.01 * c.noise(),
+    "truth, noise of 1 step": lambda c: c.truth + c.noise(),
+    "truth, noise of 10 steps": lambda c: c.truth + 10.0 * c.noise(),
+    "truth, offset of 1 step": lambda c: c.truth + c.step,
+    "one step, constant velocity": lambda c: c.resets(1),
+    "one step, fixed field": lambda c: np.concatenate([list(c.field(f, 1)) for f in range(c.n, c.n + c.h)]),
+    "reset every 5": lambda c: c.resets(5),
+    "reset every 20": lambda c: c.resets(20),
+    "one frame late": lambda c: c.all[c.n - 1 : c.n + c.h - 1],
+    "two frames late": lambda c: c.all[c.n - 2 : c.n + c.h - 2],
+    "one frame early": lambda c: np.concatenate([c.truth[1:], c.truth[-1:]]),
+    "every 5th frame, interpolated": lambda c: interpolated(c, 5),
+    "mean of three frames": lambda c: (
+        (c.truth + c.all[c.n - 1 : c.n + c.h - 1] + np.concatenate([c.truth[1:], c.truth[-1:]])) / 3.0
+    ),
+}
+
+
+def trace_of(case: Case, predicted: Floats) -> Trace:
+    """Return the trace of a prediction."""
+    scenario, tracer = case.scenario, Tracer(case.scenario)
+    sides = (snapshots(scenario, positions) for positions in (case.truth, predicted))
+    for frame, true, guess in zip(scenario.setting.predicted_frames, *sides, strict=True):
+        tracer.add(FramePair(scenario, frame, true, guess))
+    return tracer.result()
+
+
+def cases(exam: Exam) -> Iterator[Case]:
+    """Yield the test scenarios of a split."""
+    held = []
+    for number in exam.scenarios:
+        with exam.opened(number) as opened:
+            held.append((opened.scenario, opened.file.read("position").astype(np.float64)))
+    for i, (scenario, positions) in enumerate(held):
+        yield Case(scenario, positions, held[i - 1][1])
+
+
+def main() -> int:
+    """Print one line per split and prediction: the worst over its scenarios."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--size", default="mini")
+    parser.add_argument("--root", type=Path)
+    parser.add_argument("--splits", default=",".join(SPLITS))
+    options = parser.parse_args()
+    print(
+        f"{'prediction':32s} {'split':14s}" + "".join(f"{name:>17s}" for name in (*COLUMNS, "energy", "area"))
+    )
+    for split in options.splits.split(","):
+        exam = load_exam(load().size(split, options.size), resolve_root(options.root))
+        held = list(cases(exam))
+        for kind, table in (("honest", HONEST), ("made from the truth", DISHONEST)):
+            print(f"-- {split} {options.size}, {kind}")
+            for name, predict in table.items():
+                traces = [trace_of(case, predict(case)) for case in held]
+                print(line(name, split, [evidence(t) for t in traces], traces))
+    return 0
+
+
+def line(name: str, split: str, found: list[Evidence], traces: list[Trace]) -> str:
+    """Return the least and the greatest of each number over the scenarios."""
+    cells = [[getattr(e, column) for e in found] for column in COLUMNS]
+    cells.append([float(np.mean(t.predicted_motion) / np.mean(t.motion)) for t in traces])
+    cells.append([float(np.mean(t.occupancy)) for t in traces])
+    return f"{name:32s} {split:14s}" + "".join(f"{min(c):8.3g}..{max(c):<7.3g}" for c in cells)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,158 @@
+"""Commands around submissions: template, validate, score, compare."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from .options import JsonFlag, QuietFlag, RootOption, SizeOption, SplitArgument, SplitOption, WorkersOption
+from .options import chosen
+from .output import print_json, print_table, say, spell_bytes
+from .progress import progress_bar
+
+if TYPE_CHECKING:
+    from lagbench.comparison import ComparisonResult
+    from lagbench.score_card import ScoreCard
+    from lagbench.submission import ValidationResult
+
+__all__ = ["compare", "score", "template", "validate"]
+
+PredictionsArgument = Annotated[Path, typer.Argument(metavar="FILE", help="A predictions.nc.")]
+EveryFlag = Annotated[bool, typer.Option("--all", help="Show every metric.")]
+
+
+def template(
+    name: SplitArgument = None,
+    split: SplitOption = None,
+    size: SizeOption = "full",
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="FILE", help="File to write.")
+    ] = Path("predictions.nc"),
+    root: RootOption = None,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
+) -> None:
+    """Write a valid predictions.nc to fill: the persistence prediction."""
+    from lagbench.submission import template as run
+
+    result = run(chosen(name, split), size, output=output, root=root)
+    if as_json:
+        print_json(result)
+        return
+    first, last = result.frames
+    shape = f"{len(result.scenarios)} scenarios, frames {first} to {last}, {result.particles} particles"
+    say(f"{result.path}: {shape}, {spell_bytes(result.bytes)}", quiet=quiet)
+
+
+def validate(
+    predictions: PredictionsArgument,
+    root: RootOption = None,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
+) -> None:
+    """Check a predictions.nc and say all that is wrong with it and how to mend it."""
+    from lagbench.submission import validate as run
+
+    result = run(predictions, root=root)
+    if as_json:
+        print_json(result)
+    elif not quiet:
+        _checked(result)
+    raise typer.Exit(result.exit_code)
+
+
+def _checked(result: ValidationResult) -> None:
+    for finding in result.findings:
+        say(str(finding))
+    for check, reason in result.skipped.items():
+        say(f"not made [{check}]: {reason}")
+    counts = f"{len(result.errors)} errors, {len(result.warnings)} warnings, {len(result.passed)} checks passed"
+    say(f"{result.path}: {'valid' if result.valid else 'not valid'}, {counts}")
+
+
+def score(
+    predictions: PredictionsArgument,
+    root: RootOption = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", metavar="FOLDER", help="Where scores go; beside FILE by default."),
+    ] = None,
+    workers: WorkersOption = None,
+    scheduler: Annotated[
+        str | None, typer.Option("--scheduler", metavar="ADDRESS", help="Dask scheduler, as in tcp://host:8786.")
+    ] = None,
+    extras: Annotated[
+        str, typer.Option("--extras", metavar="NAMES", help="Extras with metrics, as in transport.")
+    ] = "",
+    every: EveryFlag = False,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
+) -> None:
+    """Score a predictions.nc beside two floors; write scores.json and scores.nc."""
+    from lagbench.scoring import score as run
+
+    with progress_bar(quiet=quiet) as draw:
+        card = run(
+            predictions,
+            root=root,
+            output_dir=output,
+            workers=workers,
+            scheduler=scheduler,
+            extras=tuple(name for name in extras.split(",") if name),
+            progress=draw,
+            examined=_complain,
+        )
+    if as_json:
+        print_json(card.as_json())
+    elif not quiet:
+        _scored(card, every=every)
+
+
+def _complain(result: ValidationResult) -> None:
+    """Tell on stderr what rejects a file; the error that follows names the first finding only."""
+    if len(result.errors) > 1:
+        typer.echo("\n".join(str(finding) for finding in result.errors), err=True)
+
+
+def _scored(card: ScoreCard, *, every: bool) -> None:
+    from lagbench.score_tables import card_tables, flag_lines
+
+    for table in card_tables(card, every=every):
+        print_table(table.title, table.columns, table.rows)
+    for line in flag_lines(card):
+        say(line)
+    say("written: " + ", ".join(str(path) for path in card.files))
+
+
+def compare(
+    first: Annotated[str, typer.Argument(metavar="A", help="scores.json, its folder, or predictions.nc.")],
+    second: Annotated[
+        str, typer.Argument(metavar="B", help="Another, or persistence or constant-velocity.")
+    ],
+    metric: Annotated[
+        list[str] | None, typer.Option("--metric", metavar="NAME", help="Metric to compare by; repeatable.")
+    ] = None,
+    root: RootOption = None,
+    workers: WorkersOption = None,
+    every: EveryFlag = False,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
+) -> None:
+    """Compare two submissions over scenarios: exact sign-flip test and intervals."""
+    from lagbench.comparison import compare as run
+
+    result = run(first, second, metrics=metric or (), root=root, workers=workers)
+    if as_json:
+        print_json(result.as_json())
+    elif not quiet:
+        _compared(result, every=every or bool(metric))
+
+
+def _compared(result: ComparisonResult, *, every: bool) -> None:
+    from lagbench.score_tables import comparison_table
+
+    table = comparison_table(result, every=every)
+    print_table(table.title, table.columns, table.rows)
+    say(result.verdict)

@@ -1,0 +1,236 @@
+"""Compare two submissions over the test scenarios: ``lagbench compare A B``.
+
+The scenarios are the sample, paired by id. The exact sign-flip test needs six of them before
+5 % can be reached; with fewer no significance is claimed and the intervals speak alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from .errors import DataError, UnreadableFileError, UsageError, nearest
+from .metrics import Comparison, Direction, Score
+from .metrics import compare as compare_scores
+from .metrics.comparison import FEWEST_SCENARIOS
+from .registry import Registry
+from .score_card import IDENTITY, JSON_NAME, PublishedScores, read_scores
+from .scoring import evaluate
+from .sitting import SUBMISSION
+
+__all__ = ["ComparisonResult", "Contestant", "MetricComparison", "compare"]
+
+SAME = ("split", "size", "dataset_sha256")
+"""What two submissions must share."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Contestant:
+    """One side of a comparison.
+
+    Attributes:
+        name: what the user called it.
+        identity: split, size, version and hash of the data set, and the method.
+        predictions_sha256: content hash of the predicted positions.
+        ranking: name of the metric that ranks.
+        scores: scores by metric.
+    """
+
+    name: str
+    identity: Mapping[str, str]
+    predictions_sha256: str
+    ranking: str
+    scores: Mapping[str, Score]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MetricComparison:
+    """Two submissions in one metric.
+
+    Attributes:
+        unit: unit of the means.
+        first: mean of the first over scenarios.
+        second: mean of the second.
+        test: difference, interval and p-value, in the metric's loss.
+    """
+
+    unit: str
+    first: float
+    second: float
+    test: Comparison
+
+
+@dataclass(frozen=True, kw_only=True)
+class ComparisonResult:
+    """How two submissions compare.
+
+    Attributes:
+        split: split of both.
+        size: size of both.
+        first: method of the first.
+        second: method of the second.
+        same_predictions: whether both hold the same positions.
+        ranking: name of the metric that ranks.
+        scenarios: how many scenarios both have in that metric.
+        metrics: comparison by metric, the ranking one first; observables are left out.
+    """
+
+    split: str
+    size: str
+    first: str
+    second: str
+    same_predictions: bool
+    ranking: str
+    scenarios: int
+    metrics: Mapping[str, MetricComparison]
+
+    @property
+    def verdict(self) -> str:
+        """What the ranking metric says, in one sentence that claims no more than it may."""
+        said = self.metrics[self.ranking].test
+        if self.same_predictions:
+            return "both hold the same predictions"
+        if self.scenarios < FEWEST_SCENARIOS:
+            return (
+                f"{self.scenarios} scenarios: no significance is claimed under {FEWEST_SCENARIOS};"
+                " read the intervals"
+            )
+        if not said.significant:
+            return f"{self.ranking}: no difference at 5 % (p = {said.p:.3g}, {self.scenarios} scenarios)"
+        better = self.first if said.difference < 0.0 else self.second
+        return f"{self.ranking}: {better} is better (p = {said.p:.3g}, {self.scenarios} scenarios)"
+
+
+def compare(
+    first: str | Path,
+    second: str | Path,
+    *,
+    metrics: Collection[str] = (),
+    root: str | Path | None = None,
+    workers: int | None = None,
+    registry: Registry | None = None,
+) -> ComparisonResult:
+    """Compare two submissions to the same split, size and data set.
+
+    Args:
+        first: a scores.json, a folder that holds one, or a predictions.nc, which is then scored.
+        second: another; or the name of a floor, which stands in the first's scores.
+        metrics: metrics to compare; by default all that judge.
+        root: folder of all data sets, where predictions are to be scored.
+        workers: worker processes for that.
+        registry: where splits are described; ours when None.
+
+    Raises:
+        UsageError: an unknown metric, or the two belong to different splits or sizes.
+        DataError: they belong to data sets of different hashes.
+        UnreadableFileError: a file is neither scores nor predictions.
+    """
+    one, floors = _contestant(first, root, workers, registry)
+    if str(second) in floors:
+        two = _floor(one, str(second), floors[str(second)])
+    else:
+        two, _ = _contestant(second, root, workers, registry)
+    _check_same(one, two)
+    judged = _judged(one, two)
+    wanted = [_known(name, judged) for name in metrics] or list(judged)
+    names = sorted({one.ranking, *wanted}, key=lambda name: (name != one.ranking, list(judged).index(name)))
+    found = {name: _compared(one.scores[name], two.scores[name]) for name in names}
+    return ComparisonResult(
+        split=one.identity["split"],
+        size=one.identity["size"],
+        first=one.identity["method"],
+        second=two.identity["method"],
+        same_predictions=one.predictions_sha256 == two.predictions_sha256,
+        ranking=one.ranking,
+        scenarios=len(found[one.ranking].test.scenarios),
+        metrics=found,
+    )
+
+
+def _contestant(
+    source: str | Path, root: str | Path | None, workers: int | None, registry: Registry | None
+) -> tuple[Contestant, Mapping[str, Mapping[str, Score]]]:
+    """Return a submission and the floors scored beside it."""
+    path = Path(source)
+    if path.is_dir():
+        path = path / JSON_NAME
+    if path.suffix == ".json":
+        held = read_scores(path)
+    else:
+        held = _scored(path, root, workers, registry)
+    if SUBMISSION not in held.scores or held.ranking not in held.scores[SUBMISSION]:
+        raise UnreadableFileError(
+            "scores without the ranking metric",
+            where=str(path),
+            expected=f"row {SUBMISSION!r} with {held.ranking!r}",
+            fix="score the predictions again: lagbench score predictions.nc",
+        )
+    floors = {row: scores for row, scores in held.scores.items() if row != SUBMISSION}
+    contestant = Contestant(
+        name=str(source),
+        identity=held.identity,
+        predictions_sha256=held.predictions_sha256,
+        ranking=held.ranking,
+        scores=held.scores[SUBMISSION],
+    )
+    return contestant, floors
+
+
+def _scored(
+    path: Path, root: str | Path | None, workers: int | None, registry: Registry | None
+) -> PublishedScores:
+    card = evaluate(path, root=root, workers=workers, registry=registry)
+    return PublishedScores(
+        identity={name: str(getattr(card.header, name)) for name in IDENTITY},
+        predictions_sha256=card.predictions_sha256,
+        ranking=card.ranking,
+        scores=card.scores,
+    )
+
+
+def _floor(beside: Contestant, name: str, scores: Mapping[str, Score]) -> Contestant:
+    return Contestant(
+        name=name,
+        identity={**beside.identity, "method": name},
+        predictions_sha256="",
+        ranking=beside.ranking,
+        scores=scores,
+    )
+
+
+def _check_same(one: Contestant, two: Contestant) -> None:
+    for key in SAME:
+        first, second = one.identity[key], two.identity[key]
+        if first != second:
+            kind = DataError if key == "dataset_sha256" else UsageError
+            raise kind(
+                f"the two submissions differ in {key}",
+                where=f"{one.name} and {two.name}",
+                expected=first,
+                got=second,
+                fix="compare submissions to the same split, size and data set",
+            )
+
+
+def _judged(one: Contestant, two: Contestant) -> dict[str, Score]:
+    return {
+        name: score
+        for name, score in one.scores.items()
+        if name in two.scores and score.metric.direction is not Direction.NONE
+    }
+
+
+def _known(name: str, judged: Collection[str]) -> str:
+    if name not in judged:
+        raise UsageError(f"no metric {name!r} to compare by", where="--metric", fix=nearest(name, judged))
+    return name
+
+
+def _compared(first: Score, second: Score) -> MetricComparison:
+    return MetricComparison(
+        unit=first.metric.unit,
+        first=first.mean,
+        second=second.mean,
+        test=compare_scores(first, second),
+    )

@@ -1,0 +1,149 @@
+"""Score a predictions.nc: validate, measure beside the floors, aggregate, flag, write."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from .exam import Exam, load_exam, ranking_metric
+from .flags import Flag, below_twin_floor, copy_suspect, physics
+from .floors import PERSISTENCE
+from .layout import resolve_root
+from .metrics import Score, aggregate, select
+from .overview import available_cores
+from .progress import Meter, Progress
+from .registry import Registry, load
+from .score_card import JSON_NAME, ScoreCard, write_json
+from .score_file import NETCDF_NAME, write_statistics
+from .sitting import SUBMISSION, Job, Outcome, sit_scenario
+from .spread import spread
+from .submission import ValidationResult, open_predictions, validate
+
+__all__ = ["evaluate", "score"]
+
+WORTH_WORKERS = 1_000_000
+"""Particles times predicted frames below which starting worker processes costs more than it gains."""
+
+
+def score(
+    predictions: str | Path,
+    *,
+    root: str | Path | None = None,
+    output_dir: str | Path | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    extras: Collection[str] = (),
+    progress: Callable[[Progress], None] | None = None,
+    examined: Callable[[ValidationResult], None] | None = None,
+    registry: Registry | None = None,
+) -> ScoreCard:
+    """Score a submission and write scores.json and scores.nc.
+
+    Args:
+        predictions: a predictions.nc.
+        root: folder of all data sets, see :func:`lagbench.layout.resolve_root`.
+        output_dir: folder for the two files; that of the predictions by default.
+        workers: worker processes; by default one per core where the work is worth it.
+        scheduler: address of a Dask scheduler that takes the scenarios instead.
+        extras: extras whose metrics are wanted too, as in ("transport",).
+        progress: told how far the work is.
+        examined: told what the validation found, before anything is raised for it.
+        registry: where splits are described; ours when None.
+
+    Returns:
+        The score card; ``files`` names what was written.
+
+    Raises:
+        UnreadableFileError: the predictions cannot be read.
+        ChecksFailedError: they are not valid.
+        DataError: they were made from another data set, or the test subset is missing or damaged.
+        WorkFailedError: a worker or the cluster was lost, or the disk is full.
+    """
+    card = evaluate(
+        predictions,
+        root=root,
+        workers=workers,
+        scheduler=scheduler,
+        extras=extras,
+        progress=progress,
+        examined=examined,
+        registry=registry,
+    )
+    folder = Path(predictions).parent if output_dir is None else Path(output_dir)
+    json_path, netcdf_path = folder / JSON_NAME, folder / NETCDF_NAME
+    write_statistics(card, netcdf_path)
+    write_json(card, json_path)
+    return card.at(json_path, netcdf_path)
+
+
+def evaluate(
+    predictions: str | Path,
+    *,
+    root: str | Path | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    extras: Collection[str] = (),
+    progress: Callable[[Progress], None] | None = None,
+    examined: Callable[[ValidationResult], None] | None = None,
+    registry: Registry | None = None,
+) -> ScoreCard:
+    """Return the score card of a submission and write nothing; arguments as of :func:`score`."""
+    path, folder, described = Path(predictions).absolute(), resolve_root(root), registry or load()
+    result = validate(path, root=folder, require_truth=True, registry=described)
+    if examined is not None:
+        examined(result)
+    result.check()
+    with open_predictions(path) as opened:
+        header, content = opened.header, opened.content_sha256()
+    exam = load_exam(described.size(header.split, header.size), folder)
+    metrics = select(extras=extras)
+    outcomes = _outcomes(exam, path, tuple(m.name for m in metrics), workers, scheduler, Meter(progress))
+    tallies = {
+        row: {outcome.scenario: outcome.tallies[row] for outcome in outcomes} for row in outcomes[0].tallies
+    }
+    scores = {row: aggregate(metrics, held) for row, held in tallies.items()}
+    preview = next(outcome.preview for outcome in outcomes if outcome.preview is not None)
+    return ScoreCard(
+        header=header,
+        predictions_sha256=content,
+        setting=exam.setting,
+        ranking=ranking_metric(exam.size),
+        tallies=tallies,
+        scores=scores,
+        flags=_flags(exam, outcomes, scores),
+        warnings=result.warnings,
+        preview=preview,
+    )
+
+
+def _outcomes(
+    exam: Exam,
+    path: Path,
+    metrics: tuple[str, ...],
+    workers: int | None,
+    scheduler: str | None,
+    meter: Meter,
+) -> list[Outcome]:
+    """Return what was measured of every scenario, by ascending id."""
+    ids, horizon = exam.scenarios, exam.setting.horizon
+    jobs = {
+        f"scenario {i}": Job(exam=exam, scenario=i, predictions=path, metrics=metrics, pictured=i == ids[0])
+        for i in ids
+    }
+    if workers is None:
+        worth = len(ids) * horizon * exam.size.particles >= WORTH_WORKERS
+        workers = available_cores() if worth else 1
+    meter.begin("scoring", total=len(ids) * horizon, scenarios=len(ids))
+    return spread(sit_scenario, jobs, workers=workers, scheduler=scheduler, report=meter.count)
+
+
+def _flags(
+    exam: Exam, outcomes: Sequence[Outcome], scores: Mapping[str, Mapping[str, Score]]
+) -> tuple[Flag, ...]:
+    traces = [outcome.trace for outcome in outcomes]
+    error, still = (
+        np.asarray(np.mean(scores[row]["position_rmse"].per_frame, axis=0)) for row in (SUBMISSION, PERSISTENCE)
+    )
+    return copy_suspect(traces), below_twin_floor(error, still, exam.twin_floor), physics(traces)
