@@ -13,11 +13,27 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from . import submission
+    from .comparison import compare
     from .dataset import list_splits, load_manifest, open_split
     from .generation import generate
+    from .scoring import score
+    from .submission import template, validate
     from .verification import verify
 
-__all__ = ["__version__", "generate", "list_splits", "load_manifest", "open_split", "verify"]
+__all__ = [
+    "__version__",
+    "compare",
+    "generate",
+    "list_splits",
+    "load_manifest",
+    "open_split",
+    "score",
+    "submission",
+    "template",
+    "validate",
+    "verify",
+]
 
 _HOMES = {
     "open_split": "dataset",
@@ -25,6 +41,10 @@ _HOMES = {
     "load_manifest": "dataset",
     "generate": "generation",
     "verify": "verification",
+    "template": "submission",
+    "validate": "submission",
+    "score": "scoring",
+    "compare": "comparison",
 }
 
 __version__: str
@@ -37,6 +57,8 @@ def __getattr__(name: str) -> object:
         from importlib.metadata import version
 
         value = version("lagbench")
+    elif name == "submission":
+        value = importlib.import_module(".submission", __name__)
     elif name in _HOMES:
         value = getattr(importlib.import_module(f".{_HOMES[name]}", __name__), name)
     else:

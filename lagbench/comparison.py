@@ -9,13 +9,14 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from .errors import DataError, UnreadableFileError, UsageError, nearest
 from .metrics import Comparison, Direction, Score
 from .metrics import compare as compare_scores
 from .metrics.comparison import FEWEST_SCENARIOS
 from .registry import Registry
-from .score_card import IDENTITY, JSON_NAME, PublishedScores, read_scores
+from .score_card import IDENTITY, JSON_NAME, PublishedScores, digits, read_scores
 from .scoring import evaluate
 from .sitting import SUBMISSION
 
@@ -101,6 +102,24 @@ class ComparisonResult:
         better = self.first if said.difference < 0.0 else self.second
         return f"{self.ranking}: {better} is better (p = {said.p:.3g}, {self.scenarios} scenarios)"
 
+    def as_json(self) -> dict[str, Any]:
+        """Return the comparison as plain values; what is undefined is None."""
+        metrics = {
+            name: {
+                "unit": found.unit,
+                "first": digits(found.first),
+                "second": digits(found.second),
+                "difference": digits(found.test.difference),
+                "interval": [digits(bound) for bound in found.test.interval],
+                "p": digits(found.test.p),
+                "significant": found.test.significant,
+                "scenarios": list(found.test.scenarios),
+            }
+            for name, found in self.metrics.items()
+        }
+        fields = ("split", "size", "first", "second", "same_predictions", "ranking", "scenarios", "verdict")
+        return {**{name: getattr(self, name) for name in fields}, "metrics": metrics}
+
 
 def compare(
     first: str | Path,
@@ -155,10 +174,7 @@ def _contestant(
     path = Path(source)
     if path.is_dir():
         path = path / JSON_NAME
-    if path.suffix == ".json":
-        held = read_scores(path)
-    else:
-        held = _scored(path, root, workers, registry)
+    held = read_scores(path) if path.suffix == ".json" else _scored(path, root, workers, registry)
     if SUBMISSION not in held.scores or held.ranking not in held.scores[SUBMISSION]:
         raise UnreadableFileError(
             "scores without the ranking metric",

@@ -73,16 +73,19 @@ def _over_horizon(card: ScoreCard, names: Collection[str], title: str) -> Table:
     for name in names:
         score = card.submission[name]
         undefined = sum(score.undefined)
-        rows.append((
-            name,
-            _number(score.mean),
-            _interval(score),
-            *(_number(card.scores[row][name].mean) for row in floors),
-            _better(score),
-            f"{undefined} of {len(score.scenarios) * len(score.frames)}" if undefined else "",
-            score.metric.unit,
-        ))
-    columns = ("metric", SUBMISSION, "95 % interval", *floors, "better", "undefined frames", "unit")
+        rows.append(
+            (
+                name,
+                _number(score.mean),
+                _interval(score),
+                *(_number(card.scores[row][name].mean) for row in floors),
+                _better(score),
+                f"{undefined} of {len(score.scenarios) * len(score.frames)}" if undefined else "",
+                score.metric.unit,
+            )
+        )
+    heads = (row.replace("-", "-\n") for row in floors)  # narrow enough for 120 characters
+    columns = ("metric", SUBMISSION, "95 % interval", *heads, "better", "undefined", "unit")
     return Table(title, columns, tuple(rows))
 
 
@@ -123,26 +126,41 @@ def _against(card: ScoreCard, row: str) -> str:
     if math.isnan(found.difference):
         return f"{card.ranking} cannot be compared"
     word = "better" if found.difference < 0.0 else "worse" if found.difference > 0.0 else "equal"
-    p = f", p = {found.p:.3g}" if not math.isnan(found.p) else f", {len(found.scenarios)} scenarios: no p-value"
+    p = (
+        f", p = {found.p:.3g}"
+        if not math.isnan(found.p)
+        else f", {len(found.scenarios)} scenarios: no p-value"
+    )
     return f"{card.ranking} {word} by {_number(abs(found.difference))} ({_number(low)} to {_number(high)}{p})"
 
 
-def comparison_table(result: ComparisonResult) -> Table:
-    """Return the table of a comparison; differences are in the loss: negative favours the first."""
+def comparison_table(result: ComparisonResult, *, every: bool = False) -> Table:
+    """Return the table of a comparison; differences are in the loss: negative favours the first.
+
+    Args:
+        result: the comparison.
+        every: whether to show all its metrics instead of the chosen ones.
+    """
     rows = []
     for name, found in result.metrics.items():
+        if not every and name not in (result.ranking, *SHOWN):
+            continue
         low, high = found.test.interval
-        rows.append((
-            name,
-            _number(found.first),
-            _number(found.second),
-            _number(found.test.difference),
-            f"{_number(low)} to {_number(high)}",
-            "" if math.isnan(found.test.p) else f"{found.test.p:.3g}",
-            found.unit,
-        ))
+        rows.append(
+            (
+                name,
+                _number(found.first),
+                _number(found.second),
+                _number(found.test.difference),
+                "" if math.isnan(low) else f"{low:.3g} to {high:.3g}",
+                "" if math.isnan(found.test.p) else f"{found.test.p:.3g}",
+                found.unit,
+            )
+        )
     columns = ("metric", result.first, result.second, "loss difference", "95 % interval", "p", "unit")
-    return Table(f"{result.first} against {result.second} on {result.split} {result.size}", columns, tuple(rows))
+    return Table(
+        f"{result.first} against {result.second} on {result.split} {result.size}", columns, tuple(rows)
+    )
 
 
 def _better(score: Score) -> str:
@@ -153,7 +171,7 @@ def _better(score: Score) -> str:
 
 def _interval(score: Score) -> str:
     low, high = score.interval
-    return "" if math.isnan(low) else f"{_number(low)} to {_number(high)}"
+    return "" if math.isnan(low) else f"{low:.3g} to {high:.3g}"
 
 
 def _number(value: float) -> str:

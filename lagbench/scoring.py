@@ -144,6 +144,7 @@ def _flags(
 ) -> tuple[Flag, ...]:
     traces = [outcome.trace for outcome in outcomes]
     error, still = (
-        np.asarray(np.mean(scores[row]["position_rmse"].per_frame, axis=0)) for row in (SUBMISSION, PERSISTENCE)
+        np.asarray(np.mean(scores[row]["position_rmse"].per_frame, axis=0))
+        for row in (SUBMISSION, PERSISTENCE)
     )
     return copy_suspect(traces), below_twin_floor(error, still, exam.twin_floor), physics(traces)

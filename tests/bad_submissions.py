@@ -79,7 +79,9 @@ def simple(check: str, name: str, change: Callable[[h5py.File], object], *, says
     FAULTS[name] = Fault(make, check, 4 if check == "dataset" else 1, says=says)
 
 
-def replace(file: h5py.File, name: str, dims: tuple[str, ...], data: Any = None, **options: Any) -> h5py.Dataset:
+def replace(
+    file: h5py.File, name: str, dims: tuple[str, ...], data: Any = None, **options: Any
+) -> h5py.Dataset:
     """Replace a variable by another of the same name, with dimension scales attached."""
     attributes = {} if name not in file else {k: v for k, v in file[name].attrs.items() if k == "units"}
     if name in file:
@@ -143,11 +145,13 @@ def rows(bench: Bench, name: str, scenarios: list[int], frames: list[int], pick:
 
 @fault("readable", 3, says="cannot open")
 def missing_file(bench: Bench) -> Path:
+    """No such file."""
     return bench.folder / "nowhere.nc"
 
 
 @fault("readable", 3, says="folder")
 def folder(bench: Bench) -> Path:
+    """A folder of that name."""
     path = bench.folder / "folder.nc"
     path.mkdir(exist_ok=True)
     return path
@@ -155,6 +159,7 @@ def folder(bench: Bench) -> Path:
 
 @fault("readable", 3, says="pipe")
 def fifo(bench: Bench) -> Path:
+    """A named pipe that nobody writes to: opening it would wait for ever."""
     path = bench.folder / "fifo.nc"
     if not path.exists():
         os.mkfifo(path)
@@ -163,6 +168,7 @@ def fifo(bench: Bench) -> Path:
 
 @fault("readable", 3, says="device")
 def endless_device(bench: Bench) -> Path:
+    """A link to a device that never ends."""
     path = bench.folder / "zero.nc"
     path.unlink(missing_ok=True)
     path.symlink_to("/dev/zero")
@@ -171,6 +177,7 @@ def endless_device(bench: Bench) -> Path:
 
 @fault("readable", 3)
 def broken_symlink(bench: Bench) -> Path:
+    """A link to nowhere."""
     path = bench.folder / "broken.nc"
     path.unlink(missing_ok=True)
     path.symlink_to(bench.folder / "nowhere.nc")
@@ -179,6 +186,7 @@ def broken_symlink(bench: Bench) -> Path:
 
 @fault("readable", 3)
 def symlink_to_itself(bench: Bench) -> Path:
+    """A link that leads to itself."""
     path = bench.folder / "circle.nc"
     path.unlink(missing_ok=True)
     path.symlink_to(path)
@@ -215,6 +223,7 @@ _bytes("windows_newlines", lambda data: data.replace(b"\n", b"\r\n"))
 
 @fault("readable", 3, says="netCDF-3")
 def netcdf3(bench: Bench) -> Path:
+    """The format before HDF5."""
     path = bench.folder / "netcdf3.nc"
     with netCDF4.Dataset(path, "w", format="NETCDF3_CLASSIC") as file:
         file.split = "cavity"
@@ -223,6 +232,7 @@ def netcdf3(bench: Bench) -> Path:
 
 @fault("readable", 3, says="HDF5 cannot read")
 def chunk_damaged(bench: Bench) -> Path:
+    """A compressed chunk with eight bytes overwritten."""
     path = bench.copy("chunk_damaged.nc")
     with h5py.File(path) as file:
         info = file["position"].id.get_chunk_info(7)
@@ -232,10 +242,11 @@ def chunk_damaged(bench: Bench) -> Path:
     return path
 
 
-def _stream(mebibytes: int) -> bytes:
+def _stream(gibibytes: int) -> bytes:
     """Return a zlib stream that unpacks to so much nothing."""
-    packer, zeros = zlib.compressobj(9), bytes(1 << 20)
-    return b"".join([*(packer.compress(zeros) for _ in range(mebibytes)), packer.flush()])
+    packer, zeros = zlib.compressobj(9), bytes(1 << 24)
+    blocks = [packer.compress(zeros) + packer.flush(zlib.Z_FULL_FLUSH) for _ in range(2)]
+    return blocks[0] + (64 * gibibytes - 1) * blocks[1]
 
 
 @fault("format", says="longer packed")
@@ -243,7 +254,7 @@ def small_chunk_bomb(bench: Bench) -> Path:
     """A chunk of 768 bytes whose zlib stream unpacks to 2 GiB."""
     path = bench.copy("small_chunk_bomb.nc")
     with h5py.File(path, "r+") as file:
-        file["position"].id.write_direct_chunk((1, 1, 0, 0), _stream(2048))
+        file["position"].id.write_direct_chunk((1, 1, 0, 0), _stream(2))
     return path
 
 
@@ -254,7 +265,7 @@ def large_chunk_bomb(bench: Bench) -> Path:
     options = {"maxshape": (None,) * 4, "chunks": (1, 8, 1 << 17, 2), "dtype": "f4", "compression": 1}
     with h5py.File(path, "r+") as file:
         dataset = replace(file, "position", DIMS, shape=SHAPE, **options)
-        dataset.id.write_direct_chunk((1, 0, 0, 0), _stream(2048))
+        dataset.id.write_direct_chunk((1, 0, 0, 0), _stream(2))
     return path
 
 
@@ -291,6 +302,7 @@ _attribute("attribute_is_compound", "training", np.zeros(1, [("a", "i4")]), says
 
 @fault("format", says="single")
 def huge_attribute(bench: Bench) -> Path:
+    """An attribute of 64 MiB."""
     path = bench.copy("huge_attribute.nc")
     with h5py.File(path, "r+", libver="latest") as file:
         file.attrs.create("training", np.zeros(64 << 20, np.int8))
@@ -299,6 +311,7 @@ def huge_attribute(bench: Bench) -> Path:
 
 @fault("format", says="characters")
 def huge_text(bench: Bench) -> Path:
+    """A text of 8 MiB."""
     path = bench.copy("huge_text.nc")
     with h5py.File(path, "r+") as file:
         file.attrs["training"] = "x" * (8 << 20)
@@ -448,8 +461,12 @@ def _transposed(name: str, order: tuple[int, ...], says: str) -> None:
 
 _transposed("space_before_particle", (0, 1, 3, 2), "transpose")
 _transposed("frame_before_scenario", (1, 0, 2, 3), "transpose")
-simple("dims", "axes_swapped_names_kept", lambda f: _unchecked(f, positions(f).swapaxes(2, 3)), says="swapped")
-simple("dims", "one_scenario_only", lambda f: replace(f, "position", DIMS[1:], positions(f)[0]), says="leading")
+simple(
+    "dims", "axes_swapped_names_kept", lambda f: _unchecked(f, positions(f).swapaxes(2, 3)), says="swapped"
+)
+simple(
+    "dims", "one_scenario_only", lambda f: replace(f, "position", DIMS[1:], positions(f)[0]), says="leading"
+)
 simple("dims", "dimensions_without_names", lambda f: _bare(f, positions(f)), says="scales")
 simple("dims", "flattened", lambda f: _bare(f, positions(f).reshape(3, -1)))
 simple("dims", "three_components", lambda f: _unchecked(f, np.zeros((3, 8, PARTICLES, 3), "f4")))
@@ -469,6 +486,7 @@ def _unchecked(file: h5py.File, values: NDArray[np.float32]) -> None:
 
 @fault("dims", says="'odd_name'")
 def dimension_misnamed(bench: Bench) -> Path:
+    """Particles under another name."""
     path = bench.folder / "dimension_misnamed.nc"
     with h5py.File(bench.copy(path.name), "r+") as file:
         values = positions(file)
@@ -532,12 +550,21 @@ _rows("scenario_enormous", "scenarios", [3, 4, 1 << 62], ALL, says="unknown")
 _rows("no_scenarios", "scenarios", [], ALL, slice(0), says="missing")
 _rows("every_second_frame", "frames", [3, 4, 5], ALL[::2], np.s_[:, ::2], says="every 2nd")
 _rows("every_third_frame", "frames", [3, 4, 5], ALL[::3], np.s_[:, ::3], says="every 3rd")
-_rows("input_frames_included", "frames", [3, 4, 5], [0, 1, 2, *ALL], np.s_[:, [0] * 3 + [*range(8)]], says="input")
+_rows(
+    "input_frames_included",
+    "frames",
+    [3, 4, 5],
+    [0, 1, 2, *ALL],
+    np.s_[:, [0] * 3 + [*range(8)]],
+    says="input",
+)
 _rows("frames_counted_from_0", "frames", [3, 4, 5], list(range(8)), says="absolute number is 3")
 _rows("frames_shifted", "frames", [3, 4, 5], [n + 2 for n in ALL], says="shifted by 2")
 _rows("frames_stop_early", "frames", [3, 4, 5], ALL[:5], np.s_[:, :5], says="too early")
 _rows("frames_reversed", "frames", [3, 4, 5], ALL[::-1], np.s_[:, ::-1], says="order")
-_rows("frame_twice", "frames", [3, 4, 5], [3, 4, 5, 5, 6, 7, 8, 9, 10], np.s_[:, [*range(8), 0]], says="twice")
+_rows(
+    "frame_twice", "frames", [3, 4, 5], [3, 4, 5, 5, 6, 7, 8, 9, 10], np.s_[:, [*range(8), 0]], says="twice"
+)
 _rows("frame_left_out", "frames", [3, 4, 5], [3, 4, 6, 7, 8, 9, 10], np.s_[:, :7], says="lacks the frames 5")
 _rows("no_frames", "frames", [3, 4, 5], [], np.s_[:, :0], says="no frames")
 _rows("frames_enormous", "frames", [3, 4, 5], [3, 1 << 61], np.s_[:, :2], says="every")
@@ -548,12 +575,14 @@ _rows("frames_enormous", "frames", [3, 4, 5], [3, 1 << 61], np.s_[:, :2], says="
 
 @fault("particles", says="47")
 def particle_missing(bench: Bench) -> Path:
+    """One particle too few."""
     with built(bench, "particle_missing", particles=47) as (path, _):
         return path
 
 
 @fault("particles", says="96")
 def particles_doubled(bench: Bench) -> Path:
+    """Twice as many particles."""
     with built(bench, "particles_doubled", particles=96) as (path, _):
         return path
 
@@ -565,7 +594,12 @@ simple("dtype", "positions_bool", lambda f: store(f, positions(f) > 0.5), says="
 simple("dtype", "positions_opaque", lambda f: store(f, np.zeros(SHAPE, "V4")), says="opaque")
 simple("dtype", "positions_text", lambda f: store(f, positions(f).astype("S8")), says="string")
 _TEXT, _RAGGED = h5py.string_dtype(), h5py.vlen_dtype(np.float32)
-simple("dtype", "positions_vlen", lambda f: replace(f, "position", DIMS, shape=SHAPE, dtype=_RAGGED), says="length")
+simple(
+    "dtype",
+    "positions_vlen",
+    lambda f: replace(f, "position", DIMS, shape=SHAPE, dtype=_RAGGED),
+    says="length",
+)
 simple("dtype", "positions_vlen_text", lambda f: replace(f, "position", DIMS, shape=SHAPE, dtype=_TEXT))
 simple(
     "dtype", "positions_references", lambda f: replace(f, "position", DIMS, shape=SHAPE, dtype=h5py.ref_dtype)
@@ -618,7 +652,12 @@ _value("finite", "all_nan", _put(..., np.nan), "finite")
 _value("finite", "all_infinite", _put(..., -np.inf), "finite")
 _value("start", "particles_permuted", _permuted, "another order")
 _value("start", "x_and_y_swapped", lambda v: v[..., ::-1], "swapped")
-_value("start", "standardised", lambda v: (v - v.mean((1, 2), keepdims=True)) / v.std((1, 2), keepdims=True), "standardised")
+_value(
+    "start",
+    "standardised",
+    lambda v: (v - v.mean((1, 2), keepdims=True)) / v.std((1, 2), keepdims=True),
+    "standardised",
+)
 _value("start", "displacements", _displacements, "displacements")
 _value("start", "all_zero", np.zeros_like, "displacements")
 _value("start", "huge_values", lambda v: v + np.float32(1e30), "follow")

@@ -11,7 +11,7 @@ from typer.core import TyperGroup
 
 from lagbench.errors import LagbenchError
 
-from . import data, draw, show, upkeep
+from . import data, draw, scoring, show, upkeep
 from . import demo as tour
 
 __all__ = ["app"]
@@ -86,6 +86,14 @@ app.command("generate", epilog="Example: lagbench generate --split cavity --size
 )
 app.command("verify", epilog="Example: lagbench verify --split cavity --size tiny --regenerate 2")(
     data.verify
+)
+app.command("template", epilog="Example: lagbench template cavity --size tiny -o predictions.nc")(
+    scoring.template
+)
+app.command("validate", epilog="Example: lagbench validate predictions.nc")(scoring.validate)
+app.command("score", epilog="Example: lagbench score predictions.nc")(scoring.score)
+app.command("compare", epilog="Example: lagbench compare ours/scores.json theirs/scores.json")(
+    scoring.compare
 )
 app.command("plot", epilog="Example: lagbench plot cavity --size tiny --scenario 3 --frame 15 -o flow.png")(
     draw.plot

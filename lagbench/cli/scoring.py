@@ -7,8 +7,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .options import JsonFlag, QuietFlag, RootOption, SizeOption, SplitArgument, SplitOption, WorkersOption
-from .options import chosen
+from .options import (
+    JsonFlag,
+    QuietFlag,
+    RootOption,
+    SizeOption,
+    SplitArgument,
+    SplitOption,
+    WorkersOption,
+    chosen,
+)
 from .output import print_json, print_table, say, spell_bytes
 from .progress import progress_bar
 
@@ -27,9 +35,9 @@ def template(
     name: SplitArgument = None,
     split: SplitOption = None,
     size: SizeOption = "full",
-    output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="FILE", help="File to write.")
-    ] = Path("predictions.nc"),
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="File to write.")] = Path(
+        "predictions.nc"
+    ),
     root: RootOption = None,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
@@ -68,7 +76,9 @@ def _checked(result: ValidationResult) -> None:
         say(str(finding))
     for check, reason in result.skipped.items():
         say(f"not made [{check}]: {reason}")
-    counts = f"{len(result.errors)} errors, {len(result.warnings)} warnings, {len(result.passed)} checks passed"
+    counts = (
+        f"{len(result.errors)} errors, {len(result.warnings)} warnings, {len(result.passed)} checks passed"
+    )
     say(f"{result.path}: {'valid' if result.valid else 'not valid'}, {counts}")
 
 
@@ -81,7 +91,8 @@ def score(
     ] = None,
     workers: WorkersOption = None,
     scheduler: Annotated[
-        str | None, typer.Option("--scheduler", metavar="ADDRESS", help="Dask scheduler, as in tcp://host:8786.")
+        str | None,
+        typer.Option("--scheduler", metavar="ADDRESS", help="Dask scheduler, as in tcp://host:8786."),
     ] = None,
     extras: Annotated[
         str, typer.Option("--extras", metavar="NAMES", help="Extras with metrics, as in transport.")
@@ -128,9 +139,7 @@ def _scored(card: ScoreCard, *, every: bool) -> None:
 
 def compare(
     first: Annotated[str, typer.Argument(metavar="A", help="scores.json, its folder, or predictions.nc.")],
-    second: Annotated[
-        str, typer.Argument(metavar="B", help="Another, or persistence or constant-velocity.")
-    ],
+    second: Annotated[str, typer.Argument(metavar="B", help="Another, or persistence or constant-velocity.")],
     metric: Annotated[
         list[str] | None, typer.Option("--metric", metavar="NAME", help="Metric to compare by; repeatable.")
     ] = None,

@@ -17,7 +17,7 @@ from lagbench.layout import resolve_root
 from lagbench.registry import Registry, Size, load
 
 from .anatomy import Anatomy, dissect
-from .findings import Findings, ValidationResult
+from .findings import CHECKS, Findings, ValidationResult
 from .format_checks import check_dims, check_dtype, check_format
 from .opening import check_file, opened
 from .reader import Predictions, attach
@@ -153,7 +153,7 @@ def _report_unreadable(error: UnreadableFileError, out: Findings) -> None:
         got=error.got,
         fix=error.fix or "write it again",
     )
-    out.skip("the file cannot be read", *("format", "split", "dims", "dtype"), *TASK, *VALUES)
+    out.skip("the file cannot be read", *CHECKS)
 
 
 def _unreadable(path: Path, error: UnreadableFileError) -> ValidationResult:

@@ -1,0 +1,117 @@
+"""A data set of the size of cavity full, and a submission to it, made without simulating.
+
+Particles are carried by swirls that differ between scenarios, so that fields and errors are
+of realistic shape; nothing is learned from the values.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from lagbench.format import ScenarioKey, ScenarioWriter, scenario_path
+from lagbench.registry import Registry, default_path, load
+from lagbench.submission import PredictionsWriter
+
+__all__ = ["ScoreData", "make_score_data"]
+
+SPEED = 0.0022
+"""Per-frame speed of the swirls, as in the cavity [length/frame]."""
+
+BOX = (0.0625, 0.875)
+"""Lower corner and side of the box [length]."""
+
+
+@dataclass(frozen=True)
+class ScoreData:
+    """Where the data set and the submission are.
+
+    Attributes:
+        root: folder of all data sets.
+        registry: registry that describes this one.
+        predictions: a predictions.nc.
+    """
+
+    root: Path
+    registry: Registry
+    predictions: Path
+
+
+def make_score_data(folder: Path, *, horizon: int = 90) -> ScoreData:
+    """Write six test scenarios of 8192 particles and predictions with growing errors.
+
+    Args:
+        folder: an empty folder.
+        horizon: frames to predict.
+    """
+    size = load().size("cavity", "full")
+    frames = size.task.input_frames + horizon
+    root, hashes = folder / "root", {}
+    for scenario in size.subsets["test"]:
+        key = ScenarioKey(split="cavity", size="full", version=size.version, scenario=scenario, subset="test")
+        hashes[scenario] = _write_truth(scenario_path(root, key), key, frames, size.particles)
+    registry = load(_write_registry(folder / "datasets.yaml", horizon, frames, hashes))
+    path = folder / "predictions.nc"
+    writer = PredictionsWriter(path, split="cavity", size="full", method="swirls", registry=registry)
+    with writer:
+        for scenario in size.subsets["test"]:
+            guess = list(_flow(scenario, frames, size.particles, error=0.02))[size.task.input_frames :]
+            writer.add(scenario, np.stack(guess))
+    return ScoreData(root, registry, path)
+
+
+def _flow(scenario: int, frames: int, particles: int, *, error: float = 0.0) -> Iterator[NDArray[np.float32]]:
+    """Yield positions frame by frame; an error makes the swirls faster by that share."""
+    rng = np.random.Generator(np.random.PCG64(scenario))
+    low, side = BOX
+    x = low + side * rng.random((particles, 2))
+    waves = 1 + scenario % 3
+    for frame in range(frames):
+        yield x.astype(np.float32)
+        s = waves * np.pi * (x - low) / side
+        u = np.stack([np.sin(s[:, 0]) * np.cos(s[:, 1]), -np.cos(s[:, 0]) * np.sin(s[:, 1])], axis=1)
+        x = np.clip(x + SPEED * (1.0 + (error if frame >= 5 else 0.0)) * u, low, low + side)
+
+
+def _write_truth(path: Path, key: ScenarioKey, frames: int, particles: int) -> str:
+    writer = ScenarioWriter(
+        path,
+        key,
+        particles=particles,
+        frames=frames,
+        frame_interval=0.1,
+        material=np.zeros(particles),
+        particle_mass=1e-4 * BOX[1] ** 2 / particles,
+        parameters={"start_substep": 0},
+        seed="made up",
+        device="cpu",
+        generator="benchmarks",
+    )
+    with writer:
+        for position in _flow(key.scenario, frames, particles):
+            writer.append(position, position)
+    return writer.content_sha256
+
+
+def _write_registry(path: Path, horizon: int, frames: int, hashes: dict[int, str]) -> Path:
+    held = yaml.safe_load(default_path().read_text())
+    size = held["splits"]["cavity"]["sizes"]["full"]
+    size["task"]["horizon"], size["frames"] = horizon, frames
+    held["measured"] = {
+        "cavity": {
+            "full": {
+                "dataset_sha256": "0" * 64,
+                "subset_sha256": {},
+                "scenario_sha256": {i: digest[:16] for i, digest in hashes.items()},
+                "statistics": {"position_std": [0.25, 0.25], "velocity_std": [0.0015, 0.0015]},
+                "twin_floor": [1e-6] * horizon,
+            }
+        }
+    }
+    path.write_text(yaml.safe_dump(held))
+    return path

@@ -1,0 +1,227 @@
+"""Charts as SVG: axes with few quiet lines, marks whose colours the page's style sheet knows.
+
+Classes of marks: ``s0`` .. ``s5`` series, ``d1`` .. ``d3`` dashes, ``truth``, ``floor0`` ..
+for the floors. Each chart has a title and a description for those who do not see it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .markup import Markup, join, path_data, tag
+from .scale import Scale
+
+__all__ = ["Bar", "Plot", "bar_chart"]
+
+WIDTH, HEIGHT = 460, 270
+LEFT, RIGHT, TOP, BOTTOM = 44, 10, 30, 40
+MARGIN = 3
+"""Marks may reach so far over the rim of the plot [pixel]."""
+
+FAR = 3.0
+"""Marks are cut off at so many heights or widths of the plot."""
+
+ROW, BAR = 40, 11
+"""Height of a bar's row, and of the bar [pixel]."""
+
+
+class Plot:
+    """One chart, built mark by mark.
+
+    Args:
+        x: horizontal axis.
+        y: vertical axis.
+        x_label: quantity and unit of the horizontal axis.
+        y_label: quantity and unit of the vertical axis; it stands above the plot.
+        height: height [pixel]; the width is 460.
+    """
+
+    def __init__(self, x: Scale, y: Scale, *, x_label: str, y_label: str, height: int = HEIGHT) -> None:
+        self._x, self._y = x, y
+        self._labels = (x_label, y_label)
+        self._height = height
+        self._across, self._up = WIDTH - LEFT - RIGHT, height - TOP - BOTTOM
+        self._marks: list[Markup] = []
+
+    def line(self, x: ArrayLike, y: ArrayLike, kind: str, title: str = "") -> None:
+        """Draw a line through points; NaN leaves a gap."""
+        data = path_data(zip(self._columns(x), self._rows(y), strict=True))
+        self._add("path", title, d=data, class_=f"line {kind}")
+
+    def band(self, x: ArrayLike, low: ArrayLike, high: ArrayLike, kind: str) -> None:
+        """Fill between two lines where both are numbers."""
+        columns, below, above = self._columns(x), self._rows(low), self._rows(high)
+        known = np.isfinite(below) & np.isfinite(above)
+        for run in _runs(known):
+            there = zip(columns[run], above[run], strict=True)
+            back = zip(columns[run][::-1], below[run][::-1], strict=True)
+            self._add("path", "", d=path_data([*there, *back]) + "Z", class_=f"band {kind}")
+
+    def steps(self, edges: ArrayLike, heights: ArrayLike, kind: str, title: str = "") -> None:
+        """Draw a histogram's outline.
+
+        Args:
+            edges: edges of the bins, shape [bin + 1].
+            heights: height of each bin, shape [bin].
+            kind: classes of the mark.
+            title: shown under the pointer.
+        """
+        x = np.repeat(np.asarray(edges, np.float64), 2)[1:-1]
+        self.line(x, np.repeat(np.asarray(heights, np.float64), 2), f"steps {kind}", title)
+
+    def dots(self, x: ArrayLike, y: ArrayLike, kind: str) -> None:
+        """Draw a cloud of points."""
+        points = zip(self._columns(x), self._rows(y), strict=True)
+        data = "".join(path_data([point]) for point in points)
+        self._add("path", "", d=data, class_=f"dots {kind}")
+
+    def level(self, value: float, label: str, *, above: bool = True) -> None:
+        """Draw a horizontal line with a name at its right end."""
+        row = float(self._rows(np.array([value]))[0])
+        self._add("path", "", d=path_data([(0, row), (self._across, row)]), class_="level")
+        place = row - 5 if above else row + 13
+        self._marks.append(tag("text", label, x=self._across, y=f"{place:.1f}", class_="note end"))
+
+    def svg(self, title: str, description: str) -> Markup:
+        """Return the chart.
+
+        Args:
+            title: what it shows.
+            description: what is to be seen, for those who do not see it.
+        """
+        area = tag(
+            "svg",
+            tag("g", *self._marks, transform=f"translate({MARGIN} {MARGIN})"),
+            x=LEFT - MARGIN,
+            y=TOP - MARGIN,
+            width=self._across + 2 * MARGIN,
+            height=self._up + 2 * MARGIN,
+        )
+        return _canvas(self._height, title, description, *self._axes(), area)
+
+    def _add(self, name: str, title: str, **attributes: object) -> None:
+        self._marks.append(tag(name, *([tag("title", title)] if title else []), **attributes))
+
+    def _columns(self, x: ArrayLike) -> NDArray[np.float64]:
+        return np.clip(self._x.share(x), -FAR, FAR) * self._across
+
+    def _rows(self, y: ArrayLike) -> NDArray[np.float64]:
+        return (1.0 - np.clip(self._y.share(y), -FAR, FAR)) * self._up
+
+    def _axes(self) -> list[Markup]:
+        """Return grid lines, tick labels and the names of the axes."""
+        bottom, right = TOP + self._up, WIDTH - RIGHT
+        drawn = []
+        for tick in self._y.ticks:
+            row = TOP + float(self._rows(tick.value))
+            drawn.append(tag("path", d=path_data([(LEFT, row), (right, row)]), class_="grid"))
+            drawn.append(_text(tick.label, LEFT - 7, row + 4, "tick end"))
+        for tick in self._x.ticks:
+            column = LEFT + float(self._columns(tick.value))
+            drawn.append(tag("path", d=path_data([(column, bottom), (column, bottom + 4)]), class_="mark"))
+            drawn.append(_text(tick.label, column, bottom + 17, "tick middle"))
+        drawn.append(tag("path", d=path_data([(LEFT, bottom), (right, bottom)]), class_="axis"))
+        x_label, y_label = self._labels
+        drawn.append(_text(_with_factor(x_label, self._x), right, self._height - 5, "label end"))
+        drawn.append(_text(_with_factor(y_label, self._y), 2, 14, "label"))
+        return drawn
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bar:
+    """One bar of a chart.
+
+    Attributes:
+        label: what it stands for.
+        value: its length; NaN leaves it out.
+        written: the value as text.
+        dots: values of the scenarios, drawn on the bar.
+        kind: classes of the mark.
+        bold: whether it is the best.
+    """
+
+    label: str
+    value: float
+    written: str
+    dots: Sequence[float]
+    kind: str
+    bold: bool = False
+
+
+def bar_chart(bars: Sequence[Bar], scale: Scale, label: str, title: str, description: str) -> Markup:
+    """Return horizontal bars with their names above them.
+
+    Args:
+        bars: the bars from top to bottom.
+        scale: axis of the values.
+        label: quantity and unit of the axis.
+        title: what the chart shows.
+        description: for those who do not see it.
+    """
+    left, right = 8, 14
+    across, bottom = WIDTH - left - right, ROW * len(bars) + 6
+
+    def place(value: float) -> float:
+        return left + across * float(np.clip(np.nan_to_num(scale.share(value), nan=0.0), 0.0, 1.0))
+
+    drawn: list[Markup] = []
+    for tick in scale.ticks:
+        column = place(tick.value)
+        drawn.append(tag("path", d=path_data([(column, 4), (column, bottom)]), class_="grid"))
+        drawn.append(_text(tick.label, column, bottom + 16, "tick middle"))
+    zero = place(0.0) if not scale.log else left
+    for number, bar in enumerate(bars):
+        drawn += _bar(bar, number * ROW + 19, zero, place)
+    drawn.append(tag("path", d=path_data([(zero, 4), (zero, bottom)]), class_="axis"))
+    drawn.append(_text(_with_factor(label, scale), WIDTH - right, bottom + 34, "label end"))
+    return _canvas(bottom + 40, title, description, *drawn)
+
+
+def _bar(bar: Bar, top: int, zero: float, place: object) -> list[Markup]:
+    at = place if callable(place) else float
+    name = tag("tspan", bar.label, class_="strong" if bar.bold else None)
+    value = tag("tspan", f"  {bar.written}", class_="value")
+    drawn = [tag("text", name, value, x=8, y=top - 5, class_="name")]
+    if np.isfinite(bar.value):
+        low, high = sorted((zero, at(bar.value)))
+        box = {"x": f"{low:.1f}", "y": top, "width": f"{max(high - low, 1.0):.1f}", "height": BAR}
+        drawn.append(tag("rect", **box, class_=f"bar {bar.kind}"))
+    points = [(at(value), top + BAR / 2) for value in bar.dots if np.isfinite(value)]
+    if points:
+        drawn.append(tag("path", d="".join(path_data([p]) for p in points), class_="dots on"))
+    return drawn
+
+
+def _canvas(height: int, title: str, description: str, *drawn: object) -> Markup:
+    return tag(
+        "svg",
+        tag("title", title),
+        tag("desc", description),
+        *drawn,
+        viewBox=f"0 0 {WIDTH} {height}",
+        class_="chart",
+        role="img",
+    )
+
+
+def _text(text: str, x: float, y: float, kind: str) -> Markup:
+    return tag("text", text, x=f"{x:.1f}", y=f"{y:.1f}", class_=kind)
+
+
+def _with_factor(label: str, scale: Scale) -> Markup:
+    factor = tag("tspan", f"  {scale.factor}", class_="factor") if scale.factor else ""
+    return join([label, factor])
+
+
+def _runs(known: NDArray[np.bool_]) -> list[slice]:
+    """Return the stretches of True.
+
+    >>> _runs(np.array([True, True, False, True]))
+    [slice(0, 2, None), slice(3, 4, None)]
+    """
+    change = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(np.int8)))
+    return [slice(int(a), int(b)) for a, b in change.reshape(-1, 2)]

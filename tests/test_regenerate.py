@@ -1,0 +1,56 @@
+"""Data made here have the hashes of datasets.yaml: the promise of docs/determinism.md."""
+
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from lagbench.generation import generate
+from lagbench.manifest import read_manifest
+from lagbench.registry import Size, load
+from lagbench.verification import verify
+
+ROOT = Path(__file__).parent.parent
+SPLITS = tuple(load().splits)
+
+
+def _turn() -> int:
+    """Return the number of commits so far: it picks the scenarios that this run regenerates."""
+    count = subprocess.run(
+        ["git", "rev-list", "--count", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    return int(count.stdout) if count.returncode == 0 else 0
+
+
+def _size(split: str, name: str) -> Size:
+    size = load().size(split, name)
+    assert size.measured is not None, f"{split} {name} has no hashes in datasets.yaml"
+    return size
+
+
+@pytest.mark.parametrize("split", SPLITS)
+def test_tiny_is_made_to_the_bit(split: str, tmp_path: Path) -> None:
+    """All of tiny: scenario, subset and data set hashes, statistics and twin floor."""
+    size = _size(split, "tiny")
+    measured = size.measured
+    assert measured is not None
+    result = generate(split, "tiny", root=tmp_path)
+    assert result.dataset_sha256 == measured.dataset_sha256
+    manifest = read_manifest(tmp_path, split, "tiny", size.major)
+    assert manifest is not None
+    assert manifest.subset_sha256 == measured.subset_sha256
+    for name, row in measured.statistics.items():
+        assert tuple(manifest.statistics[name]) == row
+    verify(split, "tiny", root=tmp_path, complete=True).check()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size_name", ["mini", "full"])
+@pytest.mark.parametrize("split", SPLITS)
+def test_one_scenario_is_made_to_the_bit(split: str, size_name: str, tmp_path: Path) -> None:
+    """One scenario of mini and of full, another one after every commit."""
+    size = _size(split, size_name)
+    scenario = size.scenarios[_turn() % len(size.scenarios)]
+    result = generate(split, size_name, scenarios=(scenario,), root=tmp_path)
+    assert result.simulated == (scenario,)
+    assert result.verdict == "what is there is equal to datasets.yaml"

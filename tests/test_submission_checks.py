@@ -1,0 +1,195 @@
+"""The checks: warnings, truth that is missing or wrong, all findings together, guesses."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from bad_submissions import FAULTS, positions, rows, store
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scenario_factory import make_key, write_scenario
+from submission_data import FRAMES, GIVEN, PARTICLES, Bench, make_bench, truth
+
+from lagbench.errors import ChecksFailedError, DataError, UnreadableFileError
+from lagbench.format import scenario_path
+from lagbench.registry import Registry
+from lagbench.submission import Severity, ValidationResult, validate
+from lagbench.submission.guesses import guess_frames, guess_scenarios
+from lagbench.submission.truth import Truth
+
+Values = NDArray[np.float32]
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
+    """A small data set and a valid submission."""
+    return make_bench(tmp_path_factory.mktemp("bench"))
+
+
+def changed(bench: Bench, edit: Callable[[Values], Values]) -> ValidationResult:
+    """Validate the valid file with other positions."""
+    path = bench.copy("changed.nc")
+    with h5py.File(path, "r+") as file:
+        store(file, edit(positions(file)))
+    return bench.validate(path)
+
+
+def test_particles_outside_the_box_are_flagged(bench: Bench) -> None:
+    """One position of 1152 at x = 1.5: a warning with its place, exit code 0."""
+
+    def edit(values: Values) -> Values:
+        values[1, 4, 9, 0] = 1.5
+        return values
+
+    result = changed(bench, edit)
+    flag = next(f for f in result.findings if f.check == "in_domain")
+    assert (flag.severity, result.exit_code) == (Severity.WARNING, 0)
+    assert flag.where == "first in scenario 4, frame 7, particle 9"
+    # 1 / (3 * 8 * 48) = 0.087 %; the wall is at 0.95
+    assert "0.09%" in flag.what
+    assert "0.55" in flag.got
+
+
+def test_a_cell_beyond_the_wall_is_no_warning(bench: Bench) -> None:
+    """The wall is at 0.95 and a solver cell is 0.1 wide: 1.04 passes, 1.06 does not."""
+    for place, flagged in ((1.04, False), (1.06, True)):
+        result = changed(bench, lambda values, place=place: np.full_like(values, place))
+        assert ("in_domain" in {f.check for f in result.warnings}) == flagged
+
+
+def test_jumps_are_flagged(bench: Bench) -> None:
+    """Particles permuted in the middle of the rollout jump; the start is right."""
+
+    def edit(values: Values) -> Values:
+        values[:, 4:] = values[:, 4:, ::-1]
+        return values
+
+    result = changed(bench, edit)
+    assert {f.check for f in result.findings} == {"max_displacement"}
+    assert [f.where.split(",")[1].strip() for f in result.warnings] == ["from frame 6 to 7"] * 3
+    assert result.exit_code == 0
+
+
+def test_the_limit_of_the_start_is_ten_displacements(bench: Bench) -> None:
+    """Scenarios moved by 0.9 and 1.1 times the limit at their first frame: the second is far."""
+    size = bench.registry.size("cavity", "tiny")
+    source = Truth(size, bench.root)
+    limit = 10 * source.largest_displacement(3, enough=np.inf)
+    steps = np.diff(np.concatenate([source.given(3), truth(3)]).astype("f8"), axis=0)
+    assert limit == pytest.approx(10 * np.sqrt((steps**2).sum(-1)).max())
+    for factor, far in ((0.9, False), (1.1, True)):
+
+        def edit(values: Values, factor: float = factor) -> Values:
+            values[0] = source.given(3)[-1] + np.float32([factor * limit, 0])
+            return values
+
+        assert (changed(bench, edit).exit_code == 1) == far
+
+
+def test_scanning_the_truth_stops_when_it_knows_enough(bench: Bench) -> None:
+    """A displacement that is surely reached ends the search at once."""
+    source = Truth(bench.registry.size("cavity", "tiny"), bench.root)
+    everything = source.largest_displacement(4, enough=np.inf)
+    assert 0 < source.largest_displacement(4, enough=1e-9) <= everything
+
+
+def test_all_findings_are_reported_together(bench: Bench) -> None:
+    """A missing scenario, a NaN, a stale hash and a wrong type in one run, in the order of the checks."""
+    path = rows(bench, "several", [3, 5], list(range(GIVEN, FRAMES)), [0, 2])
+    with h5py.File(path, "r+") as file:
+        file.attrs["dataset_sha256"] = "ab" * 32
+        file["position"][1, 2, 3, 0] = np.nan
+    result = bench.validate(path)
+    assert [f.check for f in result.errors] == ["dataset", "scenarios", "finite"]
+    assert result.exit_code == 4
+
+
+def test_without_the_data_set_what_needs_no_truth_is_checked(bench: Bench, tmp_path: Path) -> None:
+    """Two checks are skipped and give the command; for scoring that is an error of exit code 4."""
+    elsewhere = replace(bench, root=tmp_path)
+    result = elsewhere.validate(bench.valid)
+    assert result.exit_code == 0
+    assert set(result.skipped) == {"start", "max_displacement"}
+    assert "lagbench generate --split cavity" in result.skipped["start"]
+    required = elsewhere.validate(bench.valid, require_truth=True)
+    assert required.exit_code == 4
+    with pytest.raises(DataError, match="3 of 3 test scenarios are not generated"):
+        required.check()
+
+
+@pytest.mark.parametrize("damage", ["cut", "another"])
+def test_a_damaged_data_set_is_told_from_a_bad_submission(bench: Bench, tmp_path: Path, damage: str) -> None:
+    """A truncated or foreign test scenario is exit code 4 and names the file."""
+    root = tmp_path / "root"
+    shutil.copytree(bench.root, root)
+    key = make_key(4)
+    path = scenario_path(root, key)
+    if damage == "cut":
+        path.write_bytes(path.read_bytes()[:3000])
+    else:
+        write_scenario(root, key, frames=FRAMES, particles=PARTICLES, seed="another")
+    result = replace(bench, root=root).validate(bench.valid)
+    assert result.exit_code == 4
+    assert str(path) in result.errors[0].where
+
+
+def test_without_a_recorded_hash_the_check_warns(unmeasured: Registry, bench: Bench, tmp_path: Path) -> None:
+    """A registry that nobody measured cannot vouch: the check says so and does not reject."""
+    path = bench.copy("unmeasured.nc")
+    result = validate(path, root=tmp_path, registry=unmeasured, isolated=False)
+    flag = next(f for f in result.findings if f.check == "dataset")
+    assert flag.severity is Severity.WARNING
+    assert "datasets.yaml" in flag.got
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [("truncated_half", UnreadableFileError), ("stale_hash", DataError), ("one_nan", ChecksFailedError)],
+)
+def test_check_raises_the_error_of_the_exit_code(bench: Bench, name: str, kind: type[Exception]) -> None:
+    """3, 4 and 1; a valid file raises nothing."""
+    with pytest.raises(kind, match=FAULTS[name].check):
+        bench.validate(FAULTS[name].make(bench)).check()
+    bench.validate(bench.valid).check()
+
+
+def test_findings_read_as_what_where_expected_got_fix(bench: Bench) -> None:
+    """The text of one, whole."""
+    path = rows(bench, "text", [3, 4, 5], [3, 5, 7, 9], np.s_[:, ::2])
+    assert str(bench.validate(path).errors[0]) == (
+        "error [frames] the frames are not those to predict\n"
+        "  where: coordinate 'frame'\n"
+        "  expected: 3-10 (absolute numbers, 8 of them)\n"
+        "  got: 3,5,7,9 (4)\n"
+        "  fix: seems to skip: it holds every 2nd frame only"
+    )
+
+
+@given(st.lists(st.integers(-(2**63), 2**63 - 1) | st.integers(0, 30), max_size=40))
+def test_guesses_never_fail(numbers: list[int]) -> None:
+    """Any numbers give one line."""
+    assert guess_frames(numbers, range(6, 26)).isprintable()
+    assert guess_scenarios(numbers, {"train": (0, 1), "test": (3, 4)}).isprintable()
+
+
+@pytest.mark.parametrize(
+    ("numbers", "word"),
+    [
+        (range(96), "input frames"),
+        (range(6, 96, 4), "every 4th"),
+        (range(6, 600), "after 95"),
+        (range(1, 91), "absolute number is 6"),
+        (range(5, 95), "shifted by -1"),
+        ([*range(6, 50), *range(51, 96)], "lacks the frames 50"),
+    ],
+)
+def test_guesses_about_frames(numbers: range, word: str) -> None:
+    """Given 6 frames and a horizon of 90: what each wrong numbering seems to be."""
+    assert word in guess_frames(list(numbers), range(6, 96))

@@ -1,0 +1,148 @@
+"""Every faulty file is named by its check; none raises, none needs much memory or time."""
+
+from __future__ import annotations
+
+import os
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bad_submissions import FAULTS
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from submission_data import Bench, make_bench
+
+from lagbench.submission import CHECKS, ValidationResult
+
+SECONDS = 10.0
+MEBIBYTES = 1000.0
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
+    """A small data set and a valid submission."""
+    return make_bench(tmp_path_factory.mktemp("bench"))
+
+
+def cpu_seconds() -> float:
+    """Computing time of this process and its children: unlike wall time, no matter of the load [s]."""
+    used = os.times()
+    return used.user + used.system + used.children_user + used.children_system
+
+
+def child_peak() -> float:
+    """Largest resident memory of any child so far [MiB]."""
+    return resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
+
+
+def assert_complete(result: ValidationResult) -> None:
+    """Every check has found something, passed, or says why it was not made; exit code and errors agree."""
+    found = {finding.check for finding in result.findings}
+    assert found | set(result.passed) | set(result.skipped) == set(CHECKS)
+    assert result.exit_code in (0, 1, 3, 4)
+    assert (result.exit_code == 0) == result.valid
+    for finding in result.findings:
+        parts = (finding.what, finding.where, finding.expected, finding.got, finding.fix)
+        assert all(part and part.isprintable() for part in parts), finding
+
+
+def test_there_are_enough_faults() -> None:
+    """At least 40 distinct ones, and every check that rejects has one."""
+    assert len(FAULTS) >= 40
+    warnings = {"in_domain", "max_displacement"}
+    assert {fault.check for fault in FAULTS.values()} == set(CHECKS) - warnings
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_faulty_file_fails_its_check(bench: Bench, name: str) -> None:
+    """The right check, exit code and hint; in this process but for files that would stop it."""
+    fault = FAULTS[name]
+    path = fault.make(bench)
+    started = cpu_seconds()
+    result = bench.validate(path, isolated=fault.hostile)
+    assert cpu_seconds() - started < SECONDS
+    assert child_peak() < MEBIBYTES
+    assert fault.check in {finding.check for finding in result.errors}
+    assert result.exit_code == fault.exit_code
+    assert fault.says in "\n".join(map(str, result.errors))
+    assert_complete(result)
+
+
+@pytest.mark.parametrize("name", ["truncated_half", "stale_hash", "one_nan", "external_link", "fifo"])
+def test_the_child_process_says_the_same(bench: Bench, name: str) -> None:
+    """What the child finds is what this process finds."""
+    path = FAULTS[name].make(bench)
+    assert bench.validate(path, isolated=True) == bench.validate(path)
+
+
+def test_a_valid_file_passes_all_checks(bench: Bench) -> None:
+    """Exit code 0, nothing found, nothing skipped."""
+    result = bench.validate(bench.valid, isolated=True)
+    assert result.passed == CHECKS
+    assert (result.exit_code, result.split, result.method) == (0, "cavity", "truth")
+
+
+MUTATIONS = st.lists(
+    st.tuples(
+        st.floats(0, 1, exclude_max=True), st.sampled_from([0, 1, 8, 127, 128, 255]) | st.integers(0, 255)
+    ),
+    min_size=1,
+    max_size=8,
+)
+
+
+def mutate(bench: Bench, changes: list[tuple[float, int]], keep: float) -> Path:
+    """Write the valid file with some bytes changed and its end cut off."""
+    data = np.frombuffer(bench.valid.read_bytes(), np.uint8).copy()
+    for place, value in changes:
+        data[int(place * len(data))] = value
+    path = bench.folder / "mutated.nc"
+    path.write_bytes(data[: max(1, int(keep * len(data)))].tobytes())
+    return path
+
+
+def check_mutation(bench: Bench, changes: list[tuple[float, int]], keep: float) -> None:
+    """A changed file passes or fails named checks, in bounds; a child that dies is one of them."""
+    path = mutate(bench, changes, keep)
+    started = cpu_seconds()
+    result = bench.validate(path, isolated=True)
+    assert cpu_seconds() - started < SECONDS
+    assert child_peak() < MEBIBYTES
+    assert "Traceback" not in str(result)
+    assert_complete(result)
+    assert result.exit_code in (0, 1, 3, 4)
+
+
+KEEP = st.just(1.0) | st.floats(0, 1)
+RELAXED = [HealthCheck.too_slow, HealthCheck.function_scoped_fixture]
+
+
+@settings(max_examples=15, deadline=None, derandomize=True, database=None, suppress_health_check=RELAXED)
+@given(changes=MUTATIONS, keep=KEEP)
+def test_changed_bytes_never_escape_the_checks(
+    bench: Bench, changes: list[tuple[float, int]], keep: float
+) -> None:
+    """Bytes changed anywhere, files cut anywhere."""
+    check_mutation(bench, changes, keep)
+
+
+@pytest.mark.slow
+@settings(max_examples=200, deadline=None, derandomize=True, database=None, suppress_health_check=RELAXED)
+@given(changes=MUTATIONS, keep=KEEP)
+def test_many_changed_bytes_never_escape_the_checks(
+    bench: Bench, changes: list[tuple[float, int]], keep: float
+) -> None:
+    """The same for more files."""
+    check_mutation(bench, changes, keep)
+
+
+@pytest.mark.slow
+def test_the_script_makes_and_recognises_all_of_them(tmp_path: Path) -> None:
+    """Every fault in a child process, within time and memory: exit code 0."""
+    script = Path(__file__).parent / "bad_submissions.py"
+    done = subprocess.run([sys.executable, script, tmp_path], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert " 0 not recognised" in done.stdout
