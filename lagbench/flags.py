@@ -31,7 +31,7 @@ AUTOCORRELATION = 0.5
 DROP = 0.5
 """An error that falls to less than this share within one frame was reset to the truth."""
 
-SHIFT_GAIN = 0.4
+SHIFT_GAIN = 0.25
 """When a shift in time leaves less than this share of the error, the truth was shifted."""
 
 GROWTH = 2.0
@@ -118,6 +118,8 @@ def copy_suspect(traces: Sequence[Trace]) -> Flag:
     """
     found = [evidence(trace) for trace in traces]
     reasons = []
+    if any(e.steps == 0.0 for e in found):
+        reasons.append("the prediction of a scenario is the truth")
     if any(e.autocorrelation < AUTOCORRELATION for e in found):
         reasons.append("the error of a frame does not follow from that of the frame before")
     if any(e.drop < DROP for e in found):

@@ -13,7 +13,8 @@ import h5py
 import numpy as np
 import pytest
 import xarray as xr
-from bad_submissions import FAULTS, positions, rows, store
+from bad_submissions import FAULTS
+from faulty import positions, rows, store
 from submission_data import FRAMES, GIVEN, HORIZON, PARTICLES, TESTS, Bench, make_bench, truth
 
 from lagbench.errors import ChecksFailedError, UnreadableFileError, UsageError

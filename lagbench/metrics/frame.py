@@ -19,6 +19,7 @@ from lagbench.format import MATERIALS
 from lagbench.grid import Fields, Grid, fields
 
 from .bonds import Bonds
+from .projections import sorted_projections
 
 __all__ = ["ELASTIC", "PERCENTILES", "Floats", "FramePair", "Scenario", "Setting", "Snapshot", "snapshots"]
 
@@ -87,6 +88,11 @@ class Snapshot:
     def fields(self) -> Fields:
         """Grid fields of these particles [per frame]."""
         return fields(self.position, self.velocity, self.grid, full=self.full)
+
+    @cached_property
+    def projections(self) -> Floats:
+        """Positions along fixed directions, sorted [length], shape [direction, particle]."""
+        return sorted_projections(self.position)
 
 
 @dataclass(frozen=True, kw_only=True)

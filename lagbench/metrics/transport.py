@@ -14,11 +14,9 @@ from lagbench.extras import require
 
 from .frame import Floats, FramePair
 from .metric import Direction, Metric, at_slow_frames
+from .projections import DIRECTIONS, sorted_projections
 
 __all__ = ["DIRECTIONS", "METRICS", "sinkhorn_divergence", "sliced_wasserstein2"]
-
-DIRECTIONS = 64
-"""Directions on which :func:`sliced_wasserstein2` projects, at equal angles over a half turn."""
 
 BLUR = 0.1
 """Entropic regularisation of LagrangeBench's Sinkhorn divergence [length^2]."""
@@ -39,15 +37,12 @@ def sliced_wasserstein2(x: Floats, y: Floats) -> float:
         x: one cloud [length], shape [particle, 2].
         y: another of as many particles [length], shape [particle, 2].
     """
-    squares = [
-        np.mean((np.sort(_along(angle, x)) - np.sort(_along(angle, y))) ** 2)
-        for angle in np.arange(DIRECTIONS) * (math.pi / DIRECTIONS)
-    ]
-    return math.sqrt(float(np.mean(squares)))
+    return _distance(sorted_projections(x), sorted_projections(y))
 
 
-def _along(angle: float, points: Floats) -> Floats:
-    return points[:, 0] * math.cos(angle) + points[:, 1] * math.sin(angle)
+def _distance(x: Floats, y: Floats) -> float:
+    """Return the root mean square of the differences of sorted projections [length]."""
+    return math.sqrt(float(np.mean((x - y) ** 2)))
 
 
 def sinkhorn_divergence(x: Floats, y: Floats) -> float:
@@ -73,7 +68,7 @@ def sinkhorn_divergence(x: Floats, y: Floats) -> float:
 
 def sliced_w2(pair: FramePair) -> float:
     """Return the sliced Wasserstein-2 distance of predicted from true positions [length]."""
-    return sliced_wasserstein2(pair.truth.position, pair.prediction.position)
+    return _distance(pair.truth.projections, pair.prediction.projections)
 
 
 def sinkhorn(pair: FramePair) -> float:

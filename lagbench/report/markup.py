@@ -17,9 +17,9 @@ SHAPES = frozenset({"circle", "line", "path", "rect", "stop", "use"})
 """Elements of SVG that close themselves."""
 
 _ESCAPES = {ord("&"): "&amp;", ord("<"): "&lt;", ord(">"): "&gt;", ord('"'): "&quot;", ord("'"): "&#39;"}
-_UNPRINTABLE = {code: "\ufffd" for code in (*range(9), 11, 12, *range(14, 32), *range(127, 160))}
+_UNPRINTABLE = dict.fromkeys((*range(9), 11, 12, *range(14, 32), *range(127, 160)), "�")
 # marks that turn the direction of the text around them
-_TURNING = {code: "\ufffd" for code in (0x061C, 0x200E, 0x200F, *range(0x202A, 0x202F), *range(0x2066, 0x206A))}
+_TURNING = dict.fromkeys((1564, 8206, 8207, *range(8234, 8239), *range(8294, 8298)), "�")
 _TABLE = _ESCAPES | _UNPRINTABLE | _TURNING
 
 
@@ -48,7 +48,7 @@ def join(parts: Iterable[object], separator: str = "") -> Markup:
     return Markup(escaped(separator).join(escaped(part) for part in parts))
 
 
-def tag(name: str, *children: object, **attributes: object) -> Markup:
+def tag(name: str, /, *children: object, **attributes: object) -> Markup:
     """Return an element; children and values that are no markup are escaped.
 
     Args:
@@ -85,7 +85,9 @@ def path_data(points: Iterable[tuple[float, float]]) -> str:
             pieces[-1].append(f"{_short(x)} {_short(y)}")
         elif pieces[-1]:
             pieces.append([])
-    return "".join(f"M{piece[0]}h0" if len(piece) == 1 else "M" + "L".join(piece) for piece in pieces if piece)
+    return "".join(
+        f"M{piece[0]}h0" if len(piece) == 1 else "M" + "L".join(piece) for piece in pieces if piece
+    )
 
 
 def _short(value: float) -> str:

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.resources import files
 
 from .markup import Markup, join, tag
-from .style import STYLE
 
 __all__ = ["Figure", "Section", "document", "key", "paragraph", "table"]
 
@@ -86,29 +86,32 @@ def document(title: str, head: Markup, sections: Sequence[Section], foot: Markup
         tag("meta", name="referrer", content="no-referrer"),
         tag("title", title),
         tag("link", rel="icon", href="data:,"),
-        tag("style", Markup(STYLE)),
+        tag("style", Markup(_style())),
     ]
     whole = tag("html", tag("head", *meta), tag("body", *body), lang="en")
     return f"<!DOCTYPE html>\n{whole}\n"
 
 
+def _style() -> str:
+    """Return the style sheet, which lies beside this module."""
+    return files(__package__).joinpath("style.css").read_text("utf-8")
+
+
 def _section(section: Section, first: int) -> Markup:
     figures = [_figure(figure, first + i) for i, figure in enumerate(section.figures)]
     grid = tag("div", *figures, class_="figures") if figures else Markup("")
-    return tag(
-        "section", tag("h2", section.title), section.lead, grid, id=section.name, class_="part"
-    ) + Markup("\n")
+    heading = tag("h2", section.title)
+    return join([tag("section", heading, section.lead, grid, id=section.name, class_="part"), "\n"])
 
 
 def _figure(figure: Figure, number: int) -> Markup:
     heading = tag("h3", tag("span", f"Figure {number}", class_="number"), " ", figure.title)
     source = tag("span", f"thesis {figure.thesis}", class_="thesis")
-    numbers = (
-        tag("details", tag("summary", "Numbers"), figure.data, class_="numbers") if figure.data else ""
-    )
+    numbers = tag("details", tag("summary", "Numbers"), figure.data, class_="numbers") if figure.data else ""
     caption = tag("figcaption", tag("p", figure.caption, " ", source))
     kind = "figure wide" if figure.wide else "figure"
-    return tag("figure", heading, figure.body, caption, numbers, id=figure.name, class_=kind) + Markup("\n")
+    drawn = tag("figure", heading, figure.body, caption, numbers, id=figure.name, class_=kind)
+    return join([drawn, "\n"])
 
 
 def key(items: Sequence[tuple[str, str]], *, kind: str = "line") -> Markup:
@@ -118,7 +121,9 @@ def key(items: Sequence[tuple[str, str]], *, kind: str = "line") -> Markup:
         items: classes of the mark and its name.
         kind: class of the marks themselves, "line" or "square".
     """
-    return tag("ul", *(tag("li", _swatch(mark, kind), tag("span", name)) for mark, name in items), class_="key")
+    return tag(
+        "ul", *(tag("li", _swatch(mark, kind), tag("span", name)) for mark, name in items), class_="key"
+    )
 
 
 def _swatch(mark: str, kind: str) -> Markup:
@@ -129,7 +134,9 @@ def _swatch(mark: str, kind: str) -> Markup:
     return tag("svg", drawn, viewBox="0 0 22 10", class_="swatch", aria_hidden="true")
 
 
-def table(head: Sequence[object], rows: Sequence[Sequence[object]], *, kind: str = "", label: str = "") -> Markup:
+def table(
+    head: Sequence[object], rows: Sequence[Sequence[object]], *, kind: str = "", label: str = ""
+) -> Markup:
     """Return a table in a box of its own that scrolls when it is wider than the page.
 
     Args:

@@ -19,21 +19,26 @@ MAX_NAME = 200
 _START = "start from what `lagbench template` writes, or use lagbench.submission.write"
 
 
-def check_format(anatomy: Anatomy, out: Findings) -> None:
-    """Check links, variables, storage and attributes."""
+def check_format(anatomy: Anatomy, out: Findings) -> bool:
+    """Check links, variables, storage and attributes; tell whether the values can be read."""
     out.made("format")
     _check_links(anatomy, out)
     for name in ("position", "scenario", "frame"):
         _check_variable(name, anatomy, out)
     for name, array in anatomy.arrays.items():
-        check_storage(array, out)
-        if name != "position" and array.shape is not None and name not in anatomy.integers:
-            expected = f"one dimension of at most {MAX_COORDINATE} integers"
-            got = f"{array.kind}, shape {array.shape}"
+        stored = check_storage(array, out)
+        if stored and name != "position" and name not in anatomy.integers:
             out.error(
-                "format", "a coordinate cannot be read", where=name, expected=expected, got=got, fix=_START
+                "format",
+                "a coordinate cannot be read",
+                where=f"variable {name!r}",
+                expected=f"one dimension of at most {MAX_COORDINATE} integers",
+                got=f"{array.kind}, shape {array.shape}, chunks {array.chunks}",
+                fix=_START,
             )
+    readable = not out.failed("format")
     _check_attributes(anatomy, out)
+    return readable
 
 
 def _check_links(anatomy: Anatomy, out: Findings) -> None:

@@ -171,7 +171,9 @@ def header_of(anatomy: Anatomy) -> Header:
 
 
 def _optional(value: object, kind: type[Any]) -> Any:  # noqa: ANN401
-    return kind(value) if isinstance(value, (str, int, float)) else None
+    if kind is float and isinstance(value, int):
+        return float(value)
+    return value if isinstance(value, kind) else None
 
 
 def _open_position(file: h5py.File, anatomy: Anatomy) -> h5py.h5d.DatasetID:

@@ -87,7 +87,7 @@ def examine(request: Request) -> ValidationResult:
 
 
 def _examine(request: Request, file: h5py.File, anatomy: Anatomy, out: Findings) -> None:
-    check_format(anatomy, out)
+    stored = check_format(anatomy, out)
     laid_out = check_dims(anatomy, out)
     typed = check_dtype(anatomy, out)
     size = check_split(anatomy, request.registry, out)
@@ -98,11 +98,10 @@ def _examine(request: Request, file: h5py.File, anatomy: Anatomy, out: Findings)
     check_scenarios(anatomy, size, out)
     in_time = check_frames(anatomy, size, out)
     sized = check_particles(anatomy, size, out)
-    failed = out.failed("format", "dims", "dtype", "particles")
-    # Frames beyond the horizon would make the work as long as the file claims to be.
-    too_many = len(anatomy.integers.get("frame", ())) > 2 * (size.task.input_frames + size.task.horizon)
-    if failed or too_many or not (laid_out and typed and sized):
-        out.skip(f"{failed or 'frames'} failed", *VALUES)
+    # Frames far beyond the horizon would make the work as long as the file claims to be.
+    bounded = len(anatomy.integers.get("frame", ())) <= 2 * (size.task.input_frames + size.task.horizon)
+    if not (stored and laid_out and typed and sized and bounded):
+        out.skip(f"{out.failed('format', 'dims', 'dtype', 'particles', 'frames')} failed", *VALUES)
         return
     with ExitStack() as stack:
         predictions = attach(file, request.path, anatomy, stack)
@@ -131,6 +130,7 @@ def _examine_values(
         check_jumps(surveys, truth, out)
     except DataError as error:
         _report_dataset(error, out)
+        out.skip(f"{error.what}: {error.where}", "start", "max_displacement")
 
 
 def _report_dataset(error: DataError, out: Findings) -> None:

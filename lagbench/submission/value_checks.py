@@ -156,7 +156,6 @@ def check_domain(surveys: list[Survey], size: Size, out: Findings) -> None:
 
 def check_jumps(surveys: list[Survey], truth: Truth, out: Findings) -> None:
     """Flag particles that jump much farther in a frame than any particle of the truth."""
-    out.made("max_displacement")
     for one in surveys:
         limit = JUMP * truth.largest_displacement(one.scenario, enough=one.jump / JUMP)
         if one.jump_at and one.jump > limit:
@@ -169,11 +168,11 @@ def check_jumps(surveys: list[Survey], truth: Truth, out: Findings) -> None:
                 got=f"{one.jump:.3g}",
                 fix="check the rollout for instability, and that particles keep their order",
             )
+    out.made("max_displacement")
 
 
 def check_start(predictions: Predictions, truth: Truth, out: Findings) -> None:
     """Check that the first predicted frame follows the last given one, particle by particle."""
-    out.made("start")
     header = predictions.header
     for scenario in sorted(set(header.scenarios) & set(truth.size.subsets["test"])):
         given = truth.given(scenario)[-1]
@@ -192,3 +191,4 @@ def check_start(predictions: Predictions, truth: Truth, out: Findings) -> None:
                 got=f"{distance:.3g}",
                 fix=guess_start(first, given, limit),
             )
+    out.made("start")

@@ -1,0 +1,260 @@
+"""Curves over frames: errors, correlation and energy, of scenarios and of methods."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagbench.metrics import Metric, Score, bootstrap_interval
+
+from .chart import Plot
+from .markup import Markup, join, tag
+from .numbers import html
+from .page import Figure, key, table
+from .scale import Scale, linear, spanning
+from .subject import Row, Subject, kind_of
+
+__all__ = ["body_curves", "energy_curves", "error_curves", "method_curves"]
+
+Floats = NDArray[np.float64]
+
+STABLE = 0.8
+"""Correlation below which a rollout no longer counts as stable."""
+
+TOLERATED = 3.0
+"""The axis of energies reaches so many times the truth's greatest; what is beyond is cut off."""
+
+
+def error_curves(subject: Subject) -> Iterator[Figure]:
+    """Yield the error over frames for all test scenarios, one figure per entry (Fig. 5.10)."""
+    name = "vorticity_mse" if subject.full_box else "attribute_mse"
+    scores = [row.scores[name] for row in subject.rows if name in row.scores]
+    entries = [row for row in subject.rows if row.entry is not None and name in row.scores]
+    if not scores:
+        return
+    y = spanning([score.per_frame for score in scores], log=None)
+    for row in entries:
+        score, number = row.scores[name], row.entry.number if row.entry else 0
+        body = [key(_scenario_key(score)), _scenario_chart(subject, score, y, row.name)]
+        yield Figure(
+            name=f"scenarios-{number}",
+            title=f"Error over frames, every test scenario: {row.name}",
+            thesis="Fig. 5.10",
+            body=join(body),
+            caption=join(
+                [f"{_sentence(score.metric)} One line per test scenario; flat lines do not drift. "]
+                + (["The axis is shared by all files."] if len(entries) > 1 else [])
+            ),
+            data=_numbers(subject, [(f"scenario {i}", row) for i, row in _by_scenario(score)], "scenario"),
+        )
+
+
+def _scenario_key(score: Score) -> list[tuple[str, str]]:
+    return [(kind_of(i), f"scenario {number}") for i, number in enumerate(score.scenarios)]
+
+
+def _by_scenario(score: Score) -> Iterator[tuple[int, Floats]]:
+    yield from zip(score.scenarios, score.per_frame, strict=True)
+
+
+def _scenario_chart(subject: Subject, score: Score, y: Scale, name: str) -> Markup:
+    plot = Plot(_frame_axis(subject), y, x_label="frame", y_label=_quantity(score.metric))
+    for i, (scenario, values) in enumerate(_by_scenario(score)):
+        plot.line(subject.frames, values, kind_of(i), f"scenario {scenario}")
+    return plot.svg(
+        f"{score.metric.name} over frames",
+        f"Lines of {len(score.scenarios)} test scenarios of {name} from frame {subject.frames[0]}"
+        f" to {subject.frames[-1]}.",
+    )
+
+
+def method_curves(subject: Subject) -> Iterator[Figure]:
+    """Yield the methods side by side: mean over scenarios with its interval (Fig. 5.11)."""
+    for name, thesis in (
+        ("vorticity_mse" if subject.full_box else "attribute_mse", "Fig. 5.11"),
+        ("position_rmse", "Fig. 5.11"),
+        ("velocity_rmse", "Fig. 5.11"),
+        ("vorticity_pearson", "Fig. 5.13"),
+    ):
+        rows = [row for row in subject.rows if name in row.scores]
+        if rows:
+            yield _method_figure(subject, rows, name, thesis)
+
+
+def _method_figure(subject: Subject, rows: Sequence[Row], name: str, thesis: str) -> Figure:
+    metric = rows[0].scores[name].metric
+    series = [(row, _mean(row.scores[name])) for row in rows]
+    correlation = name == "vorticity_pearson"
+    y = spanning([values for _, values in series])
+    if correlation:
+        y = linear(min(0.0, _least(values for _, values in series)), 1.0)
+    plot = Plot(_frame_axis(subject), y, x_label="frame", y_label=_quantity(metric))
+    for row, _ in series:
+        if row.entry is not None:
+            plot.band(subject.frames, *_interval(row.scores[name]), row.kind)
+    for row, values in reversed(series):
+        plot.line(subject.frames, values, row.kind, row.name)
+    items = [(row.kind, row.name) for row in rows]
+    twin = np.asarray(subject.exam.twin_floor)
+    if name == "position_rmse" and len(twin) == len(subject.frames):
+        plot.line(subject.frames, twin, "twin", "the solver after a nudge of 2^-20")
+        items.append(("twin", "twin of the solver"))
+    if correlation:
+        plot.level(STABLE, f"stable above {STABLE}")
+    return Figure(
+        name=f"methods-{name.replace('_', '-')}",
+        title=f"{_title(metric)} over frames",
+        thesis=thesis,
+        body=join([key(items), _chart(plot, metric, rows)]),
+        caption=join(
+            [
+                f"{_sentence(metric)} Mean over {len(subject.scenarios)} test scenarios; the bands are 95 %"
+                " bootstrap intervals over scenarios. ",
+                "Grey: floors that cost nothing.",
+            ]
+        ),
+        data=_numbers(subject, [(row.name, values) for row, values in series], "method"),
+    )
+
+
+def _chart(plot: Plot, metric: Metric, rows: Sequence[Row]) -> Markup:
+    names = ", ".join(row.name for row in rows)
+    return plot.svg(f"{metric.name} over frames", f"{metric.summary}, one line each for {names}.")
+
+
+def energy_curves(subject: Subject) -> Iterator[Figure]:
+    """Yield kinetic energy: what is kept of it (Fig. 5.19), and its value (Fig. 5.28)."""
+    first = subject.entries[0].card.submission
+    kept = [(row, _mean(row.scores["energy_retention"])) for row in subject.rows]
+    true = _mean(first["energy_retention_true"])
+    yield _energy_figure(
+        subject,
+        "energy-kept",
+        "Kinetic energy kept",
+        "Fig. 5.19",
+        [("truth", "truth", 100.0 * true)] + [(row.name, row.kind, 100.0 * values) for row, values in kept],
+        "kinetic energy [% of the last given frame]",
+        f"Kinetic energy relative to the last given frame, mean over {len(subject.scenarios)} test scenarios."
+        " A surrogate that damps falls below the truth, one that blows up rises above it;"
+        " more energy than the truth is no merit.",
+    )
+    scenario = subject.scenarios[0]
+    yield _energy_figure(
+        subject,
+        "energy-raw",
+        f"Kinetic energy, scenario {scenario}",
+        "Fig. 5.28",
+        [("truth", "truth", first["energy_true"].per_frame[0])]
+        + [(row.name, row.kind, row.scores["energy_predicted"].per_frame[0]) for row in subject.rows],
+        "kinetic energy [mass length²/frame²]",
+        f"E = Σ m |u|² / 2 with u the displacement per frame, in scenario {scenario}.",
+    )
+
+
+def _energy_figure(
+    subject: Subject,
+    name: str,
+    title: str,
+    thesis: str,
+    series: Sequence[tuple[str, str, Floats]],
+    quantity: str,
+    text: str,
+) -> Figure:
+    top = np.nanmax(series[0][2], initial=0.0)
+    cut = [np.minimum(values, TOLERATED * top) if top > 0.0 else values for _, _, values in series]
+    plot = Plot(_frame_axis(subject), spanning(cut, log=False), x_label="frame", y_label=quantity)
+    for label, kind, values in reversed(series):
+        plot.line(subject.frames, values, kind, label)
+    beyond = any(np.any(values > TOLERATED * top) for _, _, values in series) and top > 0.0
+    more = f" What exceeds {TOLERATED:g} times the truth's maximum is cut off." if beyond else ""
+    names = ", ".join(label for label, _, _ in series)
+    return Figure(
+        name=name,
+        title=title,
+        thesis=thesis,
+        body=join(
+            [
+                key([(kind, label) for label, kind, _ in series]),
+                plot.svg(title, f"Kinetic energy over frames of {names}."),
+            ]
+        ),
+        caption=join([text, more]),
+        data=_numbers(subject, [(label, values) for label, _, values in series], "method"),
+    )
+
+
+def body_curves(subject: Subject) -> Iterator[Figure]:
+    """Yield how elastic bodies keep their shape and hold together (section 4.8.2)."""
+    for name in ("shape_error", "connectivity"):
+        rows = [row for row in subject.rows if name in row.scores]
+        if rows:
+            yield _body_figure(subject, rows, name)
+
+
+def _body_figure(subject: Subject, rows: Sequence[Row], name: str) -> Figure:
+    metric = rows[0].scores[name].metric
+    series = [(row.name, row.kind, _mean(row.scores[name])) for row in rows]
+    true = rows[0].scores.get(f"{name}_true")
+    if true is not None:
+        series.insert(0, ("truth", "truth", _mean(true)))
+    y = linear(0.0, 1.0) if name == "connectivity" else spanning([s for _, _, s in series], log=False)
+    plot = Plot(_frame_axis(subject), y, x_label="frame", y_label=_quantity(metric))
+    for label, kind, values in reversed(series):
+        plot.line(subject.frames, values, kind, label)
+    return Figure(
+        name=f"bodies-{name.replace('_', '-')}",
+        title=f"{_title(metric)} of jelly and rope",
+        thesis="section 4.8.2",
+        body=join([key([(kind, label) for label, kind, _ in series]), _chart(plot, metric, rows)]),
+        caption=join([f"{_sentence(metric)} Mean over the scenarios with an elastic body."]),
+        data=_numbers(subject, [(label, values) for label, _, values in series], "method"),
+    )
+
+
+def _frame_axis(subject: Subject) -> Scale:
+    return linear(float(subject.frames[0]), float(subject.frames[-1]), count=6, tight=True)
+
+
+def _mean(score: Score) -> Floats:
+    """Return the mean over scenarios per frame, NaN where none has a value, shape [frame]."""
+    known = np.isfinite(score.per_frame)
+    count = known.sum(axis=0)
+    total = np.where(known, score.per_frame, 0.0).sum(axis=0)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def _interval(score: Score) -> tuple[Floats, Floats]:
+    """Return the 95 % bootstrap interval of the mean per frame."""
+    bounds = np.array([bootstrap_interval(column) for column in score.per_frame.T])
+    return bounds[:, 0], bounds[:, 1]
+
+
+def _least(series: Iterator[Floats]) -> float:
+    return float(min((np.min(s[np.isfinite(s)], initial=0.0) for s in series), default=0.0))
+
+
+def _title(metric: Metric) -> str:
+    written = metric.name.replace("_", " ").replace("pearson", "correlation")
+    for short in ("mse", "mae", "rmse"):
+        written = written.replace(f" {short}", f" {short.upper()}")
+    return written[0].upper() + written[1:]
+
+
+def _quantity(metric: Metric) -> str:
+    unit = metric.unit.replace("^2", "²")
+    return _title(metric) + (f" [{unit}]" if unit != "1" else "")
+
+
+def _sentence(metric: Metric) -> str:
+    unit = f" [{metric.unit.replace('^2', '²')}]" if metric.unit != "1" else ""
+    return f"{metric.summary[0].upper()}{metric.summary[1:]}{unit} ({metric.source})."
+
+
+def _numbers(subject: Subject, series: Sequence[tuple[str, Floats]], what: str) -> Markup:
+    """Return the values at the frames of interest and the last one."""
+    frames = sorted({*subject.frames_of_interest, int(subject.frames[-1])})
+    column = {int(frame): i for i, frame in enumerate(subject.frames)}
+    rows = [[name, *(html(values[column[frame]]) for frame in frames)] for name, values in series]
+    return table([what, *(tag("span", f"frame {frame}") for frame in frames)], rows, label="Numbers")

@@ -1,0 +1,137 @@
+"""How faulty prediction files are made: the registry of faults and changes to a valid file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import netCDF4
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from submission_data import FRAMES, GIVEN, HORIZON, PARTICLES, TESTS, Bench
+
+DIMS = ("scenario", "frame", "particle", "space")
+SHAPE = (len(TESTS), HORIZON, PARTICLES, 2)
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A way to be wrong.
+
+    Attributes:
+        make: writes the file and returns its path.
+        check: check that must name it.
+        exit_code: exit code that it must lead to.
+        hostile: whether it must be looked at in a child process only.
+        says: a word that the message must contain.
+    """
+
+    make: Callable[[Bench], Path]
+    check: str
+    exit_code: int
+    hostile: bool = False
+    says: str = ""
+
+
+FAULTS: dict[str, Fault] = {}
+
+
+def fault(
+    check: str, exit_code: int = 1, *, hostile: bool = False, says: str = ""
+) -> Callable[[Callable[[Bench], Path]], Callable[[Bench], Path]]:
+    """Register a function that makes a faulty file."""
+
+    def register(make: Callable[[Bench], Path]) -> Callable[[Bench], Path]:
+        FAULTS[make.__name__] = Fault(make, check, exit_code, hostile, says)
+        return make
+
+    return register
+
+
+def simple(check: str, name: str, change: Callable[[h5py.File], object], *, says: str = "") -> None:
+    """Register a fault that changes an open copy of the valid file."""
+
+    def make(bench: Bench) -> Path:
+        path = bench.copy(f"{name}.nc")
+        with h5py.File(path, "r+") as file:
+            change(file)
+        return path
+
+    FAULTS[name] = Fault(make, check, 4 if check == "dataset" else 1, says=says)
+
+
+def replace(
+    file: h5py.File, name: str, dims: tuple[str, ...], data: Any = None, **options: Any
+) -> h5py.Dataset:
+    """Replace a variable by another of the same name, with dimension scales attached."""
+    attributes = {} if name not in file else {k: v for k, v in file[name].attrs.items() if k == "units"}
+    if name in file:
+        del file[name]
+    dataset = file.create_dataset(name, data=data, **options)
+    dataset.attrs.update(attributes)
+    for axis, dim in enumerate(dims):
+        if dim in file and dim != name:
+            dataset.dims[axis].attach_scale(file[dim])
+    return dataset
+
+
+def positions(file: h5py.File) -> NDArray[np.float32]:
+    """Return the positions of an open file."""
+    values: NDArray[np.float32] = file["position"][...]
+    return values
+
+
+def store(file: h5py.File, values: ArrayLike, **options: Any) -> h5py.Dataset:
+    """Put other positions in place of those of an open file."""
+    return replace(file, "position", DIMS, np.asarray(values), **options)
+
+
+@contextmanager
+def built(
+    bench: Bench,
+    name: str,
+    *,
+    scenarios: ArrayLike = TESTS,
+    frames: ArrayLike = range(GIVEN, FRAMES),
+    particles: int = PARTICLES,
+    dims: tuple[str, ...] = DIMS,
+    unlimited: bool = False,
+) -> Iterator[tuple[Path, netCDF4.Dataset]]:
+    """Yield a new file with other coordinates; unwritten frames stand still in the middle."""
+    path = bench.folder / f"{name}.nc"
+    numbers = {"scenario": np.array(scenarios, np.int64), "frame": np.array(frames, np.int64)}
+    lengths = {d: len(n) for d, n in numbers.items()} | {"particle": particles, "space": 2}
+    with netCDF4.Dataset(bench.valid) as valid, netCDF4.Dataset(path, "w") as file:
+        for dim, length in lengths.items():
+            file.createDimension(dim, None if unlimited and dim == "frame" else length)
+        for dim, values in numbers.items():
+            file.createVariable(dim, "i8", (dim,))[:] = values
+        position = file.createVariable("position", "f4", dims, zlib=True)
+        position[:] = np.full([lengths[d] for d in dims], 0.5, np.float32)
+        file.setncatts({n: valid.getncattr(n) for n in valid.ncattrs()})
+        yield path, file
+
+
+def rows(bench: Bench, name: str, scenarios: list[int], frames: list[int], pick: Any) -> Path:
+    """Write a selection of the valid positions under other coordinates."""
+    with h5py.File(bench.valid) as valid:
+        values = positions(valid)[pick]
+    with built(bench, name, scenarios=scenarios, frames=frames) as (path, file):
+        file["position"][:] = values
+    return path
+
+
+def attribute(name: str, attribute: str, value: Any, *, check: str = "format", says: str = "") -> None:
+    """Register a fault that sets a global attribute, or removes it where the value is None."""
+
+    def change(file: h5py.File) -> None:
+        if value is None:
+            del file.attrs[attribute]
+        else:
+            file.attrs[attribute] = value
+
+    simple(check, name, change, says=says or attribute)

@@ -1,0 +1,97 @@
+"""Generated tiny data and submissions to it, for tests of the scorer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagbench.exam import Exam, load_exam
+from lagbench.generation import GenerationResult
+from lagbench.registry import Registry, Size
+from lagbench.score_card import ScoreCard
+from lagbench.scoring import evaluate, score
+from lagbench.submission import write
+
+Floats = NDArray[np.floating[Any]]
+Predict = Callable[[Floats, int, int], Floats]
+"""From all true positions [frame, particle, 2], given frames n and horizon h to predictions."""
+
+
+@dataclass(frozen=True)
+class ScoreBench:
+    """A generated data set whose hashes stand in its manifest only."""
+
+    root: Path
+    registry: Registry
+    size: Size
+
+    @property
+    def exam(self) -> Exam:
+        """Its test subset."""
+        return load_exam(self.size, self.root)
+
+    def truth(self, scenario: int) -> Floats:
+        """All positions of a test scenario, shape [frame, particle, 2]."""
+        with self.exam.opened(scenario) as opened:
+            return np.asarray(opened.file.read("position"))
+
+    def submit(self, path: Path, predict: Predict, **labels: Any) -> Path:
+        """Write the submission of a method."""
+        n, h = self.size.task.input_frames, self.size.task.horizon
+        guesses = {i: predict(self.truth(i), n, h) for i in self.size.subsets["test"]}
+        return write(
+            path,
+            guesses,
+            split=self.size.split,
+            size=self.size.name,
+            root=self.root,
+            registry=self.registry,
+            **{"method": "guess", **labels},
+        )
+
+    def evaluate(self, path: Path, **options: Any) -> ScoreCard:
+        """Return the score card of a submission."""
+        return evaluate(path, root=self.root, registry=self.registry, **options)
+
+    def score(self, path: Path, **options: Any) -> ScoreCard:
+        """Score a submission and write the card."""
+        return score(path, root=self.root, registry=self.registry, **options)
+
+
+def bench_of(generated: GenerationResult, registry: Registry) -> ScoreBench:
+    """Return the bench of a generated data set."""
+    return ScoreBench(generated.root, registry, registry.size(generated.split, generated.size))
+
+
+def right(truth: Floats, n: int, h: int) -> Floats:
+    """Predict the truth."""
+    return truth[n : n + h]
+
+
+def still(truth: Floats, n: int, h: int) -> Floats:
+    """Predict the last given frame."""
+    return np.broadcast_to(truth[n - 1], truth[n : n + h].shape)
+
+
+def straight(truth: Floats, n: int, h: int) -> Floats:
+    """Predict motion at the last given velocity."""
+    last = truth[n - 1].astype(np.float64)
+    steps = np.arange(1, h + 1)[:, None, None]
+    return np.asarray(last + steps * (last - truth[n - 2]))
+
+
+def late(truth: Floats, n: int, h: int) -> Floats:
+    """Predict the truth, one frame late."""
+    return truth[n - 1 : n + h - 1]
+
+
+def half_right(truth: Floats, n: int, h: int) -> Floats:
+    """Predict the truth for half the horizon, then stand still."""
+    guess = np.array(truth[n : n + h])
+    guess[h // 2 :] = guess[h // 2 - 1]
+    return guess

@@ -1,0 +1,261 @@
+"""The scorer against closed answers, other routes to the same numbers, and itself."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from score_bench import ScoreBench, bench_of, half_right, right, still, straight
+
+from lagbench.dataset import open_split
+from lagbench.errors import ChecksFailedError, DataError, UnreadableFileError, UsageError, WorkFailedError
+from lagbench.generation import GenerationResult
+from lagbench.metrics import Direction
+from lagbench.progress import Progress
+from lagbench.registry import Registry
+from lagbench.score_card import ScoreCard, digits
+from lagbench.score_file import read_statistics
+from lagbench.scoring import score
+from lagbench.sitting import SUBMISSION
+from lagbench.submission import template, validate
+
+
+@pytest.fixture(scope="module")
+def bench(generated: GenerationResult, unmeasured: Registry) -> ScoreBench:
+    """Tiny curl noise, two test scenarios of 20 predicted frames."""
+    return bench_of(generated, unmeasured)
+
+
+@pytest.fixture(scope="module")
+def standing(bench: ScoreBench, tmp_path_factory: pytest.TempPathFactory) -> ScoreCard:
+    """The score card of persistence, written."""
+    folder = tmp_path_factory.mktemp("standing")
+    return bench.score(bench.submit(folder / "predictions.nc", still))
+
+
+def held(card: ScoreCard) -> dict[str, Any]:
+    """Return what scores.json holds."""
+    return dict(json.loads(card.files[0].read_bytes()))
+
+
+def test_truth_scores_perfectly(bench: ScoreBench, tmp_path: Path) -> None:
+    """The truth itself gets the perfect value of every metric that has one, and is suspect."""
+    card = bench.evaluate(bench.submit(tmp_path / "predictions.nc", right))
+    for name, found in card.submission.items():
+        if found.metric.perfect is not None:
+            np.testing.assert_allclose(found.values, found.metric.perfect, atol=1e-12, err_msg=name)
+    assert card.submission["stable_frames"].mean == bench.size.task.horizon
+    raised = {flag.name for flag in card.flags if flag.raised}
+    assert raised == {"copy_suspect", "below_twin_floor"}
+
+
+@pytest.mark.parametrize(("row", "predict"), [("persistence", still), ("constant-velocity", straight)])
+def test_floors_are_what_a_user_would_submit(
+    bench: ScoreBench, tmp_path: Path, row: str, predict: Any
+) -> None:
+    """A floor written as a predictions.nc scores exactly like the scorer's own row."""
+    card = bench.evaluate(bench.submit(tmp_path / "predictions.nc", predict))
+    for name, found in card.submission.items():
+        np.testing.assert_array_equal(found.per_frame, card.scores[row][name].per_frame, err_msg=name)
+        np.testing.assert_array_equal(found.values, card.scores[row][name].values, err_msg=name)
+
+
+def test_template_is_persistence(bench: ScoreBench, tmp_path: Path) -> None:
+    """The template to fill scores like persistence."""
+    path = template(
+        bench.size.split, bench.size.name, output=tmp_path / "t.nc", root=bench.root, registry=bench.registry
+    ).path
+    card = bench.evaluate(path)
+    assert card.submission["mse_avg"].mean == card.scores["persistence"]["mse_avg"].mean
+    assert card.against("persistence").difference == 0.0
+
+
+def test_position_rmse_by_xarray(bench: ScoreBench, standing: ScoreCard) -> None:
+    """The position RMSE equals that of the public loader's arrays: frame mean, root, scenario mean."""
+    data = open_split(bench.size.split, size=bench.size.name, root=bench.root)
+    n, h = bench.size.task.input_frames, bench.size.task.horizon
+    position = data["position"].astype("float64").compute()
+    error = position.isel(frame=n - 1).drop_vars("frame") - position.isel(frame=slice(n, n + h))
+    rmse = ((error**2).mean(("frame", "particle", "space")) ** 0.5).values
+    np.testing.assert_allclose(standing.submission["position_rmse"].values, rmse, rtol=1e-6)
+    data.close()
+
+
+def test_json_says_what_the_card_says(standing: ScoreCard) -> None:
+    """Means, intervals, values per scenario and frames of interest stand in scores.json, nine digits each."""
+    said = held(standing)
+    assert set(said["rows"]) == {SUBMISSION, "persistence", "constant-velocity"}
+    for row, scores in standing.scores.items():
+        for name, found in scores.items():
+            entry = said["rows"][row][name]
+            assert entry["mean"] == digits(found.mean)
+            assert entry["values"] == [digits(value) for value in found.values.tolist()]
+            assert entry["undefined"] == list(found.undefined)
+            assert ("at" in entry) == found.metric.per_frame
+    frames = said["task"]["frames"]
+    assert frames == sorted({*standing.setting.frames_of_interest, standing.setting.predicted_frames[-1]})
+    assert list(said["rows"][SUBMISSION]["position_mse"]["at"]) == [str(frame) for frame in frames]
+    assert said["metrics"]["vorticity_rmse"] == {
+        "family": "vorticity",
+        "unit": "1/frame",
+        "direction": "lower",
+        "perfect": 0.0,
+        "source": "Eq. 3.3, Table 5.4",
+        "summary": "root mean squared vorticity error over the counted nodes",
+    }
+
+
+def test_undefined_is_null_and_counted(standing: ScoreCard) -> None:
+    """At rest there is no correlation: null, every frame counted, in both scenarios."""
+    entry = held(standing)["rows"][SUBMISSION]["vorticity_pearson"]
+    assert entry["mean"] is None
+    assert entry["values"] == [None, None]
+    assert entry["undefined"] == [standing.setting.horizon] * 2
+
+
+def test_freezing_midway_leaves_frames_out(bench: ScoreBench, tmp_path: Path) -> None:
+    """A rollout right for 10 of 20 frames, then frozen: Pearson is 1 over 10 frames, 10 undefined."""
+    card = bench.evaluate(bench.submit(tmp_path / "predictions.nc", half_right, diverged_at={3: 16, 4: 16}))
+    pearson = card.submission["vorticity_pearson"]
+    np.testing.assert_allclose(pearson.values, 1.0)
+    assert pearson.undefined == (10, 10)
+    assert card.submission["vorticity_rmse"].mean > 0.0
+    assert card.as_json()["diverged_at"] == {"3": 16, "4": 16}
+
+
+def test_scores_follow_from_scores_nc(standing: ScoreCard) -> None:
+    """Whoever aggregates scores.nc again gets the digits of scores.json."""
+    stored = read_statistics(standing.files[1])
+    said = held(standing)
+    again = stored.scores()
+    assert list(again) == list(said["rows"][SUBMISSION])
+    for name, found in again.items():
+        entry = said["rows"][SUBMISSION][name]
+        assert entry["mean"] == digits(found.mean), name
+        assert entry["interval"] == [digits(bound) for bound in found.interval], name
+        assert entry["undefined"] == list(found.undefined), name
+    assert stored.predictions_sha256 == said["predictions_sha256"]
+
+
+def test_same_bytes_from_worker_processes(bench: ScoreBench, standing: ScoreCard, tmp_path: Path) -> None:
+    """Two workers and another folder give the same bytes; nothing of place or time is in them."""
+    source = standing.files[0].parent / "predictions.nc"
+    card = bench.score(source, workers=2, output_dir=tmp_path / "elsewhere")
+    for first, second in zip(standing.files, card.files, strict=True):
+        assert first.read_bytes() == second.read_bytes()
+    text = card.files[0].read_text()
+    assert str(bench.root) not in text
+    assert str(source.parent) not in text
+
+
+def test_order_of_scenarios_does_not_matter(bench: ScoreBench, standing: ScoreCard, tmp_path: Path) -> None:
+    """Scenarios stored in another order are matched by id and give the same bytes."""
+    shuffled = tmp_path / "predictions.nc"
+    shuffled.write_bytes((standing.files[0].parent / "predictions.nc").read_bytes())
+    with h5py.File(shuffled, "r+") as file:
+        for name in ("scenario", "position"):
+            file[name][...] = file[name][...][::-1]
+    card = bench.score(shuffled)
+    assert card.header.scenarios == (4, 3)
+    assert card.files[0].read_bytes() == standing.files[0].read_bytes()
+    assert card.files[1].read_bytes() == standing.files[1].read_bytes()
+
+
+def test_a_wild_prediction_gets_finite_scores(bench: ScoreBench, tmp_path: Path) -> None:
+    """Positions of 1e30 saturate statistics; scores.json still is JSON without infinities."""
+
+    def wild(truth: Any, n: int, h: int) -> Any:
+        guess = np.array(straight(truth, n, h))
+        guess[h // 2 :] *= 1e30
+        return guess
+
+    card = bench.score(bench.submit(tmp_path / "predictions.nc", wild))
+    entry = held(card)["rows"][SUBMISSION]["position_mse"]
+    assert math.isfinite(entry["mean"])
+    assert entry["mean"] > 1e30
+    assert {warning["check"] for warning in held(card)["warnings"]} >= {"in_domain", "max_displacement"}
+    assert dict(held(card)["flags"])["physics"]["raised"]
+
+
+def test_progress_reaches_its_total(bench: ScoreBench, standing: ScoreCard) -> None:
+    """Every frame of every scenario is counted once, in this process and in workers."""
+    source = standing.files[0].parent / "predictions.nc"
+    for workers in (1, 2):
+        seen: list[Progress] = []
+        bench.evaluate(source, workers=workers, progress=seen.append)
+        assert seen[-1].done == seen[-1].total == 2 * bench.size.task.horizon
+
+
+def test_directions_of_floors_are_sane(standing: ScoreCard) -> None:
+    """On this smooth flow constant velocity is closer than persistence in every judged pointwise metric."""
+    for name, found in standing.scores["constant-velocity"].items():
+        metric = found.metric
+        if metric.family == "pointwise" and metric.direction is not Direction.NONE:
+            assert metric.loss(found.mean) < metric.loss(standing.scores["persistence"][name].mean), name
+
+
+def test_invalid_predictions_are_refused(bench: ScoreBench, standing: ScoreCard, tmp_path: Path) -> None:
+    """What the validation rejects is not scored and nothing is written; the listener saw why."""
+    broken = tmp_path / "predictions.nc"
+    broken.write_bytes((standing.files[0].parent / "predictions.nc").read_bytes())
+    with h5py.File(broken, "r+") as file:
+        file["position"][0, 3, 5, 1] = np.nan
+    seen: list[Any] = []
+    with pytest.raises(ChecksFailedError, match="finite"):
+        bench.score(broken, examined=seen.append)
+    assert [finding.check for finding in seen[0].errors] == ["finite"]
+    assert list(tmp_path.iterdir()) == [broken]
+
+
+def test_a_file_of_another_kind(bench: ScoreBench, tmp_path: Path) -> None:
+    """Text renamed .nc is unreadable, exit code 3."""
+    path = tmp_path / "predictions.nc"
+    path.write_text("not predictions")
+    with pytest.raises(UnreadableFileError) as caught:
+        bench.score(path)
+    assert caught.value.exit_code == 3
+
+
+def test_without_the_test_subset(bench: ScoreBench, standing: ScoreCard, tmp_path: Path) -> None:
+    """A root without the data set is a data error that names the command which makes it."""
+    source = standing.files[0].parent / "predictions.nc"
+    with pytest.raises(DataError, match="lagbench generate --split curl-noise --size tiny"):
+        score(source, root=tmp_path, registry=bench.registry)
+
+
+def test_without_statistics_of_train(bench: ScoreBench, tmp_path: Path) -> None:
+    """With the manifest gone and nothing recorded, the error says what is missing and how to get it."""
+    root = tmp_path / "root"
+    for scenario in bench.size.subsets["test"]:
+        source = bench.exam.truth.path(scenario)
+        target = root / source.relative_to(bench.root)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(source.read_bytes())
+    path = bench.submit(tmp_path / "predictions.nc", still)
+    assert validate(path, root=bench.root, registry=bench.registry).valid
+    with pytest.raises(DataError, match="recorded"):
+        score(path, root=root, registry=bench.registry)
+
+
+def test_a_folder_that_cannot_be_written(bench: ScoreBench, standing: ScoreCard, tmp_path: Path) -> None:
+    """A file in the place of the output folder fails the work, exit code 5, without a traceback."""
+    taken = tmp_path / "taken"
+    taken.write_text("")
+    with pytest.raises(WorkFailedError):
+        bench.score(standing.files[0].parent / "predictions.nc", output_dir=taken)
+
+
+def test_optional_metrics_name_their_extra(bench: ScoreBench, standing: ScoreCard) -> None:
+    """Asking for Sinkhorn without POT names the extra that installs it; with it, it is scored."""
+    source = standing.files[0].parent / "predictions.nc"
+    if importlib.util.find_spec("ot") is None:
+        with pytest.raises(UsageError, match=r"lagbench\[transport\]"):
+            bench.evaluate(source, extras=("transport",))
+    else:
+        assert bench.evaluate(source, extras=("transport",)).submission["sinkhorn"].mean > 0.0

@@ -1,0 +1,175 @@
+"""scores.nc and scores.json as files: size, preview, damage."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+from score_bench import ScoreBench, bench_of, straight
+
+from lagbench.errors import UnreadableFileError
+from lagbench.generation import GenerationResult
+from lagbench.metrics import Tally
+from lagbench.metrics.distributions import histograms
+from lagbench.preview import FRAMES, PARTICLES
+from lagbench.registry import Registry
+from lagbench.score_card import ScoreCard, digits, read_scores
+from lagbench.score_file import read_statistics, write_statistics
+from lagbench.sitting import SUBMISSION, as_stored
+
+
+@pytest.fixture(scope="module")
+def bench(generated: GenerationResult, unmeasured: Registry) -> ScoreBench:
+    """Tiny curl noise."""
+    return bench_of(generated, unmeasured)
+
+
+@pytest.fixture(scope="module")
+def card(bench: ScoreBench, tmp_path_factory: pytest.TempPathFactory) -> ScoreCard:
+    """The score card of constant velocity, written."""
+    return bench.score(bench.submit(tmp_path_factory.mktemp("card") / "predictions.nc", straight))
+
+
+def noisy(card: ScoreCard) -> ScoreCard:
+    """Return a card as large as one of cavity full and as hard to compress: noise throughout."""
+    rng = np.random.Generator(np.random.PCG64(0))
+    names, frames = card.tallies[SUBMISSION][3].names, tuple(range(6, 96))
+    ones = np.ones((len(names), 90), np.int64)
+    tallies = {
+        i: as_stored(Tally(names, frames, rng.standard_normal(ones.shape), ones, 0 * ones))
+        for i in range(54, 60)
+    }
+    preview = replace(
+        card.preview,
+        map_frames=tuple(range(8)),
+        vorticity=rng.standard_normal((2, 8, 40, 40)).astype(np.float32),
+        histogram=rng.random((2, 8, 64)).astype(np.float32),
+        histogram_range=rng.standard_normal((8, 2)).astype(np.float32),
+        film_frames=tuple(range(FRAMES)),
+        particles=tuple(range(PARTICLES)),
+        material=np.zeros(PARTICLES, np.int8),
+        film=rng.random((2, FRAMES, PARTICLES, 2)).astype(np.float32),
+    )
+    return replace(card, tallies={SUBMISSION: tallies}, preview=preview)
+
+
+def test_a_full_cavity_submission_takes_300_kb(card: ScoreCard, tmp_path: Path) -> None:
+    """Even incompressible statistics and pictures of six scenarios of 90 frames stay below 300 kB."""
+    path = tmp_path / "scores.nc"
+    write_statistics(noisy(card), path)
+    assert 200_000 < path.stat().st_size <= 300_000
+
+
+def test_statistics_read_back(card: ScoreCard) -> None:
+    """Statistics, and which were measured and undefined, come back bit for bit."""
+    stored = read_statistics(card.files[1])
+    for scenario, tally in card.tallies[SUBMISSION].items():
+        again = stored.tallies[scenario]
+        assert (again.names, again.frames) == (tally.names, tally.frames)
+        for field in ("total", "weight", "undefined"):
+            np.testing.assert_array_equal(getattr(again, field), getattr(tally, field))
+
+
+def test_stored_statistics_saturate() -> None:
+    """Beyond float32 a statistic becomes the largest float32, of either sign; rounding is to float32."""
+    values = {0: {"a": 1e300, "b": -1e300, "c": 0.1, "d": math.nan}}
+    stored = as_stored(Tally.of("abcd", (0,), values))
+    largest = float(np.finfo(np.float32).max)
+    np.testing.assert_array_equal(stored.total[:, 0], [largest, -largest, float(np.float32(0.1)), 0.0])
+    assert stored.undefined[:, 0].tolist() == [0, 0, 0, 1]
+
+
+def test_preview_shows_the_truth_beside_the_prediction(bench: ScoreBench, card: ScoreCard) -> None:
+    """Xarray unpacks the preview to within one level of the positions, fields and shares it was made of."""
+    with xr.open_dataset(card.files[1], group="preview") as preview:
+        n = bench.size.task.input_frames
+        truth = bench.truth(int(preview.attrs["scenario"]))
+        frames, particles = preview["film_frame"].values, preview["film_particle"].values
+        assert len(frames) == bench.size.task.horizon
+        assert len(particles) == PARTICLES
+        level = 2.0 / 65534
+        film = preview["film"].values
+        np.testing.assert_allclose(film[0], truth[frames][:, particles], atol=level)
+        guess = straight(truth, n, len(frames))[:, particles]
+        np.testing.assert_allclose(film[1], guess, atol=level)
+        omega = preview["vorticity"].values
+        assert np.isnan(omega[0]).any()
+        assert np.array_equal(np.isnan(omega[0]), np.isnan(omega[1]))
+        for i in range(len(preview["map_frame"])):
+            known = ~np.isnan(omega[0, i])
+            shares = histograms(omega[0, i][known], omega[1, i][known])
+            assert shares is not None
+            assert abs(preview["histogram"].values[:, i].sum(axis=1) - 1.0).max() < 0.01
+
+
+def test_json_read_back(card: ScoreCard) -> None:
+    """What compare needs comes back from scores.json: values per scenario, identity, ranking."""
+    published = read_scores(card.files[0])
+    assert published.ranking == "vorticity_rmse"
+    assert published.identity["method"] == card.header.method
+    for row, scores in card.scores.items():
+        for name, score in scores.items():
+            again = published.scores[row][name]
+            assert [digits(v) for v in again.values.tolist()] == [digits(v) for v in score.values.tolist()]
+            assert again.undefined == score.undefined
+
+
+def damaged(card: ScoreCard, change: Callable[[dict[str, Any]], object]) -> bytes:
+    """Return scores.json after a change."""
+    held = json.loads(card.files[0].read_bytes())
+    change(held)
+    return json.dumps(held).encode()
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda _: b"",
+        lambda _: b"\xff\xfe",
+        lambda _: b"[1, 2]",
+        lambda _: b"null",
+        lambda card: card.files[0].read_bytes()[:500],
+        lambda card: damaged(card, lambda held: held.update(lagbench_scores=2)),
+        lambda card: damaged(card, lambda held: held.pop("rows")),
+        lambda card: damaged(card, lambda held: held.update(rows=[])),
+        lambda card: damaged(card, lambda held: held["task"].update(scenarios=["a"])),
+        lambda card: damaged(card, lambda held: held["task"].update(scenarios=[3])),
+    ],
+)
+def test_damaged_json_is_unreadable(
+    card: ScoreCard, tmp_path: Path, make: Callable[[ScoreCard], bytes]
+) -> None:
+    """Whatever is wrong with a scores.json, the error names the file and how to make it again."""
+    path = tmp_path / "scores.json"
+    path.write_bytes(make(card))
+    with pytest.raises(UnreadableFileError, match="lagbench score"):
+        read_scores(path)
+
+
+@pytest.mark.parametrize("length", [0, 100, 5000, 20000])
+def test_truncated_netcdf_is_unreadable(card: ScoreCard, tmp_path: Path, length: int) -> None:
+    """A scores.nc that was cut off is unreadable, not a traceback."""
+    path = tmp_path / "scores.nc"
+    path.write_bytes(card.files[1].read_bytes()[:length])
+    with pytest.raises(UnreadableFileError):
+        read_statistics(path)
+
+
+def test_predictions_are_no_scores(card: ScoreCard) -> None:
+    """A predictions.nc in the place of scores.nc is told apart."""
+    with pytest.raises(UnreadableFileError, match=r"not a scores\.nc"):
+        read_statistics(card.files[1].parent / "predictions.nc")
+
+
+def test_nine_digits() -> None:
+    """Numbers keep nine significant digits; what is no number is None."""
+    assert digits(1.23456789012e-7) == 1.23456789e-7
+    assert digits(math.nan) is None
+    assert digits(math.inf) is None
