@@ -16,7 +16,7 @@ from .metrics import Comparison, Direction, Score
 from .metrics import compare as compare_scores
 from .metrics.comparison import FEWEST_SCENARIOS
 from .registry import Registry
-from .score_card import IDENTITY, JSON_NAME, PublishedScores, digits, read_scores
+from .score_card import JSON_NAME, PublishedScores, digits, parse_scores, read_scores
 from .scoring import evaluate
 from .sitting import SUBMISSION
 
@@ -196,13 +196,8 @@ def _contestant(
 def _scored(
     path: Path, root: str | Path | None, workers: int | None, registry: Registry | None
 ) -> PublishedScores:
-    card = evaluate(path, root=root, workers=workers, registry=registry)
-    return PublishedScores(
-        identity={name: str(getattr(card.header, name)) for name in IDENTITY},
-        predictions_sha256=card.predictions_sha256,
-        ranking=card.ranking,
-        scores=card.scores,
-    )
+    # through JSON, so that its digits are those of a scores.json
+    return parse_scores(evaluate(path, root=root, workers=workers, registry=registry).as_json())
 
 
 def _floor(beside: Contestant, name: str, scores: Mapping[str, Score]) -> Contestant:

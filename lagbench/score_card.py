@@ -25,7 +25,16 @@ from .sitting import SUBMISSION
 from .statistics import round_digits
 from .submission import Finding, Header
 
-__all__ = ["FORMAT", "JSON_NAME", "PublishedScores", "ScoreCard", "digits", "read_scores", "write_json"]
+__all__ = [
+    "FORMAT",
+    "JSON_NAME",
+    "PublishedScores",
+    "ScoreCard",
+    "digits",
+    "parse_scores",
+    "read_scores",
+    "write_json",
+]
 
 FORMAT = 1
 """Number of the layout of scores.json and scores.nc; stored as ``lagbench_scores``."""
@@ -203,20 +212,7 @@ def read_scores(path: Path) -> PublishedScores:
         UnreadableFileError: it is not one.
     """
     try:
-        held = json.loads(path.read_bytes())
-        if held["lagbench_scores"] != FORMAT:
-            raise ValueError(f"layout {held['lagbench_scores']!r}, not {FORMAT}")
-        ids = tuple(int(i) for i in held["task"]["scenarios"])
-        known = available()
-        return PublishedScores(
-            identity={name: str(held[name]) for name in IDENTITY},
-            predictions_sha256=str(held["predictions_sha256"]),
-            ranking=str(held["ranking_metric"]),
-            scores={
-                row: {n: _read_score(known[n], ids, said) for n, said in scores.items() if n in known}
-                for row, scores in held["rows"].items()
-            },
-        )
+        return parse_scores(json.loads(path.read_bytes()))
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise UnreadableFileError(
             "not a scores.json of lagbench",
@@ -225,6 +221,28 @@ def read_scores(path: Path) -> PublishedScores:
             got=f"{type(error).__name__}: {error}",
             fix="score the predictions again: lagbench score predictions.nc",
         ) from error
+
+
+def parse_scores(held: Mapping[str, Any]) -> PublishedScores:
+    """Return what a score card as JSON says: :meth:`ScoreCard.as_json`, or a scores.json.
+
+    Raises:
+        ValueError: another layout, or numbers of values that do not fit; likewise KeyError,
+            TypeError and AttributeError where keys are missing or of another kind.
+    """
+    if held["lagbench_scores"] != FORMAT:
+        raise ValueError(f"layout {held['lagbench_scores']!r}, not {FORMAT}")
+    ids = tuple(int(i) for i in held["task"]["scenarios"])
+    known = available()
+    return PublishedScores(
+        identity={name: str(held[name]) for name in IDENTITY},
+        predictions_sha256=str(held["predictions_sha256"]),
+        ranking=str(held["ranking_metric"]),
+        scores={
+            row: {n: _read_score(known[n], ids, said) for n, said in scores.items() if n in known}
+            for row, scores in held["rows"].items()
+        },
+    )
 
 
 def _read_score(metric: Metric, ids: tuple[int, ...], said: Mapping[str, Any]) -> Score:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -87,7 +88,7 @@ class Subject:
     title: str
     entries: tuple[Entry, ...]
 
-    @property
+    @cached_property
     def rows(self) -> tuple[Row, ...]:
         """Entries, then the floors."""
         entries = [Row(name=e.name, kind=e.kind, scores=e.card.submission, entry=e) for e in self.entries]

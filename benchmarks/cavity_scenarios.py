@@ -1,0 +1,57 @@
+"""Print what each cavity scenario is: wall, direction, speed, Reynolds number, start, energy.
+
+    python benchmarks/cavity_scenarios.py --root FOLDER [--size full] [--subset train]
+
+The mean kinetic energy per unit mass is that of the solver's particle velocities over all
+frames [length^2/s^2]. Exits with 1 if two scenarios have the same draws or the same energy.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+from lagbench.format import ScenarioKey, read_scenario, scenario_path
+from lagbench.registry import Size, load
+
+NAMES = ("wall", "direction", "speed", "reynolds_number", "start_substep")
+
+
+def main() -> int:
+    """Print one Markdown row per scenario and say whether all differ."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--root", type=Path, required=True)
+    parser.add_argument("--size", default="full")
+    parser.add_argument("--subset", default="train")
+    given = parser.parse_args()
+    size = load().size("cavity", given.size)
+    ids = size.subsets[given.subset]
+    rows = [_row(size, given.root, given.subset, scenario) for scenario in ids]
+    print("| id | wall | direction | speed [length/s] | Re | start substep | mean kinetic energy |")
+    print("|---:|---|---|---:|---:|---:|---:|")
+    for scenario, (wall, direction, speed, reynolds, start, energy) in zip(ids, rows, strict=True):
+        print(
+            f"| {scenario} | {wall} | {direction} | {speed:.4f} | {reynolds:.1f} | {start} | {energy:.3e} |"
+        )
+    alike = len(rows) - min(len({row[:-1] for row in rows}), len({row[-1] for row in rows}))
+    print(f"\n{len(rows)} scenarios, {alike} alike")
+    return 1 if alike else 0
+
+
+def _row(size: Size, root: Path, subset: str, scenario: int) -> tuple:
+    key = ScenarioKey(
+        split=size.split, size=size.name, version=size.version, scenario=scenario, subset=subset
+    )
+    with read_scenario(scenario_path(root, key)) as file:
+        drawn = tuple(file.header.parameters[name] for name in NAMES)
+        energy = [
+            0.5 * float((file.read("velocity", f).astype(np.float64) ** 2).sum(-1).mean())
+            for f in range(size.frame_count(scenario))
+        ]
+    return *drawn, float(np.mean(energy))
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

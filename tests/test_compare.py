@@ -1,0 +1,188 @@
+"""Comparing submissions: against hand-worked p-values and both ways of naming them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from score_bench import ScoreBench, bench_of, half_right, still, straight
+
+from lagbench.comparison import ComparisonResult, compare
+from lagbench.errors import DataError, UnreadableFileError, UsageError
+from lagbench.generation import GenerationResult
+from lagbench.registry import Registry
+from lagbench.score_tables import card_tables, comparison_table, flag_lines
+
+
+@pytest.fixture(scope="module")
+def bench(generated: GenerationResult, unmeasured: Registry) -> ScoreBench:
+    """Tiny curl noise, two test scenarios."""
+    return bench_of(generated, unmeasured)
+
+
+@pytest.fixture(scope="module")
+def scored(bench: ScoreBench, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Folders of two scored submissions."""
+    folders = {}
+    for name, predict in {"still": still, "straight": straight}.items():
+        folders[name] = tmp_path_factory.mktemp(name)
+        bench.score(bench.submit(folders[name] / "predictions.nc", predict, method=name))
+    return folders
+
+
+def published(
+    folder: Path, values: list[float], *, method: str, metric: str = "mse_avg", **changes: Any
+) -> Path:
+    """Write a scores.json of one metric with these values per scenario."""
+    row = {metric: {"values": values, "undefined": [0] * len(values)}}
+    held = {
+        "lagbench_scores": 1,
+        "split": "cavity",
+        "size": "full",
+        "dataset_version": "1.0.0",
+        "dataset_sha256": "0" * 64,
+        "method": method,
+        "predictions_sha256": method,
+        "task": {"scenarios": list(range(len(values)))},
+        "ranking_metric": metric,
+        "rows": {"submission": row},
+    }
+    path = folder / method / "scores.json"
+    path.parent.mkdir(parents=True)
+    path.write_text(json.dumps(held | changes))
+    return path
+
+
+def test_six_wins_of_six(tmp_path: Path) -> None:
+    """Better in all of six scenarios: p = 2 / 2^6 = 0.03125, significant, said in words."""
+    a = published(tmp_path, [1, 2, 3, 4, 5, 6], method="a")
+    b = published(tmp_path, [2, 3, 4, 5, 6, 8], method="b")
+    result = compare(a, b)
+    found = result.metrics["mse_avg"]
+    assert found.test.p == pytest.approx(2 / 64)
+    assert found.test.difference == pytest.approx(-7 / 6)
+    assert (found.first, found.second) == (3.5, pytest.approx(28 / 6))
+    assert result.verdict == "mse_avg: a is better (p = 0.0312, 6 scenarios)"
+    assert compare(b, a).verdict == result.verdict
+
+
+def test_five_of_six_is_no_difference(tmp_path: Path) -> None:
+    """One loss as large as the wins: |sum| of 4 or more in 14 of 64 patterns, p = 0.21875."""
+    a = published(tmp_path, [1, 1, 1, 1, 1, 3], method="a")
+    b = published(tmp_path, [2, 2, 2, 2, 2, 2], method="b")
+    result = compare(a, b)
+    # sums of six signs: 6 once, 4 six times, and their negatives
+    assert result.metrics["mse_avg"].test.p == pytest.approx(14 / 64)
+    assert "no difference at 5 %" in result.verdict
+
+
+def test_under_six_scenarios_nothing_is_claimed(tmp_path: Path) -> None:
+    """Five clear wins give intervals, no p-value, and a sentence that says why."""
+    a = published(tmp_path, [1, 2, 3, 4, 5], method="a")
+    b = published(tmp_path, [2, 3, 4, 5, 7], method="b")
+    result = compare(a, b)
+    assert np.isnan(result.metrics["mse_avg"].test.p)
+    assert result.metrics["mse_avg"].test.interval[1] < 0.0
+    assert "no significance is claimed under 6" in result.verdict
+    assert result.as_json()["metrics"]["mse_avg"]["p"] is None
+
+
+def test_higher_is_better_is_turned(tmp_path: Path) -> None:
+    """Differences are in the loss: a higher correlation is a negative difference."""
+    a = published(tmp_path, [0.9] * 6, method="a", metric="vorticity_pearson")
+    b = published(tmp_path, [0.8] * 6, method="b", metric="vorticity_pearson")
+    assert compare(a, b).metrics["vorticity_pearson"].test.difference == pytest.approx(-0.1)
+
+
+@pytest.mark.parametrize(
+    ("changes", "kind", "word"),
+    [
+        ({"split": "fluid"}, UsageError, "split"),
+        ({"size": "mini"}, UsageError, "size"),
+        ({"dataset_sha256": "1" * 64}, DataError, "dataset_sha256"),
+    ],
+)
+def test_other_data_are_not_compared(
+    tmp_path: Path, changes: dict[str, str], kind: type[Exception], word: str
+) -> None:
+    """Submissions to another split, size or data set are refused, naming what differs."""
+    a = published(tmp_path, [1.0] * 6, method="a")
+    b = published(tmp_path, [1.0] * 6, method="b", **changes)
+    with pytest.raises(kind, match=f"differ in {word}"):
+        compare(a, b)
+
+
+def test_folders_files_and_predictions_agree(bench: ScoreBench, scored: dict[str, Path]) -> None:
+    """A folder, its scores.json and its predictions.nc, scored on the way, say the same."""
+    still_, straight_ = scored["still"], scored["straight"]
+    by_folder = compare(still_, straight_)
+    by_file = compare(still_ / "scores.json", straight_ / "scores.json")
+    nc = "predictions.nc"
+    fresh = compare(still_ / nc, straight_ / nc, root=bench.root, registry=bench.registry)
+    assert by_folder.as_json() == by_file.as_json() == fresh.as_json()
+    assert by_folder.first == "still"
+    assert list(by_folder.metrics)[0] == by_folder.ranking
+
+
+def test_floors_stand_in_the_scores(scored: dict[str, Path]) -> None:
+    """A floor's name compares with the row beside the submission: equal to having submitted it."""
+    by_name = compare(scored["still"], "constant-velocity").as_json()
+    by_file = compare(scored["still"], scored["straight"]).as_json()
+    assert by_name["metrics"] == by_file["metrics"]
+    assert (by_name["second"], by_file["second"]) == ("constant-velocity", "straight")
+
+
+def test_the_same_predictions_are_told(scored: dict[str, Path]) -> None:
+    """Comparing a submission with itself says so."""
+    assert compare(scored["still"], scored["still"]).verdict == "both hold the same predictions"
+
+
+def test_unknown_metrics_name_the_nearest(scored: dict[str, Path]) -> None:
+    """A misspelt metric is a usage error with the nearest name."""
+    with pytest.raises(UsageError, match="vorticity_rmse"):
+        compare(scored["still"], scored["straight"], metrics=["vorticity_rsme"])
+    only: ComparisonResult = compare(scored["still"], scored["straight"], metrics=["mse_end"])
+    assert list(only.metrics) == ["vorticity_rmse", "mse_end"]
+
+
+def test_missing_scores(tmp_path: Path) -> None:
+    """A folder without scores, and scores without the ranking metric, are unreadable."""
+    with pytest.raises(UnreadableFileError):
+        compare(tmp_path, tmp_path)
+    bare = published(tmp_path, [1.0], method="a", ranking_metric="vorticity_rmse")
+    with pytest.raises(UnreadableFileError, match="ranking"):
+        compare(bare, bare)
+
+
+def test_tables_show_floors_undefined_and_units(bench: ScoreBench, tmp_path: Path) -> None:
+    """The tables hold floors beside the submission, intervals, undefined frames, frames of interest."""
+    card = bench.evaluate(bench.submit(tmp_path / "predictions.nc", half_right))
+    horizon, at_frames, per_scenario = card_tables(card)
+    assert [column.replace("-\n", "-") for column in horizon.columns[3:5]] == [
+        "persistence",
+        "constant-velocity",
+    ]
+    rows = {row[0]: row for row in horizon.rows}
+    assert next(iter(rows)) == card.ranking
+    assert rows["vorticity_pearson"][6] == "20 of 40"
+    assert rows["vorticity_rmse"][-1] == "1/frame"
+    assert " to " in rows["vorticity_rmse"][2]
+    assert at_frames.columns == ("metric", "15", "25")
+    assert per_scenario.columns == ("row", "3", "4")
+    every, *_ = card_tables(card, every=True)
+    assert [row[0] for row in every.rows] == list(card.submission)
+    assert len({len(row) for row in horizon.rows} | {len(horizon.columns)}) == 1
+    lines = list(flag_lines(card))
+    assert any(line.startswith("flag copy_suspect: raised") for line in lines)
+    assert any("2 scenarios: no p-value" in line for line in lines)
+
+
+def test_comparison_table(scored: dict[str, Path]) -> None:
+    """The short table leads with the ranking metric; all metrics come when asked for."""
+    result = compare(scored["still"], scored["straight"])
+    short, whole = comparison_table(result), comparison_table(result, every=True)
+    assert short.rows[0][0] == "vorticity_rmse"
+    assert len(short.rows) < len(whole.rows) == len(result.metrics)
