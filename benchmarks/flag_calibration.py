@@ -15,14 +15,14 @@ The thresholds in lagbench/flags.py lie between the extremes that this prints.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.exam import Exam, load_exam
-from lagbench.flags import Evidence, evidence
+from lagbench.flags import copy_suspect, evidence
 from lagbench.grid import Grid, fields
 from lagbench.layout import resolve_root
 from lagbench.metrics import FramePair, Scenario, snapshots
@@ -159,15 +159,15 @@ def cases(exam: Exam) -> Iterator[Case]:
 
 
 def main() -> int:
-    """Print one line per split and prediction: the worst over its scenarios."""
+    """Print one line per split and prediction: least and greatest number over its scenarios."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--size", default="mini")
     parser.add_argument("--root", type=Path)
     parser.add_argument("--splits", default=",".join(SPLITS))
     options = parser.parse_args()
-    print(
-        f"{'prediction':32s} {'split':14s}" + "".join(f"{name:>17s}" for name in (*COLUMNS, "energy", "area"))
-    )
+    names = "".join(f"{name:>17s}" for name in (*COLUMNS, "energy", "area"))
+    print(f"{'prediction':32s} {'split':14s}{names}  copy_suspect")
+    seen: dict[str, list[list[float]]] = {"honest": [], "made from the truth": []}
     for split in options.splits.split(","):
         exam = load_exam(load().size(split, options.size), resolve_root(options.root))
         held = list(cases(exam))
@@ -175,16 +175,28 @@ def main() -> int:
             print(f"-- {split} {options.size}, {kind}")
             for name, predict in table.items():
                 traces = [trace_of(case, predict(case)) for case in held]
-                print(line(name, split, [evidence(t) for t in traces], traces))
+                numbers = [numbers_of(trace) for trace in traces]
+                seen[kind] += numbers
+                raised = "raised" if copy_suspect(traces).raised else "-"
+                print(f"{name:32s} {split:14s}{ranges(numbers)}  {raised}")
+    for kind, numbers in seen.items():
+        print(f"{'all splits, ' + kind:47s}{ranges(numbers)}")
     return 0
 
 
-def line(name: str, split: str, found: list[Evidence], traces: list[Trace]) -> str:
-    """Return the least and the greatest of each number over the scenarios."""
-    cells = [[getattr(e, column) for e in found] for column in COLUMNS]
-    cells.append([float(np.mean(t.predicted_motion) / np.mean(t.motion)) for t in traces])
-    cells.append([float(np.mean(t.occupancy)) for t in traces])
-    return f"{name:32s} {split:14s}" + "".join(f"{min(c):8.3g}..{max(c):<7.3g}" for c in cells)
+def numbers_of(trace: Trace) -> list[float]:
+    """Return the numbers of one scenario, in the order of the columns."""
+    found = evidence(trace)
+    energy = float(np.mean(trace.predicted_motion) / np.mean(trace.motion))
+    return [*(float(getattr(found, column)) for column in COLUMNS), energy, float(np.mean(trace.occupancy))]
+
+
+def ranges(numbers: Sequence[Sequence[float]]) -> str:
+    """Return the least and the greatest of each number over scenarios; NaN is left out."""
+    columns = np.array(numbers).T
+    known = [column[~np.isnan(column)] for column in columns]
+    cells = [f"{min(c):.3g}..{max(c):.3g}" if c.size else "-" for c in known]
+    return "".join(f"{cell:>17s}" for cell in cells)
 
 
 if __name__ == "__main__":

@@ -27,6 +27,9 @@ __all__ = ["ScenarioFile", "ScenarioHeader", "check_scenario", "read_scenario", 
 BLOCK_BYTES = 1 << 20
 """Files are streamed in pieces of about this size [bytes]."""
 
+CHUNK_CACHE = 1 << 20
+"""Chunk cache of a variable [bytes]; the default of 64 MB would keep whole scenarios."""
+
 DEFLATE_RATIO = 1032
 """No zlib stream unpacks to more than this many times its length."""
 
@@ -151,6 +154,9 @@ def read_scenario(path: Path) -> ScenarioFile:
         stack.callback(file.close)
         file.set_auto_maskandscale(False)
         file.set_auto_chartostring(False)
+        for variable in file.variables.values():
+            if variable.chunking() != "contiguous":
+                variable.set_var_chunk_cache(CHUNK_CACHE)
         opened = ScenarioFile(path, file)
         stack.pop_all()
     return opened

@@ -7,11 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
+from .errors import UsageError, nearest
 from .exam import Exam, load_exam, ranking_metric
 from .flags import Flag, below_twin_floor, copy_suspect, physics
 from .floors import PERSISTENCE
 from .layout import resolve_root
-from .metrics import Score, aggregate, select
+from .metrics import Metric, Score, aggregate, available, select
 from .overview import available_cores
 from .progress import Meter, Progress
 from .registry import Registry, load
@@ -56,6 +57,7 @@ def score(
         The score card; ``files`` names what was written.
 
     Raises:
+        UsageError: an extra that brings no metrics, or that is not installed.
         UnreadableFileError: the predictions cannot be read.
         ChecksFailedError: they are not valid.
         DataError: they were made from another data set, or the test subset is missing or damaged.
@@ -90,6 +92,7 @@ def evaluate(
     registry: Registry | None = None,
 ) -> ScoreCard:
     """Return the score card of a submission and write nothing; arguments as of :func:`score`."""
+    metrics = _chosen(extras)
     path, folder, described = Path(predictions).absolute(), resolve_root(root), registry or load()
     result = validate(path, root=folder, require_truth=True, registry=described)
     if examined is not None:
@@ -98,7 +101,6 @@ def evaluate(
     with open_predictions(path) as opened:
         header, content = opened.header, opened.content_sha256()
     exam = load_exam(described.size(header.split, header.size), folder)
-    metrics = select(extras=extras)
     outcomes = _outcomes(exam, path, tuple(m.name for m in metrics), workers, scheduler, Meter(progress))
     tallies = {
         row: {outcome.scenario: outcome.tallies[row] for outcome in outcomes} for row in outcomes[0].tallies
@@ -116,6 +118,15 @@ def evaluate(
         warnings=result.warnings,
         preview=preview,
     )
+
+
+def _chosen(extras: Collection[str]) -> tuple[Metric, ...]:
+    """Return the metrics to measure; refuse an extra that brings none."""
+    known = {metric.extra for metric in available().values() if metric.extra}
+    for extra in extras:
+        if extra not in known:
+            raise UsageError(f"no extra {extra!r} with metrics", where="--extras", fix=nearest(extra, known))
+    return select(extras=extras)
 
 
 def _outcomes(

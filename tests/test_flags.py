@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import pickle
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -125,12 +126,8 @@ def test_physics_by_hand() -> None:
     """A prediction at rest and one of twenty times the energy are raised, one of twice is not."""
     rest = made([1, 2, 3])
     for factor, raised in ((0.0, True), (0.5, False), (2.0, False), (20.0, True)):
-        energies = (rest.error, rest.overlap, rest.motion, factor * rest.motion)
-        trace = Trace(*energies, rest.shifted, rest.occupancy, rest.outside)
-        assert physics([trace]).raised == raised
-    wide = Trace(
-        rest.error, rest.overlap, rest.motion, rest.motion, rest.shifted, 2 * rest.occupancy, rest.outside
-    )
+        assert physics([replace(rest, predicted_motion=factor * rest.motion)]).raised == raised
+    wide = replace(rest, occupancy=2.0 * rest.occupancy)
     assert "area" in physics([wide]).reasons[0]
 
 

@@ -254,6 +254,8 @@ def test_a_folder_that_cannot_be_written(bench: ScoreBench, standing: ScoreCard,
 def test_optional_metrics_name_their_extra(bench: ScoreBench, standing: ScoreCard) -> None:
     """Asking for Sinkhorn without POT names the extra that installs it; with it, it is scored."""
     source = standing.files[0].parent / "predictions.nc"
+    with pytest.raises(UsageError, match="did you mean 'transport'"):
+        bench.evaluate(source, extras=("transprot",))
     if importlib.util.find_spec("ot") is None:
         with pytest.raises(UsageError, match=r"lagbench\[transport\]"):
             bench.evaluate(source, extras=("transport",))

@@ -1,4 +1,4 @@
-"""Bars at the key frame: correlation (Fig. 5.13) and divergence (Fig. 5.16)."""
+"""Bars at the key frame: correlation (Fig. 5.13), divergence (Fig. 5.16), distance."""
 
 from __future__ import annotations
 
@@ -15,12 +15,14 @@ from .numbers import html, text
 from .page import Figure, table
 from .scale import Scale, linear, spanning
 from .subject import Row, Subject
+from .wording import clipped, quantity, sentence
 
 __all__ = ["bar_figures"]
 
 SHOWN = (
     ("vorticity_pearson", "Correlation of vorticity", "Fig. 5.13"),
     ("vorticity_kl", "Divergence of vorticity", "Fig. 5.16"),
+    ("vorticity_w1", "Distance of vorticity distributions", "Fig. 5.16"),
 )
 
 
@@ -38,11 +40,10 @@ def _figure(subject: Subject, rows: list[Row], name: str, title: str, thesis: st
     ordered = sorted(rows, key=lambda row: _loss(metric, mean(row.scores[name].at(frame))))
     best = next((row for row in ordered if row.entry is not None), None)
     bars = [_bar(row, name, frame, best=row is best and len(subject.entries) > 1) for row in ordered]
-    unit = f" [{metric.unit}]" if metric.unit != "1" else ""
     drawn = bar_chart(
         bars,
         _scale(metric, bars),
-        f"{name.replace('_', ' ')}{unit}",
+        quantity(metric),
         f"{title} at frame {frame}",
         "; ".join(f"{bar.label}: {bar.written}" for bar in bars),
     )
@@ -54,14 +55,17 @@ def _figure(subject: Subject, rows: list[Row], name: str, title: str, thesis: st
         body=drawn,
         caption=join(
             [
-                f"{metric.summary[0].upper()}{metric.summary[1:]}{unit} ({metric.source}) at frame {frame}:"
-                f" mean over {len(subject.scenarios)} test scenarios, dots are the scenarios. {better};"
+                f"{sentence(metric)} Mean over {len(subject.scenarios)} test scenarios at frame {frame},"
+                f" dots are the scenarios. {better};"
                 f" perfect is {metric.perfect:g}. A dash means undefined, as for a prediction at rest."
             ]
         ),
         data=table(
             ["method", "mean", *(f"scenario {i}" for i in subject.scenarios)],
-            [[bar.label, html(bar.value), *(html(v) for v in bar.dots)] for bar in bars],
+            [
+                [row.name, html(bar.value), *(html(v) for v in bar.dots)]
+                for row, bar in zip(ordered, bars, strict=True)
+            ],
             label=title,
         ),
     )
@@ -75,7 +79,7 @@ def _bar(row: Row, name: str, frame: int, *, best: bool) -> Bar:
     values = row.scores[name].at(frame)
     middle = mean(values)
     return Bar(
-        label=row.name,
+        label=clipped(row.name),
         value=middle,
         written=text(middle),
         dots=tuple(values.tolist()),

@@ -185,7 +185,7 @@ def _bar(bar: Bar, top: int, zero: float, place: object) -> list[Markup]:
     at = place if callable(place) else float
     name = tag("tspan", bar.label, class_="strong" if bar.bold else None)
     value = tag("tspan", f"  {bar.written}", class_="value")
-    drawn = [tag("text", name, value, x=8, y=top - 5, class_="name")]
+    drawn = [tag("text", name, value, x=14, y=top - 5, class_="name")]
     if np.isfinite(bar.value):
         low, high = sorted((zero, at(bar.value)))
         box = {"x": f"{low:.1f}", "y": top, "width": f"{max(high - low, 1.0):.1f}", "height": BAR}

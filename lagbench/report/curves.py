@@ -15,6 +15,7 @@ from .numbers import html
 from .page import Figure, key, table
 from .scale import Scale, linear, spanning
 from .subject import Row, Subject, kind_of
+from .wording import quantity, sentence, words
 
 __all__ = ["body_curves", "energy_curves", "error_curves", "method_curves"]
 
@@ -28,27 +29,27 @@ TOLERATED = 3.0
 
 
 def error_curves(subject: Subject) -> Iterator[Figure]:
-    """Yield the error over frames for all test scenarios, one figure per entry (Fig. 5.10)."""
-    name = "vorticity_mse" if subject.full_box else "attribute_mse"
-    scores = [row.scores[name] for row in subject.rows if name in row.scores]
-    entries = [row for row in subject.rows if row.entry is not None and name in row.scores]
-    if not scores:
-        return
-    y = spanning([score.per_frame for score in scores], log=None)
-    for row in entries:
-        score, number = row.scores[name], row.entry.number if row.entry else 0
-        body = [key(_scenario_key(score)), _scenario_chart(subject, score, y, row.name)]
-        yield Figure(
-            name=f"scenarios-{number}",
-            title=f"Error over frames, every test scenario: {row.name}",
-            thesis="Fig. 5.10",
-            body=join(body),
-            caption=join(
-                [f"{_sentence(score.metric)} One line per test scenario; flat lines do not drift. "]
-                + (["The axis is shared by all files."] if len(entries) > 1 else [])
-            ),
-            data=_numbers(subject, [(f"scenario {i}", row) for i, row in _by_scenario(score)], "scenario"),
-        )
+    """Yield the error over frames for all test scenarios, two figures per entry (Fig. 5.10)."""
+    for row in subject.rows:
+        for name in ("vorticity_mse" if subject.full_box else "attribute_mse", "position_rmse"):
+            if row.entry is not None and name in row.scores:
+                yield _scenario_figure(subject, row, name)
+
+
+def _scenario_figure(subject: Subject, row: Row, name: str) -> Figure:
+    score = row.scores[name]
+    number = row.entry.number if row.entry else 0
+    several = len(subject.entries) > 1
+    y = spanning([r.scores[name].per_frame for r in subject.rows if r.entry is not None])
+    shared = " The axis is shared by all files." if several else ""
+    return Figure(
+        name=f"scenarios-{name.replace('_', '-')}-{number}",
+        title=f"{words(name, capital=True)}, every test scenario" + (f": {row.name}" if several else ""),
+        thesis="Fig. 5.10",
+        body=join([key(_scenario_key(score)), _scenario_chart(subject, score, y, row.name)]),
+        caption=join([f"{sentence(score.metric)} One line per test scenario.{shared}"]),
+        data=_numbers(subject, [(f"scenario {i}", values) for i, values in _by_scenario(score)], "scenario"),
+    )
 
 
 def _scenario_key(score: Score) -> list[tuple[str, str]]:
@@ -60,7 +61,7 @@ def _by_scenario(score: Score) -> Iterator[tuple[int, Floats]]:
 
 
 def _scenario_chart(subject: Subject, score: Score, y: Scale, name: str) -> Markup:
-    plot = Plot(_frame_axis(subject), y, x_label="frame", y_label=_quantity(score.metric))
+    plot = Plot(_frame_axis(subject), y, x_label="frame", y_label=quantity(score.metric))
     for i, (scenario, values) in enumerate(_by_scenario(score)):
         plot.line(subject.frames, values, kind_of(i), f"scenario {scenario}")
     return plot.svg(
@@ -90,7 +91,7 @@ def _method_figure(subject: Subject, rows: Sequence[Row], name: str, thesis: str
     y = spanning([values for _, values in series])
     if correlation:
         y = linear(min(0.0, _least(values for _, values in series)), 1.0)
-    plot = Plot(_frame_axis(subject), y, x_label="frame", y_label=_quantity(metric))
+    plot = Plot(_frame_axis(subject), y, x_label="frame", y_label=quantity(metric))
     for row, _ in series:
         if row.entry is not None:
             plot.band(subject.frames, *_interval(row.scores[name]), row.kind)
@@ -105,12 +106,12 @@ def _method_figure(subject: Subject, rows: Sequence[Row], name: str, thesis: str
         plot.level(STABLE, f"stable above {STABLE}")
     return Figure(
         name=f"methods-{name.replace('_', '-')}",
-        title=f"{_title(metric)} over frames",
+        title=f"{words(metric.name, capital=True)} over frames",
         thesis=thesis,
         body=join([key(items), _chart(plot, metric, rows)]),
         caption=join(
             [
-                f"{_sentence(metric)} Mean over {len(subject.scenarios)} test scenarios; the bands are 95 %"
+                f"{sentence(metric)} Mean over {len(subject.scenarios)} test scenarios; the bands are 95 %"
                 " bootstrap intervals over scenarios. ",
                 "Grey: floors that cost nothing.",
             ]
@@ -200,15 +201,15 @@ def _body_figure(subject: Subject, rows: Sequence[Row], name: str) -> Figure:
     if true is not None:
         series.insert(0, ("truth", "truth", _mean(true)))
     y = linear(0.0, 1.0) if name == "connectivity" else spanning([s for _, _, s in series], log=False)
-    plot = Plot(_frame_axis(subject), y, x_label="frame", y_label=_quantity(metric))
+    plot = Plot(_frame_axis(subject), y, x_label="frame", y_label=quantity(metric))
     for label, kind, values in reversed(series):
         plot.line(subject.frames, values, kind, label)
     return Figure(
         name=f"bodies-{name.replace('_', '-')}",
-        title=f"{_title(metric)} of jelly and rope",
+        title=f"{words(metric.name, capital=True)} of jelly and rope",
         thesis="section 4.8.2",
         body=join([key([(kind, label) for label, kind, _ in series]), _chart(plot, metric, rows)]),
-        caption=join([f"{_sentence(metric)} Mean over the scenarios with an elastic body."]),
+        caption=join([f"{sentence(metric)} Mean over the scenarios with an elastic body."]),
         data=_numbers(subject, [(label, values) for label, _, values in series], "method"),
     )
 
@@ -233,23 +234,6 @@ def _interval(score: Score) -> tuple[Floats, Floats]:
 
 def _least(series: Iterator[Floats]) -> float:
     return float(min((np.min(s[np.isfinite(s)], initial=0.0) for s in series), default=0.0))
-
-
-def _title(metric: Metric) -> str:
-    written = metric.name.replace("_", " ").replace("pearson", "correlation")
-    for short in ("mse", "mae", "rmse"):
-        written = written.replace(f" {short}", f" {short.upper()}")
-    return written[0].upper() + written[1:]
-
-
-def _quantity(metric: Metric) -> str:
-    unit = metric.unit.replace("^2", "²")
-    return _title(metric) + (f" [{unit}]" if unit != "1" else "")
-
-
-def _sentence(metric: Metric) -> str:
-    unit = f" [{metric.unit.replace('^2', '²')}]" if metric.unit != "1" else ""
-    return f"{metric.summary[0].upper()}{metric.summary[1:]}{unit} ({metric.source})."
 
 
 def _numbers(subject: Subject, series: Sequence[tuple[str, Floats]], what: str) -> Markup:

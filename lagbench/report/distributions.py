@@ -116,7 +116,7 @@ def residual_figures(subject: Subject, gallery: Gallery) -> Iterator[Figure]:
     x = _covering(pairs[0].true_vorticity)
     count = len(pairs[0].true_vorticity)
     drawn = f" {min(count, MOST_DOTS)} of {count} nodes are drawn." if count > MOST_DOTS else ""
-    text_ = (
+    said = (
         f"Residual r = predicted − true vorticity [1/frame] at the grid nodes, scenario {scenario}, frame"
         f" {subject.key_frame}."
     )
@@ -126,7 +126,7 @@ def residual_figures(subject: Subject, gallery: Gallery) -> Iterator[Figure]:
         "residuals-truth",
         "Residual against true vorticity",
         "Fig. 5.14",
-        f"{text_} A cloud without slope around 0 is good; slope −1 means that no rotation is"
+        f"{said} A cloud without slope around 0 is good; slope −1 means that no rotation is"
         f" predicted.{drawn}",
         (x, y),
         by_truth=True,
@@ -137,7 +137,7 @@ def residual_figures(subject: Subject, gallery: Gallery) -> Iterator[Figure]:
         "residuals-node",
         "Residual against node number",
         "Fig. 5.15",
-        f"{text_} Nodes are numbered column by column from the lower left: clusters are places.{drawn}",
+        f"{said} Nodes are numbered column by column from the lower left: clusters are places.{drawn}",
         (linear(0.0, float(pairs[0].nodes.size), tight=True), y),
         by_truth=False,
     )
@@ -164,9 +164,8 @@ def _residual_figure(
         plot.level(0.0, "")
         spread = text(float(np.sqrt(np.mean(pair.vorticity_residual**2))))
         drawn = plot.svg(f"{title}, {entry.name}", f"{len(x)} nodes, RMS residual {spread} per frame.")
-        heading = tag(
-            "p", entry.name, tag("span", f"  RMS {spread}", class_="muted n"), class_="panels-title"
-        )
+        rms = tag("span", f"RMS {spread}", class_="muted n")
+        heading = tag("p", entry.name, "  ", rms, class_="panels-title")
         charts.append(tag("div", heading, drawn))
     return Figure(
         name=name,

@@ -62,7 +62,7 @@ def field_figure(subject: Subject, gallery: Gallery) -> Figure:
     rows = [
         ("speed", pictures("speed", speeds, fast, signed=False)),
         ("vorticity", pictures("vorticity", omegas, strong, signed=True)),
-        ("vorticity error", pictures("vorticity error", errors, strong, signed=True)),
+        ("vorticity error", [tag("span"), *pictures("vorticity error", errors, strong, signed=True)[1:]]),
     ]
     keys = [
         ramp("sequential", fast, "speed [length/frame]"),
@@ -139,12 +139,14 @@ def scenario_figure(subject: Subject, gallery: Gallery) -> Figure:
     rows = [("truth", pictures("true vorticity", [moment.true_vorticity for moment in moments]))]
     for i, entry in enumerate(subject.entries):
         rows.append((entry.name, pictures("predicted", [_vorticity(m.pairs[i]) for m in moments])))
-    columns = [" · ".join([f"scenario {m.scenario}", *_short(gallery.walls[m.scenario])]) for m in moments]
+    columns = [
+        join([f"scenario {m.scenario}", *_short(gallery.walls[m.scenario])], tag("br")) for m in moments
+    ]
     return Figure(
         name="every-scenario",
         title=f"Every test scenario at frame {frame}",
         thesis="Figs. 5.26, 5.27",
-        body=grid(columns, rows),
+        body=grid(columns, rows, width=5.0),
         caption=tag(
             "span",
             "Vorticity; each column has a colour scale of its own, set by its truth. Orange edges move.",
@@ -162,7 +164,8 @@ def _where(scenario: int, walls: Walls) -> str:
     said = f"Scenario {scenario}"
     details = _short(walls)
     if walls.moving:
-        details.append(f"{' and '.join(walls.moving)} wall moves (orange edge)")
+        verb = "walls move" if len(walls.moving) > 1 else "wall moves"
+        details.append(f"{' and '.join(walls.moving)} {verb} (orange)")
     return f"{said}: {', '.join(details)}." if details else f"{said}."
 
 

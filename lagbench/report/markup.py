@@ -43,7 +43,7 @@ def escaped(text: object) -> Markup:
     return Markup(whole.translate(_TABLE))
 
 
-def join(parts: Iterable[object], separator: str = "") -> Markup:
+def join(parts: Iterable[object], separator: object = "") -> Markup:
     """Return parts one after the other, those that are no markup escaped."""
     return Markup(escaped(separator).join(escaped(part) for part in parts))
 

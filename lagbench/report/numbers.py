@@ -33,13 +33,15 @@ def power(exponent: int) -> str:
 def text(value: float, digits: int = DIGITS) -> str:
     """Return a number with so many significant digits.
 
-    >>> text(0.012345), text(-2.5e-7), text(1200000.0), text(math.nan)
-    ('0.0123', '−2.50×10⁻⁷', '1.20×10⁶', '–')
+    >>> text(0.012345), text(-2.5e-7), text(1200000.0), text(20.0), text(math.nan)
+    ('0.0123', '−2.50×10⁻⁷', '1.20×10⁶', '20', '–')
     """
     if not math.isfinite(value):
         return MISSING if math.isnan(value) else ("∞" if value > 0 else "−∞")
     if value == 0.0:
         return "0"
+    if value == int(value) and abs(value) < 10.0 ** PLAIN[1]:
+        return _minus(str(int(value)))
     mantissa, _, exponent = f"{value:.{digits - 1}e}".partition("e")
     order = int(exponent)
     if PLAIN[0] <= order < PLAIN[1]:

@@ -15,6 +15,7 @@ from .markup import Markup, join, tag
 from .numbers import text
 from .page import table
 from .subject import Entry, Row, Subject
+from .wording import unit, words
 
 __all__ = ["flag_list", "head", "identity", "title"]
 
@@ -51,42 +52,34 @@ def _tiles(subject: Subject) -> Iterator[Markup]:
     best = subject.best_entry
     whose = f"{best.name}: " if len(subject.entries) > 1 else ""
     ranking = subject.ranking.name
-    yield _tile(f"{whose}{_words(ranking)}", best.scores[ranking], _beside(subject, best))
+    yield _tile(f"{whose}{words(ranking)}", best.scores[ranking], _beside(subject, best))
     for name in TILES:
         score = best.scores.get(name)
         if score is None or name == ranking:
             continue
         if name == "stable_frames":
-            yield _tile("stable frames", score, f"of {subject.exam.setting.horizon}, correlation ≥ 0.8")
+            yield _tile("stable", score, f"of {subject.exam.setting.horizon}, correlation above 0.8")
         elif name == "vorticity_pearson":
             yield _at_frame(subject, score)
         else:
-            yield _tile(_words(name), score, "mean over the horizon")
+            yield _tile(words(name), score, "mean over the horizon")
 
 
 def _tile(what: str, score: Score, more: str) -> Markup:
-    unit = score.metric.unit.replace("^2", "²")
-    shown = tag("span", f" {unit}", class_="unit") if unit != "1" else ""
-    low, high = score.interval
-    spread = "" if math.isnan(low) else f"{text(low)} … {text(high)}, "
-    return tag(
-        "li",
-        tag("span", what, class_="what"),
-        tag("span", text(score.mean), shown, class_="big"),
-        tag("span", f"{spread}{more}", class_="more"),
-    )
+    return _card(f"{what}{unit(score.metric)}", score.mean, score.interval, more)
+
+
+def _card(what: str, value: float, bounds: tuple[float, float], more: str) -> Markup:
+    low, high = bounds
+    spread = "" if math.isnan(low) else tag("span", f"{text(low)} … {text(high)}", class_="more")
+    number = tag("span", text(value), class_="big")
+    return tag("li", tag("span", what, class_="what"), number, spread, tag("span", more, class_="more"))
 
 
 def _at_frame(subject: Subject, score: Score) -> Markup:
     values = score.at(subject.key_frame)
-    low, high = bootstrap_interval(values)
-    spread = "" if math.isnan(low) else f"{text(low)} … {text(high)}, "
-    return tag(
-        "li",
-        tag("span", "vorticity correlation", class_="what"),
-        tag("span", text(mean(values)), class_="big"),
-        tag("span", f"{spread}at frame {subject.key_frame}", class_="more"),
-    )
+    more = f"at frame {subject.key_frame}"
+    return _card(words(score.metric.name), mean(values), bootstrap_interval(values), more)
 
 
 def _beside(subject: Subject, row: Row) -> str:
@@ -99,10 +92,6 @@ def _beside(subject: Subject, row: Row) -> str:
     below = floor.scores[metric.name].mean
     ratio = row.scores[metric.name].mean / below if below > 0.0 else math.nan
     return f"{text(ratio, 2)} × {floor.name}"
-
-
-def _words(name: str) -> str:
-    return " ".join(part.upper() if part in ("mse", "mae", "rmse") else part for part in name.split("_"))
 
 
 def flag_list(subject: Subject) -> Markup:

@@ -66,7 +66,7 @@ def document(title: str, head: Markup, sections: Sequence[Section], foot: Markup
         sections: its sections; figures are numbered through all of them.
         foot: last lines.
     """
-    links = [tag("li", tag("a", section.title, href=f"#{section.name}")) for section in sections]
+    links = [tag("li", tag("a", section.title, href=f"#part-{section.name}")) for section in sections]
     contents = tag("nav", tag("ol", *links), class_="contents", aria_label="Contents")
     first = 1
     written = []
@@ -101,7 +101,7 @@ def _section(section: Section, first: int) -> Markup:
     figures = [_figure(figure, first + i) for i, figure in enumerate(section.figures)]
     grid = tag("div", *figures, class_="figures") if figures else Markup("")
     heading = tag("h2", section.title)
-    return join([tag("section", heading, section.lead, grid, id=section.name, class_="part"), "\n"])
+    return join([tag("section", heading, section.lead, grid, id=f"part-{section.name}", class_="part"), "\n"])
 
 
 def _figure(figure: Figure, number: int) -> Markup:

@@ -14,6 +14,8 @@ from .markup import Markup, join, tag
 from .numbers import html, interval, text
 from .page import paragraph, table
 from .subject import Row, Subject
+from .wording import unit as unit_of
+from .wording import words
 
 __all__ = ["every_metric", "frame_table", "score_table", "scenario_table", "verdict_table"]
 
@@ -82,7 +84,7 @@ def _score_rows(subject: Subject, names: Sequence[str]) -> Markup:
                 *(_cell(score, best=i == best) for i, score in enumerate(scores)),
             ]
         )
-    return table(["metric", *(_heading(row) for row in rows)], cells, label="Scores")
+    return table(["metric", *(_heading(row) for row in rows)], cells, kind="scores", label="Scores")
 
 
 def _heading(row: Row) -> Markup:
@@ -97,7 +99,7 @@ def _best(metric: Metric, means: Sequence[float]) -> int | None:
 
 
 def _named(metric: Metric, *, ranks: bool) -> Markup:
-    unit = tag("span", f" [{metric.unit.replace('^2', '²')}]", class_="unit") if metric.unit != "1" else ""
+    unit = tag("span", unit_of(metric), class_="unit")
     aim = f"aims at {metric.perfect:g}" if metric.direction is Direction.TARGET else _WORDS[metric.direction]
     flag = join([" ", tag("span", "ranks", class_="flag ok")]) if ranks else ""
     name = tag("span", metric.name.replace("_", "_\u200b"), unit, flag, class_="metric")
@@ -122,7 +124,7 @@ def frame_table(subject: Subject) -> Markup:
     for i, row in enumerate(subject.rows):
         numbers = [tag("span", text(means[n][i]), class_="n best" if best[n] == i else "n") for n in names]
         cells.append([_heading(row), *numbers])
-    return table(["method", *(n.replace("_", " ") for n in names)], cells, label=f"Scores at frame {frame}")
+    return table(["method", *(words(n) for n in names)], cells, label=f"Scores at frame {frame}")
 
 
 def scenario_table(subject: Subject) -> Markup:
@@ -151,12 +153,12 @@ def verdict_table(subject: Subject) -> Markup:
                 "" if same else html(said.p),
             ]
         )
-    head = ["method", "rank", name.replace("_", " "), "loss above leader", "95 % interval", "p"]
+    head = ["method", "rank", words(name), "loss above leader", "95 % interval", "p"]
     count = len(subject.scenarios)
     note = (
         f"Under {FEWEST_SCENARIOS} scenarios no significance is claimed and all share the leader's rank."
         if count < FEWEST_SCENARIOS
         else "Methods that do not differ from the leader at 5 % share its rank."
     )
-    text_ = f"p: exact two-sided sign-flip test over {count} scenarios. {note}"
-    return join([table(head, cells, label="Comparison"), paragraph(tag("small", text_, class_="muted"))])
+    said = f"p: exact two-sided sign-flip test over {count} scenarios. {note}"
+    return join([table(head, cells, label="Comparison"), paragraph(tag("small", said, class_="muted"))])

@@ -21,6 +21,7 @@ from .page import Figure, Section, document, paragraph
 from .particles import particle_figures
 from .subject import Subject, subject_of
 from .tables import every_metric, frame_table, scenario_table, score_table, verdict_table
+from .wording import words
 
 __all__ = ["FILE_NAME", "render", "write_report"]
 
@@ -77,7 +78,7 @@ def _sections(subject: Subject, gallery: Gallery) -> Iterator[Section]:
         name="rollout",
         title="Error over the rollout",
         lead=paragraph("How the error grows from frame to frame."),
-        figures=[*error_curves(subject), *method_curves(subject)],
+        figures=[*method_curves(subject), *error_curves(subject)],
     )
     if subject.full_box:
         yield _vorticity(subject, gallery)
@@ -111,11 +112,11 @@ def _scores(subject: Subject) -> Section:
     parts = [
         paragraph("Mean over the horizon and the test scenarios, 95 % interval below; bold is best."),
         score_table(subject),
-        tag("h4", f"Ranking by {subject.ranking.name.replace('_', ' ')}"),
+        tag("h4", f"Ranking by {words(subject.ranking.name)}"),
         verdict_table(subject),
         tag("h4", f"At frame {frame}"),
         frame_table(subject),
-        tag("h4", f"{subject.ranking.name.replace('_', ' ')} per test scenario"),
+        tag("h4", f"{words(subject.ranking.name, capital=True)} per test scenario"),
         scenario_table(subject),
         tag("h4", "Flags and warnings"),
         flag_list(subject),
@@ -124,10 +125,11 @@ def _scores(subject: Subject) -> Section:
 
 
 def _vorticity(subject: Subject, gallery: Gallery) -> Section:
+    now, over_time = histogram_figures(subject, gallery)
+    bars = list(bar_figures(subject))
     figures: list[Figure] = [
         field_figure(subject, gallery),
-        *histogram_figures(subject, gallery),
-        *bar_figures(subject),
+        *(now, *bars[:1], over_time, *bars[1:]),
         *residual_figures(subject, gallery),
     ]
     text = "Where the flow rotates, how strongly, and how the prediction differs."

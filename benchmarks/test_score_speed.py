@@ -1,0 +1,102 @@
+"""How long and in what memory a full cavity submission is scored, beside a naive scorer.
+
+    OMP_NUM_THREADS=1 pytest benchmarks/test_score_speed.py -s
+
+Ours runs in a fresh process as ``lagbench score`` would: six scenarios, 90 or 600 frames, all
+metrics but Sinkhorn, both floors, two workers. The naive one scores two scenarios' first frames
+of the same files in the same run; its time is scaled to all frames.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from naive_scorer import naive_scores
+from score_data import ScoreData, make_score_data
+
+from lagbench.exam import load_exam
+
+WALL_SECONDS = 2.0
+"""Target after imports on two idle cores [s]."""
+
+MEMORY = 500e6
+"""Target for the largest process [bytes]."""
+
+NAIVE_FRAMES = 4
+SCENARIOS = 6
+
+CHILD = """
+import json, resource, sys, time
+from pathlib import Path
+import lagbench.scoring, netCDF4
+from lagbench.registry import load
+folder, workers = Path(sys.argv[1]), int(sys.argv[2])
+who = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+peak = lambda: int(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0])
+cpu = lambda: sum(sum(resource.getrusage(one)[:2]) for one in who)
+wall, used = time.perf_counter(), cpu()
+card = lagbench.scoring.score(folder / "predictions.nc", root=folder / "root",
+                              registry=load(folder / "datasets.yaml"), workers=workers)
+print(json.dumps({
+    "wall": time.perf_counter() - wall,
+    "cpu": cpu() - used,
+    # the maximum that getrusage tells of this process is that of its parent before exec
+    "memory": 1024 * max(peak(), resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss),
+    "metrics": len(card.submission),
+    "bytes": card.files[1].stat().st_size,
+}))
+"""
+
+
+def run_ours(folder: Path, workers: int) -> dict[str, float]:
+    """Score in a fresh process; return its time, processor time and memory."""
+    command = [sys.executable, "-c", CHILD, str(folder), str(workers)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    return dict(json.loads(done.stdout))
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> ScoreData:
+    """Six scenarios of 90 frames."""
+    return make_score_data(tmp_path_factory.mktemp("short"))
+
+
+def test_score_beside_a_naive_scorer(data: ScoreData) -> None:
+    """All metrics of three rows take a fifth of the time of five naive ones of one row, or less."""
+    folder = data.predictions.parent
+    one, two = run_ours(folder, 1), run_ours(folder, 2)
+    exam = load_exam(data.registry.size("cavity", "full"), data.root)
+    start, used = time.perf_counter(), time.process_time()
+    for row, scenario in enumerate(exam.scenarios[:2]):
+        naive_scores(exam.truth.path(scenario), data.predictions, row, 6, NAIVE_FRAMES)
+    scale = SCENARIOS * 90 / (2 * NAIVE_FRAMES)
+    naive = {"wall": scale * (time.perf_counter() - start), "cpu": scale * (time.process_time() - used)}
+    for name, found in (("one worker", one), ("two workers", two)):
+        print(
+            f"\n{name}: {found['wall']:.2f} s, {found['cpu']:.2f} CPU-s, {found['memory'] / 1e6:.0f} MB,"
+            f" {found['metrics']} metrics x 3 rows, scores.nc {found['bytes'] / 1e3:.0f} kB"
+            f" (targets {WALL_SECONDS} s on two idle cores, {MEMORY / 1e6:.0f} MB, 300 kB)"
+        )
+    ratio = naive["cpu"] / one["cpu"]
+    print(
+        f"naive, 5 metrics x 1 row: {naive['wall']:.0f} s, {naive['cpu']:.0f} CPU-s: {ratio:.0f} times ours"
+    )
+    assert ratio >= 5
+    assert max(one["memory"], two["memory"]) <= MEMORY
+    assert two["bytes"] <= 300_000
+
+
+def test_memory_does_not_grow_with_the_horizon(data: ScoreData, tmp_path: Path) -> None:
+    """6 x 594 predicted frames (all 600 but the given six) take the memory of 6 x 90."""
+    short = run_ours(data.predictions.parent, 1)
+    long = run_ours(make_score_data(tmp_path, horizon=594).predictions.parent, 1)
+    print(
+        f"\n6 x 90: {short['memory'] / 1e6:.0f} MB, {short['cpu']:.1f} CPU-s;"
+        f" 6 x 594: {long['memory'] / 1e6:.0f} MB, {long['cpu']:.1f} CPU-s, {long['wall']:.1f} s"
+    )
+    assert long["memory"] <= min(MEMORY, 1.15 * short["memory"])

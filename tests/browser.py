@@ -1,0 +1,152 @@
+"""Headless Chromium by its DevTools protocol over a pipe: no port, no driver, no package."""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+"""The browser; None where there is none (Debian: apt-get install chromium)."""
+
+FLAGS = (
+    *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"),
+    *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
+    *("--disable-dev-shm-usage", "--hide-scrollbars", "--remote-debugging-pipe"),
+)
+
+
+@dataclass
+class Page:
+    """What a browser saw when it opened a page.
+
+    Attributes:
+        messages: console messages, log entries and exceptions.
+        requests: addresses asked for, data: aside.
+    """
+
+    browser: Browser
+    session: str
+    messages: list[str] = field(default_factory=list)
+    requests: list[str] = field(default_factory=list)
+
+    def value(self, expression: str) -> Any:
+        """Return what an expression evaluates to."""
+        said = self.call("Runtime.evaluate", expression=expression, returnByValue=True)
+        return said["result"]["value"]
+
+    def screenshot(self) -> bytes:
+        """Return what is to be seen as PNG."""
+        return base64.b64decode(self.call("Page.captureScreenshot")["data"])
+
+    def pdf(self) -> bytes:
+        """Return the page as printed."""
+        return base64.b64decode(self.call("Page.printToPDF")["data"])
+
+    def call(self, method: str, **parameters: Any) -> dict[str, Any]:
+        """Call a method of the page."""
+        answer = self.browser.call(method, self.session, **parameters)
+        self._notice()
+        return answer
+
+    def _notice(self) -> None:
+        for event in self.browser.events:
+            method, said = event["method"], event["params"]
+            if method in ("Log.entryAdded", "Runtime.consoleAPICalled", "Runtime.exceptionThrown"):
+                self.messages.append(json.dumps(said))
+            if method == "Network.requestWillBeSent" and not said["request"]["url"].startswith("data:"):
+                self.requests.append(said["request"]["url"])
+        self.browser.events.clear()
+
+
+class Browser:
+    """A running browser."""
+
+    def __init__(self, write: int, read: int) -> None:
+        self._out, self._in = os.fdopen(write, "wb", 0), os.fdopen(read, "rb")
+        self._number = 0
+        self._rest = b""
+        self.events: list[dict[str, Any]] = []
+
+    def call(self, method: str, session: str | None = None, **parameters: Any) -> dict[str, Any]:
+        """Call a method and return its answer; events on the way are kept."""
+        self._number += 1
+        message = {"id": self._number, "method": method, "params": parameters}
+        if session is not None:
+            message["sessionId"] = session
+        self._out.write(json.dumps(message).encode() + b"\0")
+        while True:
+            said = self._receive()
+            if said.get("id") == self._number:
+                if "error" in said:
+                    raise RuntimeError(f"{method}: {said['error']}")
+                return dict(said["result"])
+            if "method" in said:
+                self.events.append(said)
+
+    def wait(self, method: str) -> None:
+        """Wait for an event."""
+        while not any(event["method"] == method for event in self.events):
+            said = self._receive()
+            if "method" in said:
+                self.events.append(said)
+
+    def open(self, path: Path, *, width: int, height: int = 900, dark: bool = False) -> Page:
+        """Open a file in a new tab and wait until it is loaded."""
+        target = self.call("Target.createTarget", url="about:blank")["targetId"]
+        session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        page = Page(self, session)
+        for domain in ("Page", "Network", "Log", "Runtime"):
+            page.call(f"{domain}.enable")
+        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 600}
+        page.call("Emulation.setDeviceMetricsOverride", **size)
+        scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
+        page.call("Emulation.setEmulatedMedia", features=[scheme])
+        page.call("Page.navigate", url=path.absolute().as_uri())
+        self.wait("Page.loadEventFired")
+        return page
+
+    def close(self) -> None:
+        """Close the pipe."""
+        self._out.close()
+        self._in.close()
+
+    def _receive(self) -> dict[str, Any]:
+        while b"\0" not in self._rest:
+            piece = os.read(self._in.fileno(), 1 << 20)
+            if not piece:
+                raise RuntimeError("the browser has gone")
+            self._rest += piece
+        message, _, self._rest = self._rest.partition(b"\0")
+        return dict(json.loads(message))
+
+
+@contextmanager
+def browser() -> Iterator[Browser]:
+    """Start a browser with a profile of its own; stop it at the end."""
+    theirs_in, ours_out = os.pipe()
+    ours_in, theirs_out = os.pipe()
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
+        # the protocol wants descriptors 3 and 4
+        shell = f'exec "$@" 3<&{theirs_in} 4>&{theirs_out}'
+        command = ["bash", "-c", shell, "bash", str(CHROMIUM), *FLAGS, f"--user-data-dir={profile}"]
+        process = subprocess.Popen(
+            command, pass_fds=(theirs_in, theirs_out), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        os.close(theirs_in)
+        os.close(theirs_out)
+        running = Browser(ours_out, ours_in)
+        try:
+            yield running
+        finally:
+            running.close()
+            process.terminate()
+            process.wait(10)

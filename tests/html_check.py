@@ -1,0 +1,86 @@
+"""Read HTML strictly: every element closed in order, attributes once, ids unique."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from html.parser import HTMLParser
+
+VOID = {"br", "col", "hr", "img", "link", "meta"}
+CLOSED = {"circle", "line", "path", "rect", "stop", "use"}
+"""Elements of SVG that end with a slash here."""
+
+
+@dataclass
+class Element:
+    """One element: name, attributes, and the text in it and below."""
+
+    name: str
+    attributes: dict[str, str]
+    text: str = ""
+
+
+@dataclass
+class Reading:
+    """What was read."""
+
+    elements: list[Element] = field(default_factory=list)
+    faults: list[str] = field(default_factory=list)
+
+    def named(self, name: str) -> list[Element]:
+        """Return the elements of a name."""
+        return [element for element in self.elements if element.name == name]
+
+    def of_class(self, kind: str) -> list[Element]:
+        """Return the elements of a class."""
+        return [e for e in self.elements if kind in e.attributes.get("class", "").split()]
+
+    @property
+    def ids(self) -> list[str]:
+        """All ids in order."""
+        return [e.attributes["id"] for e in self.elements if "id" in e.attributes]
+
+
+class _Reader(HTMLParser):
+    def __init__(self) -> None:
+        super().__init__(convert_charrefs=True)
+        self.reading = Reading()
+        self.open: list[Element] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        element = self._add(tag, attrs)
+        if tag not in VOID:
+            self.open.append(element)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self._add(tag, attrs)
+        if tag not in CLOSED:
+            self.reading.faults.append(f"<{tag}/>")
+
+    def handle_endtag(self, tag: str) -> None:
+        if not self.open or self.open[-1].name != tag:
+            self.reading.faults.append(f"</{tag}> closes {self.open[-1].name if self.open else 'nothing'}")
+        else:
+            self.open.pop()
+
+    def handle_data(self, data: str) -> None:
+        for element in self.open:
+            element.text += data
+
+    def _add(self, tag: str, attrs: list[tuple[str, str | None]]) -> Element:
+        names = [name for name, _ in attrs]
+        if len(set(names)) < len(names):
+            self.reading.faults.append(f"<{tag}> has an attribute twice")
+        element = Element(tag, {name: value or "" for name, value in attrs})
+        self.reading.elements.append(element)
+        return element
+
+
+def read_html(text: str) -> Reading:
+    """Read a page or a piece of one."""
+    reader = _Reader()
+    reader.feed(text)
+    reader.close()
+    reader.reading.faults += [f"<{element.name}> is never closed" for element in reader.open]
+    ids = reader.reading.ids
+    reader.reading.faults += [f"id {name} twice" for name in sorted(set(ids)) if ids.count(name) > 1]
+    return reader.reading

@@ -1,0 +1,46 @@
+"""Jobs for worker processes and clusters; they import this module by name."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from lagbench.pool import Report
+from lagbench.sitting import Job, Outcome, sit_scenario
+
+
+@dataclass(frozen=True)
+class Deadly:
+    """A scoring job whose first try kills its worker.
+
+    Attributes:
+        job: the job.
+        marker: file that says that it was tried; None for a harmless job.
+    """
+
+    job: Job
+    marker: Path | None
+
+
+def sit_after_dying_once(deadly: Deadly, report: Report) -> Outcome:
+    """Kill the worker on the first call with a marker, else score."""
+    if deadly.marker is not None and not deadly.marker.exists():
+        deadly.marker.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return sit_scenario(deadly.job, report)
+
+
+def double(number: int, report: Report) -> int:
+    """Report one unit and return twice the number; smaller numbers take longer."""
+    time.sleep(0.02 * max(0, 4 - number))
+    report(1)
+    return 2 * number
+
+
+def always_die(number: int, report: Report) -> int:
+    """Kill the worker on every call."""
+    os.kill(os.getpid(), signal.SIGKILL)
+    return number

@@ -1,0 +1,279 @@
+"""The report: whole, harmless, the same every time, and right in what it shows."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from html_check import Reading, read_html
+from hypothesis import given
+from hypothesis import strategies as st
+from report_bench import SPLITS, ReportBench, damped, make_report_bench, noisy, runaway, still
+
+from lagbench.errors import UsageError
+from lagbench.report import write_report
+from lagbench.report.markup import Markup, tag
+from lagbench.report.numbers import text
+
+HOSTILE = (
+    "<script>alert(1)</script>",
+    '" onmouseover="alert(1)" x=\'',
+    "'><img src=x onerror=alert(1)>",
+    "</style></title><svg onload=alert(1)>",
+    "a\u202egnp.exe\u0000\u0007",
+    "javascript:alert(1)//${alert(1)}{{alert(1)}}",
+)
+
+EVERYWHERE = {
+    "histogram": "Fig. 5.12",
+    "bars-vorticity-pearson": "Fig. 5.13",
+    "residuals-truth": "Fig. 5.14",
+    "residuals-node": "Fig. 5.15",
+    "bars-vorticity-kl": "Fig. 5.16",
+    "fields": "Fig. 5.17",
+    "histograms": "Fig. 5.18",
+    "energy-kept": "Fig. 5.19",
+    "energy-raw": "Fig. 5.28",
+    "methods-position-rmse": "Fig. 5.11",
+    "scenarios-position-rmse-0": "Fig. 5.10",
+}
+"""Figures of every split, and those of the thesis that they correspond to."""
+
+FULL_BOX = {
+    "scenarios-vorticity-mse-0": "Fig. 5.10",
+    "methods-vorticity-mse": "Fig. 5.11",
+    "arrows-0": "Fig. 5.22",
+    "streamlines-0": "Figs. 5.23, 5.24",
+    "vorticity": "Figs. 5.25–5.27",
+    "every-scenario": "Figs. 5.26, 5.27",
+}
+
+FREE_SURFACE = {"scenarios-attribute-mse-0": "Fig. 5.10", "methods-attribute-mse": "Fig. 5.11"}
+
+PARTICLES = {
+    "fluid": {"particles-3": "Fig. 4.11", "particles-4": "Fig. 4.11"},
+    "multimaterial": {
+        **{f"particles-{i}": "Figs. 4.12, 4.13" for i in (7, 8, 9, 10, 12)},
+        "particles-11": "Fig. 4.11",
+        "bodies-shape-error": "section 4.8.2",
+        "bodies-connectivity": "section 4.8.2",
+    },
+}
+
+
+@pytest.fixture(scope="module")
+def bench_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], ReportBench]:
+    """A function that makes the bench of a split, once."""
+    made: dict[str, ReportBench] = {}
+
+    def bench(split: str) -> ReportBench:
+        if split not in made:
+            made[split] = make_report_bench(tmp_path_factory.mktemp(split), split)
+        return made[split]
+
+    return bench
+
+
+@pytest.fixture(scope="module")
+def page_of(
+    bench_of: Callable[[str], ReportBench], tmp_path_factory: pytest.TempPathFactory
+) -> Callable[[str], str]:
+    """A function that returns the page of two methods on a split, made once."""
+    made: dict[str, str] = {}
+
+    def page(split: str) -> str:
+        if split not in made:
+            folder = tmp_path_factory.mktemp("page")
+            methods = {"GNS & friends": damped, "noisy <i>": noisy}
+            made[split] = bench_of(split).report(folder, methods).read_text("utf-8")
+        return made[split]
+
+    return page
+
+
+def expected_figures(split: str) -> dict[str, str]:
+    """Return the figures that a report on a split must have."""
+    if split in PARTICLES:
+        return EVERYWHERE | FREE_SURFACE | PARTICLES[split]
+    return EVERYWHERE | FULL_BOX
+
+
+def assert_harmless(reading: Reading) -> None:
+    """Nothing runs, and nothing is fetched from outside the page."""
+    assert not {e.name for e in reading.elements} & {"script", "iframe", "object", "embed", "form", "base"}
+    for element in reading.elements:
+        for name, value in element.attributes.items():
+            assert not name.startswith("on"), (element.name, name)
+            if name in ("src", "href", "xlink:href", "action", "data", "srcset"):
+                assert value.startswith(("#", "data:image/png;base64,", "data:,")), value
+            assert "url(" not in value
+    for style in reading.named("style"):
+        assert not re.search(r"url\(|@import|https?:", style.text)
+
+
+@pytest.mark.parametrize("split", SPLITS)
+def test_page_is_whole(page_of: Callable[[str], str], split: str) -> None:
+    """Elements close in order, ids are unique, links of the contents lead somewhere, 3 MB hold it."""
+    page = page_of(split)
+    reading = read_html(page)
+    assert not reading.faults
+    assert page.startswith("<!DOCTYPE html>")
+    assert len(page.encode()) < 3_000_000
+    targets = [a.attributes["href"] for a in reading.named("a")]
+    assert targets
+    assert {target.removeprefix("#") for target in targets} <= set(reading.ids)
+
+
+@pytest.mark.parametrize("split", SPLITS)
+def test_every_figure_is_there(page_of: Callable[[str], str], split: str) -> None:
+    """Each figure of the thesis has its counterpart, with a caption that names it."""
+    reading = read_html(page_of(split))
+    figures = {e.attributes["id"]: e for e in reading.named("figure")}
+    for name, thesis in expected_figures(split).items():
+        assert name in figures, name
+        assert f"thesis {thesis}" in figures[name].text, name
+    numbers = [e.text for e in reading.of_class("number")]
+    assert numbers == [f"Figure {k}" for k in range(1, len(figures) + 1)]
+    assert len(reading.named("figcaption")) == len(figures)
+
+
+@pytest.mark.parametrize("split", SPLITS)
+def test_everything_can_be_read_aloud(page_of: Callable[[str], str], split: str) -> None:
+    """Pictures have a text, drawings a title, charts a description too."""
+    reading = read_html(page_of(split))
+    assert all(image.attributes.get("alt") for image in reading.named("img"))
+    charts, titled = reading.of_class("chart"), page_of(split).count("<desc>")
+    assert charts
+    assert titled == len(charts)
+    for drawing in reading.named("svg"):
+        spoken = drawing.attributes.get("aria-hidden") == "true" or drawing.text
+        assert spoken or "role" not in drawing.attributes
+
+
+@pytest.mark.parametrize("split", SPLITS)
+def test_page_is_harmless(page_of: Callable[[str], str], split: str) -> None:
+    """No script, no handler, no address outside the page, and a policy that forbids both."""
+    reading = read_html(page_of(split))
+    assert_harmless(reading)
+    policies = [m.attributes["content"] for m in reading.named("meta") if "http-equiv" in m.attributes]
+    assert len(policies) == 1
+    assert policies[0].startswith("default-src 'none'")
+    assert "script-src" not in policies[0]
+
+
+def test_strangers_text_is_shown_not_run(bench_of: Callable[[str], ReportBench], tmp_path: Path) -> None:
+    """Hostile names of methods, files and trainings stand on the page as text."""
+    bench = bench_of("curl-noise")
+    paths = [
+        bench.submit(tmp_path / f"{i} '\"<b>&.nc", noisy, name, training=name, device=name)
+        for i, name in enumerate(HOSTILE)
+        if "\0" not in name
+    ]
+    cards = [bench.card(path) for path in paths]
+    page = write_report(tmp_path / "out", cards, paths, root=bench.root, registry=bench.registry)
+    reading = read_html(page.read_text("utf-8"))
+    assert not reading.faults
+    assert_harmless(reading)
+    heading = reading.named("h1")[0].text
+    for card in cards:
+        assert card.header.method in heading
+    assert "0 '" in reading.named("pre")[0].text
+
+
+@given(st.text())
+def test_any_text_survives_escaping(words: str) -> None:
+    """What stands in an element and an attribute is the text itself, but for what cannot be shown."""
+    reading = read_html(tag("p", words, title=words))
+    assert not reading.faults
+    element = reading.elements[0]
+    assert len(reading.elements) == 1
+    assert element.attributes["title"] == element.text
+    for shown, meant in zip(element.text, words, strict=True):
+        assert shown == meant or shown in "\ufffd?"
+
+
+def test_plain_text_is_untouched() -> None:
+    """Letters, signs and line breaks are not replaced."""
+    words = "Größe µ ≤ 3 × 10⁻⁴,\n\t'x' & \"y\" <z> 中文 🙂"
+    assert read_html(tag("p", words)).elements[0].text == words
+    assert tag("p", Markup("<b>x</b>")) == "<p><b>x</b></p>"
+
+
+def test_same_bytes_every_time(bench_of: Callable[[str], ReportBench], tmp_path: Path) -> None:
+    """The same predictions give the same page wherever they lie; no folder stands in it."""
+    bench = bench_of("multimaterial")
+    first = bench.report(tmp_path / "here", {"a": damped, "b": noisy}).read_bytes()
+    second = bench.report(tmp_path / "there", {"a": damped, "b": noisy}).read_bytes()
+    assert first == second
+    assert str(tmp_path).encode() not in first
+    assert str(bench.root).encode() not in first
+
+
+@pytest.mark.parametrize("split", SPLITS)
+@pytest.mark.parametrize("method", [still, runaway])
+def test_undefined_and_huge_numbers_are_drawn_around(
+    bench_of: Callable[[str], ReportBench], tmp_path: Path, split: str, method: Callable[..., object]
+) -> None:
+    """A prediction at rest has no correlation, a runaway leaves every axis: the page holds both."""
+    page = bench_of(split).report(tmp_path, {"odd": method}).read_text("utf-8")  # type: ignore[dict-item]
+    reading = read_html(page)
+    assert not reading.faults
+    for element in reading.elements:
+        for name in ("d", "x", "y", "width", "height", "viewbox", "transform"):
+            drawn = element.attributes.get(name, "")
+            assert not re.search(r"nan|inf|e\+?\d", drawn), (element.name, name, drawn[:80])
+            assert all(len(number) < 8 for number in re.findall(r"\d+", drawn))
+    assert set(expected_figures(split)) <= set(reading.ids)
+
+
+def test_scores_on_the_page_are_those_of_the_card(
+    bench_of: Callable[[str], ReportBench], tmp_path: Path
+) -> None:
+    """Mean and interval of the ranking metric stand in the table, the floors beside them."""
+    bench = bench_of("cavity")
+    path = bench.submit(tmp_path / "p.nc", damped, "damped", parameters=1_600_000, seconds_per_frame=0.25)
+    card = bench.card(path)
+    page = write_report(tmp_path, [card], [path], root=bench.root, registry=bench.registry)
+    reading = read_html(page.read_text("utf-8"))
+    shown = " ".join(e.text for e in reading.of_class("scores"))
+    for scores in card.scores.values():
+        for bound in (scores["vorticity_rmse"].mean, *scores["vorticity_rmse"].interval):
+            assert text(bound) in shown
+    everything = " ".join(e.text for e in reading.named("main"))
+    for said in (card.predictions_sha256, card.header.dataset_sha256, "lagbench score p.nc --report report"):
+        assert said in everything
+    assert "1\u202f600\u202f000" in everything
+    for flag in card.flags:
+        assert flag.name.replace("_", " ") in everything
+
+
+def test_methods_of_one_name_are_told_apart(bench_of: Callable[[str], ReportBench], tmp_path: Path) -> None:
+    """Two files of one method get numbers, so does one with a floor's name."""
+    bench = bench_of("curl-noise")
+    names = ["gns", "gns", "persistence"]
+    methods = [damped, noisy, still]
+    paths = [
+        bench.submit(tmp_path / f"{i}.nc", method, name)
+        for i, (method, name) in enumerate(zip(methods, names, strict=True))
+    ]
+    page = write_report(
+        tmp_path, [bench.card(p) for p in paths], paths, root=bench.root, registry=bench.registry
+    )
+    heading = read_html(page.read_text("utf-8")).named("h1")[0].text
+    assert heading == "gns (1) · gns (2) · persistence (1)"
+
+
+def test_cards_must_belong_together(bench_of: Callable[[str], ReportBench], tmp_path: Path) -> None:
+    """No card, a card without its file, and two data sets are refused."""
+    one, two = bench_of("curl-noise"), bench_of("cavity")
+    first, second = one.submit(tmp_path / "1.nc", still, "a"), two.submit(tmp_path / "2.nc", still, "b")
+    cards = [one.card(first), two.card(second)]
+    with pytest.raises(UsageError, match="needs score cards"):
+        write_report(tmp_path, [], [], root=one.root, registry=one.registry)
+    with pytest.raises(UsageError, match="needs score cards"):
+        write_report(tmp_path, cards[:1], [], root=one.root, registry=one.registry)
+    with pytest.raises(UsageError, match="two values of split"):
+        write_report(tmp_path, cards, [first, second], root=one.root, registry=one.registry)
+    assert not (tmp_path / "index.html").exists()

@@ -1,0 +1,76 @@
+"""The report in a real browser: nothing asked for, nothing complained of, nothing cut off."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from browser import CHROMIUM, Browser, browser
+from PIL import Image
+from report_bench import damped, make_report_bench, noisy
+
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here: apt-get install chromium")
+
+HOSTILE = "<script>console.error(1)</script><img src=http://example.com/x onerror=console.error(2)>"
+
+
+@pytest.fixture(scope="module")
+def running() -> Iterator[Browser]:
+    """One browser for all tests."""
+    with browser() as started:
+        yield started
+
+
+@pytest.fixture(scope="module", params=["cavity", "multimaterial"])
+def report(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A report on two methods, one of them hostile."""
+    folder = tmp_path_factory.mktemp(request.param)
+    return make_report_bench(folder, request.param).report(folder, {"GNS": damped, HOSTILE: noisy})
+
+
+def brightness(png: bytes) -> float:
+    """Return the median brightness of a picture, from 0 to 1."""
+    return float(np.median(np.asarray(Image.open(io.BytesIO(png)).convert("L")))) / 255.0
+
+
+@pytest.mark.parametrize("width", [1280, 390, 320])
+@pytest.mark.parametrize("dark", [False, True])
+def test_page_opens_in_silence(running: Browser, report: Path, width: int, dark: bool) -> None:
+    """No message, no request but the page itself, no sideways scrolling, its scheme as asked."""
+    page = running.open(report, width=width, dark=dark)
+    assert page.value("document.documentElement.scrollWidth") <= width
+    assert page.value("document.images.length") > 5
+    assert page.value("[...document.images].every(i => i.complete && i.naturalWidth > 0)")
+    assert page.value("document.scripts.length") == 0
+    picture = page.screenshot()
+    assert (brightness(picture) < 0.3) is dark
+    assert (
+        len(np.unique(np.asarray(Image.open(io.BytesIO(picture)).convert("RGB")).reshape(-1, 3), axis=0)) > 50
+    )
+    assert page.messages == []
+    assert page.requests == [report.absolute().as_uri()]
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+def test_texts_of_charts_lie_within_them(running: Browser, report: Path, width: int) -> None:
+    """No label is cut off at the edge of the window, none is smaller than 7 pixels."""
+    page = running.open(report, width=width)
+    boxes = page.value(
+        "[...document.querySelectorAll('.chart text')].map(t => { const b = t.getBoundingClientRect();"
+        " return [b.left, b.right, parseFloat(getComputedStyle(t).fontSize) * t.getCTM().a]; })"
+    )
+    assert len(boxes) > 50
+    left, right, size = np.array(boxes).T
+    assert left.min() >= 0
+    assert right.max() <= width
+    assert size.min() >= 7.0
+
+
+def test_page_prints(running: Browser, report: Path) -> None:
+    """Printing gives a PDF of some pages."""
+    pdf = running.open(report, width=1280).pdf()
+    assert pdf.startswith(b"%PDF")
+    assert 3 <= pdf.count(b"/Type /Page\n") <= 40

@@ -1,0 +1,244 @@
+"""Charts, pictures and streamlines of the report against answers known without them."""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+
+import numpy as np
+import pytest
+from html_check import read_html
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+from lagbench.report.chart import BOTTOM, HEIGHT, LEFT, RIGHT, TOP, WIDTH, Bar, Plot, bar_chart
+from lagbench.report.distributions import _edges, _shares
+from lagbench.report.markup import path_data
+from lagbench.report.numbers import interval, text
+from lagbench.report.particles import SIDE, paint
+from lagbench.report.png import LEVELS, diverging, sequential
+from lagbench.report.scale import linear, logarithmic, spanning
+from lagbench.report.streamlines import streamlines
+
+ACROSS, UP = WIDTH - LEFT - RIGHT, HEIGHT - TOP - BOTTOM
+
+
+def drawn(plot: Plot, kind: str) -> str:
+    """Return the path of a chart's mark of a class."""
+    reading = read_html(plot.svg("a", "b"))
+    assert not reading.faults
+    return next(e.attributes["d"] for e in reading.of_class(kind))
+
+
+def pixels(png: bytes) -> np.ndarray:
+    """Return a PNG as red, green, blue, opacity, read by Pillow."""
+    return np.asarray(Image.open(io.BytesIO(png)).convert("RGBA"))
+
+
+def test_lines_are_where_their_values_say() -> None:
+    """In a plot of 406 x 200 pixels over [0, 10] x [0, 4], (5, 1) is at (203, 150)."""
+    assert (ACROSS, UP) == (406, 200)
+    plot = Plot(linear(0, 10), linear(0, 4), x_label="x", y_label="y")
+    plot.line([0, 5, 10], [0, 1, 4], "s0", "three points")
+    assert drawn(plot, "s0") == "M0 200L203 150L406 0"
+
+
+def test_missing_values_leave_gaps() -> None:
+    """A NaN ends a line and a band; the next value starts another."""
+    plot = Plot(linear(0, 4), linear(0, 4), x_label="x", y_label="y")
+    low, high = [0, 0, math.nan, 1, 1], [1, 1, 2, 2, 2]
+    plot.band([0, 1, 2, 3, 4], low, high, "s1")
+    plot.line([0, 1, 2, 3, 4], low, "s2")
+    assert len(re.findall("M", drawn(plot, "s2"))) == 2
+    bands = read_html(plot.svg("a", "b")).of_class("band")
+    assert len(bands) == 2
+    assert bands[0].attributes["d"] == "M0 150L101.5 150L101.5 200L0 200Z"
+
+
+def test_steps_outline_a_histogram() -> None:
+    """Two bins make a staircase of four corners."""
+    plot = Plot(linear(0, 2), linear(0, 10), x_label="x", y_label="y")
+    plot.steps([0, 1, 2], [5, 10], "s3")
+    assert drawn(plot, "s3") == "M0 100L203 100L203 0L406 0"
+
+
+def test_logarithmic_axis_is_even_in_decades() -> None:
+    """Each decade takes the same room; zero and negatives have no place."""
+    axis = logarithmic(2e-4, 0.03)
+    assert (axis.low, axis.high) == pytest.approx((1e-4, 0.1))
+    np.testing.assert_allclose(axis.share([1e-4, 1e-3, 1e-2, 1e-1]), [0, 1 / 3, 2 / 3, 1], atol=1e-12)
+    assert np.isnan(axis.share([0.0, -1.0, math.nan])).all()
+    assert [tick.label for tick in axis.ticks] == ["10⁻⁴", "10⁻³", "10⁻²", "10⁻¹"]
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "labels", "factor"),
+    [
+        (0, 10, ["0", "2", "4", "6", "8", "10"], ""),
+        (0, 0.9, ["0", "0.2", "0.4", "0.6", "0.8", "1.0"], ""),
+        (-1, 1, ["−1.0", "−0.5", "0", "0.5", "1.0"], ""),
+        (0, 0.0009, ["0", "2", "4", "6", "8", "10"], "×10⁻⁴"),
+        (0, 2.2e6, ["0", "0.5", "1.0", "1.5", "2.0", "2.5"], "×10⁶"),
+        (3, 3, ["1.0", "2.0", "3.0", "4.0", "5.0"], ""),
+    ],
+)
+def test_ticks_are_round(low: float, high: float, labels: list[str], factor: str) -> None:
+    """Steps are 1, 2, 2.5 or 5 times a power of ten; small and large numbers share a factor."""
+    axis = linear(low, high)
+    told = [tick.label for tick in axis.ticks]
+    if (low, high) == (3, 3):
+        assert axis.low < 3 < axis.high
+        return
+    if factor == "×10⁻⁴":
+        assert axis.factor in ("", "×10⁻⁴", "×10⁻³")
+    else:
+        assert (told, axis.factor) == (labels, factor)
+
+
+@given(st.floats(-1e12, 1e12), st.floats(1e-12, 1e12), st.integers(2, 8))
+def test_axes_hold_their_range(low: float, width: float, count: int) -> None:
+    """A loose axis covers its range, and its labels times its factor are its ticks."""
+    high = low + width
+    if not high - low > 1e-9 * max(abs(low), abs(high)):
+        return
+    axis = linear(low, high, count=count)
+    slack = 1e-6 * (axis.high - axis.low)
+    assert axis.low <= low + slack
+    assert axis.high >= high - slack
+    assert 2 <= len(axis.ticks) <= count + 2
+    for tick in axis.ticks:
+        said = float(tick.label.replace("−", "-")) * 10.0**axis.exponent
+        assert said == pytest.approx(tick.value, abs=2 * slack, rel=1e-6)
+
+
+def test_axes_of_errors() -> None:
+    """Wide ranges are logarithmic, narrow or signed ones linear from 0; NaN gives an axis too."""
+    assert spanning([np.geomspace(1e-4, 1.0, 20)]).log
+    assert not spanning([[0.5, 1.0]]).log
+    assert spanning([[0.5, 1.0]]).low == 0.0
+    assert not spanning([[-1.0, 1e-6, 1.0]]).log
+    for empty in ([], [[math.nan]], [[0.0]], [[math.inf, 1e301]]):
+        axis = spanning(empty)
+        assert axis.high > axis.low
+
+
+def test_bars_are_as_long_as_their_values() -> None:
+    """Over [0, 1] on 438 pixels, 0.5 is 219 pixels long; an undefined bar is left out."""
+    bars = [
+        Bar(label="half", value=0.5, written="0.5", dots=(0.25, math.nan), kind="s0", bold=True),
+        Bar(label="none", value=math.nan, written="–", dots=(), kind="s1"),
+    ]
+    reading = read_html(bar_chart(bars, linear(0, 1), "share", "title", "words"))
+    assert not reading.faults
+    boxes = reading.of_class("bar")
+    assert len(boxes) == 1
+    assert float(boxes[0].attributes["width"]) == pytest.approx(438 / 2)
+    assert reading.of_class("on")[0].attributes["d"].startswith("M117.5 ")  # 8 + 438 / 4
+    assert "none  –" in reading.elements[0].text
+
+
+def test_numbers_are_short() -> None:
+    """Three digits, powers of ten where zeros would stand, dashes where nothing is."""
+    assert [text(v) for v in (0.5, 123.456, 0.00012, 1e9, -3.0)] == [
+        "0.500",
+        "123",
+        "1.20×10⁻⁴",
+        "1.00×10⁹",
+        "−3",
+    ]
+    assert [text(v) for v in (math.nan, math.inf, -math.inf, 0.0)] == ["–", "∞", "−∞", "0"]
+    assert text(0.99999) == "1.00"
+    assert interval((math.nan, 1.0)) == ""
+    assert "0.100 … 0.200" in interval((0.1, 0.2))
+
+
+@given(st.floats(-1e300, 1e300))
+def test_numbers_are_right(value: float) -> None:
+    """What is written reads back to three digits."""
+    written = text(value).replace("−", "-")
+    mantissa, _, power = written.partition("×10")
+    exponent = power.translate(str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")) or "0"
+    assert float(f"{mantissa}e{exponent}") == pytest.approx(value, rel=5.1e-3, abs=1e-300)
+
+
+def test_path_data_splits_at_gaps() -> None:
+    """Infinities leave gaps as NaN does; nothing gives nothing."""
+    assert path_data([]) == ""
+    assert path_data([(math.inf, 0.0), (1.0, 2.0)]) == "M1 2h0"
+    assert path_data([(-0.01, 0.04), (1.25, 2.0)]) == "M0 0L1.2 2"
+
+
+def test_signed_pictures() -> None:
+    """Blue below 0, vermilion above, clear at 0, grey where nothing is; x goes right, y up."""
+    field = np.array([[-1.0, 0.0], [0.5, np.nan]])  # [x, y]
+    shown = pixels(diverging(field, 1.0))
+    assert shown.shape == (2, 2, 4)
+    assert shown[1, 0].tolist() == [0x00, 0x72, 0xB2, 255]  # x = 0, y = 0: lower left
+    assert shown[0, 0, 3] == 0
+    assert shown[1, 1].tolist() == [0xD5, 0x5E, 0x00, round(255 * 0.5)]
+    assert shown[0, 1].tolist() == [128, 128, 128, 34]
+    assert pixels(diverging(np.full((1, 1), np.inf), 1.0))[0, 0].tolist() == [0xD5, 0x5E, 0x00, 255]
+
+
+def test_pictures_of_magnitudes() -> None:
+    """Opacity grows with the value up to the limit."""
+    shown = pixels(sequential(np.linspace(0.0, 2.0, LEVELS + 1)[:, None], 1.0))[0, :, 3].astype(int)
+    assert shown[0] == 0
+    assert (np.diff(shown) >= 0).all()
+    assert shown[LEVELS // 2 :].tolist() == [255] * (LEVELS // 2 + 1)
+
+
+def test_painted_particles() -> None:
+    """A particle is a disc of its material's colour at its place; those outside are not drawn."""
+    position = np.array([[0.25, 0.75], [0.75, 0.25], [1.5, 0.5]])
+    shown = pixels(paint(position, np.array([0, 3, 1]), ((0.0, 1.0), (0.0, 1.0)), 0.1))
+    assert shown.shape == (SIDE, SIDE, 4)
+    assert shown[SIDE // 4, SIDE // 4].tolist() == [0x00, 0x72, 0xB2, 255]
+    assert shown[3 * SIDE // 4, 3 * SIDE // 4].tolist() == [0xE6, 0x9F, 0x00, 255]
+    full = math.pi * (0.5 * 1.3 * 0.1 * SIDE) ** 2
+    assert shown[..., 3].sum() / 255 == pytest.approx(2 * full, rel=0.03)
+
+
+def test_streamlines_of_a_solid_rotation_are_circles() -> None:
+    """Along each line the distance from the middle stays; together they reach most of the box."""
+    n = 33
+    x, y = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
+    velocity = np.stack([-(y - 16.0), x - 16.0], axis=-1)
+    lines = streamlines(velocity, np.ones((n, n), bool))
+    assert len(lines) > 5
+    for line in lines:
+        radius = np.hypot(line.x - 16.0, line.y - 16.0)
+        assert np.ptp(radius) < 0.05 * max(radius.mean(), 1.0)
+        np.testing.assert_allclose(line.speed, radius, rtol=1e-6)
+        turning = (line.x[:-1] - 16) * np.diff(line.y) - (line.y[:-1] - 16) * np.diff(line.x)
+        assert (turning > 0).all()  # with the flow, not against it
+
+
+def test_streamlines_end_where_nothing_counts() -> None:
+    """A uniform flow stops at nodes that do not count; a flow at rest has none."""
+    velocity = np.zeros((20, 20, 2))
+    velocity[..., 0] = 1.0
+    counted = np.ones((20, 20), bool)
+    counted[10:] = False
+    lines = streamlines(velocity, counted)
+    assert lines
+    assert max(line.x.max() for line in lines) < 9.0
+    assert all(np.ptp(line.y) < 1e-12 for line in lines)
+    assert streamlines(0.0 * velocity, counted) == []
+
+
+def test_histogram_shares() -> None:
+    """Inside the truth's range the shares are NumPy's; what lies beyond is in the end bins."""
+    rng = np.random.Generator(np.random.PCG64(3))
+    truth, guess = rng.random(500), 3.0 * rng.random(500) - 1.0
+    edges = _edges(truth)
+    assert (edges[0], edges[-1]) == (truth.min(), truth.max())
+    expected = 100.0 * np.histogram(guess, edges)[0] / 500
+    shares = _shares(guess, edges)
+    assert shares.sum() == pytest.approx(100.0)
+    np.testing.assert_allclose(shares[1:-1], expected[1:-1])
+    assert shares[0] > expected[0]
+    assert shares[-1] > expected[-1]
+    assert _shares(np.array([]), _edges(np.array([]))).sum() == 0.0

@@ -1,0 +1,119 @@
+"""Jobs here, in processes and on a real Dask cluster: the same results, workers killed or not."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from score_bench import ScoreBench, bench_of, straight
+from spread_jobs import Deadly, always_die, double, sit_after_dying_once
+
+from lagbench import scoring, spread
+from lagbench.errors import UsageError, WorkFailedError
+from lagbench.generation import GenerationResult
+from lagbench.pool import Report
+from lagbench.registry import Registry
+from lagbench.sitting import Job, Outcome
+
+distributed = pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Any]:
+    """A Dask cluster of two worker processes that can import the test modules."""
+    before = os.environ.get("PYTHONPATH")
+    os.environ["PYTHONPATH"] = str(Path(__file__).parent)
+    options = {"n_workers": 2, "threads_per_worker": 1, "processes": True, "dashboard_address": None}
+    try:
+        with distributed.LocalCluster(**options, silence_logs=50) as running:
+            yield running
+    finally:
+        if before is None:
+            del os.environ["PYTHONPATH"]
+        else:
+            os.environ["PYTHONPATH"] = before
+
+
+@pytest.fixture(scope="module")
+def bench(generated: GenerationResult, unmeasured: Registry) -> ScoreBench:
+    """Tiny curl noise."""
+    return bench_of(generated, unmeasured)
+
+
+JOBS = {f"job {i}": i for i in range(6)}
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_results_come_in_order(workers: int) -> None:
+    """Results stand in the order of the jobs although later ones end first; every unit is counted."""
+    units: list[int] = []
+    assert spread.spread(double, JOBS, workers=workers, report=units.append) == [0, 2, 4, 6, 8, 10]
+    assert sum(units) == 6
+
+
+def test_an_address_that_nobody_answers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An unreachable scheduler fails the work; an address of no known kind is a usage error."""
+    monkeypatch.setattr(spread, "CONNECT_SECONDS", 0.5)
+    with pytest.raises(WorkFailedError, match="cannot reach the Dask scheduler"):
+        spread.spread(double, JOBS, scheduler="tcp://127.0.0.1:9")
+    with pytest.raises(UsageError, match="tcp://"):
+        spread.spread(double, JOBS, scheduler="carrier-pigeon://roof")
+
+
+@pytest.mark.slow
+def test_cluster_gives_the_same_bytes_though_a_worker_is_killed(
+    bench: ScoreBench, cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """scores.json and scores.nc from two cluster workers, one killed in the middle, equal those from here."""
+    source = bench.submit(tmp_path / "predictions.nc", straight)
+    here = bench.score(source, output_dir=tmp_path / "here")
+    address = cluster.scheduler_address
+    there = bench.score(source, output_dir=tmp_path / "there", scheduler=address)
+    marker = tmp_path / "killed"
+
+    def killing(function: Any, jobs: dict[str, Job], **options: Any) -> list[Outcome]:
+        first = next(iter(jobs))
+        held = {name: Deadly(job, marker if name == first else None) for name, job in jobs.items()}
+        return spread.spread(sit_after_dying_once, held, **options)
+
+    monkeypatch.setattr(scoring, "spread", killing)
+    survived = bench.score(source, output_dir=tmp_path / "survived", scheduler=address)
+    assert marker.exists()
+    for card in (there, survived):
+        for mine, other in zip(here.files, card.files, strict=True):
+            assert mine.read_bytes() == other.read_bytes()
+
+
+@pytest.mark.slow
+def test_a_job_that_kills_every_worker(cluster: Any) -> None:
+    """A job that no worker survives ends as failed work that names it, not as a hang."""
+    with pytest.raises(WorkFailedError, match="job 0"):
+        spread.spread(always_die, {"job 0": 0}, scheduler=cluster.scheduler_address)
+
+
+def test_a_killed_process_changes_nothing(
+    bench: ScoreBench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two worker processes, one killed in the middle: the same bytes as from one."""
+    source = bench.submit(tmp_path / "predictions.nc", straight)
+    here = bench.score(source, output_dir=tmp_path / "here", workers=1)
+    marker, counted = tmp_path / "killed", []
+
+    def killing(function: Any, jobs: dict[str, Job], *, report: Report, **options: Any) -> list[Outcome]:
+        held = {name: Deadly(job, marker) for name, job in jobs.items()}
+
+        def count(units: int) -> None:
+            counted.append(units)
+            report(units)
+
+        return spread.spread(sit_after_dying_once, held, report=count, **options)
+
+    monkeypatch.setattr(scoring, "spread", killing)
+    there = bench.score(source, output_dir=tmp_path / "there", workers=2)
+    assert marker.exists()
+    assert sum(counted) == 2 * bench.size.task.horizon
+    for mine, other in zip(here.files, there.files, strict=True):
+        assert mine.read_bytes() == other.read_bytes()
