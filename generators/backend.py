@@ -9,27 +9,36 @@ from __future__ import annotations
 import contextlib
 import io
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
+
+from lagbench.errors import UsageError
+from lagbench.extras import require
+from lagbench.pool import available_cores
+
+from .solver import Device
 
 # Taichi greets on stdout as it is imported, which would spoil `--json`, and asks the network.
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
+ti = require("taichi", extra="generate")
 
-import taichi as ti
+__all__ = ["HARMLESS", "place", "start"]
 
-from lagbench.errors import UsageError
-
-from .solver import Device
-
-__all__ = ["available_threads", "place", "start"]
+HARMLESS = frozenset(
+    {
+        "TI_DEVICE_MEMORY_FRACTION",
+        "TI_DEVICE_MEMORY_GB",
+        "TI_ENABLE_CUDA",
+        "TI_LIB_DIR",
+        "TI_OFFLINE_CACHE_FILE_PATH",
+        "TI_SKIP_VERSION_CHECK",
+        "TI_VISIBLE_DEVICE",
+    }
+)
+"""Variables of Taichi's that a user may set: they choose memory, places and cards, never arithmetic."""
 
 _started: list[tuple[bool, int]] = []
-
-
-def available_threads() -> int:
-    """Return the number of processors that this process may use."""
-    return len(os.sched_getaffinity(0))
 
 
 def start(device: Device, *, scenarios: int = 1, threads: int | None = None) -> int:
@@ -43,7 +52,7 @@ def start(device: Device, *, scenarios: int = 1, threads: int | None = None) -> 
         threads: threads that parallel loops use; None for all of the pool.
 
     Raises:
-        UsageError: CPU and CUDA in one process, more threads than the pool has, or several
+        UsageError: no Taichi, CPU and CUDA in one process, more threads than the pool has, or several
             scenarios on the serial device.
     """
     if device is Device.CPU and scenarios != 1:
@@ -56,7 +65,7 @@ def start(device: Device, *, scenarios: int = 1, threads: int | None = None) -> 
         )
     on_gpu = device is Device.CUDA
     if not _started:
-        _initialise(on_gpu, max(2, available_threads(), threads or 0))
+        _initialise(on_gpu, max(2, available_cores(), threads or 0))
     running_on_gpu, pool = _started[0]
     if running_on_gpu != on_gpu or (threads or 1) > pool:
         raise UsageError(
@@ -65,13 +74,24 @@ def start(device: Device, *, scenarios: int = 1, threads: int | None = None) -> 
             expected=f"{'CUDA' if running_on_gpu else 'CPU'} with at most {pool} threads",
             fix="use another process",
         )
-    return threads or min(pool, available_threads())
+    return threads or min(pool, available_cores())
+
+
+@contextlib.contextmanager
+def _only_harmless_variables() -> Iterator[None]:
+    """Hide the variables that would change device, precision or optimisation behind our back."""
+    names = [name for name in os.environ if name.startswith("TI_") and name not in HARMLESS]
+    hidden = {name: os.environ.pop(name) for name in names}
+    try:
+        yield
+    finally:
+        os.environ.update(hidden)
 
 
 def _initialise(on_gpu: bool, pool: int) -> None:
     greeting = io.StringIO()
     try:
-        with contextlib.redirect_stdout(greeting):
+        with contextlib.redirect_stdout(greeting), _only_harmless_variables():
             ti.init(
                 arch=ti.cuda if on_gpu else ti.cpu,
                 default_fp=ti.f32,

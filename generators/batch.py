@@ -24,9 +24,10 @@ from lagbench.registry import Size
 
 from .base import ClosedBoxParameters, FreeSurfaceParameters, InitialState, Split
 from .draws import generator
+from .preflight import blamed_on_parameters
 from .solver import Device, Solver, build
 
-__all__ = ["Batch", "Extremes", "Job", "Report", "draw", "split_module", "substeps_of"]
+__all__ = ["Batch", "Extremes", "Job", "Report", "draw", "solver_constants", "split_module", "substeps_of"]
 
 STRIDE = 4_000_000
 """Particle-substeps between two reports: about a tenth of a second on a core."""
@@ -70,15 +71,29 @@ def split_module(size: Size) -> Split:
     return cast("Split", module)
 
 
+def solver_constants(size: Size) -> ClosedBoxParameters | FreeSurfaceParameters:
+    """Return the constants of the solver of a size.
+
+    Raises:
+        UsageError: the split's module cannot be imported.
+        UnreadableFileError: a parameter is missing or impossible; names file, key and value.
+    """
+    module = split_module(size)
+    with blamed_on_parameters(size, "choosing the solver's constants"):
+        return module.solver_parameters(size)
+
+
 def draw(size: Size, scenario: int) -> InitialState:
     """Return a scenario before its first substep.
 
     Raises:
         WorkFailedError: the parameters lead to values that cannot be drawn.
+        UnreadableFileError: the split's module cannot use a parameter, or misses one.
     """
-    rng = generator(size.split, size.name, size.major, scenario)
+    rng, module = generator(size.split, size.name, size.major, scenario), split_module(size)
     try:
-        return split_module(size).initial_state(size, scenario, rng)
+        with blamed_on_parameters(size, f"drawing scenario {scenario}"):
+            return module.initial_state(size, scenario, rng)
     except WorkFailedError as error:
         raise _placed(error, f"{size.split} {size.name}, scenario {scenario}") from error
 
@@ -127,14 +142,14 @@ class Batch:
         self.job = job
         self.states = [draw(job.size, scenario) for scenario in job.scenarios]
         self.extremes = [Extremes() for _ in job.scenarios]
-        self.solver = _solver(
-            split_module(job.size).solver_parameters(job.size), job.device, len(self.states)
-        )
+        self.solver = _solver(solver_constants(job.size), job.device, len(self.states))
         with self._naming():
             self.solver.load(self.states)
         self._report = report
         self._frames = frames or [job.size.frame_count(scenario) for scenario in job.scenarios]
+        self._stride = max(1, STRIDE // (job.size.particles * len(self.states)))
         self._now = 0
+        self._displaced: list[tuple[int, NDArray[np.float32]]] = []
 
     def recordings(self) -> Iterator[tuple[int, int]]:
         """Yield (index in the batch, frame) whenever the solver stands at that frame.
@@ -156,6 +171,11 @@ class Batch:
         """
         return self._position[index], self._velocity[index]
 
+    def displace(self, offset: NDArray[np.float32]) -> None:
+        """Add an offset to the positions [length], shape [scenario, particle, 2]."""
+        self.solver.displace(offset)
+        self._displaced.append((self._now, offset.copy()))
+
     def _schedule(self) -> list[tuple[int, int, int]]:
         interval = self.job.size.substeps_per_frame
         return sorted(
@@ -165,13 +185,36 @@ class Batch:
         )
 
     def _advance_to(self, substep: int) -> None:
-        stride = max(1, STRIDE // (self.job.size.particles * len(self.states)))
         while self._now < substep:
-            count = min(stride, substep - self._now)
+            count = min(self._stride, substep - self._now)
             with self._naming():
-                self.solver.advance(count)
+                try:
+                    self.solver.advance(count)
+                except WorkFailedError:
+                    self._replay(count)
+                    raise
             self._now += count
             self._account(count)
+
+    def _replay(self, count: int) -> None:
+        """Repeat everything up to here, then single substeps, to learn which one breaks first.
+
+        Returns when none of them breaks: then the failure was not the simulation's.
+
+        Raises:
+            WorkFailedError: as the solver tells it, of the first broken substep.
+        """
+        self.solver.load(self.states)
+        done = 0
+        for start, offset in [*self._displaced, (self._now, None)]:
+            while done < start:
+                step = min(self._stride, start - done)
+                self.solver.advance(step)
+                done += step
+            if offset is not None:
+                self.solver.displace(offset)
+        for _ in range(count):
+            self.solver.advance(1)
 
     def _account(self, count: int) -> None:
         """Widen the extremes of the scenarios that still record, and report the work."""

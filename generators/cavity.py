@@ -2,8 +2,9 @@
 
 Expected behaviour: a vortex fills the box from the moving wall inwards; two opposite walls
 make one vortex (directions opposed) or two (alike). Which walls move goes by id, so that every
-subset of ``full`` holds all six choices; direction, speed, Reynolds number and start are drawn. Recording starts anywhere between rest
-and the nearly steady flow. The Reynolds number is U L / nu with the box's width L.
+subset of ``full`` holds all six choices; direction, speed, Reynolds number and start are drawn.
+Recording starts anywhere between rest and the nearly steady flow. The Reynolds number is
+U L / nu with the box's width L.
 """
 
 from __future__ import annotations

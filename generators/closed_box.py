@@ -112,12 +112,12 @@ class ClosedBox(Driver[ClosedBoxParameters]):
         """
         self._kernels.release()
 
-    def _broken(self, index: int, health: Health) -> list[str]:
+    def _broken(self, index: int, health: Health) -> dict[str, str]:
         bounds = {
-            "J > 0": health.jacobian_min > 0.0,
-            f"J <= {JACOBIAN_BOUND:g}": health.jacobian_max <= JACOBIAN_BOUND,
+            "J > 0": (health.jacobian_min <= 0.0, health.jacobian_min),
+            f"J <= {JACOBIAN_BOUND:g}": (health.jacobian_max > JACOBIAN_BOUND, health.jacobian_max),
         }
-        return [name for name, holds in bounds.items() if not holds]
+        return {name: f"J = {value:.6g}" for name, (left, value) in bounds.items() if left}
 
     def _check_state(self, index: int, state: InitialState) -> None:
         super()._check_state(index, state)

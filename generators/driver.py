@@ -94,8 +94,8 @@ class Driver(ABC, Generic[Parameters]):
         """Return what each scenario went through during the last advance."""
 
     @abstractmethod
-    def _broken(self, index: int, health: Health) -> list[str]:
-        """Return the bounds of this formulation that a scenario has left."""
+    def _broken(self, index: int, health: Health) -> dict[str, str]:
+        """Return the bounds of this formulation that a scenario has left, and what it reached."""
 
     def load(self, states: Sequence[InitialState]) -> None:
         """Start one scenario per state.
@@ -164,17 +164,22 @@ class Driver(ABC, Generic[Parameters]):
 
     def _check_health(self, index: int, health: Health, substeps: int) -> None:
         fastest = self._kernels.speed_bound
-        broken = [] if health.finite else ["every number is finite"]
-        if not health.max_speed <= fastest:
-            broken.append(f"CFL: abs(v) <= dx/dt = {fastest:.6g}")
-        broken += self._broken(index, health)
+        broken: dict[str, str] = {}
+        if not health.finite:
+            broken["every number is finite"] = "NaN or an infinite number"
+        # NaN breaks no bound here: it is told above, and as a value it would say nothing.
+        if health.max_speed > fastest:
+            broken[f"CFL: abs(v) <= dx/dt = {fastest:.6g}"] = f"abs(v) = {health.max_speed:.6g}"
+        broken |= self._broken(index, health)
         if broken:
+            last = self._substeps
+            span = f"substep {last}" if substeps == 1 else f"substeps {last - substeps} to {last}"
             raise WorkFailedError(
                 "the simulation blew up",
-                where=f"scenario {index}, substeps {self._substeps - substeps} to {self._substeps}",
+                where=f"scenario {index}, {span}",
                 expected="; ".join(broken),
-                got=health,
-                fix="use a smaller dt or smaller velocities",
+                got="; ".join(broken.values()),
+                fix="a smaller dt (a larger substeps_per_frame), a softer material or smaller velocities",
             )
 
 

@@ -145,9 +145,11 @@ class FreeSurface(Driver[FreeSurfaceParameters]):
     def health(self) -> list[Health]:
         """Return what each scenario went through during the last advance."""
         extremes = self._kernels.extremes.to_numpy()
+        # The kernels keep a huge number where they saw something that is none.
+        extremes = np.where(np.abs(extremes) < _LARGEST, extremes, np.nan)
         return [
             Health(
-                finite=bool(np.isfinite(seen).all() and np.abs(seen).max() < _LARGEST),
+                finite=bool(np.isfinite(seen).all()),
                 max_speed=float(seen[:, 0].max()),
                 jacobian_min=float(seen[:, 1].min()),
                 jacobian_max=float(seen[:, 2].max()),
@@ -155,7 +157,9 @@ class FreeSurface(Driver[FreeSurfaceParameters]):
             for seen in extremes
         ]
 
-    def _broken(self, index: int, health: Health) -> list[str]:
+    def _broken(self, index: int, health: Health) -> dict[str, str]:
         reach = self._kernels.extremes.to_numpy()[index, :, 3].max()
         bound = self._kernels.reach_bound
-        return [] if reach <= bound else [f"fixed-point sums: abs(v) + abs(A o) = {reach:.6g} <= {bound:.6g}"]
+        what = "abs(v) + abs(A o)"
+        left = bound < reach < _LARGEST
+        return {} if not left else {f"fixed-point sums: {what} <= {bound:.6g}": f"{what} = {reach:.6g}"}

@@ -19,8 +19,8 @@ from lagbench.errors import WorkFailedError
 
 from .base import FreeSurfaceParameters, InitialState, Material
 from .draws import RandomSource, choice, direction, quantise, uniform
-from .parameters import constants, free_surface_walls
-from .shapes import Body, Disc, Rectangle, Region, Shape, place, seeds
+from .parameters import constants, free_surface_walls, interval, ranges
+from .shapes import Body, Disc, Rectangle, Shape, place, seeds
 
 if TYPE_CHECKING:
     from lagbench.registry import Size
@@ -39,17 +39,7 @@ PAIRS = (
 )
 """Materials of the two bodies, by id % 6."""
 
-MARGIN = 0.02
-"""Least distance between a body and a wall at the start [length]."""
-
-GAP = 0.04
-"""Least distance between the two bodies at the start [length]."""
-
-ATTRACTION = (0.5, 2.5)
-"""Least and greatest rate of the attractor: velocity over distance [1/s]."""
-
-_ATTRACTOR: Region = ((0.3, 0.7), (0.3, 0.6))
-_ASPECT = (0.7, 1.4)
+# Says when to give up; no scenario of datasets.yaml comes near it.
 _ATTEMPTS = 1000
 
 
@@ -59,7 +49,7 @@ def solver_parameters(size: Size) -> FreeSurfaceParameters:
 
 
 def _rope(rng: RandomSource, size: Size) -> Rectangle:
-    length = uniform(rng, size.value("rope_length_min"), size.value("rope_length_max"))
+    length = uniform(rng, *interval(size, "rope_length"))
     return Rectangle(length, size.value("rope_width"), direction(rng))
 
 
@@ -67,10 +57,10 @@ def _shape(rng: RandomSource, material: Material, size: Size) -> Shape:
     """Draw a rope, a ball of jelly, or a rectangle or disc of anything else."""
     if material is Material.ROPE:
         return _rope(rng, size)
-    area = uniform(rng, size.value("area_min"), size.value("area_max"))
+    area = uniform(rng, *interval(size, "area"))
     if material is Material.JELLY or choice(rng, 2) == 1:
         return Disc.of_area(area)
-    width = math.sqrt(area * uniform(rng, *_ASPECT))
+    width = math.sqrt(area * uniform(rng, *interval(size, "aspect")))
     return Rectangle(width, area / width)
 
 
@@ -86,30 +76,34 @@ def _apart(rng: RandomSource, size: Size, shapes: tuple[Shape, Shape]) -> tuple[
     The second's outline is probed where it matters: at evenly spread points inside it.
     """
     low, high = free_surface_walls(size)
-    inner = (low + MARGIN, high - MARGIN)
+    inner = (low + size.value("margin"), high - size.value("margin"))
+    gap, cells = float(size.value("gap")), int(size.value("gap_cells"))
     for _ in range(_ATTEMPTS):
         first, second = (place(rng, shape, (inner, inner)) for shape in shapes)
-        if float(np.min(first.distance(_probe(second)))) >= GAP:
+        if float(np.min(first.distance(_probe(second, cells)))) >= gap:
             return first, second
     raise WorkFailedError(
         "two bodies found no room side by side",
-        expected=f"a gap of {GAP} within {_ATTEMPTS} attempts",
+        expected=f"a gap of {gap} within {_ATTEMPTS} attempts",
         fix="lower the areas or lengths of this split in datasets.yaml",
     )
 
 
-def _probe(body: Body) -> Array:
-    """Return points on a fine grid that lie inside a body [length], shape [point, 2]."""
-    side = np.linspace(-1.0, 1.0, 65)
+def _probe(body: Body, cells: int) -> Array:
+    """Return nodes of a grid over a body that lie inside it [length], shape [point, 2].
+
+    The grid has ``cells`` cells across the bounding box, each way.
+    """
+    side = (2.0 * np.arange(cells + 1) - cells) / cells
     x, y = np.meshgrid(side * body.shape.reach[0], side * body.shape.reach[1])
     grid = body.centre + np.stack([x.ravel(), y.ravel()], axis=-1)
     return np.asarray(grid[body.distance(grid) <= 0.0])
 
 
-def _pull(rng: RandomSource, bodies: tuple[Body, Body]) -> tuple[Array, Array, float]:
+def _pull(rng: RandomSource, bodies: tuple[Body, Body], size: Size) -> tuple[Array, Array, float]:
     """Draw the attractor: velocity of each body = rate (point - centre) [length/s]."""
-    point = np.array([uniform(rng, *interval) for interval in _ATTRACTOR])
-    rate = uniform(rng, *ATTRACTION)
+    point = np.array([uniform(rng, *component) for component in ranges(size, "attractor")])
+    rate = uniform(rng, *interval(size, "attraction"))
     first, second = (quantise(rate * (point - body.centre)) for body in bodies)
     return first, second, rate
 
@@ -120,7 +114,7 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     first, second = (_shape(rng, material, size) for material in materials)
     bodies = _apart(rng, size, (first, second))
     counts = _shares(size.particles, first, second)
-    *velocities, rate = _pull(rng, bodies)
+    *velocities, rate = _pull(rng, bodies, size)
     friction = 0.0 if Material.LIQUID in materials else float(size.value("friction"))
     drawn: dict[str, int | float | str] = {
         "pair": "-".join(material.name.lower() for material in materials),

@@ -3,17 +3,17 @@
 usage: python -m lagbench.generators.record --split cavity --size tiny [--root FOLDER]
            [--registry datasets.yaml] [--released tests/data/released_hashes.json] [--allow-change]
 
-Reads the manifest of a complete data set, checks its files against it, and writes the block
-``measured`` of datasets.yaml; what stands above that block is not touched. Also keeps the list
-of released hashes, by which a test notices bits that change without their version. A recorded
-hash of the same MAJOR version is only replaced with --allow-change.
+Reads the manifest of a complete data set, checks its files against it, computes the statistics
+of train anew, and writes the block ``measured`` of datasets.yaml; what stands above that block
+is not touched. Also keeps the list of released hashes, by which a test notices bits that change
+without their version. A recorded hash of the same MAJOR version is only replaced with
+--allow-change.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import math
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -24,7 +24,7 @@ from lagbench.errors import DataError, LagbenchError
 from lagbench.layout import dataset_folder, resolve_root
 from lagbench.manifest import Manifest, read_manifest
 from lagbench.registry import Measured, Size, default_path, load
-from lagbench.statistics import round_digits
+from lagbench.statistics import file_statistics
 
 __all__ = [
     "check_files",
@@ -34,6 +34,7 @@ __all__ = [
     "released_name",
     "render",
     "replace_measured",
+    "with_statistics",
 ]
 
 MARKER = "\nmeasured:"
@@ -79,13 +80,22 @@ def measured_values(manifest: Manifest) -> Measured:
         subset_sha256=manifest.subset_sha256,
         scenario_sha256={entry.scenario: entry.content_sha256[:_SHORT] for entry in manifest.files},
         statistics=manifest.statistics,
-        twin_floor=_mean_floor(twins),
+        twin_floor=manifest.mean_twin_floor(),
     )
 
 
-def _mean_floor(twins: Sequence[Sequence[float]]) -> tuple[float, ...]:
-    """Return the mean over scenarios at each predicted frame that all of them have."""
-    return tuple(round_digits(math.fsum(column) / len(column)) for column in zip(*twins, strict=False))
+def with_statistics(folder: Path, manifest: Manifest) -> Manifest:
+    """Return a manifest whose statistics follow from the files of train.
+
+    Args:
+        folder: folder of the data set.
+        manifest: what the folder holds.
+
+    Raises:
+        DataError: there is no file of train, or one is damaged.
+    """
+    train = [folder / entry.path for entry in manifest.files if entry.subset == "train"]
+    return manifest.model_copy(update={"statistics": file_statistics(train)})
 
 
 def render(measured: Mapping[str, Mapping[str, Measured]]) -> str:
@@ -205,7 +215,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         check_files(folder, manifest)
         released = _released(options.registry, options.released)
         values = record(
-            size, manifest, registry=options.registry, released=released, allow=options.allow_change
+            size,
+            with_statistics(folder, manifest),
+            registry=options.registry,
+            released=released,
+            allow=options.allow_change,
         )
     except LagbenchError as error:
         sys.stderr.write(f"record: {error}\n")

@@ -66,7 +66,8 @@ class Solver(Protocol):
 
         Raises:
             WorkFailedError: a scenario left the bounds within which the solver is valid; names
-                the scenario's index, the range of substeps and the broken bound.
+                the scenario's index, the range of substeps (for a single one its number, from
+                1), the broken bounds and the values that broke them.
         """
 
     def position(self) -> NDArray[np.float32]:

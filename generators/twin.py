@@ -75,7 +75,7 @@ def twin_floors(job: Job, report: Report) -> dict[int, tuple[float, ...]]:
             if frame == size.task.input_frames - 1:
                 offsets[:] = 0.0
                 offsets[index] = nudge(size, job.scenarios[index])
-                batch.solver.displace(offsets)
+                batch.displace(offsets)
             elif frame >= size.task.input_frames:
                 truth = truths[index].read("position", slice(frame, frame + 1))[0]
                 floors[index].append(_rmse(batch.frame(index)[0], truth))

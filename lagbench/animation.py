@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,10 +25,16 @@ from .plots import describe
 from .recording import Recording, open_recording
 from .video import SUFFIXES, open_video
 
+if TYPE_CHECKING:
+    from .registry import Registry
+
 __all__ = ["KINDS", "animate"]
 
 KINDS = (Panel.SPEED, Panel.MATERIAL, Panel.VORTICITY)
 """What an animation can show."""
+
+SLOWEST, FASTEST = 0.01, 1000.0
+"""Frames per second that every player and both formats can hold [1/s]."""
 
 SAMPLES = 12
 """Frames that set the colour scale, spread over the scenario."""
@@ -46,6 +53,7 @@ def animate(
     frames_per_second: float = 30.0,
     every: int = 1,
     quiet: bool = False,
+    registry: Registry | None = None,
 ) -> Path:
     """Turn a scenario into an MP4 or GIF file; return its path.
 
@@ -57,12 +65,15 @@ def animate(
         beside: second scenario file, drawn to the right with the same colour scale; frames
             are matched by number and end with the shorter of the two.
         kind: one of :data:`KINDS`; material where there are several, else speed, when None.
-        frames_per_second: frames shown per second; a GIF rounds to hundredths of a second.
+        frames_per_second: frames shown per second, 0.01 to 1000; a GIF rounds to hundredths of
+            a second.
         every: show every n-th frame.
         quiet: show no progress; without a terminal on stderr none is shown anyway.
+        registry: where splits are described; ours when None.
 
     Raises:
-        UsageError: unknown kind or ending, a rate or step that is not positive, no matplotlib.
+        UsageError: unknown kind or ending, a rate out of bounds, a step that is not positive,
+            no matplotlib.
         DataError: a scenario file is missing or damaged.
         WorkFailedError: the video cannot be encoded or written.
     """
@@ -70,7 +81,7 @@ def animate(
     _check(path, kind, frames_per_second, every)
     with ExitStack() as stack:
         sources = [source] if beside is None else [source, beside]
-        recordings = [stack.enter_context(open_recording(item)) for item in sources]
+        recordings = [stack.enter_context(open_recording(item, registry=registry)) for item in sources]
         film = _Film(recordings, _kind(kind, recordings))
         numbers = range(0, min(recording.frames for recording in recordings), every)
         write = stack.enter_context(open_video(path, film.size, frames_per_second))
@@ -91,8 +102,13 @@ def _check(path: Path, kind: Panel | str | None, rate: float, every: int) -> Non
         raise UsageError(
             f"an animation cannot show {kind!r}", where="--kind", fix=nearest(str(kind), map(str, KINDS))
         )
-    if rate <= 0 or every < 1:
-        raise UsageError("an animation needs a positive rate and step", got=f"{rate} frames/s, every {every}")
+    if not SLOWEST <= rate <= FASTEST or every < 1:  # nan lies in no interval
+        raise UsageError(
+            "an animation needs a positive rate and step",
+            where="--fps, --every",
+            expected=f"{SLOWEST:g} to {FASTEST:g} frames/s, every 1 or more",
+            got=f"{rate} frames/s, every {every}",
+        )
 
 
 def _kind(kind: Panel | str | None, recordings: Sequence[Recording]) -> Panel:

@@ -6,28 +6,27 @@ simulates, so that Ctrl-C reaches it at once and a crash of the solver cannot ta
 
 from __future__ import annotations
 
-import importlib.util
-import platform
 from collections.abc import Sequence
-from importlib.metadata import version
 from pathlib import Path
 
 from .atomic import remove_leftovers
 from .cards import write_cards
-from .errors import DataError, UsageError
+from .errors import DataError
 from .generators.batch import Job
 from .generators.simulate import Outcome, scenario_key, simulate
 from .generators.solver import Device
 from .generators.twin import twin_floors, twin_substeps
-from .inventory import State, examine, is_unchanged
-from .layout import dataset_folder, scenario_path
+from .identity import environment_of, promises_bits
+from .inventory import examine
+from .layout import MANIFEST_NAME, dataset_folder, scenario_path
 from .manifest import FileEntry, Manifest, describe_file, merge, read_manifest, write_manifest
 from .plan import Estimate, check_disk, estimate
 from .pool import Event, Pool, Task
 from .progress import Meter
-from .registry import Size
+from .registry import Size, Split
 from .scenario_ids import spell_ids
 from .statistics import file_statistics, round_digits
+from .verdict import compare
 
 __all__ = ["Campaign"]
 
@@ -41,9 +40,10 @@ class Campaign:
     Args:
         size: tier of a split.
         root: folder that holds all data sets.
-        device: where the solver runs; a GPU whose bits differ marks the manifest ``tolerance``.
+        device: where the solver runs.
         workers: worker processes.
         meter: counts the work.
+        split: the split that the size belongs to.
 
     Attributes:
         manifest: what the folder holds, as far as is known.
@@ -59,6 +59,8 @@ class Campaign:
         device: Device,
         workers: int,
         meter: Meter,
+        *,
+        split: Split,
     ) -> None:
         self.size, self.root, self.device, self.workers = size, root, device, workers
         self.manifest = self._merged(None, [])
@@ -66,21 +68,26 @@ class Campaign:
         self.to_do: Estimate = estimate(size, ())
         self.verdict = ""
         self._meter = meter
+        self._split = split
 
     def survey(self, wanted: Sequence[int], *, force: bool = False) -> None:
         """Find out what is there and what is to do; writes nothing."""
-        base = self._readable_manifest()
-        suspects = [i for i in self.size.scenarios if i in wanted or self._is_new(i, base)]
-        findings = {i: examine(self.root, self.size, i, trusted=base.entry(i)) for i in suspects}
-        good = [f for f in findings.values() if f.state is State.GOOD]
-        bad = findings.keys() - {f.scenario for f in good}
-        base = base.model_copy(update={"files": tuple(e for e in base.files if e.scenario not in bad)})
-        self.manifest = self._merged(base, [self._described(f.scenario, base) for f in good])
+        old = self._old_manifest()
+        suspects = [i for i in self.size.scenarios if i in wanted or self._has_changed(i, old)]
+        self._meter.begin("checking", total=len(suspects), scenarios=len(suspects))
+        good: list[FileEntry] = []
+        for scenario in suspects:
+            finding = examine(self.root, self.size, scenario, manifest=old, quick=True)
+            good += [finding.entry] if finding.entry else []
+            self._meter.count(1, scenarios=1)
+        bad = set(suspects) - {entry.scenario for entry in good}
+        kept = tuple(e for e in old.files if e.scenario not in bad)
+        self.manifest = self._merged(old.model_copy(update={"files": kept}), good)
         self.kept = [i for i in wanted if i not in bad and not force]
         self.to_do = estimate(self.size, [i for i in wanted if i not in self.kept])
 
     def run(self, wanted: Sequence[int], *, force: bool = False) -> None:
-        """Simulate what is missing or wrong; write manifest and cards; compare.
+        """Simulate what is missing or wrong; write the manifest, compare, write cards.
 
         Raises:
             WorkFailedError: no space, a scenario blew up, workers keep dying.
@@ -97,44 +104,33 @@ class Campaign:
             # The workers are gone by now; what they had not finished goes too.
             remove_leftovers(folder)
         self._record_statistics()
+        promised = self.to_do.scenarios if promises_bits(environment_of(self.device)) else ()
+        self.verdict = compare(self.size, self.manifest, promised=promised)
         self._write_cards()
-        self.verdict = self._compare()
 
     def missing(self) -> tuple[int, ...]:
         """Return the ids of the size that the manifest does not hold."""
         return tuple(i for i in self.size.scenarios if self.manifest.entry(i) is None)
 
-    def _readable_manifest(self) -> Manifest:
-        """Return the manifest on disk without entries whose file changed its length or is gone."""
+    def _old_manifest(self) -> Manifest:
+        """Return the manifest on disk, an empty one where there is none that can be read."""
         try:
             old = read_manifest(self.root, self.size.split, self.size.name, self.size.major)
         except DataError:  # it is written anew from the files
             old = None
-        if old is None:
-            return self._merged(None, [])
-        files = tuple(entry for entry in old.files if self._bytes(entry.scenario) == entry.bytes)
-        return old.model_copy(update={"files": files})
+        return self._merged(old, [])
 
     def _path(self, scenario: int) -> Path:
         return scenario_path(self.root, scenario_key(self.size, scenario))
 
-    def _bytes(self, scenario: int) -> int | None:
-        try:
-            return self._path(scenario).stat().st_size
-        except (OSError, UsageError):  # gone, or the size no longer has this id
-            return None
+    def _has_changed(self, scenario: int, old: Manifest) -> bool:
+        """Return whether a file came, went, or has another length than the manifest says."""
+        entry, path = old.entry(scenario), self._path(scenario)
+        return (path.stat().st_size if path.exists() else None) != (entry.bytes if entry else None)
 
-    def _is_new(self, scenario: int, base: Manifest) -> bool:
-        return base.entry(scenario) is None and self._bytes(scenario) is not None
-
-    def _described(self, scenario: int, base: Manifest) -> FileEntry:
-        """Return the manifest entry of a good file, the known one where nothing changed."""
-        known = base.entry(scenario)
-        if known is not None and is_unchanged(self._path(scenario), known):
-            return known
-        return describe_file(self.root, scenario_key(self.size, scenario))
-
-    def _merged(self, base: Manifest | None, files: Sequence[FileEntry]) -> Manifest:
+    def _merged(
+        self, base: Manifest | None, files: Sequence[FileEntry], *, simulated: bool = False
+    ) -> Manifest:
         return merge(
             base,
             files,
@@ -142,7 +138,8 @@ class Campaign:
             size=self.size.name,
             version=self.size.version,
             subsets=self.size.subsets,
-            environment=_environment(self.device),
+            environment=environment_of(self.device) if simulated else None,
+            recorded=self.size.measured.scenario_sha256 if self.size.measured else None,
         )
 
     def _simulate(self) -> None:
@@ -210,7 +207,7 @@ class Campaign:
             describe_file(self.root, scenario_key(self.size, outcome.scenario), outcome.facts)
             for outcome in outcomes
         ]
-        self._keep(self._merged(self.manifest, entries))
+        self._keep(self._merged(self.manifest, entries, simulated=True))
         self._meter.count(scenarios=len(entries))
         for outcome in outcomes:
             if self._is_test(outcome.scenario):
@@ -226,13 +223,16 @@ class Campaign:
 
     def _keep(self, manifest: Manifest) -> None:
         self.manifest = manifest
-        write_manifest(self.root, manifest)
+        folder = dataset_folder(self.root, self.size.split, self.size.name, self.size.major)
+        if manifest.files or (folder / MANIFEST_NAME).exists():
+            write_manifest(self.root, manifest)
 
     def _record_statistics(self) -> None:
         """Bring the statistics of train up to date and write the manifest."""
-        manifest, train = self.manifest, self.size.subsets["train"]
-        changed = not manifest.statistics or any(i in self.to_do.scenarios for i in train)
-        if "train" in manifest.subset_sha256 and changed:
+        manifest, train, measured = self.manifest, self.size.subsets["train"], self.size.measured
+        # Those of other bits differ from datasets.yaml by right.
+        doubted = measured and manifest.identity == "bitwise" and manifest.statistics != measured.statistics
+        if "train" in manifest.subset_sha256 and (doubted or not manifest.statistics):
             self._meter.begin("statistics", total=1, scenarios=len(train))
             rows = file_statistics([self._path(i) for i in train])
             manifest = manifest.model_copy(update={"statistics": rows})
@@ -240,35 +240,7 @@ class Campaign:
 
     def _write_cards(self) -> None:
         self._meter.begin("cards", total=1, scenarios=len(self.manifest.files))
-        write_cards(self.root, self.size, self.manifest)
-
-    def _compare(self) -> str:
-        """Return how the hashes compare with datasets.yaml, in words.
-
-        Raises:
-            DataError: a scenario has another hash.
-        """
-        measured = self.size.measured
-        if measured is None:
-            return "datasets.yaml holds no hash of this size yet: nothing to compare with"
-        differing = [
-            entry.scenario
-            for entry in self.manifest.files
-            if not entry.content_sha256.startswith(measured.scenario_sha256.get(entry.scenario, ""))
-        ]
-        if differing:
-            if self.device is Device.CUDA:
-                self._keep(self.manifest.model_copy(update={"identity": "tolerance"}))
-            raise DataError(
-                f"{len(differing)} of {len(self.manifest.files)} scenarios have another hash",
-                where=f"{self.size.split} {self.size.name}, scenarios {spell_ids(differing)}",
-                expected="the hashes in datasets.yaml",
-                fix="see docs/determinism.md; `lagbench doctor` prints what a report needs",
-            )
-        if self.manifest.identity == "tolerance":
-            self._keep(self.manifest.model_copy(update={"identity": "bitwise"}))
-        whole = self.manifest.complete
-        return "equal to datasets.yaml" if whole else "what is there is equal to datasets.yaml"
+        write_cards(self.root, self.size, self._split, self.manifest)
 
 
 _ENVIRONMENT = {
@@ -277,11 +249,3 @@ _ENVIRONMENT = {
     Device.PARALLEL: {},
     Device.CUDA: {},
 }
-
-
-def _environment(device: Device) -> dict[str, str]:
-    """Return what the manifest says about the machine that wrote files."""
-    names = ("lagbench", "numpy", "netCDF4", "taichi")
-    libraries = {name: version(name) for name in names if importlib.util.find_spec(name)}
-    system = {"python": platform.python_version(), "machine": platform.machine(), "system": platform.system()}
-    return {**system, **libraries, "device": device.value}

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from .atomic import write_atomically
@@ -16,7 +16,7 @@ from .croissant import KEYWORDS, croissant_json
 from .layout import dataset_folder
 from .manifest import FileEntry, Manifest
 from .markdown import escape, table
-from .registry import Size, Split, load
+from .registry import Registry, Size, Split
 from .scenario_ids import spell_ids
 
 __all__ = ["CARD_NAME", "CROISSANT_NAME", "NOTES", "PICTURES", "dataset_card", "write_cards"]
@@ -55,14 +55,16 @@ VARIABLES = (
 )
 
 
-def write_cards(root: Path, size: Size, manifest: Manifest) -> list[Path]:
+def write_cards(root: Path, size: Size, split: Split, manifest: Manifest) -> list[Path]:
     """Write README.md, croissant.json and, with matplotlib, the pictures; return their paths.
 
-    Each file appears whole or not at all.
+    Each file appears whole or not at all. Where the text is already there and the pictures
+    too, nothing is written: the card names every content hash, so the data are the same.
 
     Args:
         root: folder that holds all data sets.
         size: tier of the split.
+        split: the split itself.
         manifest: what the folder of the data set holds.
 
     Raises:
@@ -70,26 +72,37 @@ def write_cards(root: Path, size: Size, manifest: Manifest) -> list[Path]:
         WorkFailedError: the operating system refused.
     """
     folder = dataset_folder(root, size.split, size.name, size.major)
-    split = load().split(size.split)
-    pictures = _draw(root, size, manifest, folder) if importlib.util.find_spec("matplotlib") else []
-    card = dataset_card(size, split, manifest, pictures=pictures)
-    write_atomically(folder / CARD_NAME, card.encode())
-    write_atomically(folder / CROISSANT_NAME, croissant_json(size, split, manifest).encode())
-    return [folder / name for name in (CARD_NAME, CROISSANT_NAME, *pictures)]
+    pictures = list(PICTURES) if manifest.files and importlib.util.find_spec("matplotlib") else []
+    texts = {
+        folder / CARD_NAME: dataset_card(size, split, manifest, pictures=pictures).encode(),
+        folder / CROISSANT_NAME: croissant_json(size, split, manifest).encode(),
+    }
+    drawn = [folder / name for name in pictures]
+    if not _are_there(texts, drawn):
+        if drawn:
+            _draw(root, size, split, manifest)
+        for path, text in texts.items():
+            write_atomically(path, text)
+    return [*texts, *drawn]
 
 
-def _draw(root: Path, size: Size, manifest: Manifest, folder: Path) -> list[str]:
-    """Draw the pictures of the card; return their names."""
+def _are_there(texts: Mapping[Path, bytes], pictures: Sequence[Path]) -> bool:
+    """Return whether all files of a card are on disk, with these texts."""
+    found = all(path.is_file() for path in (*texts, *pictures))
+    return found and all(path.read_bytes() == text for path, text in texts.items())
+
+
+def _draw(root: Path, size: Size, split: Split, manifest: Manifest) -> None:
+    """Draw the pictures of the card."""
     from .plots import contact_sheet, plot_frame
 
-    if not manifest.files:
-        return []
+    splits = Registry({size.split: split}, {})
+    folder = dataset_folder(root, size.split, size.name, size.major)
     sheet, single = PICTURES
-    contact_sheet(size.split, size.name, folder / sheet, root=root)
+    contact_sheet(size.split, size.name, folder / sheet, root=root, registry=splits)
     shown = next((e for e in manifest.files if e.subset == "test"), manifest.files[0])
     frame = min(size.task.frames_of_interest[-1], shown.frames - 1)
-    plot_frame(folder / shown.path, frame, folder / single)
-    return [sheet, single]
+    plot_frame(folder / shown.path, frame, folder / single, registry=splits)
 
 
 def dataset_card(size: Size, split: Split, manifest: Manifest, *, pictures: list[str]) -> str:

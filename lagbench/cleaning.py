@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
 from .atomic import SUFFIX
+from .cards import CARD_NAME, CROISSANT_NAME, PICTURES
 from .errors import WorkFailedError
 from .layout import MANIFEST_NAME, dataset_folder, resolve_root
 from .locking import LOCK_NAME, dataset_lock
@@ -14,8 +16,8 @@ from .registry import Registry, Size, load
 
 __all__ = ["CleanResult", "clean"]
 
-CARDS = (MANIFEST_NAME, "README.md", "croissant.json", "*.png", "pictures/*.png")
-"""What stands beside the subsets, as glob patterns."""
+CARDS = (MANIFEST_NAME, CARD_NAME, CROISSANT_NAME, *PICTURES)
+"""What lagbench writes beside the subsets."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +51,7 @@ def clean(
         size: name of the size.
         root: folder of all data sets; else ``LAGBENCH_ROOT``, else the user data folder.
         leftovers: remove only temporary files of killed writers.
-        dry_run: only say what would go.
+        dry_run: only say what would go; writes nothing, a lock neither.
         registry: where splits are described; ours when None.
 
     Raises:
@@ -61,7 +63,7 @@ def clean(
     folder = dataset_folder(home, split, size, tier.major)
     if not folder.is_dir():
         return CleanResult(removed=(), bytes=0, dry_run=dry_run)
-    with dataset_lock(home, split, size, tier.major, timeout=0):
+    with nullcontext() if dry_run else dataset_lock(home, split, size, tier.major, timeout=0):
         found = tuple(_leftovers(folder) if leftovers else _generated(folder, tier))
         length = sum(path.stat().st_size for path in found)
         if not dry_run:
@@ -78,7 +80,7 @@ def _leftovers(folder: Path) -> list[Path]:
 def _generated(folder: Path, size: Size) -> list[Path]:
     """Return the files that lagbench wrote; nobody else's."""
     scenarios = [folder / subset / f"{i:04d}.nc" for subset, ids in size.subsets.items() for i in ids]
-    cards = [path for pattern in CARDS for path in folder.glob(pattern)]
+    cards = [folder / name for name in CARDS]
     return sorted({path for path in (*scenarios, *cards, *_leftovers(folder)) if path.is_file()})
 
 

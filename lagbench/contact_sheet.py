@@ -20,7 +20,7 @@ from .layout import resolve_root
 from .palette import MUTED
 from .panels import Panel, colour_bar, draw, limit_of, material_key
 from .recording import Recording, Scene, open_recording
-from .registry import Size, load
+from .registry import Registry, Size, load
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -75,6 +75,7 @@ def contact_sheet(
     root: str | Path | None = None,
     kind: Panel | str | None = None,
     frame: int | None = None,
+    registry: Registry | None = None,
 ) -> Path:
     """Draw many scenarios of a split on one page as a PNG file; return its path.
 
@@ -86,13 +87,14 @@ def contact_sheet(
         kind: what each panel shows; the default suits the split.
         frame: frame to show where the sheet is a table of scenarios; the last frame of
             interest of a driven flow, else the first frame, when None.
+        registry: where splits are described; ours when None.
 
     Raises:
         UsageError: unknown split, size or kind, no matplotlib.
         DataError: no scenario is there, or a file is damaged.
     """
-    tier = load().size(split, size)
-    files = scenario_files(tier, resolve_root(root))
+    splits = registry or load()
+    files = scenario_files(splits.size(split, size), resolve_root(root))
     if not files:
         raise DataError(
             "nothing to draw",
@@ -100,13 +102,13 @@ def contact_sheet(
             fix=f"lagbench generate --split {split} --size {size}",
         )
     panel = None if kind is None else Panel(kind)
-    kinds = _first_of_each_kind(files)
-    sheet = _over_time(kinds, panel) if kinds else _table(files, panel, frame)
+    kinds = _first_of_each_kind(files, splits)
+    sheet = _over_time(kinds, panel, splits) if kinds else _table(files, panel, frame, splits)
     columns = max(len(row) for row in sheet.rows)
     width = 2 * MARGIN + columns * (SIDE + GAP) - GAP
     height = TOP + len(sheet.rows) * (SIDE + LABEL + GAP) + BAR
     with figure(max(width, 5.0), height) as drawn:
-        header(drawn, f"{load().split(split).title} · {split} {size}", sheet.subtitle, left=MARGIN)
+        header(drawn, f"{splits.split(split).title} · {split} {size}", sheet.subtitle, left=MARGIN)
         _draw_sheet(drawn, sheet)
         return save_png(drawn, output)
 
@@ -126,19 +128,19 @@ def _kind_of(recording: Recording) -> str:
     return names[0] if names else ""
 
 
-def _first_of_each_kind(files: Sequence[Path]) -> dict[str, Path]:
+def _first_of_each_kind(files: Sequence[Path], splits: Registry) -> dict[str, Path]:
     """Return the first scenario of every family or pair, in order of appearance."""
     found: dict[str, Path] = {}
     for path in files:
-        with open_recording(path) as recording:
+        with open_recording(path, registry=splits) as recording:
             if kind := _kind_of(recording):
                 found.setdefault(kind, path)
     return dict(sorted(found.items(), key=lambda item: item[1].name))
 
 
-def _over_time(kinds: dict[str, Path], panel: Panel | None) -> _Sheet:
+def _over_time(kinds: dict[str, Path], panel: Panel | None, splits: Registry) -> _Sheet:
     """Return one row per kind: the same moments of each, one colour scale."""
-    rows = [list(_moments(path)) for path in kinds.values()]
+    rows = [list(_moments(path, splits)) for path in kinds.values()]
     if panel is None:
         mixed = any(np.unique(row[0].recording.material).size > 1 for row in rows)
         panel = Panel.MATERIAL if mixed else Panel.SPEED
@@ -150,8 +152,8 @@ def _over_time(kinds: dict[str, Path], panel: Panel | None) -> _Sheet:
     return _Sheet(rows=cells, panel=panel, subtitle="the first scenario of each kind over time", limit=limit)
 
 
-def _moments(path: Path) -> Iterator[Scene]:
-    with open_recording(path) as recording:
+def _moments(path: Path, splits: Registry) -> Iterator[Scene]:
+    with open_recording(path, registry=splits) as recording:
         for share in TIMES:
             yield recording.scene(round(share * (recording.frames - 1)))
 
@@ -160,9 +162,9 @@ def _moment_label(kind: str, scene: Scene, *, first: bool) -> str:
     return f"{scene.recording.scenario}  {kind}" if first else f"frame {scene.frame}"
 
 
-def _table(files: Sequence[Path], panel: Panel | None, frame: int | None) -> _Sheet:
+def _table(files: Sequence[Path], panel: Panel | None, frame: int | None, splits: Registry) -> _Sheet:
     """Return a table of scenarios at one frame."""
-    with open_recording(files[0]) as recording:
+    with open_recording(files[0], registry=splits) as recording:
         driven = bool(recording.wall_velocity.any())
         panel = panel or (Panel.STREAMLINES if driven else Panel.VORTICITY)
         if frame is None:
@@ -170,7 +172,7 @@ def _table(files: Sequence[Path], panel: Panel | None, frame: int | None) -> _Sh
             frame = min(latest, recording.frames - 1)
     scenes = []
     for path in files[: DRIVEN if driven else DECAYING]:
-        with open_recording(path) as recording:
+        with open_recording(path, registry=splits) as recording:
             scenes.append(recording.scene(frame))
     scaled = driven and panel in (Panel.STREAMLINES, Panel.SPEED)
     common = float(np.median([limit_of(panel, scene) for scene in scenes]))

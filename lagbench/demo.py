@@ -1,4 +1,4 @@
-"""From nothing to data: generate, verify and draw the four splits at size ``tiny``."""
+"""From nothing to data: generate, verify and draw the splits at size ``tiny``."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from pathlib import Path
 
 from .generation import GenerationResult, Progress, generate
 from .layout import ScenarioKey, resolve_root, scenario_path
-from .registry import Size, load
+from .registry import Registry, Size, load
 from .verification import VerificationResult, verify
 
-__all__ = ["DEMO_SIZE", "DemoResult", "demo"]
+__all__ = ["DEMO_SIZE", "DemoResult", "demo", "demo_splits"]
 
 DEMO_SIZE = "tiny"
 
@@ -29,6 +29,11 @@ class DemoResult:
     generation: GenerationResult
     verification: VerificationResult
     picture: Path
+
+
+def demo_splits(registry: Registry) -> list[str]:
+    """Return the splits that have a size ``tiny``; those of other packages need not."""
+    return [name for name, split in registry.splits.items() if DEMO_SIZE in split.sizes]
 
 
 def demo(

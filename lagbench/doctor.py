@@ -12,13 +12,27 @@ from pathlib import Path
 
 from .errors import LagbenchError
 from .layout import resolve_root
-from .overview import available_cores
 from .plan import free_bytes
+from .pool import available_cores
 from .registry import load
 
 __all__ = ["Check", "Diagnosis", "doctor"]
 
-NEEDED = ("numpy", "scipy", "xarray", "netCDF4", "pydantic", "PyYAML", "typer", "rich")
+NEEDED = (
+    "numpy",
+    "scipy",
+    "xarray",
+    "netCDF4",
+    "h5py",
+    "dask",
+    "pandas",
+    "pydantic",
+    "PyYAML",
+    "typer",
+    "rich",
+    "platformdirs",
+    "filelock",
+)
 OPTIONAL = {
     "taichi": "generate",
     "matplotlib": "plots",

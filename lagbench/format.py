@@ -21,6 +21,7 @@ from .checksums import ContentHasher, plain
 from .errors import DataError, LagbenchError, WorkFailedError
 from .layout import ScenarioKey, scenario_path
 from .scenario_file import ScenarioFile, ScenarioHeader, check_scenario, read_scenario, rehash
+from .variables import AXES, MATERIALS, WALLS, attributes_of
 
 __all__ = [
     "FORMAT",
@@ -38,31 +39,8 @@ __all__ = [
 FORMAT = 1
 """Number of the file layout; stored as attribute ``lagbench_format``."""
 
-MATERIALS = ("liquid", "jelly", "snow", "rope")
-"""Meaning of the values 0, 1, 2, 3 of ``material``."""
-
 CHUNK_CACHE = 1 << 20
 """Chunk cache of a variable while writing [bytes]; frames are written once, in order."""
-
-WALLS = ("left", "right", "bottom", "top")
-AXES = ("x", "y")
-
-_ATTRIBUTES: Mapping[str, Mapping[str, object]] = {
-    "frame": {"long_name": "frame number; 0 is the state when recording starts", "units": "1"},
-    "time": {"long_name": "time since frame 0", "units": "s"},
-    "particle": {"long_name": "particle number", "units": "1"},
-    "space": {"long_name": "axis of the unit box"},
-    "wall": {"long_name": "wall of the box"},
-    "position": {"long_name": "particle position in lengths of the unit box", "units": "1"},
-    "velocity": {"long_name": "particle velocity of the solver in box lengths per second", "units": "s-1"},
-    "material": {
-        "long_name": "constitutive model",
-        "flag_values": np.arange(len(MATERIALS), dtype=np.int8),
-        "flag_meanings": " ".join(MATERIALS),
-    },
-    "particle_mass": {"long_name": "mass of one particle, density times area over particles", "units": "1"},
-    "wall_velocity": {"long_name": "velocity of each wall in box lengths per second", "units": "s-1"},
-}
 
 _RESERVED = {
     *("Conventions", "title", "source", "license", "lagbench_format", "lagbench_version"),
@@ -221,10 +199,7 @@ class ScenarioWriter:
                 fill_value=False,
                 chunk_cache=CHUNK_CACHE,
             )
-        variable.setncatts(_ATTRIBUTES[name])
-        if "frame" in dims and len(dims) > 1:
-            # xarray makes a coordinate only of what this CF attribute names.
-            variable.coordinates = "time"
+        variable.setncatts(attributes_of(name, dims))
         self._hasher.declare(name, dtype, dims, shape)
 
     def _global_attributes(self) -> dict[str, object]:

@@ -18,8 +18,8 @@ from .campaign import Campaign
 from .errors import UsageError, nearest
 from .layout import dataset_folder, resolve_root
 from .locking import dataset_lock
-from .overview import available_cores
 from .plan import Scenarios, Selection, free_bytes, select
+from .pool import worker_count
 from .progress import Meter, Progress
 from .registry import Registry, load
 
@@ -106,17 +106,19 @@ def generate(
         registry: where splits are described; ours when None.
 
     Raises:
-        UsageError: unknown split, size, subset, scenario or device, or Taichi is not installed.
+        UsageError: unknown split, size, subset, scenario or device, fewer than one worker, or
+            Taichi is not installed.
         WorkFailedError: disk full or not writable, a scenario blew up, workers keep dying.
         DataError: the result has other hashes than datasets.yaml.
     """
     started = time.monotonic()
-    tier = (registry or load()).size(split, size)
+    splits = registry or load()
+    tier = splits.size(split, size)
     wanted = select(tier, subset=subset, scenarios=scenarios)
     target, folder = parse_device(device), resolve_root(root)
-    cores = workers or (available_cores() if target.value == "cpu" else 1)
-    free = free_bytes(folder)
-    campaign = Campaign(tier, folder, target, cores, Meter(progress))
+    cores = worker_count(workers, default=None if target.value == "cpu" else 1)
+    free = free_bytes(dataset_folder(folder, split, size, tier.major))
+    campaign = Campaign(tier, folder, target, cores, Meter(progress), split=splits.split(split))
     if dry_run:
         campaign.survey(wanted, force=force)
     else:

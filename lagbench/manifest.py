@@ -6,21 +6,25 @@ scenarios leaves ``complete: false``; a later one merges its files into what is 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
 from .atomic import write_atomically
 from .checksums import HASHED_SUBSETS, dataset_hash, file_sha256, subset_hash
 from .errors import DataError
+from .identity import may_differ
 from .layout import MANIFEST_NAME, ScenarioKey, dataset_folder, major_of, scenario_path
 from .scenario_file import read_scenario
+from .statistics import round_digits
 
 __all__ = ["FileEntry", "Manifest", "describe_file", "merge", "read_manifest", "write_manifest"]
 
 Hash = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]*$")]
 Row = Annotated[tuple[float, ...], Field(strict=False)]
 
 
@@ -34,7 +38,7 @@ class FileEntry(_Strict):
     Attributes:
         scenario: id of the scenario.
         subset: subset that holds it.
-        path: file relative to the manifest's folder.
+        path: file relative to the manifest's folder: ``<subset>/<id:04d>.nc`` and nothing else.
         frames: recorded frames.
         particles: particles in every frame.
         content_sha256: content hash.
@@ -46,7 +50,7 @@ class FileEntry(_Strict):
     """
 
     scenario: int
-    subset: str
+    subset: Name
     path: str
     frames: int
     particles: int
@@ -56,6 +60,21 @@ class FileEntry(_Strict):
     device: str
     facts: dict[str, float] = Field(default_factory=dict)
     twin_floor: Row = ()
+
+    @field_validator("path")
+    @classmethod
+    def _follows(cls, path: str, info: ValidationInfo) -> str:
+        """Refuse a path that leads elsewhere: files are opened and published by it."""
+        if {"subset", "scenario"} <= info.data.keys():
+            wanted = f"{info.data['subset']}/{info.data['scenario']:04d}.nc"
+            if path != wanted:
+                message = f"expected {wanted!r}"
+                raise ValueError(message)
+        return path
+
+    def has_hash(self, recorded: str | None) -> bool:
+        """Return whether the content hash begins with the digits that datasets.yaml has."""
+        return recorded is not None and self.content_sha256.startswith(recorded)
 
 
 class Manifest(_Strict):
@@ -67,8 +86,8 @@ class Manifest(_Strict):
         size: name of the size.
         version: semantic version of the split.
         complete: whether every scenario of train, valid and test is there.
-        identity: "bitwise" where every device that wrote a file keeps the promise of equal
-            bits, else "tolerance".
+        identity: "bitwise" where every file comes from a machine that promises equal bits or
+            has the hash of datasets.yaml, else "tolerance"; see ``lagbench.identity``.
         dataset_sha256: data set hash; None until complete.
         subset_sha256: hash of every complete subset.
         statistics: mean and std per component over train, see ``lagbench.statistics``; empty
@@ -93,9 +112,27 @@ class Manifest(_Strict):
         """Return the entry of a scenario; None where it is not generated."""
         return next((entry for entry in self.files if entry.scenario == scenario), None)
 
+    def mean_twin_floor(self) -> tuple[float, ...]:
+        """Return the mean twin floor over test at each frame that all have [length].
 
-def describe_file(root: Path, key: ScenarioKey, facts: Mapping[str, float] | None = None) -> FileEntry:
+        Nine digits; empty where a test scenario has no twin.
+        """
+        twins = [entry.twin_floor for entry in self.files if entry.subset == "test"]
+        if not all(twins):
+            return ()
+        return tuple(round_digits(math.fsum(column) / len(column)) for column in zip(*twins, strict=False))
+
+
+def describe_file(
+    root: Path, key: ScenarioKey, facts: Mapping[str, float] | None = None, *, digest: str | None = None
+) -> FileEntry:
     """Return the manifest entry of a scenario file on disk; its content is not re-hashed.
+
+    Args:
+        root: folder that holds all data sets.
+        key: what names the scenario.
+        facts: further numbers by name.
+        digest: SHA-256 of the file's bytes where it is known already.
 
     Raises:
         DataError: the file is missing or unreadable.
@@ -111,7 +148,7 @@ def describe_file(root: Path, key: ScenarioKey, facts: Mapping[str, float] | Non
         particles=header.particles,
         content_sha256=header.content_sha256,
         bytes=path.stat().st_size,
-        file_sha256=file_sha256(path),
+        file_sha256=digest or file_sha256(path),
         device=header.device,
         facts=dict(facts or {}),
     )
@@ -125,8 +162,8 @@ def merge(
     size: str,
     version: str,
     subsets: Mapping[str, Sequence[int]],
-    environment: Mapping[str, str],
-    identity: Literal["bitwise", "tolerance"] = "bitwise",
+    environment: Mapping[str, str] | None = None,
+    recorded: Mapping[int, str] | None = None,
     statistics: Mapping[str, Sequence[float]] | None = None,
 ) -> Manifest:
     """Return a manifest with new files put in; new entries replace old ones of the same id.
@@ -138,28 +175,30 @@ def merge(
         size: name of the size.
         version: semantic version of the split.
         subsets: subset to the scenario ids that it must hold.
-        environment: machine and library versions of this generation.
-        identity: whether this generation's device keeps the promise of equal bits.
-        statistics: statistics over train; those of the old manifest when None.
+        environment: machine and library versions that wrote the new files; None where they
+            were found on disk.
+        recorded: scenario to the first digits of its content hash in datasets.yaml.
+        statistics: statistics over train; when None those of the old manifest, where train
+            is still the same.
     """
-    known = {i for ids in subsets.values() for i in ids}
-    entries = {entry.scenario: entry for entry in old.files if entry.scenario in known} if old else {}
-    entries |= {entry.scenario: entry for entry in files}
+    kept = [entry for entry in old.files if entry.scenario in subsets.get(entry.subset, ())] if old else []
+    entries = {entry.scenario: entry for entry in (*kept, *files)}
     hashes = _subset_hashes(entries, subsets)
     complete = all(name in hashes for name in HASHED_SUBSETS)
     environments = list(old.environments) if old else []
-    if dict(environment) not in environments:
+    if environment is not None and dict(environment) not in environments:
         environments.append(dict(environment))
-    kept = old.statistics if old and statistics is None else dict(statistics or {})
+    if statistics is None and old and old.subset_sha256.get("train") == hashes.get("train"):
+        statistics = old.statistics
     return Manifest(
         split=split,
         size=size,
         version=version,
         complete=complete,
-        identity="tolerance" if "tolerance" in {identity, old and old.identity} else "bitwise",
+        identity=_identity(entries.values(), environments, recorded or {}),
         dataset_sha256=dataset_hash(split, size, major_of(version), hashes) if complete else None,
         subset_sha256=hashes,
-        statistics={name: tuple(row) for name, row in kept.items()} if "train" in hashes else {},
+        statistics={n: tuple(row) for n, row in (statistics or {}).items()} if "train" in hashes else {},
         environments=tuple(environments),
         files=tuple(entries[scenario] for scenario in sorted(entries)),
     )
@@ -200,6 +239,13 @@ def write_manifest(root: Path, manifest: Manifest) -> Path:
     path = folder / MANIFEST_NAME
     write_atomically(path, (manifest.model_dump_json(indent=1) + "\n").encode())
     return path
+
+
+def _identity(
+    entries: Iterable[FileEntry], environments: Sequence[Mapping[str, str]], recorded: Mapping[int, str]
+) -> Literal["bitwise", "tolerance"]:
+    unproven = [entry for entry in entries if not entry.has_hash(recorded.get(entry.scenario))]
+    return "tolerance" if any(may_differ(entry.device, environments) for entry in unproven) else "bitwise"
 
 
 def _subset_hashes(entries: Mapping[int, FileEntry], subsets: Mapping[str, Sequence[int]]) -> dict[str, str]:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
 from .cards import PICTURES
 from .layout import dataset_folder
 from .plan import estimate
+from .pool import available_cores
 from .registry import Size
 
 __all__ = ["Overview", "available_cores", "overview"]
@@ -53,11 +53,6 @@ class Overview:
         if there == wanted:
             return "yes"
         return f"{there} of {wanted}" if there else "no"
-
-
-def available_cores() -> int:
-    """Return the number of processors that this process may use."""
-    return len(os.sched_getaffinity(0))
 
 
 def overview(size: Size, root: Path) -> Overview:

@@ -5,6 +5,7 @@ Nothing here writes; drawing the initial states tells how many substeps lie ahea
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -101,9 +102,14 @@ def scenario_bytes(size: Size, scenario: int) -> int:
 
 
 def estimate(size: Size, scenarios: Sequence[int]) -> Estimate:
-    """Return what simulating these scenarios takes."""
-    from .generators.batch import substeps_of
+    """Return what simulating these scenarios takes.
 
+    Raises:
+        UnreadableFileError: the solver or the draws cannot use a parameter of the size.
+    """
+    from .generators.batch import solver_constants, substeps_of
+
+    solver_constants(size)
     substeps = tuple(substeps_of(size, i) for i in scenarios)
     return Estimate(
         scenarios=tuple(scenarios),
@@ -114,9 +120,22 @@ def estimate(size: Size, scenarios: Sequence[int]) -> Estimate:
     )
 
 
-def free_bytes(root: Path) -> int:
-    """Return the free space of the file system that holds, or would hold, a folder [bytes]."""
-    existing = next(folder for folder in (root, *root.parents) if folder.exists())
+def free_bytes(folder: Path) -> int:
+    """Return the free space of the file system that holds, or would hold, a folder [bytes].
+
+    Raises:
+        WorkFailedError: nothing can be written there: the nearest existing parent is a file, or
+            is not ours to write.
+    """
+    existing = next(place for place in (folder, *folder.parents) if place.exists())
+    if not existing.is_dir() or not os.access(existing, os.W_OK | os.X_OK):
+        raise WorkFailedError(
+            "no data set can be written here",
+            where=str(folder),
+            expected="a folder that you may write to",
+            got=f"{existing} is {'write-protected' if existing.is_dir() else 'a file'}",
+            fix="name another folder: --root or LAGBENCH_ROOT",
+        )
     return shutil.disk_usage(existing).free
 
 

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.figure import Figure
 
+    from .registry import Registry
+
 __all__ = ["KINDS", "Panel", "contact_sheet", "describe", "plot_frame"]
 
 ALL = "all"
@@ -34,7 +36,14 @@ SEPARATOR = "  ·  "
 DIRECTIONS = {(1, 0): "right", (-1, 0): "left", (0, 1): "up", (0, -1): "down"}
 
 
-def plot_frame(source: str | Path | xr.Dataset, frame: int, output: str | Path, *, kind: str = ALL) -> Path:
+def plot_frame(
+    source: str | Path | xr.Dataset,
+    frame: int,
+    output: str | Path,
+    *,
+    kind: str = ALL,
+    registry: Registry | None = None,
+) -> Path:
     """Draw one frame of a scenario as a PNG file; return its path.
 
     Args:
@@ -42,6 +51,7 @@ def plot_frame(source: str | Path | xr.Dataset, frame: int, output: str | Path, 
         frame: absolute frame number; negative ones count from the end.
         output: file to write, ending in .png.
         kind: one of :data:`KINDS`; ``all`` draws three panels side by side.
+        registry: where splits are described; ours when None.
 
     Raises:
         UsageError: unknown kind, no such frame, a name that is no .png, no matplotlib.
@@ -49,7 +59,7 @@ def plot_frame(source: str | Path | xr.Dataset, frame: int, output: str | Path, 
     """
     if kind not in KINDS:
         raise UsageError(f"no kind of picture {kind!r}", where="--kind", fix=nearest(kind, KINDS))
-    with open_recording(source) as recording:
+    with open_recording(source, registry=registry) as recording:
         scene = recording.scene(frame)
     panels = _panels(recording) if kind == ALL else [Panel(kind)]
     width = 2 * MARGIN + len(panels) * SIDE + (len(panels) - 1) * GAP

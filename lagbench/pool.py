@@ -27,9 +27,9 @@ from multiprocessing.connection import Connection, wait
 from types import TracebackType
 from typing import Any, Self
 
-from .errors import LagbenchError, WorkFailedError
+from .errors import LagbenchError, UsageError, WorkFailedError
 
-__all__ = ["ATTEMPTS", "Event", "Pool", "Report", "Task", "serve"]
+__all__ = ["ATTEMPTS", "Event", "Pool", "Report", "Task", "available_cores", "serve", "worker_count"]
 
 ATTEMPTS = 3
 """Times that a task is tried when the worker under it dies."""
@@ -45,6 +45,24 @@ _BOOT = (
     "import sys, json; sys.path[:] = json.loads(sys.argv[2]); "
     "from lagbench.pool import serve; serve(int(sys.argv[1]))"
 )
+
+
+def available_cores() -> int:
+    """Return the number of processors that this process may use."""
+    return len(os.sched_getaffinity(0))
+
+
+def worker_count(wanted: int | None, *, default: int | None = None) -> int:
+    """Return how many workers to start: those wanted, else the default, else one per core.
+
+    Raises:
+        UsageError: fewer than one is wanted.
+    """
+    if wanted is None:
+        return default or available_cores()
+    if wanted < 1:
+        raise UsageError("there is no work without a worker", where="--workers", expected=">= 1", got=wanted)
+    return wanted
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,13 +98,21 @@ class Event:
     value: Any
 
 
+@dataclass(frozen=True)
+class _Attempt:
+    """A task and how many workers have died under it."""
+
+    task: Task
+    deaths: int = 0
+
+
 @dataclass
 class _Worker:
     """A worker process, the parent's end of its channel and what it works on."""
 
     process: subprocess.Popen[bytes]
     channel: Connection
-    task: Task | None = None
+    attempt: _Attempt | None = None
     progress: int = 0
 
 
@@ -97,14 +123,20 @@ class Pool:
     Args:
         size: workers at the most; they start when there is work for them.
         environment: variables added to the environment of the workers.
+
+    Raises:
+        UsageError: a size below one, with which no task would ever run.
     """
 
     size: int
     environment: Mapping[str, str] = field(default_factory=dict)
     _workers: list[_Worker] = field(default_factory=list, init=False)
-    _waiting: list[tuple[float, int, Task]] = field(default_factory=list, init=False)
+    _waiting: list[tuple[float, int, _Attempt]] = field(default_factory=list, init=False)
     _number: Iterator[int] = field(default_factory=itertools.count, init=False)
-    _attempts: dict[int, int] = field(default_factory=dict, init=False)
+
+    def __post_init__(self) -> None:
+        """Refuse a pool in which no task could ever run."""
+        self.size = worker_count(self.size)
 
     def __enter__(self) -> Self:
         """Return the pool itself."""
@@ -120,7 +152,7 @@ class Pool:
 
     def submit(self, task: Task) -> None:
         """Queue a task; also while :meth:`events` runs."""
-        heapq.heappush(self._waiting, (-task.cost, next(self._number), task))
+        self._queue(_Attempt(task))
 
     def events(self) -> Iterator[Event]:
         """Run every queued task and yield news until all are done.
@@ -129,11 +161,11 @@ class Pool:
             LagbenchError: what a task raised.
             WorkFailedError: a task crashed, or its worker died :data:`ATTEMPTS` times.
         """
-        while self._waiting or any(worker.task for worker in self._workers):
+        while self._waiting or any(worker.attempt for worker in self._workers):
             self._assign()
             for worker in self._ready():
-                if worker.task is not None:
-                    yield self._receive(worker, worker.task)
+                if worker.attempt is not None:
+                    yield self._receive(worker, worker.attempt)
 
     def process_ids(self) -> list[int]:
         """Return the process ids of the living workers."""
@@ -150,7 +182,7 @@ class Pool:
 
     def _dismiss(self) -> None:
         """Ask idle workers to end: Taichi saves what it compiled as its process exits."""
-        idle = [worker for worker in self._workers if worker.task is None]
+        idle = [worker for worker in self._workers if worker.attempt is None]
         for worker in idle:
             with contextlib.suppress(OSError):  # it died while idle
                 worker.channel.send_bytes(_FAREWELL)
@@ -158,16 +190,19 @@ class Pool:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 worker.process.wait(_PATIENCE)
 
+    def _queue(self, attempt: _Attempt) -> None:
+        heapq.heappush(self._waiting, (-attempt.task.cost, next(self._number), attempt))
+
     def _assign(self) -> None:
-        idle = [worker for worker in self._workers if worker.task is None]
+        idle = [worker for worker in self._workers if worker.attempt is None]
         while self._waiting and (idle or len(self._workers) < self.size):
             worker = idle.pop() if idle else self._start()
-            _, _, task = heapq.heappop(self._waiting)
-            worker.task, worker.progress = task, 0
+            _, _, attempt = heapq.heappop(self._waiting)
+            worker.attempt, worker.progress = attempt, 0
             try:
-                worker.channel.send_bytes(pickle.dumps((task.function, task.arguments)))
+                worker.channel.send_bytes(pickle.dumps((attempt.task.function, attempt.task.arguments)))
             except OSError:  # it died while idle
-                self._bury(worker, task)
+                self._bury(worker, attempt)
 
     def _start(self) -> _Worker:
         ours, theirs = socket.socketpair()
@@ -187,39 +222,39 @@ class Pool:
 
     def _ready(self) -> list[_Worker]:
         """Wait until a busy worker has news; one that died has some too."""
-        busy = [worker for worker in self._workers if worker.task]
+        busy = [worker for worker in self._workers if worker.attempt]
         ready = wait([worker.channel for worker in busy])
         return [worker for worker in busy if worker.channel in ready]
 
-    def _receive(self, worker: _Worker, task: Task) -> Event:
+    def _receive(self, worker: _Worker, attempt: _Attempt) -> Event:
         try:
             kind, value = worker.channel.recv()
         except (EOFError, OSError):
-            return self._bury(worker, task)
+            return self._bury(worker, attempt)
         if kind == "progress":
             worker.progress += value
-            return Event(task=task, kind=kind, value=value)
-        worker.task = None
+            return Event(task=attempt.task, kind=kind, value=value)
+        worker.attempt = None
         if kind == "done":
-            return Event(task=task, kind=kind, value=value)
+            return Event(task=attempt.task, kind=kind, value=value)
         raise value
 
-    def _bury(self, worker: _Worker, task: Task) -> Event:
+    def _bury(self, worker: _Worker, attempt: _Attempt) -> Event:
         """Forget a dead worker; queue its task again unless it was tried often enough."""
         self._workers.remove(worker)
         worker.process.kill()
         code = worker.process.wait()
         worker.channel.close()
-        self._attempts[id(task)] = self._attempts.get(id(task), 0) + 1
-        if self._attempts[id(task)] >= ATTEMPTS:
+        again = _Attempt(attempt.task, attempt.deaths + 1)
+        if again.deaths >= ATTEMPTS:
             raise WorkFailedError(
                 f"a worker process died {ATTEMPTS} times",
-                where=task.name,
+                where=again.task.name,
                 got=_last_words(code),
                 fix="free memory or take fewer workers: --workers 1",
             )
-        self.submit(task)
-        return Event(task=task, kind="lost", value=worker.progress)
+        self._queue(again)
+        return Event(task=again.task, kind="lost", value=worker.progress)
 
 
 def _last_words(code: int) -> str:

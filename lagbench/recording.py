@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from . import grid as gridding
 from .errors import UsageError
 from .format import read_scenario
-from .registry import Size, load
+from .registry import Registry, Size, load
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -72,6 +72,7 @@ class Recording:
 
     Attributes:
         size: tier of the split, from the registry.
+        title: title of the split.
         scenario: id.
         subset: subset that holds the scenario.
         frames: recorded frames.
@@ -87,6 +88,7 @@ class Recording:
         frames: int,
         variables: set[str],
         read: Read,
+        registry: Registry,
     ) -> None:
         """Read what holds for all frames.
 
@@ -96,8 +98,10 @@ class Recording:
             frames: recorded frames.
             variables: names of the variables there.
             read: returns a variable, or one of its frames.
+            registry: where the split is described.
         """
-        self.size: Size = load().size(str(identity["split"]), str(identity["size"]))
+        self.size: Size = registry.size(str(identity["split"]), str(identity["size"]))
+        self.title = registry.split(self.size.split).title
         self.scenario = int(identity["scenario"])
         self.subset = str(identity["subset"])
         self.parameters = parameters
@@ -108,11 +112,6 @@ class Recording:
         moving = "wall_velocity" in variables
         self.wall_velocity = read("wall_velocity", 0).astype(np.float64) if moving else np.zeros((4, 2))
         self._mass = float(read("particle_mass", slice(None)))
-
-    @property
-    def title(self) -> str:
-        """Title of the split."""
-        return load().split(self.size.split).title
 
     @property
     def particles(self) -> int:
@@ -171,24 +170,31 @@ class Recording:
 
 
 @contextmanager
-def open_recording(source: str | Path | xr.Dataset) -> Iterator[Recording]:
+def open_recording(
+    source: str | Path | xr.Dataset, *, registry: Registry | None = None
+) -> Iterator[Recording]:
     """Open a scenario file, or a data set of one scenario, for drawing.
+
+    Args:
+        source: scenario file, or a data set of one scenario.
+        registry: where splits are described; ours when None.
 
     Raises:
         DataError: the file is missing or damaged.
         UsageError: the data set holds several scenarios, or its split is unknown.
     """
     if not isinstance(source, str | Path):
-        yield _of_dataset(source)
+        yield _of_dataset(source, registry or load())
         return
     with read_scenario(Path(source)) as file:
         head = file.header
         key = head.key
         identity = {"split": key.split, "size": key.size, "scenario": key.scenario, "subset": key.subset}
-        yield Recording(identity, head.parameters, head.frames, set(file.variables), file.read)
+        variables = set(file.variables)
+        yield Recording(identity, head.parameters, head.frames, variables, file.read, registry or load())
 
 
-def _of_dataset(data: xr.Dataset) -> Recording:
+def _of_dataset(data: xr.Dataset, registry: Registry) -> Recording:
     """Return the recording that a data set of one scenario holds."""
     if "scenario" in data.dims:
         raise UsageError(
@@ -206,7 +212,7 @@ def _of_dataset(data: xr.Dataset) -> Recording:
         variable = data[name]
         return np.asarray(variable.isel(frame=frames) if "frame" in variable.dims else variable)
 
-    return Recording(identity, attributes, frames, {str(name) for name in data.variables}, read)
+    return Recording(identity, attributes, frames, {str(name) for name in data.variables}, read, registry)
 
 
 _IDENTITY = ("split", "size", "scenario", "subset")

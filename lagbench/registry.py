@@ -11,13 +11,22 @@ from __future__ import annotations
 import functools
 import os
 from collections.abc import Mapping
-from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    ValidationError,
+    model_validator,
+)
 
 from .errors import UnreadableFileError, UsageError, nearest
+from .limits import check_frames, check_parameters, check_subsets
+from .plugins import added_splits
 from .scenario_ids import parse_ids, spell_ids
 from .yamlfile import read_yaml
 
@@ -44,13 +53,11 @@ def _ids(value: str | int) -> tuple[int, ...]:
 
 
 Ids = Annotated[tuple[int, ...], BeforeValidator(_ids)]
-Interval = Annotated[tuple[float, float], Field(strict=False)]
+Interval = Annotated[tuple[FiniteFloat, FiniteFloat], Field(strict=False)]
 Hash = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 ShortHash = Annotated[str, Field(pattern=r"^[0-9a-f]{16}$")]
 REGISTRY_VARIABLE = "LAGBENCH_REGISTRY"
 """Environment variable that names a datasets.yaml to use instead of ours."""
-
-SUBSETS = ("train", "valid", "test", "extra")
 
 
 class _Strict(BaseModel):
@@ -102,7 +109,7 @@ class Task(_Strict):
     horizon: int = Field(gt=0)
     frames_of_interest: tuple[int, ...] = Field(strict=False)
     score_grid: ScoreGrid
-    radius: float = Field(gt=0)
+    radius: float = Field(gt=0, allow_inf_nan=False)
 
 
 class Measured(_Strict):
@@ -134,7 +141,10 @@ class _SizeEntry(_Strict):
 
 
 class Size(BaseModel):
-    """One tier of a split with all that is needed to simulate, read and score it."""
+    """One tier of a split with all that is needed to simulate, read and score it.
+
+    ``file`` is the datasets.yaml that describes it.
+    """
 
     model_config = ConfigDict(frozen=True)
 
@@ -148,6 +158,7 @@ class Size(BaseModel):
     parameters: dict[str, Parameter]
     task: Task
     measured: Measured | None = None
+    file: Path = Path("datasets.yaml")
 
     @property
     def major(self) -> int:
@@ -237,17 +248,25 @@ class Split(_Strict):
     @model_validator(mode="after")
     def _consistent(self) -> Split:
         for name, size in self.sizes.items():
-            _check_parameters(name, size.parameters, self.parameters)
-            _check_subsets(name, size)
+            check_parameters(name, size.parameters, {n: p.value for n, p in self.parameters.items()})
+            check_subsets(name, size.subsets)
+            needed = size.task.input_frames + size.task.horizon
+            check_frames(name, size.frames, size.subsets, task_frames=needed)
         return self
 
 
 class Registry:
     """All splits of one datasets.yaml and of the installed packages that add splits."""
 
-    def __init__(self, splits: Mapping[str, Split], measured: Mapping[str, Mapping[str, Measured]]) -> None:
+    def __init__(
+        self,
+        splits: Mapping[str, Split],
+        measured: Mapping[str, Mapping[str, Measured]],
+        files: Mapping[str, Path] | None = None,
+    ) -> None:
         self.splits = dict(splits)
         self.measured = measured
+        self.files = dict(files or {})
 
     def split(self, name: str) -> Split:
         """Return a split by name.
@@ -282,6 +301,7 @@ class Registry:
             parameters=_merge(parent.parameters, entry.parameters),
             task=entry.task,
             measured=self.measured.get(split, {}).get(name),
+            file=self.files.get(split, Path("datasets.yaml")),
         )
 
 
@@ -305,7 +325,8 @@ def load(path: Path | None = None) -> Registry:
 
     Args:
         path: a datasets.yaml; else the one that ``LAGBENCH_REGISTRY`` names; else ours, with
-            those of entry points.
+            the splits that entry points name; a package whose split cannot be read, or has a
+            name that is taken, is left out with a :class:`~lagbench.plugins.PluginWarning`.
 
     Raises:
         UnreadableFileError: not YAML, an unknown key or a value of the wrong type.
@@ -320,25 +341,18 @@ def _load(path: Path | None, modified: int) -> Registry:
     """Load a file once per modification time."""
     own = _read(path or default_path())
     splits, measured = dict(own.splits), dict(own.measured)
+    files = dict.fromkeys(splits, path or default_path())
     if path is None:
-        for point in entry_points(group="lagbench.generators"):
-            if point.name not in splits:
-                other = _read(_registry_of(point))
-                splits |= other.splits
-                measured |= other.measured
-    return Registry(splits, measured)
+        modules = {name: split.generator for name, split in own.splits.items()}
+        for name, (split, hashes, file) in added_splits(modules, _read_split).items():
+            splits[name], measured[name], files[name] = split, hashes, file
+    return Registry(splits, measured, files)
 
 
-def _registry_of(point: EntryPoint) -> Path:
-    """Return the datasets.yaml that another package's split module names as REGISTRY."""
-    module = point.load()
-    if not hasattr(module, "REGISTRY"):
-        raise UsageError(
-            f"split {point.name!r} has no registry",
-            where=f"entry point {point.value}",
-            expected="a module attribute REGISTRY: the path of its datasets.yaml",
-        )
-    return Path(module.REGISTRY)
+def _read_split(path: Path, name: str) -> tuple[Split, dict[str, Measured], Path]:
+    """Return one split of a datasets.yaml, its measured values and the file."""
+    file = _read(path)
+    return Registry(file.splits, {}).split(name), file.measured.get(name, {}), path
 
 
 def _read(path: Path) -> _File:
@@ -346,7 +360,7 @@ def _read(path: Path) -> _File:
     try:
         return _File.model_validate(read_yaml(path))
     except ValidationError as error:
-        lines = [f"{'.'.join(map(str, item['loc']))}: {item['msg']}" for item in error.errors()[:10]]
+        lines = [_mistake(item["loc"], item["msg"], item["input"]) for item in error.errors()[:10]]
         raise UnreadableFileError(
             f"{error.error_count()} mistake(s) in the registry",
             where=str(path),
@@ -355,35 +369,12 @@ def _read(path: Path) -> _File:
         ) from None
 
 
+def _mistake(place: tuple[int | str, ...], message: str, given: object) -> str:
+    """Return one line: key, what is expected there, and what was got if that is short."""
+    got = f"; got {given!r}" if isinstance(given, str | int | float) and "; got " not in message else ""
+    return f"{'.'.join(map(str, place))}: {message.removeprefix('Value error, ')}{got}"
+
+
 def _merge(split: Mapping[str, Parameter], size: Mapping[str, Number | bool | str]) -> dict[str, Parameter]:
     """Return the split's parameters with the size's values put in."""
     return {name: p.model_copy(update={"value": size.get(name, p.value)}) for name, p in split.items()}
-
-
-def _check_parameters(
-    size: str, given: Mapping[str, Number | bool | str], declared: Mapping[str, Parameter]
-) -> None:
-    for name in given:
-        if name not in declared:
-            message = f"size {size}: undeclared parameter {name!r}: {nearest(name, declared)}"
-            raise ValueError(message)
-    missing = [n for n, p in declared.items() if p.value is None and n not in given]
-    if missing:
-        message = f"size {size}: no value for {', '.join(missing)}"
-        raise ValueError(message)
-
-
-def _check_subsets(size: str, entry: _SizeEntry) -> None:
-    unknown = set(entry.subsets) - set(SUBSETS)
-    if unknown:
-        message = f"size {size}: {nearest(min(unknown), SUBSETS)}"
-        raise ValueError(message)
-    ids = [i for subset in entry.subsets.values() for i in subset]
-    if len(ids) != len(set(ids)):
-        message = f"size {size}: a scenario stands in two subsets"
-        raise ValueError(message)
-    if isinstance(entry.frames, dict):
-        counted = sorted(i for group in entry.frames.values() for i in group)
-        if counted != sorted(ids):
-            message = f"size {size}: frames must name every scenario once"
-            raise ValueError(message)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from .checksums import ContentHasher, plain
 from .errors import DataError, LagbenchError
 from .layout import ScenarioKey
+from .variables import differing_attributes
 
 if TYPE_CHECKING:
     import netCDF4
@@ -126,6 +127,26 @@ class ScenarioFile:
         for start in starts:
             yield self.read(name, slice(start, start + step))
 
+    def check_attributes(self) -> None:
+        """Refuse attributes that make other readers read other values.
+
+        Raises:
+            DataError: a variable has not the attributes of the format.
+        """
+        for name in self.variables:
+            with _damage(self.path, name):
+                variable = self._file.variables[name]
+                found = {key: variable.getncattr(key) for key in variable.ncattrs()}
+                unlike = differing_attributes(name, variable.dimensions, found)
+            if unlike:
+                raise DataError(
+                    "attributes of a variable are not those of the format",
+                    where=f"{self.path}, variable {name!r}",
+                    expected="those of docs/format.md",
+                    got=", ".join(f"{key} = {found.get(key, 'missing')}" for key in unlike),
+                    fix=_REPAIR,
+                )
+
     def computed_hasher(self) -> ContentHasher:
         """Return a hasher that has read the whole file."""
         header = self.header
@@ -173,7 +194,7 @@ def rehash(path: Path) -> str:
 
 
 def check_scenario(path: Path, expected: str | None = None) -> str:
-    """Recompute a file's content hash and compare it with the stored and the expected one.
+    """Recompute a file's content hash, compare it, and check what is not hashed.
 
     Args:
         path: scenario file.
@@ -183,12 +204,14 @@ def check_scenario(path: Path, expected: str | None = None) -> str:
         The content hash.
 
     Raises:
-        DataError: the file is missing or damaged, or its hash is another; the message names
-            file and, where one can be told, variable.
+        DataError: the file is missing or damaged, its hash is another, or its attributes
+            change what readers make of it; the message names file and, where one can be told,
+            variable.
     """
     with read_scenario(path) as file:
         stored = file.header
         hasher = file.computed_hasher()
+        file.check_attributes()
     for name, digest in hasher.digests().items():
         if stored.variable_sha256.get(name) != digest:
             where = f"{path}, variable {name!r}"

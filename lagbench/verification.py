@@ -1,7 +1,8 @@
 """Verify a data set: hash the files again, compare with datasets.yaml, simulate some anew.
 
 The manifest is a claim of whoever wrote it; datasets.yaml comes with lagbench. So files are
-held against datasets.yaml, and against the manifest only where datasets.yaml has no hash yet.
+held against datasets.yaml, and against the manifest only where datasets.yaml has no hash yet,
+or where a machine wrote files that promises no equal bits.
 """
 
 from __future__ import annotations
@@ -19,12 +20,12 @@ from .generators.solver import Device
 from .inventory import Finding, State, examine, extra_files, recorded_hash
 from .layout import dataset_folder, resolve_root
 from .manifest import Manifest, read_manifest
-from .overview import available_cores
 from .plan import Scenarios, Selection, estimate, select
-from .pool import Pool, Task
+from .pool import Pool, Task, worker_count
 from .progress import Meter, Progress
 from .registry import Registry, Size, load
 from .scenario_ids import spell_ids
+from .verdict import TOLERATED, UNLIKE, hash_verdict, unlike_measures
 
 __all__ = ["SubsetReport", "VerificationResult", "verify"]
 
@@ -133,15 +134,15 @@ def verify(
         registry: where splits are described; ours when None.
 
     Raises:
-        UsageError: unknown split, size, subset or scenario.
+        UsageError: unknown split, size, subset or scenario, or fewer than one worker.
         WorkFailedError: simulating anew failed.
     """
     tier = (registry or load()).size(split, size)
     ids, folder = select(tier, subset=subset, scenarios=scenarios), resolve_root(root)
-    meter = Meter(progress)
-    findings = _examine_all(folder, tier, ids, meter)
+    meter, cores = Meter(progress), worker_count(workers)
     manifest, warnings = _manifest(folder, tier)
-    anew = _regenerate(tier, evenly_spaced(ids, regenerate), workers or available_cores(), meter)
+    findings = _examine_all(folder, tier, ids, manifest, meter)
+    anew = _regenerate(tier, evenly_spaced(ids, regenerate), cores, meter)
     regenerated = {i: _likeness(tier, findings[i], content) for i, content in anew.items()}
     problems = [f.problem for f in findings.values() if f.problem]
     problems += [f"scenario {i} differs when simulated anew" for i in anew if regenerated[i] == DIFFERENT]
@@ -158,7 +159,7 @@ def verify(
         dataset_sha256=whole,
         regenerated=regenerated,
         problems=tuple(problems),
-        warnings=(*warnings, *_gaps(reports), *_unlike(tier, manifest, findings)),
+        warnings=(*warnings, *_gaps(reports), *_notes(tier, manifest, findings)),
         must_be_complete=complete,
         verdict=verdict,
     )
@@ -167,7 +168,6 @@ def verify(
 IDENTICAL = "identical"
 DIFFERENT = "different"
 INCOMPARABLE = "nothing to compare with"
-UNLIKE = "NOT that of datasets.yaml"
 
 
 def evenly_spaced(ids: Sequence[int], count: int) -> tuple[int, ...]:
@@ -183,11 +183,13 @@ def evenly_spaced(ids: Sequence[int], count: int) -> tuple[int, ...]:
     return tuple(ids[(2 * k * last + count - 1) // (2 * (count - 1))] for k in range(count))
 
 
-def _examine_all(root: Path, size: Size, ids: Sequence[int], meter: Meter) -> dict[int, Finding]:
+def _examine_all(
+    root: Path, size: Size, ids: Sequence[int], manifest: Manifest | None, meter: Meter
+) -> dict[int, Finding]:
     meter.begin("hashing", total=len(ids), scenarios=len(ids))
     findings = {}
     for scenario in ids:
-        findings[scenario] = examine(root, size, scenario)
+        findings[scenario] = examine(root, size, scenario, manifest=manifest)
         meter.count(1, scenarios=1)
     return findings
 
@@ -199,9 +201,8 @@ def _manifest(root: Path, size: Size) -> tuple[Manifest | None, list[str]]:
         return None, [str(error)]
     if manifest is None:
         return None, ["there is no manifest: lagbench generate writes it"]
-    if manifest.identity == "tolerance":
-        return manifest, ["identity: tolerance - a device wrote these files that does not keep equal bits"]
-    return manifest, []
+    tolerance = "identity: tolerance - a device wrote these files that does not promise equal bits"
+    return manifest, [tolerance] if manifest.identity == "tolerance" else []
 
 
 def _regenerate(size: Size, ids: Sequence[int], workers: int, meter: Meter) -> dict[int, str]:
@@ -227,10 +228,12 @@ def _regenerate(size: Size, ids: Sequence[int], workers: int, meter: Meter) -> d
 
 def _likeness(size: Size, finding: Finding, content: str) -> str:
     """Compare a scenario simulated anew with its file, else with datasets.yaml."""
-    known = finding.content_sha256 or recorded_hash(size, finding.scenario)
-    if known is None:
+    known = [finding.content_sha256] if finding.content_sha256 else []
+    if finding.tolerated or not known:
+        known += filter(None, [recorded_hash(size, finding.scenario)])
+    if not known:
         return INCOMPARABLE
-    return IDENTICAL if content.startswith(known) else DIFFERENT
+    return IDENTICAL if any(map(content.startswith, known)) else DIFFERENT
 
 
 def _reports(
@@ -264,7 +267,8 @@ def _subset_digest(size: Size, name: str, findings: Mapping[int, Finding]) -> st
 
 def _subset_verdict(size: Size, name: str, findings: Mapping[int, Finding]) -> str:
     recorded = size.measured.subset_sha256.get(name) if size.measured else None
-    return _verdict(_subset_digest(size, name, findings), recorded)
+    tolerated = any(findings[i].tolerated for i in size.subsets[name] if i in findings)
+    return hash_verdict(_subset_digest(size, name, findings), recorded, tolerated=tolerated)
 
 
 def _whole(size: Size, findings: Mapping[int, Finding]) -> tuple[str | None, str]:
@@ -272,15 +276,9 @@ def _whole(size: Size, findings: Mapping[int, Finding]) -> tuple[str | None, str
     digests = {name: _subset_digest(size, name, findings) for name in HASHED_SUBSETS}
     known = {name: digest for name, digest in digests.items() if digest is not None}
     whole = dataset_hash(size.split, size.name, size.major, known) if len(known) == len(digests) else None
-    return whole, _verdict(whole, size.measured.dataset_sha256 if size.measured else None)
-
-
-def _verdict(computed: str | None, recorded: str | None) -> str:
-    if recorded is None:
-        return "no hash in datasets.yaml yet"
-    if computed is None:
-        return "incomplete"
-    return "equal to datasets.yaml" if computed == recorded else UNLIKE
+    recorded = size.measured.dataset_sha256 if size.measured else None
+    tolerated = any(finding.tolerated for finding in findings.values())
+    return whole, hash_verdict(whole, recorded, tolerated=tolerated)
 
 
 def _gaps(reports: Sequence[SubsetReport]) -> list[str]:
@@ -288,8 +286,14 @@ def _gaps(reports: Sequence[SubsetReport]) -> list[str]:
     return gaps + [f"{r.name} has files of no scenario: {', '.join(r.extra)}" for r in reports if r.extra]
 
 
-def _unlike(size: Size, manifest: Manifest | None, findings: Mapping[int, Finding]) -> list[str]:
-    """Return the scenarios of which the manifest says another hash than the files have."""
-    entries = {entry.scenario: entry.content_sha256 for entry in manifest.files} if manifest else {}
+def _notes(size: Size, manifest: Manifest | None, findings: Mapping[int, Finding]) -> list[str]:
+    """Return how files that are right differ from datasets.yaml, and the manifest from both."""
+    tolerated = [i for i, finding in findings.items() if finding.tolerated]
+    notes = [f"scenarios {spell_ids(tolerated)} have {TOLERATED}"] if tolerated else []
+    if manifest is None:
+        return notes
+    entries = {entry.scenario: entry.content_sha256 for entry in manifest.files}
     unlike = [i for i, f in findings.items() if i in entries and f.content_sha256 not in (None, entries[i])]
-    return [f"the manifest has other hashes of {spell_ids(unlike)}"] if unlike else []
+    notes += [f"the manifest has other hashes of {spell_ids(unlike)}"] if unlike else []
+    names = unlike_measures(size, manifest)
+    return notes + ([f"the manifest has another {', '.join(names)} than datasets.yaml"] if names else [])

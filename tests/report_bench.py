@@ -12,6 +12,7 @@ import yaml
 from numpy.typing import NDArray
 
 from lagbench.checksums import dataset_hash, subset_hash
+from lagbench.exam import Exam, load_exam
 from lagbench.format import ScenarioKey, ScenarioWriter, scenario_path
 from lagbench.registry import Registry, Size, default_path, load
 from lagbench.report import write_report
@@ -33,6 +34,11 @@ class ReportBench:
     root: Path
     registry: Registry
     size: Size
+
+    @property
+    def exam(self) -> Exam:
+        """Its test subset."""
+        return load_exam(self.size, self.root)
 
     def submit(self, path: Path, method: Method, name: str, **labels: Any) -> Path:
         """Write the submission of a method."""

@@ -166,6 +166,9 @@ def test_no_progress_without_a_terminal(
         ({"kind": "streamlines"}, "cannot show"),
         ({"kind": "sped"}, "did you mean 'speed'"),
         ({"frames_per_second": 0}, "positive"),
+        ({"frames_per_second": float("nan")}, "positive"),
+        ({"frames_per_second": float("inf")}, "positive"),
+        ({"frames_per_second": 1e-9}, "0.01 to 1000"),
         ({"every": 0}, "positive"),
     ],
 )

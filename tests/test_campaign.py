@@ -1,20 +1,27 @@
-"""What a device whose bits differ leaves in the manifest."""
+"""What a generation checks, what it compares with datasets.yaml, and what it then leaves."""
 
 from __future__ import annotations
 
+import json
+import platform
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from conftest import SIZE, SPLIT
+from forging import forge
 
-from lagbench.campaign import Campaign
+from lagbench import cards, checksums
 from lagbench.errors import DataError
+from lagbench.generation import GenerationResult, generate
 from lagbench.generators.record import measured_values
-from lagbench.generators.solver import Device
-from lagbench.manifest import Manifest, read_manifest
-from lagbench.progress import Meter
-from lagbench.registry import Registry
+from lagbench.manifest import Manifest, read_manifest, write_manifest
+from lagbench.progress import Progress
+from lagbench.registry import Measured, Registry
+from lagbench.verification import verify
+
+Copy = Callable[[], Path]
 
 
 def manifest_of(root: Path) -> Manifest:
@@ -24,18 +31,183 @@ def manifest_of(root: Path) -> Manifest:
     return manifest
 
 
-def test_a_gpu_with_other_bits_marks_the_manifest(copied: Callable[[], Path], unmeasured: Registry) -> None:
-    """Other hashes from a GPU: tolerance and an error; files made right again on a CPU: bitwise again."""
+def with_measured(registry: Registry, values: Measured) -> Registry:
+    """Return a registry with other measured values of the tiny data set."""
+    return Registry(registry.splits, {SPLIT: {SIZE: values}})
+
+
+@pytest.fixture
+def right(generated: GenerationResult) -> Measured:
+    """What datasets.yaml says about the generated data set once it is recorded."""
+    values: Measured = measured_values(manifest_of(generated.root))
+    return values
+
+
+def card_of(root: Path) -> str:
+    """Return the text of the data set's card."""
+    return (root / SPLIT / SIZE / "v1" / "README.md").read_text()
+
+
+def elsewhere(root: Path, machine: str = "aarch64") -> None:
+    """Make the manifest say that another kind of machine wrote the files."""
+    manifest = manifest_of(root)
+    environment = {**manifest.environments[0], "machine": machine}
+    write_manifest(root, manifest.model_copy(update={"environments": (environment,)}))
+
+
+# --- comparison with datasets.yaml -----------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"dataset_sha256": "0" * 64}, "data set"),
+        ({"subset_sha256": {"train": "0" * 64}}, "train"),
+    ],
+)
+def test_data_set_and_subset_hashes_are_compared(
+    change: dict[str, object], named: str, copied: Copy, unmeasured: Registry, right: Measured
+) -> None:
+    """Equal scenarios are not enough to be called equal to datasets.yaml."""
+    registry = with_measured(unmeasured, right.model_copy(update=change))
+    with pytest.raises(DataError, match="another hash") as caught:
+        generate(SPLIT, SIZE, root=copied(), registry=registry)
+    assert named in str(caught.value)
+    assert caught.value.exit_code == 4
+
+
+def test_a_scenario_without_a_hash_is_a_difference(
+    copied: Copy, unmeasured: Registry, right: Measured
+) -> None:
+    """Where a size is measured, an id that its hashes leave out equals nothing."""
+    listed = {i: digest for i, digest in right.scenario_sha256.items() if i != 2}
+    registry = with_measured(unmeasured, right.model_copy(update={"scenario_sha256": listed}))
+    with pytest.raises(DataError, match="1 of 5 scenarios have another hash") as caught:
+        generate(SPLIT, SIZE, root=copied(), registry=registry)
+    assert "scenarios 2" in str(caught.value.where)
+
+
+def test_equal_hashes_are_told(copied: Copy, unmeasured: Registry, right: Measured) -> None:
+    """All hashes hold: the verdict says so and nothing is simulated."""
+    result = generate(SPLIT, SIZE, root=copied(), registry=with_measured(unmeasured, right))
+    assert (result.verdict, result.simulated) == ("equal to datasets.yaml", ())
+
+
+def test_a_forged_file_is_made_anew(copied: Copy, unmeasured: Registry, generated: GenerationResult) -> None:
+    """Without a recorded hash the manifest's counts: a file that agrees with itself is not adopted."""
     root = copied()
-    right = measured_values(manifest_of(root))
-    wrong = right.model_copy(update={"scenario_sha256": {**right.scenario_sha256, 4: "0" * 16}})
-    size = unmeasured.size(SPLIT, SIZE)
-    gpu = Campaign(size.model_copy(update={"measured": wrong}), root, Device.CUDA, 1, Meter())
-    gpu.manifest = manifest_of(root)
-    with pytest.raises(DataError, match="1 of 5 scenarios have another hash"):
-        gpu._compare()
+    forge(root / SPLIT / SIZE / "v1" / "test" / "0003.nc")
+    result = generate(SPLIT, SIZE, root=root, workers=1, registry=unmeasured)
+    assert result.simulated == (3,)
+    assert result.dataset_sha256 == generated.dataset_sha256
+
+
+# --- machines that promise no equal bits -----------------------------------------------------
+
+
+def test_another_machine_is_tolerance_until_its_hashes_are_found_equal(
+    copied: Copy, unmeasured: Registry, right: Measured
+) -> None:
+    """Without a recorded hash nothing shows that the bits are equal; the card says it too."""
+    root = copied()
+    elsewhere(root)
+    generate(SPLIT, SIZE, root=root, registry=unmeasured)
     assert manifest_of(root).identity == "tolerance"
-    cpu = Campaign(size.model_copy(update={"measured": right}), root, Device.CPU, 1, Meter())
-    cpu.run(size.scenarios)
-    assert cpu.verdict == "equal to datasets.yaml"
+    assert "tolerance" in card_of(root)
+    generate(SPLIT, SIZE, root=root, registry=with_measured(unmeasured, right))
     assert manifest_of(root).identity == "bitwise"
+    assert "same bits on every" in card_of(root)
+
+
+def test_other_bits_of_another_machine_are_kept_and_told(
+    tmp_path: Path, unmeasured: Registry, right: Measured, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An ARM CPU whose bits differ: tolerance in manifest and card, no error, nothing simulated twice."""
+    wrong = {**right.scenario_sha256, 4: "0" * 16}
+    registry = with_measured(unmeasured, right.model_copy(update={"scenario_sha256": wrong}))
+    options = {"root": tmp_path, "scenarios": "4", "workers": 1, "registry": registry}
+    monkeypatch.setattr(platform, "machine", lambda: "aarch64")
+    first = generate(SPLIT, SIZE, **options)  # type: ignore[arg-type]
+    assert first.simulated == (4,)
+    assert "tolerance" in first.verdict
+    assert manifest_of(tmp_path).identity == "tolerance"
+    assert "tolerance" in card_of(tmp_path)
+    assert generate(SPLIT, SIZE, **options).simulated == ()  # type: ignore[arg-type]
+    verify(SPLIT, SIZE, root=tmp_path, registry=registry).check()
+    monkeypatch.setattr(platform, "machine", lambda: "x86_64")
+    assert generate(SPLIT, SIZE, **options).simulated == ()  # type: ignore[arg-type]
+    with pytest.raises(DataError, match="have another hash"):  # a broken promise is never tolerated
+        generate(SPLIT, SIZE, force=True, **options)  # type: ignore[arg-type]
+
+
+def test_a_broken_promise_leaves_no_card(tmp_path: Path, unmeasured: Registry, right: Measured) -> None:
+    """Other bits on a machine that promises equal ones: an error, bitwise still, and no card says more."""
+    wrong = {**right.scenario_sha256, 4: "0" * 16}
+    registry = with_measured(unmeasured, right.model_copy(update={"scenario_sha256": wrong}))
+    with pytest.raises(DataError, match="1 of 1 scenarios have another hash") as caught:
+        generate(SPLIT, SIZE, scenarios="4", root=tmp_path, workers=1, registry=registry)
+    assert caught.value.exit_code == 4
+    assert manifest_of(tmp_path).identity == "bitwise"
+    assert not (tmp_path / SPLIT / SIZE / "v1" / "README.md").exists()
+
+
+# --- what an existing manifest says ----------------------------------------------------------
+
+
+def test_wrong_statistics_are_mended(copied: Copy, unmeasured: Registry, right: Measured) -> None:
+    """Where datasets.yaml says otherwise, the statistics of train are computed anew."""
+    root = copied()
+    manifest = manifest_of(root)
+    lie = {**manifest.statistics, "velocity_std": (1.0, 1.0)}
+    write_manifest(root, manifest.model_copy(update={"statistics": lie}))
+    generate(SPLIT, SIZE, root=root, registry=with_measured(unmeasured, right))
+    assert manifest_of(root).statistics == right.statistics
+
+
+def test_paths_of_a_manifest_are_not_published(copied: Copy, unmeasured: Registry) -> None:
+    """A manifest that names a file elsewhere is written anew from the files."""
+    root = copied()
+    folder = root / SPLIT / SIZE / "v1"
+    told = json.loads((folder / "manifest.json").read_text())
+    told["files"][3]["path"] = "../../../../../etc/passwd"
+    (folder / "manifest.json").write_text(json.dumps(told))
+    generate(SPLIT, SIZE, root=root, workers=1, registry=unmeasured)
+    for name in ("manifest.json", "croissant.json", "README.md"):
+        assert "passwd" not in (folder / name).read_text()
+
+
+# --- going on costs little -------------------------------------------------------------------
+
+
+def test_a_second_call_hashes_each_file_once_and_draws_nothing(
+    copied: Copy, unmeasured: Registry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Bytes are read once, progress is told meanwhile, and cards that would be the same stay."""
+    root = copied()
+    read: Counter[str] = Counter()
+    news: list[Progress] = []
+
+    def counted(path: Path) -> str:
+        read[path.name] += 1
+        return checksums.file_sha256(path)
+
+    def refuse(*_: object) -> list[str]:
+        pytest.fail("pictures are drawn again")
+
+    for module in ("inventory", "manifest"):
+        monkeypatch.setattr(f"lagbench.{module}.file_sha256", counted)
+    monkeypatch.setattr(cards, "_draw", refuse)
+    generate(SPLIT, SIZE, root=root, registry=unmeasured, progress=news.append)
+    assert read == {f"{i:04d}.nc": 1 for i in range(5)}
+    checking = [state for state in news if state.stage == "checking"]
+    assert (checking[0].done, checking[-1].done, checking[-1].total) == (0, 5, 5)
+
+
+@pytest.mark.parametrize("name", ["README.md", "croissant.json", "pictures/frame.png"])
+def test_a_card_that_is_gone_or_changed_is_made_anew(name: str, copied: Copy, unmeasured: Registry) -> None:
+    """Only cards that are there and the same are left alone."""
+    path = copied() / SPLIT / SIZE / "v1" / name
+    before = path.read_bytes()
+    path.unlink()
+    generate(SPLIT, SIZE, root=path.parents[4 if "/" in name else 3], registry=unmeasured)
+    assert path.read_bytes() == before

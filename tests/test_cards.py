@@ -56,13 +56,18 @@ def make(
     return size, manifest
 
 
+def write(root: Path, size: Size, manifest: Manifest) -> list[Path]:
+    """Write cards with what our registry says of the split."""
+    return cards.write_cards(root, size, registry.load().split(size.split), manifest)
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Write cards of a complete made-up cavity tiny."""
     root = tmp_path_factory.mktemp("root")
     size, manifest = make(root)
     assert manifest.complete
-    written = cards.write_cards(root, size, manifest)
+    written = write(root, size, manifest)
     folder = dataset_folder(root, "cavity", "tiny", 1)
     assert {p.relative_to(folder).as_posix() for p in written} == {
         "README.md",
@@ -141,8 +146,8 @@ def test_every_picture_of_the_card_is_there(folder: Path) -> None:
 def test_the_same_manifest_gives_the_same_bytes(tmp_path: Path) -> None:
     """Cards written twice, and by another process at another time, do not differ; no date is in them."""
     size, manifest = make(tmp_path)
-    first = {path: path.read_bytes() for path in cards.write_cards(tmp_path, size, manifest)}
-    second = {path: path.read_bytes() for path in cards.write_cards(tmp_path, size, manifest)}
+    first = {path: path.read_bytes() for path in write(tmp_path, size, manifest)}
+    second = {path: path.read_bytes() for path in write(tmp_path, size, manifest)}
     assert first == second
     text = "".join(data.decode() for path, data in first.items() if path.suffix != ".png")
     assert not re.search(r"\b20\d\d-\d\d-\d\d|\d\d:\d\d:\d\d", text)
@@ -161,7 +166,7 @@ def test_without_matplotlib_there_are_no_pictures(tmp_path: Path, monkeypatch: p
     """The card is written all the same and links no picture."""
     size, manifest = make(tmp_path)
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    written = cards.write_cards(tmp_path, size, manifest)
+    written = write(tmp_path, size, manifest)
     assert [path.name for path in written] == ["README.md", "croissant.json"]
     assert "![" not in written[0].read_text()
 
@@ -178,7 +183,7 @@ def test_a_partial_data_set_says_so(tmp_path: Path) -> None:
 def test_an_empty_data_set_has_cards(tmp_path: Path) -> None:
     """Nothing generated yet: cards without pictures, files or records."""
     size, manifest = make(tmp_path, scenarios=())
-    written = cards.write_cards(tmp_path, size, manifest)
+    written = write(tmp_path, size, manifest)
     assert [path.name for path in written] == ["README.md", "croissant.json"]
     assert json.loads(written[1].read_text())["distribution"] == []
 

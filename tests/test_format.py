@@ -162,6 +162,46 @@ def test_changed_attributes_are_found(written: tuple[Path, str], name: str) -> N
         check_scenario(path)
 
 
+@pytest.mark.parametrize(
+    ("variable", "name", "value"),
+    [
+        ("position", "scale_factor", 2.0),
+        ("velocity", "add_offset", 1.0),
+        ("position", "_FillValue", np.array([0.5], np.float32)),
+        ("material", "missing_value", np.int8(0)),
+        ("position", "valid_max", np.float32(0.5)),
+        ("velocity", "valid_range", np.array([0.0, 0.5], np.float32)),
+        ("material", "_Unsigned", "true"),
+        ("position", "units", "m"),
+        ("time", "units", "days since 2000-01-01"),
+        ("material", "flag_meanings", "rope snow jelly liquid"),
+        ("material", "flag_values", np.array([3, 2, 1, 0], np.int8)),
+        ("velocity", "coordinates", None),
+    ],
+)
+def test_attributes_that_change_the_meaning_are_refused(
+    written: tuple[Path, str], variable: str, name: str, value: object
+) -> None:
+    """The values are the same, yet readers that follow CF would read others: file, variable, attribute."""
+    path, content = written
+    with h5py.File(path, "r+") as file:
+        if value is None:
+            del file[variable].attrs[name]
+        else:
+            file[variable].attrs[name] = value
+    assert rehash(path) == content
+    with pytest.raises(DataError, match=rf"(?s){path.name}, variable '{variable}'.*{name}"):
+        check_scenario(path)
+
+
+def test_prose_may_be_worded_anew(written: tuple[Path, str]) -> None:
+    """A patch release may better a long_name: no reader computes with it."""
+    path, content = written
+    with h5py.File(path, "r+") as file:
+        file["position"].attrs["long_name"] = "where the particles are"
+    assert check_scenario(path) == content
+
+
 def test_another_expected_hash_is_told(written: tuple[Path, str]) -> None:
     """A sound file of another scenario fails only against the expected hash; 16 digits suffice."""
     path, content = written

@@ -10,11 +10,11 @@ import pytest
 from free_surface_scenarios import Part, parameters, run, scenario, snapshot, start
 from reference_free_surface import FreeSurfaceReference
 
-from lagbench.generators import backend
 from lagbench.generators.base import InitialState, Material
 from lagbench.generators.free_surface import FreeSurface
 from lagbench.generators.shapes import Disc, Rectangle
 from lagbench.generators.solver import Device, build
+from lagbench.pool import available_cores
 
 CONSTANTS = parameters()
 SQUARE = Rectangle(0.2, 0.2)
@@ -53,7 +53,7 @@ CASES += [
 ]
 THREADS = [
     1,
-    pytest.param(2, marks=pytest.mark.skipif(backend.available_threads() < 2, reason="one processor")),
+    pytest.param(2, marks=pytest.mark.skipif(available_cores() < 2, reason="one processor")),
 ]
 
 

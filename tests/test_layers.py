@@ -30,13 +30,16 @@ FILES = (
     "checksums",
     "scenario_ids",
     "yamlfile",
+    "limits",
+    "variables",
+    "identity",
     "scenario_file",
     "format",
     "grid",
 )
 """Modules below everything else, which know files and arrays but no split."""
 
-REGISTRY = (*FILES, "registry", "locking", "statistics", "manifest", "extras", "progress", "pool")
+REGISTRY = (*FILES, "registry", "locking", "statistics", "manifest", "extras", "plugins", "progress", "pool")
 """The next layer, which knows splits; it may use the first."""
 
 ALLOWED = {

@@ -95,13 +95,92 @@ def test_statistics_wait_for_train_and_stay() -> None:
     assert merged(first, (2, 3, 4)).statistics == STATISTICS
 
 
-def test_identity_and_environments_add_up() -> None:
-    """One device without equal bits taints the whole; equal environments are listed once."""
-    first = merged(None, (0,))
-    second = merged(first, (1,), identity="tolerance", environment={"python": "3.12"})
-    third = merged(second, (2,))
-    assert (first.identity, third.identity) == ("bitwise", "tolerance")
-    assert third.environments == ({"python": "3.11"}, {"python": "3.12"})
+def test_statistics_of_other_train_files_go() -> None:
+    """They belong to the hash of train: a new train file takes them away."""
+    first = merged(None, range(5), statistics=STATISTICS)
+    other = entry(1, "f" * 64)
+    again = merge(
+        first, [other], split="cavity", size="tiny", version="1.2.0", subsets=SUBSETS, environment={}
+    )
+    assert again.complete
+    assert again.statistics == {}
+
+
+def machine(name: str, device: str = "cpu") -> dict[str, str]:
+    """Return an environment."""
+    return {"machine": name, "system": "Linux", "device": device}
+
+
+def test_environments_add_up() -> None:
+    """Equal ones are listed once; a merge that wrote no file adds none."""
+    first = merged(None, (0,), environment=machine("x86_64"))
+    second = merged(first, (1,), environment=machine("aarch64"))
+    third = merged(merged(second, (2,), environment=machine("x86_64")), (3,), environment=None)
+    assert third.environments == (machine("x86_64"), machine("aarch64"))
+
+
+@pytest.mark.parametrize(
+    ("environment", "identity"),
+    [
+        (machine("x86_64"), "bitwise"),
+        (machine("AMD64", "parallel"), "bitwise"),
+        (machine("aarch64"), "tolerance"),
+        (machine("x86_64", "cuda"), "tolerance"),
+        ({**machine("x86_64"), "system": "Darwin"}, "tolerance"),
+    ],
+)
+def test_identity_needs_a_promise_or_evidence(environment: dict[str, str], identity: str) -> None:
+    """x86-64 Linux CPUs promise equal bits; elsewhere every file needs the hash of datasets.yaml."""
+    files = [entry(i).model_copy(update={"device": environment["device"]}) for i in range(3)]
+    options = {"split": "cavity", "size": "tiny", "version": "1.2.0", "subsets": SUBSETS}
+    made = merge(None, files, environment=environment, **options)  # type: ignore[arg-type]
+    assert made.identity == identity
+    hashes = {file.scenario: file.content_sha256[:16] for file in files}
+    for recorded, expected in (
+        (hashes, "bitwise"),
+        ({**hashes, 1: "0" * 16}, identity),
+        ({0: hashes[0]}, identity),
+    ):
+        assert merge(made, [], recorded=recorded, **options).identity == expected  # type: ignore[arg-type]
+    rest = merged(made, (3,), environment=machine("x86_64"))
+    assert rest.identity == identity
+
+
+def test_the_mean_twin_floor_is_that_of_test() -> None:
+    """Mean over the test scenarios at each frame that all have; none where one has no twin."""
+    whole = merged(None, range(5))
+    assert whole.mean_twin_floor() == ()
+    floors = {3: (1e-6, 2e-3), 4: (3e-6, 4e-3, 1.0)}
+    files = tuple(e.model_copy(update={"twin_floor": floors.get(e.scenario, ())}) for e in whole.files)
+    assert whole.model_copy(update={"files": files}).mean_twin_floor() == (2e-6, 3e-3)
+
+
+@pytest.mark.parametrize(
+    ("change", "key"),
+    [
+        ({"path": "../../../../../etc/passwd"}, "path"),
+        ({"path": "/etc/passwd"}, "path"),
+        ({"path": "train/0004.nc"}, "path"),
+        ({"subset": "..", "path": "../0003.nc"}, "subset"),
+        ({"subset": "../../etc", "path": "../../etc/0003.nc"}, "subset"),
+    ],
+)
+def test_paths_follow_from_subset_and_id(tmp_path: Path, change: dict[str, str], key: str) -> None:
+    """An entry cannot name a file elsewhere; the error names entry and key."""
+    path = write_manifest(tmp_path, merged(None, range(5)))
+    told = json.loads(path.read_text())
+    told["files"][3] |= change
+    path.write_text(json.dumps(told))
+    with pytest.raises(DataError, match=rf"(?s)manifest is damaged.*key files.3.{key}"):
+        read_manifest(tmp_path, "cavity", "tiny", 1)
+
+
+def test_an_entry_in_the_wrong_subset_is_dropped() -> None:
+    """Which subset holds a scenario is the registry's word; the file is described anew."""
+    whole = merged(None, range(5))
+    moved = [e.model_copy(update={"subset": "train"}) if e.scenario == 3 else e for e in whole.files]
+    again = merged(whole.model_copy(update={"files": tuple(moved)}), ())
+    assert [e.scenario for e in again.files] == [0, 1, 2, 4]
 
 
 def test_round_trip_and_atomic_write(tmp_path: Path) -> None:

@@ -12,8 +12,8 @@ from pathlib import Path
 import pool_tasks
 import pytest
 
-from lagbench.errors import DataError, WorkFailedError
-from lagbench.pool import ATTEMPTS, Pool, Task
+from lagbench.errors import DataError, UsageError, WorkFailedError
+from lagbench.pool import ATTEMPTS, Pool, Task, available_cores, worker_count
 
 HERE = str(Path(__file__).parent)
 
@@ -81,6 +81,28 @@ def test_a_task_that_always_kills_its_worker_is_given_up() -> None:
     assert f"died {ATTEMPTS} times" in text
     assert "cavity tiny, scenario 3" in text
     assert "SIGKILL" in text
+
+
+def test_attempts_are_counted_for_each_submission(tmp_path: Path) -> None:
+    """A task that loses one worker each time it is submitted is never given up; nothing adds up."""
+    marker = tmp_path / "seen"
+    task = Task(name="a", function=pool_tasks.die_once, arguments=(marker,))
+    with Pool(1) as pool:
+        for _ in range(ATTEMPTS):
+            pool.submit(task)
+            assert [event.kind for event in pool.events()][-1] == "done"
+            marker.unlink()
+
+
+def test_fewer_than_one_worker_is_refused() -> None:
+    """Zero or less is a usage error, not a pool that never works; None means one per core."""
+    for wanted in (0, -1):
+        with pytest.raises(UsageError, match="without a worker"):
+            worker_count(wanted)
+        with pytest.raises(UsageError, match="without a worker"):
+            Pool(wanted)
+    assert worker_count(None) == available_cores() >= 1
+    assert (worker_count(None, default=1), worker_count(3, default=1)) == (1, 3)
 
 
 def test_errors_of_ours_arrive_whole() -> None:

@@ -15,7 +15,7 @@ from conftest import SIZE, SPLIT
 from lagbench.errors import DataError
 from lagbench.generation import GenerationResult
 from lagbench.generators.record import main, measured_values, released_name, render, replace_measured
-from lagbench.manifest import Manifest, read_manifest
+from lagbench.manifest import Manifest, read_manifest, write_manifest
 from lagbench.registry import Measured, default_path, load
 
 RELEASED = Path(__file__).parent / "data" / "released_hashes.json"
@@ -59,6 +59,20 @@ def test_what_is_recorded_is_what_was_measured(
     assert len(measured.twin_floor) == 20
     assert measured.twin_floor[7] == pytest.approx((twins[0][7] + twins[1][7]) / 2, rel=1e-8)
     assert registry.read_text().startswith(unmeasured_path.read_text().rstrip("\n"))
+
+
+def test_statistics_are_computed_anew(
+    copied: Callable[[], Path], registry: Path, generated: GenerationResult
+) -> None:
+    """What the manifest says about train is not taken on trust."""
+    root = copied()
+    manifest = manifest_of(root)
+    lie = manifest.model_copy(update={"statistics": {**manifest.statistics, "velocity_std": (1.0, 1.0)}})
+    write_manifest(root, lie)
+    assert run(root, registry) == 0
+    measured = load(registry).size(SPLIT, SIZE).measured
+    assert measured is not None
+    assert measured.statistics == manifest_of(generated.root).statistics
 
 
 def test_recording_again_changes_no_byte(generated: GenerationResult, registry: Path) -> None:

@@ -41,7 +41,10 @@ def test_tiny_is_made_to_the_bit(split: str, tmp_path: Path) -> None:
     assert manifest.subset_sha256 == measured.subset_sha256
     for name, row in measured.statistics.items():
         assert tuple(manifest.statistics[name]) == row
-    verify(split, "tiny", root=tmp_path, complete=True).check()
+    assert manifest.mean_twin_floor() == measured.twin_floor
+    verified = verify(split, "tiny", root=tmp_path, complete=True)
+    verified.check()
+    assert verified.warnings == ()
 
 
 @pytest.mark.slow

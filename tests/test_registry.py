@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 
-from lagbench import registry
 from lagbench.errors import UnreadableFileError, UsageError
-from lagbench.registry import SUBSETS, Registry, Size, default_path, load
+from lagbench.limits import SUBSETS
+from lagbench.registry import Size, default_path, load
 
 TIERS = [
     (split, size)
@@ -161,29 +160,3 @@ def test_a_registry_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setenv("LAGBENCH_REGISTRY", str(tmp_path / "none.yaml"))
     with pytest.raises(UnreadableFileError, match="cannot read"):
         load()
-
-
-def test_other_packages_add_splits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An entry point whose module names a REGISTRY adds its splits to ours."""
-
-    def renamed(data: dict[str, dict[str, object]]) -> None:
-        data["splits"] = {"sloshing": data["splits"]["fluid"]}
-
-    path = edited(tmp_path, renamed)
-    (tmp_path / "sloshing_split.py").write_text(f"REGISTRY = {str(path)!r}\n")
-    (tmp_path / "careless_split.py").write_text("")
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.delenv("LAGBENCH_REGISTRY", raising=False)
-
-    def with_points(*names: str) -> Registry:
-        points = [EntryPoint(name, f"{name}_split", "lagbench.generators") for name in names]
-        monkeypatch.setattr(registry, "entry_points", lambda group: points)
-        registry._load.cache_clear()
-        return load()
-
-    try:
-        assert with_points("sloshing").size("sloshing", "tiny").particles == 256
-        with pytest.raises(UsageError, match="REGISTRY"):
-            with_points("careless")
-    finally:
-        registry._load.cache_clear()

@@ -237,10 +237,11 @@ def test_scores_on_the_page_are_those_of_the_card(
     card = bench.card(path)
     page = write_report(tmp_path, [card], [path], root=bench.root, registry=bench.registry)
     reading = read_html(page.read_text("utf-8"))
-    shown = " ".join(e.text for e in reading.of_class("scores"))
-    for scores in card.scores.values():
-        for bound in (scores["vorticity_rmse"].mean, *scores["vorticity_rmse"].interval):
-            assert text(bound) in shown
+    ranked = [scores["vorticity_rmse"] for scores in card.scores.values()]
+    means = [element.text for element in reading.of_class("n")]
+    intervals = [element.text for element in reading.of_class("ci")]
+    assert means[:3] == [text(score.mean) for score in ranked]
+    assert intervals[:3] == [" … ".join(map(text, score.interval)) for score in ranked]
     everything = " ".join(e.text for e in reading.named("main"))
     for said in (card.predictions_sha256, card.header.dataset_sha256, "lagbench score p.nc --report report"):
         assert said in everything

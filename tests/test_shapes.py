@@ -20,7 +20,7 @@ SHAPES: dict[str, shapes.Shape] = {
     "rectangle": shapes.Rectangle(0.3, 0.15),
     "rope": shapes.Rectangle(0.65, 0.05, (0.6, 0.8)),
     "disc": shapes.Disc.of_area(0.05),
-    "blobs": shapes.Blobs.of_area(0.05, ROW),
+    "blobs": shapes.Blobs.of_area(0.05, ROW, cells=512),
 }
 
 
@@ -66,7 +66,7 @@ def test_rectangle_distance_by_hand() -> None:
 
 def test_blobs_of_one_disc_are_a_disc() -> None:
     """The counted area of a unit disc is pi to 1e-3, hence the radius sqrt(area / pi)."""
-    blob = shapes.Blobs.of_area(0.05, np.zeros((1, 2)))
+    blob = shapes.Blobs.of_area(0.05, np.zeros((1, 2)), cells=512)
     assert blob.radius == pytest.approx(math.sqrt(0.05 / math.pi), rel=1e-3)
     assert blob.centres == ((0.0, 0.0),)
 

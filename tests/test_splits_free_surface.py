@@ -2,19 +2,62 @@
 
 from __future__ import annotations
 
+import ast
+import importlib
 import math
 from collections import Counter
+from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scenario_draws import SIZES, all_of, changed, draw, neighbours, state_of
+from scenario_draws import SIZES, all_of, changed, digest, draw, neighbours, state_of
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from lagbench import registry
 from lagbench.errors import WorkFailedError
+from lagbench.generators import fluid, multimaterial
 from lagbench.generators.base import InitialState, Material
+
+DECLARED = [
+    (split, name) for split in ("fluid", "multimaterial") for name in registry.load().split(split).parameters
+]
+
+
+def other_value(name: str, value: float) -> float:
+    """Return another value of a parameter with which bodies can still be drawn."""
+    if name in ("gap", "gap_cells"):  # only another verdict on a placement shows
+        return {"gap": 0.1, "gap_cells": 2}[name]
+    if isinstance(value, int):
+        return value + 1
+    if name.endswith("_max"):
+        return 0.8 * value if value else -0.1
+    return 1.25 * value if value else 0.1
+
+
+def decided(size: registry.Size) -> list[str]:
+    """Return all that the parameters of a size decide: initial states and solver constants."""
+    states = [digest(draw(size, scenario)) for scenario in size.scenarios]
+    return [*states, repr(importlib.import_module(size.generator).solver_parameters(size))]
+
+
+@pytest.mark.parametrize(("split", "name"), DECLARED)
+def test_every_parameter_decides_bits(split: str, name: str) -> None:
+    """Another value in datasets.yaml gives another state or another solver constant."""
+    size = registry.load().size(split, "tiny")
+    assert decided(changed(size, **{name: other_value(name, size.value(name))})) != decided(size)
+
+
+@pytest.mark.parametrize("module", [fluid, multimaterial])
+def test_no_number_in_the_source_decides_bits(module: ModuleType) -> None:
+    """What is drawn has its ranges in datasets.yaml: the source holds 0, 1, 2, halves and a limit."""
+    tree = ast.parse(Path(str(module.__file__)).read_text())
+    numbers = {
+        n.value for n in ast.walk(tree) if isinstance(n, ast.Constant) and type(n.value) in (int, float)
+    }
+    assert numbers <= {0, 0.5, 1, 2, getattr(module, "_ATTEMPTS", 0)}
 
 
 def test_fluid_families_follow_the_id() -> None:

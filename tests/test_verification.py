@@ -6,11 +6,14 @@ import itertools
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import h5py
+import netCDF4
 import numpy as np
 import pytest
 from conftest import SIZE, SPLIT
+from forging import forge, mend_manifest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -19,6 +22,7 @@ from lagbench.generation import GenerationResult
 from lagbench.generators.record import measured_values, replace_measured
 from lagbench.manifest import Manifest, read_manifest
 from lagbench.registry import Registry, load
+from lagbench.scenario_file import check_scenario
 from lagbench.verification import evenly_spaced, verify
 
 Copy = Callable[[], Path]
@@ -130,22 +134,101 @@ def test_a_changed_value_is_found_though_the_file_is_whole(copied: Copy, measure
     assert "variable 'velocity'" in result.problems[0]
 
 
-def test_a_forger_who_mends_file_and_manifest_is_caught(
+def test_a_forger_who_mends_the_file_is_caught(
     copied: Copy, measured: Registry, unmeasured: Registry
 ) -> None:
-    """Scenario 4 renamed to 3, all hashes in file and manifest made to agree: datasets.yaml knows better."""
+    """A file that agrees with itself is held against datasets.yaml, else against the manifest."""
     root = copied()
-    forged = file_of(root)
-    forged.write_bytes(file_of(root, "test/0004").read_bytes())
+    content = forge(file_of(root))
+    assert check_scenario(file_of(root)) == content
+    for registry in (measured, unmeasured):
+        with pytest.raises(DataError, match="another content hash") as caught:
+            verify(SPLIT, SIZE, root=root, registry=registry).check()
+        assert caught.value.exit_code == 4
+        assert "test/0003.nc" in str(caught.value)
+        assert content in str(caught.value)
+
+
+def test_a_forger_who_mends_the_manifest_too_is_caught(copied: Copy, measured: Registry) -> None:
+    """File and manifest agree: datasets.yaml knows better."""
+    root = copied()
+    path = file_of(root)
+    mend_manifest(path.parents[1] / "manifest.json", 3, path, forge(path))
+    with pytest.raises(DataError, match="another content hash") as caught:
+        verify(SPLIT, SIZE, root=root, registry=measured).check()
+    assert caught.value.exit_code == 4
+
+
+def test_a_file_of_another_scenario_is_caught(copied: Copy, unmeasured: Registry) -> None:
+    """Scenario 4 under the name of 3 is whole, but not what its place says."""
+    root = copied()
+    file_of(root).write_bytes(file_of(root, "test/0004").read_bytes())
     result = verify(SPLIT, SIZE, root=root, registry=unmeasured)
     assert "a file holds another scenario" in result.problems[0]
+
+
+@pytest.mark.parametrize(("name", "value"), [("scale_factor", 2.0), ("units", "m")])
+def test_attributes_that_change_the_meaning_are_found(
+    name: str, value: object, copied: Copy, measured: Registry
+) -> None:
+    """Whatever makes other readers read other values is a fault, though no stored value changed."""
+    root = copied()
+    with netCDF4.Dataset(file_of(root), "r+") as file:
+        file["position"].setncattr(name, value)
+    with pytest.raises(DataError, match=rf"(?s)0003.nc, variable 'position'.*{name}") as caught:
+        verify(SPLIT, SIZE, root=root, registry=measured).check()
+    assert caught.value.exit_code == 4
+
+
+def change_manifest(root: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    """Change the manifest of the tiny data set as a text editor would."""
+    path = file_of(root).parents[1] / "manifest.json"
+    told = json.loads(path.read_text())
+    change(told)
+    path.write_text(json.dumps(told))
+
+
+def test_statistics_and_twin_floor_of_the_manifest_are_compared(copied: Copy, measured: Registry) -> None:
+    """They follow from files that are right: another value is the manifest's fault and a warning."""
+    root = copied()
+    change_manifest(root, lambda told: told["statistics"].update(velocity_std=[1.0, 1.0]))
+    change_manifest(root, lambda told: told["files"][4]["twin_floor"].__setitem__(3, 0.5))
+    result = verify(SPLIT, SIZE, root=root, registry=measured)
+    assert [line for line in result.warnings if "velocity_std" in line]
+    assert [line for line in result.warnings if "twin floor" in line]
+    result.check()
+
+
+def wrong_hash(measured: Registry, scenario: int) -> Registry:
+    """Return a registry with other hashes of one scenario, its subset and the data set."""
     own = measured.size(SPLIT, SIZE).measured
     assert own is not None
-    wrong = own.model_copy(update={"scenario_sha256": {**own.scenario_sha256, 0: "f" * 16}})
-    registry = Registry(measured.splits, {SPLIT: {SIZE: wrong}})
-    result = verify(SPLIT, SIZE, root=root, scenarios="0", registry=registry)
-    assert "the file has another content hash" in result.problems[0]
-    assert "ffffffffffffffff" in result.problems[0]
+    update = {
+        "scenario_sha256": {**own.scenario_sha256, scenario: "0" * 16},
+        "subset_sha256": {**own.subset_sha256, "test": "0" * 64},
+        "dataset_sha256": "0" * 64,
+    }
+    return Registry(measured.splits, {SPLIT: {SIZE: own.model_copy(update=update)}})
+
+
+@pytest.mark.parametrize("machine", ["aarch64", "x86_64"])
+def test_other_bits_of_other_machines_are_warnings(machine: str, copied: Copy, measured: Registry) -> None:
+    """Files of a machine that promises no equal bits pass with a warning; those of one that does fail."""
+    root, registry = copied(), wrong_hash(measured, 4)
+    change_manifest(root, lambda told: told.update(identity="tolerance"))
+    change_manifest(root, lambda told: told["environments"][0].update(machine=machine, system="Linux"))
+    result = verify(SPLIT, SIZE, root=root, registry=registry)
+    if machine == "x86_64":
+        with pytest.raises(DataError, match="another content hash"):
+            result.check()
+        return
+    assert (result.problems, result.identity) == ((), "tolerance")
+    assert any("scenarios 4 have other bits than datasets.yaml" in line for line in result.warnings)
+    assert "tolerance" in result.verdict
+    result.check()
+    forge(file_of(root, "test/0004"))
+    with pytest.raises(DataError, match="another content hash"):
+        verify(SPLIT, SIZE, root=root, registry=registry).check()
 
 
 def test_the_data_set_hash_is_compared_too(generated: GenerationResult, measured: Registry) -> None:
@@ -220,8 +303,8 @@ def test_simulating_anew_finds_other_bits(tmp_path: Path, measured: Registry) ->
 
 
 def test_unknown_names_are_usage_errors(tmp_path: Path, measured: Registry) -> None:
-    """Split, size, subset and ids are checked as generate checks them."""
-    for options in ({"subset": "trian"}, {"scenarios": "7"}):
+    """Split, size, subset, ids and workers are checked as generate checks them."""
+    for options in ({"subset": "trian"}, {"scenarios": "7"}, {"workers": 0}, {"workers": -1}):
         with pytest.raises(UsageError):
             verify(SPLIT, SIZE, root=tmp_path, registry=measured, **options)  # type: ignore[arg-type]
 

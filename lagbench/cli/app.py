@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import os
 import sys
-from typing import Annotated, Any
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Annotated, Any, TextIO
 
 import typer
 from typer.core import TyperGroup
@@ -25,7 +28,8 @@ class _Commands(TyperGroup):
 
     def invoke(self, ctx: Any) -> Any:  # noqa: ANN401 (typer and click disagree on its type)
         try:
-            return super().invoke(ctx)
+            with _plain_warnings():
+                return super().invoke(ctx)
         except LagbenchError as error:
             typer.echo(f"lagbench: {error}", err=True)
             raise typer.Exit(error.exit_code) from error
@@ -44,6 +48,29 @@ class _Commands(TyperGroup):
                 err=True,
             )
             raise typer.Exit(FAILED) from error
+
+
+@contextmanager
+def _plain_warnings() -> Iterator[None]:
+    """Tell our users' warnings in one line; those for developers keep their place in the code."""
+    with warnings.catch_warnings():
+        show = warnings.showwarning
+
+        def tell(
+            message: Warning | str,
+            category: type[Warning],
+            filename: str,
+            lineno: int,
+            file: TextIO | None = None,
+            line: str | None = None,
+        ) -> None:
+            if category.__module__.startswith("lagbench."):
+                typer.echo(f"warning: {message}", err=True)
+            else:
+                show(message, category, filename, lineno, file, line)
+
+        warnings.showwarning = tell
+        yield
 
 
 def _is_usage(error: Exception) -> bool:

@@ -122,7 +122,7 @@ def verify(
             progress=draw,
         )
     if as_json:
-        print_json(result)
+        print_json({**vars(result), "complete": result.complete})
     elif not quiet:
         _verified(result)
     for warning in result.warnings:

@@ -6,33 +6,40 @@ import time
 
 import typer
 
-from .options import QuietFlag, RootOption, WorkersOption
-from .output import print_table, say
+from .options import JsonFlag, QuietFlag, RootOption, WorkersOption
+from .output import print_json, print_table, say
 from .progress import progress_bar
 
 __all__ = ["demo"]
 
 
-def demo(root: RootOption = None, workers: WorkersOption = None, quiet: QuietFlag = False) -> None:
-    """Generate, verify and draw the four splits at size tiny: a first look in a minute."""
+def demo(
+    root: RootOption = None,
+    workers: WorkersOption = None,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
+) -> None:
+    """Generate, verify and draw every split at size tiny: a first look in a minute."""
     from lagbench.demo import demo as run
+    from lagbench.demo import demo_splits
     from lagbench.registry import load
 
     started = time.monotonic()
-    rows = []
-    for split in load().splits:
-        typer.echo(f"{split}: generating, verifying, drawing", err=True)
+    results = {}
+    for split in demo_splits(load()):
+        if not quiet:
+            typer.echo(f"{split}: generating, verifying, drawing", err=True)
         with progress_bar(quiet=quiet) as draw:
-            result = run(split, root=root, workers=workers, progress=draw)
-        rows.append(
-            (
-                split,
-                (result.generation.dataset_sha256 or "")[:16],
-                result.verification.verdict,
-                result.picture,
-            )
-        )
+            results[split] = run(split, root=root, workers=workers, progress=draw)
+    if as_json:
+        print_json(results)
+        return
+    rows = [
+        (split, (one.generation.dataset_sha256 or "")[:16], one.verification.verdict, one.picture)
+        for split, one in results.items()
+    ]
     if not quiet:
         print_table("", ("split", "hash", "data set", "picture"), rows)
-    say(f"four data sets, verified and drawn, in {time.monotonic() - started:.0f} s", quiet=quiet)
+    seconds = time.monotonic() - started
+    say(f"{len(rows)} data sets, verified and drawn, in {seconds:.0f} s", quiet=quiet)
     say("next: lagbench generate --split cavity --size mini", quiet=quiet)

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from lagbench.errors import DataError, UnreadableFileError, UsageError
 
 from .options import JsonFlag, QuietFlag, RootOption, SizeOption, chosen
 from .output import print_json, say
@@ -36,6 +40,30 @@ def _source(name: str | None, split: str | None, size: str, scenario: int | None
     subset = tier.subset_of(wanted)
     key = ScenarioKey(split=tier.split, size=size, version=tier.version, scenario=wanted, subset=subset)
     return scenario_path(resolve_root(root), key)
+
+
+@contextmanager
+def _told_as_given(*names: str | None) -> Iterator[None]:
+    """Call what is wrong with a file that the user named an unreadable file, no damaged data set."""
+    try:
+        yield
+    except DataError as error:
+        if not any(name and (error.where or "").startswith(str(Path(name))) for name in names):
+            raise
+        raise UnreadableFileError(
+            error.what,
+            where=error.where,
+            expected=error.expected or "a scenario file, as lagbench generate writes it",
+            got=error.got,
+            fix="name another file, or a split: lagbench plot cavity --size tiny",
+        ) from error
+
+
+def _target(path: Path) -> Path:
+    """Return the path of a file to write, whose folder must be there."""
+    if not path.parent.is_dir():
+        raise UsageError("there is no such folder", where="--output", got=path.parent, fix="create it first")
+    return path
 
 
 def _default_name(source: Path, ending: str) -> Path:
@@ -75,12 +103,14 @@ def plot(
 
     if sheet:
         chosen_split = chosen(name, split)
-        page = output or Path(f"{chosen_split}-{size}-sheet.png")
+        page = _target(output or Path(f"{chosen_split}-{size}-sheet.png"))
         _done(contact_sheet(chosen_split, size, page, root=root), as_json=as_json, quiet=quiet)
         return
     source = _source(name, split, size, scenario, root)
-    target = output or _default_name(source, f"-frame{frame}.png")
-    _done(plot_frame(source, frame, target, kind=kind), as_json=as_json, quiet=quiet)
+    target = _target(output or _default_name(source, f"-frame{frame}.png"))
+    with _told_as_given(name):
+        plot_frame(source, frame, target, kind=kind)
+    _done(target, as_json=as_json, quiet=quiet)
 
 
 def animate(
@@ -109,8 +139,8 @@ def animate(
     other = Path(second) if second else None
     if beside is not None:
         other = _source(name, split, size, beside, root)
-    target = output or _default_name(source, ".mp4")
-    path = run(
-        source, target, beside=other, kind=kind, frames_per_second=fps, every=every, quiet=quiet or as_json
-    )
-    _done(path, as_json=as_json, quiet=quiet)
+    target = _target(output or _default_name(source, ".mp4"))
+    hidden = quiet or as_json
+    with _told_as_given(name, second):
+        run(source, target, beside=other, kind=kind, frames_per_second=fps, every=every, quiet=hidden)
+    _done(target, as_json=as_json, quiet=quiet)

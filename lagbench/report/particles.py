@@ -29,7 +29,7 @@ FINE = 3
 DOT = 1.3
 """Diameter of a dot in particle distances."""
 
-ROWS = 20
+ROWS = 24
 """Most rows of panels on the page; more would make it too heavy."""
 
 SHADES = FINE * FINE
@@ -40,7 +40,8 @@ def particle_figures(subject: Subject, gallery: Gallery) -> Iterator[Figure]:
     per_scenario = 1 + len(subject.entries)
     shown = subject.scenarios[: max(1, ROWS // per_scenario)]
     for scenario in shown:
-        yield _figure(subject, gallery, scenario, left_out=len(subject.scenarios) - len(shown))
+        left_out = len(subject.scenarios) - len(shown) if scenario == shown[-1] else 0
+        yield _figure(subject, gallery, scenario, left_out=left_out)
 
 
 def _figure(subject: Subject, gallery: Gallery, scenario: int, *, left_out: int) -> Figure:
@@ -51,7 +52,7 @@ def _figure(subject: Subject, gallery: Gallery, scenario: int, *, left_out: int)
         rows.append((entry.name, panels))
     present = np.unique(moments[0].setting_of.material).tolist()
     seconds = [f"frame {m.frame}\u2002{m.frame * subject.exam.size.frame_interval:.2f} s" for m in moments]
-    more = f" {left_out} further scenarios are left out for want of room." if left_out else ""
+    more = f" For want of room {left_out} more test scenarios are not drawn." if left_out else ""
     what = f": {walls.mark}" if walls.mark else ""
     return Figure(
         name=f"particles-{scenario}",

@@ -142,15 +142,15 @@ def verdict_table(subject: Subject) -> Markup:
     ranks = shared_ranks({row.name: row.scores[name] for row in subject.rows})
     cells = []
     for row in sorted(subject.rows, key=lambda row: (ranks[row.name], row is not leader)):
-        said, same = compare(row.scores[name], leader.scores[name]), row is leader
+        found, same = compare(row.scores[name], leader.scores[name]), row is leader
         cells.append(
             [
                 _heading(row),
                 str(ranks[row.name]),
                 html(row.scores[name].mean),
-                tag("span", "leader", class_="muted") if same else html(said.difference),
-                "" if same else interval(said.interval),
-                "" if same else html(said.p),
+                tag("span", "leader", class_="muted") if same else html(found.difference),
+                "" if same else interval(found.interval),
+                "" if same else html(found.p),
             ]
         )
     head = ["method", "rank", words(name), "loss above leader", "95 % interval", "p"]
@@ -160,5 +160,5 @@ def verdict_table(subject: Subject) -> Markup:
         if count < FEWEST_SCENARIOS
         else "Methods that do not differ from the leader at 5 % share its rank."
     )
-    said = f"p: exact two-sided sign-flip test over {count} scenarios. {note}"
-    return join([table(head, cells, label="Comparison"), paragraph(tag("small", said, class_="muted"))])
+    test = f"p: exact two-sided sign-flip test over {count} scenarios. {note}"
+    return join([table(head, cells, label="Comparison"), paragraph(tag("small", test, class_="muted"))])

@@ -1,0 +1,189 @@
+"""A blow-up names its scenario, the first broken substep, the broken bound and its value."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import SIZE, SPLIT
+from numpy.typing import NDArray
+
+from lagbench.errors import WorkFailedError
+from lagbench.generation import generate
+from lagbench.generators import batch, twin
+from lagbench.generators.base import InitialState
+from lagbench.generators.batch import Batch, Job, split_module
+from lagbench.generators.simulate import simulate
+from lagbench.generators.solver import Device, Solver, build
+from lagbench.manifest import read_manifest
+from lagbench.registry import Registry, Size, load
+
+
+@pytest.fixture
+def stiff_registry(unmeasured_path: Path, tmp_path: Path) -> Registry:
+    """Curl noise that is too stiff for its dt: all scenarios blow up, some later than others."""
+    text, own = unmeasured_path.read_text(), tmp_path / "stiff.yaml"
+    assert "modulus: {value: 5.0e-4" in text
+    own.write_text(text.replace("modulus: {value: 5.0e-4", "modulus: {value: 0.1"))
+    return load(own)
+
+
+@pytest.fixture
+def stiff(stiff_registry: Registry) -> Size:
+    """The same as a size."""
+    return stiff_registry.size(SPLIT, SIZE)
+
+
+def first_bad(size: Size, scenarios: tuple[int, ...]) -> tuple[int, int]:
+    """Return (scenario, substep) of the first failure, one substep and one solver at a time."""
+    ends = {}
+    for scenario in scenarios:
+        solver = build(split_module(size).solver_parameters(size))
+        solver.load([batch.draw(size, scenario)])
+        for substep in range(1, 313):
+            try:
+                solver.advance(1)
+            except WorkFailedError:
+                ends[scenario] = substep
+                break
+    return min((substep, scenario) for scenario, substep in ends.items())[::-1]
+
+
+def failure(
+    size: Size, scenarios: tuple[int, ...], root: Path, device: Device = Device.CPU
+) -> WorkFailedError:
+    """Return the error that simulating some scenarios ends with."""
+    with pytest.raises(WorkFailedError, match="the simulation blew up") as caught:
+        simulate(Job(size=size, scenarios=scenarios, root=root, device=device), lambda units: None)
+    return caught.value
+
+
+def test_the_substep_is_the_first_broken_one(stiff: Size, tmp_path: Path) -> None:
+    """The report agrees with a solver that is asked after every substep; it is not just the first."""
+    _, substep = first_bad(stiff, (2,))
+    assert substep > 1
+    assert failure(stiff, (2,), tmp_path).where == f"{SPLIT} {SIZE}, scenario 2, substep {substep}"
+    assert not list(tmp_path.rglob("*.nc*"))
+
+
+def test_the_first_scenario_of_a_batch_is_named(stiff: Size, tmp_path: Path) -> None:
+    """Of scenarios that advance together, the one that breaks first; not the first of the batch."""
+    together = (2, 1, 3)
+    scenario, substep = first_bad(stiff, together)
+    error = failure(stiff, together, tmp_path, Device.PARALLEL)
+    assert error.where == f"{SPLIT} {SIZE}, scenario {scenario}, substep {substep}"
+
+
+def test_strides_before_the_failure_do_not_matter(
+    stiff: Size, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Reports every substep, every five or every frame: the same error."""
+    texts = set()
+    for stride in (1, 5, 10_000):
+        monkeypatch.setattr(batch, "STRIDE", stride * stiff.particles)
+        texts.add(str(failure(stiff, (2,), tmp_path)))
+    assert len(texts) == 1
+
+
+@pytest.mark.parametrize(
+    ("scenario", "expected", "got"),
+    [
+        (1, r"J > 0", r"J = -0\.\d+"),
+        (2, r"CFL: abs\(v\) <= dx/dt = 12; J > 0", r"abs\(v\) = 20\.\d+; J = -2\.\d+"),
+    ],
+)
+def test_only_broken_bounds_and_their_values(
+    scenario: int, expected: str, got: str, stiff: Size, tmp_path: Path
+) -> None:
+    """The bounds that the first broken substep left and the values beyond them, no name of our classes."""
+    error = failure(stiff, (scenario,), tmp_path)
+    assert re.fullmatch(expected, str(error.expected))
+    assert re.fullmatch(got, str(error.got))
+    assert "Health" not in str(error)
+    assert "substeps_per_frame" in str(error.fix)
+
+
+def test_a_good_run_loads_its_states_once(
+    unmeasured: Registry, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing is replayed where nothing fails."""
+    size = unmeasured.size(SPLIT, SIZE)
+    loads: list[int] = []
+    kind = type(build(split_module(size).solver_parameters(size)))
+    load_states = kind.load
+
+    def counted(solver: Solver, states: Sequence[InitialState]) -> None:
+        loads.append(len(states))
+        load_states(solver, states)
+
+    monkeypatch.setattr(kind, "load", counted)
+    simulate(Job(size=size, scenarios=(2,), root=tmp_path), lambda units: None)
+    assert loads == [1]
+
+
+def test_a_twin_is_replayed_with_its_nudge(
+    copied: Callable[[], Path], unmeasured: Registry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A nudge that is not a number breaks the twin, in the replay as well, one substep later."""
+    size = unmeasured.size(SPLIT, SIZE)
+
+    def shove(entry: Size, scenario: int) -> NDArray[np.float32]:
+        return np.full((entry.particles, 2), np.nan, dtype=np.float32)
+
+    monkeypatch.setattr(twin, "nudge", shove)
+    job = Job(size=size, scenarios=(3,), root=copied())
+    with pytest.raises(WorkFailedError, match="blew up") as caught:
+        twin.twin_floors(job, lambda units: None)
+    start = (size.task.input_frames - 1) * size.substeps_per_frame
+    assert caught.value.where == f"{SPLIT} {SIZE}, scenario 3, substep {start + 1}"
+    assert caught.value.expected == "every number is finite"
+
+
+def test_a_failure_that_does_not_repeat_keeps_its_range(stiff: Size, tmp_path: Path) -> None:
+    """Where the replay passes (a bit that flipped), the range of the first report is all there is."""
+    running = Batch(Job(size=stiff, scenarios=(2,), root=tmp_path), lambda units: None)
+    solver = running.solver
+
+    class Flaky:
+        """Fails on its first advance only."""
+
+        failed = False
+
+        def __getattr__(self, name: str) -> object:
+            return getattr(solver, name)
+
+        def advance(self, substeps: int) -> None:
+            if not self.failed:
+                self.failed = True
+                where = f"scenario 0, substeps 0 to {substeps}"
+                raise WorkFailedError("the simulation blew up", where=where)
+
+    running.solver = Flaky()
+    with pytest.raises(WorkFailedError, match="scenario 2, substeps 0 to 12"):
+        list(running.recordings())
+
+
+def test_no_manifest_where_no_scenario_succeeded(stiff_registry: Registry, tmp_path: Path) -> None:
+    """A failed scenario leaves neither file nor manifest; one that is there already stays."""
+    root = tmp_path / "data"
+    with pytest.raises(WorkFailedError, match="blew up"):
+        generate(SPLIT, SIZE, scenarios="2", root=root, workers=1, registry=stiff_registry)
+    assert [p.name for p in root.rglob("*") if p.is_file() and not p.name.startswith(".lock")] == []
+
+
+def test_a_failure_keeps_the_manifest_of_the_others(
+    copied: Callable[[], Path], stiff_registry: Registry
+) -> None:
+    """Files of an earlier generation and their manifest stay as they were."""
+    root = copied()
+    manifest = read_manifest(root, SPLIT, SIZE, 1)
+    assert manifest is not None
+    (root / SPLIT / SIZE / "v1" / "valid" / "0002.nc").unlink()
+    with pytest.raises(WorkFailedError, match="blew up"):
+        generate(SPLIT, SIZE, scenarios="2", root=root, workers=1, registry=stiff_registry)
+    after = read_manifest(root, SPLIT, SIZE, 1)
+    assert after is not None
+    assert [e.scenario for e in after.files] == [0, 1, 3, 4]

@@ -1,0 +1,149 @@
+"""The command line and files: what it is given, what it writes, what it leaves alone."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from importlib.metadata import requires
+from pathlib import Path
+
+import pytest
+from conftest import SIZE, SPLIT
+from typer.testing import CliRunner, Result
+
+from lagbench.cli.app import app
+from lagbench.demo import demo_splits
+from lagbench.doctor import NEEDED
+from lagbench.generation import GenerationResult
+from lagbench.registry import Registry
+
+Run = Callable[..., Result]
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, unmeasured_path: Path) -> Run:
+    """A function that runs lagbench with our splits and no recorded hashes."""
+    monkeypatch.setenv("LAGBENCH_REGISTRY", str(unmeasured_path))
+    monkeypatch.delenv("LAGBENCH_DEBUG", raising=False)
+    return lambda *words: CliRunner().invoke(app, [str(word) for word in words])
+
+
+def files_below(folder: Path) -> set[str]:
+    """Return the names of all files, relative to the folder."""
+    return {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_clean_leaves_the_pictures_of_others(run: Run, copied: Callable[[], Path]) -> None:
+    """A user's own PNG files, beside our cards and among our pictures, stay."""
+    root = copied()
+    folder = root / SPLIT / SIZE / "v1"
+    mine = {"mine.png", "pictures/mine.png", "README.txt"}
+    for name in mine:
+        (folder / name).write_bytes(b"mine")
+    assert run("clean", SPLIT, "--size", SIZE, "--root", root).exit_code == 0
+    assert files_below(folder) == mine
+
+
+def test_a_dry_clean_writes_nothing(
+    run: Run, copied: Callable[[], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It takes no lock, so it also works on a folder that nobody may write, and beside a writer."""
+    root = copied()
+    before = files_below(root)
+
+    def refused(*_: object, **__: object) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr("lagbench.cleaning.dataset_lock", refused)
+    result = run("clean", SPLIT, "--size", SIZE, "--root", root, "--dry-run")
+    assert result.exit_code == 0, result.output
+    assert "10 files" in result.stdout
+    assert files_below(root) == before
+
+
+@pytest.mark.parametrize("command", ["plot", "animate"])
+@pytest.mark.parametrize(("name", "word"), [("none.nc", "missing"), ("text.nc", "not one of lagbench")])
+def test_a_file_that_the_user_names_and_cannot_be_read_exits_3(
+    command: str, name: str, word: str, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A missing file and a text file are unreadable files, not damaged data sets."""
+    monkeypatch.chdir(tmp_path)
+    Path("text.nc").write_text("no netCDF")
+    for source in (name, tmp_path / name, f"./{name}"):
+        result = run(command, source)
+        assert result.exit_code == 3, result.output
+        assert word in result.stderr
+        assert name in result.stderr
+        assert "lagbench generate writes what is missing" not in result.stderr
+
+
+def test_a_damaged_scenario_of_a_split_exits_4(run: Run, copied: Callable[[], Path], tmp_path: Path) -> None:
+    """The same damage below the root folder is a damaged data set, whose remedy is to generate."""
+    root = copied()
+    (root / SPLIT / SIZE / "v1" / "test" / "0003.nc").write_text("no netCDF")
+    result = run("plot", SPLIT, "--size", SIZE, "--root", root, "-o", tmp_path / "x.png")
+    assert result.exit_code == 4
+    assert "lagbench generate" in result.stderr
+
+
+@pytest.mark.parametrize(
+    "words",
+    [("plot", "-o", "{}/a.png"), ("plot", "--sheet", "-o", "{}/a.png"), ("animate", "-o", "{}/a.gif")],
+)
+def test_pictures_go_to_folders_that_are_there(
+    words: tuple[str, ...], run: Run, generated: GenerationResult, tmp_path: Path
+) -> None:
+    """A folder that is misspelt is refused, not made."""
+    lost = tmp_path / "lost"
+    command, *options = (word.format(lost) for word in words)
+    result = run(command, SPLIT, "--size", SIZE, "--root", generated.root, *options)
+    assert result.exit_code == 2, result.output
+    assert str(lost) in result.stderr
+    assert not lost.exists()
+
+
+@pytest.mark.parametrize("rate", ["nan", "inf", "0", "-3"])
+def test_a_rate_that_is_no_rate_exits_2(
+    rate: str, run: Run, generated: GenerationResult, tmp_path: Path
+) -> None:
+    """Neither a fault of ours nor raw output of ffmpeg."""
+    for ending in ("gif", "mp4"):
+        target = tmp_path / f"a.{ending}"
+        result = run("animate", generated.folder / "test" / "0003.nc", "--fps", rate, "-o", target)
+        assert result.exit_code == 2, result.output
+        assert "0.01 to 1000 frames/s" in result.stderr
+
+
+def test_verify_says_as_json_whether_all_is_there(run: Run, copied: Callable[[], Path]) -> None:
+    """`complete` is true, and false once a file is gone."""
+    root = copied()
+    words = ("verify", SPLIT, "--size", SIZE, "--root", root, "--json")
+    assert json.loads(run(*words).stdout)["complete"] is True
+    (root / SPLIT / SIZE / "v1" / "test" / "0003.nc").unlink()
+    assert json.loads(run(*words).stdout)["complete"] is False
+
+
+def test_the_demo_takes_the_splits_that_have_a_tiny_size(
+    run: Run, unmeasured: Registry, copied: Callable[[], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A split without one is left out, and the JSON object names what was made."""
+    small = unmeasured.split(SPLIT)
+    large = small.model_copy(update={"sizes": {"full": small.sizes["full"]}})
+    registry = Registry({"large": large, SPLIT: small}, {})
+    assert demo_splits(registry) == [SPLIT]
+    monkeypatch.setattr("lagbench.registry.load", lambda: registry)
+    root = copied()
+    result = run("demo", "--root", root, "--json")
+    assert result.exit_code == 0, result.output
+    made = json.loads(result.stdout)
+    assert list(made) == [SPLIT]
+    assert made[SPLIT]["generation"]["kept"] == [0, 1, 2, 3, 4]
+    assert Path(made[SPLIT]["picture"]).is_file()
+    assert "1 data sets, verified and drawn" in run("demo", "--root", root).stdout
+
+
+def test_doctor_looks_at_every_dependency() -> None:
+    """The libraries that it asks for are those that the package declares, no more and no fewer."""
+    declared = [line for line in requires("lagbench") or [] if "extra ==" not in line]
+    assert {name.lower() for name in NEEDED} == {re.split(r"[^\w.-]", line)[0].lower() for line in declared}
