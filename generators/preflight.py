@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import MISSING, fields
+from difflib import get_close_matches
 from typing import TYPE_CHECKING
 
-from lagbench.errors import UnreadableFileError, UsageError, nearest
+from lagbench.errors import UnreadableFileError, UsageError
 from lagbench.limits import Limit
 
 from .base import ClosedBoxParameters, FreeSurfaceParameters
@@ -100,12 +101,13 @@ def _missing(name: str, kind: Kind, size: Size) -> UnreadableFileError:
     """Return an error that names the parameter that may have been meant."""
     known = {field.name for field in fields(kind)}
     strange = [other for other in size.parameters if other not in known]
+    close = get_close_matches(name, strange, n=3)
     return UnreadableFileError(
         "a parameter is missing",
         where=f"{size.file}, {_key(size, name)}",
         expected=name,
-        got=f"parameters {', '.join(strange)}",
-        fix=f"declare {name} under parameters of the split; {nearest(name, strange)}",
+        got=", ".join(close) or "no name like it",
+        fix=f"did you mean {close[0]!r}?" if close else f"declare {name} under parameters of the split",
     )
 
 

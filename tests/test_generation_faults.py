@@ -71,7 +71,7 @@ def test_a_root_that_cannot_be_a_folder(tmp_path: Path, unmeasured: Registry) ->
     (tmp_path / "file").write_text("no folder")
     with pytest.raises(WorkFailedError) as caught:
         generate(SPLIT, SIZE, root=tmp_path / "file" / "data", registry=unmeasured)
-    assert "cannot lock the data set" in str(caught.value)
+    assert "no data set can be written here" in str(caught.value)
     assert "--root" in str(caught.value)
     assert caught.value.exit_code == 5
 

@@ -28,8 +28,10 @@ DECLARED = [
 
 def other_value(name: str, value: float) -> float:
     """Return another value of a parameter with which bodies can still be drawn."""
-    if name in ("gap", "gap_cells"):  # only another verdict on a placement shows
-        return {"gap": 0.1, "gap_cells": 2}[name]
+    # A gap shows by another verdict on a placement only; a J of liquid below 1 is refused.
+    special = {"gap": 0.1, "gap_cells": 2, "jacobian_max": 1.1}
+    if name in special:
+        return special[name]
     if isinstance(value, int):
         return value + 1
     if name.endswith("_max"):

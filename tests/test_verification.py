@@ -306,7 +306,7 @@ def test_unknown_names_are_usage_errors(tmp_path: Path, measured: Registry) -> N
     """Split, size, subset, ids and workers are checked as generate checks them."""
     for options in ({"subset": "trian"}, {"scenarios": "7"}, {"workers": 0}, {"workers": -1}):
         with pytest.raises(UsageError):
-            verify(SPLIT, SIZE, root=tmp_path, registry=measured, **options)  # type: ignore[arg-type]
+            verify(SPLIT, SIZE, root=tmp_path, registry=measured, **options)
 
 
 @given(st.lists(st.integers(0, 9999), min_size=1, unique=True).map(sorted), st.integers(0, 80))

@@ -28,7 +28,7 @@ def grid(
     cells = [tag("span"), *(tag("span", column, class_="time") for column in columns)]
     for name, panels in rows:
         cells += [tag("span", name, class_="side"), *panels]
-    tracks = f"grid-template-columns:minmax(4.2rem,6rem) repeat({len(columns)},minmax({width}rem,1fr))"
+    tracks = f"grid-template-columns:minmax(5.2rem,6.5rem) repeat({len(columns)},minmax({width}rem,1fr))"
     return tag("div", tag("div", *cells, class_="panels", style=tracks), class_="scroll", tabindex=0)
 
 
