@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 from types import ModuleType
 
 from .errors import UsageError
 
-__all__ = ["require"]
+__all__ = ["check_installed", "require"]
 
 
 def require(module: str, *, extra: str) -> ModuleType:
@@ -25,8 +26,22 @@ def require(module: str, *, extra: str) -> ModuleType:
     except ModuleNotFoundError as error:
         if (error.name or "").split(".")[0] != module.split(".")[0]:
             raise
-        raise UsageError(
-            f"{module.split('.')[0]} is not installed",
-            where=f"this needs the extra {extra!r}",
-            fix=f"pip install 'lagbench[{extra}]'",
-        ) from None
+        raise _missing(module, extra) from None
+
+
+def check_installed(module: str, *, extra: str) -> None:
+    """Refuse before work starts, without importing: workers will import the module.
+
+    Raises:
+        UsageError: it is not installed; the message holds the command that installs it.
+    """
+    if importlib.util.find_spec(module) is None:
+        raise _missing(module, extra)
+
+
+def _missing(module: str, extra: str) -> UsageError:
+    return UsageError(
+        f"{module.split('.')[0]} is not installed",
+        where=f"this needs the extra {extra!r}",
+        fix=f"pip install 'lagbench[{extra}]'",
+    )

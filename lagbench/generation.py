@@ -7,7 +7,6 @@ as an uninterrupted one.
 
 from __future__ import annotations
 
-import importlib.util
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from typing import TYPE_CHECKING
 
 from .campaign import Campaign
 from .errors import UsageError, nearest
+from .extras import check_installed
 from .layout import dataset_folder, resolve_root
 from .locking import dataset_lock
 from .plan import Scenarios, Selection, free_bytes, select
@@ -122,7 +122,7 @@ def generate(
     if dry_run:
         campaign.survey(wanted, force=force)
     else:
-        _require_taichi()
+        check_installed("taichi", extra="generate")
         with dataset_lock(folder, split, size, tier.major, on_wait=on_wait):
             campaign.run(wanted, force=force)
     seconds = time.monotonic() - started
@@ -165,11 +165,3 @@ def parse_device(name: str) -> Device:
     if name not in names:
         raise UsageError(f"no device {name!r}", where="--device", fix=nearest(name, names))
     return Device(name)
-
-
-def _require_taichi() -> None:
-    """Refuse before anything is written; the workers import Taichi, this process never does."""
-    if importlib.util.find_spec("taichi") is None:
-        raise UsageError(
-            "taichi is not installed", where="lagbench generate", fix="pip install 'lagbench[generate]'"
-        )

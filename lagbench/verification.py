@@ -14,6 +14,7 @@ from pathlib import Path
 
 from .checksums import HASHED_SUBSETS, dataset_hash, subset_hash
 from .errors import DataError
+from .extras import check_installed
 from .generators.batch import Job
 from .generators.simulate import simulate
 from .generators.solver import Device
@@ -140,6 +141,8 @@ def verify(
     tier = (registry or load()).size(split, size)
     ids, folder = select(tier, subset=subset, scenarios=scenarios), resolve_root(root)
     meter, cores = Meter(progress), worker_count(workers)
+    if regenerate:
+        check_installed("taichi", extra="generate")
     manifest, warnings = _manifest(folder, tier)
     findings = _examine_all(folder, tier, ids, manifest, meter)
     anew = _regenerate(tier, evenly_spaced(ids, regenerate), cores, meter)

@@ -320,3 +320,10 @@ def test_evenly_spaced_ids(ids: list[int], count: int) -> None:
         places = [ids.index(i) for i in chosen]
         gaps = [b - a for a, b in itertools.pairwise(places)]
         assert max(gaps) - min(gaps) <= 1
+
+
+def test_regeneration_needs_taichi(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Without Taichi the extra is named before anything is hashed."""
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(UsageError, match=r"pip install 'lagbench\[generate\]'"):
+        verify("fluid", "tiny", root=tmp_path, regenerate=1)

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from lagbench.errors import UsageError
+
 from .options import (
     JsonFlag,
     QuietFlag,
@@ -28,6 +30,9 @@ if TYPE_CHECKING:
 __all__ = ["compare", "score", "template", "validate"]
 
 PredictionsArgument = Annotated[Path, typer.Argument(metavar="FILE", help="A predictions.nc.")]
+FilesArgument = Annotated[
+    list[Path], typer.Argument(metavar="FILE...", help="A predictions.nc; several with --report.")
+]
 EveryFlag = Annotated[bool, typer.Option("--all", help="Show every metric.")]
 
 
@@ -83,11 +88,15 @@ def _checked(result: ValidationResult) -> None:
 
 
 def score(
-    predictions: PredictionsArgument,
+    predictions: FilesArgument,
     root: RootOption = None,
     output: Annotated[
         Path | None,
         typer.Option("--output", "-o", metavar="FOLDER", help="Where scores go; beside FILE by default."),
+    ] = None,
+    report: Annotated[
+        Path | None,
+        typer.Option("--report", metavar="FOLDER", help="Write index.html with all figures there."),
     ] = None,
     workers: WorkersOption = None,
     scheduler: Annotated[
@@ -104,21 +113,30 @@ def score(
     """Score a predictions.nc beside two floors; write scores.json and scores.nc."""
     from lagbench.scoring import score as run
 
-    with progress_bar(quiet=quiet) as draw:
-        card = run(
-            predictions,
-            root=root,
-            output_dir=output,
-            workers=workers,
-            scheduler=scheduler,
-            extras=tuple(name for name in extras.split(",") if name),
-            progress=draw,
-            examined=_complain,
-        )
+    if len(predictions) > 1 and report is None:
+        raise UsageError("several files are scored for one report", fix="add --report FOLDER")
+    cards = []
+    for path in predictions:
+        with progress_bar(quiet=quiet) as draw:
+            card = run(
+                path,
+                root=root,
+                output_dir=(output or report or path.parent) / path.stem if len(predictions) > 1 else output,
+                workers=workers,
+                scheduler=scheduler,
+                extras=tuple(name for name in extras.split(",") if name),
+                progress=draw,
+                examined=_complain,
+            )
+        cards.append(card)
+        if not as_json and not quiet:
+            _scored(card, every=every)
     if as_json:
-        print_json(card.as_json())
-    elif not quiet:
-        _scored(card, every=every)
+        print_json(cards[0].as_json() if len(cards) == 1 else [card.as_json() for card in cards])
+    if report is not None:
+        from lagbench.report import write_report
+
+        say(f"report: {write_report(report, cards, predictions, root=root)}", quiet=quiet or as_json)
 
 
 def _complain(result: ValidationResult) -> None:
