@@ -1,6 +1,6 @@
 """Simulate scenarios of a size and write each to its file.
 
-Only netCDF4 and Taichi are imported beside NumPy, which keeps a worker below 400 MB.
+Neither xarray nor pandas is imported, which keeps a worker below 400 MB.
 """
 
 from __future__ import annotations

@@ -53,7 +53,12 @@ def parser() -> argparse.ArgumentParser:
     add = made.add_argument
     add("--case", type=Case, choices=list(Case), required=True, help="which closed box")
     add("--json", type=Path, metavar="FILE", help="results")
-    add("--re", type=float, metavar="R", help="Reynolds number (needed by cavity; curl-noise: inviscid)")
+    add(
+        "--re",
+        type=float,
+        metavar="R",
+        help="Reynolds number; curl-noise is inviscid without it",
+    )
     add("--grid", type=int, default=40, metavar="N", help="cells across the unit box (default 40)")
     add("--particles", type=int, metavar="P", help="particles (default 8192 (N/40)^2, curl-noise 8096)")
     add("--substeps", type=int, metavar="K", help="solver steps (default 100000, curl-noise 600 frames)")

@@ -18,7 +18,7 @@ from .scenario_ids import parse_ids, spell_ids
 __all__ = ["Estimate", "check_disk", "estimate", "free_bytes", "scenario_bytes", "select"]
 
 SECONDS_PER_PARTICLE_SUBSTEP = 45e-9
-"""Orientation for one core [s]; docs/performance.md has measurements."""
+"""Orientation for one core [s]; benchmarks/ measures it."""
 
 BYTES_PER_PARTICLE = 2 * 2 * 4
 """Position and velocity in one frame, two float32 each, before compression [bytes]."""
