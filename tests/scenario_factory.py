@@ -12,6 +12,20 @@ from lagbench.format import ScenarioKey, ScenarioWriter, scenario_path
 
 PARAMETERS = {"dt": 0.002, "grid": 16, "start_substep": 40, "wall_moving": "top"}
 
+DIMS = {
+    "frame": ("frame",),
+    "time": ("frame",),
+    "particle": ("particle",),
+    "space": ("space",),
+    "wall": ("wall",),
+    "position": ("frame", "particle", "space"),
+    "velocity": ("frame", "particle", "space"),
+    "material": ("particle",),
+    "particle_mass": (),
+    "wall_velocity": ("frame", "wall", "space"),
+}
+"""Dimensions of every variable of a closed-box file."""
+
 
 def make_key(
     scenario: int = 3, *, split: str = "cavity", size: str = "tiny", subset: str = "test"

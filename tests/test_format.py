@@ -15,7 +15,7 @@ import pytest
 import xarray as xr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from scenario_factory import PARAMETERS, frames_of, make_key, write_scenario
+from scenario_factory import DIMS, PARAMETERS, frames_of, make_key, write_scenario
 
 from lagbench.checksums import content_hash, file_sha256
 from lagbench.errors import DataError, WorkFailedError
@@ -29,18 +29,6 @@ from lagbench.format import (
 )
 
 KEY = make_key()
-DIMS = {
-    "frame": ("frame",),
-    "time": ("frame",),
-    "particle": ("particle",),
-    "space": ("space",),
-    "wall": ("wall",),
-    "position": ("frame", "particle", "space"),
-    "velocity": ("frame", "particle", "space"),
-    "material": ("particle",),
-    "particle_mass": (),
-    "wall_velocity": ("frame", "wall", "space"),
-}
 TYPES = {
     **dict.fromkeys(("frame", "particle"), "int32"),
     **dict.fromkeys(("time", "particle_mass"), "float64"),

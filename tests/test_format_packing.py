@@ -12,23 +12,11 @@ import netCDF4
 import xarray as xr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from scenario_factory import make_key, write_scenario
+from scenario_factory import DIMS, make_key, write_scenario
 
 from lagbench.format import rehash
 
 KEY = make_key()
-DIMS = {
-    "frame": ("frame",),
-    "time": ("frame",),
-    "particle": ("particle",),
-    "space": ("space",),
-    "wall": ("wall",),
-    "position": ("frame", "particle", "space"),
-    "velocity": ("frame", "particle", "space"),
-    "material": ("particle",),
-    "particle_mass": (),
-    "wall_velocity": ("frame", "wall", "space"),
-}
 
 
 @settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
