@@ -9,10 +9,13 @@ both floors beside every submission. Intervals are 95 % bootstrap intervals over
 from __future__ import annotations
 
 import argparse
+import sys
 import tempfile
 from pathlib import Path
 
 import lagbench
+from lagbench.errors import DataError
+from lagbench.score_card import ScoreCard
 
 DATA = ("cavity/full", "cavity/mini", "curl-noise/mini", "fluid/mini", "multimaterial/mini")
 METRICS = ("vorticity_rmse", "vorticity_pearson", "position_rmse", "mse_avg", "energy_error")
@@ -29,14 +32,23 @@ def main() -> int:
     print(f"|---|---|{'---:|' * len(METRICS)}")
     for name in given.data:
         split, size = name.split("/")
-        with tempfile.TemporaryDirectory() as folder:
-            file = Path(folder) / "predictions.nc"
-            lagbench.template(split, size, output=file, root=given.root)
-            card = lagbench.score(file, root=given.root)
+        try:
+            card = _score(split, size, given.root)
+        except DataError as error:
+            print(f"{name} is left out: {error}", file=sys.stderr)
+            continue
         for row in ROWS:
             cells = [_cell(card.scores[row][metric], ranks=metric == card.ranking) for metric in METRICS]
             print(f"| {split} {size} | {row} | {' | '.join(cells)} |", flush=True)
     return 0
+
+
+def _score(split: str, size: str, root: Path) -> ScoreCard:
+    """Score the template of a data set, in a folder that is gone afterwards."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "predictions.nc"
+        lagbench.template(split, size, output=file, root=root)
+        return lagbench.score(file, root=root)
 
 
 def _cell(score: lagbench.metrics.Score, *, ranks: bool) -> str:

@@ -24,6 +24,9 @@ from lagbench.exam import load_exam
 WALL_SECONDS = 2.0
 """Target after imports on two idle cores [s]."""
 
+CPU_SECONDS = 2 * WALL_SECONDS
+"""Target of processor time with one worker: what two cores have in that time [s]."""
+
 MEMORY = 500e6
 """Target for the largest process [bytes]."""
 
@@ -87,6 +90,7 @@ def test_score_beside_a_naive_scorer(data: ScoreData) -> None:
         f"naive, 5 metrics x 1 row: {naive['wall']:.0f} s, {naive['cpu']:.0f} CPU-s: {ratio:.0f} times ours"
     )
     assert ratio >= 5
+    assert one["cpu"] <= CPU_SECONDS
     assert max(one["memory"], two["memory"]) <= MEMORY
     assert two["bytes"] <= 300_000
 

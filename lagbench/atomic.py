@@ -9,14 +9,17 @@ from pathlib import Path
 
 from .errors import LagbenchError, WorkFailedError
 
-__all__ = ["atomic_path", "remove_leftovers", "write_atomically"]
+__all__ = ["atomic_path", "check_writable", "remove_leftovers", "write_atomically"]
 
 SUFFIX = ".partial"
 """Ending of temporary names; nothing but this module creates or removes such files."""
 
+ROOT_OPTION = "--root or LAGBENCH_ROOT"
+"""What names the folder that most files go to."""
+
 
 @contextmanager
-def atomic_path(target: Path) -> Iterator[Path]:
+def atomic_path(target: Path, *, option: str = ROOT_OPTION) -> Iterator[Path]:
     """Yield a temporary name beside the target; rename it there on a clean exit.
 
     The parent folder is created. Before the rename the file is flushed to disk, after it
@@ -25,11 +28,12 @@ def atomic_path(target: Path) -> Iterator[Path]:
 
     Args:
         target: path that shall appear.
+        option: what the user names another folder with, for the message.
 
     Raises:
         WorkFailedError: the operating system refused (no space, no permission).
     """
-    temporary = target.with_name(f".{target.name}.{os.getpid()}{SUFFIX}")
+    temporary = _temporary(target)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         yield temporary
@@ -39,24 +43,39 @@ def atomic_path(target: Path) -> Iterator[Path]:
     except LagbenchError:
         raise
     except OSError as error:
-        raise WorkFailedError(
-            "cannot write a file",
-            where=str(target),
-            got=error.strerror or error,
-            fix="free disk space, or name a folder that you may write to: --root or LAGBENCH_ROOT",
-        ) from error
+        raise _refused(target, option, error) from error
     finally:
         _discard(temporary)
 
 
-def write_atomically(target: Path, data: bytes) -> None:
+def write_atomically(target: Path, data: bytes, *, option: str = ROOT_OPTION) -> None:
     """Write bytes to a file that appears whole or not at all.
 
     Raises:
         WorkFailedError: the operating system refused.
     """
-    with atomic_path(target) as temporary:
+    with atomic_path(target, option=option) as temporary:
         temporary.write_bytes(data)
+
+
+def check_writable(folder: Path, *, option: str = ROOT_OPTION) -> None:
+    """Make a folder and see that files can be written there, before work whose result goes there.
+
+    Args:
+        folder: the folder.
+        option: what the user names another folder with, for the message.
+
+    Raises:
+        WorkFailedError: the operating system refused.
+    """
+    probe = _temporary(folder / "probe")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe.touch()
+    except OSError as error:
+        raise _refused(folder, option, error) from error
+    finally:
+        _discard(probe)
 
 
 def remove_leftovers(folder: Path) -> list[Path]:
@@ -68,6 +87,19 @@ def remove_leftovers(folder: Path) -> list[Path]:
     for path in found:
         path.unlink(missing_ok=True)
     return found
+
+
+def _temporary(target: Path) -> Path:
+    return target.with_name(f".{target.name}.{os.getpid()}{SUFFIX}")
+
+
+def _refused(target: Path, option: str, error: OSError) -> WorkFailedError:
+    return WorkFailedError(
+        "cannot write there",
+        where=str(target),
+        got=error.strerror or error,
+        fix=f"free disk space, or name a folder that you may write to: {option}",
+    )
 
 
 def _discard(path: Path) -> None:

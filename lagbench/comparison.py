@@ -12,13 +12,16 @@ from pathlib import Path
 from typing import Any
 
 from .errors import DataError, UnreadableFileError, UsageError, nearest
+from .method_names import told_apart
 from .metrics import Comparison, Direction, Score
 from .metrics import compare as compare_scores
 from .metrics.comparison import FEWEST_SCENARIOS
+from .published import PublishedScores, parse_scores, read_scores
 from .registry import Registry
-from .score_card import JSON_NAME, PublishedScores, digits, parse_scores, read_scores
-from .scoring import evaluate
+from .score_card import JSON_NAME, digits
+from .scoring import score
 from .sitting import SUBMISSION
+from .submission.format_checks import MAX_NAME
 
 __all__ = ["ComparisonResult", "Contestant", "MetricComparison", "compare"]
 
@@ -69,8 +72,8 @@ class ComparisonResult:
     Attributes:
         split: split of both.
         size: size of both.
-        first: method of the first.
-        second: method of the second.
+        first: method of the first, told apart from that of the second.
+        second: method of the second, likewise, or the name of the floor.
         same_predictions: whether both hold the same positions.
         ranking: name of the metric that ranks.
         scenarios: how many scenarios both have in that metric.
@@ -146,20 +149,23 @@ def compare(
         UnreadableFileError: a file is neither scores nor predictions.
     """
     one, floors = _contestant(first, root, workers, registry)
-    if str(second) in floors:
-        two = _floor(one, str(second), floors[str(second)])
+    floor = str(second) if str(second) in floors else None
+    if floor is not None:
+        two = _floor(one, floor, floors[floor])
     else:
         two, _ = _contestant(second, root, workers, registry)
     _check_same(one, two)
     judged = _judged(one, two)
-    wanted = [_known(name, judged) for name in metrics] or list(judged)
-    names = sorted({one.ranking, *wanted}, key=lambda name: (name != one.ranking, list(judged).index(name)))
-    found = {name: _compared(one.scores[name], two.scores[name]) for name in names}
+    methods = one.identity["method"], two.identity["method"]
+    names = told_apart(methods) if floor is None else [*told_apart(methods[:1], taken=(floor,)), floor]
+    wanted = [_known(name, judged) for name in metrics] or judged
+    order = sorted({one.ranking, *wanted}, key=lambda name: (name != one.ranking, judged.index(name)))
+    found = {name: _compared(one.scores[name], two.scores[name]) for name in order}
     return ComparisonResult(
         split=one.identity["split"],
         size=one.identity["size"],
-        first=one.identity["method"],
-        second=two.identity["method"],
+        first=names[0],
+        second=names[1],
         same_predictions=one.predictions_sha256 == two.predictions_sha256,
         ranking=one.ranking,
         scenarios=len(found[one.ranking].test.scenarios),
@@ -175,12 +181,9 @@ def _contestant(
     if path.is_dir():
         path = path / JSON_NAME
     held = read_scores(path) if path.suffix == ".json" else _scored(path, root, workers, registry)
-    if SUBMISSION not in held.scores or held.ranking not in held.scores[SUBMISSION]:
-        raise UnreadableFileError(
-            "scores without the ranking metric",
-            where=str(path),
-            expected=f"row {SUBMISSION!r} with {held.ranking!r}",
-            fix="score the predictions again: lagbench score predictions.nc",
+    if SUBMISSION not in held.scores:
+        raise _incomplete(
+            str(path), f"a row {SUBMISSION!r}", ", ".join(map(repr, list(held.scores)[:10]))[:MAX_NAME]
         )
     floors = {row: scores for row, scores in held.scores.items() if row != SUBMISSION}
     contestant = Contestant(
@@ -197,7 +200,8 @@ def _scored(
     path: Path, root: str | Path | None, workers: int | None, registry: Registry | None
 ) -> PublishedScores:
     # through JSON, so that its digits are those of a scores.json
-    return parse_scores(evaluate(path, root=root, workers=workers, registry=registry).as_json())
+    card = score(path, root=root, workers=workers, registry=registry, write=False)
+    return parse_scores(card.as_json())
 
 
 def _floor(beside: Contestant, name: str, scores: Mapping[str, Score]) -> Contestant:
@@ -224,12 +228,23 @@ def _check_same(one: Contestant, two: Contestant) -> None:
             )
 
 
-def _judged(one: Contestant, two: Contestant) -> dict[str, Score]:
-    return {
-        name: score
-        for name, score in one.scores.items()
-        if name in two.scores and score.metric.direction is not Direction.NONE
-    }
+def _judged(one: Contestant, two: Contestant) -> list[str]:
+    """Return the names of the metrics to compare by, the ranking one of the first among them."""
+    judging = [name for name, held in one.scores.items() if held.metric.direction is not Direction.NONE]
+    for side, names in ((one, judging), (two, two.scores)):
+        if one.ranking not in names:
+            raise _incomplete(side.name, f"values of a ranking metric that judges, {one.ranking!r}", None)
+    return [name for name in judging if name in two.scores]
+
+
+def _incomplete(where: str, expected: str, got: str | None) -> UnreadableFileError:
+    return UnreadableFileError(
+        "scores without the row or the ranking metric",
+        where=where,
+        expected=expected,
+        got=got,
+        fix="score the predictions again: lagbench score predictions.nc",
+    )
 
 
 def _known(name: str, judged: Collection[str]) -> str:

@@ -85,8 +85,8 @@ def contact_sheet(
         output: file to write, ending in .png.
         root: folder that holds all data sets; see ``resolve_root``.
         kind: what each panel shows; the default suits the split.
-        frame: frame to show where the sheet is a table of scenarios; the last frame of
-            interest of a driven flow, else the first frame, when None.
+        frame: frame to show where the sheet is a table of scenarios; when None, the first, or
+            the last frame of interest of what starts at rest or is driven.
         registry: where splits are described; ours when None.
 
     Raises:
@@ -168,7 +168,8 @@ def _table(files: Sequence[Path], panel: Panel | None, frame: int | None, splits
         driven = bool(recording.wall_velocity.any())
         panel = panel or (Panel.STREAMLINES if driven else Panel.VORTICITY)
         if frame is None:
-            latest = recording.size.task.frames_of_interest[-1] if driven else 0
+            starts_at_rest = driven or not recording.scene(0).speed.any()
+            latest = recording.size.task.frames_of_interest[-1] if starts_at_rest else 0
             frame = min(latest, recording.frames - 1)
     scenes = []
     for path in files[: DRIVEN if driven else DECAYING]:

@@ -20,6 +20,9 @@ __all__ = ["Estimate", "check_disk", "estimate", "free_bytes", "scenario_bytes",
 SECONDS_PER_PARTICLE_SUBSTEP = 45e-9
 """Orientation for one core [s]; benchmarks/ measures it."""
 
+SECONDS_PER_FRAME = 1.5e-3
+"""Orientation for reading, checking and writing one frame of a scenario [s]."""
+
 BYTES_PER_PARTICLE = 2 * 2 * 4
 """Position and velocity in one frame, two float32 each, before compression [bytes]."""
 
@@ -111,12 +114,14 @@ def estimate(size: Size, scenarios: Sequence[int]) -> Estimate:
 
     solver_constants(size)
     substeps = tuple(substeps_of(size, i) for i in scenarios)
+    frames = sum(size.frame_count(i) for i in scenarios)
+    simulating = sum(substeps) * size.particles * SECONDS_PER_PARTICLE_SUBSTEP
     return Estimate(
         scenarios=tuple(scenarios),
         substeps=substeps,
-        frames=sum(size.frame_count(i) for i in scenarios),
+        frames=frames,
         bytes=sum(scenario_bytes(size, i) for i in scenarios),
-        core_seconds=sum(substeps) * size.particles * SECONDS_PER_PARTICLE_SUBSTEP,
+        core_seconds=simulating + frames * SECONDS_PER_FRAME,
     )
 
 

@@ -8,33 +8,21 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from .atomic import write_atomically
-from .errors import UnreadableFileError
 from .flags import Flag
-from .metrics import Comparison, Metric, Score, Setting, Tally, available, bootstrap_interval, compare
+from .metrics import Comparison, Metric, Score, Setting, Tally, bootstrap_interval, compare
 from .metrics.reductions import mean
 from .preview import Preview
 from .sitting import SUBMISSION
 from .statistics import round_digits
 from .submission import Finding, Header
 
-__all__ = [
-    "FORMAT",
-    "JSON_NAME",
-    "PublishedScores",
-    "ScoreCard",
-    "digits",
-    "parse_scores",
-    "read_scores",
-    "write_json",
-]
+__all__ = ["FORMAT", "IDENTITY", "JSON_NAME", "ScoreCard", "digits", "write_json"]
 
 FORMAT = 1
 """Number of the layout of scores.json and scores.nc; stored as ``lagbench_scores``."""
@@ -42,6 +30,8 @@ FORMAT = 1
 JSON_NAME = "scores.json"
 
 IDENTITY = ("split", "size", "dataset_version", "dataset_sha256", "method")
+"""What says which data set was predicted, and by what."""
+
 LABELS = ("seconds_per_frame", "device", "seed", "parameters", "training")
 
 
@@ -185,79 +175,4 @@ def write_json(card: ScoreCard, path: Path) -> None:
         WorkFailedError: the operating system refused.
     """
     text = json.dumps(card.as_json(), indent=1, allow_nan=False, ensure_ascii=False)
-    write_atomically(path, f"{text}\n".encode())
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class PublishedScores:
-    """What a scores.json says, as far as another submission can be compared with it.
-
-    Attributes:
-        identity: split, size, version and hash of the data set, and the method.
-        predictions_sha256: content hash of the predicted positions.
-        ranking: name of the metric that ranks.
-        scores: scores by row and metric, over the horizon; values per frame are not in the file.
-    """
-
-    identity: Mapping[str, str]
-    predictions_sha256: str
-    ranking: str
-    scores: Mapping[str, Mapping[str, Score]]
-
-
-def read_scores(path: Path) -> PublishedScores:
-    """Read a scores.json; metrics that are not installed here are left out.
-
-    Raises:
-        UnreadableFileError: it is not one.
-    """
-    try:
-        return parse_scores(json.loads(path.read_bytes()))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise UnreadableFileError(
-            "not a scores.json of lagbench",
-            where=str(path),
-            expected="what `lagbench score` writes beside the predictions",
-            got=f"{type(error).__name__}: {error}",
-            fix="score the predictions again: lagbench score predictions.nc",
-        ) from error
-
-
-def parse_scores(held: Mapping[str, Any]) -> PublishedScores:
-    """Return what a score card as JSON says: :meth:`ScoreCard.as_json`, or a scores.json.
-
-    Raises:
-        ValueError: another layout, or numbers of values that do not fit; likewise KeyError,
-            TypeError and AttributeError where keys are missing or of another kind.
-    """
-    if held["lagbench_scores"] != FORMAT:
-        raise ValueError(f"layout {held['lagbench_scores']!r}, not {FORMAT}")
-    ids = tuple(int(i) for i in held["task"]["scenarios"])
-    known = available()
-    return PublishedScores(
-        identity={name: str(held[name]) for name in IDENTITY},
-        predictions_sha256=str(held["predictions_sha256"]),
-        ranking=str(held["ranking_metric"]),
-        scores={
-            row: {n: _read_score(known[n], ids, said) for n, said in scores.items() if n in known}
-            for row, scores in held["rows"].items()
-        },
-    )
-
-
-def _read_score(metric: Metric, ids: tuple[int, ...], said: Mapping[str, Any]) -> Score:
-    values = _floats(said["values"])
-    if len(values) != len(ids):
-        raise ValueError(f"{metric.name}: {len(values)} values of {len(ids)} scenarios")
-    return Score(
-        metric=metric,
-        scenarios=ids,
-        frames=(),
-        per_frame=np.empty((len(ids), 0)),
-        values=np.array(values),
-        undefined=tuple(int(count) for count in said["undefined"]),
-    )
-
-
-def _floats(values: Iterable[float | None]) -> list[float]:
-    return [math.nan if value is None else float(value) for value in values]
+    write_atomically(path, f"{text}\n".encode(), option="--output")

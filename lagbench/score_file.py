@@ -1,8 +1,9 @@
 """scores.nc: the statistics of a submission per scenario and frame, and its preview.
 
 Every score of the submission follows from it: ``read_statistics(path).scores()`` gives the
-digits of scores.json. Statistics are float32 and NaN where undefined;
-``measured`` tells which were measured at all. A full cavity submission takes about 0.2 MB.
+digits of scores.json. Statistics are float32 and NaN where undefined, those of long rollouts
+rounded to 11 significant bits (see :func:`lagbench.sitting.as_stored`), so that no full size takes
+more than 0.3 MB; ``measured`` tells which were measured at all.
 """
 
 from __future__ import annotations
@@ -17,15 +18,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .atomic import atomic_path
-from .errors import UnreadableFileError, WorkFailedError
+from .errors import WorkFailedError
 from .metrics import Score, Tally, aggregate, available
 from .preview import Preview
+from .published import unreadable_scores
 from .score_card import FORMAT, IDENTITY, ScoreCard
 from .sitting import SUBMISSION
 
 __all__ = ["NETCDF_NAME", "StoredScores", "read_statistics", "write_statistics"]
 
 NETCDF_NAME = "scores.nc"
+
+INDEX = 4096
+"""About what HDF5 takes for the index of chunks; smaller variables are not compressed [bytes]."""
 
 LEVELS = 65534
 """Greatest packed value of a preview; 65535 stands for what is missing."""
@@ -48,7 +53,7 @@ def write_statistics(card: ScoreCard, path: Path) -> None:
     """
     import netCDF4
 
-    with atomic_path(path) as temporary, ExitStack() as stack:
+    with atomic_path(path, option="--output") as temporary, ExitStack() as stack:
         try:
             file = netCDF4.Dataset(temporary, "w", format="NETCDF4")
             stack.callback(file.close)
@@ -127,8 +132,17 @@ def _store(
         if dim not in group.dimensions:
             group.createDimension(dim, length)
     fill = given.pop("_FillValue", False)
+    packed = values.nbytes > INDEX
     variable = group.createVariable(
-        name, values.dtype, dims, compression="zlib", complevel=9, shuffle=True, fill_value=fill
+        name,
+        values.dtype,
+        dims,
+        compression="zlib" if packed else None,
+        complevel=9,
+        shuffle=True,
+        fill_value=fill,
+        chunksizes=values.shape if packed else None,
+        contiguous=not packed,
     )
     variable.setncatts(given)
     variable.set_auto_maskandscale(False)
@@ -184,13 +198,7 @@ def read_statistics(path: Path) -> StoredScores:
                 },
             )
     except Exception as error:  # HDF5 on damaged bytes raises nearly any type
-        raise UnreadableFileError(
-            "not a scores.nc of lagbench",
-            where=str(path),
-            expected="what `lagbench score` writes beside the predictions",
-            got=f"{type(error).__name__}: {error}",
-            fix="score the predictions again: lagbench score predictions.nc",
-        ) from error
+        raise unreadable_scores(path, error) from error
 
 
 def _tally(

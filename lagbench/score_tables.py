@@ -125,7 +125,10 @@ def _against(card: ScoreCard, row: str) -> str:
     low, high = found.interval
     if math.isnan(found.difference):
         return f"{card.ranking} cannot be compared"
-    word = "better" if found.difference < 0.0 else "worse" if found.difference > 0.0 else "equal"
+    if found.difference < 0.0:
+        word, low, high = "better", -high, -low  # the bounds of what is printed: how much better
+    else:
+        word = "worse" if found.difference > 0.0 else "equal"
     p = (
         f", p = {found.p:.3g}"
         if not math.isnan(found.p)

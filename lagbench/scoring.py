@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from .atomic import check_writable
 from .errors import UsageError, nearest
 from .exam import Exam, load_exam, ranking_metric
 from .flags import Flag, below_twin_floor, copy_suspect, physics
@@ -22,7 +23,7 @@ from .sitting import SUBMISSION, Job, Outcome, sit_scenario
 from .spread import spread
 from .submission import ValidationResult, open_predictions, validate
 
-__all__ = ["evaluate", "score"]
+__all__ = ["score"]
 
 WORTH_WORKERS = 1_000_000
 """Particles times predicted frames below which starting worker processes costs more than it gains."""
@@ -39,6 +40,7 @@ def score(
     progress: Callable[[Progress], None] | None = None,
     examined: Callable[[ValidationResult], None] | None = None,
     registry: Registry | None = None,
+    write: bool = True,
 ) -> ScoreCard:
     """Score a submission and write scores.json and scores.nc.
 
@@ -52,6 +54,7 @@ def score(
         progress: told how far the work is.
         examined: told what the validation found, before anything is raised for it.
         registry: where splits are described; ours when None.
+        write: whether to write the two files.
 
     Returns:
         The score card; ``files`` names what was written.
@@ -61,53 +64,28 @@ def score(
         UnreadableFileError: the predictions cannot be read.
         ChecksFailedError: they are not valid.
         DataError: they were made from another data set, or the test subset is missing or damaged.
-        WorkFailedError: a worker or the cluster was lost, or the disk is full.
+        WorkFailedError: a worker or the cluster was lost, the disk is full, or the folder
+            cannot be written to, which is seen before the work.
     """
-    card = evaluate(
-        predictions,
-        root=root,
-        workers=workers,
-        scheduler=scheduler,
-        extras=extras,
-        progress=progress,
-        examined=examined,
-        registry=registry,
-    )
-    folder = Path(predictions).parent if output_dir is None else Path(output_dir)
-    json_path, netcdf_path = folder / JSON_NAME, folder / NETCDF_NAME
-    write_statistics(card, netcdf_path)
-    write_json(card, json_path)
-    return card.at(json_path, netcdf_path)
-
-
-def evaluate(
-    predictions: str | Path,
-    *,
-    root: str | Path | None = None,
-    workers: int | None = None,
-    scheduler: str | None = None,
-    extras: Collection[str] = (),
-    progress: Callable[[Progress], None] | None = None,
-    examined: Callable[[ValidationResult], None] | None = None,
-    registry: Registry | None = None,
-) -> ScoreCard:
-    """Return the score card of a submission and write nothing; arguments as of :func:`score`."""
     metrics = _chosen(extras)
-    path, folder, described = Path(predictions).absolute(), resolve_root(root), registry or load()
-    result = validate(path, root=folder, require_truth=True, registry=described)
+    path, holder, described = Path(predictions).absolute(), resolve_root(root), registry or load()
+    folder = Path(predictions).parent if output_dir is None else Path(output_dir)
+    result = validate(path, root=holder, require_truth=True, registry=described)
     if examined is not None:
         examined(result)
     result.check()
+    if write:
+        check_writable(folder, option="--output")
     with open_predictions(path) as opened:
         header, content = opened.header, opened.content_sha256()
-    exam = load_exam(described.size(header.split, header.size), folder)
+    exam = load_exam(described.size(header.split, header.size), holder)
     outcomes = _outcomes(exam, path, tuple(m.name for m in metrics), workers, scheduler, Meter(progress))
     tallies = {
         row: {outcome.scenario: outcome.tallies[row] for outcome in outcomes} for row in outcomes[0].tallies
     }
     scores = {row: aggregate(metrics, held) for row, held in tallies.items()}
     preview = next(outcome.preview for outcome in outcomes if outcome.preview is not None)
-    return ScoreCard(
+    card = ScoreCard(
         header=header,
         predictions_sha256=content,
         setting=exam.setting,
@@ -118,6 +96,14 @@ def evaluate(
         warnings=result.warnings,
         preview=preview,
     )
+    return _written(card, folder) if write else card
+
+
+def _written(card: ScoreCard, folder: Path) -> ScoreCard:
+    json_path, netcdf_path = folder / JSON_NAME, folder / NETCDF_NAME
+    write_statistics(card, netcdf_path)
+    write_json(card, json_path)
+    return card.at(json_path, netcdf_path)
 
 
 def _chosen(extras: Collection[str]) -> tuple[Metric, ...]:

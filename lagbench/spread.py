@@ -6,8 +6,10 @@ jobs ran.
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from functools import partial
 from typing import Any, TypeVar
@@ -29,6 +31,9 @@ POLL_SECONDS = 0.02
 
 LOST_SECONDS = 60.0
 """How long a Dask cluster may be without any worker."""
+
+LOGGERS = ("distributed", "distributed.client", "distributed.comm", "distributed.core")
+"""Loggers that print when a cluster is lost."""
 
 
 def spread(
@@ -79,7 +84,7 @@ def _in_processes(
 def _on_cluster(
     function: Callable[[Job, Report], Result], jobs: Mapping[str, Job], address: str, report: Report
 ) -> list[Result]:
-    with _connected(address) as client:
+    with _quiet(), _connected(address) as client:
         # the scheduler runs what a killed worker held on another one
         futures = client.map(partial(_alone, function), list(jobs.values()), pure=False, key="lagbench")
         return _gather(client, dict(zip(jobs, futures, strict=True)), report)
@@ -111,8 +116,34 @@ def _connected(address: str) -> Iterator[Any]:
         ) from error
     try:
         yield client
+    except (CancelledError, distributed.comm.CommClosedError) as error:
+        raise _lost(error) from error
     finally:
         client.close()
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep Dask's logs off the terminal: what matters of them becomes an error of ours.
+
+    After an error they stay off: a client that lost its scheduler logs until the process ends.
+    """
+    require("distributed", extra="cluster")  # its import sets the levels of its loggers
+    levels = {name: logging.getLogger(name).level for name in LOGGERS}
+    for name in LOGGERS:
+        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
+    yield
+    for name, level in levels.items():
+        logging.getLogger(name).setLevel(level)
+
+
+def _lost(got: object) -> WorkFailedError:
+    return WorkFailedError(
+        "the Dask cluster is lost",
+        where="--scheduler",
+        got=f"{type(got).__name__}: {got}" if isinstance(got, Exception) else got,
+        fix="start scheduler and workers, then run the same command again",
+    )
 
 
 def _gather(client: Any, futures: Mapping[str, Any], report: Report) -> list[Any]:  # noqa: ANN401
@@ -124,17 +155,19 @@ def _gather(client: Any, futures: Mapping[str, Any], report: Report) -> list[Any
             if name not in results and future.done():
                 results[name], units = _fetch(name, future)
                 report(units)
-        if client.status == "running" and client.scheduler_info()["workers"]:
+        if _has_workers(client):
             alive = time.monotonic()
         if client.status in ("closed", "failed") or time.monotonic() - alive > LOST_SECONDS:
-            raise WorkFailedError(
-                "the Dask cluster is lost",
-                where="--scheduler",
-                got=f"{client.status}, no worker for {time.monotonic() - alive:.0f} s",
-                fix="start workers, then run the same command again",
-            )
+            raise _lost(f"{client.status}, no worker for {time.monotonic() - alive:.0f} s")
         time.sleep(POLL_SECONDS)
     return [results[name] for name in futures]
+
+
+def _has_workers(client: Any) -> bool:  # noqa: ANN401
+    try:
+        return client.status == "running" and bool(client.scheduler_info()["workers"])
+    except OSError:  # the connection broke since the status was set
+        return False
 
 
 def _fetch(name: str, future: Any) -> Any:  # noqa: ANN401
@@ -148,3 +181,7 @@ def _fetch(name: str, future: Any) -> Any:  # noqa: ANN401
             got=str(error),
             fix="give the workers more memory, or leave --scheduler out",
         ) from error
+    except (CancelledError, OSError) as error:
+        if future.status == "error":  # the job itself raised it
+            raise
+        raise _lost(error) from error

@@ -118,6 +118,23 @@ _value("start", "huge_values", lambda v: v + np.float32(1e30), "follow")
 _value("start", "scenarios_mixed_up", lambda v: v[[1, 2, 0]], "follow")
 
 
+def _marks(*marks: int, dim: str = "scenario") -> Callable[[h5py.File], object]:
+    def change(file: h5py.File) -> None:
+        if dim not in file:
+            file.create_dataset(dim, data=np.arange(len(marks))).make_scale(dim)
+        replace(file, "diverged_at", (dim,), np.array(marks, np.int32))
+
+    return change
+
+
+simple("diverged_at", "marks_on_their_own_dimension", _marks(-1, -1, -1, dim="mark"), says="per scenario")
+simple("diverged_at", "marks_too_few", _marks(-1, -1, dim="mark"), says="per scenario")
+simple("diverged_at", "mark_beyond_the_horizon", _marks(-1, 100_000, -1), says="100000")
+simple("diverged_at", "mark_at_a_given_frame", _marks(2, -1, -1), says="no predicted frame")
+simple("diverged_at", "mark_below_never", _marks(-1, -1, -5), says="-5")
+simple("diverged_at", "moves_after_its_mark", _marks(-1, 7, -1), says="scenario 4, frame 10")
+
+
 @fault("finite", says="never written")
 def frame_never_written(bench: Bench) -> Path:
     """What netCDF leaves where a frame was skipped while writing."""

@@ -17,7 +17,7 @@ from lagbench.format import ScenarioKey, ScenarioWriter, scenario_path
 from lagbench.registry import Registry, Size, default_path, load
 from lagbench.report import write_report
 from lagbench.score_card import ScoreCard
-from lagbench.scoring import evaluate
+from lagbench.scoring import score
 from lagbench.submission import write
 
 Floats = NDArray[np.float64]
@@ -49,7 +49,7 @@ class ReportBench:
 
     def card(self, path: Path) -> ScoreCard:
         """Return the score card of a submission."""
-        return evaluate(path, root=self.root, registry=self.registry, workers=1)
+        return score(path, root=self.root, registry=self.registry, workers=1, write=False)
 
     def report(self, folder: Path, files: Mapping[str, Method]) -> Path:
         """Submit, score and report methods by name."""

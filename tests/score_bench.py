@@ -14,7 +14,7 @@ from lagbench.exam import Exam, load_exam
 from lagbench.generation import GenerationResult
 from lagbench.registry import Registry, Size
 from lagbench.score_card import ScoreCard
-from lagbench.scoring import evaluate, score
+from lagbench.scoring import score
 from lagbench.submission import write
 
 Floats = NDArray[np.floating[Any]]
@@ -56,7 +56,7 @@ class ScoreBench:
 
     def evaluate(self, path: Path, **options: Any) -> ScoreCard:
         """Return the score card of a submission."""
-        return evaluate(path, root=self.root, registry=self.registry, **options)
+        return score(path, root=self.root, registry=self.registry, write=False, **options)
 
     def score(self, path: Path, **options: Any) -> ScoreCard:
         """Score a submission and write the card."""

@@ -44,3 +44,8 @@ def always_die(number: int, report: Report) -> int:
     """Kill the worker on every call."""
     os.kill(os.getpid(), signal.SIGKILL)
     return number
+
+
+def time_out(number: int, report: Report) -> int:
+    """Fail as a slow file system does."""
+    raise TimeoutError("of the job")

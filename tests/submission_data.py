@@ -57,6 +57,13 @@ def truth(scenario: int) -> NDArray[np.float32]:
     return frames_of(scenario, FRAMES, PARTICLES)[GIVEN:]
 
 
+def frozen(values: NDArray[np.float32], mark: int) -> NDArray[np.float32]:
+    """Return a rollout that repeats the frame before an absolute frame number from there on."""
+    values = values.copy()
+    values[mark - GIVEN :] = values[mark - GIVEN - 1]
+    return values
+
+
 def make_bench(folder: Path) -> Bench:
     """Write the data set (test only), its registry with hashes, and the truth as predictions."""
     folder.mkdir(parents=True, exist_ok=True)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from lagbench.atomic import atomic_path, remove_leftovers, write_atomically
+from lagbench.atomic import atomic_path, check_writable, remove_leftovers, write_atomically
 from lagbench.errors import DataError, WorkFailedError
 
 
@@ -43,6 +43,16 @@ def test_the_system_refusing_is_told_with_path_and_remedy(tmp_path: Path) -> Non
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(WorkFailedError, match=r"(?s)cannot write.*in-the-way.*--root"):
         write_atomically(tmp_path / "file" / "in-the-way", b"")
+
+
+def test_a_folder_is_tried_before_the_work(tmp_path: Path) -> None:
+    """A usable folder is made and left empty; an unusable one is told with the option that names it."""
+    check_writable(tmp_path / "deep" / "folder")
+    assert list((tmp_path / "deep" / "folder").iterdir()) == []
+    (tmp_path / "file").touch()
+    for folder in (tmp_path / "file", tmp_path / "file" / "below", Path("/proc/self")):
+        with pytest.raises(WorkFailedError, match=r"(?s)cannot write.*--output"):
+            check_writable(folder, option="--output")
 
 
 def test_leftovers_of_killed_writers_are_removed(tmp_path: Path) -> None:

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import h5py
 import pytest
 from conftest import SIZE, SPLIT
 from typer.testing import CliRunner, Result
 
+from lagbench import scoring, submission
 from lagbench.cli.app import app
 from lagbench.generation import GenerationResult
 
@@ -107,3 +112,102 @@ def test_a_root_without_data(run: Run, predictions: Path, tmp_path: Path) -> Non
     result = run("score", predictions, "--root", tmp_path / "empty")
     assert result.exit_code == 4
     assert "lagbench generate" in result.stderr
+
+
+def copies(predictions: Path, *names: str) -> list[Path]:
+    """Return copies of a submission under these names beside it."""
+    paths = [predictions.parent / name for name in names]
+    for path in paths:
+        path.parent.mkdir(exist_ok=True)
+        shutil.copyfile(predictions, path)
+    return paths
+
+
+@pytest.mark.parametrize("method", ["[/b]", "[red]x[/red]", "a [link=http://b]"])
+def test_names_are_no_markup(run: Run, predictions: Path, method: str) -> None:
+    """A method's name with square brackets is printed as it is, in titles and heads of columns."""
+    with h5py.File(predictions, "r+") as file:
+        file.attrs["method"] = method
+    scored = run("score", predictions)
+    assert scored.exit_code == 0, scored.stderr
+    assert f"{method} on {SPLIT}" in scored.stdout
+    compared = run("compare", predictions.parent, "persistence")
+    assert compared.exit_code == 0, compared.stderr
+    title, head = (line for line in compared.stdout.splitlines() if method in line)
+    assert title.startswith(f"{method} against persistence")
+    assert "loss difference" in head
+
+
+def test_several_files_keep_their_scores(run: Run, predictions: Path) -> None:
+    """Equal names in two folders: scores go beside each file, the page alone into the report folder."""
+    paths = copies(predictions, "a/p.nc", "b/p.nc")
+    rep = predictions.parent / "rep"
+    result = run("score", *paths, "--report", rep)
+    assert result.exit_code == 0, result.stderr
+    for path in paths:
+        assert {held.name for held in (path.parent / "p").iterdir()} == {"scores.json", "scores.nc"}
+    assert [path.name for path in rep.iterdir()] == ["index.html"]
+
+
+def test_scores_never_share_a_folder(run: Run, predictions: Path) -> None:
+    """Two files whose scores would overwrite each other are a usage error before any is scored."""
+    first, second = copies(predictions, "a/p.nc", "b/p.nc")
+    rep = predictions.parent / "rep"
+    for words in ((first, second, "--output", rep), (first, first)):
+        result = run("score", *words, "--report", rep)
+        assert result.exit_code == 2
+        assert "one folder" in result.stderr
+    assert not rep.exists()
+    assert [path.name for path in first.parent.iterdir()] == ["p.nc"]
+
+
+def test_several_files_are_checked_before_any_is_scored(
+    run: Run, predictions: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another size, or a broken last file, ends the command before the first is scored."""
+    first, second = copies(predictions, "a.nc", "b.nc")
+    real = submission.validate
+
+    def other(path: Path, **options: Any) -> submission.ValidationResult:
+        found = real(path, **options)
+        return dataclasses.replace(found, size="mini") if Path(path) == second else found
+
+    rep = predictions.parent / "rep"
+    with monkeypatch.context() as patch:
+        patch.setattr(submission, "validate", other)
+        result = run("score", first, second, "--report", rep)
+    assert result.exit_code == 2
+    assert "two data sets" in result.stderr
+    second.write_text("text")
+    assert run("score", first, second, "--report", rep).exit_code == 3
+    assert not (predictions.parent / "a").exists()
+    assert not rep.exists()
+
+
+@pytest.mark.parametrize("option", ["--output", "--report"])
+def test_an_unusable_folder_is_told_before_the_work(
+    run: Run, predictions: Path, monkeypatch: pytest.MonkeyPatch, option: str
+) -> None:
+    """A file in the place of the folder ends the command before any scenario is measured."""
+
+    def measured(*_: object, **__: object) -> None:
+        raise AssertionError("scenarios were measured")
+
+    monkeypatch.setattr(scoring, "spread", measured)
+    taken = predictions.parent / "taken"
+    taken.write_text("")
+    result = run("score", predictions, option, taken)
+    assert result.exit_code == 5
+    assert f"write to: {option}" in result.stderr
+
+
+@pytest.mark.parametrize("method", ["\x1b[31mred", "bell\a", "x" * 201, " "])
+def test_foreign_text_does_not_reach_the_terminal(run: Run, predictions: Path, method: str) -> None:
+    """Control characters or endless text in a scores.json make it unreadable; none is printed."""
+    run("score", predictions, "--quiet")
+    path = predictions.parent / "scores.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"method": method}))
+    result = run("compare", path, "persistence")
+    assert result.exit_code == 3
+    assert "method is not printable" in result.stderr
+    assert not set("\x1b\a") & set(result.stdout + result.stderr)

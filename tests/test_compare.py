@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -149,6 +150,70 @@ def test_unknown_metrics_name_the_nearest(scored: dict[str, Path]) -> None:
     assert list(only.metrics) == ["vorticity_rmse", "mse_end"]
 
 
+def test_equal_names_are_told_apart(tmp_path: Path) -> None:
+    """Two submissions of one method are numbered; a floor keeps its name, who borrows it is numbered."""
+    a = published(tmp_path / "a", [1, 2, 3, 4, 5, 6], method="toy", predictions_sha256="a")
+    b = published(tmp_path / "b", [2, 3, 4, 5, 6, 8], method="toy", predictions_sha256="b")
+    result = compare(a, b)
+    assert (result.first, result.second) == ("toy (1)", "toy (2)")
+    assert "toy (1) is better" in result.verdict
+    assert comparison_table(result).columns[1:3] == ("toy (1)", "toy (2)")
+    rows = json.loads(a.read_text())["rows"]
+    borrowed = published(tmp_path, [1] * 6, method="floor", rows={**rows, "floor": rows["submission"]})
+    result = compare(borrowed, "floor")
+    assert (result.first, result.second) == ("floor (1)", "floor")
+
+
+def row_of(values: list[object], undefined: list[object] | None = None) -> dict[str, object]:
+    """Return the rows of a scores.json with one metric."""
+    held = {"values": values, "undefined": [0] * len(values) if undefined is None else undefined}
+    return {"submission": {"mse_avg": held}}
+
+
+MALFORMED: dict[str, dict[str, Any]] = {
+    "a number beyond float64": {"rows": row_of([10**400, *[1] * 5])},
+    "an infinite value": {"rows": row_of([float("inf"), *[1] * 5])},
+    "infinitely many undefined frames": {"rows": row_of([1] * 6, [float("inf")] * 6)},
+    "undefined frames of one scenario": {"rows": row_of([1] * 6, [0])},
+    "ids that occur twice": {"task": {"scenarios": [28] * 6}},
+    "an id that is no integer": {"task": {"scenarios": [0, 1, 2, 3, 4, 5.5]}},
+    "an observable that ranks": {
+        "ranking_metric": "energy_true",
+        "rows": {"submission": {"energy_true": {"values": [1] * 6, "undefined": [0] * 6}}},
+    },
+    "a name that is no text": {"method": 5},
+    "a name with an escape": {"method": "\x1b[31m"},
+    "rows in a list": {"rows": [1]},
+    "a layout of its own": {"lagbench_scores": 2},
+}
+
+
+@pytest.mark.parametrize("changes", MALFORMED.values(), ids=MALFORMED)
+def test_malformed_scores_are_unreadable(tmp_path: Path, changes: dict[str, Any]) -> None:
+    """Whatever is wrong in a scores.json, it is the file that cannot be read, on either side."""
+    good = published(tmp_path, [1.0] * 6, method="good")
+    bad = published(tmp_path, [1.0] * 6, method="bad")
+    bad.write_text(json.dumps(json.loads(bad.read_text()) | changes))
+    for sides in ((good, bad), (bad, good)):
+        with pytest.raises(UnreadableFileError):
+            compare(*sides)
+
+
+def test_endless_brackets_are_unreadable(tmp_path: Path) -> None:
+    """JSON deeper than Python's stack is a file that cannot be read."""
+    path = tmp_path / "scores.json"
+    path.write_text("[" * 100_000)
+    with pytest.raises(UnreadableFileError, match="RecursionError"):
+        compare(path, path)
+
+
+def test_a_floor_without_the_ranking_metric(tmp_path: Path) -> None:
+    """An empty row of a floor cannot be compared with."""
+    bare = published(tmp_path, [1.0] * 6, method="a", rows={**row_of([1] * 6), "persistence": {}})
+    with pytest.raises(UnreadableFileError, match="ranking"):
+        compare(bare, "persistence")
+
+
 def test_missing_scores(tmp_path: Path) -> None:
     """A folder without scores, and scores without the ranking metric, are unreadable."""
     with pytest.raises(UnreadableFileError):
@@ -184,3 +249,17 @@ def test_comparison_table(scored: dict[str, Path]) -> None:
     short, whole = comparison_table(result), comparison_table(result, every=True)
     assert short.rows[0][0] == "vorticity_rmse"
     assert len(short.rows) < len(whole.rows) == len(result.metrics)
+
+
+@pytest.mark.parametrize(("predict", "row", "word"), [(straight, 0, "better"), (still, 1, "worse")])
+def test_how_much_better_lies_in_its_interval(
+    bench: ScoreBench, tmp_path: Path, predict: Any, row: int, word: str
+) -> None:
+    """The printed interval is that of the printed number: it has its sign and holds it."""
+    card = bench.evaluate(bench.submit(tmp_path / "predictions.nc", predict))
+    line = list(flag_lines(card))[row]
+    number = r"(-?[\d.e-]+)"
+    found = re.search(rf"{word} by {number} \({number} to {number}", line)
+    assert found, line
+    by, low, high = map(float, found.groups())
+    assert 0.0 < low <= by <= high

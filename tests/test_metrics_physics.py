@@ -13,8 +13,9 @@ from lagbench.metrics.energy import energy_error
 
 
 def measured(name: str, *args: object, **kwargs: object) -> float:
-    """Measure a metric on the pair that the arguments describe."""
-    return METRICS[name].measure(pair_of(*args, **kwargs))  # type: ignore[arg-type]
+    """Measure a metric on the pair that the arguments describe, alone in its rollout."""
+    pair, metric = pair_of(*args, **kwargs), METRICS[name]  # type: ignore[arg-type]
+    return float(metric.series(*(np.array([METRICS[n].measure(pair)]) for n in metric.of))[0])
 
 
 def scores_of(truth: Floats, prediction: Floats) -> dict[str, Score]:
@@ -74,6 +75,21 @@ def test_momentum_by_hand() -> None:
     x = [[0.3, 0.5], [0.7, 0.5]]
     u = np.array([[3.0, 0.0], [0.0, 4.0]])
     assert measured("momentum_error", x, u, u + np.array([0.3, 0.4])) == pytest.approx(1.0 / 7.0)
+
+
+def test_momentum_errors_have_a_floor() -> None:
+    """A truth that slows to 1e-6 of its speed is scaled by 1e-3 of the first frame: 0.1, then 100."""
+    x = lattice(12)
+    u = 0.01 * np.stack([-(x[:, 1] - 0.5), x[:, 0] - 0.5], axis=1) + 0.001
+    truth = np.stack([x, x + u, x + 2 * u, x + 2 * u + 1e-6 * u])
+    prediction = truth.copy()
+    prediction[2:] = truth[1] + 1.1 * np.arange(1, 3)[:, None, None] * u
+    scores = scores_of(truth, prediction)
+    first, second = (scores["momentum_error"].per_frame[0, i] for i in (0, 1))
+    gap = np.hypot(*np.sum(u, axis=0)) / np.sum(np.hypot(u[:, 0], u[:, 1]))
+    assert first == pytest.approx(0.1 * gap)
+    assert second == pytest.approx((1.1 - 1e-6) / 1e-3 * gap, rel=1e-6)
+    assert scores["angular_momentum_error"].per_frame[0, 1] < 1.2e3
 
 
 def test_angular_momentum_of_rotation() -> None:

@@ -121,7 +121,7 @@ def of_pearson(*values: float) -> Tally:
 
 
 def test_undefined_frames_are_left_out_and_counted() -> None:
-    """Correlations 0.9, NaN, 0.7: mean 0.8 of two, one undefined; stable for two frames."""
+    """Correlations 0.9, NaN, 0.7: mean 0.8 of two, one undefined; stable for one defined frame."""
     tallies = {3: of_pearson(0.9, math.nan, 0.7)}
     found = score(METRICS["vorticity_pearson"], tallies)
     stable = score(METRICS["stable_frames"], tallies)
@@ -130,7 +130,15 @@ def test_undefined_frames_are_left_out_and_counted() -> None:
     assert found.mean == pytest.approx(0.8)
     assert found.undefined == (1,)
     assert math.isnan(found.at(3)[0])
-    assert stable.mean == 2.0
+    assert stable.mean == 1.0
+
+
+def test_standing_still_is_not_stable() -> None:
+    """One good frame, then 89 at rest without a correlation: one stable frame, not 90."""
+    stable = score(METRICS["stable_frames"], {3: of_pearson(0.9, *[math.nan] * 89)})
+    assert stable is not None
+    assert stable.mean == 1.0
+    assert stable.undefined == (89,)
 
 
 def test_a_scenario_without_a_defined_frame_is_left_out() -> None:

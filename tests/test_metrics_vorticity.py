@@ -198,14 +198,14 @@ def test_wasserstein_grows_where_the_histogram_saturates() -> None:
     ("correlations", "frames"),
     [
         ([0.9, 0.85, 0.79, 0.95], 2.0),
-        ([0.9, math.nan, 0.5], 2.0),
+        ([0.9, math.nan, 0.5], 1.0),
         ([0.8, 0.8], 2.0),
         ([0.1], 0.0),
-        ([0.9, math.nan], 2.0),
+        ([0.9, math.nan], 1.0),
     ],
 )
 def test_stable_frames_by_hand(correlations: list[float], frames: float) -> None:
-    """Frames before the first value under 0.8; undefined frames pass, the threshold itself holds."""
+    """Frames before the first value under 0.8; undefined ones do not count, the threshold itself holds."""
     assert frames_before_fall(np.array(correlations)) == frames
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import math
 import re
 import subprocess
 import sys
@@ -21,9 +22,10 @@ from report_bench import damped, make_report_bench, motion
 import lagbench.report
 from lagbench.exam import Exam
 from lagbench.grid import Grid, fields
-from lagbench.metrics import Setting
+from lagbench.metrics import METRICS, Setting, Tally, aggregate
 from lagbench.registry import load
 from lagbench.report.maps import inside, limit_of
+from lagbench.report.opening import _stable_of
 from lagbench.report.subject import Subject
 from lagbench.submission.truth import Truth
 
@@ -118,3 +120,16 @@ def test_style_sheet_is_packaged() -> None:
     others = [p.name for p in folder.iterdir() if p.is_file() and p.suffix != ".py"]
     assert "style.css" in others
     assert all(any(fnmatch(name, pattern) for pattern in data["lagbench.report"]) for name in others)
+
+
+def test_the_stable_tile_says_how_many_frames_do_not_count() -> None:
+    """Two scenarios of 3 frames, 2 of them without a correlation: both numbers stand on the tile."""
+    names, frames, nan = ("vorticity_pearson",), (2, 3, 4), math.nan
+    rows = {0: (0.9, nan, nan), 1: (0.9, 0.9, 0.7)}
+    tallies = {
+        i: Tally.of(names, frames, {f: {names[0]: v} for f, v in zip(frames, row, strict=True)})
+        for i, row in rows.items()
+    }
+    stable = aggregate([METRICS["stable_frames"]], tallies)["stable_frames"]
+    assert stable.values.tolist() == [1.0, 2.0]
+    assert _stable_of(stable) == "of 3, correlation above 0.8; 2 of 6 frames undefined"

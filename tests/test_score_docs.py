@@ -5,7 +5,10 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from typer.main import get_command
+
 from lagbench import flags
+from lagbench.cli.app import app
 from lagbench.metrics import METRICS
 
 TEXT = (Path(__file__).parent.parent / "docs" / "scoring.md").read_text()
@@ -31,3 +34,12 @@ def test_thresholds_of_the_flags() -> None:
     assert f"outside {flags.ENERGY[0]:g} to {flags.ENERGY[1]:g} times" in TEXT
     assert f"outside {flags.OCCUPANCY[0]:g} to {flags.OCCUPANCY[1]:g} times" in TEXT
     assert (flags.TWIN_REGULAR, "past a tenth of that of persistence" in TEXT) == (0.1, True)
+
+
+def test_every_option_of_score_is_described() -> None:
+    """The table of options holds all that `lagbench score` has, and none that it has not."""
+    table = TEXT[TEXT.index("| option | does |") : TEXT.index("Several files are scored")]
+    cells = "".join(line.split("|")[1] for line in table.splitlines() if line.startswith("| `"))
+    score = get_command(app).commands["score"]  # type: ignore[attr-defined]
+    options = {name for p in score.params for name in p.opts if name.startswith("-")}
+    assert set(re.findall(r"(?<![\w-])--?[a-z]+", cells)) == options - {"--help"}

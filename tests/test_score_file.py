@@ -16,11 +16,12 @@ from score_bench import ScoreBench, bench_of, straight
 
 from lagbench.errors import UnreadableFileError
 from lagbench.generation import GenerationResult
-from lagbench.metrics import Tally
+from lagbench.metrics import Tally, aggregate, select
 from lagbench.metrics.distributions import histograms
 from lagbench.preview import FRAMES, PARTICLES
+from lagbench.published import read_scores
 from lagbench.registry import Registry
-from lagbench.score_card import ScoreCard, digits, read_scores
+from lagbench.score_card import ScoreCard, digits
 from lagbench.score_file import read_statistics, write_statistics
 from lagbench.sitting import SUBMISSION, as_stored
 
@@ -65,6 +66,58 @@ def test_a_full_cavity_submission_takes_300_kb(card: ScoreCard, tmp_path: Path) 
     path = tmp_path / "scores.nc"
     write_statistics(noisy(card), path)
     assert 200_000 < path.stat().st_size <= 300_000
+
+
+def scattered(card: ScoreCard) -> ScoreCard:
+    """Return a card as large as one of multimaterial full, with a scatter of a hundredth in every frame.
+
+    As there, every scenario has two of the four materials, and transport is measured in two frames.
+    """
+    rng = np.random.Generator(np.random.PCG64(1))
+    names, frames = card.tallies[SUBMISSION][3].names, tuple(range(2, 600))
+    levels, tallies = 10.0 ** rng.uniform(-6, 0, (len(names), 1)), {}
+    for i, lacking in zip(
+        range(54, 60), [("jelly", "snow"), ("snow", "rope"), ("liquid", "rope")] * 2, strict=True
+    ):
+        there = np.array([not name.endswith(lacking) for name in names])[:, None] & np.ones(598, bool)
+        there[names.index("sliced_w2"), 1:-1] = False
+        values = levels * (1 + 0.01 * rng.standard_normal(there.shape))
+        weight = there.astype(np.int64)
+        tallies[i] = as_stored(Tally(names, frames, np.where(there, values, 0.0), weight, 0 * weight))
+    fields = rng.standard_normal((2, 2, 65, 65)).astype(np.float32)
+    fields[:, :, :, 26:] = np.nan  # the material fills less than two fifths of the box
+    steps = 1e-3 * rng.standard_normal((2, FRAMES, PARTICLES, 2))
+    film = (rng.random((1, 1, PARTICLES, 2)) + np.cumsum(steps, axis=1)).astype(np.float32)
+    preview = replace(noisy(card).preview, map_frames=(60, 599), vorticity=fields, film=film)
+    preview = replace(
+        preview, histogram=preview.histogram[:, :2], histogram_range=preview.histogram_range[:2]
+    )
+    return replace(card, tallies={SUBMISSION: tallies}, preview=preview)
+
+
+def test_a_full_multimaterial_submission_takes_300_kb(card: ScoreCard, tmp_path: Path) -> None:
+    """Six scenarios of 598 frames that scatter stay below 300 kB, and their scores follow from the file."""
+    path, made = tmp_path / "scores.nc", scattered(card)
+    write_statistics(made, path)
+    assert 200_000 < path.stat().st_size <= 300_000
+    again = read_statistics(path)
+    expected = aggregate(select(again.tallies[54].names), made.tallies[SUBMISSION])
+    for name, score in expected.items():
+        assert again.scores()[name].mean == score.mean or math.isnan(score.mean)
+
+
+def test_long_rollouts_are_rounded_to_eleven_bits() -> None:
+    """Within 2^-11 of the value; 0, 1 and what saturates stay, and rounding twice changes nothing."""
+    frames = range(101)
+    values = {f: {"a": 1e-9 * math.pi**f, "b": 0.0, "c": 1.0, "d": -1e300} for f in frames}
+    given = Tally.of("abcd", frames, values)
+    stored = as_stored(given)
+    np.testing.assert_allclose(stored.total[0, :80], given.total[0, :80], rtol=2.0**-11)
+    assert len(np.unique(np.frexp(stored.total[0, :80])[0] * 2**11 % 1)) == 1
+    assert set(stored.total[1]) == {0.0}
+    assert set(stored.total[2]) == {1.0}
+    assert set(stored.total[3]) == {-float(np.finfo(np.float32).max)}
+    np.testing.assert_array_equal(as_stored(stored).total[:3], stored.total[:3])
 
 
 def test_statistics_read_back(card: ScoreCard) -> None:

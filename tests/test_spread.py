@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from score_bench import ScoreBench, bench_of, straight
-from spread_jobs import Deadly, always_die, double, sit_after_dying_once
+from spread_jobs import Deadly, always_die, double, sit_after_dying_once, time_out
 
 from lagbench import scoring, spread
 from lagbench.errors import UsageError, WorkFailedError
@@ -41,6 +43,40 @@ def cluster() -> Iterator[Any]:
 def bench(generated: GenerationResult, unmeasured: Registry) -> ScoreBench:
     """Tiny curl noise."""
     return bench_of(generated, unmeasured)
+
+
+LOSABLE = """
+from distributed import LocalCluster
+options = dict(n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None)
+with LocalCluster(**options, protocol="tcp://") as cluster:
+    print(cluster.scheduler_address, flush=True)
+    input()
+"""
+"""A scheduler and its worker in one process: a job that kills its worker takes the scheduler along."""
+
+
+LOSER = """
+import sys
+from lagbench.errors import WorkFailedError
+from lagbench.spread import spread
+from spread_jobs import always_die
+try:
+    spread(always_die, {"job 0": 0}, scheduler=sys.argv[1])
+except WorkFailedError as error:
+    print(error.what)
+"""
+
+
+@pytest.fixture
+def losable() -> Iterator[str]:
+    """The address of a scheduler that dies with its worker."""
+    command = [sys.executable, "-c", LOSABLE]
+    there = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, env=there) as process:
+        assert process.stdout is not None
+        yield process.stdout.readline().decode().strip()
+        process.kill()
 
 
 JOBS = {f"job {i}": i for i in range(6)}
@@ -87,6 +123,22 @@ def test_cluster_gives_the_same_bytes_though_a_worker_is_killed(
             assert mine.read_bytes() == other.read_bytes()
 
 
+def test_a_lost_scheduler(losable: str, capfd: pytest.CaptureFixture[str]) -> None:
+    """A scheduler that dies in the middle ends as failed work that says so, without Dask's traces."""
+    with pytest.raises(WorkFailedError, match="the Dask cluster is lost"):
+        spread.spread(always_die, {"job 0": 0}, scheduler=losable)
+    captured = capfd.readouterr()
+    assert captured.out + captured.err == ""
+
+
+def test_a_lost_scheduler_stays_quiet_to_the_end(losable: str) -> None:
+    """Nothing of Dask's is printed either when the process ends."""
+    there = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
+    command = [sys.executable, "-c", LOSER, losable]
+    ended = subprocess.run(command, env=there, capture_output=True, text=True, check=True)
+    assert (ended.stdout, ended.stderr) == ("the Dask cluster is lost\n", "")
+
+
 @pytest.mark.slow
 def test_a_job_that_kills_every_worker(cluster: Any) -> None:
     """A job that no worker survives ends as failed work that names it, not as a hang."""
@@ -117,3 +169,10 @@ def test_a_killed_process_changes_nothing(
     assert sum(counted) == 2 * bench.size.task.horizon
     for mine, other in zip(here.files, there.files, strict=True):
         assert mine.read_bytes() == other.read_bytes()
+
+
+@pytest.mark.slow
+def test_an_error_of_a_job_is_not_a_lost_cluster(cluster: Any) -> None:
+    """A job's own time-out passes through as it is."""
+    with pytest.raises(TimeoutError, match="of the job"):
+        spread.spread(time_out, {"job 0": 0}, scheduler=cluster.scheduler_address)

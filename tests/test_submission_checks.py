@@ -79,6 +79,22 @@ def test_jumps_are_flagged(bench: Bench) -> None:
     assert result.exit_code == 0
 
 
+def test_a_jump_from_the_last_given_frame_is_flagged(bench: Bench) -> None:
+    """A particle that starts 15 steps away and stays there jumps once, before the first predicted frame."""
+    source = Truth(bench.registry.size("cavity", "tiny"), bench.root)
+    far = 15 * source.largest_displacement(4, enough=np.inf)
+
+    def edit(values: Values) -> Values:
+        values[1, :, 9] = source.given(4)[-1, 9]
+        values[1, :, 9, 0] += far
+        return values
+
+    result = changed(bench, edit)
+    assert [f.check for f in result.findings] == ["max_displacement"]
+    assert result.warnings[0].where == f"scenario 4, from frame {GIVEN - 1} to {GIVEN}, particle 9"
+    assert result.exit_code == 0
+
+
 def test_the_limit_of_the_start_is_ten_displacements(bench: Bench) -> None:
     """Scenarios moved by 0.9 and 1.1 times the limit at their first frame: the second is far."""
     size = bench.registry.size("cavity", "tiny")

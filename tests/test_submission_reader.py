@@ -15,7 +15,7 @@ import pytest
 import xarray as xr
 from bad_submissions import FAULTS
 from faulty import positions, rows, store
-from submission_data import FRAMES, GIVEN, HORIZON, PARTICLES, TESTS, Bench, make_bench, truth
+from submission_data import FRAMES, GIVEN, HORIZON, PARTICLES, TESTS, Bench, frozen, make_bench, truth
 
 from lagbench.errors import ChecksFailedError, UnreadableFileError, UsageError
 from lagbench.submission import open_predictions, write
@@ -202,6 +202,7 @@ def test_a_frozen_rollout_is_recorded(bench: Bench) -> None:
     """diverged_at comes back by id; other scenarios have none."""
     path = bench.folder / "frozen.nc"
     values = {i: truth(i) for i in TESTS}
+    values[5] = frozen(truth(5), 7)
     write(path, values, split="cavity", size="tiny", method="m", registry=bench.registry, diverged_at={5: 7})
     with open_predictions(path) as predictions:
         assert predictions.header.diverged_at == {5: 7}

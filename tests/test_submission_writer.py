@@ -131,12 +131,30 @@ def test_wrong_arrays_are_refused_and_leave_no_file(bench: Bench, values: Any, m
 
 @pytest.mark.parametrize(
     ("labels", "message"),
-    [({"sed": 3}, "did you mean 'seed'"), ({"seed": "three"}, "int"), ({"seconds_per_frame": -1}, "float")],
+    [
+        ({"sed": 3}, "did you mean 'seed'"),
+        ({"seed": "three"}, "an integer"),
+        ({"seed": True}, "an integer"),
+        ({"parameters": -5}, "an integer >= 0"),
+        ({"seconds_per_frame": -1}, "positive"),
+        ({"seconds_per_frame": float("inf")}, "positive"),
+    ],
 )
 def test_wrong_labels_are_refused(bench: Bench, labels: dict[str, Any], message: str) -> None:
     """Unknown names suggest the nearest; types are checked."""
     with pytest.raises(UsageError, match=message):
         write(bench.folder / "p.nc", {}, **options(bench, **labels))
+
+
+@pytest.mark.parametrize(
+    ("mark", "message"),
+    [(7, "frame 8 differs"), (100_000, "no such frame"), (GIVEN - 1, "no such frame"), (-5, "no such frame")],
+)
+def test_a_rollout_must_be_frozen_where_it_says(bench: Bench, mark: int, message: str) -> None:
+    """A mark beyond the horizon, in the given frames, or before motion that goes on."""
+    values = {i: truth(i) for i in TESTS}
+    with pytest.raises(UsageError, match=message):
+        write(bench.folder / "moving.nc", values, diverged_at={4: mark}, **options(bench))
 
 
 def test_labels_may_come_while_writing(bench: Bench) -> None:

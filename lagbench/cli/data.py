@@ -137,6 +137,6 @@ def _verified(result: VerificationResult) -> None:
     columns = ("subset", "present", "missing", "wrong", "extra", "hash")
     print_table(f"{result.split} {result.size} in {result.folder}", columns, rows)
     if result.regenerated:
-        listing = ", ".join(f"{i} {word}" for i, word in result.regenerated.items())
+        listing = ", ".join(f"scenario {i} {word}" for i, word in result.regenerated.items())
         say(f"regenerated: {listing}")
     say(f"data set hash: {result.verdict}")

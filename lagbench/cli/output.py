@@ -11,6 +11,12 @@ import typer
 
 __all__ = ["print_json", "print_table", "say", "spell_bytes", "spell_seconds"]
 
+LAST_COLUMN = 24
+"""Characters that the last column of a table, which wraps, keeps at least."""
+
+COLUMN_GAP = 3
+"""Characters between two columns of a table."""
+
 
 def say(text: str, *, quiet: bool = False) -> None:
     """Print a line on stdout unless the user asked for silence."""
@@ -41,15 +47,23 @@ def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[obje
     from rich.text import Text
 
     cells = [[str(cell) for cell in row] for row in rows]
-    table = Table(title=title or None, box=SIMPLE_HEAD, title_justify="left", pad_edge=False)
+    table = Table(title=Text(title) if title else None, box=SIMPLE_HEAD, title_justify="left", pad_edge=False)
     for number, column in enumerate(columns, start=1):
         numeric = all(row[number - 1][:1] in "0123456789-" for row in cells)
-        table.add_column(column, justify="right" if numeric else "left", no_wrap=number < len(columns))
+        table.add_column(Text(column), justify="right" if numeric else "left", no_wrap=number < len(columns))
     for row in cells:
         table.add_row(*(Text(cell) for cell in row))
     console = Console()
     # In a file or a pipe the width is fixed, so that the output is the same everywhere.
-    (console if console.is_terminal else Console(width=120)).print(table)
+    width = console.width if console.is_terminal else 120
+    # On a narrow terminal long lines run on to the next: a number cut short would be worse.
+    Console(width=max(width, _least_width(columns, cells))).print(table)
+
+
+def _least_width(columns: Sequence[str], cells: Sequence[Sequence[str]]) -> int:
+    """Return the width below which a column other than the last would be cut."""
+    widths = [max(map(len, column)) for column in zip(columns, *cells, strict=True)]
+    return sum(widths[:-1]) + min(widths[-1], LAST_COLUMN) + COLUMN_GAP * len(widths)
 
 
 def spell_bytes(count: float) -> str:

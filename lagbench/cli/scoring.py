@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from lagbench.atomic import check_writable
 from lagbench.errors import UsageError
 
 from .options import (
@@ -92,7 +94,12 @@ def score(
     root: RootOption = None,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", metavar="FOLDER", help="Where scores go; beside FILE by default."),
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="FOLDER",
+            help="Where scores go; beside FILE by default. With several, in folders named like them.",
+        ),
     ] = None,
     report: Annotated[
         Path | None,
@@ -115,13 +122,18 @@ def score(
 
     if len(predictions) > 1 and report is None:
         raise UsageError("several files are scored for one report", fix="add --report FOLDER")
+    targets = _targets(predictions, output)
+    if len(predictions) > 1:
+        _check_together(predictions, root)
+    if report is not None:
+        check_writable(report, option="--report")
     cards = []
-    for path in predictions:
+    for path, target in zip(predictions, targets, strict=True):
         with progress_bar(quiet=quiet) as draw:
             card = run(
                 path,
                 root=root,
-                output_dir=(output or report or path.parent) / path.stem if len(predictions) > 1 else output,
+                output_dir=target,
                 workers=workers,
                 scheduler=scheduler,
                 extras=tuple(name for name in extras.split(",") if name),
@@ -137,6 +149,44 @@ def score(
         from lagbench.report import write_report
 
         say(f"report: {write_report(report, cards, predictions, root=root)}", quiet=quiet or as_json)
+
+
+def _targets(predictions: Sequence[Path], output: Path | None) -> list[Path]:
+    """Return the folder for the scores of each file; refuse two files with one folder."""
+    if len(predictions) == 1:
+        return [output or predictions[0].parent]
+    targets = [(output or path.parent) / path.stem for path in predictions]
+    held: dict[Path, Path] = {}
+    for path, target in zip(predictions, targets, strict=True):
+        other = held.setdefault(target.resolve(), path)
+        if other is not path:
+            raise UsageError(
+                "the scores of two files would go to one folder",
+                where=str(target),
+                got=f"{other} and {path}",
+                fix="name each file once, give them names of their own, or leave --output out",
+            )
+    return targets
+
+
+def _check_together(predictions: Sequence[Path], root: Path | None) -> None:
+    """Refuse, before any is scored, an invalid file and one to another split or size."""
+    from lagbench.submission import validate as examine
+
+    first = None
+    for path in predictions:
+        result = examine(path, root=root, require_truth=True)
+        _complain(result)
+        result.check()
+        first = first or result
+        if (result.split, result.size) != (first.split, first.size):
+            raise UsageError(
+                "one report, two data sets",
+                where=str(path),
+                expected=f"{first.split} {first.size}, as in {first.path}",
+                got=f"{result.split} {result.size}",
+                fix="report submissions to one data set together, others on their own",
+            )
 
 
 def _complain(result: ValidationResult) -> None:

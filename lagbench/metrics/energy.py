@@ -12,11 +12,9 @@ import numpy as np
 
 from .frame import Floats, FramePair, Snapshot
 from .metric import Direction, Metric
+from .reductions import floored_quotient, quotient
 
-__all__ = ["ENERGY_FLOOR", "METRICS", "energy_error", "kinetic_energy", "quotient"]
-
-ENERGY_FLOOR = 1e-3
-"""Share of the truth's greatest energy below which errors are no longer scaled by E(f)."""
+__all__ = ["METRICS", "energy_error", "kinetic_energy"]
 
 
 def kinetic_energy(snapshot: Snapshot, particle_mass: float) -> float:
@@ -50,21 +48,13 @@ def _retained(pair: FramePair, snapshot: Snapshot) -> float:
     return kinetic_energy(snapshot, mass) / given if given > 0.0 else math.nan
 
 
-def quotient(numerator: Floats, denominator: Floats) -> Floats:
-    """Return the ratio of two series, NaN where the denominator is 0, shape [frame]."""
-    ratio = np.full(len(numerator), np.nan)
-    np.divide(numerator, denominator, out=ratio, where=denominator != 0.0)
-    return ratio
-
-
 def energy_error(predicted: Floats, true: Floats) -> Floats:
     """Return ``|E_pred - E_true| / max(E_true, 1e-3 max(E_true))`` per frame [1].
 
     The floor keeps frames in which the truth rests from ruling the mean. NaN where the truth
     rests in all frames.
     """
-    scale = np.maximum(true, ENERGY_FLOOR * np.max(true, initial=0.0, where=~np.isnan(true)))
-    return quotient(np.abs(predicted - true), scale)
+    return floored_quotient(np.abs(predicted - true), true)
 
 
 METRICS = (

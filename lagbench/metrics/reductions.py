@@ -1,4 +1,4 @@
-"""From a value per frame to one number of a scenario.
+"""From values per frame to other values per frame, or to one number of a scenario.
 
 NaN marks a frame that was not measured or is undefined. The means leave it out; with no
 frame left the result is NaN.
@@ -12,12 +12,41 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["STABLE_PEARSON", "FirstFrames", "frames_before_fall", "last", "mean", "root_mean_square"]
+__all__ = [
+    "SCALE_FLOOR",
+    "STABLE_PEARSON",
+    "FirstFrames",
+    "floored_quotient",
+    "frames_before_fall",
+    "last",
+    "mean",
+    "quotient",
+    "root_mean_square",
+]
 
 Floats = NDArray[np.float64]
 
 STABLE_PEARSON = 0.8
 """A rollout is stable until the vorticity correlation falls below this."""
+
+SCALE_FLOOR = 1e-3
+"""Share of the truth's greatest value below which errors are no longer scaled by its value."""
+
+
+def quotient(numerator: Floats, denominator: Floats) -> Floats:
+    """Return the ratio of two series, NaN where the denominator is 0, shape [frame]."""
+    ratio = np.full(len(numerator), np.nan)
+    np.divide(numerator, denominator, out=ratio, where=denominator != 0.0)
+    return ratio
+
+
+def floored_quotient(error: Floats, scale: Floats) -> Floats:
+    """Return ``error / max(scale, 1e-3 max(scale))``, shape [frame]; NaN where all scales are 0.
+
+    The floor keeps frames in which the truth rests from ruling the mean.
+    """
+    greatest = np.max(scale, initial=0.0, where=~np.isnan(scale))
+    return quotient(error, np.maximum(scale, SCALE_FLOOR * greatest))
 
 
 def mean(values: Floats) -> float:
@@ -56,12 +85,14 @@ class FirstFrames:
 
 
 def frames_before_fall(values: Floats) -> float:
-    """Return how many frames pass before a value first lies below :data:`STABLE_PEARSON`.
+    """Return how many defined frames pass before one first lies below :data:`STABLE_PEARSON`.
 
-    Undefined frames do not end the count but pass like others; with none defined the
-    answer is NaN. A rollout that never falls gets the whole horizon.
+    Undefined frames neither end the count nor count: standing still is no merit. With none
+    defined the answer is NaN. A rollout that is always defined and never falls gets the whole
+    horizon.
     """
-    if np.isnan(values).all():
+    defined = values[~np.isnan(values)]
+    if not defined.size:
         return math.nan
-    fallen = np.flatnonzero(values < STABLE_PEARSON)
-    return float(fallen[0] if fallen.size else len(values))
+    fallen = np.flatnonzero(defined < STABLE_PEARSON)
+    return float(fallen[0] if fallen.size else defined.size)

@@ -21,7 +21,7 @@ __all__ = ["bar_figures"]
 
 SHOWN = (
     ("vorticity_pearson", "Correlation of vorticity", "Fig. 5.13"),
-    ("vorticity_kl", "Divergence of vorticity", "Fig. 5.16"),
+    ("vorticity_kl", "KL divergence of vorticity", "Fig. 5.16"),
     ("vorticity_w1", "Distance of vorticity distributions", "Fig. 5.16"),
 )
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 from lagbench.flags import Flag
 from lagbench.metrics import Direction, Score, bootstrap_interval
-from lagbench.metrics.reductions import mean
+from lagbench.metrics.reductions import STABLE_PEARSON, mean
 from lagbench.submission import Finding
 
 from .markup import Markup, join, tag
@@ -58,11 +58,18 @@ def _tiles(subject: Subject) -> Iterator[Markup]:
         if score is None or name == ranking:
             continue
         if name == "stable_frames":
-            yield _tile("stable", score, f"of {subject.exam.setting.horizon}, correlation above 0.8")
+            yield _tile("stable", score, _stable_of(score))
         elif name == "vorticity_pearson":
             yield _at_frame(subject, score)
         else:
             yield _tile(words(name), score, "mean over the horizon")
+
+
+def _stable_of(score: Score) -> str:
+    """Return out of how many frames, and how many of all scenarios' do not count."""
+    lost, every = sum(score.undefined), len(score.scenarios) * len(score.frames)
+    said = f"of {len(score.frames)}, correlation above {STABLE_PEARSON}"
+    return f"{said}; {lost} of {every} frames undefined" if lost else said
 
 
 def _tile(what: str, score: Score, more: str) -> Markup:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from lagbench.errors import UsageError
 from lagbench.exam import Exam, load_exam
 from lagbench.layout import resolve_root
+from lagbench.method_names import told_apart
 from lagbench.metrics import Metric, Score
 from lagbench.registry import Registry, load
 from lagbench.score_card import ScoreCard
@@ -208,7 +208,7 @@ def subject_of(
         _check_same(cards[0], card, path)
     described, header = registry or load(), cards[0].header
     exam = load_exam(described.size(header.split, header.size), resolve_root(root))
-    names = _names([card.header.method for card in cards], taken=cards[0].scores)
+    names = told_apart([card.header.method for card in cards], taken=cards[0].scores)
     entries = [
         Entry(number=i, name=name, card=card, predictions=Path(path))
         for i, (name, card, path) in enumerate(zip(names, cards, predictions, strict=True))
@@ -227,17 +227,3 @@ def _check_same(first: ScoreCard, card: ScoreCard, path: Path) -> None:
                 got=got,
                 fix="report submissions to one data set together, others on their own",
             )
-
-
-def _names(methods: Sequence[str], taken: Collection[str] = ()) -> list[str]:
-    """Return the methods; those that occur twice, or have a floor's name, with a number.
-
-    >>> _names(["gns", "gat", "gns"])
-    ['gns (1)', 'gat', 'gns (2)']
-    """
-    count, seen = Counter([*methods, *taken]), Counter[str]()
-    names = []
-    for method in methods:
-        seen[method] += 1
-        names.append(f"{method} ({seen[method]})" if count[method] > 1 else method)
-    return names

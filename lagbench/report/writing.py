@@ -58,7 +58,7 @@ def write_report(
     """
     subject = subject_of(cards, [Path(path) for path in predictions], root=root, registry=registry)
     path = Path(folder) / FILE_NAME
-    write_atomically(path, render(subject).encode())
+    write_atomically(path, render(subject).encode(), option="--report")
     return path
 
 

@@ -22,6 +22,7 @@ CHECKS = (
     "particles",
     "dtype",
     "finite",
+    "diverged_at",
     "start",
     "in_domain",
     "max_displacement",

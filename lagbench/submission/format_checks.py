@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import math
-
 from lagbench.errors import nearest
 
 from .anatomy import MAX_COORDINATE, MAX_LINKS, Anatomy, Odd
 from .findings import Findings, quoted
-from .header import DIMS, FORMAT, OPTIONAL, REQUIRED, SPACE
+from .header import DIMS, FORMAT, NEVER, OPTIONAL, REQUIRED, SPACE, fits, kind_of
 from .storage import check_storage
 
-__all__ = ["check_dims", "check_dtype", "check_format"]
+__all__ = ["check_dims", "check_dtype", "check_format", "check_marks"]
 
 MAX_NAME = 200
 """Longest required attribute [characters]."""
@@ -86,17 +84,10 @@ def _check_attributes(anatomy: Anatomy, out: Findings) -> None:
             or not value.isprintable()
         ):
             _bad_attribute(name, f"printable text of 1 to {MAX_NAME} characters", value, out)
-    for name, kind in OPTIONAL.items():
+    for name in OPTIONAL:
         value = anatomy.attributes[name]
-        if value is not None and not _fits(value, kind):
-            words = {str: "text", int: "an integer", float: "a positive number"}
-            _bad_attribute(name, f"{words[kind]}, or no such attribute", value, out)
-
-
-def _fits(value: object, kind: type) -> bool:
-    if kind is float:
-        return isinstance(value, (int, float)) and 0 < value < math.inf
-    return isinstance(value, kind)
+        if value is not None and not fits(name, value):
+            _bad_attribute(name, f"{kind_of(name)}, or no such attribute", value, out)
 
 
 def _bad_attribute(name: str, expected: object, value: object, out: Findings) -> None:
@@ -173,3 +164,37 @@ def check_dtype(anatomy: Anatomy, out: Findings) -> bool:
             fix="store the positions themselves as float32",
         )
     return not out.failed("dtype")
+
+
+def check_marks(anatomy: Anatomy, out: Findings) -> bool:
+    """Check that ``diverged_at``, where it is there, has a predicted frame or -1 per scenario."""
+    array = anatomy.arrays.get("diverged_at")
+    if array is None:
+        out.made("diverged_at")
+        return True
+    marks, frames = anatomy.integers.get("diverged_at"), anatomy.integers.get("frame")
+    if marks is None or frames is None:
+        out.skip("'diverged_at' or 'frame' cannot be read", "diverged_at")
+        return False
+    out.made("diverged_at")
+    where = "variable 'diverged_at'"
+    if array.dims != ("scenario",) or len(marks) != len(anatomy.integers.get("scenario", ())):
+        out.error(
+            "diverged_at",
+            "it is not told per scenario",
+            where=where,
+            expected="one value per scenario, on the dimension 'scenario'",
+            got=f"{len(marks)} on {quoted(array.dims[0]) if any(array.dims) else 'one without a name'}",
+            fix="store it beside 'scenario', or leave it out",
+        )
+    wrong = sorted(set(marks) - {NEVER, *frames})
+    if wrong:
+        out.error(
+            "diverged_at",
+            "a rollout is frozen at no predicted frame",
+            where=where,
+            expected=f"absolute numbers of predicted frames, {NEVER} for a rollout that did not diverge",
+            got=", ".join(map(str, wrong[:5])),
+            fix=f"name the first frozen frame, or {NEVER}",
+        )
+    return not out.failed("diverged_at")

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-__all__ = ["DIMS", "FORMAT", "OPTIONAL", "REQUIRED", "SPACE", "Header"]
+__all__ = ["DIMS", "FORMAT", "NEVER", "OPTIONAL", "REQUIRED", "SPACE", "Header", "fits", "kind_of"]
 
 FORMAT = 1
 """Number of the file layout; stored as attribute ``lagbench_format``."""
@@ -15,6 +16,9 @@ DIMS = ("scenario", "frame", "particle", "space")
 
 SPACE = 2
 """Components of a position."""
+
+NEVER = -1
+"""Value of ``diverged_at`` for a rollout that did not diverge."""
 
 REQUIRED = ("split", "size", "dataset_version", "dataset_sha256", "method")
 """Text attributes that every file has, beside ``lagbench_format``."""
@@ -27,6 +31,30 @@ OPTIONAL: Mapping[str, type[str] | type[int] | type[float]] = {
     "training": str,
 }
 """Attributes that a file may have: cost, provenance and size of the model."""
+
+_KINDS = {str: "text", int: "an integer", float: "a positive number"}
+
+
+def kind_of(name: str) -> str:
+    """Return in words what an optional attribute must be.
+
+    >>> kind_of("seed"), kind_of("parameters")
+    ('an integer', 'an integer >= 0')
+    """
+    return f"{_KINDS[OPTIONAL[name]]}{' >= 0' if name == 'parameters' else ''}"
+
+
+def fits(name: str, value: object) -> bool:
+    """Tell whether an optional attribute may have a value.
+
+    >>> fits("seed", -5), fits("parameters", -5), fits("parameters", 0)
+    (True, False, True)
+    """
+    if isinstance(value, bool):
+        return False
+    if OPTIONAL[name] is float:
+        return isinstance(value, (int, float)) and 0 < value < math.inf
+    return isinstance(value, OPTIONAL[name]) and not (name == "parameters" and int(value) < 0)
 
 
 @dataclass(frozen=True, kw_only=True)

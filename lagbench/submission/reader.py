@@ -17,7 +17,7 @@ from lagbench.scenario_ids import spell_ids
 
 from .anatomy import Anatomy, dissect
 from .findings import Findings
-from .format_checks import check_dims, check_dtype, check_format
+from .format_checks import check_dims, check_dtype, check_format, check_marks
 from .header import DIMS, OPTIONAL, REQUIRED, SPACE, Header
 from .opening import opened, reading
 from .storage import cache_of
@@ -134,7 +134,7 @@ def open_predictions(path: str | Path) -> Predictions:
         file = stack.enter_context(opened(path))
         anatomy = dissect(file, path)
         out = Findings()
-        for check in (check_format, check_dims, check_dtype):
+        for check in (check_format, check_dims, check_dtype, check_marks):
             check(anatomy, out)
         out.result(path).check()
         return attach(file, path, anatomy, stack)

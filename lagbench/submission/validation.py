@@ -14,21 +14,30 @@ import h5py
 
 from lagbench.errors import DataError, UnreadableFileError
 from lagbench.layout import resolve_root
-from lagbench.registry import Registry, Size, load
+from lagbench.registry import Registry, load
 
 from .anatomy import Anatomy, dissect
 from .findings import CHECKS, Findings, ValidationResult
-from .format_checks import check_dims, check_dtype, check_format
+from .format_checks import check_dims, check_dtype, check_format, check_marks
 from .opening import check_file, opened
 from .reader import Predictions, attach
 from .sandbox import Request, run_isolated
 from .task_checks import check_dataset, check_frames, check_particles, check_scenarios, check_split
 from .truth import Truth
-from .value_checks import check_domain, check_finite, check_jumps, check_start, survey
+from .value_checks import (
+    Survey,
+    check_domain,
+    check_finite,
+    check_frozen,
+    check_jumps,
+    check_start,
+    survey,
+)
 
 __all__ = ["examine", "validate"]
 
-VALUES = ("finite", "start", "in_domain", "max_displacement")
+TRUE = ("start", "max_displacement")
+VALUES = ("finite", "in_domain", *TRUE)
 TASK = ("dataset", "scenarios", "frames", "particles")
 
 
@@ -90,6 +99,7 @@ def _examine(request: Request, file: h5py.File, anatomy: Anatomy, out: Findings)
     stored = check_format(anatomy, out)
     laid_out = check_dims(anatomy, out)
     typed = check_dtype(anatomy, out)
+    marked = check_marks(anatomy, out)
     size = check_split(anatomy, request.registry, out)
     if size is None:
         out.skip("the split is not known", *TASK, *VALUES)
@@ -105,32 +115,34 @@ def _examine(request: Request, file: h5py.File, anatomy: Anatomy, out: Findings)
         return
     with ExitStack() as stack:
         predictions = attach(file, request.path, anatomy, stack)
-        _examine_values(predictions, Truth(size, request.root), size, in_time, request.require_truth, out)
+        surveys = survey(predictions, size)
+        check_finite(surveys, out)
+        if marked:
+            check_frozen(predictions, surveys, out)
+        check_domain(surveys, size, out)
+        if not in_time:
+            out.skip("frames failed", *TRUE)
+            return
+        _compare(predictions, surveys, Truth(size, request.root), request.require_truth, out)
 
 
-def _examine_values(
-    predictions: Predictions, truth: Truth, size: Size, in_time: bool, require_truth: bool, out: Findings
+def _compare(
+    predictions: Predictions, surveys: list[Survey], truth: Truth, require_truth: bool, out: Findings
 ) -> None:
-    surveys = survey(predictions, size)
-    check_finite(surveys, out)
-    check_domain(surveys, size, out)
-    if not in_time:
-        out.skip("frames failed", "start", "max_displacement")
-        return
     try:
         truth.require()
     except DataError as error:
         if require_truth:
             _report_dataset(error, out)
         reason = f"{error.what} in {truth.root}"
-        out.skip(f"{reason}: {error.fix}", "start", "max_displacement")
+        out.skip(f"{reason}: {error.fix}", *TRUE)
         return
     try:
         check_start(predictions, truth, out)
         check_jumps(surveys, truth, out)
     except DataError as error:
         _report_dataset(error, out)
-        out.skip(f"{error.what}: {error.where}", "start", "max_displacement")
+        out.skip(f"{error.what}: {error.where}", *TRUE)
 
 
 def _report_dataset(error: DataError, out: Findings) -> None:

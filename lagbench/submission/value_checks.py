@@ -14,7 +14,16 @@ from .guesses import guess_start
 from .reader import Predictions
 from .truth import Truth
 
-__all__ = ["JUMP", "Survey", "check_domain", "check_finite", "check_jumps", "check_start", "survey"]
+__all__ = [
+    "JUMP",
+    "Survey",
+    "check_domain",
+    "check_finite",
+    "check_frozen",
+    "check_jumps",
+    "check_start",
+    "survey",
+]
 
 JUMP = 10.0
 """A step is suspect beyond this many of the truth's largest per-frame displacement."""
@@ -40,6 +49,7 @@ class Survey:
         first_outside: frame and particle of the first one outside.
         jump: largest distance of a particle between consecutive frames [length].
         jump_at: frame and particle of it.
+        settled: frame that is repeated from there to the end.
     """
 
     scenario: int
@@ -54,6 +64,8 @@ class Survey:
     first_outside: tuple[int, int] | None = None
     jump: float = 0.0
     jump_at: tuple[int, int] | None = None
+    settled: int = 0
+    _first: tuple[int, NDArray[np.float32]] | None = field(default=None, repr=False)
     _last: NDArray[np.float32] | None = field(default=None, repr=False)
 
     def add(self, first: int, block: NDArray[np.float32], size: Size) -> None:
@@ -70,7 +82,22 @@ class Survey:
             block = np.where(wrong, np.float32(np.nan), block)
         self.values += block.size
         self._add_places(first, block, size)
-        self._add_steps(first, block)
+        if self._last is None:
+            self._first, self.settled = (first, block[:1].copy()), first
+            self._add_steps(first + 1, block)
+        else:
+            self._add_steps(first, np.concatenate([self._last, block]))
+        self._last = block[-1:].copy()
+
+    def follow(self, given: NDArray[np.float32]) -> None:
+        """Take in the step from the last given frame to the first predicted one.
+
+        Args:
+            given: positions at the last given frame [length], shape [particle, space].
+        """
+        if self._first:
+            frame, first = self._first
+            self._add_jumps(frame, np.concatenate([given[None], first]))
 
     def _add_wrong(self, first: int, block: NDArray[np.float32], wrong: NDArray[np.bool_]) -> None:
         if self.first_bad is None:
@@ -93,16 +120,20 @@ class Survey:
             self.farthest = max(self.farthest, float(beyond[far].max()))
             self.off_grid += int(np.count_nonzero(((block < 0) | (block > 1)).any(axis=-1)))
 
-    def _add_steps(self, first: int, block: NDArray[np.float32]) -> None:
-        joined = block if self._last is None else np.concatenate([self._last, block])
-        start = first if self._last is None else first - 1
+    def _add_steps(self, first: int, joined: NDArray[np.float32]) -> None:
+        moved = np.flatnonzero((joined[1:] != joined[:-1]).any(axis=(1, 2)))
+        if moved.size:
+            self.settled = first + int(moved[-1])
+        self._add_jumps(first, joined)
+
+    def _add_jumps(self, first: int, joined: NDArray[np.float32]) -> None:
+        """Take in the steps between consecutive frames, of which the first leads to ``first``."""
         steps = np.diff(joined.astype(np.float64), axis=0)
         squares = np.nan_to_num(np.sum(steps * steps, axis=-1))
         if squares.size and squares.max() > self.jump**2:
             frame, particle = np.unravel_index(int(squares.argmax()), squares.shape)
             self.jump = float(np.sqrt(squares.max()))
-            self.jump_at = (start + int(frame) + 1, int(particle))
-        self._last = block[-1:]
+            self.jump_at = (first + int(frame), int(particle))
 
 
 def survey(predictions: Predictions, size: Size) -> list[Survey]:
@@ -135,6 +166,21 @@ def check_finite(surveys: list[Survey], out: Findings) -> None:
     )
 
 
+def check_frozen(predictions: Predictions, surveys: list[Survey], out: Findings) -> None:
+    """Report rollouts that go on moving after the frame at which they are said to be frozen."""
+    for one in surveys:
+        mark = predictions.header.diverged_at.get(one.scenario)
+        if mark is not None and one.settled > mark:
+            out.error(
+                "diverged_at",
+                "the rollout moves after it was frozen",
+                where=f"scenario {one.scenario}, frame {one.settled}",
+                expected=f"the positions of frame {mark} from there on, as 'diverged_at' says",
+                got=f"another position in frame {one.settled} than in the one before",
+                fix="freeze a diverging rollout at its last finite frame, or leave 'diverged_at' out",
+            )
+
+
 def check_domain(surveys: list[Survey], size: Size, out: Findings) -> None:
     """Flag positions more than a solver cell outside the box."""
     out.made("in_domain")
@@ -157,6 +203,7 @@ def check_domain(surveys: list[Survey], size: Size, out: Findings) -> None:
 def check_jumps(surveys: list[Survey], truth: Truth, out: Findings) -> None:
     """Flag particles that jump much farther in a frame than any particle of the truth."""
     for one in surveys:
+        one.follow(truth.given(one.scenario)[-1])
         limit = JUMP * truth.largest_displacement(one.scenario, enough=one.jump / JUMP)
         if one.jump_at and one.jump > limit:
             frame, particle = one.jump_at

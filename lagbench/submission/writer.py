@@ -17,16 +17,13 @@ from lagbench.layout import resolve_root
 from lagbench.registry import Registry, Size, load
 from lagbench.scenario_ids import spell_ids
 
-from .header import DIMS, FORMAT, OPTIONAL, SPACE
+from .header import DIMS, FORMAT, NEVER, OPTIONAL, SPACE, fits, kind_of
 from .task_checks import dataset_hash_of, frames_to_predict
 
 __all__ = ["Label", "PredictionsWriter"]
 
 CHUNK_CACHE = 1 << 20
 """Chunk cache while writing [bytes]; frames are written once, in order."""
-
-NEVER = -1
-"""Value of ``diverged_at`` for a rollout that did not diverge."""
 
 Label = str | int | float
 """Value of an optional attribute."""
@@ -86,19 +83,17 @@ class PredictionsWriter:
         """Set optional attributes, at any time before the exit.
 
         Args:
-            **labels: seconds_per_frame [s], device, seed, parameters (trainable, a number),
+            **labels: seconds_per_frame [s], device, seed, parameters (trainable, a number >= 0),
                 training (in words).
 
         Raises:
-            UsageError: there is no such label, or its value is of another type.
+            UsageError: there is no such label, or it cannot have that value.
         """
         for name, value in labels.items():
             if name not in OPTIONAL:
                 raise UsageError(f"no label {name!r}", fix=nearest(name, OPTIONAL))
-            kind = OPTIONAL[name]
-            fits = isinstance(value, (int, float)) and value > 0 if kind is float else isinstance(value, kind)
-            if not fits:
-                raise UsageError(f"the label {name!r} does not fit", expected=kind.__name__, got=repr(value))
+            if not fits(name, value):
+                raise UsageError(f"the label {name!r} does not fit", expected=kind_of(name), got=repr(value))
             self._labels[name] = value
 
     def __enter__(self) -> Self:
@@ -133,7 +128,8 @@ class PredictionsWriter:
             diverged_at: absolute frame from which a diverging rollout is frozen.
 
         Raises:
-            UsageError: unknown or repeated scenario, wrong shape, or values that are not finite.
+            UsageError: unknown or repeated scenario, wrong shape, values that are not finite, or
+                a rollout that is not frozen where ``diverged_at`` says.
             WorkFailedError: the disk is full.
         """
         if scenario not in self._rows or scenario in self._written:
@@ -145,6 +141,8 @@ class PredictionsWriter:
         row = self._rows[scenario]
         for name, values in zip(self._names, arrays, strict=True):
             checked = self._checked(name, scenario, values)
+            if name == "position" and diverged_at is not None:
+                self._check_frozen(scenario, checked, diverged_at)
             try:
                 self._file[name][row] = checked
             except (OSError, RuntimeError) as error:
@@ -192,6 +190,24 @@ class PredictionsWriter:
                 fix="freeze a diverging rollout at its last finite frame and give diverged_at",
             )
         return array
+
+    def _check_frozen(self, scenario: int, position: NDArray[np.float32], mark: int) -> None:
+        frames = frames_to_predict(self.size)
+        where = f"diverged_at of scenario {scenario}"
+        if mark not in frames:
+            raise UsageError(
+                "no such frame is predicted", where=where, expected=spell_ids(frames), got=repr(mark)
+            )
+        rest = position[frames.index(mark) :]
+        moved = np.flatnonzero((rest != rest[0]).any(axis=(1, 2)))
+        if moved.size:
+            raise UsageError(
+                "the rollout moves after it was frozen",
+                where=where,
+                expected=f"the same positions from frame {mark} on",
+                got=f"frame {mark + int(moved[0])} differs",
+                fix="freeze a diverging rollout at its last finite frame",
+            )
 
     def _define(self) -> None:
         size = self.size

@@ -1,0 +1,48 @@
+"""The packages under docs/examples do what the README says of them."""
+
+import importlib.util
+import sys
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import pytest
+
+import lagbench
+from lagbench import plugins, registry
+from lagbench.generation import generate
+from lagbench.metrics import METRICS
+
+EXAMPLES = Path(__file__).parent.parent / "docs" / "examples"
+
+
+@pytest.fixture
+def dam_break(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make the example's split known as its entry point would."""
+    monkeypatch.syspath_prepend(str(EXAMPLES / "dam_break"))
+    point = EntryPoint(name="dam-break", value="dam_break", group="lagbench.generators")
+    for module in (registry, plugins):
+        if hasattr(module, "entry_points"):
+            monkeypatch.setattr(module, "entry_points", lambda group: [point])
+    monkeypatch.setenv("PYTHONPATH", str(EXAMPLES / "dam_break"))
+
+
+def test_dam_break_is_a_split(dam_break: None, tmp_path: Path) -> None:
+    """It is listed, generated and scored like one of ours; the column starts at rest and falls."""
+    assert "dam-break" in registry.load().splits
+    result = generate("dam-break", "tiny", subset="test", root=tmp_path)
+    assert result.simulated == (3, 4)
+    test = lagbench.open_split("dam-break", subset="test", size="tiny", root=tmp_path)
+    height = test.position.sel(space="y").mean("particle")
+    assert (height.isel(frame=-1) < 0.8 * height.isel(frame=0)).all()
+
+
+def test_enstrophy_is_a_metric() -> None:
+    """The module's METRICS is a metric that ours do not have."""
+    spec = importlib.util.spec_from_file_location("enstrophy", EXAMPLES / "enstrophy" / "enstrophy.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["enstrophy"] = module
+    spec.loader.exec_module(module)
+    assert module.METRICS.name == "enstrophy_error"
+    assert module.METRICS.name not in METRICS
