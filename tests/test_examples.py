@@ -2,6 +2,7 @@
 
 import importlib.util
 import sys
+from collections.abc import Iterator
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
@@ -16,14 +17,17 @@ EXAMPLES = Path(__file__).parent.parent / "docs" / "examples"
 
 
 @pytest.fixture
-def dam_break(monkeypatch: pytest.MonkeyPatch) -> None:
+def dam_break(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Make the example's split known as its entry point would."""
-    monkeypatch.syspath_prepend(str(EXAMPLES / "dam_break"))
-    point = EntryPoint(name="dam-break", value="dam_break", group="lagbench.generators")
-    for module in (registry, plugins):
-        if hasattr(module, "entry_points"):
-            monkeypatch.setattr(module, "entry_points", lambda group: [point])
-    monkeypatch.setenv("PYTHONPATH", str(EXAMPLES / "dam_break"))
+    folder = str(EXAMPLES / "dam_break")
+    monkeypatch.syspath_prepend(folder)
+    monkeypatch.setenv("PYTHONPATH", folder)
+    monkeypatch.delenv(registry.REGISTRY_VARIABLE, raising=False)
+    point = EntryPoint(name="dam-break", value="dam_break", group=plugins.GROUP)
+    monkeypatch.setattr(plugins, "entry_points", lambda group: [point])
+    registry._load.cache_clear()
+    yield
+    registry._load.cache_clear()
 
 
 def test_dam_break_is_a_split(dam_break: None, tmp_path: Path) -> None:
