@@ -88,7 +88,9 @@ def _method_figure(subject: Subject, rows: Sequence[Row], name: str, thesis: str
     metric = rows[0].scores[name].metric
     series = [(row, _mean(row.scores[name])) for row in rows]
     correlation = name == "vorticity_pearson"
-    y = spanning([values for _, values in series])
+    twin = np.asarray(subject.exam.twin_floor)
+    twinned = name == "position_rmse" and len(twin) == len(subject.frames)
+    y = spanning([*(values for _, values in series), *([twin] if twinned else [])])
     if correlation:
         y = linear(min(0.0, _least(values for _, values in series)), 1.0)
     plot = Plot(_frame_axis(subject), y, x_label="frame", y_label=quantity(metric))
@@ -98,8 +100,7 @@ def _method_figure(subject: Subject, rows: Sequence[Row], name: str, thesis: str
     for row, values in reversed(series):
         plot.line(subject.frames, values, row.kind, row.name)
     items = [(row.kind, row.name) for row in rows]
-    twin = np.asarray(subject.exam.twin_floor)
-    if name == "position_rmse" and len(twin) == len(subject.frames):
+    if twinned:
         plot.line(subject.frames, twin, "twin", "the solver after a nudge of 2^-20")
         items.append(("twin", "twin of the solver"))
     if correlation:
