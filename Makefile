@@ -21,7 +21,7 @@ lint: $(VENV)/.dev
 	$(BIN)/ruff format --check .
 
 types: $(VENV)/.dev
-	$(BIN)/mypy lagbench generators
+	$(BIN)/mypy lagbench generators baselines
 
 bench: $(VENV)/.dev
 	$(BIN)/pytest benchmarks
@@ -32,7 +32,7 @@ $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(VENV)/.demo: $(BIN)/python pyproject.toml constraints.txt
-	$(PIP) install --quiet -c constraints.txt -e '.[generate,plots]'
+	$(PIP) install --quiet -c constraints.txt -e '.[generate,plots,baselines]'
 	touch $@
 
 $(VENV)/.dev: $(BIN)/python pyproject.toml constraints.txt

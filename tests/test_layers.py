@@ -39,8 +39,18 @@ FILES = (
 )
 """Modules below everything else, which know files and arrays but no split."""
 
-REGISTRY = (*FILES, "registry", "locking", "statistics", "manifest", "extras", "plugins", "progress", "pool")
+REGISTRY = (*FILES, "registry", "locating", "locking", "statistics", "manifest", "extras", "plugins", "progress", "pool")
 """The next layer, which knows splits; it may use the first."""
+
+ABOVE_SCORES = (
+    *REGISTRY,
+    "metrics",
+    "submission",
+    "baselines",
+    *("scoring", "exam", "score_card", "score_file", "score_tables", "published", "floors", "comparison"),
+    *("markdown", "recording", "palette", "canvas", "panels"),
+)
+"""What scripts that regenerate tables and figures may use: the scorer and the plots too, never the solver."""
 
 ALLOWED = {
     "lagbench.errors": (),
@@ -49,6 +59,7 @@ ALLOWED = {
     "lagbench.generators": (*REGISTRY, "generators"),
     "lagbench.metrics": (*REGISTRY, "metrics"),
     "lagbench.baselines": (*REGISTRY, "metrics", "submission", "baselines"),
+    "lagbench.baselines.reproduce": ABOVE_SCORES,
 }
 """What a module or package may import of lagbench, by first name; others may import all but the CLI."""
 

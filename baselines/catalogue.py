@@ -1,0 +1,123 @@
+"""The baselines by name: those that entry points of installed packages name.
+
+An entry point of the group ``lagbench.baselines`` names a subclass of
+:class:`~lagbench.baselines.baseline.Baseline`, or one of
+:class:`~lagbench.baselines.operators.operator.Operator`, which becomes a graph network whose
+node update it is.
+"""
+
+from __future__ import annotations
+
+import inspect
+import warnings
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+
+from lagbench.errors import LagbenchError, UsageError, nearest
+from lagbench.plugins import PluginWarning
+
+from .baseline import Baseline
+
+__all__ = ["GROUP", "Entry", "every_entry", "find", "names"]
+
+GROUP = "lagbench.baselines"
+"""Entry points of this group name a baseline and its class; ours register the same way."""
+
+OWN = "lagbench.baselines."
+RECIPES = Path(__file__).parent / "recipes"
+OPERATOR_RECIPES = "gns"
+"""Recipe file that all operators share, so that they differ in the operator only."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Entry:
+    """A baseline as an entry point names it.
+
+    Attributes:
+        name: name on the command line.
+        model: its class.
+        recipes: YAML file of its recipes; None where there is none.
+    """
+
+    name: str
+    model: type[Baseline]
+    recipes: Path | None
+
+
+def names() -> tuple[str, ...]:
+    """Return the names of all baselines, sorted; nothing is imported."""
+    return tuple(sorted(_points()))
+
+
+def find(name: str) -> Entry:
+    """Return a baseline by name.
+
+    Raises:
+        UsageError: there is none (the message names the nearest), or its package is broken.
+    """
+    points = _points()
+    if name not in points:
+        raise UsageError(f"no baseline {name!r}", where="--baseline", fix=nearest(name, points))
+    try:
+        return _entry(points[name])
+    except Exception as error:  # a stranger's module: importing it may raise anything
+        raise UsageError(
+            f"the baseline {name!r} cannot be loaded",
+            where=_package(points[name]),
+            got=_reason(error),
+            fix="mend or uninstall that package",
+        ) from error
+
+
+def every_entry() -> dict[str, Entry]:
+    """Return every baseline that can be loaded; others are left out with a PluginWarning."""
+    found = {}
+    for name, point in _points().items():
+        try:
+            found[name] = _entry(point)
+        except Exception as error:  # as above
+            message = f"package {_package(point)} adds no baseline {name!r}: {_reason(error)}"
+            warnings.warn(message, PluginWarning, stacklevel=2)
+    return found
+
+
+def _points() -> dict[str, EntryPoint]:
+    """Return the entry points by name; ours are not to be replaced."""
+    found: dict[str, EntryPoint] = {}
+    for point in sorted(entry_points(group=GROUP), key=lambda point: not point.value.startswith(OWN)):
+        held = found.setdefault(point.name, point)
+        if held.value != point.value:
+            message = f"package {_package(point)} adds no baseline {point.name!r}: its name is taken"
+            warnings.warn(message, PluginWarning, stacklevel=3)
+    return found
+
+
+def _entry(point: EntryPoint) -> Entry:
+    loaded = point.load()
+    if not inspect.isclass(loaded):
+        raise UsageError(f"{point.value} is no class", expected="a subclass of Baseline or Operator")
+    if issubclass(loaded, Baseline):
+        return Entry(name=point.name, model=loaded, recipes=_recipes(loaded, point.name))
+    from .operators.operator import Operator
+    from .simulator import GraphNetwork
+
+    if not issubclass(loaded, Operator):
+        raise UsageError(f"{point.value} is no baseline", expected="a subclass of Baseline or Operator")
+    model = GraphNetwork.with_operator(loaded)
+    return Entry(name=point.name, model=model, recipes=_recipes(loaded, OPERATOR_RECIPES))
+
+
+def _recipes(loaded: type, name: str) -> Path | None:
+    """Return the file that a class names as ``recipes``, else ours of that name."""
+    given = getattr(loaded, "recipes", None)
+    path = Path(given) if given else RECIPES / f"{name}.yaml"
+    return path if given or path.is_file() else None
+
+
+def _package(point: EntryPoint) -> str:
+    return point.dist.name if point.dist else point.value.partition(".")[0]
+
+
+def _reason(error: Exception) -> str:
+    return str(error) if isinstance(error, LagbenchError) else f"{type(error).__name__}: {error}"

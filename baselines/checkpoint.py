@@ -1,0 +1,220 @@
+"""Checkpoints: tensors and JSON text in a file that cannot run code.
+
+A file of ``torch.save`` with plain entries: ``lagbench_checkpoint`` (format number),
+``about`` (JSON: baseline, model options, facts of the data set, training so far), ``weights``,
+and, for resuming, ``optimizer``. It is read with ``weights_only=True``: a file with any other
+object in it, which unpickling would run, is refused.
+"""
+
+from __future__ import annotations
+
+import json
+import pickle
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from pydantic import ValidationError
+from torch import Tensor, nn
+
+from lagbench.atomic import atomic_path
+from lagbench.errors import DataError, LagbenchError, UnreadableFileError
+from lagbench.registry import Registry
+
+from .baseline import Baseline
+from .catalogue import find
+from .facts import Facts, facts_of
+
+__all__ = ["Checkpoint", "check_data", "load", "load_weights", "restore", "rounded_weights", "save"]
+
+FORMAT = 1
+KEY = "lagbench_checkpoint"
+SAFE = "a checkpoint that lagbench train wrote"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Checkpoint:
+    """A model with all that it needs to predict, and to be trained on.
+
+    Attributes:
+        baseline: name of the baseline.
+        options: options of the model, plain values.
+        facts: public figures of the data set that it was trained on.
+        weights: parameters and buffers by name.
+        training: what training has done so far, plain values.
+        optimizer: state of the optimiser; None in a file that is for predictions only.
+    """
+
+    baseline: str
+    options: Mapping[str, Any]
+    facts: Facts
+    weights: Mapping[str, Tensor]
+    training: Mapping[str, Any] = field(default_factory=dict)
+    optimizer: Mapping[str, Any] | None = None
+
+
+def save(path: Path, checkpoint: Checkpoint) -> None:
+    """Write a checkpoint; it appears whole or not at all.
+
+    Raises:
+        WorkFailedError: the operating system refused.
+    """
+    about = {
+        "baseline": checkpoint.baseline,
+        "options": dict(checkpoint.options),
+        "facts": checkpoint.facts.as_json(),
+        "training": dict(checkpoint.training),
+    }
+    content: dict[str, Any] = {
+        KEY: FORMAT,
+        "about": json.dumps(about, sort_keys=True),
+        "weights": {name: tensor.detach().cpu() for name, tensor in checkpoint.weights.items()},
+    }
+    if checkpoint.optimizer is not None:
+        content["optimizer"] = dict(checkpoint.optimizer)
+    with atomic_path(path, option="--output") as temporary:
+        torch.save(content, temporary)
+
+
+def load(path: str | Path) -> Checkpoint:
+    """Read a checkpoint; nothing in the file is run.
+
+    Raises:
+        UnreadableFileError: the file is missing, damaged, no checkpoint, or holds objects other
+            than tensors and plain values.
+    """
+    file = Path(path)
+    content = _content(file)
+    try:
+        if content[KEY] != FORMAT:
+            raise _unfit(file, f"format {FORMAT}", f"format {content[KEY]!r}")
+        about = json.loads(content["about"])
+        return Checkpoint(
+            baseline=str(about["baseline"]),
+            options=dict(about["options"]),
+            facts=Facts.from_json(about["facts"]),
+            weights=_tensors(content["weights"]),
+            training=dict(about["training"]),
+            optimizer=content.get("optimizer"),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise _unfit(file, SAFE, f"{type(error).__name__}: {' '.join(str(error).split())[:200]}") from None
+
+
+def restore(checkpoint: Checkpoint, *, where: str = "the checkpoint") -> Baseline:
+    """Return the model of a checkpoint, in float32, ready to predict.
+
+    Args:
+        checkpoint: what :func:`load` returned.
+        where: what to call it in messages.
+
+    Raises:
+        UsageError: no such baseline is installed.
+        UnreadableFileError: options or weights do not fit the baseline.
+    """
+    entry = find(checkpoint.baseline)
+    try:
+        model = entry.model.build(checkpoint.options, checkpoint.facts)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(map(str, first["loc"]))
+        raise UnreadableFileError(
+            f"option {key!r} of the model does not fit",
+            where=where,
+            got=first["msg"],
+            fix=f"it is from another version of {checkpoint.baseline}; train anew",
+        ) from None
+    load_weights(model, checkpoint.weights, where=where)
+    return model.eval()
+
+
+def load_weights(model: nn.Module, weights: Mapping[str, Tensor], *, where: str) -> None:
+    """Copy weights into a model; those in bfloat16 become float32.
+
+    Raises:
+        UnreadableFileError: names, shapes or values do not fit.
+    """
+    broken = [name for name, value in weights.items() if not torch.isfinite(value).all()]
+    if broken:
+        raise UnreadableFileError("weights are not finite", where=where, got=", ".join(broken[:3]))
+    try:
+        model.load_state_dict(dict(weights))
+    except RuntimeError as error:
+        raise UnreadableFileError(
+            "the weights do not fit the model", where=where, got=" ".join(str(error).split())[:300]
+        ) from None
+
+
+def rounded_weights(model: nn.Module) -> dict[str, Tensor]:
+    """Return parameters in bfloat16, and buffers (statistics, closed forms) as they are."""
+    trained = {name for name, _ in model.named_parameters()}
+    return {
+        name: value.detach().to(torch.bfloat16) if name in trained else value.detach()
+        for name, value in model.state_dict().items()
+    }
+
+
+def check_data(checkpoint: Checkpoint, *, root: Path, registry: Registry | None = None, where: str) -> Facts:
+    """Check that the data at hand are those that the model was trained on; return their facts.
+
+    Args:
+        checkpoint: what :func:`load` returned.
+        root: folder of all data sets.
+        registry: where splits are described; ours when None.
+        where: what to call the checkpoint in messages.
+
+    Raises:
+        UsageError: no such split is known.
+        DataError: they are missing, or of another hash.
+    """
+    trained = checkpoint.facts
+    here = facts_of(trained.split, trained.size, root=root, registry=registry)
+    if here.dataset_sha256 != trained.dataset_sha256:
+        raise DataError(
+            "the model was trained on another version of the data set",
+            where=where,
+            expected=f"{trained.split} {trained.size} {trained.version}, hash {trained.dataset_sha256}",
+            got=f"{here.version}, hash {here.dataset_sha256}",
+            fix="train again on the data at hand, or generate the version that it was trained on",
+        )
+    return here
+
+
+def _content(file: Path) -> dict[str, Any]:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            content = torch.load(file, map_location="cpu", weights_only=True)
+    except OSError as error:
+        raise UnreadableFileError(
+            "cannot read the checkpoint", where=str(file), got=error.strerror or error
+        ) from None
+    except pickle.UnpicklingError as error:
+        raise UnreadableFileError(
+            "the file holds more than tensors and plain values, and was not opened",
+            where=str(file),
+            expected=SAFE,
+            got=str(error).split("\n")[0][:200],
+            fix="do not load it otherwise either: such a file can run code",
+        ) from None
+    except Exception as error:  # damaged archives raise nearly any type
+        raise _unfit(file, SAFE, f"{type(error).__name__}: {str(error)[:200]}") from None
+    if not isinstance(content, dict) or KEY not in content:
+        raise _unfit(file, SAFE, type(content).__name__)
+    return content
+
+
+def _tensors(values: object) -> dict[str, Tensor]:
+    if not isinstance(values, Mapping):
+        raise TypeError("weights are no mapping")
+    for name, value in values.items():
+        if not isinstance(name, str) or not isinstance(value, Tensor):
+            raise TypeError(f"weight {name!r} is no tensor")
+    return dict(values)
+
+
+def _unfit(file: Path, expected: str, got: str) -> LagbenchError:
+    return UnreadableFileError("not a checkpoint of lagbench", where=str(file), expected=expected, got=got)

@@ -1,0 +1,145 @@
+"""What a baseline may know of a data set: public figures of datasets.yaml, never a test scenario."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Self
+
+from pydantic import TypeAdapter
+
+from lagbench.errors import DataError
+from lagbench.layout import dataset_folder
+from lagbench.locating import locate
+from lagbench.manifest import Manifest, read_manifest
+from lagbench.registry import Registry, Size
+from lagbench.scenario_file import read_scenario
+
+__all__ = ["Facts", "facts_of"]
+
+Pair = tuple[float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Facts:
+    """Public figures of one size of a split; they travel in every checkpoint.
+
+    Attributes:
+        split: name of the split.
+        size: name of the size.
+        version: semantic version of the split.
+        dataset_sha256: hash of the data set.
+        particles: particles in one scenario.
+        bounds: box that holds the particles, (low, high) along x and y [length].
+        radius: connectivity radius [length].
+        input_frames: frames given at the start of a test scenario.
+        horizon: frames to predict after them.
+        score_cells: cells across of the scorer's grid.
+        score_placement: ``cell_centres`` or ``nodes``, where that grid's nodes lie.
+        frame_interval: time between frames [s].
+        moving_walls: whether scenario files hold ``wall_velocity``.
+        statistics: over train: ``position_mean``, ``position_std`` [length], ``velocity_mean``,
+            ``velocity_std`` [length/frame], ``acceleration_mean``, ``acceleration_std``
+            [length/frame^2], one (x, y) pair each.
+    """
+
+    split: str
+    size: str
+    version: str
+    dataset_sha256: str
+    particles: int
+    bounds: tuple[Pair, Pair]
+    radius: float
+    input_frames: int
+    horizon: int
+    score_cells: int
+    score_placement: str
+    frame_interval: float
+    moving_walls: bool
+    statistics: Mapping[str, Pair]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return plain values, as checkpoints hold them."""
+        return asdict(self)
+
+    @classmethod
+    def from_json(cls, values: object) -> Self:
+        """Return the facts that :meth:`as_json` gave.
+
+        Raises:
+            pydantic.ValidationError: they are none.
+        """
+        return TypeAdapter(cls).validate_python(values)
+
+
+def facts_of(
+    split: str, size: str = "full", *, root: str | Path | None = None, registry: Registry | None = None
+) -> Facts:
+    """Return the public figures of a generated data set.
+
+    Args:
+        split: name of the split.
+        size: name of the size.
+        root: folder of all data sets; else ``LAGBENCH_ROOT``, else the user data folder.
+        registry: where splits are described; ours when None.
+
+    Raises:
+        UsageError: unknown split or size.
+        DataError: it is not generated, or train is not complete and nothing is recorded.
+    """
+    tier, folder, _ = locate(split, size, root=root, registry=registry)
+    manifest = read_manifest(folder, tier.split, size, tier.major)
+    if manifest is None:
+        raise _absent(tier, folder, "the data set is not generated")
+    task = tier.task
+    return Facts(
+        split=tier.split,
+        size=size,
+        version=tier.version,
+        dataset_sha256=_hash(tier, manifest, folder),
+        particles=tier.particles,
+        bounds=tier.bounds,
+        radius=task.radius,
+        input_frames=task.input_frames,
+        horizon=task.horizon,
+        score_cells=task.score_grid.cells,
+        score_placement=task.score_grid.placement,
+        frame_interval=tier.frame_interval,
+        moving_walls=_moving_walls(tier, manifest, folder),
+        statistics=_statistics(tier, manifest, folder),
+    )
+
+
+def _absent(size: Size, root: Path, what: str) -> DataError:
+    return DataError(
+        what,
+        where=str(dataset_folder(root, size.split, size.name, size.major)),
+        fix=f"lagbench generate --split {size.split} --size {size.name} --root {root}",
+    )
+
+
+def _hash(size: Size, manifest: Manifest, root: Path) -> str:
+    """Return the hash of what is here; where some subset is missing, the recorded one."""
+    recorded = size.measured.dataset_sha256 if size.measured else None
+    known = manifest.dataset_sha256 or recorded
+    if known is None:
+        raise _absent(size, root, "the data set is not complete")
+    return known
+
+
+def _statistics(size: Size, manifest: Manifest, root: Path) -> dict[str, Pair]:
+    """Return mean and std over train: measured here, else the recorded ones."""
+    recorded = size.measured.statistics if size.measured else {}
+    found = manifest.statistics or recorded
+    if not found:
+        raise _absent(size, root, "the subset train is not complete, its statistics are unknown")
+    return {name: (float(x), float(y)) for name, (x, y) in found.items()}
+
+
+def _moving_walls(size: Size, manifest: Manifest, root: Path) -> bool:
+    if not manifest.files:
+        raise _absent(size, root, "the data set is empty")
+    folder = dataset_folder(root, size.split, size.name, size.major)
+    with read_scenario(folder / manifest.files[0].path) as file:
+        return "wall_velocity" in file.variables

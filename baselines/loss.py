@@ -1,0 +1,125 @@
+"""Loss of a predicted frame: six terms of motion, density and flow (thesis Eqs. 5.29-5.35).
+
+All terms are in normalised units, as in the thesis: accelerations, velocities and positions
+over their deviations in train; the grid's velocities too, so that vorticity and divergence
+have the unit 1/length; density over that around a particle. Weights are applied by the trainer.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lagbench.grid import Grid
+
+from .grid_fields import Fields, counted_nodes, fields, node_velocity, transfer
+from .motion import Motion
+
+__all__ = ["GRID_TERMS", "PARTICLE_TERMS", "TERMS", "LossNorm", "Scales", "loss_terms", "mean_norm"]
+
+PARTICLE_TERMS = ("acceleration", "velocity", "position")
+GRID_TERMS = ("density", "divergence", "vorticity")
+TERMS = PARTICLE_TERMS + GRID_TERMS
+"""The terms of Eq. 5.35, in its order but for positions."""
+
+
+class LossNorm(enum.StrEnum):
+    """The p of the norms: L2 is the squared error, L1 the absolute one."""
+
+    L1 = "l1"
+    L2 = "l2"
+
+
+class Scales(NamedTuple):
+    """Deviations that errors are divided by, (x, y) each, shape [2]; named as in :class:`Motion`."""
+
+    position: Tensor
+    velocity: Tensor
+    acceleration: Tensor
+
+    @property
+    def speed(self) -> Tensor:
+        """Root mean square of the velocity's two deviations [length/frame], shape []."""
+        return (self.velocity**2).mean().sqrt()
+
+
+def mean_norm(error: Tensor, norm: LossNorm, count: Tensor | int | None = None) -> Tensor:
+    """Return ``(1/N) sum_i ||e_i||_p``, 0 = perfect; components are summed (Eqs. 5.29-5.34).
+
+    Args:
+        error: normalised errors [1], shape [..., component].
+        norm: L2 squares, L1 takes absolute values.
+        count: particles or nodes N; those of the array by default.
+    """
+    each = error**2 if norm is LossNorm.L2 else error.abs()
+    return each.sum() / (each[..., 0].numel() if count is None else count)
+
+
+def loss_terms(
+    predicted: Motion,
+    target: Motion,
+    sample: Tensor,
+    *,
+    grid: Grid,
+    scales: Scales,
+    norm: LossNorm,
+    weights: Mapping[str, float],
+) -> dict[str, Tensor]:
+    """Return the six terms, raw; those of weight 0 without a graph.
+
+    Args:
+        predicted: predicted frame.
+        target: true frame.
+        sample: window of each particle, ascending, int64, shape [particle].
+        grid: grid of density, divergence and vorticity.
+        scales: deviations that make the errors dimensionless.
+        norm: L1 or L2.
+        weights: weight of each term; missing ones are 1.
+    """
+    terms = {}
+    for name in PARTICLE_TERMS:
+        with _graph(weights, name):
+            error = getattr(predicted, name) - getattr(target, name)
+            terms[name] = mean_norm(error / getattr(scales, name), norm)
+    with _graph(weights, *GRID_TERMS):
+        true, own = _fields(predicted, target, sample, grid)
+    with _graph(weights, "density"):
+        terms["density"] = mean_norm((own.density - true.density).unsqueeze(-1), norm)
+    count = true.differentiable.sum().clamp(min=1)
+    for name in ("divergence", "vorticity"):
+        with _graph(weights, name):
+            error = (getattr(own, name) - getattr(true, name)) / scales.speed
+            terms[name] = mean_norm(error.unsqueeze(-1), norm, count)
+    return terms
+
+
+def _fields(predicted: Motion, target: Motion, sample: Tensor, grid: Grid) -> tuple[Fields, Fields]:
+    """Return the fields of truth and prediction, both at the nodes that count in the truth."""
+    windows = int(sample[-1]) + 1
+    with torch.no_grad():
+        sums = transfer(target.position, target.velocity, grid, sample=sample, windows=windows)
+        # A node's weight around a particle, on the average: the full weight of a box that is full,
+        # and defined for a splash too, whose area is not known here.
+        full = float((sums.weight**2).sum() / sums.weight.sum())
+        velocity = node_velocity(sums, full)
+        true = Fields(grid, sums.weight, velocity, counted_nodes(sums.weight, full), full)
+    own = fields(
+        predicted.position,
+        predicted.velocity,
+        grid,
+        full=full,
+        sample=sample,
+        windows=windows,
+        counted=true.counted,
+    )
+    return true, own
+
+
+def _graph(weights: Mapping[str, float], *names: str) -> torch.set_grad_enabled:
+    """Record a graph only if one is recorded at all and one of the terms counts."""
+    counts = any(weights.get(name, 1.0) != 0.0 for name in names)
+    return torch.set_grad_enabled(torch.is_grad_enabled() and counts)

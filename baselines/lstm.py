@@ -1,0 +1,107 @@
+"""LSTM in a learned latent space, with and without an MLP between its layers (thesis section 4.7)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+import torch
+from pydantic import Field, PositiveInt
+from torch import Tensor, nn
+
+from lagbench.grid import Grid, Placement
+
+from .batch import Batch
+from .facts import Facts
+from .frame_model import FrameWindow, squared_errors
+from .frame_network import FrameNetwork, FrameNetworkOptions
+from .grid_fields import transfer
+from .mlp import Activation, dense
+
+__all__ = ["LSTM", "LSTMWithMLP"]
+
+
+class LSTM(FrameNetwork):
+    """Two frames in, the next one out (Table 4.6).
+
+    Each frame is encoded particle by particle and averaged over the particles; two LSTM layers
+    read the latent vectors, each followed by dropout; a decoder turns the last output into the
+    states of all particles. LSTM cells use tanh, as PyTorch's do; the table's ELU stands in
+    encoder, interleaved MLP and decoder.
+    """
+
+    method = "lstm"
+    interleaved: ClassVar[bool] = False
+
+    class Options(FrameNetworkOptions):
+        """Options of both LSTMs.
+
+        Attributes:
+            latent: length of the latent vector of a frame and width of both LSTM layers.
+            encoder: widths of pointwise layers before the latent one.
+            decoder: widths of hidden layers after the second LSTM layer.
+            dropout: after the first and after the second LSTM layer.
+            density_weight: of the density term in the loss. With 1 its gradient, which moves particles
+                within a cell, drowns that of the positions: a mean position is then missed by 1.2 deviations.
+        """
+
+        latent: PositiveInt = 1250
+        encoder: tuple[PositiveInt, ...] = ()
+        decoder: tuple[PositiveInt, ...] = (1250,)
+        dropout: tuple[float, float] = (0.2, 0.1)
+        density_weight: float = Field(default=0.03, ge=0, allow_inf_nan=False)
+
+    options: Options
+
+    def __init__(self, options: Options, facts: Facts) -> None:
+        super().__init__(options, facts)
+        latent = options.latent
+        pointwise = dense((self.input_features, *options.encoder, latent), Activation.ELU)
+        self.encoder = nn.Sequential(*pointwise, nn.ELU())
+        self.first = nn.LSTM(latent, latent, batch_first=True)
+        self.between = nn.Sequential(nn.Linear(latent, latent), nn.ELU()) if self.interleaved else None
+        self.second = nn.LSTM(latent, latent, batch_first=True)
+        self.dropout = nn.ModuleList(nn.Dropout(share) for share in options.dropout)
+        self.decoder = dense((latent, *options.decoder, self.features), Activation.ELU)
+
+    @property
+    def inputs(self) -> int:
+        """Two frames."""
+        return 2
+
+    @property
+    def weights(self) -> Mapping[str, float]:
+        """Weight of the density term; the others have 1."""
+        return {"density": self.options.density_weight}
+
+    def forward(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
+        """Return the errors of position and velocity, and that of the density map [1]."""
+        truth, predicted = self._one_step(batch, generator)
+        return {**squared_errors(truth, predicted), "density": self._density_error(truth, predicted)}
+
+    def _density_error(self, truth: Tensor, predicted: Tensor) -> Tensor:
+        """Return ``sum (d' - d)^2 / sum d^2`` over the nodes of the scorer's grid: 1 for an empty map."""
+        density, guess = (self._density(state) for state in (truth, predicted))
+        return (guess - density).square().sum() / density.square().sum()
+
+    def _density(self, state: Tensor) -> Tensor:
+        """Return the particles' weight at every node, shape [window, x node, y node]."""
+        position = self.frame_state.position(state)
+        grid = Grid(self.facts.score_cells, Placement(self.facts.score_placement))
+        return transfer(position, torch.zeros_like(position), grid).weight
+
+    def next_state(self, window: FrameWindow) -> Tensor:
+        """Return the next standardised state [1], shape [window, particle, 4]."""
+        latent = self.encoder(self.given(window)).mean(dim=2)
+        latent = self.dropout[0](self.first(latent)[0])
+        if self.between is not None:
+            latent = self.between(latent)
+        last = self.dropout[1](self.second(latent)[0][:, -1])
+        return self.meant(self.decoder(last), window)
+
+
+class LSTMWithMLP(LSTM):
+    """The LSTM with an ELU layer of the same width between its two layers."""
+
+    method = "lstm-mlp"
+    interleaved = True

@@ -1,0 +1,101 @@
+"""The device and the threads that a model runs on."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from platform import machine as architecture
+from typing import Any
+
+import torch
+
+from lagbench.errors import UsageError, WorkFailedError
+
+__all__ = [
+    "chosen_device",
+    "hardware",
+    "is_helper",
+    "memory_errors_told",
+    "multiplies_bfloat16",
+    "threads_used",
+]
+
+
+def chosen_device(name: str) -> str:
+    """Return ``cpu`` or ``cuda``; ``auto`` takes a GPU that is there.
+
+    Raises:
+        UsageError: no such device, or it is not there.
+    """
+    there = torch.cuda.is_available()
+    if name == "auto":
+        return "cuda" if there else "cpu"
+    if name not in ("cpu", "cuda") or (name == "cuda" and not there):
+        expected = "cpu, cuda or auto" if there else "cpu or auto: torch sees no GPU"
+        raise UsageError(f"no device {name!r} here", where="--device", expected=expected)
+    return name
+
+
+def is_helper() -> bool:
+    """Return whether this process helps another, the first, to train: it writes and says nothing."""
+    return any(os.environ.get(name, "0") != "0" for name in ("LOCAL_RANK", "RANK"))
+
+
+@contextmanager
+def threads_used(count: int | None) -> Iterator[None]:
+    """Use so many threads for a while; one per core by default."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count or len(os.sched_getaffinity(0)))
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@contextmanager
+def memory_errors_told(fix: str) -> Iterator[None]:
+    """Turn whatever torch raises when memory is full into an error that says what to lower.
+
+    Args:
+        fix: what to lower.
+
+    Raises:
+        WorkFailedError: memory is full.
+    """
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        full = isinstance(error, (MemoryError, torch.OutOfMemoryError))
+        if not full and "can't allocate memory" not in str(error):
+            raise
+        raise WorkFailedError("out of memory", got=str(error).split("\n")[0][:200], fix=fix) from error
+
+
+def hardware(device: str = "cpu") -> dict[str, Any]:
+    """Return what the machine is, without its name."""
+    return {
+        "processor": _processor() or architecture(),
+        "cores": len(os.sched_getaffinity(0)),
+        "threads": torch.get_num_threads(),
+        "device": torch.cuda.get_device_name() if device == "cuda" else "cpu",
+    }
+
+
+def multiplies_bfloat16(device: str) -> bool:
+    """Return whether the device has instructions for products of bfloat16."""
+    if device == "cuda":
+        return bool(torch.cuda.is_bf16_supported(including_emulation=False))
+    flags = {flag for name in ("flags", "Features") for flag in _processor(name).split()}
+    return not flags.isdisjoint({"avx512_bf16", "amx_bf16", "bf16"})
+
+
+def _processor(field: str = "model name") -> str:
+    """Return what Linux tells of the first processor; nothing where it tells nothing."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return ""
+    parts = (line.partition(":") for line in lines)
+    return next((value.strip() for name, _, value in parts if name.strip() == field), "")

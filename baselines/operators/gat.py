@@ -1,0 +1,41 @@
+"""GAT: attention from a node, its neighbour and their edge, added up."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch_geometric.nn import GATConv
+
+from .operator import Losses, Operator
+
+__all__ = ["GAT"]
+
+
+class GAT(Operator):
+    r"""Graph attention of Velickovic et al. (2018): PyG's GATConv.
+
+    .. math::
+
+        x_i' &= \sum_{j \in N(i) \cup \{i\}} \alpha_{ij} \Theta x_j \\
+        \alpha_{ij} &= \mathrm{softmax}_j\,\mathrm{LeakyReLU}(
+            a_r^T \Theta x_i + a_s^T \Theta x_j + a_e^T \Theta_e m_{ij})
+
+    The edge of a particle with itself is the mean of those that it receives.
+    """
+
+    method = "GNS + GATConv"
+
+    def __init__(self, latent: int, hidden: int) -> None:
+        super().__init__(latent, hidden)
+        self.conv = GATConv(2 * latent, latent, edge_dim=latent)
+
+    def forward(
+        self,
+        node: Tensor,
+        edge_index: Tensor,
+        edge: Tensor,
+        *,
+        generator: torch.Generator | None = None,
+    ) -> tuple[Tensor, Losses]:
+        """Return the update of each node."""
+        return self.conv(node, edge_index, edge), {}

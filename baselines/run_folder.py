@@ -1,0 +1,102 @@
+"""The folder of a training: checkpoint.pt, weights.pt, training.json, tensorboard/."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from lagbench.atomic import write_atomically
+from lagbench.errors import UsageError
+
+from .checkpoint import Checkpoint, load
+from .recipe import Recipe
+
+__all__ = ["RunFolder", "default_folder"]
+
+
+def default_folder(recipe: Recipe) -> Path:
+    """Return ``runs/<split>/<size>/<baseline>-<seed>`` in the present folder."""
+    return Path("runs") / recipe.name / f"{recipe.baseline}-{recipe.training.seed}"
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """Paths of a training's files, and what an earlier run left there."""
+
+    path: Path
+
+    @property
+    def checkpoint(self) -> Path:
+        """The last state, to go on from."""
+        return self.path / "checkpoint.pt"
+
+    @property
+    def weights(self) -> Path:
+        """The best weights in bfloat16, to predict from."""
+        return self.path / "weights.pt"
+
+    @property
+    def record(self) -> Path:
+        """What the training did and cost, as JSON."""
+        return self.path / "training.json"
+
+    @property
+    def logs(self) -> Path:
+        """Folder of TensorBoard's files."""
+        return self.path / "tensorboard"
+
+    def earlier(self, recipe: Recipe, *, resume: bool, fresh: bool) -> Checkpoint | None:
+        """Return the checkpoint to go on from; None for a training from the start.
+
+        Args:
+            recipe: the recipe of the training.
+            resume: go on from what is there; else anything there is an error.
+            fresh: train anew whatever is there.
+
+        Raises:
+            UsageError: the folder holds another training, or one that must not be resumed.
+            UnreadableFileError: its checkpoint is damaged.
+        """
+        if fresh or not self.checkpoint.exists():
+            return None
+        found = load(self.checkpoint)
+        if found.training.get("recipe") != recipe.as_json():
+            raise UsageError(
+                "the folder holds a training with another recipe",
+                where=str(self.path),
+                expected=_first_difference(recipe.as_json(), found.training.get("recipe")),
+                fix="name another folder with --output, or train anew with --fresh",
+            )
+        if not resume:
+            raise UsageError(
+                "the folder holds a training",
+                where=str(self.path),
+                fix="go on with --resume, train anew with --fresh, or name another --output",
+            )
+        return found
+
+    def clear(self) -> None:
+        """Remove what an earlier training left, and nothing else."""
+        for file in (self.checkpoint, self.weights, self.record):
+            file.unlink(missing_ok=True)
+        shutil.rmtree(self.logs, ignore_errors=True)
+
+    def write_record(self, record: dict[str, Any]) -> None:
+        """Write training.json; it appears whole or not at all."""
+        text = json.dumps(record, indent=2, sort_keys=True)
+        write_atomically(self.record, text.encode() + b"\n", option="--output")
+
+
+def _first_difference(wanted: dict[str, Any], found: object, path: str = "") -> str:
+    """Return the first key whose value differs, with both values."""
+    theirs = found if isinstance(found, dict) else {}
+    for key in sorted({*wanted, *theirs}):
+        mine, other = wanted.get(key), theirs.get(key)
+        if mine != other:
+            if isinstance(mine, dict) and isinstance(other, dict):
+                return _first_difference(mine, other, f"{path}{key}.")
+            return f"{path}{key} = {mine!r}, as asked for; the folder has {other!r}"
+    return "the same recipe"

@@ -1,0 +1,274 @@
+"""Graph networks that move particles: one step from features to positions, rolled out or trained.
+
+    a = S^-1(network(features(x, v)))        or  v' = S^-1(network(features(x, v)))
+    v' = v + a,   x' = x + v'                semi-implicit Euler, time in frames
+
+after Sanchez-Gonzalez et al. (2020) and thesis §§5.6-5.7. Training and rollouts share
+:meth:`GraphNetwork.step`. The network's last layer starts at zero: an untrained model with
+target acceleration keeps every velocity, and training starts from there.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import ClassVar
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+
+from lagbench.errors import UsageError
+from lagbench.grid import Grid, Placement
+
+from .baseline import Baseline, Options
+from .batch import Batch
+from .facts import Facts
+from .features import EDGE_FEATURES, VELOCITIES, NodeFeatures, Scale, edge_features
+from .loss import LossNorm, Scales, loss_terms
+from .motion import Motion, State, integrate
+from .network import EncodeProcessDecode
+from .noise import noisy
+from .operators.operator import Losses, Operator
+from .radius_graph import radius_graph
+from .symmetry import Symmetry, draw, image
+
+__all__ = ["GraphNetwork", "GraphNetworkOptions", "LossWeights", "Target"]
+
+HISTORY = VELOCITIES + 1
+
+
+class Target(enum.StrEnum):
+    """What the network predicts; untrained, it gives the train mean of it."""
+
+    ACCELERATION = "acceleration"
+    VELOCITY = "velocity"
+
+
+class LossWeights(Options):
+    """Weights of Eq. 5.35; a term of weight 0 is logged and not learnt from."""
+
+    acceleration: float = Field(default=1.0, ge=0.0)
+    velocity: float = Field(default=1.0, ge=0.0)
+    position: float = Field(default=1.0, ge=0.0)
+    density: float = Field(default=1.0, ge=0.0)
+    divergence: float = Field(default=1.0, ge=0.0)
+    vorticity: float = Field(default=1.0, ge=0.0)
+
+
+class GraphNetworkOptions(Options):
+    """Options of a graph network.
+
+    Attributes:
+        latent: width of nodes, edges and hidden layers.
+        layers: processor layers.
+        target: what the network predicts.
+        noise_std: deviation of the noise on the last given velocity, per component
+            [length/frame]; near the error of one predicted step is good, far above it training
+            learns to remove noise and little else.
+        loss: weights of the six terms.
+        loss_norm: L2 or L1.
+        link_weight: weight of an operator's link prediction; the operator's own when None.
+        rollout_loss_steps: own steps that the loss is averaged over; gradients pass through all.
+        wall_velocity: whether the velocities of moving walls are features.
+        symmetry: images that training windows are replaced by at random.
+        radius: connectivity radius [length]; the data set's when None.
+        clamp: keep particles of a rollout in the box, and their velocities true to that; else
+            they may leave it. Training never clamps.
+    """
+
+    latent: int = Field(default=128, ge=1)
+    layers: int = Field(default=10, ge=1)
+    target: Target = Target.ACCELERATION
+    noise_std: float = Field(default=6.7e-4, ge=0.0)
+    loss: LossWeights = LossWeights()
+    loss_norm: LossNorm = LossNorm.L2
+    link_weight: float | None = Field(default=None, ge=0.0)
+    rollout_loss_steps: int = Field(default=1, ge=1)
+    wall_velocity: bool = False
+    symmetry: Symmetry = Symmetry.NONE
+    radius: float | None = Field(default=None, gt=0.0)
+    clamp: bool = False
+
+
+class GraphNetwork(Baseline):
+    """A graph network whose node update is an operator; :meth:`with_operator` names it.
+
+    Class attributes:
+        operator: node update of every processor layer.
+    """
+
+    Options = GraphNetworkOptions
+    options: GraphNetworkOptions
+    operator: ClassVar[type[Operator]]
+
+    def __init__(self, options: GraphNetworkOptions, facts: Facts) -> None:
+        super().__init__(options, facts)
+        self._check()
+        noise, statistics = options.noise_std, facts.statistics
+        self.radius = facts.radius if options.radius is None else options.radius
+        self.grid = Grid(facts.score_cells, Placement(facts.score_placement))
+        self.position = Scale(statistics["position_mean"], statistics["position_std"])
+        self.velocity = Scale(statistics["velocity_mean"], statistics["velocity_std"], noise=noise)
+        self.acceleration = Scale(
+            statistics["acceleration_mean"], statistics["acceleration_std"], noise=noise
+        )
+        self.features = NodeFeatures(facts, self.velocity, self.radius, moving_walls=options.wall_velocity)
+        self.network = EncodeProcessDecode(
+            self.operator,
+            node_features=self.features.count,
+            edge_features=EDGE_FEATURES,
+            latent=options.latent,
+            layers=options.layers,
+        )
+        for parameter in self.network.decoder[-1].parameters():
+            nn.init.zeros_(parameter)
+
+    def _check(self) -> None:
+        if self.options.wall_velocity and not self.facts.moving_walls:
+            raise UsageError(
+                f"the walls of {self.facts.split} do not move",
+                where="model.wall_velocity",
+                expected=False,
+                got=True,
+                fix="leave the option out",
+            )
+
+    @classmethod
+    def with_operator(cls, operator: type[Operator]) -> type[GraphNetwork]:
+        """Return the graph network with an operator; the same class for the same operator."""
+        key = (cls, operator)
+        if key not in _CLASSES:
+            names = {"operator": operator, "method": operator.method, "__doc__": operator.__doc__}
+            _CLASSES[key] = type(f"{operator.__name__}Network", (cls,), names)
+        return _CLASSES[key]
+
+    @property
+    def history(self) -> int:
+        """Frames given: six, of which five velocities."""
+        return HISTORY
+
+    @property
+    def future(self) -> int:
+        """Frames to predict in training: as many as the loss has rollout steps."""
+        return self.options.rollout_loss_steps
+
+    @property
+    def weights(self) -> Mapping[str, float]:
+        """Weight of each term of the loss, the operator's own included."""
+        own = dict(self.operator.weights)
+        if self.options.link_weight is not None and "link" in own:
+            own["link"] = self.options.link_weight
+        return self.options.loss.model_dump() | own
+
+    def forward(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
+        """Return the six terms of Eq. 5.35 and the operator's own, raw, means over the steps.
+
+        Args:
+            batch: windows of ``history + future`` frames; left unchanged.
+            generator: source of noise, images and the operator's draws; without one there is no
+                noise and no image.
+        """
+        batch = batch if generator is None else self._disturbed(batch, generator)
+        state = self.start(batch.part(slice(HISTORY)))
+        steps = []
+        for frame in range(HISTORY, HISTORY + self.future):
+            following, own = self.step(state, generator)
+            target = batch.position[:, frame]
+            velocity = target - batch.position[:, frame - 1]
+            steps.append(self._loss(state, following, target, velocity) | dict(own))
+            state = following
+        return {name: torch.stack([terms[name] for terms in steps]).mean() for name in steps[0]}
+
+    def _disturbed(self, batch: Batch, generator: torch.Generator) -> Batch:
+        """Return the batch as its random image, with noise."""
+        if self.options.symmetry is not Symmetry.NONE:
+            matrix = draw(self.options.symmetry, batch.windows, generator)
+            batch = image(batch, matrix, self.facts.bounds)
+        if self.options.noise_std > 0.0:
+            position = noisy(batch.position, HISTORY, self.options.noise_std, generator)
+            batch = replace(batch, position=position)
+        return batch
+
+    def _loss(self, state: State, following: State, position: Tensor, velocity: Tensor) -> dict[str, Tensor]:
+        """Return the six terms of one step; both accelerations start from the state's velocity."""
+        last = state.velocity[:, -1]
+        predicted = following.velocity[:, -1]
+        return loss_terms(
+            Motion(following.position, predicted, predicted - last),
+            Motion(position, velocity, velocity - last),
+            state.sample,
+            grid=self.grid,
+            scales=Scales(self.position.std, self.velocity.std, self.acceleration.std),
+            norm=self.options.loss_norm,
+            weights=self.weights,
+        )
+
+    def start(self, given: Batch) -> State:
+        """Return the state after the given frames; where they are fewer than six, the first velocity repeats.
+
+        Raises:
+            UsageError: fewer than two frames.
+        """
+        if given.frames < 2:
+            raise UsageError(
+                "too few frames to start from", expected="2 or more, 6 for all", got=given.frames
+            )
+        position = given.position[:, -HISTORY:]
+        velocity = position.diff(dim=1)
+        missing = VELOCITIES - velocity.shape[1]
+        velocity = torch.cat([velocity[:, :1].expand(-1, missing, -1), velocity], dim=1)
+        walls = None
+        if self.options.wall_velocity and given.wall_velocity is not None:
+            walls = (given.wall_velocity[:, -1] * self.facts.frame_interval)[given.sample]
+        return State(
+            position=position[:, -1],
+            velocity=velocity,
+            material=given.material,
+            sample=given.sample,
+            wall_velocity=walls,
+        )
+
+    def advance(self, state: State) -> tuple[State, Tensor]:
+        """Advance by one frame: the next state and positions [length], shape [particle, 2]."""
+        following, _ = self.step(state)
+        if self.options.clamp:
+            following = self._clamped(state, following)
+        return following, following.position
+
+    def step(self, state: State, generator: torch.Generator | None = None) -> tuple[State, Losses]:
+        """Return the state one frame on and the operator's own losses.
+
+        Args:
+            state: where the particles are.
+            generator: source of the operator's draws.
+        """
+        output, own = self.predict(state, self.edges(state), generator)
+        last = state.velocity[:, -1]
+        if self.options.target is Target.VELOCITY:
+            velocity = self.velocity.inverse(output)
+            return state.moved(state.position + velocity, velocity), own
+        return state.moved(*integrate(state.position, last, self.acceleration.inverse(output))), own
+
+    def edges(self, state: State) -> Tensor:
+        """Search the neighbours: senders and receivers, int64, shape [2, edge]."""
+        return radius_graph(state.position.detach(), self.radius, state.sample)
+
+    def predict(
+        self, state: State, edge_index: Tensor, generator: torch.Generator | None = None
+    ) -> tuple[Tensor, Losses]:
+        """Return the standardised target [1], shape [particle, 2], and the operator's own losses."""
+        node = self.features(state.position, state.velocity, state.material, state.wall_velocity)
+        edge = edge_features(state.position, edge_index, self.radius)
+        output: tuple[Tensor, Losses] = self.network(node, edge_index, edge, generator)
+        return output
+
+    def _clamped(self, state: State, following: State) -> State:
+        """Return the next state with every particle in the box."""
+        low, high = following.position.new_tensor(self.facts.bounds).T
+        position = following.position.clamp(low, high)
+        return state.moved(position, position - state.position)
+
+
+_CLASSES: dict[tuple[type[GraphNetwork], type[Operator]], type[GraphNetwork]] = {}

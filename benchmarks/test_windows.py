@@ -1,0 +1,152 @@
+"""Training windows per second from files of cavity full's size, beside two conventional readers.
+
+    OMP_NUM_THREADS=1 pytest benchmarks/test_windows.py -s
+
+The readers do what geoelements/gns (NPZ, everything in memory) and LagrangeBench (HDF5, one group
+per trajectory, windows read when asked for) do for a window of 6 + 1 frames; all draw windows at
+random. Ours is timed over whole pools of its sampler, decompression included, in one process.
+Memory is that of a fresh process that has read from twice as many scenarios.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from pytest_benchmark.fixture import BenchmarkFixture
+from torch.utils.data import DataLoader
+from window_data import FRAMES, write_gns_npz, write_lagrangebench_h5, write_ours
+
+from lagbench.baselines.windows import WindowDataset, WindowSampler, collate
+from lagbench.registry import load
+
+TARGET = 1000.0
+"""Windows per second in one process."""
+
+SCENARIOS = 12
+"""Their frames fill more than one pool of the sampler."""
+
+FEW = 7
+"""So do these."""
+
+OTHERS = 3
+"""Scenarios for the other readers, whose speed does not depend on the number."""
+
+HISTORY = 6
+SEED = 0
+
+CHILD = """
+import json, sys
+from pathlib import Path
+from lagbench.baselines.windows import WindowDataset, WindowSampler
+from lagbench.registry import load
+root, windows = Path(sys.argv[1]), int(sys.argv[2])
+data = WindowDataset("cavity", root=root, history=6, registry=load(root / "datasets.yaml"))
+for drawn, index in enumerate(WindowSampler(data, seed=0)):
+    data[index]
+    if drawn == windows:
+        break
+peak = int(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0])
+print(json.dumps(1024 * peak))
+"""
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the train subset in our format."""
+    folder = tmp_path_factory.mktemp("windows")
+    write_ours(folder, SCENARIOS)
+    return folder
+
+
+def dataset(root: Path) -> WindowDataset:
+    """Open the train subset with an empty cache."""
+    return WindowDataset("cavity", root=root, history=HISTORY, registry=load(root / "datasets.yaml"))
+
+
+def rate(read: Callable[[int], object], indices: Iterator[int] | NDArray[np.int64], count: int) -> float:
+    """Return windows per second of processor time, which hardly changes on a busy machine."""
+    drawn = iter(indices)
+    start = time.process_time()
+    for _ in range(count):
+        read(int(next(drawn)))
+    return count / (time.process_time() - start)
+
+
+def test_windows_per_second(benchmark: BenchmarkFixture, root: Path) -> None:
+    """At least 1000 windows a second, each epoch in one random order, decompression included."""
+    data = dataset(root)
+    rates: list[float] = []
+
+    def epoch() -> None:
+        rates.append(rate(data.__getitem__, iter(WindowSampler(data, seed=SEED + len(rates))), len(data)))
+
+    benchmark.pedantic(epoch, rounds=2)  # type: ignore[no-untyped-call]
+    fresh = dataset(root)
+    loader = DataLoader(fresh, 2, sampler=WindowSampler(fresh, seed=SEED), collate_fn=collate)
+    start = time.process_time()
+    batches = sum(1 for _ in loader)
+    loaded = 2 * batches / (time.process_time() - start)
+    plain = rate(dataset(root).__getitem__, np.random.default_rng(SEED).integers(len(data), size=500), 500)
+    print(f"\nours, sampler's order: {min(rates):.0f} windows/s (target {TARGET:.0f})")
+    print(f"ours through DataLoader and collate, batch 2: {loaded:.0f}; any order, cold cache: {plain:.0f}")
+    assert min(rates) >= TARGET
+
+
+def test_memory_is_flat(root: Path, tmp_path: Path) -> None:
+    """Peak memory after an epoch of 12 scenarios is that of one of 7, within 5 %."""
+    few = tmp_path / "few"
+    few.mkdir()
+    write_ours(few, FEW)
+    peaks = [_peak(folder, windows) for folder, windows in ((few, 4100), (root, 7000))]
+    print(f"\npeak memory, {FEW} scenarios: {peaks[0] / 1e6:.0f} MB; {SCENARIOS}: {peaks[1] / 1e6:.0f} MB")
+    assert peaks[1] <= 1.05 * peaks[0]
+
+
+def _peak(root: Path, windows: int) -> float:
+    command = [sys.executable, "-c", CHILD, str(root), str(windows)]
+    return float(json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout))
+
+
+def test_npz_in_memory(tmp_path: Path) -> None:
+    """How geoelements/gns reads: whole trajectories in memory, a window is a view of them."""
+    write_gns_npz(tmp_path / "train.npz", OTHERS)
+    start = time.process_time()
+    with np.load(tmp_path / "train.npz") as held:
+        trajectories = [held[name] for name in held.files]
+    loading = time.process_time() - start
+    per = FRAMES - HISTORY
+
+    def read(index: int) -> tuple[NDArray[np.float32], ...]:
+        frames = trajectories[index // per]
+        stop = index % per + HISTORY
+        position = np.transpose(frames[stop - HISTORY : stop], (1, 0, 2))
+        # Their collate stacks the windows: that copy is where the bytes are touched.
+        return np.ascontiguousarray(position), np.full(len(position), 5), frames[stop].copy()
+
+    found = rate(read, np.random.default_rng(SEED).integers(OTHERS * per, size=1000), 1000)
+    size = sum(frames.nbytes for frames in trajectories)
+    print(f"\nNPZ in memory: {found:.0f} windows/s, after {loading:.1f} s to load {size / 1e6:.0f} MB")
+
+
+def test_hdf5_of_trajectories(tmp_path: Path) -> None:
+    """How LagrangeBench reads: seven frames of a group of an HDF5 file."""
+    write_lagrangebench_h5(tmp_path / "train.h5", OTHERS)
+    per = FRAMES - HISTORY - 1
+    with h5py.File(tmp_path / "train.h5") as file:
+
+        def read(index: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+            group, first = file[f"{index // per:05d}"], index % per
+            position = group["position"][first : first + HISTORY + 1].transpose((1, 0, 2))
+            return position, group["particle_type"][:]
+
+        found = rate(read, np.random.default_rng(SEED).integers(OTHERS * per, size=200), 200)
+    print(f"\nHDF5 of trajectories: {found:.0f} windows/s")

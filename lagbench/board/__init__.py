@@ -1,0 +1,1 @@
+"""The leaderboard: submissions as data, one static page, every number recomputable."""

@@ -1,0 +1,54 @@
+"""Predictions of the scorer's own floors, so that they stand on the board as entries."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from lagbench.errors import UsageError, nearest
+from lagbench.exam import load_exam
+from lagbench.floors import FLOORS
+from lagbench.layout import resolve_root
+from lagbench.registry import Registry, load
+from lagbench.submission import PredictionsWriter
+
+__all__ = ["write_floor"]
+
+
+def write_floor(
+    name: str,
+    path: Path,
+    *,
+    split: str,
+    size: str,
+    root: str | Path | None = None,
+    registry: Registry | None = None,
+) -> Path:
+    """Write the predictions of a floor.
+
+    Args:
+        name: name of the floor.
+        path: file to write.
+        split: name of the split.
+        size: name of the size.
+        root: folder of all data sets.
+        registry: where splits are described; ours when None.
+
+    Raises:
+        UsageError: unknown floor, split or size.
+        DataError: the test subset is missing or damaged.
+        WorkFailedError: the disk is full or not writable.
+    """
+    if name not in FLOORS:
+        raise UsageError(f"no floor {name!r}", where="--floor", fix=nearest(name, FLOORS))
+    described, folder = registry or load(), resolve_root(root)
+    exam = load_exam(described.size(split, size), folder)
+    writer = PredictionsWriter(
+        path, split=split, size=size, method=name, root=folder, registry=described, parameters=0
+    )
+    with writer:
+        for number in exam.scenarios:
+            with exam.opened(number) as truth:
+                writer.add(number, np.stack([held.position for held in FLOORS[name](truth.scenario)]))
+    return writer.path

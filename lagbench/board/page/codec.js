@@ -1,0 +1,38 @@
+// Packed arrays: two letters a number, twelve bits; see lagbench/board/packing.py.
+
+const BOARD = JSON.parse(document.getElementById("board").textContent);
+
+const LEVELS = 4094;
+const LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789-_";
+const PLACES = new Uint8Array(128);
+[...LETTERS].forEach((letter, place) => { PLACES[letter.charCodeAt(0)] = place; });
+
+/** Return the numbers of `[text, low, high, log]`, NaN where missing. */
+function unpack([text, low, high, log]) {
+  const values = new Float64Array(text.length / 2);
+  for (let i = 0; i < values.length; i += 1) {
+    const step = 64 * PLACES[text.charCodeAt(2 * i)] + PLACES[text.charCodeAt(2 * i + 1)];
+    const share = step / LEVELS;
+    if (step > LEVELS) values[i] = NaN;
+    else values[i] = log ? low * (high / low) ** share : low + (high - low) * share;
+  }
+  return values;
+}
+
+/** Return what a number in the payload refers to; arrays are unpacked once. */
+function pooled(index) {
+  const held = BOARD.pool[index];
+  return typeof held[0] === "string" ? (unpacked[index] ??= unpack(held)) : held;
+}
+
+const unpacked = [];
+
+function curveOf(packed) {
+  if (!packed) return null;
+  const { frames, mean, low, high } = packed;
+  return { frames: pooled(frames), mean: pooled(mean), low: pooled(low), high: pooled(high) };
+}
+
+function histogramOf([low, high, shares]) {
+  return { low, high, shares: pooled(shares) };
+}

@@ -1,0 +1,114 @@
+// A rollout as a film: the truth and the prediction side by side.
+
+const SECONDS = 9;
+const TRAIL = 7;
+const MATERIALS = ["#0072b2", "#d55e00", "#56b4e9", "#e69f00"];
+const quiet = matchMedia("(prefers-reduced-motion: reduce)");
+
+/** Return positions of all particles at a time between the stored frames (Catmull-Rom). */
+function positionsAt(film, count, frames, time) {
+  const last = frames - 1;
+  const at = Math.min(last, Math.max(0, time));
+  const i = Math.min(last - 1, Math.floor(at));
+  const t = last > 0 ? at - i : 0;
+  const weights = last > 0 ? [((2 - t) * t - 1) * t / 2, ((3 * t - 5) * t * t + 2) / 2, ((4 - 3 * t) * t + 1) * t / 2, (t - 1) * t * t / 2] : [0, 1, 0, 0];
+  const rows = [i - 1, i, i + 1, i + 2].map((k) => 2 * count * Math.min(last, Math.max(0, k)));
+  const found = new Float64Array(2 * count);
+  for (let k = 0; k < found.length; k += 1) {
+    for (let j = 0; j < 4; j += 1) found[k] += weights[j] * film[rows[j] + k];
+  }
+  return found;
+}
+
+/** Return a colour per particle: its material, or where it started, so that mixing shows. */
+function particleColours(materials, first) {
+  const one = materials.every((material) => material === materials[0]);
+  const style = getComputedStyle(document.documentElement);
+  if (!one) return materials.map((material) => MATERIALS[material] ?? MATERIALS[0]);
+  const shades = [0, 1, 4].map((k) => style.getPropertyValue(`--c${k}`).trim());
+  return materials.map((_, k) => shades[Math.min(2, Math.max(0, Math.floor(3 * first[2 * k])))]);
+}
+
+/** Plays one film on some canvases; `stop` ends it. */
+class Film {
+  constructor(tab, row) {
+    this.frames = pooled(row.pictures.filmFrames);
+    this.materials = pooled(row.pictures.material);
+    this.sides = [["truth", pooled(tab.truth.film)], [short(row.name), pooled(row.pictures.film)]];
+    this.time = 0;
+    this.playing = false;
+    this.canvases = this.sides.map(([name]) => el("canvas", { width: 560, height: 560, class: "film", role: "img", "aria-label": `Particles of ${name}` }));
+    this.play = button("Play", () => this.toggle(), { class: "plain play" });
+    this.slider = el("input", { type: "range", min: 0, max: this.frames.length - 1, step: "any", value: 0, "aria-label": "Frame of the film" });
+    this.slider.addEventListener("input", () => this.show(Number(this.slider.value)));
+    this.told = el("output", { class: "muted n" });
+    this.repaint = () => this.show(this.time);
+    document.addEventListener("schemechange", this.repaint);
+    this.show(0);
+  }
+
+  element() {
+    const sides = this.sides.map(([name], i) => el("div", {}, el("p", { class: "panels-title" }, name), el("div", { class: "panel" }, this.canvases[i])));
+    return [el("div", { class: "films" }, sides), el("div", { class: "film-tools" }, this.play, this.slider, this.told)];
+  }
+
+  toggle(wanted = !this.playing) {
+    this.playing = wanted;
+    this.play.textContent = wanted ? "Pause" : "Play";
+    if (!wanted) return;
+    if (this.time >= this.frames.length - 1) this.time = 0;
+    let before = null;
+    const step = (now) => {
+      if (!this.playing) return;
+      const passed = before === null ? 0 : (now - before) / 1000;
+      before = now;
+      this.show(this.time + (passed * (this.frames.length - 1)) / SECONDS);
+      if (this.time >= this.frames.length - 1) this.toggle(false);
+      else requestAnimationFrame(step);
+    };
+    requestAnimationFrame(step);
+  }
+
+  show(time) {
+    this.time = Math.min(time, this.frames.length - 1);
+    this.slider.value = this.time;
+    this.told.textContent = `frame ${this.frames[Math.round(this.time)]}`;
+    const count = this.materials.length;
+    const colours = particleColours(this.materials, positionsAt(this.sides[0][1], count, this.frames.length, 0));
+    this.sides.forEach(([, film], i) => this.paint(this.canvases[i], film, count, colours));
+  }
+
+  paint(canvas, film, count, colours) {
+    const context = canvas.getContext("2d");
+    const { width } = canvas;
+    context.clearRect(0, 0, width, width);
+    const path = [];
+    for (let k = TRAIL; k >= 0; k -= 1) {
+      if (this.time - 0.35 * k >= 0) path.push(positionsAt(film, count, this.frames.length, this.time - 0.35 * k));
+    }
+    const place = (spots, k) => [width * spots[2 * k], width * (1 - spots[2 * k + 1])];
+    for (let k = 0; k < count; k += 1) {
+      context.strokeStyle = context.fillStyle = colours[k];
+      context.globalAlpha = 0.3;
+      context.lineWidth = 2.5;
+      context.beginPath();
+      path.forEach((spots, j) => (j ? context.lineTo(...place(spots, k)) : context.moveTo(...place(spots, k))));
+      context.stroke();
+      context.globalAlpha = 0.9;
+      context.beginPath();
+      context.arc(...place(path.at(-1), k), 5, 0, 2 * Math.PI);
+      context.fill();
+    }
+  }
+
+  stop() {
+    this.toggle(false);
+    document.removeEventListener("schemechange", this.repaint);
+  }
+}
+
+function drawFilm(tab, row) {
+  const film = new Film(tab, row);
+  const caption = `${film.materials.length} of the particles of scenario ${row.pictures.scenario}, ${film.frames.length} frames and what lies between them.`;
+  return [figure("Rollout", film.element(), caption, { width: "wide", name: "film" }), film];
+}

@@ -1,0 +1,218 @@
+"""Adopt a user's own trajectories: arrays or netCDF in, a hashed local split out."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Unpack
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagbench.checksums import HASHED_SUBSETS
+from lagbench.errors import DataError, UnreadableFileError, UsageError
+from lagbench.progress import Progress
+from lagbench.variables import MATERIALS
+
+from .description import Description, Wishes
+from .local_split import LocalSplit, make_local_split, output_name
+from .trajectory import Frame, Trajectory, check_array, frames_of
+
+__all__ = ["ENDINGS", "adopt"]
+
+ENDINGS = (".npy", ".npz", ".nc")
+"""Files that are read: an array, named arrays, netCDF."""
+
+POSITION, VELOCITY, MATERIAL, WALLS = "position", "velocity", "material", "wall_velocity"
+
+Read = Callable[[str], NDArray[Any]]
+
+
+def adopt(
+    sources: str | Path | Sequence[str | Path],
+    *,
+    output: str | Path,
+    valid: int | None = None,
+    test: int | None = None,
+    progress: Callable[[Progress], None] | None = None,
+    **wishes: Unpack[Wishes],
+) -> LocalSplit:
+    """Make a local split of trajectories in .npy, .npz or netCDF files.
+
+    A .npy file holds positions [frame, particle, 2], or several trajectories [trajectory, frame,
+    particle, 2]; .npz and netCDF files hold ``position`` and, if they like, ``velocity`` of the
+    same shape, ``material`` [particle] (0 liquid, 1 jelly, 2 snow, 3 rope; liquid when absent)
+    and ``wall_velocity`` [4, 2] or [frame, 4, 2] (left, right, bottom, top). Nothing is unpickled.
+
+    Args:
+        sources: a folder with subfolders ``train``, ``valid`` and ``test``; or files, or a
+            folder of files, which are sorted by name and of which the last are taken for
+            test, those before for valid.
+        output: folder to make; its last part is the name of the split.
+        valid: trajectories for valid; a tenth, at least one, when None.
+        test: trajectories for test; a tenth, at least one, when None.
+        progress: called as the work advances.
+        **wishes: ``radius`` and ``frame_interval``, which must be given, and what else is known,
+            see :class:`lagbench.exchange.description.Description`.
+
+    Raises:
+        UsageError: no radius or frame interval, too few trajectories, a folder that is there, a
+            task that does not fit the data.
+        UnreadableFileError: a file is damaged, pickled, or holds no positions.
+        DataError: positions are not plane, not finite, or outside the unit box.
+        WorkFailedError: the disk is full or not writable.
+    """
+    for name in ("radius", "frame_interval"):
+        if wishes.get(name) is None:
+            raise UsageError(f"the {name.replace('_', ' ')} is not known", fix=f"--{name.replace('_', '-')}")
+    given = [Path(sources)] if isinstance(sources, str | Path) else [Path(source) for source in sources]
+    files = _by_subset(given, valid=valid, test=test)
+    count = sum(map(len, files.values()))
+    about = Description(name=output_name(output), source=f"{count} trajectories of the user's own", **wishes)
+    subsets = {subset: (_open(path, row) for path, row in rows) for subset, rows in files.items()}
+    return make_local_split(about, subsets, output, command="adopt", progress=progress)
+
+
+Row = tuple[Path, int | None]
+"""A file and, where it holds several, the number of the trajectory in it."""
+
+
+def _by_subset(given: Sequence[Path], *, valid: int | None, test: int | None) -> Mapping[str, list[Row]]:
+    """Return the trajectories of each subset."""
+    if len(given) == 1 and (given[0] / HASHED_SUBSETS[0]).is_dir():
+        if valid is not None or test is not None:
+            raise UsageError("the folders say what is valid and test", where="--valid and --test")
+        return {subset: _rows(given[0] / subset) for subset in HASHED_SUBSETS}
+    rows = [row for path in given for row in _rows(path)]
+    tenth = max(1, len(rows) // 10)
+    for_valid, for_test = (tenth if n is None else n for n in (valid, test))
+    for_train = len(rows) - for_valid - for_test
+    if min(for_train, for_valid, for_test) < 1:
+        raise UsageError(
+            "each subset needs a trajectory",
+            where="--valid and --test",
+            expected="at least one each, and one left for train",
+            got=f"{len(rows)} trajectories, {for_valid} for valid, {for_test} for test",
+        )
+    return {
+        "train": rows[:for_train],
+        "valid": rows[for_train : for_train + for_valid],
+        "test": rows[for_train + for_valid :],
+    }
+
+
+def _rows(path: Path) -> list[Row]:
+    """Return the trajectories of a file, or of the files of a folder by name."""
+    if path.is_dir():
+        found = sorted(file for file in path.iterdir() if file.suffix in ENDINGS and file.is_file())
+        return [row for file in found for row in _rows(file)]
+    if path.suffix not in ENDINGS or not path.is_file():
+        raise UnreadableFileError(
+            "this is no file of trajectories", where=str(path), expected=f"a folder, or {', '.join(ENDINGS)}"
+        )
+    if path.suffix != ".npy":
+        return [(path, None)]
+    shape = _array(path).shape
+    return [(path, row) for row in range(shape[0])] if len(shape) == 4 else [(path, None)]
+
+
+def _open(path: Path, row: int | None) -> Trajectory:
+    """Return a trajectory whose arrays are read frame by frame where the file allows it."""
+    if path.suffix == ".npy":
+        array = _array(path)
+        name = str(path) if row is None else f"{path}, trajectory {row}"
+        held = {POSITION: array if row is None else array[row]}
+        return _trajectory(name, held, lambda: frames_of(held[POSITION]))
+    if path.suffix == ".npz":
+        arrays = _arrays(path)
+        return _trajectory(str(path), arrays, lambda: frames_of(arrays[POSITION], arrays.get(VELOCITY)))
+    return _netcdf(path)
+
+
+def _trajectory(name: str, arrays: Mapping[str, Any], read: Callable[[], Iterator[Frame]]) -> Trajectory:
+    """Return the trajectory of named arrays after a look at their shapes."""
+    if POSITION not in arrays:
+        raise UnreadableFileError(
+            "there are no positions", where=name, expected=f"an array {POSITION!r}", got=", ".join(arrays)
+        )
+    shape = tuple(arrays[POSITION].shape)
+    check_array(name, shape, arrays[POSITION].dtype)
+    frames, particles = shape[:2]
+    if VELOCITY in arrays and tuple(arrays[VELOCITY].shape) != shape:
+        raise DataError(
+            "velocities have another shape", where=name, expected=shape, got=tuple(arrays[VELOCITY].shape)
+        )
+    material = np.asarray(arrays[MATERIAL][...]) if MATERIAL in arrays else np.zeros(particles, np.int8)
+    known = material.dtype.kind in "iu" and material.shape == (particles,)
+    if not known or not np.isin(material, range(len(MATERIALS))).all():
+        raise DataError(
+            "these are no materials",
+            where=f"{name}, {MATERIAL}",
+            expected=f"{particles} integers: " + ", ".join(f"{i} {m}" for i, m in enumerate(MATERIALS)),
+            got=f"{material.dtype} of shape {material.shape}",
+        )
+    walls = np.asarray(arrays[WALLS][...], np.float64) if WALLS in arrays else None
+    if walls is not None and walls.shape not in ((4, 2), (frames, 4, 2)):
+        raise DataError(
+            "these are no walls",
+            where=f"{name}, {WALLS}",
+            expected="shape (4, 2) or (frame, 4, 2)",
+            got=walls.shape,
+        )
+    return Trajectory(
+        name=name, frames=frames, material=material.astype(np.int8), read=read, wall_velocity=walls
+    )
+
+
+def _array(path: Path) -> NDArray[Any]:
+    """Return the mapped array of a .npy file."""
+    try:
+        array: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise _unreadable(path, error) from error
+    return array
+
+
+def _arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a .npz file that a trajectory may have."""
+    try:
+        with np.load(path, allow_pickle=False) as held:
+            return {name: held[name] for name in (POSITION, VELOCITY, MATERIAL, WALLS) if name in held}
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise _unreadable(path, error) from error
+
+
+def _netcdf(path: Path) -> Trajectory:
+    import netCDF4
+
+    try:
+        file = netCDF4.Dataset(path, "r")
+    except OSError as error:
+        raise _unreadable(path, error) from error
+    file.set_auto_maskandscale(False)
+    held = {
+        name: file.variables[name] for name in (POSITION, VELOCITY, MATERIAL, WALLS) if name in file.variables
+    }
+
+    def read() -> Iterator[Frame]:
+        for number in range(held[POSITION].shape[0]):
+            try:
+                frame = np.asarray(held[POSITION][number])
+                velocity = np.asarray(held[VELOCITY][number]) if VELOCITY in held else None
+            except (OSError, RuntimeError) as error:
+                raise _unreadable(path, error) from error
+            yield frame, velocity
+
+    return _trajectory(str(path), held, read)
+
+
+def _unreadable(path: Path, error: Exception) -> UnreadableFileError:
+    pickled = any(words in str(error) for words in ("allow_pickle", "Python objects"))
+    return UnreadableFileError(
+        "the file holds pickled objects" if pickled else "cannot read the file",
+        where=str(path),
+        expected="arrays of numbers",
+        got=None if pickled else f"{type(error).__name__}: {error}",
+        fix="lagbench import --format gns-npz reads trajectories of GNS code bases" if pickled else None,
+    )

@@ -1,0 +1,300 @@
+"""What a user says of data from elsewhere, and what follows from it where nothing is said."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TypedDict
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagbench.errors import UsageError
+from lagbench.locating import is_name
+from lagbench.registry import NO_GENERATOR
+from lagbench.scenario_ids import spell_ids
+
+__all__ = ["Box", "Description", "Measure", "Wishes", "estimate_spacing", "rate_of", "split_yaml"]
+
+Box = tuple[tuple[float, float], tuple[float, float]]
+
+SIZE = "full"
+"""Size of every local split."""
+
+VERSION = "1.0.0"
+WIDE = 3.0
+"""Radii within which neighbours are counted to estimate the spacing."""
+
+PER_CELL = 2.5
+"""Spacings of particles across a cell of the score grid where the user gives none; the splits of
+lagbench have 1.8 to 2.6."""
+
+_UNITS: Mapping[str, tuple[str, str]] = {
+    "particles": ("1", "particles in one test scenario; the most of any where they differ"),
+    "grid": ("1", "cells across the unit box; predictions may leave the bounds by one"),
+    "substeps_per_frame": ("1", "solver steps between recorded frames, 1 where they are unknown"),
+    "frame_rate": ("1/s", "recorded frames per second"),
+    "density": ("mass/length^2", "rest density"),
+    "spacing": ("length", "distance of neighbouring particles at first"),
+    "source_scale": ("length of the source", "what a unit of length is in the source"),
+    "source_x": ("length of the source", "x in the source of the lower left corner"),
+    "source_y": ("length of the source", "y in the source of the lower left corner"),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measure:
+    """How lengths of the source become lengths of the unit box: ``(x - corner) / scale``.
+
+    A scale that is a power of two, with the corner 0, loses no bit.
+    """
+
+    scale: float = 1.0
+    corner: tuple[float, float] = (0.0, 0.0)
+
+    @classmethod
+    def fitting(cls, bounds: Box) -> Measure:
+        """Return the measure by which a box fits into the unit box.
+
+        The scale is the least power of two that holds it; the corner stays 0 where that is enough.
+        """
+        low, high = np.array(bounds, dtype=np.float64).T
+        corner = np.where((low >= 0.0) & (high <= _power(float(high.max()))), 0.0, low)
+        corner = corner if not corner.any() else low
+        scale = _power(float((high - corner).max()))
+        return cls(scale=scale, corner=(float(corner[0]), float(corner[1])))
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether nothing changes."""
+        return self.scale == 1.0 and not any(self.corner)
+
+    def place(self, position: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Return positions in the unit box, float32."""
+        if self.is_plain:
+            return position.astype(np.float32, copy=False)
+        moved = (position.astype(np.float64) - self.corner) / self.scale
+        return moved.astype(np.float32)
+
+    def box(self, bounds: Box) -> Box:
+        """Return a box of the source in the unit box."""
+        (left, right), (bottom, top) = (
+            tuple((value - corner) / self.scale for value in pair)
+            for pair, corner in zip(bounds, self.corner, strict=True)
+        )
+        return (left, right), (bottom, top)
+
+
+def _power(length: float) -> float:
+    """Return the least power of two that is not below a length, at least 1."""
+    return 2.0 ** max(0, math.ceil(math.log2(length))) if length > 1.0 else 1.0
+
+
+class Wishes(TypedDict, total=False):
+    """What a user may say of data from elsewhere; see :class:`Description`."""
+
+    title: str
+    text: str
+    citation: str
+    licence: str
+    radius: float
+    frame_interval: float
+    bounds: Box
+    rescale: bool
+    density: float
+    spacing: float
+    input_frames: int
+    horizon: int
+    frames_of_interest: Sequence[int]
+    cells: int
+    full_box: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class Description:
+    """What is known of data from elsewhere; lengths are those of the source.
+
+    Attributes:
+        name: name of the split.
+        title: title of the split; its name when empty.
+        text: what the data are.
+        citation: whom to cite.
+        licence: licence of the data.
+        source: where they come from.
+        radius: connectivity radius.
+        frame_interval: time between frames [s].
+        bounds: box that holds the particles; None where the positions say.
+        rescale: whether to fit the bounds into the unit box.
+        density: rest density [mass/length^2].
+        spacing: distance of neighbouring particles at first; None to estimate it.
+        input_frames: frames given to a model.
+        horizon: frames to predict; None for all that every test scenario has.
+        frames_of_interest: absolute frames at which the scorer reports; None for the last one.
+        cells: cells across of the score grid; None for one that suits the spacing.
+        full_box: whether material fills the box, so that vorticity ranks; else positions rank.
+    """
+
+    name: str
+    title: str = ""
+    text: str = ""
+    citation: str = "none"
+    licence: str = "unknown"
+    source: str
+    radius: float
+    frame_interval: float
+    bounds: Box | None = None
+    rescale: bool = False
+    density: float = 1.0
+    spacing: float | None = None
+    input_frames: int = 6
+    horizon: int | None = None
+    frames_of_interest: Sequence[int] | None = None
+    cells: int | None = None
+    full_box: bool = False
+    measure: Measure = field(init=False, default=Measure())
+
+    def __post_init__(self) -> None:
+        """Check what the user gave.
+
+        Raises:
+            UsageError: a name that cannot be one, a number out of range, a scale without bounds.
+        """
+        if not is_name(self.name):
+            proposal = re.sub(r"[^a-z0-9_-]+", "-", self.name.lower()).strip("-_0123456789") or "own"
+            raise UsageError(
+                "a split cannot have that name",
+                where="--output, its last part",
+                expected="small letters, digits, - and _, a letter first",
+                got=self.name,
+                fix=f"--output {proposal}",
+            )
+        positive = {
+            "--radius": self.radius,
+            "--frame-interval": self.frame_interval,
+            "--density": self.density,
+        }
+        positive |= {"--spacing": 1.0 if self.spacing is None else self.spacing}
+        for option, value in positive.items():
+            if not (math.isfinite(value) and value > 0.0):
+                raise UsageError("not a number above 0", where=option, got=value)
+        if self.bounds is not None and any(not low < high for low, high in self.bounds):
+            raise UsageError("bounds run from low to high", where="--bounds", got=self.bounds)
+        if self.rescale:
+            if self.bounds is None:
+                raise UsageError("what is to fit the unit box?", where="--rescale", fix="add --bounds")
+            object.__setattr__(self, "measure", Measure.fitting(self.bounds))
+
+
+def estimate_spacing(position: NDArray[np.floating], radius: float) -> float:
+    """Return the distance of neighbouring particles ``sqrt(area / particles)``.
+
+    The density deep inside the material is that within three radii of a particle, where the
+    upper quartile over particles leaves surfaces out.
+
+    Args:
+        position: one frame, shape [particle, 2].
+        radius: connectivity radius, same unit.
+    """
+    from scipy.spatial import cKDTree
+
+    points = position.astype(np.float64)
+    reach = WIDE * radius
+    counts = cKDTree(points).query_ball_point(points, reach, return_length=True)
+    return math.sqrt(math.pi * reach**2 / float(np.quantile(counts, 0.75)))
+
+
+def split_yaml(
+    about: Description,
+    *,
+    subsets: Mapping[str, Sequence[int]],
+    frames: Mapping[int, int],
+    particles: int,
+    spacing: float,
+    bounds: Box,
+    measured: Mapping[str, object],
+) -> dict[str, object]:
+    """Return the content of split.yaml as plain values.
+
+    Args:
+        about: what is known of the data.
+        subsets: scenario ids of each subset.
+        frames: frames of each scenario.
+        particles: particles in one scenario.
+        spacing: distance of neighbouring particles at first [length of the unit box].
+        bounds: box that holds the particles [length of the unit box].
+        measured: hashes and statistics.
+
+    Raises:
+        UsageError: test scenarios are too short for the task.
+    """
+    shortest = min(frames[i] for i in subsets["test"])
+    horizon = about.horizon or shortest - about.input_frames
+    last = about.input_frames + horizon - 1
+    if horizon < 1 or last >= shortest:
+        raise UsageError(
+            "a test scenario is too short for the task",
+            where="--input-frames and --horizon",
+            expected=f"together at most {shortest}",
+            got=f"{about.input_frames} and {horizon}",
+        )
+    cells = about.cells or min(4096, max(4, round(1.0 / (PER_CELL * spacing))))
+    interest = (last,) if about.frames_of_interest is None else tuple(about.frames_of_interest)
+    task = {
+        "input_frames": about.input_frames,
+        "horizon": horizon,
+        "frames_of_interest": list(interest),
+        "score_grid": {"cells": cells, "placement": "cell_centres" if about.full_box else "nodes"},
+        "radius": about.radius / about.measure.scale,
+    }
+    values: dict[str, object] = {
+        "particles": particles,
+        "grid": cells,
+        "substeps_per_frame": 1,
+        "frame_rate": rate_of(about.frame_interval),
+        "density": about.density,
+        "spacing": spacing,
+        "source_scale": about.measure.scale,
+        "source_x": about.measure.corner[0],
+        "source_y": about.measure.corner[1],
+    }
+    size = {
+        "subsets": {name: spell_ids(ids) for name, ids in subsets.items()},
+        "frames": _frame_groups(frames),
+        "bounds": [list(pair) for pair in bounds],
+        "parameters": {},
+        "task": task,
+    }
+    split = {
+        "version": VERSION,
+        "title": about.title or about.name,
+        "description": about.text or about.source,
+        "citation": about.citation,
+        "licence": about.licence,
+        "generator": NO_GENERATOR,
+        "source": about.source,
+        "parameters": {
+            name: {"value": value, "unit": _UNITS[name][0], "description": _UNITS[name][1]}
+            for name, value in values.items()
+        },
+        "sizes": {SIZE: size},
+    }
+    return {"format": 1, "splits": {about.name: split}, "measured": {about.name: {SIZE: dict(measured)}}}
+
+
+def rate_of(frame_interval: float) -> float:
+    """Return frames per second to 12 digits: 1 / (0.1 / 12 * 12) is 10.
+
+    >>> rate_of(0.1 / 12 * 12)
+    10.0
+    """
+    return float(f"{1.0 / frame_interval:.12g}")
+
+
+def _frame_groups(frames: Mapping[int, int]) -> int | dict[int, str]:
+    """Return one count of frames, or the ids of each."""
+    counts = sorted(set(frames.values()))
+    if len(counts) == 1:
+        return counts[0]
+    return {count: spell_ids(i for i, c in sorted(frames.items()) if c == count) for count in counts}

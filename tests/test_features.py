@@ -1,0 +1,225 @@
+"""Features, noise and symmetries of graph networks against closed forms and brute force."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from graph_cases import RADIUS, batch, facts, jittered, swirl
+
+from lagbench.baselines.features import NodeFeatures, Scale, edge_features, wall_distance
+from lagbench.baselines.noise import noisy, random_walk
+from lagbench.baselines.radius_graph import radius_graph
+from lagbench.baselines.symmetry import Symmetry, draw, image
+from lagbench.errors import UsageError
+
+BOUNDS = facts().bounds
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    """Return a seeded source of randomness."""
+    return torch.Generator().manual_seed(seed)
+
+
+def node_features(**options: bool) -> NodeFeatures:
+    """Return the features of the test's box, the velocity scale without noise."""
+    statistics = facts().statistics
+    torch.manual_seed(0)
+    return NodeFeatures(
+        facts(), Scale(statistics["velocity_mean"], statistics["velocity_std"]), RADIUS, **options
+    )
+
+
+def test_noise_widens_the_deviation_of_the_data() -> None:
+    """Data of deviation 3 and 0 with noise of deviation 4 have deviation 5 and 4."""
+    scale = Scale((1.0, 2.0), (3.0, 0.0), noise=4.0)
+    value = torch.tensor([[6.0, 6.0], [-4.0, 2.0]])
+    assert torch.equal(scale(value), torch.tensor([[1.0, 1.0], [-1.0, 0.0]]))
+    assert torch.equal(scale.inverse(scale(value)), value)
+
+
+def test_walls_are_seen_within_the_radius_only() -> None:
+    """In the box [1/16, 15/16] with radius 1/16: left, right, bottom, top by hand."""
+    position = torch.tensor([[0.5, 0.5], [0.09375, 0.875], [0.0, 0.921875]])
+    expected = [
+        [1.0, 1.0, 1.0, 1.0],
+        [0.5, 1.0, 1.0, 1.0],  # (0.09375 - 0.0625) / 0.0625; the top is one radius away
+        [-1.0, 1.0, 1.0, 0.25],  # one radius outside; (0.9375 - 0.921875) / 0.0625
+    ]
+    assert torch.equal(wall_distance(position, BOUNDS, RADIUS), torch.tensor(expected))
+
+
+def test_edges_show_what_a_loop_over_pairs_shows() -> None:
+    """Displacement and distance over the radius equal a double loop in float64."""
+    position = jittered(3)
+    points = torch.from_numpy(position)
+    edges = radius_graph(points, RADIUS)
+    shown = edge_features(points, edges, RADIUS).numpy()
+    expected = [
+        (*(position[s] - position[r]) / RADIUS, np.hypot(*(position[s] - position[r])) / RADIUS)
+        for s, r in edges.T.tolist()
+    ]
+    assert len(expected) > 500
+    np.testing.assert_allclose(shown, expected, atol=1e-14)
+    assert shown[:, 2].max() <= 1.0
+
+
+def test_coinciding_particles_have_a_finite_gradient() -> None:
+    """The distance of two particles in one place is 0, and so is its gradient."""
+    position = torch.tensor([[0.5, 0.5], [0.5, 0.5], [0.5, 0.53125]], requires_grad=True)
+    edges = torch.tensor([[0, 2], [1, 1]])
+    shown = edge_features(position, edges, RADIUS)
+    assert shown[:, 2].tolist() == [0.0, 0.5]
+    shown[:, 2].sum().backward()
+    assert position.grad is not None
+    # d distance / d y of the third is 1 / radius, of the second its opposite.
+    assert position.grad.tolist() == [[0.0, 0.0], [0.0, -16.0], [0.0, 16.0]]
+
+
+def test_a_particle_shows_thirty_numbers() -> None:
+    """Five velocities over their deviation, oldest first, four walls, the material's embedding."""
+    features = node_features()
+    velocity = torch.arange(10.0).reshape(1, 5, 2) * torch.tensor([0.004, 0.003])
+    shown = features(torch.tensor([[0.5, 0.5]]), velocity, torch.tensor([2]))
+    assert shown.shape == (1, 30)
+    assert features.count == 30
+    torch.testing.assert_close(shown[0, :10], torch.arange(10.0))
+    assert shown[0, 10:14].tolist() == [1.0] * 4
+    assert torch.equal(shown[0, 14:], features.embedding.weight[2])
+
+
+def test_moving_walls_are_felt_near_them() -> None:
+    """A wall's velocity over the deviation counts in full at the wall, by half half-way, 0 beyond."""
+    features = node_features(moving_walls=True)
+    assert features.count == 38
+    position = torch.tensor([[0.5, 0.9375], [0.5, 0.90625], [0.5, 0.8]])
+    walls = torch.zeros(3, 4, 2)
+    walls[:, 3] = torch.tensor([0.008, 0.003])
+    still = torch.zeros(3, 5, 2)
+    shown = features(position, still, torch.zeros(3, dtype=torch.int64), walls)[:, 30:].reshape(3, 4, 2)
+    torch.testing.assert_close(shown[:, 3], torch.tensor([[2.0, 1.0], [1.0, 0.5], [0.0, 0.0]]))
+    assert not shown[:, :3].any()
+    assert not features(position, still, torch.zeros(3, dtype=torch.int64))[:, 30:].any()
+
+
+def test_features_do_not_see_where_particles_are() -> None:
+    """Away from walls a common shift changes no bit of any feature."""
+    features = node_features(moving_walls=True)
+    position = torch.from_numpy(np.round(jittered(1, 8, 0.3, 0.6) * 1024) / 1024).float()
+    velocity = torch.randn(len(position), 5, 2, generator=generator()) * 0.01
+    material = torch.arange(len(position)) % 4
+    walls = torch.randn(len(position), 4, 2, generator=generator())
+    shifted = position + torch.tensor([0.125, -0.0625])
+    edges = radius_graph(position, RADIUS)
+    assert torch.equal(radius_graph(shifted, RADIUS), edges)
+    assert torch.equal(
+        features(position, velocity, material, walls), features(shifted, velocity, material, walls)
+    )
+    assert torch.equal(edge_features(position, edges, RADIUS), edge_features(shifted, edges, RADIUS))
+
+
+@pytest.fixture(scope="module")
+def walks() -> torch.Tensor:
+    """Noise of deviation 0.3 on six frames of 40,000 particles."""
+    return random_walk(40_000, 6, 0.3, generator())
+
+
+def test_noise_has_the_stated_deviation_at_the_last_velocity(walks: torch.Tensor) -> None:
+    """Velocity noise is a walk: covariance of steps j and k is std^2 min(j, k) / 5 (80,000 draws)."""
+    velocity = walks.diff(dim=1)
+    covariance = torch.einsum("pjc,pkc->jk", velocity, velocity) / velocity[:, 0].numel()
+    step = torch.arange(1.0, 6.0)
+    expected = 0.09 * torch.minimum(step[:, None], step) / 5.0
+    # The error of a variance from n draws is sqrt(2 / n) of it: 0.5 %; five of those.
+    torch.testing.assert_close(covariance, expected, rtol=0.0, atol=0.025 * 0.09)
+    assert abs(float(velocity[:, -1].std()) - 0.3) < 0.003
+    assert not walks[:, 0].any()
+
+
+def test_components_and_particles_are_disturbed_on_their_own(walks: torch.Tensor) -> None:
+    """Noise of x and y, and of neighbours in the row, is uncorrelated."""
+    last = walks.diff(dim=1)[:, -1] / 0.3
+    for one, other in ((last[:, 0], last[:, 1]), (last[1:, 0], last[:-1, 0])):
+        assert abs(float((one * other).mean())) < 5 / np.sqrt(len(one))
+
+
+def test_the_target_makes_up_for_the_noise() -> None:
+    """The next velocity is the true one; the acceleration is the true one less the velocity noise."""
+    truth = batch(swirl(0, 8)).position.double()
+    disturbed = noisy(truth, 6, 1e-3, generator(1))
+    noise = disturbed - truth
+    assert float(noise[:, 5].abs().mean()) > 1e-4
+    torch.testing.assert_close(disturbed.diff(dim=1)[:, 5:], truth.diff(dim=1)[:, 5:], atol=1e-15, rtol=0)
+    acceleration = truth.diff(dim=1).diff(dim=1)[:, 4] - noise.diff(dim=1)[:, 4]
+    torch.testing.assert_close(disturbed.diff(dim=1).diff(dim=1)[:, 4], acceleration, atol=1e-15, rtol=0)
+
+
+def test_noise_is_seeded_and_leaves_the_data_alone() -> None:
+    """Equal seeds give equal noise, others other noise; the window keeps its bits."""
+    window = batch(swirl(0, 7)).position
+    kept = window.clone()
+    first, again, other = (noisy(window, 6, 1e-3, generator(seed)) for seed in (1, 1, 2))
+    assert torch.equal(window, kept)
+    assert torch.equal(first, again)
+    assert not torch.equal(first[:, 1:], other[:, 1:])
+
+
+@pytest.mark.parametrize(("symmetry", "images"), [("none", 1), ("mirror", 2), ("square", 8)])
+def test_every_image_is_drawn_evenly(symmetry: str, images: int) -> None:
+    """8000 draws hold each image of the group 8000 / images times, within five deviations."""
+    drawn = draw(Symmetry(symmetry), 8000, generator()).reshape(-1, 4)
+    different, counts = drawn.unique(dim=0, return_counts=True)
+    assert len(different) == images
+    assert different.abs().sum(dim=1).tolist() == [2.0] * images
+    assert [1.0, 0.0, 0.0, 1.0] in different.tolist()
+    assert abs(counts - 8000 / images).max() <= 5 * np.sqrt(8000 / images)
+    if symmetry == "mirror":
+        assert (different[:, 3] == 1.0).all()  # gravity stays down
+
+
+def test_walls_move_with_the_particles_on_them() -> None:
+    """In every image a particle that rides on a wall still rides on the wall that it is at."""
+    middle = np.array([[0.0625, 0.5], [0.9375, 0.5], [0.5, 0.0625], [0.5, 0.9375]])
+    rider = batch(np.stack([middle, middle]), walls=True)
+    assert rider.wall_velocity is not None
+    rider = batch(np.stack([middle, middle + rider.wall_velocity[0, 0].numpy()]), walls=True)
+    seen = set()
+    for matrix in draw(Symmetry.SQUARE, 200, generator()).unique(dim=0):
+        turned = image(rider, matrix[None], BOUNDS)
+        assert turned.wall_velocity is not None
+        place = (turned.position[:, None, 0] - torch.from_numpy(middle).float()).norm(dim=2).argmin(dim=1)
+        velocity = turned.position[:, 1] - turned.position[:, 0]
+        torch.testing.assert_close(turned.wall_velocity[0, 0][place], velocity, atol=1e-6, rtol=0)
+        seen.add(tuple(place.tolist()))
+    assert len(seen) == 8
+
+
+def test_images_are_per_window_and_leave_the_data_alone() -> None:
+    """The first window stays, the second is mirrored in x: x becomes 1 - x in this box."""
+    windows = batch(swirl(0, 3), swirl(1, 3), walls=True)
+    kept = windows.position.clone()
+    matrix = torch.stack([torch.eye(2), torch.diag(torch.tensor([-1.0, 1.0]))])
+    turned = image(windows, matrix, BOUNDS)
+    assert torch.equal(windows.position, kept)
+    torch.testing.assert_close(turned.position[:256], kept[:256])
+    torch.testing.assert_close(turned.position[256:, :, 0], 1.0 - kept[256:, :, 0])
+    torch.testing.assert_close(turned.position[256:, :, 1], kept[256:, :, 1])
+
+
+def test_images_are_exact_under_autocast() -> None:
+    """Mixed precision does not round positions or wall velocities to bfloat16."""
+    windows = batch(swirl(0, 3), swirl(1, 3), walls=True)
+    matrix = draw(Symmetry.SQUARE, 2, generator(3))
+    plain = image(windows, matrix, BOUNDS)
+    with torch.autocast("cpu", torch.bfloat16):
+        mixed = image(windows, matrix, BOUNDS)
+    assert torch.equal(mixed.position, plain.position)
+    assert mixed.wall_velocity is not None
+    assert plain.wall_velocity is not None
+    assert torch.equal(mixed.wall_velocity, plain.wall_velocity)
+
+
+def test_axes_change_places_only_in_a_square() -> None:
+    """In an oblong box a quarter turn is refused, with the option that works."""
+    with pytest.raises(UsageError, match="symmetry: mirror"):
+        image(batch(swirl(0, 3)), torch.eye(2).flip(0)[None], ((0.0, 1.0), (0.0, 0.5)))

@@ -1,0 +1,251 @@
+"""The graph network: what all operators share, and that it is what it says."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from operator_graphs import OPERATORS, graph
+from torch import Tensor, nn
+
+from lagbench.baselines import blocks
+from lagbench.baselines.blocks import EdgeMLP, mlp
+from lagbench.baselines.dense import LayerNorm, Linear, linear
+from lagbench.baselines.network import EncodeProcessDecode, ProcessorLayer
+from lagbench.baselines.operators.gns import GNS
+from lagbench.baselines.operators.operator import Losses, Operator
+
+EVERY = pytest.mark.parametrize("operator", OPERATORS)
+
+
+def network(operator: type[Operator], **options: Any) -> EncodeProcessDecode:
+    """Return a small network with weights of seed 0."""
+    torch.manual_seed(0)
+    sizes = {"node_features": 7, "edge_features": 3, "latent": 16, "layers": 3} | options
+    return EncodeProcessDecode(operator, **sizes)
+
+
+def plain(split: EdgeMLP, edge: Tensor, node: Tensor, edge_index: Tensor) -> Tensor:
+    """Return the MLP of the concatenation [edge, receiver, sender]."""
+    sender, receiver = edge_index
+    whole = torch.cat([edge, node[receiver], node[sender]], dim=1)
+    update: Tensor = split.rest(nn.functional.linear(whole, split.first.weight, split.first.bias))
+    return update
+
+
+def test_split_first_layer() -> None:
+    """Per-node products give the MLP of the concatenation to 6e-7 in float32."""
+    torch.manual_seed(0)
+    layer, inputs = EdgeMLP(128, 128), graph(200, 1600, node=128, edge=128)
+    split = layer(inputs.edge, inputs.node, inputs.edge_index)
+    expected = plain(layer.double(), inputs.edge.double(), inputs.node.double(), inputs.edge_index)
+    assert float((split - expected).abs().max() / expected.abs().max()) < 6e-7
+
+
+@pytest.mark.parametrize("mixed", [False, True])
+def test_recomputed_hidden_layers(monkeypatch: pytest.MonkeyPatch, mixed: bool) -> None:
+    """Hidden layers that are computed again give the values and gradients of those that are kept."""
+    torch.manual_seed(0)
+    layer, inputs = EdgeMLP(16, 12), graph(300, 20_000, node=16, edge=16)
+    results = []
+    for limit in (1e12, 0.0):
+        monkeypatch.setattr(blocks, "LARGEST_KEPT", limit)
+        node, edge = (part.clone().requires_grad_() for part in (inputs.node, inputs.edge))
+        with torch.autocast("cpu", torch.bfloat16, enabled=mixed):
+            update = layer(edge, node, inputs.edge_index)
+        wanted = [node, edge, *layer.parameters()]
+        results.append([update, *torch.autograd.grad(update.square().sum(), wanted)])
+    for kept, again in zip(*results, strict=True):
+        assert float((kept - again).abs().max() / kept.abs().max()) < (2e-2 if mixed else 1e-5)
+
+
+@pytest.mark.parametrize("limit", [1e12, 0.0])
+def test_gradients_of_the_edge_update(monkeypatch: pytest.MonkeyPatch, limit: float) -> None:
+    """Gradients are finite differences' in float64, hidden layers kept or not."""
+    monkeypatch.setattr(blocks, "LARGEST_KEPT", limit)
+    torch.manual_seed(0)
+    layer, inputs = EdgeMLP(4, 3).double(), graph(5, 9, node=4, edge=4)
+    node, edge = inputs.node.double().requires_grad_(), inputs.edge.double().requires_grad_()
+    torch.autograd.gradcheck(
+        lambda e, n, *_: layer(e, n, inputs.edge_index), (edge, node, *layer.parameters())
+    )
+
+
+@pytest.mark.parametrize("rows", [0, 1, 257])
+def test_linear(rows: int) -> None:
+    """The product by oneDNN and its gradients are NumPy's, for views of wider matrices too."""
+    torch.manual_seed(0)
+    wide, weight, bias = torch.randn(rows, 40), torch.randn(24, 90), torch.randn(24)
+    x, part = wide[:, :30].detach(), weight[:, 30:60].detach()
+    for tensor in (x, part, bias):
+        tensor.requires_grad_()
+    y, sign = linear(x, part, bias), torch.randn(rows, 24)
+    (y * sign).sum().backward()
+    a, w, s = (tensor.detach().double().numpy() for tensor in (x, part, sign))
+    np.testing.assert_allclose(y.detach(), a @ w.T + bias.detach().numpy(), rtol=1e-4, atol=1e-4)
+    for tensor, expected in ((x, s @ w), (part, s.T @ a), (bias, s.sum(axis=0))):
+        assert tensor.grad is not None
+        np.testing.assert_allclose(tensor.grad, expected, rtol=1e-4, atol=1e-4)
+
+
+def test_linear_elsewhere() -> None:
+    """What oneDNN does not take (float64, bfloat16, other shapes) goes to torch: the same numbers."""
+    layer, x = Linear(5, 4), torch.randn(2, 3, 5)
+    expected = nn.functional.linear(x, layer.weight, layer.bias)
+    assert torch.equal(layer(x), expected)
+    assert layer.double()(x.double()).dtype == torch.float64
+    with torch.autocast("cpu", torch.bfloat16):
+        assert layer.float()(x[0]).dtype == torch.bfloat16
+
+
+def test_layer_norm_learns_in_bfloat16() -> None:
+    """In bfloat16 all gradients are those of float64 to two digits: sums over 5,000 rows do not stall."""
+    torch.manual_seed(0)
+    x, slope = torch.randn(5000, 16) * 3 + 1, torch.randn(5000, 16) * 0.1 + 1
+    rounded = x.bfloat16().requires_grad_()
+    with torch.autocast("cpu", torch.bfloat16):
+        layer = LayerNorm(16)
+        layer(rounded).backward(slope.bfloat16())
+    precise, exact = nn.LayerNorm(16).double(), x.double().requires_grad_()
+    precise(exact).backward(slope.double())
+    pairs = [(rounded, exact), *zip(layer.parameters(), precise.parameters(), strict=True)]
+    for ours, theirs in pairs:
+        assert ours.grad is not None
+        assert theirs.grad is not None
+        assert float((ours.grad - theirs.grad).norm() / theirs.grad.norm()) < 0.03
+
+
+def test_mlp() -> None:
+    """An encoder has two hidden layers and a LayerNorm, a decoder no LayerNorm."""
+    encoder, decoder = mlp([30, 128, 128, 128]), mlp([128, 128, 128, 2], norm=False)
+    assert [type(layer).__name__ for layer in encoder] == ["Linear", "ReLU"] * 2 + ["Linear", "LayerNorm"]
+    assert [type(layer).__name__ for layer in decoder] == ["Linear", "ReLU"] * 2 + ["Linear"]
+
+
+def test_layer_by_hand() -> None:
+    """A layer is the interaction network of its docstring, written out node by node."""
+    torch.manual_seed(0)
+    layer, inputs = ProcessorLayer(GNS, latent=8, hidden=6).double(), graph(6, 12, node=8, edge=8)
+    node, edge = inputs.node.double(), inputs.edge.double()
+    nodes, edges, _ = layer(node, inputs.edge_index, edge)
+    message = plain(layer.message, edge, node, inputs.edge_index)
+    assert isinstance(layer.operator, GNS)
+    for i in range(6):
+        total = sum((message[k] for k in range(12) if inputs.edge_index[1, k] == i), torch.zeros(8))
+        expected = node[i] + layer.norm(layer.operator.update(torch.cat([node[i], total])))
+        torch.testing.assert_close(nodes[i], expected, rtol=1e-10, atol=1e-10)
+    torch.testing.assert_close(edges, edge + message, rtol=1e-10, atol=1e-10)
+
+
+@EVERY
+def test_edge_latents_update(operator: type[Operator]) -> None:
+    """Every layer adds something else to the edges; ten layers are not a factor of 1024."""
+    model, inputs = network(operator, layers=10), graph(30, 150, node=7, edge=3)
+    seen: list[Tensor] = []
+    for layer in model.processor:
+        layer.register_forward_hook(lambda _, given, __: seen.append(given[2].detach()))
+    model(*inputs)
+    changes = [after - before for before, after in itertools.pairwise(seen)]
+    for before, change in zip(seen, changes, strict=False):
+        cosine = nn.functional.cosine_similarity(before, change, dim=1)
+        assert float(change.abs().mean()) > 0.1
+        assert float(cosine.max()) < 0.999  # doubling would give 1
+    assert float(seen[-1].norm() / seen[0].norm()) < 20.0
+
+
+def test_parameters() -> None:
+    """With latent 128 and 10 layers, GNS has 1.6 M parameters."""
+    count = sum(p.numel() for p in network(GNS, node_features=30, latent=128, layers=10).parameters())
+    square, norm = 128 * 128 + 128, 2 * 128
+    encoders = (31 * 128 + 2 * square + norm) + (4 * 128 + 2 * square + norm)
+    layer = (385 * 128 + 2 * square + norm) + (257 * 128 + 2 * square + norm)
+    assert count == encoders + 10 * layer + 2 * square + 129 * 2 == 1_591_682
+
+
+@EVERY
+def test_only_the_operator_differs(operator: type[Operator]) -> None:
+    """Everything outside the operators has the names and shapes that it has for GNS."""
+
+    def shared(model: nn.Module) -> dict[str, torch.Size]:
+        return {n: p.shape for n, p in model.named_parameters() if ".operator." not in n}
+
+    assert shared(network(operator)) == shared(network(GNS))
+
+
+@EVERY
+def test_gradients_reach_all_parameters(operator: type[Operator]) -> None:
+    """No weight is idle, as DDP wants it; a key's bias shifts all logits alike and has none to speak of."""
+    model, inputs = network(operator), graph(30, 150, node=7, edge=3)
+    prediction, losses = model(*inputs)
+    (prediction.square().sum() + sum(losses.values())).backward()
+    for name, parameter in model.named_parameters():
+        assert parameter.grad is not None, name
+        assert name.endswith("lin_key.bias") or bool(parameter.grad.any()), name
+
+
+@EVERY
+def test_windows_side_by_side(operator: type[Operator]) -> None:
+    """Two graphs in one call have the predictions of two calls."""
+    model = network(operator).eval()
+    one, two = graph(12, 40, node=7, edge=3, seed=1), graph(9, 24, node=7, edge=3, seed=2)
+    node, edge = torch.cat([one.node, two.node]), torch.cat([one.edge, two.edge])
+    both, _ = model(node, torch.cat([one.edge_index, two.edge_index + 12], dim=1), edge)
+    apart = torch.cat([model(*one)[0], model(*two)[0]])
+    torch.testing.assert_close(both, apart, rtol=1e-5, atol=1e-5)
+
+
+@EVERY
+def test_same_seed_same_weights(operator: type[Operator]) -> None:
+    """A seed fixes the weights and the prediction, to the bit."""
+    inputs = graph(12, 40, node=7, edge=3)
+    assert torch.equal(network(operator)(*inputs)[0], network(operator)(*inputs)[0])
+
+
+@EVERY
+def test_mixed_precision(operator: type[Operator]) -> None:
+    """Under bfloat16 the prediction is float32 and near the exact one; every weight still learns."""
+    model, inputs = network(operator, latent=32), graph(60, 400, node=7, edge=3)
+    exact, _ = model(*inputs)
+    with torch.autocast("cpu", torch.bfloat16):
+        prediction, losses = model(*inputs)
+    assert prediction.dtype == torch.float32
+    assert float((prediction - exact).norm() / exact.norm()) < 0.05
+    (prediction.square().sum() + sum(losses.values())).backward()
+    assert all(p.grad is not None and p.grad.isfinite().all() for p in model.parameters())
+
+
+class Total(Operator):
+    """A third party's operator: the sum of a node's input and its neighbours'."""
+
+    method = "GNS + sum"
+    weights = {"size": 0.5}  # noqa: RUF012
+
+    def __init__(self, latent: int, hidden: int) -> None:
+        super().__init__(latent, hidden)
+        self.linear = nn.Linear(2 * latent, latent)
+
+    def forward(
+        self,
+        node: Tensor,
+        edge_index: Tensor,
+        edge: Tensor,
+        *,
+        generator: torch.Generator | None = None,
+    ) -> tuple[Tensor, Losses]:
+        """Return the update of each node and a loss of its own."""
+        heard = node.index_add(0, edge_index[1], node[edge_index[0]])
+        return self.linear(heard), {"size": heard.square().mean()}
+
+
+def test_operator_of_others() -> None:
+    """An operator in one class works; its loss comes out as the mean over layers."""
+    model, inputs = network(Total), graph(12, 40, node=7, edge=3)
+    sizes: list[Tensor] = []
+    for layer in model.processor:
+        layer.register_forward_hook(lambda _, __, out: sizes.append(out[2]["size"]))
+    prediction, losses = model(*inputs)
+    assert prediction.shape == (12, 2)
+    assert float(losses["size"]) == pytest.approx(float(sum(sizes)) / 3)

@@ -1,0 +1,382 @@
+"""Windows are the stored frames, in a seeded order that can be resumed, in bounded memory."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import torch
+import yaml
+from scenario_factory import frames_of, make_key, write_scenario
+from torch.utils.data import DataLoader
+
+from lagbench.baselines import frame_store, window_sampler
+from lagbench.baselines.batch import Batch
+from lagbench.baselines.sources import Source
+from lagbench.baselines.windows import (
+    Window,
+    WindowDataset,
+    WindowSampler,
+    collate,
+    scenario_batch,
+    scenario_paths,
+)
+from lagbench.errors import DataError, LagbenchError, UsageError
+from lagbench.registry import Registry, load
+
+FRAMES = {0: 40, 1: 26, 2: 31}
+"""Frames of the scenarios of train."""
+
+PARTICLES = {0: 8, 1: 8, 2: 11}
+LENGTH = 7
+WINDOWS = 34 + 20 + 25
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with three scenarios of train, of unequal lengths and particle numbers, and two of test."""
+    folder = tmp_path_factory.mktemp("windows")
+    for i, frames in FRAMES.items():
+        write_scenario(folder, make_key(i, subset="train"), frames=frames, particles=PARTICLES[i])
+    for i in (4, 5):
+        write_scenario(folder, make_key(i, subset="test"), frames=26)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def registry(tmp_path_factory: pytest.TempPathFactory, unmeasured_path: Path) -> Registry:
+    """A registry that describes these scenarios as cavity tiny."""
+    held = yaml.safe_load(unmeasured_path.read_text())
+    tiny = held["splits"]["cavity"]["sizes"]["tiny"]
+    tiny["subsets"] = {"train": "0-2", "valid": 3, "test": "4-5"}
+    tiny["frames"] = {40: "0", 26: "1,3-5", 31: "2"}
+    path = tmp_path_factory.mktemp("registry") / "datasets.yaml"
+    path.write_text(yaml.safe_dump(held))
+    return load(path)
+
+
+Open = Callable[..., WindowDataset]
+
+
+@pytest.fixture
+def train(root: Path, registry: Registry) -> Open:
+    """A function that opens train with windows of 6 + 1 frames unless told otherwise."""
+
+    def opened(folder: Path = root, *, subset: str | list[str] = "train", **changes: int) -> WindowDataset:
+        lengths = {"history": 6, "future": 1, **changes}
+        return WindowDataset("cavity", size="tiny", subset=subset, root=folder, registry=registry, **lengths)
+
+    return opened
+
+
+def same(a: Batch, b: Batch) -> bool:
+    """Tell whether two batches hold the same bits."""
+    names = ("position", "sample", "material", "wall_velocity", "scenario", "frame")
+    return all(torch.equal(getattr(a, name), getattr(b, name)) for name in names)
+
+
+def test_every_window_is_the_stored_frames(train: Open) -> None:
+    """All windows of all scenarios, each once: 34 + 20 + 25 of 40, 26 and 31 frames."""
+    data = train()
+    assert len(data) == WINDOWS
+    places = []
+    for window in (data[i] for i in range(len(data))):
+        frames = frames_of(window.scenario, FRAMES[window.scenario], PARTICLES[window.scenario])
+        expected = frames[window.frame : window.frame + LENGTH]
+        np.testing.assert_array_equal(window.position.numpy(), expected.transpose(1, 0, 2))
+        assert window.position.is_contiguous()
+        places.append((window.scenario, window.frame))
+    assert places == [(i, f) for i, frames in FRAMES.items() for f in range(frames - LENGTH + 1)]
+
+
+def test_material_and_walls(train: Open) -> None:
+    """A window holds the particles' materials and its own frames of the walls' velocity."""
+    window = train(history=2, future=0)[3]
+    assert window.material.tolist() == [0, 1, 2, 3, 0, 1, 2, 3]
+    assert window.material.dtype == torch.int64
+    assert window.wall_velocity is not None
+    assert window.wall_velocity.tolist() == 2 * [[[0, 0], [0, 0], [0, 0], [0.125, 0]]]
+
+
+def test_files_without_material_or_moving_walls(tmp_path: Path, train: Open) -> None:
+    """Without material all is liquid, without moving walls there is no velocity of walls."""
+    for i, frames in FRAMES.items():
+        path, _ = write_scenario(tmp_path, make_key(i, subset="train"), frames=frames, walls=False)
+        with h5py.File(path, "a") as file:
+            del file["material"]
+    batch = collate([train(tmp_path)[i] for i in (0, 40)])
+    assert not batch.material.any()
+    assert batch.material.dtype == torch.int64
+    assert batch.wall_velocity is None
+    assert not scenario_batch(path).material.any()
+
+
+def test_collate_puts_windows_side_by_side(train: Open) -> None:
+    """Windows of 8 and 11 particles make one row; each keeps its number, scenario and first frame."""
+    data = train()
+    windows = [data[2], data[34 + 20 + 1]]
+    batch = collate(windows)
+    assert batch.sample.tolist() == 8 * [0] + 11 * [1]
+    assert (batch.scenario.tolist(), batch.frame.tolist()) == ([0, 2], [2, 1])
+    assert torch.equal(batch.position[8:], windows[1].position)
+    assert batch.material.shape == (19,)
+    assert batch.wall_velocity is not None
+    assert batch.wall_velocity.shape == (2, LENGTH, 4, 2)
+
+
+def test_unlike_windows_are_not_put_together(train: Open) -> None:
+    """No windows, unequal lengths and walls that move in some only are errors."""
+    window = train()[0]
+    for windows in ([], [window, train(history=3)[0]], [window, window._replace(wall_velocity=None)]):
+        with pytest.raises(UsageError, match="side by side"):
+            collate(windows)
+
+
+def test_changing_a_window_changes_nothing_else(train: Open, root: Path) -> None:
+    """Noise added to a window in place reaches neither the cache nor the file."""
+    data = train()
+    path = next(root.rglob("0000.nc"))
+    stored, first = path.read_bytes(), data[0].position.clone()
+    spoilt = data[0]
+    for values in (spoilt.position, spoilt.material, spoilt.wall_velocity):
+        assert values is not None
+        values.fill_(7)
+    assert torch.equal(data[0].position, first)
+    batch = collate([data[0]])
+    assert batch.material.max() == 3
+    assert batch.wall_velocity is not None
+    assert batch.wall_velocity.max() == 0.125
+    assert path.read_bytes() == stored
+
+
+@pytest.mark.parametrize("limit", [0, 100, 10 * 8 * 8])
+def test_memory_is_bounded(train: Open, limit: int) -> None:
+    """However little may be kept, windows are the same and no more is kept."""
+    data, whole = train(cache_bytes=limit), train()
+    for i in torch.randperm(len(data), generator=torch.Generator().manual_seed(0)).tolist():
+        assert torch.equal(data[i].position, whole[i].position)
+        assert data._store.cached_bytes <= limit
+    kept = sum(frame.nbytes for frame in data._store._frames.values())
+    assert kept == data._store.cached_bytes
+    assert all(frame.base is None for frame in data._store._frames.values())
+
+
+def test_open_files_are_bounded(train: Open, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With one file open at a time, others are opened anew."""
+    monkeypatch.setattr(frame_store, "OPEN_FILES", 1)
+    data = train(cache_bytes=0)
+    for i in (0, 40, 60, 0, 40, 60):
+        assert data[i].scenario == data.place(i)[0]
+        assert len(data._store._open) == 1
+        held = [path.resolve() for path in Path("/proc/self/fd").iterdir() if path.exists()]
+        assert sum(path.suffix == ".nc" for path in held) <= 1
+
+
+def test_several_subsets(train: Open) -> None:
+    """Windows of several subsets follow each other."""
+    data = train(subset=["test", "train"])
+    assert len(data) == WINDOWS + 2 * 20
+    assert data.place(0) == (4, 0)
+    assert data.place(40) == (0, 0)
+    assert data.place(-1) == (2, 24)
+
+
+def test_every_epoch_draws_every_window_once(train: Open) -> None:
+    """Epochs are different orders of all windows; seed and epoch alone decide them."""
+    data = train()
+    sampler, other = WindowSampler(data, seed=5), WindowSampler(train(cache_bytes=0), seed=5)
+    epochs = [list(sampler) for _ in range(3)]
+    assert all(sorted(epoch) == list(range(WINDOWS)) for epoch in epochs)
+    assert epochs[0] != epochs[1] != epochs[2]
+    assert epochs == [list(other) for _ in range(3)]
+    assert epochs[0] != list(WindowSampler(data, seed=6))
+    assert sampler.state_dict() == {"seed": 5, "epoch": 3, "position": 0}
+
+
+def test_an_order_is_pinned(train: Open) -> None:
+    """The first windows of seed 0: a change would break the resumption of older runs."""
+    assert WindowSampler(train(), seed=0).order(0)[:8].tolist() == [61, 70, 63, 8, 2, 53, 11, 18]
+
+
+def stream(sampler: WindowSampler) -> Iterator[int]:
+    """Yield windows of epoch after epoch."""
+    while True:
+        yield from sampler
+
+
+@pytest.mark.parametrize("drawn", [0, 1, 30, WINDOWS - 1, WINDOWS, WINDOWS + 3])
+def test_resuming_continues_bit_by_bit(train: Open, drawn: int) -> None:
+    """A sampler loaded from a state in mid-epoch draws on as the first would have."""
+    first = WindowSampler(train(), seed=3)
+    run = stream(first)
+    for _ in range(drawn):
+        next(run)
+    second = WindowSampler(train(), seed=0)
+    second.load_state_dict(json.loads(json.dumps(first.state_dict())))
+    resumed = stream(second)
+    assert [next(resumed) for _ in range(2 * WINDOWS)] == [next(run) for _ in range(2 * WINDOWS)]
+
+
+def test_ranks_share_out_one_order(train: Open) -> None:
+    """Three ranks draw every third window of the one order each, together all but the last few."""
+    data = train()
+    alone = WindowSampler(data, seed=1).order(0).tolist()
+    ranks = [WindowSampler(data, seed=1, rank=rank, ranks=3) for rank in range(3)]
+    parts = [list(sampler) for sampler in ranks]
+    assert [len(sampler) for sampler in ranks] == [len(part) for part in parts] == 3 * [WINDOWS // 3]
+    assert [window for turn in zip(*parts, strict=True) for window in turn] == alone[: WINDOWS // 3 * 3]
+
+
+def test_a_state_outlives_a_change_of_ranks(train: Open) -> None:
+    """What two ranks have not drawn, one rank draws."""
+    data = train()
+    order = WindowSampler(data, seed=1).order(0).tolist()
+    two = WindowSampler(data, seed=1, rank=1, ranks=2)
+    drawn = iter(two)
+    for _ in range(5):
+        next(drawn)
+    one = WindowSampler(data, seed=1)
+    one.load_state_dict(two.state_dict())
+    assert list(one) == order[10:]
+
+
+def test_a_process_group_tells_the_rank(train: Open, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Within torch.distributed each process draws its own part."""
+    data = train()
+    monkeypatch.setattr(torch.distributed, "is_initialized", lambda: True)
+    monkeypatch.setattr(torch.distributed, "get_rank", lambda: 1)
+    monkeypatch.setattr(torch.distributed, "get_world_size", lambda: 2)
+    assert list(WindowSampler(data, seed=1)) == list(WindowSampler(data, seed=1, rank=1, ranks=2))
+
+
+def test_impossible_ranks_are_refused(train: Open) -> None:
+    """A rank that does not exist, and more ranks than windows, are errors."""
+    data = train()
+    for rank, ranks in ((2, 2), (-1, 2), (0, WINDOWS + 1)):
+        with pytest.raises(UsageError, match="rank"):
+            WindowSampler(data, seed=0, rank=rank, ranks=ranks)
+
+
+def test_a_pool_shares_its_frames(train: Open, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With room for one pool, an epoch reads hardly more frames than there are, not seven times as many."""
+    monkeypatch.setattr(window_sampler, "RUN", 8)
+    data = train(cache_bytes=3 * 14 * 11 * 8)
+    monkeypatch.setattr(window_sampler, "POOL_BYTES", 3 * 14 * data.frame_bytes)
+    read: list[int] = []
+    inner = frame_store.FrameStore._read
+
+    def counted(store: frame_store.FrameStore, scenario: int, first: int, last: int) -> object:
+        read.extend(range(first, last))
+        return inner(store, scenario, first, last)
+
+    monkeypatch.setattr(frame_store.FrameStore, "_read", counted)
+    order = list(WindowSampler(data, seed=0))
+    assert sorted(order) == list(range(WINDOWS))
+    assert all(len({data.place(i)[0] for i in order[k : k + 24]}) <= 3 for k in range(0, WINDOWS, 24))
+    for i in order:
+        data[i]
+    # a run of 8 windows has 14 frames: 79 windows at 14/8 frames, and a few more of shorter runs
+    assert len(read) <= 2 * WINDOWS
+
+
+def test_worker_processes_read_the_same(train: Open) -> None:
+    """Two forked workers, after this process has opened the files, give the batches of none."""
+    data = train()
+    data[0]
+    batches = [
+        list(
+            DataLoader(data, 5, sampler=WindowSampler(data, seed=2), collate_fn=collate, num_workers=workers)
+        )
+        for workers in (0, 2)
+    ]
+    assert len(batches[0]) == 16
+    assert all(same(a, b) for a, b in zip(*batches, strict=True))
+
+
+def test_a_dataset_can_be_sent(train: Open) -> None:
+    """A pickled data set takes neither open files nor frames along and reads the same."""
+    data = train()
+    first = data[0]
+    sent = pickle.loads(pickle.dumps(data))
+    assert len(pickle.dumps(data)) < 5000
+    assert not sent._store._open
+    assert torch.equal(sent[0].position, first.position)
+
+
+def test_whole_scenarios_for_rollouts(root: Path, registry: Registry) -> None:
+    """All test scenarios side by side, all frames or a part of them."""
+    paths = scenario_paths("cavity", size="tiny", root=root, registry=registry)
+    assert list(paths) == [4, 5]
+    batch = scenario_batch(list(paths.values()), slice(3, 9))
+    assert (batch.windows, batch.frames) == (2, 6)
+    assert (batch.scenario.tolist(), batch.frame.tolist()) == ([4, 5], [3, 3])
+    for row, i in enumerate(paths):
+        expected = frames_of(i, 26, 8)[3:9].transpose(1, 0, 2)
+        np.testing.assert_array_equal(batch.position[batch.sample == row].numpy(), expected)
+    assert scenario_batch(paths[4]).frames == 26
+    assert scenario_batch(paths[4], slice(-2, None)).frame.tolist() == [24]
+
+
+def test_frames_that_do_not_exist_are_refused(root: Path) -> None:
+    """No frames, frames that are not consecutive and scenarios of unequal lengths are errors."""
+    paths = sorted(root.rglob("*.nc"))
+    for frames in (slice(50, 60), slice(0, 10, 2), slice(5, 5)):
+        with pytest.raises(UsageError, match="no consecutive frames"):
+            scenario_batch(paths[0], frames)
+    with pytest.raises(UsageError, match="side by side"):
+        scenario_batch(paths)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"subset": "trian"}, "did you mean 'train'"),
+        ({"size": "tiney"}, "did you mean 'tiny'"),
+        ({"split": "cavty"}, "did you mean 'cavity'"),
+        ({"history": 40}, "no scenario holds a window"),
+        ({"history": 0}, "no scenario holds a window"),
+        ({"subset": "valid"}, "1 of 1 scenarios are not generated.*missing: 3.*lagbench generate"),
+    ],
+)
+def test_what_is_not_there_is_said(
+    root: Path, registry: Registry, options: dict[str, object], words: str
+) -> None:
+    """Unknown names, too few frames and missing files are errors that say what to do."""
+    given: dict[str, Any] = {"split": "cavity", "size": "tiny", "history": 6, **options}
+    with pytest.raises(LagbenchError, match="(?s)" + words):
+        WindowDataset(**given, root=root, registry=registry)
+
+
+def test_another_scenario_under_its_name_is_refused(tmp_path: Path, train: Open) -> None:
+    """Files of another id or length, and bytes that are no netCDF file, are data errors."""
+    for i, frames in FRAMES.items():
+        write_scenario(tmp_path, make_key(i, subset="train"), frames=frames + (i == 1))
+    folder = next(tmp_path.rglob("train"))
+    (folder / "0002.nc").rename(folder / "kept")
+    (folder / "0002.nc").write_bytes((folder / "0000.nc").read_bytes())
+    (folder / "0000.nc").write_bytes(b"nothing")
+    data = train(tmp_path)
+    for window, words in ((0, "damaged"), (40, "not that of the registry"), (60, "not that of the registry")):
+        with pytest.raises(DataError, match=words) as caught:
+            data[window]
+        assert f"000{data.place(window)[0]}.nc" in str(caught.value)
+    (folder / "kept").replace(folder / "0002.nc")
+    assert isinstance(data[60], Window)
+    with pytest.raises(IndexError):
+        data[WINDOWS]
+
+
+def test_another_content_hash_is_refused(root: Path, registry: Registry) -> None:
+    """A file whose values are not those that the registry's hash names is a data error."""
+    source = Source(
+        path=next(root.rglob("0000.nc")), key=make_key(0, subset="train"), frames=40, digest="0" * 16
+    )
+    store = frame_store.FrameStore({0: source})
+    with pytest.raises(DataError, match=r"(?s)not that of the registry.*content hash 0{16}"):
+        store.frames(0, 0, 2)
