@@ -1,0 +1,254 @@
+"""The leaderboard's page in a real browser: tabs, sorting, filters, addresses, CSV, silence."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from board_browsing import active, close, form, names, press, restored, run, seen, still, until
+from board_factory import make_board
+from browser import CHROMIUM, Browser, Page, browser
+from PIL import Image
+
+from lagbench.board.columns import presets_of, value_of, written
+from lagbench.board.model import Board, Row
+from lagbench.board.page import render
+from lagbench.metrics import METRICS, Direction
+
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here: apt-get install chromium")
+
+
+@pytest.fixture(scope="module")
+def running() -> Iterator[Browser]:
+    """One browser for all tests."""
+    with browser() as started:
+        yield started
+
+
+@pytest.fixture(scope="module")
+def board() -> Board:
+    """Three tabs of eight entries each, two of which are no longer active."""
+    return make_board((("cavity", "full"), ("cavity", "mini"), ("fluid", "mini")), nodes=16)
+
+
+@pytest.fixture(scope="module")
+def file(board: Board, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Its page."""
+    path = tmp_path_factory.mktemp("board") / "index.html"
+    path.write_text(render(board), encoding="utf-8")
+    return path
+
+
+@pytest.fixture
+def page(running: Browser, file: Path) -> Iterator[Page]:
+    """The page opened, still films; nothing complained of and nothing asked for in the end."""
+    opened = running.open(file, width=1280)
+    still(opened)
+    yield opened
+    assert opened.messages == []
+    assert {request.partition("#")[0] for request in opened.requests} == {file.absolute().as_uri()}
+    close(opened)
+
+
+@pytest.mark.parametrize(("width", "dark"), [(1280, False), (390, True), (320, False)])
+def test_page_opens_in_silence(running: Browser, file: Path, width: int, dark: bool) -> None:
+    """No message, no request but the page itself, no sideways scrolling, its scheme as asked."""
+    page = running.open(file, width=width, dark=dark)
+    for opened in (False, True):
+        if opened:
+            run(page, "document.querySelector('section:not([hidden]) .entries .name').click()")
+            assert page.value("document.getElementById('panel').scrollWidth") <= width
+        assert page.value("document.documentElement.scrollWidth") <= width
+        picture = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("L"))
+        assert bool(np.median(picture) < 80) is dark
+    assert page.messages == []
+    assert page.requests == [file.absolute().as_uri()]
+    close(page)
+
+
+def test_script_writes_what_the_html_holds(running: Browser, file: Path, page: Page) -> None:
+    """Without JavaScript all tabs show the rows and digits that the script shows later."""
+    plain = running.open(file, width=1280)
+    plain.call("Emulation.setScriptExecutionDisabled", value=True)
+    plain.call("Page.reload")
+    running.wait("Page.loadEventFired")
+    root = plain.call("DOM.getDocument")["root"]["nodeId"]
+    html = plain.call("DOM.getOuterHTML", nodeId=root)["outerHTML"]
+    before = page.value(
+        f"[...new DOMParser().parseFromString({json.dumps(html)}, 'text/html')"
+        ".querySelectorAll('section.tab')]"
+        ".map(tab => [...tab.querySelectorAll('tbody tr')].map(tr =>"
+        " [tr.cells[0], tr.querySelector('.name'), ...tr.querySelectorAll('td .n')].map(e => e.textContent)))"
+    )
+    for i, rows in enumerate(before):
+        run(page, f"document.querySelectorAll('.tabs a')[{i}].click()")
+        assert seen(page) == rows
+        assert len(rows) == 8
+
+
+def test_every_preset_shows_the_board(page: Page, board: Board) -> None:
+    """Each preset shows the values of its columns, floors first."""
+    tab = board.tabs[0]
+    rows = [*(row for row in tab.rows if row.floor), *active(tab.rows)]
+    for name, keys in presets_of(tab, board.metrics).items():
+        run(page, f"document.querySelector('[data-preset={name}]').click()")
+        expected = [[written(value_of(row, key), form(key)) or "–" for key in keys] for row in rows]
+        assert [row[2:] for row in seen(page)] == expected
+        assert page.value("document.querySelector('[aria-pressed=true]').textContent") == name
+
+
+@pytest.mark.parametrize(
+    "key", ["position_rmse", "vorticity_pearson", "energy_ratio", "speed_up", "parameters"]
+)
+def test_sorting(page: Page, board: Board, key: str) -> None:
+    """A click sorts best first, another worst first; gaps stay last, floors stay where they are."""
+    floors = seen(page, ".floors")
+    run(page, "document.querySelector('[data-preset=all]').click()")
+    direction = METRICS[key].direction if key in METRICS else Direction.HIGHER
+
+    def loss(row: Row) -> float:
+        value = float(value_of(row, key))
+        return {Direction.HIGHER: -value, Direction.TARGET: abs(value - 1.0)}.get(direction, value)
+
+    rows = active(board.tabs[0].rows)
+    known = sorted((row for row in rows if not np.isnan(loss(row))), key=loss)
+    gaps = [row.name for row in rows if np.isnan(loss(row))]
+    heading = f"section:not([hidden]) [data-sort={key}]"
+    run(page, f"document.querySelector('{heading}').click()")
+    assert names(page) == [row.name for row in known] + gaps
+    first = page.value(f"document.querySelector('{heading}').closest('th').ariaSort")
+    assert first == ("descending" if direction is Direction.HIGHER else "ascending")
+    assert page.value(f"document.activeElement === document.querySelector('{heading}')")
+    run(page, f"document.querySelector('{heading}').click()")
+    assert names(page) == [row.name for row in known[::-1]] + gaps
+    assert page.value("document.querySelectorAll('section:not([hidden]) th[aria-sort]').length") == 1
+    run(page, "document.querySelector('[data-preset=main]').click()")
+    assert seen(page, ".floors") == floors
+
+
+def test_filter_by_keyboard(page: Page, board: Board) -> None:
+    """A slash leads to the filter; every word must occur; the floors stay."""
+    press(page, "/")
+    page.call("Input.insertText", text="examples GAT")
+    run(page, "0")
+    assert names(page) == [row.name for row in active(board.tabs[0].rows) if "GAT" in row.name]
+    assert len(seen(page, ".floors")) == 2
+    assert "of 6 entries" in page.value("document.querySelector('section:not([hidden]) .count').textContent")
+    page.call("Input.insertText", text=" nobody")
+    run(page, "0")
+    assert names(page) == []
+    assert "No entry matches" in page.value(
+        "document.querySelector('section:not([hidden]) .entries').textContent"
+    )
+
+
+def test_tabs_by_keyboard(page: Page, board: Board) -> None:
+    """Arrows move between tabs, one section is shown at a time, going back goes back."""
+    run(page, "document.querySelector('.tabs a').focus()")
+    press(page, "ArrowRight")
+    shown = "[...document.querySelectorAll('section.tab')].filter(s => !s.hidden).map(s => s.id)"
+    assert page.value(shown) == ["cavity-mini"]
+    press(page, "End")
+    assert page.value(shown) == ["fluid-mini"]
+    assert page.value("document.activeElement.dataset.tab") == "fluid-mini"
+    assert page.value("[...document.querySelectorAll('[aria-selected=true]')].map(a => a.dataset.tab)") == [
+        "fluid-mini"
+    ]
+    assert names(page) == [row.name for row in active(board.tabs[2].rows)]
+    run(page, "history.back()")
+    until(page, f"String({shown}) === 'cavity-mini'")
+
+
+def test_address_restores_the_state(page: Page) -> None:
+    """What was chosen stands in the address; loading that address shows the same."""
+    run(page, "document.querySelectorAll('.tabs a')[2].click()")
+    run(page, "document.querySelector('section:not([hidden]) [data-preset=energy]').click()")
+    run(page, "document.querySelector('section:not([hidden]) [data-sort=energy_error]').click()")
+    run(page, "document.querySelector('section:not([hidden]) .check input').click()")
+    run(page, "document.querySelector('section:not([hidden]) input[type=search]').focus()")
+    page.call("Input.insertText", text="du châtelet")
+    run(page, "0")
+    address, table = page.value("location.hash"), seen(page)
+    for part in ("tab=fluid-mini", "columns=energy", "sort=energy_error", "inactive=1", "filter="):
+        assert part in address
+    restored(page, "")
+    assert seen(page) != table
+    restored(page, address)
+    assert seen(page) == table
+    assert (
+        page.value("document.querySelector('section:not([hidden]) input[type=search]').value")
+        == "du châtelet"
+    )
+
+
+@pytest.mark.parametrize("address", ["#fluid-mini", "#tab=fluid-mini&columns=nothing&sort=-x&entry=y&cost=z"])
+def test_odd_addresses_do_no_harm(page: Page, board: Board, address: str) -> None:
+    """The name of a tab alone is enough; what is unknown is passed over."""
+    restored(page, address)
+    assert names(page) == [row.name for row in active(board.tabs[2].rows)]
+    assert page.value("document.getElementById('panel').open") is False
+
+
+def test_inactive_entries_hide_behind_a_toggle(page: Page, board: Board) -> None:
+    """Withdrawn and superseded entries show on demand, unranked and named so."""
+    gone = [row for row in board.tabs[0].rows if row.status != "active"]
+    assert len(gone) == 2
+    assert not {row.name for row in gone} & set(names(page))
+    run(page, "document.querySelector('section:not([hidden]) .check input').click()")
+    rows = {row[1]: row for row in seen(page, ".entries")}
+    assert [rows[row.name][0] for row in gone] == ["–", "–"]
+    chips = page.value(
+        "[...document.querySelectorAll('tr.inactive .flag')].map(e => [e.textContent, e.title])"
+    )
+    assert [row.reason for row in gone] == [
+        title for label, title in chips if label in ("withdrawn", "superseded")
+    ]
+
+
+@pytest.mark.parametrize("preset", ["main", "cost"])
+def test_csv_equals_the_table(page: Page, board: Board, tmp_path: Path, preset: str) -> None:
+    """The file has the rows and columns of the table in its order, with all digits."""
+    page.call("Page.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
+    run(page, f"document.querySelector('[data-preset={preset}]').click()")
+    run(page, "document.querySelector('section:not([hidden]) [data-sort=speed_up]').click()")
+    run(page, "document.querySelector('section:not([hidden]) .csv').click()")
+    path = tmp_path / f"lagbench-cavity-full-{preset}.csv"
+    for _ in range(100):
+        if path.exists():
+            break
+        time.sleep(0.05)
+    head, *lines = list(csv.reader(io.StringIO(path.read_text(encoding="utf-8"), newline="")))
+    keys = list(presets_of(board.tabs[0], board.metrics)[preset])
+    assert head == ["rank", "method", "status", *keys, "vorticity_rmse_low", "vorticity_rmse_high"]
+    shown = seen(page)
+    assert [line[1] for line in lines] == [row[1] for row in shown]
+    assert [line[0] for line in lines] == [row[0].lstrip("=") for row in shown]
+    rows = {row.name: row for row in board.tabs[0].rows}
+    for line, texts in zip(lines, shown, strict=True):
+        cells = [
+            cell if form(key) == "text" else float(cell or "nan")
+            for key, cell in zip(keys, line[3:-2], strict=True)
+        ]
+        assert [written(cell, form(key)) or "–" for key, cell in zip(keys, cells, strict=True)] == texts[2:]
+        value = rows[line[1]].values["vorticity_rmse"]
+        assert float(line[3]) == pytest.approx(value.mean, rel=1e-8)
+        assert [float(cell) for cell in line[-2:]] == pytest.approx([value.low, value.high], rel=1e-5)
+
+
+def test_scheme_can_be_chosen(page: Page) -> None:
+    """The button goes from the system's scheme to light, dark, and back."""
+    paper = "getComputedStyle(document.body).backgroundColor"
+    seen_papers = []
+    for _ in range(3):
+        run(page, "document.getElementById('theme').click()")
+        seen_papers.append(
+            (page.value("document.documentElement.dataset.theme ?? 'auto'"), page.value(paper))
+        )
+    light, dark = "rgb(255, 255, 255)", "rgb(16, 20, 27)"
+    assert seen_papers == [("light", light), ("dark", dark), ("auto", light)]

@@ -1,0 +1,143 @@
+"""The commands submit and leaderboard build, check, show; the stranger's path of docs/submitting.md."""
+
+from __future__ import annotations
+
+import json
+import re
+import runpy
+import shlex
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import yaml
+from conftest import SIZE, SPLIT
+from typer.testing import CliRunner, Result
+
+from lagbench import scoring
+from lagbench.board.check import CHECKS
+from lagbench.board.entry import Entry
+from lagbench.board.meta import Meta
+from lagbench.cli.app import app
+from lagbench.generation import GenerationResult
+
+DOCS = Path(__file__).parent.parent / "docs"
+TOY = DOCS / "examples" / "toy_model"
+COMMANDS = (["submit"], ["leaderboard", "build"], ["leaderboard", "check"], ["leaderboard", "show"])
+Run = Callable[..., Result]
+
+
+@pytest.fixture
+def run(
+    monkeypatch: pytest.MonkeyPatch, unmeasured_path: Path, generated: GenerationResult, tmp_path: Path
+) -> Run:
+    """A function that runs lagbench in an empty folder on the generated data set."""
+    monkeypatch.setenv("LAGBENCH_REGISTRY", str(unmeasured_path))
+    monkeypatch.setenv("LAGBENCH_ROOT", str(generated.root))
+    monkeypatch.delenv("LAGBENCH_DEBUG", raising=False)
+    monkeypatch.chdir(tmp_path)
+    return lambda *words: CliRunner().invoke(app, [str(word) for word in words])
+
+
+def make_toy(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run the example model as its docstring says, on the generated data set."""
+    words = ["toy_model.py", "--split", SPLIT, "--size", SIZE, "-o", "predictions.nc"]
+    monkeypatch.setattr(sys, "argv", words)
+    with pytest.raises(SystemExit) as end:
+        runpy.run_path(str(TOY / "toy_model.py"), run_name="__main__")
+    assert end.value.code == 0
+
+
+def test_a_strangers_path(run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """From an own model to a page, each command as documented, nothing asked on stdin."""
+    make_toy(monkeypatch)
+    assert run("validate", "predictions.nc").exit_code == 0
+    submitted = run("submit", "predictions.nc", "--from", TOY / "meta.yaml")
+    assert submitted.exit_code == 0, submitted.output
+    assert "toy-model on curl-noise tiny: vorticity_rmse" in submitted.stdout
+    entry = tmp_path / "leaderboard/submissions" / SPLIT / SIZE / "toy-model.yaml"
+    assert yaml.safe_load(entry.read_text())["parameters"] == 1
+    stale = run("leaderboard", "check")
+    assert stale.exit_code == 1
+    assert "error [page]" in stale.stderr
+    built = run("leaderboard", "build")
+    assert built.exit_code == 0, built.output
+    assert re.search(r"index.html: 1 entries, 1 tabs, .* written", built.stdout)
+    assert run("leaderboard", "build", "--check").exit_code == 0
+    checked = run("leaderboard", "check", "--predictions", "predictions.nc")
+    assert checked.exit_code == 0, checked.output
+    assert "1 entries, nothing wrong" in checked.stdout
+    shown = run("leaderboard", "show", SPLIT, "--size", SIZE)
+    assert "toy-model" in shown.stdout
+    assert "Toy model" in (tmp_path / "leaderboard" / "index.html").read_text()
+
+
+def test_machines_are_answered_in_json(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every command has --json; floors are submitted by name; a drifted page fails with exit code 1."""
+    floor = run("submit", "--floor", "persistence", "--split", SPLIT, "--size", SIZE, "--json")
+    assert floor.exit_code == 0, floor.output
+    assert json.loads(floor.stdout)["ranking"] == "vorticity_rmse"
+    built = json.loads(run("leaderboard", "build", "--json").stdout)
+    assert (built["rows"], built["tabs"]) == (1, 1)
+    assert json.loads(run("leaderboard", "check", "--json").stdout)["findings"] == []
+    shown = json.loads(run("leaderboard", "show", "--json").stdout)
+    assert shown["tabs"][0]["rows"][0]["floor"] is True
+    Path("leaderboard/index.html").write_text("stale")
+    result = run("leaderboard", "build", "--check")
+    assert result.exit_code == 1
+    assert "lagbench leaderboard build" in result.stderr
+    assert run("leaderboard", "build", "--quiet").output == ""
+    monkeypatch.setattr(scoring, "validate", None)  # a usage error comes before any work
+    result = run("submit", "--floor", "persistence", "--split", SPLIT, "--author", "A")
+    assert result.exit_code == 2
+    assert "described by lagbench itself" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "message"),
+    [
+        (["submit"], 2, "nothing to submit"),
+        (["submit", "none.nc", "--author", "A", "--command", "x"], 3, "none.nc"),
+        (["submit", "x.nc", "--split", "cavity"], 2, "name split and size themselves"),
+        (["submit", "x.nc", "--code", "javascript:alert(1)"], 2, "code: String should match pattern"),
+        (["submit", "x.nc", "--from", "none.yaml"], 3, "none.yaml"),
+        (["submit", "--floor", "median", "--split", SPLIT, "--size", SIZE], 2, "no floor 'median'"),
+        (["leaderboard", "build"], 2, "no leaderboard here"),
+        (["leaderboard", "check"], 2, "--board FOLDER"),
+        (["leaderboard", "show"], 2, "no leaderboard here"),
+    ],
+)
+def test_errors_have_their_codes(run: Run, words: list[str], code: int, message: str, tmp_path: Path) -> None:
+    """One message on stderr, no traceback, the code of docs/scoring.md, nothing written."""
+    result = run(*words)
+    assert result.exit_code == code, result.output
+    assert message in " ".join(result.stderr.split())
+    assert "Traceback" not in result.output
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("words", COMMANDS)
+def test_help_has_an_example_that_parses(run: Run, words: list[str]) -> None:
+    """The help of every command ends with an example whose words it accepts."""
+    text = " ".join(run(*words, "--help").stdout.split())
+    example = re.search(rf"Example: lagbench ({' '.join(words)}.*?)$", text)
+    assert example is not None
+    assert run(*example[1].split(), "--help").exit_code == 0
+
+
+def test_the_page_of_docs_is_true(run: Run) -> None:
+    """docs/submitting.md names every check and key; its commands are accepted, its example is the file's."""
+    text = (DOCS / "submitting.md").read_text()
+    for name, meaning in CHECKS.items():
+        assert f"| `{name}` | {meaning} |" in text
+    for key in (*Meta.model_fields, *Entry.model_fields):
+        assert f"`{key}`" in text
+    assert (TOY / "meta.yaml").read_text() in text
+    blocks = re.findall(r"```(?:bash|console)\n(.*?)```", text, re.DOTALL)
+    lines = "\n".join(blocks).replace("\\\n", " ").splitlines()
+    commands = [shlex.split(line, comments=True)[1:] for line in lines if line.startswith("lagbench ")]
+    assert len(commands) >= 8
+    for words in commands:
+        result = run(*words, "--help")
+        assert result.exit_code == 0, words

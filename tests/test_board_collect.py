@@ -1,0 +1,277 @@
+"""The board as it is collected: numbers against the scorer's, ranks, seeds, pictures."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from board_bench import PLACE, BoardBench, copied, master
+from report_bench import noisy
+
+from lagbench.board.build import build
+from lagbench.board.collect import collect
+from lagbench.board.model import Board, Row
+from lagbench.board.pictures import CURVE_FRAMES, RESIDUAL_BINS, curve, residuals
+from lagbench.board.seeds import Combined, combine
+from lagbench.board.show import as_plain, chosen_tabs, tables
+from lagbench.board.standing import standings
+from lagbench.board.stored import read_stored
+from lagbench.errors import ChecksFailedError, UsageError
+from lagbench.floors import FLOORS
+from lagbench.metrics import METRICS, Score, bootstrap_interval
+from lagbench.score_card import ScoreCard, digits
+from lagbench.score_file import read_statistics
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> BoardBench:
+    """The shared leaderboard."""
+    return master(tmp_path_factory)
+
+
+@pytest.fixture(scope="module")
+def board(bench: BoardBench) -> Board:
+    """It, collected."""
+    return collect(bench.folder, registry=bench.registry)
+
+
+@pytest.fixture
+def own(tmp_path_factory: pytest.TempPathFactory, tmp_path: Path) -> BoardBench:
+    """A copy that the test may damage."""
+    return copied(tmp_path_factory, tmp_path)
+
+
+@pytest.fixture(scope="module")
+def card(bench: BoardBench) -> ScoreCard:
+    """The score card of ``noisy``, scored apart from the board."""
+    return bench.data.card(bench.predict(noisy, "again"))
+
+
+def row_of(board: Board, method: str) -> Row:
+    """Return a row of the only tab."""
+    return next(row for row in board.tabs[0].rows if row.id == method)
+
+
+def test_values_are_those_of_the_scorer(board: Board, card: ScoreCard) -> None:
+    """Mean, interval, scenarios, undefined frames and frames of interest of every metric."""
+    values = row_of(board, "noisy").values
+    assert set(values) == set(card.submission)
+    for name, score in card.submission.items():
+        held = values[name]
+        assert digits(held.mean) == digits(score.mean)
+        assert [digits(held.low), digits(held.high)] == [digits(bound) for bound in score.interval]
+        assert np.array_equal(held.per_scenario, score.values, equal_nan=True)
+        assert held.undefined == sum(score.undefined)
+        assert math.isnan(held.std)
+        for frame, value in held.at.items():
+            assert digits(value) == digits(float(np.mean(score.at(frame)[~np.isnan(score.at(frame))])))
+
+
+def test_floors_stand_as_the_scorer_sees_them(board: Board, card: ScoreCard) -> None:
+    """A floor submitted as an entry has the scores of that floor beside any submission."""
+    for name in FLOORS:
+        row = row_of(board, name)
+        assert row.floor
+        assert row.rank is None
+        for metric, score in card.scores[name].items():
+            assert digits(row.values[metric].mean) == digits(score.mean)
+
+
+def test_seeds_are_averaged(bench: BoardBench, board: Board) -> None:
+    """Mean over seeds per scenario, sample deviation over seeds, interval over scenarios."""
+    files = [bench.folder / f"scores/cavity/tiny/damped_{seed}.nc" for seed in (0, 3)]
+    first, second = (read_statistics(path).scores() for path in files)
+    row = row_of(board, "damped")
+    assert row.seeds == 2
+    assert [found.seed for found in row.detail.predictions] == [0, 3]
+    for name in ("vorticity_rmse", "position_rmse", "energy_error"):
+        one, two = first[name].values, second[name].values
+        held = row.values[name]
+        assert held.per_scenario == pytest.approx((one + two) / 2.0)
+        assert held.mean == pytest.approx((one + two).mean() / 2.0)
+        assert held.std == pytest.approx(abs(one.mean() - two.mean()) / math.sqrt(2.0))
+        assert (held.low, held.high) == bootstrap_interval((one + two) / 2.0)
+    means = [found.mean for found in row.detail.predictions]
+    assert means == pytest.approx([first["vorticity_rmse"].mean, second["vorticity_rmse"].mean])
+
+
+def made_up(values: list[float], per_frame: Any = None) -> Score:
+    """Return a score of the ranking metric with given values per scenario."""
+    frames = np.empty((len(values), 0)) if per_frame is None else np.asarray(per_frame, float)
+    return Score(
+        metric=METRICS["vorticity_rmse"],
+        scenarios=tuple(range(len(values))),
+        frames=tuple(range(10, 10 + frames.shape[1])),
+        per_frame=frames,
+        values=np.array(values),
+        undefined=(0,) * len(values),
+    )
+
+
+def brute_force_p(first: list[float], second: list[float]) -> float:
+    """Return the sign-flip p-value by listing every pattern of signs."""
+    differences = [one - two for one, two in zip(first, second, strict=True)]
+    seen = abs(sum(differences)) - 1e-12
+    patterns = list(itertools.product((-1, 1), repeat=len(differences)))
+    return sum(abs(sum(s * d for s, d in zip(p, differences, strict=True))) >= seen for p in patterns) / len(
+        patterns
+    )
+
+
+def test_ranks_are_shared_where_the_test_cannot_decide() -> None:
+    """Whoever differs from the leader by the listed sign patterns stands behind; others share rank 1."""
+    rng = np.random.Generator(np.random.PCG64(5))
+    best = (1.0 + 0.1 * rng.random(8)).tolist()
+    held = {
+        "best": best,
+        "close": [value + (-1) ** i * 0.05 + 0.01 for i, value in enumerate(best)],
+        "worse": [value + 0.1 + 0.01 * i for i, value in enumerate(best)],
+        "worst": [value + 0.5 for value in best],
+    }
+    found = standings({name: made_up(values) for name, values in held.items()})
+    assert math.isnan(found["best"].p)
+    for name in ("close", "worse", "worst"):
+        assert found[name].p == pytest.approx(brute_force_p(held[name], best))
+    assert {name: standing.rank for name, standing in found.items()} == {
+        "best": 1,
+        "close": 1,
+        "worse": 3,
+        "worst": 4,
+    }
+    assert [found[name].shared for name in held] == [True, True, False, False]
+
+
+def test_few_scenarios_decide_nothing(board: Board) -> None:
+    """With two scenarios all ranked rows share rank 1, without a p-value, and the tab says so."""
+    (tab,) = board.tabs
+    assert not tab.decided
+    ranked = [row for row in tab.rows if row.rank is not None]
+    assert {row.id for row in ranked} == {"damped", "noisy", "flipping"}
+    assert all(row.rank == 1 and row.shared and math.isnan(row.p) for row in ranked)
+    means = [row.values[tab.ranking].mean for row in ranked]
+    assert means == sorted(means)
+    assert [row.floor for row in tab.rows[-2:]] == [True, True]
+
+
+def test_withdrawn_superseded_and_outdated_are_not_ranked(own: BoardBench) -> None:
+    """They stay on the board, below, and say why; scores of another task are left out."""
+    own.edit("noisy", lambda held: held.update(status="withdrawn", reason="leaked"))
+    own.edit("damped", lambda held: held.update(status="superseded", superseded_by="flipping"))
+    own.edit("flipping", lambda held: held["dataset"].update(sha256="0" * 64))
+    rows = {row.id: row for row in collect(own.folder, registry=own.registry).tabs[0].rows}
+    assert all(row.rank is None for row in rows.values())
+    assert (rows["noisy"].status, rows["noisy"].reason) == ("withdrawn", "leaked")
+    assert rows["damped"].superseded_by == "flipping"
+    assert not rows["flipping"].current
+
+
+def test_cost_and_speed_up(board: Board) -> None:
+    """Mean seconds per frame of the seeds, and the solver's time over it."""
+    cost = row_of(board, "damped").cost
+    assert cost is not None
+    assert (cost.seconds_per_frame, cost.solver_seconds_per_frame, cost.speed_up) == (0.5, 2.0, 4.0)
+    assert row_of(board, "noisy").cost is None
+
+
+def test_the_truth_is_not_that_of_an_explosion(bench: BoardBench, board: Board) -> None:
+    """Maps of truth and prediction share one packing: the tab's truth is that of a floor."""
+    names = ("flipping", "persistence")
+    coarse, fine = (read_stored(bench.folder / f"scores/cavity/tiny/{name}.nc") for name in names)
+    assert coarse.precision > 5.0 * fine.precision
+    assert np.array_equal(board.tabs[0].truth.vorticity, fine.preview.vorticity[0], equal_nan=True)
+
+
+def test_pictures_are_those_that_were_taken(board: Board, card: ScoreCard) -> None:
+    """Film and maps come back within half a step of their packing; energy is the scorer's."""
+    detail = row_of(board, "noisy").detail
+    assert np.abs(detail.pictures.film - card.preview.film[1]).max() <= 2.0 / 65534
+    known = ~np.isnan(card.preview.vorticity[1])
+    span = np.nanmax(card.preview.vorticity) - np.nanmin(card.preview.vorticity)
+    apart = np.abs(detail.pictures.vorticity - card.preview.vorticity[1])[known]
+    assert apart.max() <= span / 65534
+    assert detail.energy.mean == pytest.approx(card.submission["energy_predicted"].per_frame.mean(axis=0))
+    assert board.tabs[0].energy.mean == pytest.approx(card.submission["energy_true"].per_frame.mean(axis=0))
+
+
+def test_residual_histograms(card: ScoreCard) -> None:
+    """Shares of predicted minus true vorticity over its own range, against NumPy's histogram."""
+    for found, (truth, prediction) in zip(
+        residuals(card.preview), np.swapaxes(card.preview.vorticity.astype(float), 0, 1), strict=True
+    ):
+        r = (prediction - truth)[~np.isnan(truth)]
+        end = np.abs(r).max()
+        half = end / (RESIDUAL_BINS - 1)
+        counts, _ = np.histogram(r, bins=RESIDUAL_BINS, range=(-end - half, end + half))
+        assert (found.low, found.high) == (-end, end)
+        assert found.shares == pytest.approx(counts / r.size)
+
+
+def test_curves_keep_the_ends() -> None:
+    """At most 120 frames, first and last among them; mean, lowest and highest of the scenarios."""
+    frames = np.stack([np.arange(598.0), 3.0 * np.arange(598.0)])
+    frames[0, 0] = np.nan
+    found = curve(made_up([0.0, 0.0], frames))
+    assert len(found.frames) == CURVE_FRAMES
+    assert (found.frames[0], found.frames[-1]) == (10, 607)
+    assert found.mean[0] == 0.0
+    assert found.low[1:] == pytest.approx(np.array(found.frames[1:]) - 10.0)
+    assert found.high == pytest.approx(3.0 * (np.array(found.frames) - 10.0))
+    assert found.mean[1:] == pytest.approx(2.0 * (np.array(found.frames[1:]) - 10.0))
+
+
+def test_undefined_seeds_are_left_out(bench: BoardBench) -> None:
+    """A scenario that one seed has no value for takes the other's; none stays undefined."""
+    held = [
+        read_statistics(bench.folder / f"scores/cavity/tiny/{name}.nc") for name in ("noisy", "persistence")
+    ]
+    found: dict[str, Combined] = combine(held)
+    alone = held[0].scores()["vorticity_pearson"]
+    assert np.array_equal(found["vorticity_pearson"].score.values, alone.values)
+    assert math.isnan(found["vorticity_pearson"].std)
+
+
+def test_the_order_of_files_does_not_matter(bench: BoardBench, tmp_path: Path) -> None:
+    """The same submissions, copied in another order and time, give the same bytes of the page."""
+    pages = []
+    for name, reverse in (("one", False), ("two", True)):
+        target = tmp_path / name
+        for path in sorted(bench.folder.rglob("*.*"), reverse=reverse):
+            if path.is_file():
+                copy = target / path.relative_to(bench.folder)
+                copy.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(path, copy)
+        pages.append(build(target, registry=bench.registry).page.read_bytes())
+    assert pages[0] == pages[1]
+
+
+def test_an_entry_in_another_place_is_refused(own: BoardBench) -> None:
+    """Nothing is collected from a folder with a displaced entry, and no board from no folder."""
+    own.entry("noisy").rename(own.folder / PLACE / "other.yaml")
+    with pytest.raises(ChecksFailedError, match="another place"):
+        collect(own.folder, registry=own.registry)
+    with pytest.raises(UsageError, match="no leaderboard here"):
+        collect(own.folder / "nothing", registry=own.registry)
+
+
+def test_tables_and_json(board: Board) -> None:
+    """The terminal shows ranks, spread, cost, floors and flags; JSON has the same numbers."""
+    (table,) = tables(board, chosen_tabs(board, "cavity", None), ["position_rmse"])
+    assert table.columns[:4] == ("rank", "method", "vorticity_rmse", "position_rmse")
+    rows = {row[1]: row for row in table.rows}
+    assert rows["persistence"][0] == "-"
+    assert "floor" in rows["persistence"][-1]
+    assert rows["damped"][0] == "1="
+    assert " ± " in rows["damped"][2]
+    assert rows["damped"][4:6] == ("0.5", "4")
+    plain = as_plain(board.tabs)["tabs"][0]["rows"]
+    means = {row["id"]: row["metrics"]["position_rmse"]["mean"] for row in plain}
+    assert means["damped"] == digits(row_of(board, "damped").values["position_rmse"].mean)
+    with pytest.raises(UsageError, match="did you mean 'cavity tiny'"):
+        chosen_tabs(board, "cavity", "tyni")
+    with pytest.raises(UsageError, match="no metric"):
+        list(tables(board, board.tabs, ["position_rmsee"]))

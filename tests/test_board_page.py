@@ -1,0 +1,187 @@
+"""The leaderboard's page as a file: bytes, HTML, what its script is given."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from board_factory import make_board
+from html_check import read_html
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from lagbench.board.embedding import embedded
+from lagbench.board.model import Board
+from lagbench.board.packing import LEVELS, coarse, pack
+from lagbench.board.page import BUDGET, FEWEST, render
+from lagbench.board.payload import FINENESS, payload
+from lagbench.report.numbers import text
+
+DIGITS = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789-_"
+
+HOSTILE = "</script><script>console.error(1)</script><img src=http://example.com/x onerror=alert(1)>\u2028"
+
+
+@pytest.fixture(scope="module")
+def board() -> Board:
+    """Two tabs of eight entries."""
+    return make_board((("cavity", "full"), ("fluid", "mini")))
+
+
+@pytest.fixture(scope="module")
+def page(board: Board) -> str:
+    """Its page."""
+    return render(board)
+
+
+def unpack(packed: list[Any]) -> NDArray[np.float64]:
+    """Read packed numbers back, letter by letter."""
+    letters, low, high, log = packed
+    steps = [64 * DIGITS.index(a) + DIGITS.index(b) for a, b in zip(letters[::2], letters[1::2], strict=True)]
+    share = np.array(steps) / LEVELS
+    values = low * (high / low) ** share if log else low + (high - low) * share
+    return np.where(share > 1.0, np.nan, values)
+
+
+def held_by(page: str) -> Any:
+    """Return what the page's script is given."""
+    found = re.search(r'<script type="application/json" id="board">(.*?)</script>', page, re.DOTALL)
+    assert found is not None
+    return json.loads(found[1])
+
+
+@given(
+    st.lists(st.floats(-1e6, 1e6) | st.just(float("nan")), min_size=1, max_size=40),
+    st.booleans(),
+)
+def test_packed_numbers_come_back(values: list[float], log: bool) -> None:
+    """Unpacked values lie within half a step, or half a step of the logarithm, and gaps stay gaps."""
+    x = np.array(values)
+    packed: list[Any] = pack(x, log=log)
+    _, low, high, logarithmic = packed
+    back = unpack(packed)
+    np.testing.assert_array_equal(np.isnan(back), np.isnan(x))
+    known = ~np.isnan(x)
+    if logarithmic:
+        positive = known & (x >= low)
+        bound = np.log(high / low) / LEVELS if high > low else 0.0
+        assert np.all(np.abs(np.log(back[positive] / x[positive])) <= bound + 2e-5)
+    else:
+        assert np.all(
+            np.abs(back[known] - x[known]) <= 0.5 * (high - low) / LEVELS + 1e-5 * (1 + abs(x[known]))
+        )
+
+
+def test_coarse_field_keeps_its_mean() -> None:
+    """Blocks average the known nodes: 4 x 4 nodes become 2 x 2, worked by hand."""
+    field = np.arange(16.0).reshape(4, 4)
+    field[0, 0] = np.nan
+    # upper left block: 1, 4, 5 are known, mean 10/3
+    np.testing.assert_allclose(coarse(field, 2), [[10 / 3, 4.5], [10.5, 12.5]])
+    np.testing.assert_array_equal(coarse(field, 4), field)
+
+
+def test_board_arrives_at_the_script(board: Board, page: str) -> None:
+    """Scores to six digits, curves and films to their steps are what the board holds."""
+    held = held_by(page)
+    pool = held["pool"]
+    assert [tab["id"] for tab in held["tabs"]] == ["cavity-full", "fluid-mini"]
+    for tab, shown in zip(board.tabs, held["tabs"], strict=True):
+        for row, given_row in zip(tab.rows, shown["rows"], strict=True):
+            for name, told in zip(shown["metrics"], given_row["values"], strict=True):
+                mean = np.nan if not told or told[0] is None else told[0]
+                assert mean == pytest.approx(row.values[name].mean, rel=1e-8, nan_ok=True)
+            curve = row.detail.curves[tab.curves[0]]
+            packed = given_row["curves"][tab.curves[0]]
+            assert pool[packed["frames"]] == list(curve.frames)
+            np.testing.assert_allclose(unpack(pool[packed["mean"]]), curve.mean, rtol=2e-3)
+            film = unpack(pool[given_row["pictures"]["film"]])
+            count = len(pool[given_row["pictures"]["material"]])
+            np.testing.assert_allclose(film[:2], row.detail.pictures.film[0, 0], atol=3e-4)
+            np.testing.assert_allclose(film[-2:], row.detail.pictures.film[-1, -1], atol=3e-4)
+            assert film.size == 2 * count * len(pool[given_row["pictures"]["filmFrames"]])
+
+
+def test_equal_boards_give_equal_bytes(page: str) -> None:
+    """A board made anew gives the same page, which names no time and no folder."""
+    again = render(make_board((("cavity", "full"), ("fluid", "mini"))))
+    assert again == page
+    assert not re.search(r"/home/|/tmp/|/root/|\d\d:\d\d:\d\d", page)
+
+
+def test_page_is_html(page: str) -> None:
+    """Every element is closed in order and every id is there once."""
+    assert read_html(page).faults == []
+
+
+def test_tables_need_no_script(board: Board, page: str) -> None:
+    """The main scores of every active entry stand in the HTML as text."""
+    reading = read_html(page)
+    tables = [element for element in reading.named("table") if element.attributes["class"] == "board"]
+    assert len(tables) == len(board.tabs)
+    for tab, table in zip(board.tabs, tables, strict=True):
+        for row in tab.rows:
+            assert (row.name in table.text) is (row.status == "active")
+            if row.status == "active":
+                assert text(row.values[tab.ranking].mean) in table.text
+
+
+def test_policy_allows_only_our_script_and_style(page: str) -> None:
+    """The policy forbids all but the hashes of what the page holds; nothing in it runs by itself."""
+    policy = read_html(page).named("meta")[1].attributes["content"]
+    assert policy.startswith("default-src 'none';")
+    assert "unsafe" not in policy
+    inline = re.findall(r"<(script|style)>(.*?)</\1>", page, re.DOTALL)
+    assert [name for name, _ in inline] == ["style", "script", "script"]
+    for _, body in inline:
+        digest = base64.b64encode(hashlib.sha256(body.encode()).digest()).decode()
+        assert f"'sha256-{digest}'" in policy
+    assert not re.search(r"""(src|href)=["']?(https?:)?//""", page)
+    assert not re.search(r"url\(|@import|innerHTML|eval\(|\bfetch\(|XMLHttpRequest|new Function", page)
+
+
+def test_hostile_text_stays_text(board: Board) -> None:
+    """Whatever a name holds, the page has the same elements as without it."""
+    board = replace(board, tabs=(replace(board.tabs[0], rows=board.tabs[0].rows[:1]),))
+    first = board.tabs[0].rows[0]
+    bad = replace(first, name=HOSTILE, authors=(HOSTILE,), affiliation=HOSTILE, code="javascript:alert(1)")
+    page = render(replace(board, tabs=(replace(board.tabs[0], rows=(bad,)),)))
+    names = [element.name for element in read_html(page).elements]
+    assert names == [element.name for element in read_html(render(board)).elements]
+    assert held_by(page)["tabs"][0]["rows"][0]["name"] == HOSTILE
+    assert "\u2028" not in page.split('id="board">')[1]
+
+
+@given(st.text())
+def test_any_text_survives_embedding(text: str) -> None:
+    """JSON in HTML reads back as it was and holds nothing that could end its element."""
+    said = embedded({"text": text})
+    assert not set("<>&\u2028\u2029") & set(said)
+    assert json.loads(said)["text"] == text
+
+
+def test_fifty_entries_fit() -> None:
+    """Fifty entries make a page of less than 2 MB."""
+    size = len(render(make_board((("cavity", "full"), ("fluid", "full")), entries=25)).encode())
+    assert size <= BUDGET * FEWEST < 2_000_000
+
+
+def test_finer_is_longer(board: Board) -> None:
+    """Each step of fineness is shorter than the one before, so that the search may halve."""
+    one = replace(board, tabs=board.tabs[:1])
+    sizes = [len(embedded(payload(one, fineness))) for fineness in FINENESS]
+    assert sizes == sorted(sizes, reverse=True)
+
+
+def test_empty_board_is_a_page() -> None:
+    """A board without entries says so."""
+    page = render(Board(tabs=(), metrics={}))
+    assert read_html(page).faults == []
+    assert "There are no entries yet." in page

@@ -1,0 +1,222 @@
+"""The panel of an entry in a real browser, and what text of strangers does there: nothing."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from board_browsing import active, close, names, press, restored, run, still, until
+from board_factory import make_board
+from browser import CHROMIUM, Browser, Page, browser
+
+from lagbench.board.columns import value_of
+from lagbench.board.model import Board
+from lagbench.board.page import render
+
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here: apt-get install chromium")
+
+HOSTILE = "</script><script>console.error(1)</script><img src=http://example.com/x onerror=console.error(2)>"
+
+
+@pytest.fixture(scope="module")
+def running() -> Iterator[Browser]:
+    """One browser for all tests."""
+    with browser() as started:
+        yield started
+
+
+@pytest.fixture(scope="module")
+def board() -> Board:
+    """A tab of eight entries."""
+    return make_board((("cavity", "full"),), nodes=16)
+
+
+@pytest.fixture(scope="module")
+def file(board: Board, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Its page."""
+    path = tmp_path_factory.mktemp("board") / "index.html"
+    path.write_text(render(board), encoding="utf-8")
+    return path
+
+
+@pytest.fixture
+def page(running: Browser, file: Path) -> Iterator[Page]:
+    """The page opened, still films; nothing complained of and nothing asked for in the end."""
+    opened = running.open(file, width=1280)
+    still(opened)
+    yield opened
+    assert opened.messages == []
+    assert {request.partition("#")[0] for request in opened.requests} == {file.absolute().as_uri()}
+    close(opened)
+
+
+def test_panel_by_keyboard(page: Page, board: Board) -> None:
+    """Enter on a name opens its panel, Escape closes it; the focus comes back to the name."""
+    row = next(row for row in board.tabs[0].rows if row.flags)
+    run(page, f"document.querySelector('section:not([hidden]) [data-entry={row.id}] .name').focus()")
+    press(page, "Enter")
+    until(page, "document.getElementById('panel').open")
+    text = page.value("document.getElementById('panel').textContent")
+    for said in (row.name, row.detail.command, row.detail.training, row.flags[0].reasons[0], row.authors[0]):
+        assert said in text
+    assert f"entry={row.id}" in page.value("location.hash")
+    assert page.value("document.getElementById('panel').contains(document.activeElement)")
+    press(page, "Tab")
+    assert page.value("document.getElementById('panel').contains(document.activeElement)")
+    press(page, "Escape")
+    until(page, "!document.getElementById('panel').open && !location.hash.includes('entry=')")
+    assert page.value("document.activeElement.textContent") == row.name
+
+
+def test_panel_draws_everything(page: Page, board: Board) -> None:
+    """Curves, dots per scenario, maps, histograms, energy and the film are drawn."""
+    tab = board.tabs[0]
+    restored(page, "#tab=cavity-full&entry=gns")
+    drawn = page.value("[...document.querySelectorAll('#panel [data-figure]')].map(f => f.dataset.figure)")
+    assert drawn == ["errors", "scenarios", "maps", "film", "energy", "residual", "distribution"]
+    count = "document.querySelectorAll('#panel [data-figure={}] {}').length"
+    assert page.value(count.format("errors", ".line:not(.swatch *)")) == 3
+    assert page.value(count.format("errors", ".band")) == 1
+    assert page.value(count.format("scenarios", ".chart .spot.s0")) == len(tab.scenarios)
+    assert page.value(count.format("energy", ".chart .line")) == 4
+    fields = page.value(
+        "[...document.querySelectorAll('#panel canvas')].map(c =>"
+        " new Set(c.getContext('2d').getImageData(0, 0, c.width, c.height).data).size)"
+    )
+    assert len(fields) == 4 * 3 + 2
+    assert min(fields) > 4
+    run(page, "document.querySelector('#panel [data-figure=errors] select').value = 'vorticity_pearson'")
+    run(
+        page,
+        "document.querySelector('#panel [data-figure=errors] select').dispatchEvent(new Event('change'))",
+    )
+    assert "stable above 0.8" in page.value(
+        "document.querySelector('#panel [data-figure=errors]').textContent"
+    )
+
+
+def test_map_shows_the_field(page: Page, board: Board) -> None:
+    """Pixels of the truth's map: opacity is the share of the greatest value, colour its sign."""
+    restored(page, "#tab=cavity-full&entry=gns")
+    data = page.value(
+        "[...document.querySelector('#panel canvas').getContext('2d').getImageData(0, 0, 16, 16).data]"
+    )
+    pixels = np.array(data).reshape(16, 16, 4)[::-1].transpose(1, 0, 2)  # [x node, y node]
+    truth = board.tabs[0].truth.vorticity
+    field = truth[0]
+    limit = np.nanmax(np.abs(field))
+    known = np.isfinite(field)
+    assert np.all(pixels[~known] == [128, 128, 128, 34])
+    np.testing.assert_allclose(pixels[known][:, 3], 255 * np.abs(field[known]) / limit, atol=1.6)
+    strong = known & (np.abs(field) > 0.2 * limit)
+    assert np.all((pixels[strong][:, 0] > pixels[strong][:, 2]) == (field[strong] > 0))
+
+
+def test_film_plays_unless_motion_is_unwanted(page: Page) -> None:
+    """With reduced motion it waits for Play; otherwise it starts; Pause stops it."""
+    at = "Number(document.querySelector('#panel input[type=range]').value)"
+    label = "document.querySelector('#panel .play').textContent"
+    restored(page, "#tab=cavity-full&entry=gns")
+    assert (page.value(label), page.value(at)) == ("Play", 0)
+    still(page, "no-preference")
+    restored(page, "#tab=cavity-full&entry=gns")
+    assert page.value(label) == "Pause"
+    until(page, f"{at} > 0")
+    run(page, "document.querySelector('#panel .play').click()")
+    stopped = page.value(at)
+    time.sleep(0.2)
+    assert 0 < page.value(at) == stopped
+
+
+def test_command_is_copied(page: Page, board: Board) -> None:
+    """The button puts the exact command into the clipboard."""
+    page.browser.call(
+        "Browser.grantPermissions", permissions=["clipboardReadWrite", "clipboardSanitizedWrite"]
+    )
+    restored(page, "#tab=cavity-full&entry=gns")
+    page.call("Page.bringToFront")
+    page.call("Runtime.evaluate", expression="document.querySelector('.copy').click()", userGesture=True)
+    until(page, "document.querySelector('.copy').textContent === 'Copied'")
+    held = page.call("Runtime.evaluate", expression="navigator.clipboard.readText()", awaitPromise=True)
+    row = next(row for row in board.tabs[0].rows if row.id == "gns")
+    assert held["result"]["value"] == row.detail.command
+
+
+def test_scatter_leads_to_entries(page: Page, board: Board) -> None:
+    """Every entry with a cost is a dot that is a link; the best in both are joined."""
+    dots: Any = page.value(
+        "[...document.querySelectorAll('section:not([hidden]) [data-figure=cost] a.dot')]"
+        ".map(a => [a.href.baseVal, a.classList.contains('best')])"
+    )
+    rows = [row for row in active(board.tabs[0].rows) if row.cost is not None]
+    assert len(dots) == len(rows)
+    points = {row.id: (-float(value_of(row, "speed_up")), row.values["vorticity_rmse"].mean) for row in rows}
+    best = {
+        i
+        for i, (x, y) in points.items()
+        if not any(a <= x and b <= y and (a, b) != (x, y) for a, b in points.values())
+    }
+    assert {href.partition("entry=")[2] for href, front in dots if front} == best
+    run(page, "document.querySelector('section:not([hidden]) [data-figure=cost] a.dot').focus()")
+    press(page, "Enter")
+    until(page, "document.getElementById('panel').open")
+
+
+def test_hostile_text_does_nothing(running: Browser, board: Board, tmp_path: Path) -> None:
+    """Scripts, images and odd addresses in a submission show as text in table, panel and CSV."""
+    tab = board.tabs[0]
+    detail = replace(
+        tab.rows[0].detail,
+        command=HOSTILE,
+        notes=HOSTILE,
+        training=HOSTILE,
+        hardware="{{script}}",
+        scored_by=HOSTILE,
+    )
+    bad = replace(
+        tab.rows[0],
+        name=HOSTILE,
+        authors=(HOSTILE, "__proto__", "\u202eright to left"),
+        affiliation="=HYPERLINK(1)",
+        code="javascript:console.error(3)",
+        paper="data:text/html,<script>console.error(4)</script>",
+        flags=(replace(board.tabs[0].rows[4].flags[0], name="__proto__", reasons=(HOSTILE,)),),
+        detail=detail,
+    )
+    long = replace(tab.rows[1], name="=1+1" + "W" * 10_000)
+    path = tmp_path / "index.html"
+    shown = replace(board, tabs=(replace(tab, rows=(bad, long, *tab.rows[2:])),))
+    path.write_text(render(shown), encoding="utf-8")
+    page = running.open(path, width=390)
+    still(page)
+    for hash_ in ("", f"entry={bad.id}", f"entry={long.id}"):
+        restored(page, f"#tab=cavity-full&{hash_}")
+        assert page.value("document.images.length") == 0
+        assert page.value("document.scripts.length") == 3
+        assert page.value("[...document.links].every(a => ['file:', 'https:'].includes(a.protocol))")
+        assert page.value("document.documentElement.scrollWidth") <= 390
+        assert HOSTILE in page.value("document.querySelector('.entries .name').textContent")
+        if hash_.endswith(bad.id):
+            assert HOSTILE in page.value("document.querySelector('#panel h2').textContent")
+            assert "javascript:console.error(3)" in page.value("document.querySelector('#panel').textContent")
+    assert page.messages == []
+    assert {request.partition("#")[0] for request in page.requests} == {path.absolute().as_uri()}
+    close(page)
+
+
+def test_fifty_entries_are_there_within_a_second(running: Browser, tmp_path: Path) -> None:
+    """Loading to a page that answers takes less than a second of processor time."""
+    path = tmp_path / "index.html"
+    path.write_text(render(make_board((("cavity", "full"),), entries=50, nodes=40)), encoding="utf-8")
+    page = running.open(path, width=1280)
+    page.call("Performance.enable", timeDomain="threadTicks")  # the clock of a busy machine says nothing
+    restored(page, "#tab=cavity-full")
+    told = {one["name"]: one["value"] for one in page.call("Performance.getMetrics")["metrics"]}
+    assert len(names(page)) == 48
+    assert 0.01 < told["TaskDuration"] < 1.0
+    close(page)

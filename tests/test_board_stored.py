@@ -1,0 +1,100 @@
+"""Score files of strangers: self-contained, bounded, and read in a child process first."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from board_bench import BoardBench, copied
+
+from lagbench.board import isolation
+from lagbench.board.check import check_board
+from lagbench.board.isolation import unreadable_in_child
+from lagbench.board.stored import read_stored
+from lagbench.errors import UnreadableFileError
+
+SCORES = "scores/cavity/tiny"
+
+
+@pytest.fixture
+def own(tmp_path_factory: pytest.TempPathFactory, tmp_path: Path) -> BoardBench:
+    """A copy of the leaderboard that the test may damage."""
+    return copied(tmp_path_factory, tmp_path, without=["constant-velocity", "damped", "flipping"])
+
+
+def hostile(path: Path, kind: str, secret: Path) -> None:
+    """Make a valid score file one that reaches outside, unpacks to gigabytes, or has other insides."""
+    with h5py.File(path, "r+") as file:
+        preview = file["preview"]
+        film = preview["film"]
+        shape, attributes = film.shape, {name: film.attrs[name] for name in ("scale_factor", "add_offset")}
+        if kind == "infinite":
+            file["value"][0, 0, 0] = np.inf
+            return
+        if kind == "extra group":
+            file.create_group("more")
+            return
+        if kind == "bomb":
+            options = {"dtype": "f4", "compression": "gzip", "chunks": (1 << 20,), "fillvalue": 0}
+            file.create_dataset("bomb", (1 << 30,), **options)
+            return
+        del preview["film"]
+        if kind == "external link":
+            preview["film"] = h5py.ExternalLink(str(secret), "/film")
+        elif kind == "soft link":
+            preview["film"] = h5py.SoftLink("/value")
+        elif kind == "external storage":
+            size = int(np.prod(shape)) * 2
+            made = preview.create_dataset("film", shape, "u2", external=[(str(secret), 0, size)])
+            made.attrs.update(attributes)
+        elif kind == "virtual":
+            layout = h5py.VirtualLayout(shape, "u2")
+            layout[...] = h5py.VirtualSource(str(secret), "film", shape)
+            preview.create_virtual_dataset("film", layout)
+        elif kind == "another type":
+            preview.create_dataset("film", shape, "f8")
+        elif kind == "another shape":
+            preview.create_dataset("film", (2, 1, 1, 2), "u2")
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        *("external link", "soft link", "external storage", "virtual", "bomb", "extra group"),
+        *("infinite", "another type", "another shape"),
+    ],
+)
+def test_hostile_score_files_are_refused(kind: str, own: BoardBench) -> None:
+    """Nothing outside the file is shown, nothing is unpacked to gigabytes, no shape is believed."""
+    secret = own.folder.parent / "secret"
+    secret.write_bytes(bytes(range(256)) * 400)
+    path = own.folder / SCORES / "noisy.nc"
+    hostile(path, kind, secret)
+    assert path.stat().st_size <= 300_000
+    with pytest.raises(UnreadableFileError):
+        read_stored(path)
+    own.reseal("noisy")
+    result = check_board(own.folder, registry=own.registry, page=False, isolated=False)
+    assert [finding.check for finding in result.findings] == ["score_file"]
+
+
+def test_the_child_is_limited_and_started_anew(own: BoardBench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It tells which file is damaged; a file that stops it costs that file only."""
+    good, bad = own.folder / SCORES / "noisy.nc", own.folder / SCORES / "persistence.nc"
+    bad.write_bytes(bad.read_bytes()[:5000])
+    assert set(unreadable_in_child([good, bad, good])) == {bad}
+    program = own.folder.parent / "fake"
+    program.mkdir()
+    (program / "child_that_stops.py").write_text(
+        "import json, os, sys\n"
+        "for path in json.load(sys.stdin):\n"
+        "    if 'persistence' in path: os.kill(os.getpid(), 11)\n"
+        "    print('null', flush=True)\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", str(program))
+    monkeypatch.setattr(isolation, "CHILD", "child_that_stops")
+    stopped = unreadable_in_child([good, bad, good])
+    assert set(stopped) == {bad}
+    assert "had to be stopped" in stopped[bad]

@@ -1,0 +1,209 @@
+"""Submitting: what is written, what is refused, and that it is all or nothing."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from board_bench import DAY, BoardBench, copied
+from report_bench import damped, noisy, still
+
+from lagbench import __version__, submission
+from lagbench.board import submit as submitting
+from lagbench.board.check import check_board
+from lagbench.board.entry_file import read_entry
+from lagbench.board.publishing import batch
+from lagbench.checksums import file_sha256
+from lagbench.errors import ChecksFailedError, UnreadableFileError, UsageError, WorkFailedError
+from lagbench.submission import open_predictions
+
+
+@pytest.fixture
+def own(tmp_path_factory: pytest.TempPathFactory, tmp_path: Path) -> BoardBench:
+    """A copy of the leaderboard."""
+    return copied(tmp_path_factory, tmp_path)
+
+
+@pytest.fixture
+def predictions(own: BoardBench) -> Path:
+    """Predictions of a model that is not on the board yet."""
+    labels = {"device": "a laptop", "seconds_per_frame": 0.25, "parameters": 9, "training": "train"}
+    return own.predict(noisy, "my-model", **labels)
+
+
+def test_the_entry_says_all_that_is_known(own: BoardBench, predictions: Path) -> None:
+    """Labels of the predictions, what the submitter adds, data set, hashes, scores and their origin."""
+    result = own.submit(predictions, name="My model", code="https://a.org/x", solver_seconds_per_frame=0.5)
+    entry = read_entry(own.entry("my-model"))
+    assert (entry.name, entry.code, entry.date) == ("My model", "https://a.org/x", DAY)
+    assert (entry.parameters, entry.training) == (9, "train")
+    assert entry.cost is not None
+    assert entry.cost.model_dump() == {
+        "seconds_per_frame": 0.25,
+        "device": "a laptop",
+        "solver_seconds_per_frame": 0.5,
+    }
+    with open_predictions(predictions) as opened:
+        assert [made.sha256 for made in entry.predictions] == [opened.content_sha256()]
+        assert entry.dataset.sha256 == opened.header.dataset_sha256
+    assert entry.predictions[0].bytes == predictions.stat().st_size
+    assert (entry.score.scored_by, entry.score.lagbench) == ("A. Author", __version__)
+    (score_file,) = entry.score_paths
+    assert entry.score.files[0].sha256 == file_sha256(own.folder / score_file)
+    card = own.data.card(predictions)
+    assert result.mean == pytest.approx(card.submission[card.ranking].mean, rel=1e-8)
+    assert [path.name for path in result.files] == ["my-model.yaml", "my-model.nc"]
+    assert all(path.stat().st_size <= 300_000 for path in result.files)
+    assert not check_board(own.folder, registry=own.registry, page=False, isolated=False).findings
+    before = own.state()
+    own.submit(
+        predictions, replace=True, name="My model", code="https://a.org/x", solver_seconds_per_frame=0.5
+    )
+    assert own.state() == before
+
+
+def test_replacing_leaves_no_score_file_over(own: BoardBench) -> None:
+    """Two seeds that become one: the score files of both are gone, the new one is there."""
+    own.submit(own.predict(damped, "damped"), replace=True)
+    names = {path.name for path in (own.folder / "scores/cavity/tiny").iterdir()}
+    assert "damped.nc" in names
+    assert not names & {"damped_0.nc", "damped_3.nc"}
+
+
+def test_predictions_in_the_folder_are_referred_to(own: BoardBench) -> None:
+    """A file inside the leaderboard's folder is named by its path there, one elsewhere is not."""
+    inside = own.folder / "predictions" / "mine.nc"
+    inside.parent.mkdir()
+    own.data.submit(inside, noisy, "inside")
+    own.submit(inside)
+    assert read_entry(own.entry("inside")).predictions[0].path == "predictions/mine.nc"
+    assert read_entry(own.entry("noisy")).predictions[0].path is None
+    assert not check_board(own.folder, registry=own.registry, page=False, isolated=False).findings
+
+
+def tree(folder: Path) -> set[str]:
+    """Return everything under a folder, hidden files too."""
+    return {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ({"authors": ()}, "--author"),
+        ({"command": ""}, "--command"),
+        ({"method": "noisy"}, "such an entry already"),
+        ({"method": "persistence"}, "name of a floor"),
+        ({"urls": ("https://a.org/1", "https://a.org/2")}, "differ in number"),
+    ],
+)
+def test_refused_before_the_work(
+    keys: dict[str, Any], message: str, own: BoardBench, predictions: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is missing or taken is said before anything is scored, and nothing is written."""
+    monkeypatch.setattr(submitting, "score", _never)
+    before = tree(own.folder)
+    with pytest.raises(UsageError, match=message):
+        own.submit(predictions, **keys)
+    assert tree(own.folder) == before
+
+
+def _never(*_: object, **__: object) -> None:
+    raise AssertionError
+
+
+def test_files_that_do_not_belong_together(own: BoardBench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Several files need seeds that differ; a label that is no id needs --method."""
+    monkeypatch.setattr(submitting, "score", _never)
+    plain, other = own.predict(still, "plain"), own.predict(noisy, "other")
+    with pytest.raises(UsageError, match="seeds that differ"):
+        own.submit(plain, other, method="both")
+    same = own.predict(still, "same", seed=4)
+    with pytest.raises(UsageError, match="seeds that differ"):
+        own.submit(same, same)
+    odd = own.data.submit(own.folder.parent / "odd.nc", still, "My Model!")
+    with pytest.raises(UsageError, match="--method my-model"):
+        own.submit(odd)
+
+
+def test_invalid_predictions_leave_nothing(own: BoardBench, predictions: Path, tmp_path: Path) -> None:
+    """A damaged second file: the first is not scored, nothing is written."""
+    import h5py
+
+    damaged = tmp_path / "damaged.nc"
+    damaged.write_bytes(predictions.read_bytes())
+    with h5py.File(damaged, "r+") as file:
+        file["position"][0, 0, 0, 0] = float("nan")
+    before = tree(own.folder)
+    with pytest.raises(ChecksFailedError, match="finite"):
+        own.submit(predictions, damaged)
+    with pytest.raises(UnreadableFileError):
+        own.submit(tmp_path / "none.nc")
+    assert tree(own.folder) == before
+
+
+def _renew(folder: Path) -> None:
+    with batch(folder) as files:
+        files.prepare(Path("a/old")).write_text("new a")
+        files.prepare(Path("b/new")).write_text("new b")
+        files.publish(remove=[Path("gone"), Path("a/old"), Path("never")])
+
+
+@pytest.mark.parametrize("step", range(4))
+def test_a_failure_while_publishing_undoes_everything(step: int, tmp_path: Path, monkeypatch: Any) -> None:
+    """Whichever rename fails, new files are gone and old ones are back, byte for byte."""
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "old").write_text("old a")
+    (tmp_path / "gone").write_text("old gone")
+    rename: Callable[..., Path] = Path.rename
+    calls = iter(range(100))
+
+    def failing(self: Path, target: Path) -> Path:
+        if next(calls) == step:
+            raise OSError(28, "No space left on device")
+        return rename(self, target)
+
+    before = {path: path.read_text() for path in tmp_path.rglob("*") if path.is_file()}
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "rename", failing)
+        with pytest.raises(WorkFailedError, match="No space left"):
+            _renew(tmp_path)
+    assert {path: path.read_text() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
+def test_a_score_file_that_is_too_long_is_not_published(
+    own: BoardBench, predictions: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """More than 300 kB: the work failed, and nothing is left behind."""
+    monkeypatch.setattr(submitting, "MAX_SCORE_BYTES", 1000)
+    before = tree(own.folder)
+    with pytest.raises(WorkFailedError, match="too long"):
+        own.submit(predictions)
+    assert tree(own.folder) == before
+
+
+def test_floors_are_written_anew(own: BoardBench) -> None:
+    """A floor needs no words and no --replace; its positions are those of the template."""
+    before = own.state()
+    own.submit_floor("persistence")
+    assert own.state() == before
+    entry = read_entry(own.entry("persistence"))
+    assert entry.command == "lagbench submit --floor persistence --split cavity --size tiny"
+    path = own.folder.parent / "template.nc"
+    submission.template("cavity", "tiny", output=path, root=own.data.root, registry=own.registry)
+    with open_predictions(path) as opened:
+        assert entry.predictions[0].sha256 == opened.content_sha256()
+    with pytest.raises(UsageError, match="did you mean 'persistence'"):
+        own.submit_floor("persistance")
+
+
+def test_what_is_not_given(own: BoardBench) -> None:
+    """The date is today's in UTC; seeds timed on different machines have no cost."""
+    first = own.predict(damped, "mixed", seed=0, device="one", seconds_per_frame=0.25)
+    second = own.predict(noisy, "mixed", seed=1, device="two", seconds_per_frame=0.25)
+    own.submit(first, second, date=None)
+    entry = read_entry(own.entry("mixed"))
+    assert entry.cost is None
+    assert abs(entry.date - datetime.datetime.now(datetime.UTC).date()) <= datetime.timedelta(days=1)
