@@ -1,4 +1,4 @@
-# make demo   from nothing to four generated, verified and drawn data sets
+# make demo   from nothing to four verified data sets, a trained model, its scores, a leaderboard page
 # make test   install and run the tests
 PYTHON ?= python3
 VENV ?= .venv

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import torch
 from pydantic import Field, PositiveInt
@@ -19,6 +19,8 @@ from .grid_fields import transfer
 from .mlp import Activation, dense
 
 __all__ = ["LSTM", "LSTMWithMLP"]
+
+Share = Annotated[float, Field(ge=0, lt=1)]
 
 
 class LSTM(FrameNetwork):
@@ -41,14 +43,14 @@ class LSTM(FrameNetwork):
             encoder: widths of pointwise layers before the latent one.
             decoder: widths of hidden layers after the second LSTM layer.
             dropout: after the first and after the second LSTM layer.
-            density_weight: of the density term in the loss. With 1 its gradient, which moves particles
-                within a cell, drowns that of the positions: a mean position is then missed by 1.2 deviations.
+            density_weight: of the density term in the loss. The thesis states none; with 1 the
+                gradient within a cell drowns that of the positions, which then are not learned.
         """
 
         latent: PositiveInt = 1250
         encoder: tuple[PositiveInt, ...] = ()
         decoder: tuple[PositiveInt, ...] = (1250,)
-        dropout: tuple[float, float] = (0.2, 0.1)
+        dropout: tuple[Share, Share] = (0.2, 0.1)
         density_weight: float = Field(default=0.03, ge=0, allow_inf_nan=False)
 
     options: Options

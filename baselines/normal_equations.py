@@ -82,17 +82,17 @@ def solve(blocks: Blocks) -> LeastSquares:
     Raises:
         WorkFailedError: no rows, or values that are not finite.
     """
-    regressors = next((x.shape[1] for x, _ in blocks), None)
-    if regressors is None:
+    shape = next(((x.shape[1], y.shape[1]) for x, y in blocks), None)
+    if shape is None:
         raise WorkFailedError("nothing to fit", expected="scenarios longer than the lags", got="no rows")
-    return _tall(blocks) if blocks.rows >= regressors else _wide(blocks)
+    return _tall(blocks, shape) if blocks.rows >= shape[0] else _wide(blocks)
 
 
-def _tall(blocks: Blocks) -> LeastSquares:
+def _tall(blocks: Blocks, shape: tuple[int, int]) -> LeastSquares:
     """Solve with the Gram matrix of the regressors, by blocks of rows."""
-    factor = _factor(lambda: _gram(x for x, _ in blocks))
-    solution = factor.divide(_products(blocks))
-    solution += factor.divide(_products((x, _residual(x, y, solution)) for x, y in blocks))
+    factor = _factor(lambda: _gram((x for x, _ in blocks), shape[0]))
+    solution = factor.divide(_products(blocks, shape))
+    solution += factor.divide(_products(((x, _residual(x, y, solution)) for x, y in blocks), shape))
     return LeastSquares(
         coefficients=solution, condition=factor.condition, floor=factor.floor, rows=blocks.rows
     )
@@ -101,7 +101,7 @@ def _tall(blocks: Blocks) -> LeastSquares:
 def _wide(blocks: Blocks) -> LeastSquares:
     """Solve with the Gram matrix of the rows, which all fit."""
     x, y = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
-    factor = _factor(lambda: _gram([np.ascontiguousarray(x.T)]))
+    factor = _factor(lambda: _gram([np.ascontiguousarray(x.T)], len(x)))
     dual = factor.divide(np.asfortranarray(y))
     dual += factor.divide(np.asfortranarray(y - x @ (x.T @ dual)))
     return LeastSquares(
@@ -109,25 +109,19 @@ def _wide(blocks: Blocks) -> LeastSquares:
     )
 
 
-def _gram(blocks: Iterable[Matrix]) -> Matrix:
+def _gram(blocks: Iterable[Matrix], size: int) -> Matrix:
     """Return the upper triangle of X'X from blocks of rows."""
-    total: Matrix | None = None
+    total: Matrix = np.zeros((size, size), order="F")
     for x in blocks:
-        if total is None:
-            total = np.zeros((x.shape[1], x.shape[1]), order="F")
         total = blas.dsyrk(1.0, x.T, beta=1.0, c=total, overwrite_c=True)
-    assert total is not None
     return total
 
 
-def _products(blocks: Iterable[tuple[Matrix, Matrix]]) -> Matrix:
+def _products(blocks: Iterable[tuple[Matrix, Matrix]], shape: tuple[int, int]) -> Matrix:
     """Return X'Y from blocks of rows, Fortran-ordered."""
-    total: Matrix | None = None
+    total: Matrix = np.zeros(shape, order="F")
     for x, y in blocks:
-        if total is None:
-            total = np.zeros((x.shape[1], y.shape[1]), order="F")
         total = blas.dgemm(1.0, x.T, y.T, trans_b=True, beta=1.0, c=total, overwrite_c=True)
-    assert total is not None
     return total
 
 

@@ -26,6 +26,9 @@ Region = tuple[tuple[float, float], tuple[float, float]]
 # Roberts' R2 sequence: 1/g and 1/g^2 for the real root g of g^3 = g + 1.
 _R2 = np.array([0.7548776662466927, 0.5698402909980532])
 
+SEED_BLOCK = 1 << 16
+"""Points of the sequence drawn at once: a million particles take no memory beside their own."""
+
 
 class Shape(Protocol):
     """A body's outline about the origin."""
@@ -215,13 +218,14 @@ def seeds(rng: RandomSource, body: Body, count: int) -> Array:
     """
     shift = rng.random((2,))
     side = 2.0 * max(body.shape.reach)
+    block = min(4 * count, SEED_BLOCK)
     found, missing, start = [np.empty((0, 2))], count, 1
     while missing > 0:
-        index = np.arange(start, start + 4 * count, dtype=np.float64)[:, None]
+        index = np.arange(start, start + block, dtype=np.float64)[:, None]
         turns = shift + index * _R2
         local = (turns - np.floor(turns) - 0.5) * side
         inside = local[body.shape.distance(local) <= 0.0][:missing]
         found.append(inside)
         missing -= len(inside)
-        start += 4 * count
+        start += block
     return quantise(body.centre + np.concatenate(found))

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import functools
 import os
+import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from .errors import LagbenchError, WorkFailedError
 
-__all__ = ["atomic_path", "check_writable", "remove_leftovers", "write_atomically"]
+__all__ = ["atomic_path", "check_writable", "remove_leftovers", "temporary_name", "write_atomically"]
 
 SUFFIX = ".partial"
 """Ending of temporary names; nothing but this module creates or removes such files."""
@@ -33,7 +35,7 @@ def atomic_path(target: Path, *, option: str = ROOT_OPTION) -> Iterator[Path]:
     Raises:
         WorkFailedError: the operating system refused (no space, no permission).
     """
-    temporary = _temporary(target)
+    temporary = temporary_name(target)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         yield temporary
@@ -68,7 +70,7 @@ def check_writable(folder: Path, *, option: str = ROOT_OPTION) -> None:
     Raises:
         WorkFailedError: the operating system refused.
     """
-    probe = _temporary(folder / "probe")
+    probe = temporary_name(folder / "probe")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         probe.touch()
@@ -89,8 +91,15 @@ def remove_leftovers(folder: Path) -> list[Path]:
     return found
 
 
-def _temporary(target: Path) -> Path:
-    return target.with_name(f".{target.name}.{os.getpid()}{SUFFIX}")
+def temporary_name(target: Path) -> Path:
+    """Return this process's own temporary name beside a target, of which nothing may be left."""
+    return target.with_name(f".{target.name}.{os.getpid()}-{_mark()}{SUFFIX}")
+
+
+@functools.cache
+def _mark() -> str:
+    """Return what tells equal process ids of several machines apart."""
+    return secrets.token_hex(4)
 
 
 def _refused(target: Path, option: str, error: OSError) -> WorkFailedError:

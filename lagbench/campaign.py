@@ -6,18 +6,21 @@ simulates, so that Ctrl-C reaches it at once and a crash of the solver cannot ta
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from .atomic import remove_leftovers
 from .cards import write_cards
+from .cluster import Cluster
+from .crew import Crew
 from .errors import DataError
+from .gathering import gather
 from .generators.batch import Job
 from .generators.simulate import Outcome, scenario_key, simulate
 from .generators.solver import Device
 from .generators.twin import twin_floors, twin_substeps
 from .identity import environment_of, promises_bits
-from .inventory import examine
+from .inventory import Finding, Look, look
 from .layout import MANIFEST_NAME, dataset_folder, scenario_path
 from .manifest import FileEntry, Manifest, describe_file, merge, read_manifest, write_manifest
 from .plan import Estimate, check_disk, estimate
@@ -25,7 +28,8 @@ from .pool import Event, Pool, Task
 from .progress import Meter
 from .registry import Size, Split
 from .scenario_ids import spell_ids
-from .statistics import file_statistics, round_digits
+from .shared_folder import await_file
+from .statistics import file_moments, round_digits, statistics
 from .verdict import compare
 
 __all__ = ["Campaign"]
@@ -41,9 +45,10 @@ class Campaign:
         size: tier of a split.
         root: folder that holds all data sets.
         device: where the solver runs.
-        workers: worker processes.
+        crew: who simulates.
         meter: counts the work.
         split: the split that the size belongs to.
+        sources: other root folders to take finished scenarios from.
 
     Attributes:
         manifest: what the folder holds, as far as is known.
@@ -57,29 +62,28 @@ class Campaign:
         size: Size,
         root: Path,
         device: Device,
-        workers: int,
+        crew: Crew,
         meter: Meter,
         *,
         split: Split,
+        sources: Sequence[Path] = (),
     ) -> None:
-        self.size, self.root, self.device, self.workers = size, root, device, workers
+        self.size, self.root, self.device, self.crew = size, root, device, crew
+        self.sources = sources
         self.manifest = self._merged(None, [])
         self.kept: list[int] = []
         self.to_do: Estimate = estimate(size, ())
         self.verdict = ""
         self._meter = meter
         self._split = split
+        self._promised: list[int] = []
 
     def survey(self, wanted: Sequence[int], *, force: bool = False) -> None:
         """Find out what is there and what is to do; writes nothing."""
         old = self._old_manifest()
         suspects = [i for i in self.size.scenarios if i in wanted or self._has_changed(i, old)]
         self._meter.begin("checking", total=len(suspects), scenarios=len(suspects))
-        good: list[FileEntry] = []
-        for scenario in suspects:
-            finding = examine(self.root, self.size, scenario, manifest=old, quick=True)
-            good += [finding.entry] if finding.entry else []
-            self._meter.count(1, scenarios=1)
+        good = [finding.entry for finding in self._examined(suspects, old) if finding.entry]
         bad = set(suspects) - {entry.scenario for entry in good}
         kept = tuple(e for e in old.files if e.scenario not in bad)
         self.manifest = self._merged(old.model_copy(update={"files": kept}), good)
@@ -95,6 +99,8 @@ class Campaign:
         """
         folder = dataset_folder(self.root, self.size.split, self.size.name, self.size.major)
         remove_leftovers(folder)
+        for source in self.sources:
+            self._keep(gather(self.size, self.root, source, self._old_manifest()))
         self.survey(wanted, force=force)
         check_disk(self.root, self.to_do.bytes)
         self._keep(self.manifest)
@@ -104,8 +110,7 @@ class Campaign:
             # The workers are gone by now; what they had not finished goes too.
             remove_leftovers(folder)
         self._record_statistics()
-        promised = self.to_do.scenarios if promises_bits(environment_of(self.device)) else ()
-        self.verdict = compare(self.size, self.manifest, promised=promised)
+        self.verdict = compare(self.size, self.manifest, promised=self._promised)
         self._write_cards()
 
     def missing(self) -> tuple[int, ...]:
@@ -120,6 +125,16 @@ class Campaign:
             old = None
         return self._merged(old, [])
 
+    def _examined(self, suspects: Sequence[int], old: Manifest) -> list[Finding]:
+        orders = {
+            f"scenario {i}": Look(root=self.root, size=self.size, scenario=i, manifest=old.only(i))
+            for i in suspects
+        }
+        return self.crew.read(look, orders, map(self._path, suspects), self._count_files)
+
+    def _count_files(self, files: int) -> None:
+        self._meter.count(files, scenarios=files)
+
     def _path(self, scenario: int) -> Path:
         return scenario_path(self.root, scenario_key(self.size, scenario))
 
@@ -129,7 +144,10 @@ class Campaign:
         return (path.stat().st_size if path.exists() else None) != (entry.bytes if entry else None)
 
     def _merged(
-        self, base: Manifest | None, files: Sequence[FileEntry], *, simulated: bool = False
+        self,
+        base: Manifest | None,
+        files: Sequence[FileEntry],
+        environment: Mapping[str, str] | None = None,
     ) -> Manifest:
         return merge(
             base,
@@ -138,7 +156,7 @@ class Campaign:
             size=self.size.name,
             version=self.size.version,
             subsets=self.size.subsets,
-            environment=environment_of(self.device) if simulated else None,
+            environment=environment,
             recorded=self.size.measured.scenario_sha256 if self.size.measured else None,
         )
 
@@ -151,11 +169,12 @@ class Campaign:
         total = round(sum(task.cost for task in tasks))
         total += sum(twin_substeps(self.size, i) for i in self.to_do.scenarios if self._is_test(i))
         self._meter.begin("simulating", total=total, scenarios=len(self.to_do.scenarios))
-        with Pool(min(self.workers, len(tasks)), _ENVIRONMENT[self.device]) as pool:
+        folder = dataset_folder(self.root, self.size.split, self.size.name, self.size.major)
+        with self.crew.simulating(len(tasks), self.device, folder) as crew:
             for task in tasks:
-                pool.submit(task)
-            for event in pool.events():
-                self._take(event, pool)
+                crew.submit(task)
+            for event in crew.events():
+                self._take(event, crew)
 
     def _tasks(self) -> list[Task]:
         """Return one task per batch of scenarios of similar length."""
@@ -191,27 +210,34 @@ class Campaign:
         entry = self.manifest.entry(scenario)
         return self._is_test(scenario) and (entry is None or not entry.twin_floor)
 
-    def _take(self, event: Event, pool: Pool) -> None:
+    def _take(self, event: Event, crew: Pool | Cluster) -> None:
         """Act on news from a worker."""
         if event.kind == "progress":
             self._meter.count(event.value)
         elif event.kind == "lost":
             self._meter.count(-event.value)
         elif event.task.function is simulate:
-            self._take_outcomes(event.value, pool)
+            self._take_outcomes(event.value, crew, event.machine or environment_of(self.device))
         else:
             self._take_floors(event.value)
 
-    def _take_outcomes(self, outcomes: Sequence[Outcome], pool: Pool) -> None:
+    def _take_outcomes(
+        self, outcomes: Sequence[Outcome], crew: Pool | Cluster, machine: Mapping[str, str]
+    ) -> None:
+        environment = {**machine, "device": self.device.value}
+        if promises_bits(environment):
+            self._promised += [outcome.scenario for outcome in outcomes]
+        for outcome in outcomes:
+            await_file(self._path(outcome.scenario))
         entries = [
             describe_file(self.root, scenario_key(self.size, outcome.scenario), outcome.facts)
             for outcome in outcomes
         ]
-        self._keep(self._merged(self.manifest, entries, simulated=True))
+        self._keep(self._merged(self.manifest, entries, environment))
         self._meter.count(scenarios=len(entries))
         for outcome in outcomes:
             if self._is_test(outcome.scenario):
-                pool.submit(self._twin(outcome.scenario))
+                crew.submit(self._twin(outcome.scenario))
 
     def _take_floors(self, floors: dict[int, tuple[float, ...]]) -> None:
         entries = [
@@ -233,19 +259,12 @@ class Campaign:
         # Those of other bits differ from datasets.yaml by right.
         doubted = measured and manifest.identity == "bitwise" and manifest.statistics != measured.statistics
         if "train" in manifest.subset_sha256 and (doubted or not manifest.statistics):
-            self._meter.begin("statistics", total=1, scenarios=len(train))
-            rows = file_statistics([self._path(i) for i in train])
-            manifest = manifest.model_copy(update={"statistics": rows})
+            self._meter.begin("statistics", total=len(train), scenarios=len(train))
+            paths = {f"scenario {i}": self._path(i) for i in train}
+            moments = self.crew.read(file_moments, paths, paths.values(), self._count_files)
+            manifest = manifest.model_copy(update={"statistics": statistics(moments)})
         self._keep(manifest)
 
     def _write_cards(self) -> None:
         self._meter.begin("cards", total=1, scenarios=len(self.manifest.files))
         write_cards(self.root, self.size, self._split, self.manifest)
-
-
-_ENVIRONMENT = {
-    # NumPy's and HDF5's threads would only take the cores from the other workers.
-    Device.CPU: {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
-    Device.PARALLEL: {},
-    Device.CUDA: {},
-}

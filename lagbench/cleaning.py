@@ -10,9 +10,10 @@ from pathlib import Path
 from .atomic import SUFFIX
 from .cards import CARD_NAME, CROISSANT_NAME, PICTURES
 from .errors import WorkFailedError
-from .layout import MANIFEST_NAME, dataset_folder, resolve_root
+from .layout import MANIFEST_NAME, dataset_folder
+from .locating import DESCRIPTION, locate
 from .locking import LOCK_NAME, dataset_lock
-from .registry import Registry, Size, load
+from .registry import Registry, Size
 
 __all__ = ["CleanResult", "clean"]
 
@@ -58,12 +59,11 @@ def clean(
         UsageError: unknown split or size.
         WorkFailedError: another process writes the data set, or a file cannot be removed.
     """
-    tier = (registry or load()).size(split, size)
-    home = resolve_root(root)
-    folder = dataset_folder(home, split, size, tier.major)
+    tier, home, _ = locate(split, size, root=root, registry=registry)
+    folder = dataset_folder(home, tier.split, size, tier.major)
     if not folder.is_dir():
         return CleanResult(removed=(), bytes=0, dry_run=dry_run)
-    with nullcontext() if dry_run else dataset_lock(home, split, size, tier.major, timeout=0):
+    with nullcontext() if dry_run else dataset_lock(home, tier.split, size, tier.major, timeout=0):
         found = tuple(_leftovers(folder) if leftovers else _generated(folder, tier))
         length = sum(path.stat().st_size for path in found)
         if not dry_run:
@@ -81,6 +81,8 @@ def _generated(folder: Path, size: Size) -> list[Path]:
     """Return the files that lagbench wrote; nobody else's."""
     scenarios = [folder / subset / f"{i:04d}.nc" for subset, ids in size.subsets.items() for i in ids]
     cards = [folder / name for name in CARDS]
+    if not size.simulated:  # the description of a local split says nothing without its data
+        cards.append(folder.parents[1] / DESCRIPTION)
     return sorted({path for path in (*scenarios, *cards, *_leftovers(folder)) if path.is_file()})
 
 

@@ -16,11 +16,11 @@ import numpy as np
 from .canvas import figure, header, save_png
 from .errors import DataError
 from .format import ScenarioKey, scenario_path
-from .layout import resolve_root
+from .locating import locate
 from .palette import MUTED
 from .panels import Panel, colour_bar, draw, limit_of, material_key
 from .recording import Recording, Scene, open_recording
-from .registry import Registry, Size, load
+from .registry import Registry, Size
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -93,12 +93,12 @@ def contact_sheet(
         UsageError: unknown split, size or kind, no matplotlib.
         DataError: no scenario is there, or a file is damaged.
     """
-    splits = registry or load()
-    files = scenario_files(splits.size(split, size), resolve_root(root))
+    tier, folder, splits = locate(split, size, root=root, registry=registry)
+    files = scenario_files(tier, folder)
     if not files:
         raise DataError(
             "nothing to draw",
-            where=f"{split} {size} under {resolve_root(root)}",
+            where=f"{tier.split} {size} under {folder}",
             fix=f"lagbench generate --split {split} --size {size}",
         )
     panel = None if kind is None else Panel(kind)
@@ -108,7 +108,7 @@ def contact_sheet(
     width = 2 * MARGIN + columns * (SIDE + GAP) - GAP
     height = TOP + len(sheet.rows) * (SIDE + LABEL + GAP) + BAR
     with figure(max(width, 5.0), height) as drawn:
-        header(drawn, f"{splits.split(split).title} · {split} {size}", sheet.subtitle, left=MARGIN)
+        header(drawn, f"{splits.split(tier.split).title} · {tier.split} {size}", sheet.subtitle, left=MARGIN)
         _draw_sheet(drawn, sheet)
         return save_png(drawn, output)
 

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 from . import registry
 from .errors import DataError, UsageError, nearest
-from .layout import ScenarioKey, dataset_folder, resolve_root, scenario_path
+from .layout import ScenarioKey, dataset_folder, scenario_path
+from .locating import locate
 from .scenario_ids import spell_ids
 
 if TYPE_CHECKING:
@@ -33,7 +34,7 @@ def load_manifest(split: str, *, size: str = "full", root: str | Path | None = N
     """Return the manifest of a generated data set.
 
     Args:
-        split: name of the split.
+        split: name of the split, or path of a local split's folder.
         size: name of the size.
         root: folder of all data sets, see :func:`lagbench.layout.resolve_root`.
 
@@ -43,13 +44,12 @@ def load_manifest(split: str, *, size: str = "full", root: str | Path | None = N
     """
     from .manifest import read_manifest
 
-    entry = registry.load().size(split, size)
-    folder = resolve_root(root)
-    manifest = read_manifest(folder, split, size, entry.major)
+    entry, folder, _ = locate(split, size, root=root)
+    manifest = read_manifest(folder, entry.split, size, entry.major)
     if manifest is None:
         raise DataError(
             "the data set has no manifest",
-            where=str(dataset_folder(folder, split, size, entry.major)),
+            where=str(dataset_folder(folder, entry.split, size, entry.major)),
             fix=f"lagbench generate --split {split} --size {size}",
         )
     return manifest
@@ -65,7 +65,7 @@ def open_split(
     """Open one subset of a generated data set; arrays are read when computed.
 
     Args:
-        split: name of the split.
+        split: name of the split, or path of a local split's folder.
         subset: train, valid, test or, for multimaterial, extra.
         size: name of the size.
         root: folder of all data sets, see :func:`lagbench.layout.resolve_root`.
@@ -83,15 +83,15 @@ def open_split(
     """
     import xarray as xr
 
-    entry = registry.load().size(split, size)
+    entry, folder, _ = locate(split, size, root=root)
     if subset not in entry.subsets:
         where = f"{split} {size}"
         raise UsageError(f"no subset {subset!r}", where=where, fix=nearest(subset, entry.subsets))
     ids = entry.subsets[subset]
     keys = [
-        ScenarioKey(split=split, size=size, version=entry.version, scenario=i, subset=subset) for i in ids
+        ScenarioKey(split=entry.split, size=size, version=entry.version, scenario=i, subset=subset)
+        for i in ids
     ]
-    folder = resolve_root(root)
     _require(folder, keys)
     scenarios = [_open_scenario(scenario_path(folder, key), key) for key in keys]
     return _join(scenarios, xr.Variable("scenario", list(ids), {"long_name": "scenario id", "units": "1"}))

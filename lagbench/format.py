@@ -42,6 +42,9 @@ FORMAT = 1
 CHUNK_CACHE = 1 << 20
 """Chunk cache of a variable while writing [bytes]; frames are written once, in order."""
 
+PARTICLES_PER_CHUNK = 1 << 17
+"""Particles in a chunk at the most: 1 MiB, the default chunk cache of HDF5. Frames of more have several."""
+
 _RESERVED = {
     *("Conventions", "title", "source", "license", "lagbench_format", "lagbench_version"),
     *("split", "size", "version", "scenario", "subset", "seed", "generator", "device"),
@@ -71,6 +74,7 @@ class ScenarioWriter:
         device: device that simulated; not hashed.
         generator: dotted path of the split's module; not hashed.
         reynolds: Reynolds number, the parameter ``reynolds_number``; None where there is none.
+        licence: licence of the data; not hashed.
 
     Attributes:
         content_sha256: content hash, set by the clean exit.
@@ -92,13 +96,14 @@ class ScenarioWriter:
         device: str,
         generator: str,
         reynolds: float | None = None,
+        licence: str = "CC-BY-4.0",
     ) -> None:
         self.path = path
         self.key = key
         self.content_sha256 = ""
         extra = {} if reynolds is None else {"reynolds_number": reynolds}
         self._parameters = _checked({**parameters, **extra}, path)
-        self._labels = {"seed": seed, "device": device, "generator": generator}
+        self._labels = {"seed": seed, "device": device, "generator": generator, "license": licence}
         self._shape = {"frame": frames, "particle": particles, "space": len(AXES)}
         self._constants: dict[str, tuple[tuple[str, ...], NDArray[Any]]] = {
             "frame": (("frame",), np.arange(frames, dtype=np.int32)),
@@ -186,7 +191,7 @@ class ScenarioWriter:
             variable = self._file.createVariable(name, str, dims)
         else:
             moving = "particle" in dims and "frame" in dims
-            chunks = (1, *shape[1:]) if moving else shape or None
+            chunks = (1, min(shape[1], PARTICLES_PER_CHUNK), *shape[2:]) if moving else shape or None
             variable = self._file.createVariable(
                 name,
                 dtype,
@@ -211,7 +216,6 @@ class ScenarioWriter:
             "Conventions": "CF-1.11",
             "title": f"lagbench {key.split} {key.size}, scenario {key.scenario}",
             "source": f"lagbench {program}, {self._labels['generator']}",
-            "license": "CC-BY-4.0",
             "lagbench_format": FORMAT,
             "lagbench_version": program,
             "split": key.split,

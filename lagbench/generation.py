@@ -8,20 +8,22 @@ as an uninterrupted one.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from .campaign import Campaign
+from .crew import Crew
 from .errors import UsageError, nearest
 from .extras import check_installed
-from .layout import dataset_folder, resolve_root
+from .layout import dataset_folder
+from .locating import locate
 from .locking import dataset_lock
 from .plan import Scenarios, Selection, free_bytes, select
 from .pool import worker_count
 from .progress import Meter, Progress
-from .registry import Registry, load
+from .registry import Registry
 
 if TYPE_CHECKING:
     from .generators.solver import Device
@@ -83,6 +85,8 @@ def generate(
     root: str | Path | None = None,
     workers: int | None = None,
     device: str = "cpu",
+    scheduler: str | None = None,
+    gather: Sequence[str | Path] = (),
     force: bool = False,
     dry_run: bool = False,
     progress: Callable[[Progress], None] | None = None,
@@ -99,6 +103,9 @@ def generate(
         root: folder of all data sets; else ``LAGBENCH_ROOT``, else the user data folder.
         workers: worker processes; one per core, or one for the parallel devices.
         device: "cpu", "parallel" or "cuda"; the bits do not depend on it.
+        scheduler: address of a Dask scheduler whose workers simulate instead; they must see
+            the root folder under the same path.
+        gather: other root folders, from which finished scenarios are taken first.
         force: simulate anew what is there and right.
         dry_run: only say what it would take.
         progress: called as the work advances.
@@ -107,23 +114,32 @@ def generate(
 
     Raises:
         UsageError: unknown split, size, subset, scenario or device, fewer than one worker, or
-            Taichi is not installed.
-        WorkFailedError: disk full or not writable, a scenario blew up, workers keep dying.
+            Taichi is not installed; or nothing can be gathered from a folder.
+        WorkFailedError: disk full or not writable, a scenario blew up, workers keep dying, the
+            cluster is lost or does not see the root folder.
         DataError: the result has other hashes than datasets.yaml.
     """
     started = time.monotonic()
-    splits = registry or load()
-    tier = splits.size(split, size)
+    tier, folder, splits = locate(split, size, root=root, registry=registry)
     wanted = select(tier, subset=subset, scenarios=scenarios)
-    target, folder = parse_device(device), resolve_root(root)
+    target = parse_device(device)
     cores = worker_count(workers, default=None if target.value == "cpu" else 1)
-    free = free_bytes(dataset_folder(folder, split, size, tier.major))
-    campaign = Campaign(tier, folder, target, cores, Meter(progress), split=splits.split(split))
+    free = free_bytes(dataset_folder(folder, tier.split, size, tier.major))
+    campaign = Campaign(
+        tier,
+        folder,
+        target,
+        Crew(workers=cores, scheduler=scheduler),
+        Meter(progress),
+        split=splits.split(tier.split),
+        sources=[Path(source).expanduser().absolute() for source in gather],
+    )
     if dry_run:
         campaign.survey(wanted, force=force)
     else:
-        check_installed("taichi", extra="generate")
-        with dataset_lock(folder, split, size, tier.major, on_wait=on_wait):
+        if scheduler is None:
+            check_installed("taichi", extra="generate")
+        with dataset_lock(folder, tier.split, size, tier.major, on_wait=on_wait):
             campaign.run(wanted, force=force)
     seconds = time.monotonic() - started
     return _result(campaign, bytes_free=free, seconds=seconds, dry_run=dry_run)
@@ -138,13 +154,13 @@ def _result(campaign: Campaign, *, bytes_free: int, seconds: float, dry_run: boo
         root=campaign.root,
         folder=dataset_folder(campaign.root, size.split, size.name, size.major),
         device=campaign.device.value,
-        workers=campaign.workers,
+        workers=campaign.crew.workers,
         simulated=campaign.to_do.scenarios,
         kept=tuple(campaign.kept),
         missing=campaign.missing(),
         bytes_needed=campaign.to_do.bytes,
         bytes_free=bytes_free,
-        seconds_expected=campaign.to_do.seconds(campaign.workers),
+        seconds_expected=campaign.to_do.seconds(campaign.crew.workers),
         seconds=seconds,
         complete=campaign.manifest.complete,
         dataset_sha256=campaign.manifest.dataset_sha256,

@@ -112,6 +112,10 @@ class Manifest(_Strict):
         """Return the entry of a scenario; None where it is not generated."""
         return next((entry for entry in self.files if entry.scenario == scenario), None)
 
+    def only(self, scenario: int) -> Manifest:
+        """Return a manifest that names one file at the most."""
+        return self.model_copy(update={"files": tuple(e for e in self.files if e.scenario == scenario)})
+
     def mean_twin_floor(self) -> tuple[float, ...]:
         """Return the mean twin floor over test at each frame that all have [length].
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from .cards import PICTURES
 from .layout import dataset_folder
-from .plan import estimate
+from .plan import estimate, scenario_bytes
 from .pool import available_cores
 from .registry import Size
 
@@ -26,7 +26,8 @@ class Overview:
         particles: particles in one scenario.
         frames: recorded frames of all scenarios.
         bytes: disk space before compression [bytes].
-        seconds: time to generate on all cores of this machine [s], for orientation.
+        seconds: time to generate on all cores of this machine [s], for orientation; 0 for what
+            cannot be simulated.
         present: scenario files that are there, by subset; `lagbench verify` checks them.
         folder: where they are, or would be.
         picture: picture of the data set once it is generated.
@@ -58,16 +59,16 @@ class Overview:
 def overview(size: Size, root: Path) -> Overview:
     """Return what a size is, costs, and has below a root folder."""
     folder = dataset_folder(root, size.split, size.name, size.major)
-    expected = estimate(size, size.scenarios)
+    ids = size.scenarios
     return Overview(
         split=size.split,
         size=size.name,
         version=size.version,
         scenarios={subset: len(ids) for subset, ids in size.subsets.items()},
         particles=size.particles,
-        frames=expected.frames,
-        bytes=expected.bytes,
-        seconds=expected.seconds(available_cores()),
+        frames=sum(map(size.frame_count, ids)),
+        bytes=sum(scenario_bytes(size, i) for i in ids),
+        seconds=estimate(size, ids).seconds(available_cores()) if size.simulated else 0.0,
         present={subset: _present(folder / subset, ids) for subset, ids in size.subsets.items()},
         folder=folder,
         picture=next((folder / name for name in PICTURES if (folder / name).is_file()), None),

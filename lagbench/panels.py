@@ -65,6 +65,9 @@ UNITS = {
 DOT = 1.25
 """Diameter of a drawn particle in particle spacings: neighbours overlap a little."""
 
+MOST_DOTS = 1 << 16
+"""Particles drawn at the most; more would take memory and no eye would tell."""
+
 FEW_NODES = 4
 _ALONG = np.array(
     [[0.0, 1.0], [0.0, 1.0], [1.0, 0.0], [1.0, 0.0]]
@@ -162,9 +165,11 @@ def _dot_area(axes: Axes, recording: Recording) -> float:
 
 
 def _draw_dots(axes: Axes, scene: Scene, colours: NDArray[Any]) -> None:
-    """Draw a dot for every particle, cut off at the walls."""
-    x, y = scene.position.T
-    dots = axes.scatter(x, y, _dot_area(axes, scene.recording), colours, linewidths=0, zorder=2)
+    """Draw a dot for every particle, or for every k-th of too many, cut off at the walls."""
+    step = -(-len(scene.position) // MOST_DOTS)
+    x, y = scene.position[::step].T
+    area = step * _dot_area(axes, scene.recording)
+    dots = axes.scatter(x, y, area, colours[::step], linewidths=0, zorder=2)
     dots.set_clip_path(_box_patch(axes, scene.recording))
 
 

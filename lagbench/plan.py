@@ -109,7 +109,14 @@ def estimate(size: Size, scenarios: Sequence[int]) -> Estimate:
 
     Raises:
         UnreadableFileError: the solver or the draws cannot use a parameter of the size.
+        UsageError: the data of a local split were not simulated.
     """
+    if not size.simulated:
+        raise UsageError(
+            "a local split cannot be simulated",
+            where=f"{size.split} {size.name}",
+            fix="lagbench import or lagbench adopt makes it again from the data that it came from",
+        )
     from .generators.batch import solver_constants, substeps_of
 
     solver_constants(size)

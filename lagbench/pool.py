@@ -91,11 +91,13 @@ class Event:
         kind: "progress" (value: units done since the last news), "lost" (its worker died and
             it starts anew; value: units that were done in vain) or "done" (value: its result).
         value: see ``kind``.
+        machine: what :mod:`.identity` says of another machine that did it; None for this one.
     """
 
     task: Task
     kind: str
     value: Any
+    machine: Mapping[str, str] | None = None
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from . import grid as gridding
 from .errors import UsageError
 from .format import read_scenario
+from .locating import rooted
 from .registry import Registry, Size, load
 
 if TYPE_CHECKING:
@@ -191,7 +192,14 @@ def open_recording(
         key = head.key
         identity = {"split": key.split, "size": key.size, "scenario": key.scenario, "subset": key.subset}
         variables = set(file.variables)
-        yield Recording(identity, head.parameters, head.frames, variables, file.read, registry or load())
+        splits = rooted(_root_of(Path(source)), registry)
+        yield Recording(identity, head.parameters, head.frames, variables, file.read, splits)
+
+
+def _root_of(path: Path) -> Path:
+    """Return the root folder of a scenario file that stands where ``scenario_path`` puts it."""
+    parents = path.absolute().parents
+    return parents[min(4, len(parents) - 1)]
 
 
 def _of_dataset(data: xr.Dataset, registry: Registry) -> Recording:

@@ -31,6 +31,7 @@ from .scenario_ids import parse_ids, spell_ids
 from .yamlfile import read_yaml
 
 __all__ = [
+    "NO_GENERATOR",
     "Measured",
     "Parameter",
     "Registry",
@@ -58,6 +59,11 @@ Hash = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 ShortHash = Annotated[str, Field(pattern=r"^[0-9a-f]{16}$")]
 REGISTRY_VARIABLE = "LAGBENCH_REGISTRY"
 """Environment variable that names a datasets.yaml to use instead of ours."""
+
+NO_GENERATOR = "none"
+"""Generator of splits that were not simulated here; see ``lagbench.locating``."""
+
+Address = Annotated[str, Field(pattern=r"^https?://[^\s/]\S*$")]
 
 
 class _Strict(BaseModel):
@@ -165,6 +171,11 @@ class Size(BaseModel):
         """MAJOR of the version: it changes when existing bits change."""
         return int(self.version.split(".")[0])
 
+    @property
+    def simulated(self) -> bool:
+        """Whether scenarios can be simulated; those of local splits cannot."""
+        return self.generator != NO_GENERATOR
+
     def value(self, name: str) -> Any:  # noqa: ANN401
         """Return a parameter's value.
 
@@ -233,7 +244,7 @@ class Size(BaseModel):
 
 
 class Split(_Strict):
-    """A named data set: version, provenance, parameters and sizes."""
+    """A named data set: version, provenance, parameters, sizes, and base URLs of its mirrors."""
 
     version: str = Field(pattern=r"^[1-9]\d*\.\d+\.\d+$")
     title: str
@@ -244,6 +255,7 @@ class Split(_Strict):
     source: str
     parameters: dict[str, Parameter]
     sizes: dict[str, _SizeEntry]
+    mirrors: tuple[Address, ...] = Field(default=(), strict=False)
 
     @model_validator(mode="after")
     def _consistent(self) -> Split:

@@ -13,10 +13,11 @@ from .exam import Exam, load_exam, ranking_metric
 from .flags import Flag, below_twin_floor, copy_suspect, physics
 from .floors import PERSISTENCE
 from .layout import resolve_root
+from .locating import rooted
 from .metrics import Metric, Score, aggregate, available, select
 from .overview import available_cores
 from .progress import Meter, Progress
-from .registry import Registry, load
+from .registry import Registry
 from .score_card import JSON_NAME, ScoreCard, write_json
 from .score_file import NETCDF_NAME, write_statistics
 from .sitting import SUBMISSION, Job, Outcome, sit_scenario
@@ -68,7 +69,8 @@ def score(
             cannot be written to, which is seen before the work.
     """
     metrics = _chosen(extras)
-    path, holder, described = Path(predictions).absolute(), resolve_root(root), registry or load()
+    path, holder = Path(predictions).absolute(), resolve_root(root)
+    described = rooted(holder, registry)
     folder = Path(predictions).parent if output_dir is None else Path(output_dir)
     result = validate(path, root=holder, require_truth=True, registry=described)
     if examined is not None:

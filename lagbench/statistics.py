@@ -16,7 +16,7 @@ are joined by ``math.fsum``, which is correctly rounded whatever the order or th
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,6 +31,7 @@ __all__ = [
     "MomentStream",
     "Moments",
     "combine",
+    "file_moments",
     "file_statistics",
     "round_digits",
     "scenario_moments",
@@ -145,7 +146,7 @@ def file_statistics(paths: Sequence[Path]) -> dict[str, tuple[float, ...]]:
     """
     if not paths:
         raise DataError("no scenario files", expected="at least one file for statistics")
-    return statistics([_file_moments(path) for path in paths])
+    return statistics([file_moments(path) for path in paths])
 
 
 def round_digits(value: float) -> float:
@@ -157,9 +158,20 @@ def round_digits(value: float) -> float:
     return float(f"{value:.{DIGITS - 1}e}") + 0.0
 
 
-def _file_moments(path: Path) -> dict[str, Moments]:
+def file_moments(path: Path, report: Callable[[int], None] = lambda _: None) -> dict[str, Moments]:
+    """Return the moments of one scenario file, read one frame at a time.
+
+    Args:
+        path: scenario file.
+        report: told one unit of work at the end.
+
+    Raises:
+        DataError: the file is missing or damaged.
+    """
     with read_scenario(path) as file:
-        return scenario_moments(frame for block in file.blocks("position") for frame in block)
+        moments = scenario_moments(frame for block in file.blocks("position") for frame in block)
+    report(1)
+    return moments
 
 
 def _fsum(rows: Sequence[Sequence[float] | NDArray[np.float64]]) -> tuple[float, ...]:

@@ -19,12 +19,13 @@ from .generators.batch import Job
 from .generators.simulate import simulate
 from .generators.solver import Device
 from .inventory import Finding, State, examine, extra_files, recorded_hash
-from .layout import dataset_folder, resolve_root
+from .layout import dataset_folder
+from .locating import locate
 from .manifest import Manifest, read_manifest
 from .plan import Scenarios, Selection, estimate, select
 from .pool import Pool, Task, worker_count
 from .progress import Meter, Progress
-from .registry import Registry, Size, load
+from .registry import Registry, Size
 from .scenario_ids import spell_ids
 from .verdict import TOLERATED, UNLIKE, hash_verdict, unlike_measures
 
@@ -138,8 +139,8 @@ def verify(
         UsageError: unknown split, size, subset or scenario, or fewer than one worker.
         WorkFailedError: simulating anew failed.
     """
-    tier = (registry or load()).size(split, size)
-    ids, folder = select(tier, subset=subset, scenarios=scenarios), resolve_root(root)
+    tier, folder, _ = locate(split, size, root=root, registry=registry)
+    ids = select(tier, subset=subset, scenarios=scenarios)
     meter, cores = Meter(progress), worker_count(workers)
     if regenerate:
         check_installed("taichi", extra="generate")
@@ -154,9 +155,9 @@ def verify(
     problems += [f"{r.name}: its hash is {UNLIKE}" for r in reports if r.verdict == UNLIKE]
     problems += [f"the data set hash is {UNLIKE}"] if verdict == UNLIKE else []
     return VerificationResult(
-        split=split,
+        split=tier.split,
         size=size,
-        folder=dataset_folder(folder, split, size, tier.major),
+        folder=dataset_folder(folder, tier.split, size, tier.major),
         subsets=reports,
         identity=manifest.identity if manifest else "unknown",
         dataset_sha256=whole,

@@ -13,10 +13,8 @@ from conftest import SIZE, SPLIT
 from typer.testing import CliRunner, Result
 
 from lagbench.cli.app import app
-from lagbench.demo import demo_splits
 from lagbench.doctor import NEEDED
 from lagbench.generation import GenerationResult
-from lagbench.registry import Registry
 
 Run = Callable[..., Result]
 
@@ -122,25 +120,6 @@ def test_verify_says_as_json_whether_all_is_there(run: Run, copied: Callable[[],
     assert json.loads(run(*words).stdout)["complete"] is True
     (root / SPLIT / SIZE / "v1" / "test" / "0003.nc").unlink()
     assert json.loads(run(*words).stdout)["complete"] is False
-
-
-def test_the_demo_takes_the_splits_that_have_a_tiny_size(
-    run: Run, unmeasured: Registry, copied: Callable[[], Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A split without one is left out, and the JSON object names what was made."""
-    small = unmeasured.split(SPLIT)
-    large = small.model_copy(update={"sizes": {"full": small.sizes["full"]}})
-    registry = Registry({"large": large, SPLIT: small}, {})
-    assert demo_splits(registry) == [SPLIT]
-    monkeypatch.setattr("lagbench.registry.load", lambda: registry)
-    root = copied()
-    result = run("demo", "--root", root, "--json")
-    assert result.exit_code == 0, result.output
-    made = json.loads(result.stdout)
-    assert list(made) == [SPLIT]
-    assert made[SPLIT]["generation"]["kept"] == [0, 1, 2, 3, 4]
-    assert Path(made[SPLIT]["picture"]).is_file()
-    assert "1 data sets, verified and drawn" in run("demo", "--root", root).stdout
 
 
 def test_doctor_looks_at_every_dependency() -> None:

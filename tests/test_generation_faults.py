@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 from conftest import SIZE, SPLIT
 
+from lagbench.atomic import temporary_name
 from lagbench.errors import DataError, UsageError, WorkFailedError
 from lagbench.generation import GenerationResult, generate
 from lagbench.generators.batch import Job
@@ -124,7 +125,7 @@ def test_a_worker_on_a_full_disk_names_the_file(tmp_path: Path, unmeasured: Regi
     job = Job(size=unmeasured.size(SPLIT, SIZE), scenarios=(2,), root=tmp_path)
     folder = tmp_path / SPLIT / SIZE / "v1" / "valid"
     folder.mkdir(parents=True)
-    (folder / f".0002.nc.{os.getpid()}.partial").symlink_to("/dev/full")
+    temporary_name(folder / "0002.nc").symlink_to("/dev/full")
     with pytest.raises(WorkFailedError) as caught:
         simulate(job, lambda units: None)
     assert "0002.nc" in str(caught.value)

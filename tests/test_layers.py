@@ -39,7 +39,18 @@ FILES = (
 )
 """Modules below everything else, which know files and arrays but no split."""
 
-REGISTRY = (*FILES, "registry", "locating", "locking", "statistics", "manifest", "extras", "plugins", "progress", "pool")
+REGISTRY = (
+    *FILES,
+    "registry",
+    "locating",
+    "locking",
+    "statistics",
+    "manifest",
+    "extras",
+    "plugins",
+    "progress",
+    "pool",
+)
 """The next layer, which knows splits; it may use the first."""
 
 ABOVE_SCORES = (

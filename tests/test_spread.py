@@ -10,9 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from cluster_bench import local_cluster, scheduler_process
 from score_bench import ScoreBench, bench_of, straight
-from spread_jobs import Deadly, always_die, double, sit_after_dying_once, time_out
+from spread_jobs import Deadly, double, sit_after_dying_once, take_worker_along, time_out
 
+from lagbench import cluster as clusters
 from lagbench import scoring, spread
 from lagbench.errors import UsageError, WorkFailedError
 from lagbench.generation import GenerationResult
@@ -26,17 +28,8 @@ distributed = pytest.importorskip("distributed", reason="the extra 'cluster' is 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Any]:
     """A Dask cluster of two worker processes that can import the test modules."""
-    before = os.environ.get("PYTHONPATH")
-    os.environ["PYTHONPATH"] = str(Path(__file__).parent)
-    options = {"n_workers": 2, "threads_per_worker": 1, "processes": True, "dashboard_address": None}
-    try:
-        with distributed.LocalCluster(**options, silence_logs=50) as running:
-            yield running
-    finally:
-        if before is None:
-            del os.environ["PYTHONPATH"]
-        else:
-            os.environ["PYTHONPATH"] = before
+    with local_cluster() as running:
+        yield running
 
 
 @pytest.fixture(scope="module")
@@ -45,23 +38,13 @@ def bench(generated: GenerationResult, unmeasured: Registry) -> ScoreBench:
     return bench_of(generated, unmeasured)
 
 
-LOSABLE = """
-from distributed import LocalCluster
-options = dict(n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None)
-with LocalCluster(**options, protocol="tcp://") as cluster:
-    print(cluster.scheduler_address, flush=True)
-    input()
-"""
-"""A scheduler and its worker in one process: a job that kills its worker takes the scheduler along."""
-
-
 LOSER = """
 import sys
 from lagbench.errors import WorkFailedError
 from lagbench.spread import spread
-from spread_jobs import always_die
+from spread_jobs import take_worker_along
 try:
-    spread(always_die, {"job 0": 0}, scheduler=sys.argv[1])
+    spread(take_worker_along, {"job 0": 0}, scheduler=sys.argv[1])
 except WorkFailedError as error:
     print(error.what)
 """
@@ -70,13 +53,8 @@ except WorkFailedError as error:
 @pytest.fixture
 def losable() -> Iterator[str]:
     """The address of a scheduler that dies with its worker."""
-    command = [sys.executable, "-c", LOSABLE]
-    there = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
-    pipe = subprocess.PIPE
-    with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, env=there) as process:
-        assert process.stdout is not None
-        yield process.stdout.readline().decode().strip()
-        process.kill()
+    with scheduler_process() as (address, _):
+        yield address
 
 
 JOBS = {f"job {i}": i for i in range(6)}
@@ -92,7 +70,7 @@ def test_results_come_in_order(workers: int) -> None:
 
 def test_an_address_that_nobody_answers(monkeypatch: pytest.MonkeyPatch) -> None:
     """An unreachable scheduler fails the work; an address of no known kind is a usage error."""
-    monkeypatch.setattr(spread, "CONNECT_SECONDS", 0.5)
+    monkeypatch.setattr(clusters, "CONNECT_SECONDS", 0.5)
     with pytest.raises(WorkFailedError, match="cannot reach the Dask scheduler"):
         spread.spread(double, JOBS, scheduler="tcp://127.0.0.1:9")
     with pytest.raises(UsageError, match="tcp://"):
@@ -126,7 +104,7 @@ def test_cluster_gives_the_same_bytes_though_a_worker_is_killed(
 def test_a_lost_scheduler(losable: str, capfd: pytest.CaptureFixture[str]) -> None:
     """A scheduler that dies in the middle ends as failed work that says so, without Dask's traces."""
     with pytest.raises(WorkFailedError, match="the Dask cluster is lost"):
-        spread.spread(always_die, {"job 0": 0}, scheduler=losable)
+        spread.spread(take_worker_along, {"job 0": 0}, scheduler=losable)
     captured = capfd.readouterr()
     assert captured.out + captured.err == ""
 
@@ -143,7 +121,7 @@ def test_a_lost_scheduler_stays_quiet_to_the_end(losable: str) -> None:
 def test_a_job_that_kills_every_worker(cluster: Any) -> None:
     """A job that no worker survives ends as failed work that names it, not as a hang."""
     with pytest.raises(WorkFailedError, match="job 0"):
-        spread.spread(always_die, {"job 0": 0}, scheduler=cluster.scheduler_address)
+        spread.spread(take_worker_along, {"job 0": 0}, scheduler=cluster.scheduler_address)
 
 
 def test_a_killed_process_changes_nothing(
@@ -173,6 +151,6 @@ def test_a_killed_process_changes_nothing(
 
 @pytest.mark.slow
 def test_an_error_of_a_job_is_not_a_lost_cluster(cluster: Any) -> None:
-    """A job's own time-out passes through as it is."""
-    with pytest.raises(TimeoutError, match="of the job"):
+    """A job's own time-out is told as what it is."""
+    with pytest.raises(WorkFailedError, match=r"TimeoutError\('of the job'\)"):
         spread.spread(time_out, {"job 0": 0}, scheduler=cluster.scheduler_address)

@@ -14,7 +14,7 @@ from typer.core import TyperGroup
 
 from lagbench.errors import LagbenchError
 
-from . import data, draw, scoring, show, upkeep
+from . import board, data, draw, exchange, scoring, show, training, upkeep
 from . import demo as tour
 
 __all__ = ["app"]
@@ -114,6 +114,18 @@ app.command("generate", epilog="Example: lagbench generate --split cavity --size
 app.command("verify", epilog="Example: lagbench verify --split cavity --size tiny --regenerate 2")(
     data.verify
 )
+app.command(
+    "download", epilog="Example: lagbench download --split cavity --size mini --from https://host/data"
+)(exchange.download)
+app.command("export", epilog="Example: lagbench export cavity --size mini --format gns-npz -o cavity-gns")(
+    exchange.export
+)
+app.command("import", epilog="Example: lagbench import WaterDrop --format gns-npz --allow-pickle -o drop")(
+    exchange.import_split
+)
+app.command("adopt", epilog="Example: lagbench adopt runs/*.npz -o own --radius 0.03 --frame-interval 0.1")(
+    exchange.adopt
+)
 app.command("template", epilog="Example: lagbench template cavity --size tiny -o predictions.nc")(
     scoring.template
 )
@@ -122,6 +134,13 @@ app.command("score", epilog="Example: lagbench score predictions.nc")(scoring.sc
 app.command("compare", epilog="Example: lagbench compare ours/scores.json theirs/scores.json")(
     scoring.compare
 )
+app.command("train", epilog="Example: lagbench train --baseline gns --split cavity --size tiny")(
+    training.train
+)
+app.command("predict", epilog="Example: lagbench predict runs/cavity/tiny/gns-0/weights.pt")(training.predict)
+app.command("bench", epilog="Example: lagbench bench solver --split cavity --size tiny")(training.bench)
+app.command("submit", epilog="Example: lagbench submit predictions.nc --from meta.yaml")(board.submit)
+app.add_typer(board.leaderboard, name="leaderboard", epilog="Example: lagbench leaderboard show")
 app.command("plot", epilog="Example: lagbench plot cavity --size tiny --scenario 3 --frame 15 -o flow.png")(
     draw.plot
 )

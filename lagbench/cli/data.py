@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -12,6 +13,7 @@ from .options import (
     QuietFlag,
     RootOption,
     ScenariosOption,
+    SchedulerOption,
     SizeOption,
     SplitArgument,
     SplitOption,
@@ -38,6 +40,11 @@ def generate(
     root: RootOption = None,
     workers: WorkersOption = None,
     device: DeviceOption = "cpu",
+    scheduler: SchedulerOption = None,
+    gather: Annotated[
+        list[Path] | None,
+        typer.Option("--gather", metavar="FOLDER", help="Take what another root has finished; repeatable."),
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Simulate anew what is there.")] = False,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Say what it takes: bytes, time, free disk.")
@@ -57,6 +64,8 @@ def generate(
             root=root,
             workers=workers,
             device=device,
+            scheduler=scheduler,
+            gather=gather or (),
             force=force,
             dry_run=dry_run,
             progress=draw,

@@ -30,16 +30,16 @@ OutputOption = Annotated[
 
 def _source(name: str | None, split: str | None, size: str, scenario: int | None, root: Path | None) -> Path:
     """Return the scenario file that a user means by its path or by split, size and id."""
-    from lagbench.layout import ScenarioKey, resolve_root, scenario_path
-    from lagbench.registry import load
+    from lagbench.layout import ScenarioKey, scenario_path
+    from lagbench.locating import locate
 
     if name is not None and name.endswith(".nc"):
         return Path(name)
-    tier = load().size(chosen(name, split), size)
+    tier, folder, _ = locate(chosen(name, split), size, root=root)
     wanted = tier.subsets["test"][0] if scenario is None else scenario
     subset = tier.subset_of(wanted)
     key = ScenarioKey(split=tier.split, size=size, version=tier.version, scenario=wanted, subset=subset)
-    return scenario_path(resolve_root(root), key)
+    return scenario_path(folder, key)
 
 
 @contextmanager
@@ -103,7 +103,7 @@ def plot(
 
     if sheet:
         chosen_split = chosen(name, split)
-        page = _target(output or Path(f"{chosen_split}-{size}-sheet.png"))
+        page = _target(output or Path(f"{Path(chosen_split).name}-{size}-sheet.png"))
         _done(contact_sheet(chosen_split, size, page, root=root), as_json=as_json, quiet=quiet)
         return
     source = _source(name, split, size, scenario, root)

@@ -15,6 +15,7 @@ __all__ = [
     "QuietFlag",
     "RootOption",
     "ScenariosOption",
+    "SchedulerOption",
     "SizeOption",
     "SplitArgument",
     "SplitOption",
@@ -47,6 +48,10 @@ WorkersOption = Annotated[
 ]
 DeviceOption = Annotated[
     str, typer.Option("--device", metavar="NAME", help="cpu, parallel (its threads) or cuda.")
+]
+SchedulerOption = Annotated[
+    str | None,
+    typer.Option("--scheduler", metavar="ADDRESS", help="Dask scheduler, as in tcp://host:8786."),
 ]
 JsonFlag = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout.")]
 QuietFlag = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]

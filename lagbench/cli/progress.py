@@ -14,8 +14,12 @@ __all__ = ["progress_bar"]
 
 
 @contextmanager
-def progress_bar(*, quiet: bool) -> Iterator[Callable[[State], None] | None]:
+def progress_bar(*, quiet: bool, counted: str = "scenarios") -> Iterator[Callable[[State], None] | None]:
     """Yield what draws progress: overall bar, scenarios, scenarios per second, time left.
+
+    Args:
+        quiet: whether the user wants silence.
+        counted: what the work is counted in.
 
     Yields:
         A function to hand to ``generate``; None where stderr is no terminal or silence is wanted.
@@ -42,7 +46,7 @@ def progress_bar(*, quiet: bool) -> Iterator[Callable[[State], None] | None]:
                 description=news.stage,
                 total=news.total,
                 completed=news.done,
-                count=f"{news.scenarios_done}/{news.scenarios} scenarios, {news.rate:.2f}/s",
+                count=f"{news.scenarios_done}/{news.scenarios} {counted}, {news.rate:.2f}/s",
             )
 
         yield draw

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,6 +16,7 @@ from .options import (
     JsonFlag,
     QuietFlag,
     RootOption,
+    SchedulerOption,
     SizeOption,
     SplitArgument,
     SplitOption,
@@ -34,6 +36,10 @@ __all__ = ["compare", "score", "template", "validate"]
 PredictionsArgument = Annotated[Path, typer.Argument(metavar="FILE", help="A predictions.nc.")]
 FilesArgument = Annotated[
     list[Path], typer.Argument(metavar="FILE...", help="A predictions.nc; several with --report.")
+]
+OwnSplitOption = Annotated[
+    str | None,
+    typer.Option("--split", metavar="NAME", help="Split that they must be for; a local one by its folder."),
 ]
 EveryFlag = Annotated[bool, typer.Option("--all", help="Show every metric.")]
 
@@ -63,6 +69,7 @@ def template(
 
 def validate(
     predictions: PredictionsArgument,
+    split: OwnSplitOption = None,
     root: RootOption = None,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
@@ -70,7 +77,9 @@ def validate(
     """Check a predictions.nc and say all that is wrong with it and how to mend it."""
     from lagbench.submission import validate as run
 
-    result = run(predictions, root=root)
+    wanted = _wanted(split, root)
+    result = run(predictions, root=wanted.root)
+    wanted.check(result)
     if as_json:
         print_json(result)
     elif not quiet:
@@ -91,6 +100,7 @@ def _checked(result: ValidationResult) -> None:
 
 def score(
     predictions: FilesArgument,
+    split: OwnSplitOption = None,
     root: RootOption = None,
     output: Annotated[
         Path | None,
@@ -106,10 +116,7 @@ def score(
         typer.Option("--report", metavar="FOLDER", help="Write index.html with all figures there."),
     ] = None,
     workers: WorkersOption = None,
-    scheduler: Annotated[
-        str | None,
-        typer.Option("--scheduler", metavar="ADDRESS", help="Dask scheduler, as in tcp://host:8786."),
-    ] = None,
+    scheduler: SchedulerOption = None,
     extras: Annotated[
         str, typer.Option("--extras", metavar="NAMES", help="Extras with metrics, as in transport.")
     ] = "",
@@ -122,7 +129,8 @@ def score(
 
     if len(predictions) > 1 and report is None:
         raise UsageError("several files are scored for one report", fix="add --report FOLDER")
-    targets = _targets(predictions, output)
+    targets, wanted = _targets(predictions, output), _wanted(split, root)
+    root = wanted.root
     if len(predictions) > 1:
         _check_together(predictions, root)
     if report is not None:
@@ -138,7 +146,7 @@ def score(
                 scheduler=scheduler,
                 extras=tuple(name for name in extras.split(",") if name),
                 progress=draw,
-                examined=_complain,
+                examined=wanted.complain,
             )
         cards.append(card)
         if not as_json and not quiet:
@@ -187,6 +195,40 @@ def _check_together(predictions: Sequence[Path], root: Path | None) -> None:
                 got=f"{result.split} {result.size}",
                 fix="report submissions to one data set together, others on their own",
             )
+
+
+@dataclass(frozen=True)
+class _Wanted:
+    """The split that predictions must be for, if the user says, and the root folder of its data."""
+
+    name: str | None
+    root: Path | None
+
+    def check(self, result: ValidationResult) -> None:
+        """Refuse predictions for another split."""
+        if self.name is not None and result.split not in (None, self.name):
+            raise UsageError(
+                "the predictions are for another split",
+                where=str(result.path),
+                expected=self.name,
+                got=ascii(result.split),
+                fix="name that one, or leave --split out",
+            )
+
+    def complain(self, result: ValidationResult) -> None:
+        """Refuse predictions for another split; else tell what rejects the file."""
+        self.check(result)
+        _complain(result)
+
+
+def _wanted(split: str | None, root: Path | None) -> _Wanted:
+    """Return what --split and --root say together: the path of a local split names its root."""
+    if split is None:
+        return _Wanted(None, root)
+    from lagbench.locating import home
+
+    found = home(split, root=root)
+    return _Wanted(found.name, found.root)
 
 
 def _complain(result: ValidationResult) -> None:

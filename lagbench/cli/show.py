@@ -19,13 +19,14 @@ __all__ = ["cite", "info", "list_splits"]
 def list_splits(root: RootOption = None, as_json: JsonFlag = False) -> None:
     """List the splits and sizes, what they cost, and what is generated here."""
     from lagbench.layout import resolve_root
+    from lagbench.locating import rooted
     from lagbench.overview import overview
-    from lagbench.registry import load
 
-    registry, folder = load(), resolve_root(root)
+    folder = resolve_root(root)
+    registry = rooted(folder)
     found = [
         overview(registry.size(name, size), folder)
-        for name in registry.splits
+        for name in (*registry.splits, *registry.local_names())
         for size in _sizes(registry, name)
     ]
     if as_json:
@@ -51,7 +52,7 @@ def _row(entry: Overview) -> tuple[object, ...]:
         entry.particles,
         entry.frames,
         spell_bytes(entry.bytes),
-        spell_seconds(entry.seconds),
+        spell_seconds(entry.seconds) if entry.seconds else "-",
         entry.state,
     )
 
@@ -66,14 +67,13 @@ def info(
     as_json: JsonFlag = False,
 ) -> None:
     """Show a split: parameters with units, sizes in bytes, time to generate, local state."""
-    from lagbench.layout import resolve_root
+    from lagbench.locating import home
     from lagbench.overview import overview
-    from lagbench.registry import load
 
-    registry, split_name = load(), chosen(name, split)
+    split_name, folder, registry = home(chosen(name, split), root=root)
     entry = registry.split(split_name)
     sizes = [registry.size(split_name, one) for one in ([size] if size else entry.sizes)]
-    found = [overview(one, resolve_root(root)) for one in sizes]
+    found = [overview(one, folder) for one in sizes]
     if as_json:
         print_json(_facts(registry, split_name, sizes, found))
         return
@@ -127,11 +127,16 @@ def _facts(registry: Registry, split: str, sizes: list[Size], found: list[Overvi
     return {"split": split, **head, "sizes": described}
 
 
-def cite(name: SplitArgument = None, split: SplitOption = None, as_json: JsonFlag = False) -> None:
+def cite(
+    name: SplitArgument = None,
+    split: SplitOption = None,
+    root: RootOption = None,
+    as_json: JsonFlag = False,
+) -> None:
     """Print how to cite a split: version, hashes of its sizes, and the works behind it."""
-    from lagbench.registry import load
+    from lagbench.locating import home
 
-    registry, split_name = load(), chosen(name, split)
+    split_name, _, registry = home(chosen(name, split), root=root)
     entry = registry.split(split_name)
     measured = registry.measured.get(split_name, {})
     hashes = {size: values.dataset_sha256 for size, values in measured.items()}

@@ -97,7 +97,7 @@ def ask(url: str, offset: int) -> Answer:
         response = _OPENER.open(urllib.request.Request(url, headers=headers), timeout=TIMEOUT)
     except urllib.error.HTTPError as error:
         with closing(error):
-            raise _refusal(error.code, url, offset) from None
+            raise _refusal(error, url, offset) from None
     except (OSError, http.client.HTTPException) as error:
         reason = getattr(error, "reason", error)
         raise BrokenError(
@@ -118,8 +118,9 @@ def ask(url: str, offset: int) -> Answer:
     return Answer(response, offset, _number(match[3]), page)
 
 
-def _refusal(code: int, url: str, offset: int) -> Exception:
+def _refusal(error: urllib.error.HTTPError, url: str, offset: int) -> Exception:
     """Return the error that a status means."""
+    code = error.code
     if code in _GONE:
         return NotOnMirrorError("the mirror does not have the file", where=url, got=f"HTTP status {code}")
     if code == http.client.REQUESTED_RANGE_NOT_SATISFIABLE and offset:
@@ -131,7 +132,12 @@ def _refusal(code: int, url: str, offset: int) -> Exception:
             fix="another mirror: --from",
         )
         return BrokenError(truncated, stale=True)
-    refused = MirrorUnreachableError("the mirror refuses", where=url, got=f"HTTP status {code}", fix="--from")
+    refused = MirrorUnreachableError(
+        "the mirror refuses",
+        where=url,
+        got=f"HTTP status {code}: {str(error.reason)[:200]!a}",
+        fix="another mirror: --from",
+    )
     return BrokenError(refused) if code in _BUSY else refused
 
 

@@ -117,7 +117,7 @@ def download(
             manifest = errand.record()
         if not errand.missing:
             verdict = compare(tier, manifest)
-            if errand.downloaded:
+            if errand.downloaded and tier.simulated:
                 write_cards(folder, tier, splits.split(tier.split), manifest)
     if errand.missing:
         if not or_generate:
@@ -140,7 +140,7 @@ def download(
         size=tier.name,
         folder=dataset_folder(folder, tier.split, tier.name, tier.major),
         mirror=errand.mirror,
-        downloaded=tuple(errand.downloaded),
+        downloaded=tuple(sorted(errand.downloaded)),
         kept=tuple(errand.kept),
         generated=tuple(errand.missing),
         bytes=errand.bytes,

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 from lagbench.atomic import SUFFIX
@@ -136,7 +137,9 @@ def fetch_text(url: str, *, limit: int) -> bytes:
         try:
             answer = ask(url, 0)
             with closing(answer.stream):
-                _check_answer(answer, url, limit, None)
+                if answer.page:
+                    raise _no_data(url, next(answer.blocks(url), b""))
+                _check_length(answer, url, limit, None)
                 text = _exactly(answer, url, limit)
         except BrokenError as broken:
             failures += 1
@@ -166,37 +169,47 @@ def _attempt(wanted: Fetch, partial: Path, have: int, report: Callable[[int], No
         return
     answer = ask(wanted.url, have)
     with closing(answer.stream):
-        _check_answer(answer, wanted.url, wanted.limit, wanted.length)
-        most = wanted.limit if wanted.length is None else wanted.length
+        blocks = answer.blocks(wanted.url)
+        first = next(blocks, b"")
+        if answer.page or (answer.start == 0 and not first.startswith(SIGNATURE[: len(first)])):
+            raise _no_data(wanted.url, first)
+        _check_length(answer, wanted.url, wanted.limit, wanted.length)
         # Opened for writing at the place where the answer starts: 0 where it starts over.
         with partial.open("r+b" if answer.start else "wb") as out:
             out.seek(answer.start)
-            for block in answer.blocks(wanted.url):
-                if out.tell() == 0 and not block.startswith(SIGNATURE[: len(block)]):
-                    raise _no_data(wanted.url, block)
+            for block in chain([first], blocks):
                 out.write(block)
-                if out.tell() > most:
-                    raise WrongLengthError(
-                        "the mirror sends more than the file holds",
-                        where=wanted.url,
-                        expected=f"{'at most ' if wanted.length is None else ''}{most} bytes",
-                    )
+                _check_most(wanted, out.tell())
                 report(len(block))
             out.flush()
             _check_end(answer, wanted.url, out.tell())
-            if wanted.length is not None and out.tell() != wanted.length:
-                raise TruncatedError(
-                    "the mirror's file ends too early",
-                    where=wanted.url,
-                    expected=f"{wanted.length} bytes",
-                    got=f"{out.tell()} bytes",
-                )
+            _check_whole(wanted, out.tell())
 
 
-def _check_answer(answer: Answer, url: str, limit: int, length: int | None) -> None:
-    """Refuse a page, and an announced length that cannot be."""
-    if answer.page:
-        raise _no_data(url, next(answer.blocks(url), b""))
+def _check_most(wanted: Fetch, have: int) -> None:
+    """Stop a mirror that sends more than the file holds."""
+    most = wanted.limit if wanted.length is None else wanted.length
+    if have > most:
+        raise WrongLengthError(
+            "the mirror sends more than the file holds",
+            where=wanted.url,
+            expected=f"{'at most ' if wanted.length is None else ''}{most} bytes",
+        )
+
+
+def _check_whole(wanted: Fetch, have: int) -> None:
+    """Tell a file that ended before its known length though none was announced."""
+    if wanted.length is not None and have != wanted.length:
+        raise TruncatedError(
+            "the mirror's file ends too early",
+            where=wanted.url,
+            expected=f"{wanted.length} bytes",
+            got=f"{have} bytes",
+        )
+
+
+def _check_length(answer: Answer, url: str, limit: int, length: int | None) -> None:
+    """Refuse an announced length that cannot be."""
     if answer.total is None:
         return
     if length is not None and answer.total != length:

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from lagbench.errors import UsageError
 from lagbench.exam import Exam, load_exam
 from lagbench.layout import resolve_root
+from lagbench.locating import rooted
 from lagbench.method_names import told_apart
 from lagbench.metrics import Metric, Score
-from lagbench.registry import Registry, load
+from lagbench.registry import Registry
 from lagbench.score_card import ScoreCard
 from lagbench.sitting import SUBMISSION
 
@@ -206,8 +207,9 @@ def subject_of(
         )
     for card, path in zip(cards, predictions, strict=True):
         _check_same(cards[0], card, path)
-    described, header = registry or load(), cards[0].header
-    exam = load_exam(described.size(header.split, header.size), resolve_root(root))
+    folder, header = resolve_root(root), cards[0].header
+    described = rooted(folder, registry)
+    exam = load_exam(described.size(header.split, header.size), folder)
     names = told_apart([card.header.method for card in cards], taken=cards[0].scores)
     entries = [
         Entry(number=i, name=name, card=card, predictions=Path(path))

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lagbench.layout import resolve_root
-from lagbench.registry import Registry, load
+from lagbench.locating import locate
+from lagbench.registry import Registry
 
 from .truth import Truth
 from .writer import PredictionsWriter
@@ -61,12 +61,11 @@ def template(
         DataError: test scenarios are missing or damaged, or their data set has no recorded hash.
         WorkFailedError: the disk is full or not writable.
     """
-    described, folder = registry or load(), resolve_root(root)
-    entry = described.size(split, size)
+    entry, folder, described = locate(split, size, root=root, registry=registry)
     truth = Truth(entry, folder)
     truth.require()
     writer = PredictionsWriter(
-        output, split=split, size=size, method="persistence", root=folder, registry=described
+        output, split=entry.split, size=size, method="persistence", root=folder, registry=described
     )
     ids = tuple(sorted(entry.subsets["test"]))
     with writer:
@@ -75,7 +74,7 @@ def template(
     task = entry.task
     return TemplateResult(
         path=writer.path,
-        split=split,
+        split=entry.split,
         size=size,
         scenarios=ids,
         frames=(task.input_frames, task.input_frames + task.horizon - 1),

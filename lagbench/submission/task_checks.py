@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-from lagbench.errors import DataError, UsageError
+from lagbench.errors import DataError, UnreadableFileError, UsageError
 from lagbench.layout import major_of
 from lagbench.manifest import read_manifest
 from lagbench.registry import Registry, Size
@@ -39,8 +39,8 @@ def check_split(anatomy: Anatomy, registry: Registry, out: Findings) -> Size | N
     out.made("split")
     try:
         return registry.size(split, size)
-    except UsageError as error:
-        known = error.fix or ""
+    except (UsageError, UnreadableFileError) as error:
+        known = error.fix or error.what
     out.error(
         "split",
         "no such split and size",

@@ -14,7 +14,8 @@ import h5py
 
 from lagbench.errors import DataError, UnreadableFileError
 from lagbench.layout import resolve_root
-from lagbench.registry import Registry, load
+from lagbench.locating import rooted
+from lagbench.registry import Registry
 
 from .anatomy import Anatomy, dissect
 from .findings import CHECKS, Findings, ValidationResult
@@ -64,11 +65,12 @@ def validate(
     Returns:
         What was found; ``result.check()`` raises unless the file is valid.
     """
+    folder = resolve_root(root)
     request = Request(
         path=Path(path).absolute(),
-        root=resolve_root(root),
+        root=folder,
         require_truth=require_truth,
-        registry=registry or load(),
+        registry=rooted(folder, registry),
     )
     if not isolated:
         return examine(request)

@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from lagbench.atomic import atomic_path
 from lagbench.errors import DataError, UsageError, WorkFailedError, nearest
-from lagbench.layout import resolve_root
-from lagbench.registry import Registry, Size, load
+from lagbench.locating import locate
+from lagbench.registry import Registry, Size
 from lagbench.scenario_ids import spell_ids
 
 from .header import DIMS, FORMAT, NEVER, OPTIONAL, SPACE, fits, kind_of
@@ -65,8 +65,8 @@ class PredictionsWriter:
         **labels: Label,
     ) -> None:
         self.path = Path(path)
-        self.size = (registry or load()).size(split, size)
-        self._hash = dataset_sha256 or _known_hash(self.size, resolve_root(root))
+        self.size, folder, _ = locate(split, size, root=root, registry=registry)
+        self._hash = dataset_sha256 or _known_hash(self.size, folder)
         self._names = ("position", "velocity") if velocity else ("position",)
         self._rows = {scenario: row for row, scenario in enumerate(sorted(self.size.subsets["test"]))}
         self._written: set[int] = set()

@@ -1,0 +1,196 @@
+"""Make the tables and figures of the thesis at one size: train, predict, score, draw.
+
+    python -m lagbench.baselines.reproduce --size mini --root DATA --runs runs [--only table_5_4,fig_5_5]
+
+What is there is not made again; interrupted, it goes on. Writes Markdown, CSV and PNG to
+``RUNS/reproduce/<size>/`` and prints the Markdown. ``--list`` says what there is; ``--no-training``
+shows what the runs that are there allow.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from lagbench.errors import LagbenchError, UsageError, nearest
+from lagbench.layout import resolve_root
+from lagbench.registry import Registry, load
+
+from .catalogue import ITEMS, Item
+from .making import make_run
+from .mlp_studies import make_studies
+from .plan import Plan
+from .roster import EXPECTED, ROSTER, label
+from .sheet import write_sheet
+from .spending import budget
+
+__all__ = ["main", "reproduce"]
+
+
+def main(arguments: Sequence[str] | None = None, *, registry: Registry | None = None) -> int:
+    """Make what the arguments name; return the exit code.
+
+    Args:
+        arguments: command line; that of the process when None.
+        registry: where splits are described; ours when None.
+    """
+    given = _parser().parse_args(arguments)
+    try:
+        items = _chosen(given.only, given.split)
+        if given.list:
+            _say("\n".join(_lines(items)))
+            return 0
+        known = registry or load()
+        known.size("cavity", given.size)
+        root = resolve_root(given.root)
+        plan = Plan(
+            size=given.size,
+            root=root,
+            runs=given.runs,
+            output=given.output or given.runs / "reproduce" / given.size,
+            seeds=_seeds(given.seeds),
+            recipe=given.recipe,
+            settings=tuple(given.set),
+            device=given.device,
+            threads=given.threads,
+            registry=registry,
+        )
+        return reproduce(plan, items, training=not given.no_training, split=given.split)
+    except LagbenchError as error:
+        _complain(error)
+        return error.exit_code
+
+
+def reproduce(plan: Plan, items: Sequence[Item], *, training: bool = True, split: str | None = None) -> int:
+    """Make items; what fails is said, and the others are made. Return 0, or the last error's code.
+
+    Args:
+        plan: what was asked for.
+        items: tables and figures.
+        training: whether runs that are missing are made.
+        split: make all runs that the roster has for this split too.
+    """
+    code = 0
+    if training:
+        for error in _make_all(plan, items, split):
+            _complain(error)
+            code = error.exit_code
+    for item in items:
+        try:
+            sheet = item.make(plan)
+            _say(write_sheet(sheet, plan.output, item.name, _head(plan, item)))
+        except LagbenchError as error:
+            _complain(error, item.name)
+            code = error.exit_code
+    return code
+
+
+def _make_all(plan: Plan, items: Sequence[Item], split: str | None) -> Iterator[LagbenchError]:
+    """Make every run that items need, one seed after the other; yield what went wrong."""
+    wanted = {(where, name): None for item in items for where, names in item.needs.items() for name in names}
+    wanted |= {(split, name): None for name in EXPECTED.get(split or "", ()) if split}
+    for seed in plan.seeds:
+        for where, name in wanted:
+            try:
+                _note(f"{where} {plan.size} {name}-{seed}")
+                make_run(plan, where, ROSTER[name], seed)
+            except LagbenchError as error:
+                yield error
+    for study in dict.fromkeys(study for item in items for study in item.studies):
+        try:
+            _note(f"studies of {study}")
+            make_studies(plan, study)
+        except LagbenchError as error:
+            yield error
+
+
+def _head(plan: Plan, item: Item) -> str:
+    """Return the title and what was run: size, budget, seeds, hours."""
+    lines = [f"# {item.name.replace('_', ' ')}: {item.title}", "", f"Size {plan.size}."]
+    for split, names in item.needs.items():
+        known = plan.evidence(split).methods
+        for name in names:
+            seeds = known[name].seeds if name in known else ()
+            if not seeds:
+                lines.append(f"- {split}, {label(name)}: no run")
+                continue
+            hours = sum(held.cpu_hours or 0.0 for held in seeds)
+            which = ", ".join(str(held.seed) for held in seeds)
+            lines.append(
+                f"- {split}, {label(name)}: seeds {which}; {budget(seeds[0].record)} steps x windows;"
+                f" {hours:.3g} CPU hours"
+            )
+    return "\n".join(lines)
+
+
+def _chosen(only: str | None, split: str | None) -> list[Item]:
+    """Return the items that were asked for.
+
+    Raises:
+        UsageError: no such item or split; the message names the nearest.
+    """
+    if split is not None and split not in EXPECTED:
+        raise UsageError(f"no split {split!r}", where="--split", fix=nearest(split, EXPECTED))
+    names = only.split(",") if only else list(ITEMS)
+    for name in names:
+        if name not in ITEMS:
+            raise UsageError(f"no table or figure {name!r}", where="--only", fix=nearest(name, ITEMS))
+    return [ITEMS[name] for name in names if split is None or split in ITEMS[name].splits]
+
+
+def _seeds(text: str) -> tuple[int, ...]:
+    try:
+        seeds = tuple(int(part) for part in text.split(","))
+    except ValueError:
+        seeds = ()
+    if not seeds or min(seeds) < 0:
+        raise UsageError("cannot understand the seeds", where="--seeds", expected="as in 0,1", got=text)
+    return seeds
+
+
+def _lines(items: Sequence[Item]) -> Iterator[str]:
+    for item in items:
+        needs = [f"{split}: {' '.join(names)}" for split, names in item.needs.items()]
+        needs += [f"trainings of {study}" for study in item.studies]
+        yield f"{item.name:14} {item.title}; needs {'; '.join(needs) or 'no training'}"
+
+
+def _say(text: str) -> None:
+    sys.stdout.write(text + "\n")
+
+
+def _note(text: str) -> None:
+    sys.stderr.write(f"-- {text}\n")
+
+
+def _complain(error: LagbenchError, where: str = "") -> None:
+    sys.stderr.write(f"error: {where + ': ' if where else ''}{error}\n")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m lagbench.baselines.reproduce",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("--size", default="mini", help="tiny, mini or full")
+    add("--only", metavar="NAMES", help="tables and figures, as in table_5_4,fig_5_5; all by default")
+    add("--split", help="only what is about this split, and all models that are meant for it")
+    add("--root", type=Path, help="folder of all data sets")
+    add("--runs", type=Path, default=Path("runs"), help="folder of runs")
+    add("--output", "-o", type=Path, help="RUNS/reproduce/<size> by default")
+    add("--seeds", default="0", help="seeds of every training, as in 0,1")
+    add("--recipe", metavar="NAME", help="variant of the recipes, as in short")
+    add("--set", action="append", default=[], metavar="KEY=VALUE", help="change every recipe; repeatable")
+    add("--device", default="auto", help="cpu, cuda or auto")
+    add("--threads", type=int, help="CPU threads; one per core by default")
+    add("--no-training", action="store_true", help="make no run, show what is there")
+    add("--list", action="store_true", help="list tables and figures, and what they need")
+    return parser
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

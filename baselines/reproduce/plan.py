@@ -1,0 +1,88 @@
+"""What was asked for, and where everything of it lies."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+from lagbench.exam import Exam, load_exam
+from lagbench.locating import rooted
+from lagbench.registry import Registry, Size
+
+from .evidence import Evidence, Sources
+from .roster import Model
+
+__all__ = ["Plan"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """One size to reproduce.
+
+    Attributes:
+        size: name of the size.
+        root: folder of all data sets.
+        runs: folder of runs; what is there is not made again.
+        output: folder of tables and pictures.
+        seeds: seeds of every training; pictures show the first.
+        recipe: variant of the recipes, as in ``short``; None for the size's own.
+        settings: changes to every recipe, as in ``training.steps=100``.
+        device: ``cpu``, ``cuda`` or ``auto``.
+        threads: threads on the CPU; one per core by default.
+        registry: where splits are described; ours when None.
+    """
+
+    size: str
+    root: Path
+    runs: Path
+    output: Path
+    seeds: tuple[int, ...] = (0,)
+    recipe: str | None = None
+    settings: tuple[str, ...] = ()
+    device: str = "auto"
+    threads: int | None = None
+    registry: Registry | None = None
+    _evidence: dict[str, Evidence] = field(default_factory=dict, compare=False, repr=False)
+    _exams: dict[str, Exam] = field(default_factory=dict, compare=False, repr=False)
+
+    @cached_property
+    def described(self) -> Registry:
+        """Splits, those of the root folder included."""
+        return rooted(self.root, self.registry)
+
+    def tier(self, split: str) -> Size:
+        """Return what the registry says of a split at this size."""
+        return self.described.size(split, self.size)
+
+    def home(self, split: str) -> Path:
+        """Return the folder of a split's runs: ``runs/<split>/<size>[-<recipe>]``."""
+        return self.runs / split / (f"{self.size}-{self.recipe}" if self.recipe else self.size)
+
+    def folder(self, split: str, model: Model, seed: int) -> Path:
+        """Return the folder of one training."""
+        return self.home(split) / f"{model.name}-{seed}"
+
+    def predictions(self, split: str, name: str) -> Path | None:
+        """Return the predictions of a model's first seed; None where there are none, or no scores yet."""
+        if name not in self.evidence(split).methods:
+            return None
+        paths = [self.home(split) / f"{name}-{seed}" / "predictions.nc" for seed in self.seeds]
+        return next((path for path in paths if path.is_file()), None)
+
+    def evidence(self, split: str) -> Evidence:
+        """Return scores, costs and records of a split's runs; read once, after they are made."""
+        if split not in self._evidence:
+            sources = Sources(board=None, runs=self.runs, registry=self.described)
+            self._evidence[split] = Evidence(sources, split, self.size)
+        return self._evidence[split]
+
+    def exam(self, split: str) -> Exam:
+        """Return the test subset of a split.
+
+        Raises:
+            DataError: it is missing or damaged.
+        """
+        if split not in self._exams:
+            self._exams[split] = load_exam(self.tier(split), self.root)
+        return self._exams[split]

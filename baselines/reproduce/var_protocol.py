@@ -1,0 +1,211 @@
+"""VAR(1) by the thesis's own protocol (section 4.8.3, Listing 4.1), timed and weighed.
+
+    python -m lagbench.baselines.reproduce.var_protocol [--split fluid] [--size full] [--root FOLDER]
+        [--lags 1] [--json]
+
+All frames of all scenarios, in the order of their ids, are standardised per feature over all
+frames, flattened and concatenated; the first 70 % are fitted, and the next 15 % forecast from
+the last frame of training. So frames of test scenarios enter, and a forecast runs on across the
+starts of scenarios that it cannot know: as a benchmark it says nothing, as a check of
+the thesis's figures it does. The benchmark's own way is ``lagbench train --baseline var``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import resource
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagbench.baselines.normal_equations import LeastSquares, solve
+from lagbench.baselines.var import LaggedRows
+from lagbench.baselines.windows import scenario_paths
+from lagbench.registry import load
+from lagbench.scenario_file import read_scenario
+
+__all__ = ["ProtocolResult", "forecast_errors", "measure"]
+
+TRAIN, VALID = 0.70, 0.15
+"""Shares of the frames that are fitted and forecast."""
+
+THESIS = {"minutes": 33.0, "peak_gb": 19.0, "forecast_mse": 3.5e18}
+GROWTH_FRAMES = 100
+
+States = NDArray[np.float32]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProtocolResult:
+    """What the thesis states, and what explains it.
+
+    Attributes:
+        split: name of the split.
+        size: name of the size.
+        features: dimensions of the VAR.
+        frames: frames fitted.
+        fit_seconds: wall time of the fit [s].
+        cpu_seconds: CPU time of the fit, all threads [s].
+        peak_gb: largest resident memory of the process [GB].
+        condition: condition number of the regressors.
+        floor: see :class:`~lagbench.baselines.normal_equations.LeastSquares`.
+        fit_mse: mean squared error of one step over the frames fitted [standardised^2].
+        forecast_frames: frames forecast.
+        forecast_mse: mean over them [standardised^2]; infinite once a forecast overflows.
+        mse_at: mean squared error of single frames of the forecast, by frame [standardised^2].
+        growth: factor per frame by which the last frames of the forecast grow; above 1 it diverges.
+        persistence_mse: of the last frame of training, kept [standardised^2].
+    """
+
+    split: str
+    size: str
+    features: int
+    frames: int
+    fit_seconds: float
+    cpu_seconds: float
+    peak_gb: float
+    condition: float
+    floor: float
+    fit_mse: float
+    forecast_frames: int
+    forecast_mse: float
+    mse_at: dict[int, float]
+    growth: float
+    persistence_mse: float
+
+
+def measure(
+    split: str = "fluid", size: str = "full", *, root: str | Path | None = None, lags: int = 1
+) -> ProtocolResult:
+    """Fit and forecast by the thesis's protocol.
+
+    Args:
+        split: name of the split.
+        size: name of the size.
+        root: folder of all data sets.
+        lags: order of the VAR.
+    """
+    states = _all_states(split, size, root)
+    train = int(TRAIN * len(states))
+    valid = states[train : train + int(VALID * len(states))]
+    rows = LaggedRows([states[:train]], lags=lags)
+    wall, cpu = time.perf_counter(), time.process_time()
+    found = solve(rows)
+    wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
+    errors, growth = forecast_errors(found.coefficients, states[train - lags : train], valid)
+    return ProtocolResult(
+        split=split,
+        size=size,
+        features=states.shape[1],
+        frames=train,
+        fit_seconds=wall,
+        cpu_seconds=cpu,
+        peak_gb=peak,
+        condition=found.condition,
+        floor=found.floor,
+        fit_mse=_fit_mse(rows, found),
+        forecast_frames=len(valid),
+        forecast_mse=float(errors.mean()),
+        mse_at={frame: float(errors[frame - 1]) for frame in (1, 10, 100, 1000) if frame <= len(errors)},
+        growth=growth,
+        persistence_mse=float(np.square(valid - states[train - 1], dtype=np.float64).mean()),
+    )
+
+
+def _all_states(split: str, size: str, root: str | Path | None) -> States:
+    """Return the standardised states of all frames, shape [frame, feature]."""
+    paths: dict[int, Path] = {}
+    for subset in ("train", "valid", "test"):
+        paths |= scenario_paths(split, subset=subset, size=size, root=root)
+    tier = load().size(split, size)
+    states = np.empty((sum(map(tier.frame_count, paths)), tier.particles, 4), np.float32)
+    filled = 0
+    for _, path in sorted(paths.items()):
+        for block in _stored(path):
+            states[filled : filled + len(block)] = block
+            filled += len(block)
+    for feature in np.moveaxis(states, -1, 0):
+        feature -= feature.mean(dtype=np.float64)
+        feature /= feature.std(dtype=np.float64)
+    return states.reshape(len(states), -1)
+
+
+def _stored(path: Path) -> Iterator[States]:
+    """Yield blocks of positions and the solver's velocities, shape [frame, particle, 4]."""
+    with read_scenario(path) as file:
+        for position, velocity in zip(file.blocks("position"), file.blocks("velocity"), strict=True):
+            yield np.concatenate([position, velocity], axis=-1)
+
+
+def forecast_errors(
+    coefficients: NDArray[np.float64], last: States, truth: States
+) -> tuple[NDArray[np.float64], float]:
+    """Forecast and return the mean squared error of each frame and the growth per frame at the end.
+
+    Args:
+        coefficients: as :class:`~lagbench.baselines.var.VAR` lays them out.
+        last: states before the forecast, the latest last, shape [lag, feature].
+        truth: states to compare with, shape [frame, feature].
+    """
+    history = list(last[::-1].astype(np.float64))
+    errors, norms = np.full(len(truth), np.inf), np.full(len(truth), np.nan)
+    transposed = coefficients.T if coefficients.flags.f_contiguous else np.ascontiguousarray(coefficients.T)
+    for frame, true in enumerate(truth):
+        state = transposed @ np.concatenate([[1.0], *history])
+        history = [state, *history[:-1]]
+        norms[frame] = np.linalg.norm(state)
+        if not np.isfinite(norms[frame]) or norms[frame] > 1e150:
+            break
+        errors[frame] = np.square(state - true).mean()
+    grown = norms[np.isfinite(norms)]
+    span = min(GROWTH_FRAMES, len(grown) - 1)
+    return errors, float((grown[-1] / grown[-1 - span]) ** (1 / span)) if span > 0 else float("nan")
+
+
+def _fit_mse(rows: LaggedRows, found: LeastSquares) -> float:
+    errors = [np.square(y - x @ found.coefficients).sum() for x, y in rows]
+    return float(math.fsum(errors) / (rows.rows * len(found.coefficients[0])))
+
+
+def table(result: ProtocolResult) -> str:
+    """Return the thesis's figures beside ours, as Markdown."""
+    ours = {
+        "minutes": result.fit_seconds / 60,
+        "peak_gb": result.peak_gb,
+        "forecast_mse": result.forecast_mse,
+    }
+    head = (
+        f"VAR of {result.features} dimensions on {result.split} {result.size}, {result.frames} frames fitted,"
+        f" {result.forecast_frames} forecast\n\n| | thesis | ours |\n|---|---:|---:|\n"
+    )
+    lines = [f"| {name} | {THESIS[name]:.3g} | {value:.3g} |" for name, value in ours.items()]
+    names = ("cpu_seconds", "condition", "floor", "fit_mse", "growth", "persistence_mse")
+    lines += [f"| {name} | | {getattr(result, name):.6g} |" for name in names]
+    lines += [f"| mse after {frame} frames | | {value:.3g} |" for frame, value in result.mse_at.items()]
+    return head + "\n".join(lines) + "\n"
+
+
+def main() -> int:
+    """Measure what the arguments name and print it."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--split", default="fluid")
+    parser.add_argument("--size", default="full")
+    parser.add_argument("--root", type=Path)
+    parser.add_argument("--lags", type=int, default=1)
+    parser.add_argument("--json", action="store_true")
+    given = parser.parse_args()
+    result = measure(given.split, given.size, root=given.root, lags=given.lags)
+    sys.stdout.write(json.dumps(asdict(result), indent=1) + "\n" if given.json else table(result))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

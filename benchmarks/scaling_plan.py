@@ -1,0 +1,274 @@
+"""Plan data sets of large scenarios: measure rows of Table 3.1 and extrapolate to a million particles.
+
+    python benchmarks/scaling_plan.py --rows 2,4 --output docs/figures
+
+writes scaling_plan.md and prints it. Row q has the particles, grid and substeps of the thesis's Table 3.1;
+a body of liquid, four particles per cell, falls (split fluid, scenario 0). Costs are processor times, so
+that other processes do not count: of parts (solver, file, hash), and of whole generations with their
+checks, twin and cards, at two numbers of frames. Peak memory is that of the largest process; its growth
+between the two numbers of frames says what of it depends on the length of a scenario.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from table_3_1 import THESIS, Row
+
+from lagbench.generation import generate
+from lagbench.generators.batch import Batch, Job, draw
+from lagbench.generators.simulate import scenario_writer
+from lagbench.registry import Registry, load
+from lagbench.scenario_file import check_scenario
+from lagbench.statistics import file_moments
+
+FRAMES = (4, 10)
+"""Frames of the two generations."""
+
+SCENARIOS, PLANNED = 1000, 600
+"""Scenarios and frames of the data set that is planned for."""
+
+TESTS, HORIZON = 0.1, 298
+"""Share of test scenarios, and frames that their twins take."""
+
+_AREA, _COURANT, _MODULUS = 0.25, 0.4, 30.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parts:
+    """Processor time of each part, for one particle.
+
+    Attributes:
+        draw: drawing the initial state [s].
+        substep: one substep [s].
+        write: hashing, compressing and writing one frame [s].
+        check: reading and hashing one frame again [s].
+        statistics: moments of one frame [s].
+        bytes: one frame in the file [bytes].
+    """
+
+    draw: float
+    substep: float
+    write: float
+    check: float
+    statistics: float
+    bytes: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Whole:
+    """One generation of a scenario and one of a test scenario with its twin.
+
+    Attributes:
+        frames: frames of each.
+        seconds: processor time of all processes [s].
+        parent: peak memory of the parent [bytes].
+        worker: peak memory of the largest worker [bytes].
+    """
+
+    frames: int
+    seconds: float
+    parent: int
+    worker: int
+
+
+def registry_of(row: Row, frames: int) -> Registry:
+    """Return our splits with a size ``q`` of fluid that has the numbers of a row."""
+    known = load()
+    fluid = known.split("fluid")
+    interval = row.substeps * _COURANT / (row.grid * _MODULUS**0.5)
+    full = fluid.sizes["full"]
+    changed = {
+        **full.parameters,
+        "particles": row.particles,
+        "grid": row.grid,
+        "substeps_per_frame": row.substeps,
+    }
+    task = full.task.model_copy(update={"horizon": frames - 2, "frames_of_interest": (frames - 1,)})
+    subsets = {"train": (0,), "valid": (1,), "test": (2,)}
+    size = full.model_copy(update={"parameters": changed, "subsets": subsets, "frames": frames, "task": task})
+    values = {"area_min": _AREA, "area_max": _AREA, "frame_rate": 1.0 / interval}
+    parameters = {
+        name: parameter.model_copy(update={"value": values.get(name, parameter.value)})
+        for name, parameter in fluid.parameters.items()
+    }
+    split = fluid.model_copy(update={"parameters": parameters, "sizes": {"q": size}})
+    return Registry({**known.splits, "fluid": split}, {})
+
+
+def timed(function: Callable[[], object]) -> float:
+    """Return the processor time of a call [s]."""
+    start = time.process_time()
+    function()
+    return time.process_time() - start
+
+
+def measure_parts(row: Row, frames: int, root: Path) -> Parts:
+    """Time the parts of a generation in this process."""
+    size = registry_of(row, frames).size("fluid", "q")
+    job = Job(size=size, scenarios=(0,), root=root)
+    drawing = min(timed(lambda: draw(size, 0)) for _ in range(3))
+    batch = Batch(job, lambda _: None)
+    batch.solver.advance(1)
+    solving = min(timed(lambda: batch.solver.advance(row.substeps)) for _ in range(3)) / row.substeps
+    position, velocity = batch.solver.position()[0], batch.solver.velocity()[0]
+    with scenario_writer(job, 0, batch.states[0]) as writer:
+        writing = timed(lambda: [writer.append(position, velocity) for _ in range(frames)]) / frames
+    path = writer.path
+    return Parts(
+        draw=drawing / row.particles,
+        substep=solving / row.particles,
+        write=writing / row.particles,
+        check=timed(lambda: check_scenario(path)) / frames / row.particles,
+        statistics=timed(lambda: file_moments(path)) / frames / row.particles,
+        bytes=path.stat().st_size / frames / row.particles,
+    )
+
+
+def measure_whole(row: Row, frames: int, root: Path) -> Whole:
+    """Generate one scenario and one with a twin, one after the other, by one worker."""
+    start = time.process_time()
+    generate("fluid", "q", scenarios="0,2", root=root, workers=1, registry=registry_of(row, frames))
+    workers = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return Whole(
+        frames=frames,
+        seconds=time.process_time() - start + workers.ru_utime + workers.ru_stime,
+        parent=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
+        worker=workers.ru_maxrss * 1024,
+    )
+
+
+def apart(row: Row, frames: int, what: str) -> Any:  # noqa: ANN401 (plain values)
+    """Measure in a process of its own, whose peak memory is nobody else's."""
+    command = [sys.executable, __file__, "--one", f"{row.q},{frames},{what}"]
+    return json.loads(subprocess.run(command, capture_output=True, check=True, text=True).stdout)
+
+
+def one(text: str) -> int:
+    """Measure one thing and print it as JSON."""
+    q, frames, what = text.split(",")
+    row = next(row for row in THESIS if row.q == int(q))
+    with tempfile.TemporaryDirectory() as folder:
+        measure = measure_parts if what == "parts" else measure_whole
+        print(json.dumps(asdict(measure(row, int(frames), Path(folder)))))
+    return 0
+
+
+def parts_table(found: Sequence[tuple[Row, Parts]]) -> list[str]:
+    """Return the costs per particle."""
+    lines = [
+        "| q | particles | draw [ns] | substep [ns] | write a frame [ns] | hash it again [ns] "
+        "| statistics [ns] | bytes of a frame |",
+        "|--:|--:|--:|--:|--:|--:|--:|--:|",
+    ]
+    for row, p in found:
+        times = " | ".join(f"{1e9 * t:.3g}" for t in (p.draw, p.substep, p.write, p.check, p.statistics))
+        lines.append(f"| {row.q} | {row.particles:,} | {times} | {p.bytes:.3g} |")
+    return lines
+
+
+def whole_table(found: Sequence[tuple[Row, Parts, Sequence[Whole]]]) -> list[str]:
+    """Return what whole generations took, beside the sum of the parts."""
+    lines = [
+        "| q | frames | core seconds | sum of the parts | one frame [MB] | parent, peak [MB] "
+        "| worker, peak [MB] |",
+        "|--:|--:|--:|--:|--:|--:|--:|",
+    ]
+    for row, parts, runs in found:
+        for run in runs:
+            lines.append(
+                f"| {row.q} | {run.frames} | {run.seconds:.1f} | {expected(row, parts, run.frames):.1f} "
+                f"| {16 * row.particles / 1e6:.1f} | {run.parent / 1e6:.0f} | {run.worker / 1e6:.0f} |"
+            )
+    return lines
+
+
+def expected(row: Row, p: Parts, frames: int) -> float:
+    """Return what two scenarios and a twin should take by the parts [s]."""
+    simulated = 3 * (frames - 1) * row.substeps * p.substep
+    return row.particles * (3 * p.draw + simulated + 2 * frames * p.write)
+
+
+def plan_table(row: Row, p: Parts, memory: int) -> list[str]:
+    """Return bytes, core hours and memory of the planned data set."""
+    n, frames = row.particles, PLANNED
+    hours, file = SCENARIOS * n / 3600.0, frames * n * p.bytes
+    simulating = hours * (p.draw + (frames - 1) * row.substeps * p.substep)
+    twins = TESTS * hours * (p.draw + HORIZON * row.substeps * p.substep)
+    rows = {
+        "bytes before compression": f"{SCENARIOS * frames * n * 16 / 1e12:.2f} TB",
+        "bytes in files": f"{SCENARIOS * file / 1e12:.2f} TB ({file / 1e9:.1f} GB each)",
+        "simulating": f"{simulating:,.0f} core hours",
+        "compressing, hashing, writing": f"{hours * frames * p.write:,.0f} core hours",
+        f"twins of {TESTS:.0%} test scenarios": f"{twins:,.0f} core hours",
+        "statistics of 80 % train scenarios": f"{0.8 * hours * frames * p.statistics:,.0f} core hours",
+        "one `lagbench verify`": f"{hours * frames * p.check:,.0f} core hours",
+        "memory of a worker": f"{memory / 1e6:.0f} MB",
+    }
+    return [
+        f"{SCENARIOS:,} scenarios of {n:,} particles, {frames} frames of {row.substeps} substeps, "
+        f"{row.grid} x {row.grid} cells:",
+        "",
+        "| | |",
+        "|---|--:|",
+        *(f"| {name} | {value} |" for name, value in rows.items()),
+    ]
+
+
+def extrapolated(found: Sequence[tuple[Row, Parts, Sequence[Whole]]], particles: int) -> int:
+    """Return a worker's peak memory at a number of particles, by the line through two rows [bytes]."""
+    (small, _, few), (large, _, many) = found[0], found[-1]
+    low, high = few[-1].worker, many[-1].worker
+    if small is large:
+        return round(high * particles / large.particles)
+    slope = (high - low) / (large.particles - small.particles)
+    return round(high + slope * (particles - large.particles))
+
+
+def main() -> int:
+    """Measure the rows that were asked for and write the plan."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--rows", default="2,4", help="values of q, such as 2,4")
+    parser.add_argument("--output", type=Path, default=Path("docs/figures"))
+    parser.add_argument("--one", help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    if given.one:
+        return one(given.one)
+    rows = [row for row in THESIS if str(row.q) in given.rows.split(",")]
+    found = [
+        (
+            row,
+            Parts(**apart(row, FRAMES[0], "parts")),
+            [Whole(**apart(row, frames, "whole")) for frames in FRAMES],
+        )
+        for row in rows
+    ]
+    million = next(row for row in THESIS if row.q == 8)
+    lines = [
+        *parts_table([(row, parts) for row, parts, _ in found]),
+        "",
+        *whole_table(found),
+        "",
+        *plan_table(million, found[-1][1], extrapolated(found, million.particles)),
+    ]
+    text = "\n".join(lines) + "\n"
+    given.output.mkdir(parents=True, exist_ok=True)
+    (given.output / "scaling_plan.md").write_text(text, encoding="utf-8")
+    print(text)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

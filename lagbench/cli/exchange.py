@@ -1,0 +1,299 @@
+"""Commands that bring data in and out: download, export, import, adopt."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from lagbench.errors import UsageError
+
+from .options import (
+    JsonFlag,
+    QuietFlag,
+    RootOption,
+    ScenariosOption,
+    SizeOption,
+    SplitArgument,
+    SplitOption,
+    SubsetOption,
+    WorkersOption,
+    chosen,
+)
+from .output import print_json, say, spell_bytes
+from .progress import progress_bar
+
+if TYPE_CHECKING:
+    from lagbench.exchange.local_split import LocalSplit
+
+__all__ = ["adopt", "download", "export", "import_split"]
+
+FormatOption = Annotated[str, typer.Option("--format", metavar="NAME", help="gns-npz or lagrangebench-h5.")]
+FolderOption = Annotated[
+    Path,
+    typer.Option("--output", "-o", metavar="FOLDER", help="Folder to make; its last part names the split."),
+]
+TitleOption = Annotated[str | None, typer.Option("--title", metavar="TEXT", help="Title of the split.")]
+CitationOption = Annotated[str | None, typer.Option("--citation", metavar="TEXT", help="Whom to cite.")]
+LicenceOption = Annotated[
+    str | None, typer.Option("--licence", metavar="NAME", help="Licence of the data, as in CC-BY-4.0.")
+]
+RadiusOption = Annotated[
+    float | None, typer.Option("--radius", metavar="LENGTH", help="Connectivity radius of graph models.")
+]
+IntervalOption = Annotated[
+    float | None, typer.Option("--frame-interval", metavar="SECONDS", help="Time between frames.")
+]
+BoundsOption = Annotated[
+    str | None, typer.Option("--bounds", metavar="X0,X1,Y0,Y1", help="Walls of the box.")
+]
+RescaleFlag = Annotated[
+    bool, typer.Option("--rescale", help="Fit the bounds into the unit box, by a power of two.")
+]
+DensityOption = Annotated[
+    float | None, typer.Option("--density", metavar="NUMBER", help="Rest density; 1 by default.")
+]
+SpacingOption = Annotated[
+    float | None,
+    typer.Option("--spacing", metavar="LENGTH", help="Distance of particles at first; estimated by default."),
+]
+InputFramesOption = Annotated[
+    int | None, typer.Option("--input-frames", metavar="N", help="Frames given to a model; 6 by default.")
+]
+HorizonOption = Annotated[
+    int | None, typer.Option("--horizon", metavar="N", help="Frames to predict; all by default.")
+]
+InterestOption = Annotated[
+    str | None,
+    typer.Option("--frames-of-interest", metavar="FRAMES", help="As in 15,25; the last one by default."),
+]
+CellsOption = Annotated[
+    int | None, typer.Option("--cells", metavar="N", help="Cells across of the score grid.")
+]
+FullBoxFlag = Annotated[
+    bool | None,
+    typer.Option("--full-box/--free-surface", help="Whether material fills the box: vorticity ranks then."),
+]
+
+
+def download(
+    name: SplitArgument = None,
+    split: SplitOption = None,
+    size: SizeOption = "full",
+    mirror: Annotated[
+        str | None, typer.Option("--from", metavar="URL", help="Mirror; else those of datasets.yaml.")
+    ] = None,
+    subset: SubsetOption = None,
+    scenarios: ScenariosOption = None,
+    root: RootOption = None,
+    connections: Annotated[
+        int, typer.Option("--connections", metavar="N", help="Files fetched side by side.", min=1)
+    ] = 4,
+    or_generate: Annotated[
+        bool,
+        typer.Option("--or-generate/--no-generate", help="Simulate what no mirror has, or stop there."),
+    ] = True,
+    workers: WorkersOption = None,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
+) -> None:
+    """Fetch a split from a mirror and check its content; simulate what no mirror has."""
+    from lagbench.exchange.downloading import download as run
+    from lagbench.scenario_ids import spell_ids
+
+    with progress_bar(quiet=quiet) as draw:
+        result = run(
+            chosen(name, split),
+            size,
+            mirror=mirror,
+            subset=subset,
+            scenarios=scenarios,
+            root=root,
+            connections=connections,
+            or_generate=or_generate,
+            workers=workers,
+            progress=draw,
+            announce=lambda text: typer.echo(f"lagbench: {text}", err=True),
+        )
+    if as_json:
+        print_json(result)
+        return
+    counts = (
+        f"{len(result.downloaded)} downloaded, {len(result.generated)} simulated, {len(result.kept)} kept"
+    )
+    say(f"{result.split} {result.size}: {counts}, {spell_bytes(result.bytes)}", quiet=quiet)
+    say(f"  folder  {result.folder}", quiet=quiet)
+    if result.downloaded:
+        say(f"  mirror  {result.mirror}: scenarios {spell_ids(sorted(result.downloaded))}", quiet=quiet)
+    if result.dataset_sha256:
+        say(f"  hash    {result.dataset_sha256}", quiet=quiet)
+    say(f"  check   {result.verdict}", quiet=quiet)
+
+
+def export(
+    name: SplitArgument = None,
+    split: SplitOption = None,
+    size: SizeOption = "full",
+    form: FormatOption = "gns-npz",
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output", "-o", metavar="FOLDER", help="Folder for the files; SPLIT-SIZE-FORMAT here."
+        ),
+    ] = None,
+    root: RootOption = None,
+    from_walls: Annotated[
+        bool, typer.Option("--from-walls", help="lagrangebench-h5: measure positions from the lower walls.")
+    ] = False,
+    force: Annotated[bool, typer.Option("--force", help="Write over an earlier export.")] = False,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
+) -> None:
+    """Write a split in the format of another code base: train, valid, test, metadata."""
+    from lagbench.exchange.exporting import export as run
+
+    wanted = chosen(name, split)
+    folder = output or Path(f"{Path(wanted).name}-{size}-{form}")
+    with progress_bar(quiet=quiet) as draw:
+        result = run(
+            wanted,
+            size,
+            format=form,
+            output=folder,
+            root=root,
+            from_walls=from_walls,
+            force=force,
+            progress=draw,
+        )
+    if as_json:
+        print_json(result)
+        return
+    say(f"{result.split} {result.size} as {result.format} in {result.folder}", quiet=quiet)
+    for subset, count in result.trajectories.items():
+        say(f"  {subset:<6}{count} trajectories, {result.frames[subset]} frames", quiet=quiet)
+    if result.left_out:
+        say(f"  {result.left_out} frames left out: readers of this format want equal lengths", quiet=quiet)
+    say(f"  {spell_bytes(result.bytes)}", quiet=quiet)
+
+
+def import_split(
+    ctx: typer.Context,
+    source: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of train, valid, test, metadata.")],
+    form: FormatOption,
+    output: FolderOption,
+    allow_pickle: Annotated[
+        bool, typer.Option("--allow-pickle", help="Rebuild pickled arrays; other calls are refused.")
+    ] = False,
+    kinds: Annotated[
+        str | None,
+        typer.Option("--kinds", metavar="LIST", help="Material of kinds of particles, as in 3=jelly,0=drop."),
+    ] = None,
+    title: TitleOption = None,
+    citation: CitationOption = None,
+    licence: LicenceOption = None,
+    radius: RadiusOption = None,
+    frame_interval: IntervalOption = None,
+    bounds: BoundsOption = None,
+    rescale: RescaleFlag = False,
+    density: DensityOption = None,
+    spacing: SpacingOption = None,
+    input_frames: InputFramesOption = None,
+    horizon: HorizonOption = None,
+    frames_of_interest: InterestOption = None,
+    cells: CellsOption = None,
+    full_box: FullBoxFlag = None,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
+) -> None:
+    """Make a local split of another code base's data, to train on and to score."""
+    from lagbench.exchange.importing import import_split as run
+    from lagbench.exchange.kinds import parse_kinds
+
+    with progress_bar(quiet=quiet) as draw:
+        made = run(
+            source,
+            format=form,
+            output=output,
+            allow_pickle=allow_pickle,
+            kinds=parse_kinds(kinds),
+            progress=draw,
+            **_wishes(ctx),
+        )
+    _made(made, as_json=as_json, quiet=quiet)
+
+
+def adopt(
+    ctx: typer.Context,
+    sources: Annotated[
+        list[Path], typer.Argument(metavar="FILE...", help=".npy, .npz or .nc files, or a folder of them.")
+    ],
+    output: FolderOption,
+    radius: RadiusOption = None,
+    frame_interval: IntervalOption = None,
+    valid: Annotated[
+        int | None, typer.Option("--valid", metavar="N", help="Trajectories for valid; a tenth by default.")
+    ] = None,
+    test: Annotated[
+        int | None, typer.Option("--test", metavar="N", help="Trajectories for test; a tenth by default.")
+    ] = None,
+    title: TitleOption = None,
+    citation: CitationOption = None,
+    licence: LicenceOption = None,
+    bounds: BoundsOption = None,
+    rescale: RescaleFlag = False,
+    density: DensityOption = None,
+    spacing: SpacingOption = None,
+    input_frames: InputFramesOption = None,
+    horizon: HorizonOption = None,
+    frames_of_interest: InterestOption = None,
+    cells: CellsOption = None,
+    full_box: FullBoxFlag = None,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
+) -> None:
+    """Make a local split of your own trajectories: arrays or netCDF files."""
+    from lagbench.exchange.adoption import adopt as run
+
+    with progress_bar(quiet=quiet) as draw:
+        made = run(sources, output=output, valid=valid, test=test, progress=draw, **_wishes(ctx))
+    _made(made, as_json=as_json, quiet=quiet)
+
+
+def _wishes(ctx: typer.Context) -> Any:  # noqa: ANN401 (the functions type them)
+    """Return what a user says of the data: the options that import and adopt share."""
+    from lagbench.exchange.description import Wishes
+    from lagbench.scenario_ids import parse_ids
+
+    said = {n: v for n, v in ctx.params.items() if n in Wishes.__annotations__ and v is not None}
+    if "bounds" in said:
+        said["bounds"] = _box(said["bounds"])
+    if "frames_of_interest" in said:
+        said["frames_of_interest"] = parse_ids(said["frames_of_interest"])
+    return said
+
+
+def _box(text: str) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the walls x0,x1,y0,y1 as two pairs."""
+    try:
+        left, right, bottom, top = (float(part) for part in text.split(","))
+    except ValueError:
+        raise UsageError(
+            "bad bounds", where="--bounds", expected="x0,x1,y0,y1, as in 0,2,0,1", got=text
+        ) from None
+    return (left, right), (bottom, top)
+
+
+def _made(made: LocalSplit, *, as_json: bool, quiet: bool) -> None:
+    if as_json:
+        print_json(made)
+        return
+    counts = ", ".join(f"{count} {subset}" for subset, count in made.scenarios.items())
+    fewest, most = made.particles
+    span = f"{fewest}" if fewest == most else f"{fewest} to {most}"
+    say(f"{made.folder}: {counts}, {made.frames} frames, {span} particles", quiet=quiet)
+    say(f"  task    {made.input_frames} frames given, {made.horizon} to predict", quiet=quiet)
+    say(f"  hash    {made.dataset_sha256}", quiet=quiet)
+    for note in made.notes:
+        typer.echo(f"warning: {note}", err=True)
+    say(f"  use it  lagbench template --split {made.folder}/", quiet=quiet)

@@ -1,0 +1,213 @@
+"""Commands around reference models: train, predict, bench."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from lagbench.errors import LagbenchError, UsageError
+
+from .options import JsonFlag, QuietFlag, RootOption, SizeOption, SplitArgument, SplitOption, chosen
+from .output import print_json, say, spell_seconds
+from .progress import progress_bar
+
+if TYPE_CHECKING:
+    from lagbench.baselines.prediction import PredictionResult
+    from lagbench.baselines.training import TrainingResult
+    from lagbench.bench import SolverBench
+
+__all__ = ["bench", "predict", "train"]
+
+EXTRA = "baselines"
+DeviceOption = Annotated[str, typer.Option("--device", metavar="NAME", help="cpu, cuda, or auto.")]
+ThreadsOption = Annotated[
+    int | None, typer.Option("--threads", metavar="N", help="CPU threads; one per core by default.", min=1)
+]
+
+
+def train(
+    name: SplitArgument = None,
+    baseline: Annotated[
+        str | None,
+        typer.Option("--baseline", metavar="NAME", help="Model, as in gns; see docs/baselines.md."),
+    ] = None,
+    split: SplitOption = None,
+    size: SizeOption = "full",
+    recipe: Annotated[
+        str | None, typer.Option("--recipe", metavar="NAME", help="Variant, as in short; or a YAML file.")
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Change the recipe: training.steps=100; repeatable."),
+    ] = None,
+    seed: Annotated[
+        int | None, typer.Option("--seed", metavar="N", help="Seed of all chance.", min=0)
+    ] = None,
+    root: RootOption = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", metavar="FOLDER", help="runs/<split>/<size>/<baseline>-<seed>."),
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume/--no-resume", help="Go on with what is there.")] = True,
+    fresh: Annotated[bool, typer.Option("--fresh", help="Train anew whatever is there.")] = False,
+    device: DeviceOption = "auto",
+    processes: Annotated[
+        int, typer.Option("--processes", metavar="N", help="Processes, one device each (DDP).", min=1)
+    ] = 1,
+    threads: ThreadsOption = None,
+    workers: Annotated[
+        int, typer.Option("--workers", metavar="N", help="Processes that read windows ahead.", min=0)
+    ] = 0,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
+) -> None:
+    """Train a reference model; goes on where an earlier call stopped."""
+    from lagbench.extras import check_installed
+
+    if baseline is None:
+        raise UsageError("no model is named", where="--baseline", fix="name one, as in --baseline gns")
+    for module in ("torch", "torch_geometric", "pytorch_lightning"):
+        check_installed(module, extra=EXTRA)
+    from lagbench.baselines.machine import is_helper
+    from lagbench.baselines.training import train as run
+
+    quiet = quiet or is_helper()
+    with progress_bar(quiet=quiet, counted="steps") as draw:
+        result = run(
+            baseline,
+            chosen(name, split),
+            size,
+            recipe=recipe,
+            settings=tuple(settings or ()),
+            seed=seed,
+            root=root,
+            output=output,
+            resume=resume,
+            fresh=fresh,
+            device=device,
+            processes=processes,
+            threads=threads,
+            workers=workers,
+            progress=draw,
+        )
+    if as_json and not is_helper():
+        print_json(result)
+    else:
+        say("\n".join(_trained(result)), quiet=quiet)
+
+
+def _trained(result: TrainingResult) -> list[str]:
+    time = f"{spell_seconds(result.wall_seconds)}, {spell_seconds(result.cpu_seconds)} of processor time"
+    lines = [
+        f"{result.baseline} on {result.recipe}: {result.state}, step {result.step} of {result.steps}, {time}",
+        f"  parameters {result.parameters}",
+        "  loss       " + ", ".join(f"{name} {value:.4g}" for name, value in result.loss.items()),
+    ]
+    if result.best_rmse is not None:
+        lines.append(f"  best       position RMSE {result.best_rmse:.4g} on valid, step {result.best_step}")
+    lines.append(f"  weights    {result.weights}")
+    return [*lines, f"next: lagbench predict {result.weights} -o predictions.nc"]
+
+
+def predict(
+    checkpoint: Annotated[Path, typer.Argument(metavar="FILE", help="weights.pt or checkpoint.pt.")],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="File to write.")] = Path(
+        "predictions.nc"
+    ),
+    root: RootOption = None,
+    device: DeviceOption = "auto",
+    threads: ThreadsOption = None,
+    batch: Annotated[
+        int | None,
+        typer.Option("--batch", metavar="N", help="Scenarios side by side; 1 on a CPU, all on a GPU.", min=1),
+    ] = None,
+    method: Annotated[
+        str | None, typer.Option("--method", metavar="NAME", help="What the board shall call it.")
+    ] = None,
+    solver: Annotated[
+        bool, typer.Option("--bench/--no-bench", help="Time our solver too, for the speed-up.")
+    ] = True,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
+) -> None:
+    """Roll a trained model out over the test scenarios into a predictions.nc."""
+    from lagbench.extras import check_installed
+
+    for module in ("torch", "torch_geometric"):
+        check_installed(module, extra=EXTRA)
+    from lagbench.baselines.prediction import predict as run
+
+    with progress_bar(quiet=quiet) as draw:
+        result = run(
+            checkpoint,
+            output,
+            root=root,
+            device=device,
+            threads=threads,
+            batch=batch,
+            method=method,
+            progress=draw,
+        )
+    timed = _solver_time(result, quiet=quiet) if solver else None
+    if as_json:
+        print_json({**vars(result), "solver": timed})
+    else:
+        say("\n".join(_predicted(result, timed)), quiet=quiet)
+
+
+def _solver_time(result: PredictionResult, *, quiet: bool) -> SolverBench | None:
+    """Return what the solver takes here; None, with the reason on stderr, where it cannot run."""
+    from lagbench.bench import bench_apart
+
+    try:
+        return bench_apart(result.split, result.size)
+    except LagbenchError as error:
+        if not quiet:
+            typer.echo(f"warning: no speed-up over the solver: {error}", err=True)
+        return None
+
+
+def _predicted(result: PredictionResult, solver: SolverBench | None) -> list[str]:
+    lines = [
+        f"{result.path}: {result.method}, {result.scenarios} scenarios, {result.frames} frames",
+        f"  model   {result.seconds_per_frame:.3g} s per frame ({result.seconds_without_search:.3g} s"
+        f" without the neighbour search) on {result.device}",
+    ]
+    if solver is not None:
+        ratio = solver.seconds_per_frame / result.seconds_per_frame
+        lines.append(
+            f"  solver  {solver.seconds_per_frame:.3g} s per frame on one core of this machine:"
+            f" the model is {ratio:.2g} times as fast"
+        )
+    if result.diverged:
+        marks = ", ".join(f"scenario {i} at frame {frame}" for i, frame in result.diverged.items())
+        lines.append(f"  frozen  {marks}: not finite from there on")
+    return [*lines, f"next: lagbench score {result.path}"]
+
+
+def bench(
+    what: Annotated[str, typer.Argument(metavar="WHAT", help="solver.")],
+    split: SplitOption = None,
+    size: SizeOption = "full",
+    frames: Annotated[int, typer.Option("--frames", metavar="N", help="Frames to time.", min=1)] = 20,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
+) -> None:
+    """Time our solver on this machine: seconds per frame of one scenario on one core."""
+    from lagbench.bench import bench_solver
+
+    if what != "solver":
+        raise UsageError(
+            f"nothing to time is called {what!r}", expected="solver", fix="lagbench bench solver"
+        )
+    result = bench_solver(chosen(None, split), size, frames=frames)
+    if as_json:
+        print_json(result)
+        return
+    say(
+        f"{result.split} {result.size}: {result.seconds_per_frame:.3g} s per frame of {result.particles}"
+        f" particles, {result.substeps} substeps, on one core",
+        quiet=quiet,
+    )

@@ -1,0 +1,183 @@
+"""The commands train, predict and bench, as users and clusters call them."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import pickle
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from click.testing import Result
+from typer.testing import CliRunner
+
+from lagbench.baselines.catalogue import names
+from lagbench.baselines.checkpoint import load
+from lagbench.cli.app import app
+from lagbench.generation import GenerationResult
+
+Command = Callable[..., Result]
+
+SMALL = {
+    "mlp": "model.widths=[8]",
+    "lstm": "model.width=8",
+    "lstm-mlp": "model.width=8",
+}
+"""Settings that make a smoke test quick where the recipe's model is large."""
+
+
+@pytest.fixture
+def lagbench(
+    generated: GenerationResult, unmeasured_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Command:
+    """Run a command on the tiny curl-noise data, in an empty folder."""
+    monkeypatch.setenv("LAGBENCH_REGISTRY", str(unmeasured_path))
+    monkeypatch.setenv("LAGBENCH_ROOT", str(generated.root))
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    monkeypatch.chdir(tmp_path)
+
+    def call(*words: str) -> Result:
+        return CliRunner().invoke(app, list(words))
+
+    return call
+
+
+TINY = ("--split", "curl-noise", "--size", "tiny", "--threads", "1")
+
+
+@pytest.mark.parametrize("baseline", names())
+def test_every_baseline_trains_predicts_and_scores(lagbench: Command, baseline: str) -> None:
+    """Three commands lead from a baseline's name to its scores."""
+    settings = ["--set", "training.steps=2"] if not baseline.startswith("var") else []
+    trained = lagbench("train", "--baseline", baseline, *TINY, *settings, "--json")
+    assert trained.exit_code == 0, trained.output
+    result = json.loads(trained.stdout)
+    assert result["folder"] == f"runs/curl-noise/tiny/{baseline}-0"
+    predicted = lagbench("predict", result["weights"], "--threads", "1", "--no-bench", "--json")
+    assert predicted.exit_code == 0, predicted.output
+    assert json.loads(predicted.stdout)["seconds_per_frame"] > 0
+    scored = lagbench("score", "predictions.nc", "--workers", "1", "--json")
+    assert scored.exit_code == 0, scored.output
+    assert "position_rmse" in scored.stdout
+
+
+def test_words_for_people(lagbench: Command) -> None:
+    """Without --json both commands say what they did and what comes next."""
+    trained = lagbench(
+        "train", "curl-noise", "--size", "tiny", "--baseline", "gns", "--set", "training.steps=1"
+    )
+    assert "next: lagbench predict runs/curl-noise/tiny/gns-0/weights.pt" in trained.stdout
+    predicted = lagbench("predict", "runs/curl-noise/tiny/gns-0/weights.pt", "--no-bench")
+    assert "without the neighbour search" in predicted.stdout
+    assert "next: lagbench score predictions.nc" in predicted.stdout
+    assert lagbench("predict", "runs/curl-noise/tiny/gns-0/checkpoint.pt", "--no-bench", "-q").stdout == ""
+
+
+def test_the_speed_up_needs_the_solver(lagbench: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where Taichi is missing, predict says that there is no speed-up to tell, and goes on."""
+    lagbench("train", "--baseline", "gns", *TINY, "--set", "training.steps=1")
+    find = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name, *rest: None if name == "taichi" else find(name, *rest)
+    )
+    predicted = lagbench("predict", "runs/curl-noise/tiny/gns-0/weights.pt")
+    assert predicted.exit_code == 0
+    assert "no speed-up" in predicted.stderr
+    assert "lagbench[generate]" in predicted.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "message"),
+    [
+        (("--baseline", "supergatt", *TINY), 2, "did you mean 'supergat'"),
+        (TINY, 2, "--baseline gns"),
+        (("--baseline", "gns", "--split", "curl-nose"), 2, "did you mean 'curl-noise'"),
+        (("--baseline", "gns", *TINY, "--set", "model.latant=3"), 2, "did you mean 'latent'"),
+        (("--baseline", "gns", *TINY, "--recipe", "shrt"), 2, "no recipe"),
+        (("--baseline", "gns", *TINY, "--device", "tpu"), 2, "no device 'tpu'"),
+        (("--baseline", "gns", "--split", "cavity", "--size", "mini"), 4, "lagbench generate"),
+        (("--baseline", "gns", *TINY, "--output", "/proc/none"), 5, "--output"),
+    ],
+)
+def test_mistakes_of_train(lagbench: Command, words: tuple[str, ...], code: int, message: str) -> None:
+    """Every mistake has its exit code, and a message that says how to mend it."""
+    result = lagbench("train", *words)
+    assert result.exit_code == code
+    assert message in result.stderr
+
+
+def test_mistakes_of_predict(lagbench: Command, tmp_path: Path) -> None:
+    """A pickle, a missing file and data of another version are refused with 3, 3 and 4."""
+    (tmp_path / "bomb.pt").write_bytes(pickle.dumps(os.getcwd))
+    assert lagbench("predict", "bomb.pt").exit_code == 3
+    assert lagbench("predict", "none.pt").exit_code == 3
+    lagbench("train", "--baseline", "gns", *TINY, "--set", "training.steps=1")
+    weights = tmp_path / "runs/curl-noise/tiny/gns-0/weights.pt"
+    content = torch.load(weights, weights_only=True)
+    about = json.loads(content["about"])
+    about["facts"]["dataset_sha256"] = "f" * 64
+    torch.save({**content, "about": json.dumps(about)}, weights)
+    result = lagbench("predict", str(weights))
+    assert result.exit_code == 4
+    assert "another version" in result.stderr
+
+
+def command(*words: str, threads: int = 1) -> subprocess.CompletedProcess[str]:
+    """Run lagbench in a process of its own."""
+    environment = {**os.environ, "OMP_NUM_THREADS": str(threads)}
+    return subprocess.run(
+        [sys.executable, "-m", "lagbench", *words], capture_output=True, text=True, env=environment
+    )
+
+
+def test_bench_of_the_solver(lagbench: Command) -> None:
+    """The solver is timed in a process of its own; nothing else can be timed."""
+    done = command("bench", "solver", "--split", "curl-noise", "--size", "tiny", "--frames", "3", "--json")
+    found = json.loads(done.stdout)
+    assert (found["particles"], found["substeps"], found["frames"]) == (506, 12, 3)
+    # 506 particles x 12 substeps at 30 to 40 ns each: a fifth of a millisecond; never a second.
+    assert 1e-5 < found["seconds_per_frame"] < 1.0
+    assert lagbench("bench", "model", "--split", "curl-noise").exit_code == 2
+
+
+@pytest.mark.slow
+def test_two_processes_keep_one_model(lagbench: Command, tmp_path: Path) -> None:
+    """After 20 steps over two gloo processes the weights are those of one process with the joint batch.
+
+    The gradient is the mean over processes, so that two windows on each of two processes make
+    the step of four windows on one, at twice the rate (thesis section 5.7.3).
+    """
+    settings = [
+        "--set",
+        "training.steps=20",
+        "--set",
+        "training.validate_every=0",
+        "--set",
+        "model.noise_std=0",
+    ]
+    common = ["train", "--baseline", "gns", *TINY, *settings]
+    shared = command(*common, "--processes", "2", "-o", "shared", "--set", "training.batch=2")
+    assert shared.returncode == 0, shared.stderr
+    assert shared.stdout.count("finished") == 1
+    alone = command(
+        *common, "-o", "alone", "--set", "training.batch=4", "--set", "training.learning_rate=2.0e-3"
+    )
+    assert alone.returncode == 0, alone.stderr
+    one, other = (load(tmp_path / name / "checkpoint.pt").weights for name in ("shared", "alone"))
+    for name, value in one.items():
+        assert torch.allclose(value, other[name], rtol=1e-3, atol=1e-5), name
+
+
+def test_the_second_process_says_nothing(lagbench: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A helper of a training over several processes prints and writes nothing."""
+    monkeypatch.setenv("LOCAL_RANK", "1")
+    from lagbench.baselines.machine import is_helper
+
+    assert is_helper()
+    monkeypatch.setenv("LOCAL_RANK", "0")
+    assert not is_helper()

@@ -1,0 +1,181 @@
+"""Checkpoints: what comes back, what is refused, and that nothing in a file is run."""
+
+from __future__ import annotations
+
+import os
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from simple_models import FACTS, Drift, install
+
+from lagbench.baselines.checkpoint import (
+    Checkpoint,
+    check_data,
+    load,
+    restore,
+    rounded_weights,
+    save,
+)
+from lagbench.errors import DataError, UnreadableFileError, UsageError
+from lagbench.generation import GenerationResult
+from lagbench.registry import Registry
+
+
+def example(**changes: Any) -> Checkpoint:
+    """Return a checkpoint of a Drift whose parameter needs all bits of a float32."""
+    model = Drift.build({"start": 1 / 3}, FACTS)
+    fields = {
+        "baseline": "drift",
+        "options": {"start": 1 / 3},
+        "facts": FACTS,
+        "weights": model.state_dict(),
+        "training": {"step": 3, "recipe": {"training": {"seed": 4}}},
+    }
+    return Checkpoint(**{**fields, **changes})
+
+
+def test_round_trip(tmp_path: Path) -> None:
+    """Everything comes back as it was stored, the optimiser's state too."""
+    weight = torch.nn.Parameter(torch.ones(2))
+    optimizer = torch.optim.AdamW([weight])
+    weight.grad = torch.tensor([0.5, 2.0])
+    optimizer.step()
+    stored = example(optimizer=optimizer.state_dict())
+    save(tmp_path / "a.pt", stored)
+    found = load(tmp_path / "a.pt")
+    assert (found.baseline, found.options, found.facts) == (stored.baseline, stored.options, FACTS)
+    assert found.training == stored.training
+    assert torch.equal(found.weights["a"], stored.weights["a"])
+    assert found.optimizer is not None
+    # Adam's first moment after one step: (1 - 0.9) x gradient.
+    assert found.optimizer["state"][0]["exp_avg"].tolist() == pytest.approx([0.05, 0.2])
+
+
+def test_restore(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A model comes back in float32 from weights in bfloat16."""
+    install(monkeypatch, drift=Drift)
+    save(tmp_path / "a.pt", example(weights={"a": torch.tensor([0.25]).bfloat16(), "calls": torch.tensor(0)}))
+    model = restore(load(tmp_path / "a.pt"))
+    assert model.state_dict()["a"].dtype is torch.float32
+    assert model.state_dict()["a"].item() == 0.25
+
+
+def test_rounding() -> None:
+    """Parameters are rounded to nearest-even in their upper 16 bits; buffers keep every bit."""
+    model = torch.nn.BatchNorm1d(1000)
+    torch.nn.init.normal_(model.weight, generator=torch.Generator().manual_seed(0))
+    torch.nn.init.normal_(model.running_mean, generator=torch.Generator().manual_seed(1))
+    bits = model.weight.detach().numpy().view(np.uint32)
+    expected = ((bits + 0x7FFF + ((bits >> 16) & 1)) >> 16) << 16
+    found = rounded_weights(model)
+    assert found["weight"].dtype is torch.bfloat16
+    assert np.array_equal(found["weight"].float().numpy().view(np.uint32), expected)
+    assert torch.equal(found["running_mean"], model.running_mean)
+
+
+class Bomb:
+    """Unpickling it makes a folder."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Name what unpickling runs."""
+        return os.mkdir, (str(self.path),)
+
+
+@pytest.mark.parametrize("writer", ["pickle", "torch", "torch, old layout", "inside"])
+def test_a_pickle_is_refused_and_not_run(tmp_path: Path, writer: str) -> None:
+    """A file that would run code when unpickled is refused, and the code is not run."""
+    file, target = tmp_path / "bomb.pt", tmp_path / "exploded"
+    bomb = Bomb(target)
+    if writer == "pickle":
+        file.write_bytes(pickle.dumps(bomb))
+    elif writer == "inside":
+        torch.save({"lagbench_checkpoint": 1, "about": "{}", "weights": {}, "optimizer": bomb}, file)
+    else:
+        torch.save(bomb, file, _use_new_zipfile_serialization=writer == "torch")
+    with pytest.raises(UnreadableFileError, match="more than tensors"):
+        load(file)
+    assert not target.exists()
+    pickle.loads(pickle.dumps(bomb))  # the bomb is a real one
+    assert target.exists()
+
+
+def test_scripts_are_refused(tmp_path: Path) -> None:
+    """A TorchScript archive, which holds code too, is refused."""
+    file = tmp_path / "script.pt"
+    with pytest.warns(DeprecationWarning, match="torch.jit"):
+        torch.jit.save(torch.jit.script(torch.nn.ReLU()), file)
+    with pytest.raises(UnreadableFileError):
+        load(file)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"not a checkpoint at all",
+        b"PK\x03\x04 broken",
+        {"weights": {}},
+        torch.zeros(3),
+        {"lagbench_checkpoint": 2, "about": "{}", "weights": {}},
+        {"lagbench_checkpoint": 1, "about": "{", "weights": {}},
+        {"lagbench_checkpoint": 1, "about": "{}", "weights": {}},
+        {"lagbench_checkpoint": 1, "about": 5, "weights": {}},
+    ],
+)
+def test_other_files_are_unreadable(tmp_path: Path, content: object) -> None:
+    """What is no checkpoint of ours is said to be unreadable, with the file's name."""
+    file = tmp_path / "other.pt"
+    if isinstance(content, bytes):
+        file.write_bytes(content)
+    else:
+        torch.save(content, file)
+    with pytest.raises(UnreadableFileError, match=r"other\.pt"):
+        load(file)
+
+
+def test_missing_and_cut(tmp_path: Path) -> None:
+    """A missing file and one that was cut short are unreadable."""
+    with pytest.raises(UnreadableFileError, match="No such file"):
+        load(tmp_path / "none.pt")
+    save(tmp_path / "a.pt", example())
+    whole = (tmp_path / "a.pt").read_bytes()
+    (tmp_path / "a.pt").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(UnreadableFileError):
+        load(tmp_path / "a.pt")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"weights": {"a": torch.tensor([float("nan")]), "calls": torch.tensor(0)}}, "not finite"),
+        ({"weights": {"a": torch.zeros(2), "calls": torch.tensor(0)}}, "do not fit the model"),
+        ({"weights": {"a": torch.zeros(1)}}, "do not fit the model"),
+        ({"options": {"sart": 1}}, "sart"),
+    ],
+)
+def test_unfit_weights(changes: dict[str, Any], message: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Weights that are not finite or belong to another model are refused."""
+    install(monkeypatch, drift=Drift)
+    with pytest.raises(UnreadableFileError, match=message):
+        restore(example(**changes))
+
+
+def test_unknown_baseline() -> None:
+    """A checkpoint of a baseline that is not installed says so."""
+    with pytest.raises(UsageError, match="no baseline 'drift'"):
+        restore(example())
+
+
+def test_data_of_another_version(generated: GenerationResult, unmeasured: Registry) -> None:
+    """The data at hand must have the hash of the data that the model was trained on."""
+    with pytest.raises(DataError, match="another version"):
+        check_data(example(), root=generated.root, registry=unmeasured, where="a.pt")
+    with pytest.raises(DataError, match="lagbench generate"):
+        check_data(example(), root=generated.root / "nowhere", registry=unmeasured, where="a.pt")

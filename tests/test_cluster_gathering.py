@@ -1,0 +1,128 @@
+"""Data sets made in parts, as by the jobs of an array, and put together at the end."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from conftest import SIZE, SPLIT
+
+from lagbench.errors import DataError, UsageError
+from lagbench.generation import GenerationResult, generate
+from lagbench.manifest import merge, read_manifest, write_manifest
+from lagbench.registry import Registry
+
+FOLDER = Path(SPLIT) / SIZE / "v1"
+
+
+def everything(root: Path) -> dict[str, bytes]:
+    """Return path and bytes of every file of the tiny data set but its lock."""
+    folder = root / FOLDER
+    found = {str(path.relative_to(folder)): path for path in folder.rglob("*") if path.is_file()}
+    return {name: path.read_bytes() for name, path in found.items() if name != ".lock"}
+
+
+def part(generated: GenerationResult, root: Path, registry: Registry, ids: tuple[int, ...]) -> Path:
+    """Return a root that holds some scenarios only, as a job of an array leaves it."""
+    size, whole = registry.size(SPLIT, SIZE), read_manifest(generated.root, SPLIT, SIZE, 1)
+    assert whole is not None
+    entries = [entry for entry in whole.files if entry.scenario in ids]
+    for entry in entries:
+        (root / FOLDER / entry.path).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(generated.folder / entry.path, root / FOLDER / entry.path)
+    names = {"split": SPLIT, "size": SIZE, "version": size.version, "subsets": size.subsets}
+    write_manifest(root, merge(None, entries, **names, environment=whole.environments[0]))
+    return root
+
+
+@pytest.fixture
+def parts(generated: GenerationResult, unmeasured: Registry, tmp_path: Path) -> tuple[Path, Path]:
+    """Two roots with scenarios 0-2 and 3-4."""
+    first, second = ((0, 1, 2), (3, 4))
+    return (
+        part(generated, tmp_path / "part-0", unmeasured, first),
+        part(generated, tmp_path / "part-1", unmeasured, second),
+    )
+
+
+def test_two_processes_and_a_last_call(
+    tmp_path: Path, unmeasured_path: Path, generated: GenerationResult
+) -> None:
+    """The recipe for job arrays: what two processes made is the one-machine data set, file for file."""
+
+    def start(*options: str) -> subprocess.Popen[str]:
+        command = [sys.executable, "-m", "lagbench", "generate", "--split", SPLIT, "--size", SIZE]
+        there = {**os.environ, "LAGBENCH_REGISTRY": str(unmeasured_path)}
+        return subprocess.Popen([*command, *options], env=there, stdout=subprocess.PIPE, text=True)
+
+    jobs = [
+        start("--scenarios", ids, "--root", str(tmp_path / f"part-{k}"), "--workers", "1")
+        for k, ids in enumerate(("0-2", "3,4"))
+    ]
+    assert [job.communicate()[0] and job.returncode for job in jobs] == [0, 0]
+    sources = [str(tmp_path / f"part-{k}") for k in range(2)]
+    last = start("--gather", sources[0], "--gather", sources[1], "--root", str(tmp_path / "whole"))
+    output, _ = last.communicate()
+    assert last.returncode == 0
+    assert "0 scenarios simulated" in output
+    assert everything(tmp_path / "whole") == everything(generated.root)
+
+
+def test_what_no_part_holds_is_simulated(
+    parts: tuple[Path, Path], tmp_path: Path, unmeasured: Registry, generated: GenerationResult
+) -> None:
+    """A job that failed costs its scenarios only."""
+    whole = tmp_path / "whole"
+    result = generate(SPLIT, SIZE, root=whole, gather=[parts[1]], registry=unmeasured, scenarios="1,3,4")
+    assert (result.simulated, result.kept) == ((1,), (3, 4))
+    again = generate(SPLIT, SIZE, root=whole, gather=parts, registry=unmeasured)
+    assert again.simulated == ()
+    assert again.dataset_sha256 == generated.dataset_sha256
+
+
+def test_a_copy_where_nothing_can_be_linked(
+    parts: tuple[Path, Path],
+    tmp_path: Path,
+    unmeasured: Registry,
+    generated: GenerationResult,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Across file systems files are copied; the parts may then be removed."""
+
+    def refuse(*_: object) -> None:
+        raise OSError(18, "Invalid cross-device link")
+
+    monkeypatch.setattr(os, "link", refuse)
+    result = generate(SPLIT, SIZE, root=tmp_path / "whole", gather=parts, registry=unmeasured)
+    for root in parts:
+        shutil.rmtree(root)
+    assert result.simulated == ()
+    assert everything(tmp_path / "whole") == everything(generated.root)
+
+
+def test_a_damaged_part_is_named(
+    parts: tuple[Path, Path], tmp_path: Path, unmeasured: Registry, copied: Callable[[], Path]
+) -> None:
+    """A cut file, and one of another scenario under a false entry, are refused; nothing is taken."""
+    path = parts[1] / FOLDER / "test" / "0004.nc"
+    path.write_bytes(path.read_bytes()[:-2000])
+    with pytest.raises(DataError, match=r"0004\.nc"):
+        generate(SPLIT, SIZE, root=tmp_path / "whole", gather=parts[1:], registry=unmeasured)
+    shutil.copy(parts[1] / FOLDER / "test" / "0003.nc", path)
+    with pytest.raises(DataError, match=r"0004\.nc"):
+        generate(SPLIT, SIZE, root=tmp_path / "whole", gather=parts[1:], registry=unmeasured)
+    assert not (tmp_path / "whole" / FOLDER / "test" / "0004.nc").exists()
+
+
+def test_folders_without_parts(tmp_path: Path, unmeasured: Registry, copied: Callable[[], Path]) -> None:
+    """An empty folder, and the one that is written to, are no sources."""
+    with pytest.raises(UsageError, match="no manifest of that data set"):
+        generate(SPLIT, SIZE, root=tmp_path / "whole", gather=[tmp_path / "none"], registry=unmeasured)
+    root = copied()
+    with pytest.raises(UsageError, match="the folder to write to"):
+        generate(SPLIT, SIZE, root=root, gather=[root], registry=unmeasured)

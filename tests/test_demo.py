@@ -1,0 +1,181 @@
+"""The demo: data, model, scores and a leaderboard page from nothing, and once more."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import yaml
+from conftest import SIZE, SPLIT
+from typer.testing import CliRunner, Result
+
+from lagbench import demo
+from lagbench.bench import SolverBench
+from lagbench.cli.app import app
+from lagbench.errors import UsageError, WorkFailedError
+from lagbench.floors import FLOORS
+from lagbench.registry import Registry
+
+Run = Callable[..., Result]
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, unmeasured_path: Path, tmp_path: Path) -> Run:
+    """A function that runs lagbench in an empty folder, with our splits and no recorded hashes."""
+    monkeypatch.setenv("LAGBENCH_REGISTRY", str(unmeasured_path))
+    monkeypatch.delenv("LAGBENCH_DEBUG", raising=False)
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    monkeypatch.chdir(empty)
+    return lambda *words: CliRunner().invoke(app, [str(word) for word in words])
+
+
+@pytest.fixture
+def only_one(monkeypatch: pytest.MonkeyPatch, unmeasured: Registry) -> Registry:
+    """A registry of two splits, of which one has a size tiny; the demo's model, quickly trained, is its."""
+    small = unmeasured.split(SPLIT)
+    large = small.model_copy(update={"sizes": {"full": small.sizes["full"]}})
+    registry = Registry({"large": large, SPLIT: small}, {})
+    monkeypatch.setattr("lagbench.registry.load", lambda: registry)
+    monkeypatch.setattr(demo, "MODEL_SPLIT", SPLIT)
+    monkeypatch.setattr(demo, "SETTINGS", ("training.steps=2", "model.latent=8"))
+    timed = SolverBench(split=SPLIT, size=SIZE, particles=1, substeps=1, frames=1, seconds_per_frame=0.5)
+    monkeypatch.setattr("lagbench.bench.bench_apart", lambda *_: timed)
+    return registry
+
+
+def made_by(result: Result) -> dict[str, Any]:
+    """Return what the demo printed with --json."""
+    assert result.exit_code == 0, result.output
+    found: dict[str, Any] = json.loads(result.stdout)
+    return found
+
+
+def no_torch(name: str, *, extra: str) -> None:
+    """Stand in for check_installed where nothing of the extra is there."""
+    raise UsageError(f"{name} is not installed", fix=f"pip install 'lagbench[{extra}]'")
+
+
+def test_the_demo_takes_the_splits_that_have_a_tiny_size(
+    run: Run, only_one: Registry, copied: Callable[[], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A split without one is left out, and the JSON object names what was made."""
+    monkeypatch.setattr(demo, "check_installed", no_torch)
+    root = copied()
+    assert demo.demo_splits(only_one) == [SPLIT]
+    made = made_by(run("demo", "--root", root, "--json"))["splits"]
+    assert list(made) == [SPLIT]
+    assert made[SPLIT]["generation"]["kept"] == [0, 1, 2, 3, 4]
+    assert Path(made[SPLIT]["picture"]).is_file()
+
+
+def test_without_the_extra_the_data_are_made_and_one_line_says_how_to_get_the_rest(
+    run: Run, only_one: Registry, copied: Callable[[], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Exit code 0, the command that installs it, no leaderboard, and null in the JSON object."""
+    monkeypatch.setattr(demo, "check_installed", no_torch)
+    root = copied()
+    result = run("demo", "--root", root)
+    assert result.exit_code == 0, result.output
+    assert "1 data sets, verified and drawn, in" in result.stdout
+    line = "no model, no leaderboard: torch is not installed; pip install 'lagbench[baselines]'"
+    assert line in result.stdout.splitlines()
+    assert not (root / "leaderboard").exists()
+    made = made_by(run("demo", "--root", root, "--json"))
+    assert made["model"] is None
+    assert made["model_left_out"] in line
+
+
+def test_a_registry_without_the_models_split_is_no_error(only_one: Registry) -> None:
+    """The reason names the split."""
+    assert demo.model_left_out(only_one) is None
+    reason = demo.model_left_out(Registry({"large": only_one.split("large")}, {}))
+    assert reason == f"the registry has no {SPLIT} {SIZE}"
+
+
+@pytest.mark.usefixtures("only_one")
+def test_the_demo_ends_with_a_leaderboard_of_its_own(run: Run, copied: Callable[[], Path]) -> None:
+    """Model and floors are on the page that it names; nothing is written in the current folder."""
+    root = copied()
+    result = run("demo", "--root", root)
+    assert result.exit_code == 0, result.output
+    page = root / "leaderboard" / "index.html"
+    assert f"leaderboard page: {page}" in result.stdout.splitlines()
+    assert all(name in page.read_text() for name in (*FLOORS, "GNS, 2 steps"))
+    assert list(Path.cwd().iterdir()) == []
+    entry = yaml.safe_load((root / f"leaderboard/submissions/{SPLIT}/{SIZE}/gns.yaml").read_text())
+    assert entry["cost"]["solver_seconds_per_frame"] == 0.5
+    checked = run("leaderboard", "check", "--board", root / "leaderboard", "--root", root)
+    assert checked.exit_code == 0, checked.output
+
+
+@pytest.mark.usefixtures("only_one")
+def test_a_second_run_keeps_the_training(run: Run, copied: Callable[[], Path]) -> None:
+    """The same weights, predictions and scores, no more processor time, still three entries."""
+    root = copied()
+    first, second = (made_by(run("demo", "--root", root, "--json"))["model"] for _ in range(2))
+    assert second["training"] == first["training"]
+    assert second["card"]["predictions_sha256"] == first["card"]["predictions_sha256"]
+    assert second["card"]["rows"] == first["card"]["rows"]
+    assert (second["page"]["rows"], second["page"]["tabs"]) == (3, 1)
+    means = {entry["method"]: entry["mean"] for entry in second["entries"]}
+    rows = second["card"]["rows"]
+    ranking = second["card"]["ranking_metric"]
+    for method, row in (*((floor, floor) for floor in FLOORS), ("gns", "submission")):
+        assert means[method] == pytest.approx(rows[row][ranking]["mean"], rel=1e-5)
+
+
+@pytest.mark.usefixtures("only_one")
+def test_what_another_version_left_is_trained_anew(
+    copied: Callable[[], Path], run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A damaged checkpoint, and one of another recipe, cost a training and no error."""
+    root = copied()
+    made_by(run("demo", "--root", root, "--json"))
+    (root / "runs" / f"{SPLIT}-gns" / "checkpoint.pt").write_bytes(b"damaged")
+    assert demo.demo_model(root=root).training.state == "finished"
+    monkeypatch.setattr(demo, "SETTINGS", ("training.steps=3", "model.latent=8"))
+    again = demo.demo_model(root=root).training
+    assert (again.state, again.step, again.steps) == ("finished", 3, 3)
+    assert torch.load(again.weights, weights_only=True)
+
+
+def test_anothers_leaderboard_is_refused_before_the_work(run: Run, tmp_path: Path) -> None:
+    """A folder with entries of another size is left alone: exit code 2, and nothing generated."""
+    entry = tmp_path / "leaderboard" / "submissions" / "cavity" / "mini" / "mine.yaml"
+    entry.parent.mkdir(parents=True)
+    entry.touch()
+    result = run("demo", "--root", tmp_path)
+    assert result.exit_code == 2, result.output
+    assert "submissions/cavity/mini/mine.yaml" in result.stderr
+    assert not (tmp_path / "cavity").exists()
+
+
+def test_a_solver_that_cannot_be_timed_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Then the page shows no speed-up."""
+
+    def failed(*_: str) -> SolverBench:
+        raise WorkFailedError("the solver could not be timed")
+
+    monkeypatch.setattr("lagbench.bench.bench_apart", failed)
+    assert demo._solver_time() is None
+
+
+@pytest.mark.slow
+def test_the_whole_demo_from_nothing(run: Run, tmp_path: Path) -> None:
+    """Four verified data sets, and a model that beats persistence by far and is near the other floor."""
+    made = made_by(run("demo", "--root", tmp_path / "demo", "--json"))
+    assert list(made["splits"]) == ["cavity", "curl-noise", "fluid", "multimaterial"]
+    assert all(one["verification"]["complete"] for one in made["splits"].values())
+    model = made["model"]
+    assert model["training"]["split"] == "cavity"
+    assert model["solver"]["seconds_per_frame"] > 0
+    error = {row: scores["vorticity_rmse"]["mean"] for row, scores in model["card"]["rows"].items()}
+    assert error["submission"] < 0.3 * error["persistence"]
+    assert error["submission"] < 1.2 * error["constant-velocity"]
+    assert (model["page"]["rows"], model["page"]["tabs"]) == (3, 1)
+    assert Path(model["page"]["page"]).stat().st_size == model["page"]["bytes"]

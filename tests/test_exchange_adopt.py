@@ -1,0 +1,300 @@
+"""Adopting one's own trajectories: what goes in comes out, hashed, with a task, or an error says why not."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import netCDF4
+import numpy as np
+import pytest
+from exchange_readers import straight_runs
+from numpy.typing import NDArray
+from typer.testing import CliRunner
+
+import lagbench
+from lagbench.checksums import dataset_hash, subset_hash
+from lagbench.cli.app import app
+from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError
+from lagbench.exchange import adopt
+from lagbench.exchange.description import Measure, estimate_spacing
+from lagbench.exchange.local_split import LocalSplit
+from lagbench.layout import ScenarioKey, scenario_path
+from lagbench.locating import locate
+from lagbench.scenario_file import check_scenario, read_scenario
+
+BASIC: dict[str, Any] = {"radius": 0.1, "frame_interval": 0.25}
+
+
+def save_runs(folder: Path, runs: list[NDArray[np.float32]]) -> list[Path]:
+    """Write each trajectory to a .npy file."""
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = [folder / f"run{number}.npy" for number in range(len(runs))]
+    for path, run in zip(paths, runs, strict=True):
+        np.save(path, run)
+    return paths
+
+
+def scenario(made: LocalSplit, number: int) -> Path:
+    """Return the file of a scenario."""
+    size, root, _ = locate(str(made.folder))
+    subset = size.subset_of(number)
+    key = ScenarioKey(split=made.name, size="full", version="1.0.0", scenario=number, subset=subset)
+    return scenario_path(root, key)
+
+
+@pytest.fixture(scope="module")
+def runs() -> list[NDArray[np.float32]]:
+    """Six trajectories of 12 frames and 40 particles."""
+    return straight_runs(6)
+
+
+@pytest.fixture(scope="module")
+def own(tmp_path_factory: pytest.TempPathFactory, runs: list[NDArray[np.float32]]) -> LocalSplit:
+    """A local split of these trajectories, four to train on."""
+    folder = tmp_path_factory.mktemp("own")
+    return adopt(save_runs(folder / "in", runs), output=folder / "mine", **BASIC)
+
+
+def test_positions_come_out_as_they_went_in(own: LocalSplit, runs: list[NDArray[np.float32]]) -> None:
+    """Every subset of the opened split holds the arrays bit for bit, the last ones in test."""
+    for subset, wanted in {"train": runs[:4], "valid": runs[4:5], "test": runs[5:]}.items():
+        with lagbench.open_split(str(own.folder), subset=subset) as data:
+            np.testing.assert_array_equal(data["position"].values, np.stack(wanted))
+            assert data["time"].values[-1] == 11 * 0.25
+
+
+def test_velocities_are_differences(own: LocalSplit, runs: list[NDArray[np.float32]]) -> None:
+    """v(f) = (x(f) - x(f-1)) / interval, and v(0) = v(1)."""
+    with read_scenario(scenario(own, 0)) as file:
+        velocity = file.read("velocity")
+    wanted = (np.diff(runs[0].astype(np.float64), axis=0) / 0.25).astype(np.float32)
+    np.testing.assert_array_equal(velocity[1:], wanted)
+    np.testing.assert_array_equal(velocity[0], wanted[0])
+
+
+def test_hashes_follow_from_the_files(own: LocalSplit) -> None:
+    """The data set hash is that of the files' own content hashes, and what split.yaml records."""
+    content = {i: check_scenario(scenario(own, i)) for i in range(6)}
+    parts = {"train": range(4), "valid": [4], "test": [5]}
+    subsets = {name: subset_hash({i: content[i] for i in ids}) for name, ids in parts.items()}
+    size = locate(str(own.folder)).size
+    assert own.dataset_sha256 == dataset_hash("mine", "full", 1, subsets)
+    assert size.measured is not None
+    assert size.measured.dataset_sha256 == own.dataset_sha256
+    assert size.measured.scenario_sha256 == {i: digest[:16] for i, digest in content.items()}
+
+
+def test_the_same_arrays_give_the_same_hash(tmp_path: Path, runs: list[NDArray[np.float32]]) -> None:
+    """Once in files of their own, once as one array of four dimensions."""
+    one = adopt(save_runs(tmp_path / "in", runs), output=tmp_path / "a" / "mine", **BASIC)
+    np.save(tmp_path / "all.npy", np.stack(runs))
+    two = adopt(tmp_path / "all.npy", output=tmp_path / "b" / "mine", **BASIC)
+    assert one.dataset_sha256 == two.dataset_sha256
+    texts = [(made.folder / "split.yaml").read_bytes() for made in (one, two)]
+    assert texts[0] == texts[1]
+
+
+def test_a_local_split_is_verified_templated_and_scored(own: LocalSplit, tmp_path: Path) -> None:
+    """Commands take its folder; straight flight is what the constant-velocity floor predicts."""
+    path = str(own.folder)
+    assert lagbench.verify(path).verdict == "equal to datasets.yaml"
+    target = tmp_path / "predictions.nc"
+    lagbench.template(path, output=target)
+    card = lagbench.score(target, root=own.folder.parent, output_dir=tmp_path, workers=1)
+    floor = card.scores["constant-velocity"]["position_rmse"]
+    assert np.max(floor.per_frame) < 1e-5
+    assert np.min(card.scores["persistence"]["position_rmse"].per_frame) > 1e-3
+    assert card.header.split == "mine"
+
+
+def test_damage_is_told(tmp_path: Path, runs: list[NDArray[np.float32]]) -> None:
+    """A scenario put in the place of another is found by its hash."""
+    made = adopt(save_runs(tmp_path / "in", runs), output=tmp_path / "mine", **BASIC)
+    scenario(made, 0).write_bytes(scenario(made, 1).read_bytes())
+    with pytest.raises(DataError, match="another scenario"):
+        lagbench.verify(str(made.folder)).check()
+
+
+def test_named_arrays(tmp_path: Path, runs: list[NDArray[np.float32]]) -> None:
+    """An .npz file may hold velocities, materials and walls; all of them are stored."""
+    walls = np.array([[0, 0], [0, 0], [0, 0], [0.5, 0]])
+    material = np.arange(40) % 4
+    for number, run in enumerate(runs[:3]):
+        np.savez(
+            tmp_path / f"{number}.npz", position=run, velocity=-run, material=material, wall_velocity=walls
+        )
+    made = adopt([tmp_path / f"{n}.npz" for n in range(3)], output=tmp_path / "mine", **BASIC)
+    with read_scenario(scenario(made, 2)) as file:
+        np.testing.assert_array_equal(file.read("velocity"), -runs[2])
+        np.testing.assert_array_equal(file.read("material"), material)
+        np.testing.assert_array_equal(file.read("wall_velocity")[5], walls)
+
+
+def test_netcdf(tmp_path: Path, runs: list[NDArray[np.float32]]) -> None:
+    """NetCDF files of double precision in subset folders are read frame by frame, rounded once."""
+    for number, subset in enumerate(("train", "valid", "test")):
+        (tmp_path / "in" / subset).mkdir(parents=True)
+        with netCDF4.Dataset(tmp_path / "in" / subset / "a.nc", "w") as file:
+            for name, length in zip(("time", "point", "axis"), runs[0].shape, strict=True):
+                file.createDimension(name, length)
+            file.createVariable("position", "f8", ("time", "point", "axis"))[:] = runs[number] + 1e-9
+    made = adopt(tmp_path / "in", output=tmp_path / "mine", **BASIC)
+    assert made.scenarios == {"train": 1, "valid": 1, "test": 1}
+    with read_scenario(scenario(made, 2)) as file:
+        wanted = (runs[2].astype(np.float64) + 1e-9).astype(np.float32)
+        np.testing.assert_array_equal(file.read("position"), wanted)
+
+
+def test_scenarios_may_differ_in_length_and_particles(tmp_path: Path) -> None:
+    """Ragged trajectories are padded when opened; the task follows the shortest test scenario."""
+    shapes = [(12, 40), (20, 30), (15, 25), (30, 40), (18, 40)]
+    ragged = [straight_runs(1, frames=f, particles=p, seed=f)[0] for f, p in shapes]
+    made = adopt(save_runs(tmp_path / "in", ragged), output=tmp_path / "mine", test=2, **BASIC)
+    assert (made.horizon, made.particles) == (12, (25, 40))
+    with lagbench.open_split(str(made.folder), subset="train") as data:
+        assert data["frame_count"].values.tolist() == [12, 20]
+        assert data["particle_count"].values.tolist() == [40, 30]
+        np.testing.assert_array_equal(data["position"].values[1, :20, :30], ragged[1])
+    lagbench.template(str(made.folder), output=tmp_path / "p.nc")
+    assert lagbench.validate(tmp_path / "p.nc", root=tmp_path).valid
+
+
+def test_unequal_test_scenarios_are_told(tmp_path: Path) -> None:
+    """Test scenarios of different particle numbers can be opened, and a note says what cannot be."""
+    ragged = [straight_runs(1, particles=p)[0] for p in (40, 40, 30, 20)]
+    made = adopt(save_runs(tmp_path / "in", ragged), output=tmp_path / "mine", test=2, valid=1, **BASIC)
+    assert "20 to 30 particles" in made.notes[0]
+    with pytest.raises(DataError, match="other frames or particles"):
+        lagbench.template(str(made.folder), output=tmp_path / "p.nc")
+
+
+def test_a_wide_box_is_fitted_without_losing_a_bit(tmp_path: Path) -> None:
+    """A box of 3 is divided by 4: times 4, every position is the source's."""
+    wide = straight_runs(3, box=3.0)
+    made = adopt(
+        save_runs(tmp_path / "in", wide),
+        output=tmp_path / "mine",
+        radius=0.3,
+        frame_interval=0.25,
+        bounds=((0.0, 3.0), (0.0, 3.0)),
+        rescale=True,
+    )
+    size = locate(str(made.folder)).size
+    assert (size.task.radius, size.bounds[0], size.value("source_scale")) == (0.075, (0.0, 0.75), 4.0)
+    with read_scenario(scenario(made, 0)) as file:
+        np.testing.assert_array_equal(file.read("position") * 4, wide[0])
+
+
+@pytest.mark.parametrize(
+    ("bounds", "scale", "corner"),
+    [
+        (((0.0, 1.0), (0.0, 0.5)), 1.0, (0.0, 0.0)),
+        (((0.1, 5.3), (0.0, 2.0)), 8.0, (0.0, 0.0)),
+        (((-1.0, 1.0), (0.0, 3.0)), 4.0, (-1.0, 0.0)),
+        (((7.0, 7.5), (7.0, 7.25)), 8.0, (0.0, 0.0)),
+    ],
+)
+def test_measures_hold_the_box(bounds: Any, scale: float, corner: tuple[float, float]) -> None:
+    """Scale and corner are the least that bring a box into the unit box."""
+    measure = Measure.fitting(bounds)
+    assert (measure.scale, measure.corner) == (scale, corner)
+    assert all(0.0 <= value <= 1.0 for pair in measure.box(bounds) for value in pair)
+
+
+def test_the_spacing_of_a_lattice_is_found() -> None:
+    """On a square lattice the estimate is within 5 % of the lattice constant."""
+    axis = 0.2 + 0.01 * np.arange(40)
+    lattice = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    assert math.isclose(estimate_spacing(lattice, 0.015), 0.01, rel_tol=0.05)
+
+
+def broken(kind: str) -> NDArray[Any]:
+    """Return an array that is no trajectory in one way."""
+    run = straight_runs(1)[0]
+    match kind:
+        case "flat":
+            return run[0]
+        case "space":
+            return np.concatenate([run, run[..., :1]], axis=-1)
+        case "integer":
+            return run.astype(np.int32)
+        case "single":
+            return run[:1]
+        case "missing":
+            run[3, 5, 0] = np.nan
+        case "outside":
+            run[3, 5, 0] = 1.5
+        case "objects":
+            return np.array([run, None], dtype=object)
+    return run
+
+
+@pytest.mark.parametrize(
+    ("kind", "error", "words"),
+    [
+        ("flat", UnreadableFileError, "no positions"),
+        ("space", DataError, "3 components"),
+        ("integer", UnreadableFileError, "no positions"),
+        ("single", DataError, "too little"),
+        ("missing", DataError, "not finite"),
+        ("outside", DataError, "outside the unit box"),
+        ("objects", UnreadableFileError, "pickled"),
+    ],
+)
+def test_what_is_no_trajectory_leaves_nothing(
+    tmp_path: Path, kind: str, error: type[LagbenchError], words: str
+) -> None:
+    """Each fault has its message, which names the file, and no folder is made."""
+    runs = straight_runs(3)
+    paths = save_runs(tmp_path / "in", runs)
+    np.save(paths[2], broken(kind), allow_pickle=True)
+    with pytest.raises(error, match=words) as caught:
+        adopt(paths, output=tmp_path / "mine", **BASIC)
+    assert "run2.npy" in str(caught.value)
+    assert [path.name for path in tmp_path.iterdir()] == ["in"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"radius": None}, "the radius is not known"),
+        ({"radius": -1.0}, "not a number above 0"),
+        ({"horizon": 7}, "too short for the task"),
+        ({"input_frames": 12}, "too short for the task"),
+        ({"test": 3, "valid": 3}, "each subset needs a trajectory"),
+        ({"rescale": True}, "fit the unit box"),
+        ({"bounds": ((1.0, 0.0), (0.0, 1.0))}, "low to high"),
+        ({"output": "My Data"}, "--output my-data"),
+        ({"output": "cavity"}, "one of the splits of lagbench"),
+        ({"output": "in"}, "there already"),
+    ],
+)
+def test_what_a_user_says_is_checked(tmp_path: Path, changes: dict[str, Any], words: str) -> None:
+    """Wrong options are usage errors that name the option, and no folder is made."""
+    paths = save_runs(tmp_path / "in", straight_runs(4))
+    options = {"output": "mine", **BASIC, **changes}
+    with pytest.raises(UsageError, match=words):
+        adopt(paths, **{**options, "output": tmp_path / options["output"]})
+    assert [path.name for path in tmp_path.iterdir()] == ["in"]
+
+
+def test_command(tmp_path: Path) -> None:
+    """`lagbench adopt` says what it made, and other commands take the folder it names."""
+    paths = save_runs(tmp_path / "in", straight_runs(4))
+    options = ["--radius", "0.1", "--frame-interval", "0.25", "--frames-of-interest", "8,10"]
+    target = tmp_path / "mine"
+    done = CliRunner().invoke(
+        app, ["adopt", *map(str, paths), "-o", str(target), *options, "--bounds", "0,1,0.25,1"]
+    )
+    assert done.exit_code == 0, done.output
+    assert "2 train, 1 valid, 1 test, 48 frames, 40 particles" in done.stdout
+    size = locate(str(target)).size
+    assert size.task.frames_of_interest == (8, 10)
+    assert size.bounds == ((0.0, 1.0), (0.25, 1.0))
+    shown = CliRunner().invoke(app, ["info", f"{target}/"])
+    assert "mine" in shown.stdout
+    refused = CliRunner().invoke(app, ["generate", "--split", str(target)])
+    assert refused.exit_code == 2
+    assert "cannot be simulated" in refused.output

@@ -1,0 +1,293 @@
+"""Exports, held against readers that know the formats only, and against the stored data."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import pickletools
+import tracemalloc
+import zipfile
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from exchange_readers import (
+    WINDOW,
+    Trajectory,
+    frame_statistics,
+    gns_windows,
+    read_gns,
+    read_h5,
+    read_metadata,
+    straight_runs,
+)
+from typer.testing import CliRunner
+
+import lagbench
+from lagbench.cli.app import app
+from lagbench.errors import DataError, UsageError
+from lagbench.exchange import adopt, export
+from lagbench.exchange.local_split import LocalSplit
+from lagbench.generation import GenerationResult
+from lagbench.registry import Registry
+
+GNS_KEYS = {
+    *("bounds", "sequence_length", "default_connectivity_radius", "dim", "dt"),
+    *("vel_mean", "vel_std", "acc_mean", "acc_std", "lagbench"),
+}
+H5_KEYS = GNS_KEYS - {"sequence_length"} | {
+    *("case", "solver", "density_evolution", "dx", "t_end", "viscosity", "p_bg_factor", "g_ext_magnitude"),
+    *("artificial_alpha", "free_slip", "write_every", "is_bc_trick", "sequence_length_train"),
+    *("sequence_length_test", "num_trajs_train", "num_trajs_test", "num_particles_max"),
+    "periodic_boundary_conditions",
+}
+SUBSETS = ("train", "valid", "test")
+
+
+@pytest.fixture(scope="module")
+def flows(
+    generated: GenerationResult, unmeasured: Registry, tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, Path]:
+    """The generated tiny curl-noise data set in both formats."""
+    folder = tmp_path_factory.mktemp("flows")
+    made = {}
+    for form in ("gns-npz", "lagrangebench-h5"):
+        made[form] = folder / form
+        export(
+            generated.split,
+            "tiny",
+            format=form,
+            output=made[form],
+            root=generated.root,
+            registry=unmeasured,
+        )
+    return made
+
+
+@pytest.fixture(scope="module")
+def mixed(tmp_path_factory: pytest.TempPathFactory) -> LocalSplit:
+    """A local split of all four materials whose scenarios differ in length."""
+    folder = tmp_path_factory.mktemp("mixed")
+    for number, frames in enumerate((12, 30, 12, 25)):
+        run = straight_runs(1, frames=frames, seed=number)[0]
+        np.savez(folder / f"{number}.npz", position=run, material=np.arange(40) % 4)
+    files = [folder / f"{number}.npz" for number in range(4)]
+    return adopt(
+        files, output=folder / "mixed", radius=0.1, frame_interval=0.1, bounds=((0.1, 0.9), (0.1, 0.9))
+    )
+
+
+def stored(split: str, root: Path, size: str) -> dict[str, list[np.ndarray]]:
+    """Return the stored positions of every scenario, by subset."""
+    found = {}
+    for subset in SUBSETS:
+        with lagbench.open_split(split, subset=subset, size=size, root=root) as data:
+            frames = data["frame_count"].values
+            found[subset] = [data["position"].values[i, :count] for i, count in enumerate(frames)]
+    return found
+
+
+def files_of(folder: Path, ending: str) -> dict[str, list[Trajectory]]:
+    """Read an export with the reader of its format."""
+    read = read_gns if ending == ".npz" else read_h5
+    return {subset: read(folder / f"{subset}{ending}") for subset in SUBSETS}
+
+
+@pytest.mark.parametrize(("form", "ending"), [("gns-npz", ".npz"), ("lagrangebench-h5", ".h5")])
+def test_positions_are_those_stored(
+    flows: dict[str, Path], generated: GenerationResult, form: str, ending: str
+) -> None:
+    """Every trajectory has the stored bits, as float32, in the order of ids."""
+    wanted = stored(generated.split, generated.root, "tiny")
+    for subset, trajectories in files_of(flows[form], ending).items():
+        assert len(trajectories) == len(wanted[subset])
+        for (position, kinds), truth in zip(trajectories, wanted[subset], strict=True):
+            assert position.dtype == np.float32
+            np.testing.assert_array_equal(position, truth)
+            assert kinds.shape == (position.shape[1],)
+
+
+@pytest.mark.parametrize(("form", "ending"), [("gns-npz", ".npz"), ("lagrangebench-h5", ".h5")])
+def test_statistics_are_those_of_train_per_frame(flows: dict[str, Path], form: str, ending: str) -> None:
+    """Means and deviations equal those computed in one go from the exported train file."""
+    metadata = read_metadata(flows[form])
+    for name, value in frame_statistics(files_of(flows[form], ending)["train"]).items():
+        np.testing.assert_allclose(metadata[name], value, rtol=2e-8, atol=1e-14, err_msg=name)
+
+
+def test_gns_metadata(flows: dict[str, Path]) -> None:
+    """Every key is there; the number of frames is that of the positions; the box is the walls."""
+    metadata = read_metadata(flows["gns-npz"])
+    assert metadata.keys() == GNS_KEYS
+    assert (metadata["sequence_length"], metadata["dim"], metadata["dt"]) == (26, 2, 0.1)
+    assert metadata["bounds"] == [[0.05, 0.95], [0.05, 0.95]]
+    assert metadata["default_connectivity_radius"] == 0.062
+
+
+def test_gns_windows(flows: dict[str, Path], generated: GenerationResult) -> None:
+    """A GNS reader gets T - 6 windows of each trajectory, [particle, frame, space], bit for bit."""
+    truth = stored(generated.split, generated.root, "tiny")["train"]
+    windows = list(gns_windows(read_gns(flows["gns-npz"] / "train.npz")))
+    assert len(windows) == sum(len(run) - 6 for run in truth)
+    np.testing.assert_array_equal(windows[21], np.moveaxis(truth[1][1 : 1 + WINDOW], 0, 1))
+
+
+def test_lagrangebench_metadata(flows: dict[str, Path]) -> None:
+    """Every key is there; dt is the solver's, and dt times write_every the frame interval."""
+    metadata = read_metadata(flows["lagrangebench-h5"])
+    assert metadata.keys() == H5_KEYS
+    assert metadata["dt"] * metadata["write_every"] == pytest.approx(0.1)
+    assert metadata["write_every"] == 12
+    assert (metadata["sequence_length_train"], metadata["num_trajs_train"]) == (25, 2)
+    assert (metadata["sequence_length_test"], metadata["num_trajs_test"]) == (25, 2)
+    assert (metadata["num_particles_max"], metadata["free_slip"]) == (506, True)
+    assert metadata["periodic_boundary_conditions"] == [False, False]
+    # The area of the box over the particles is the square of their distance.
+    assert metadata["dx"] == pytest.approx(np.sqrt(0.9**2 / 506))
+
+
+def test_lagrangebench_cells_hold_every_particle(flows: dict[str, Path]) -> None:
+    """Cells counted from 0 up to the length of the bounds: no particle lies beyond."""
+    bounds = np.array(read_metadata(flows["lagrangebench-h5"])["bounds"])
+    length = bounds[:, 1] - bounds[:, 0]
+    for position, _ in read_h5(flows["lagrangebench-h5"] / "train.h5"):
+        assert (position >= 0).all()
+        assert (position < length).all()
+
+
+def test_lagrangebench_from_walls(generated: GenerationResult, unmeasured: Registry, tmp_path: Path) -> None:
+    """Measured from the walls the bounds start at 0, all particles lie in them, and no bit is lost."""
+    export(
+        generated.split,
+        "tiny",
+        format="lagrangebench-h5",
+        output=tmp_path,
+        root=generated.root,
+        from_walls=True,
+        registry=unmeasured,
+    )
+    metadata = read_metadata(tmp_path)
+    np.testing.assert_allclose(metadata["bounds"], [[0.0, 0.9]] * 2, atol=1e-6)
+    truth = stored(generated.split, generated.root, "tiny")["test"]
+    origin = np.array(metadata["lagbench"]["origin"])
+    for (position, _), run in zip(read_h5(tmp_path / "test.h5"), truth, strict=True):
+        assert (position >= 0).all()
+        np.testing.assert_array_equal(position.astype(np.float64) + origin, run.astype(np.float64))
+
+
+def test_lagrangebench_layout(flows: dict[str, Path]) -> None:
+    """Groups count from 00000; chunks are one frame, with gzip and shuffle; no program is written."""
+    with h5py.File(flows["lagrangebench-h5"] / "test.h5") as file:
+        assert list(file) == ["00000", "00001"]
+        position = file["00000/position"]
+        assert (position.chunks, position.compression, position.shuffle) == ((1, 506, 2), "gzip", True)
+        assert file["00000/particle_type"].dtype.kind == "i"
+    names = {path.name for path in flows["lagrangebench-h5"].iterdir()}
+    assert names == {"train.h5", "valid.h5", "test.h5", "metadata.json"}
+
+
+@pytest.mark.parametrize(("form", "numbers"), [("gns-npz", [5, 7, 6, 8]), ("lagrangebench-h5", [0, 4, 5, 6])])
+def test_each_material_has_its_number(
+    mixed: LocalSplit, tmp_path: Path, form: str, numbers: list[int]
+) -> None:
+    """Liquid, jelly, snow, rope: four numbers below 9, none of which means padding or a boundary."""
+    export(str(mixed.folder), format=form, output=tmp_path)
+    ending = ".npz" if form == "gns-npz" else ".h5"
+    _, kinds = files_of(tmp_path, ending)["train"][0]
+    assert kinds.tolist() == numbers * 10
+
+
+def test_unequal_lengths(mixed: LocalSplit, tmp_path: Path) -> None:
+    """GNS keeps them; lagrangebench-h5 cuts 30 frames into two runs of 12 and says that 6 are left out."""
+    gns = export(str(mixed.folder), format="gns-npz", output=tmp_path / "a")
+    h5 = export(str(mixed.folder), format="lagrangebench-h5", output=tmp_path / "b")
+    assert [len(run) for run, _ in read_gns(tmp_path / "a" / "train.npz")] == [12, 30]
+    assert (gns.left_out, read_metadata(tmp_path / "a")["sequence_length"]) == (0, 12)
+    runs = read_h5(tmp_path / "b" / "train.h5")
+    whole = read_gns(tmp_path / "a" / "train.npz")[1][0]
+    assert [len(run) for run, _ in runs] == [12, 12, 12]
+    np.testing.assert_array_equal(runs[2][0], whole[12:24])
+    assert h5.left_out == 6
+
+
+@pytest.mark.parametrize("form", ["gns-npz", "lagrangebench-h5"])
+def test_the_same_data_give_the_same_bytes(mixed: LocalSplit, tmp_path: Path, form: str) -> None:
+    """Two exports are equal byte for byte; a second one needs --force where the first is."""
+    hashes = []
+    for folder in ("a", "b"):
+        made = export(str(mixed.folder), format=form, output=tmp_path / folder)
+        hashes.append([hashlib.sha256(path.read_bytes()).hexdigest() for path in made.files])
+    assert hashes[0] == hashes[1]
+    with pytest.raises(UsageError, match="files of that name"):
+        export(str(mixed.folder), format=form, output=tmp_path / "a")
+    export(str(mixed.folder), format=form, output=tmp_path / "a", force=True)
+
+
+def test_a_gns_member_only_rebuilds_arrays(mixed: LocalSplit, tmp_path: Path) -> None:
+    """The pickle names NumPy's own three constructors, by the names that old and new NumPy know."""
+    export(str(mixed.folder), format="gns-npz", output=tmp_path)
+    with zipfile.ZipFile(tmp_path / "train.npz") as archive:
+        assert archive.namelist() == ["simulation_0.npy", "simulation_1.npy"]
+        assert {info.date_time for info in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
+        with archive.open("simulation_0.npy") as stream:
+            np.lib.format.read_magic(stream)
+            np.lib.format.read_array_header_1_0(stream)
+            program = stream.read()
+    called = {argument for code, argument, _ in pickletools.genops(program) if code.name == "GLOBAL"}
+    assert called == {"numpy.core.multiarray _reconstruct", "numpy ndarray", "numpy dtype"}
+
+
+@pytest.fixture(scope="module")
+def big(tmp_path_factory: pytest.TempPathFactory) -> LocalSplit:
+    """A local split of three trajectories of 4.8 MB."""
+    folder = tmp_path_factory.mktemp("big")
+    np.save(folder / "runs.npy", np.stack(straight_runs(3, frames=60, particles=10_000)))
+    return adopt(folder / "runs.npy", output=folder / "big", radius=0.02, frame_interval=0.1)
+
+
+@pytest.mark.parametrize("form", ["gns-npz", "lagrangebench-h5"])
+def test_memory_is_a_few_frames(mixed: LocalSplit, big: LocalSplit, tmp_path: Path, form: str) -> None:
+    """Exporting trajectories of 4.8 MB takes less than 2.5 MB of arrays at any time."""
+    export(str(mixed.folder), format=form, output=tmp_path / "warm")
+    tracemalloc.start()
+    export(str(big.folder), format=form, output=tmp_path / "out")
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 2.5e6
+
+
+def test_a_program_beside_the_data_is_refused(mixed: LocalSplit, tmp_path: Path) -> None:
+    """The folder of an export must not hold a force.py: its readers would run it."""
+    (tmp_path / "force.py").write_text("raise SystemExit")
+    with pytest.raises(UsageError, match="a program that readers"):
+        export(str(mixed.folder), format="lagrangebench-h5", output=tmp_path, force=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["force.py"]
+
+
+def test_missing_and_foreign_scenarios_are_told(tmp_path: Path) -> None:
+    """A scenario that is not there, and one put in another's place, stop the export with their ids."""
+    paths = []
+    for number, run in enumerate(straight_runs(4)):
+        paths.append(tmp_path / f"{number}.npy")
+        np.save(paths[-1], run)
+    made = adopt(paths, output=tmp_path / "own", radius=0.1, frame_interval=0.1)
+    train = made.folder / "full" / "v1" / "train"
+    (train / "0000.nc").write_bytes((train / "0001.nc").read_bytes())
+    with pytest.raises(DataError, match="not that of the registry"):
+        export(str(made.folder), format="gns-npz", output=tmp_path / "out")
+    (train / "0000.nc").unlink()
+    with pytest.raises(DataError, match="1 of 2 scenarios of train are not there"):
+        export(str(made.folder), format="gns-npz", output=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_command(mixed: LocalSplit, tmp_path: Path) -> None:
+    """`lagbench export` writes where it is told and says what; an unknown format names the nearest."""
+    arguments = ["export", str(mixed.folder), "--format", "lagrangebench-h5", "-o", str(tmp_path / "out")]
+    done = CliRunner().invoke(app, [*arguments, "--json"])
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout)["trajectories"] == {"train": 3, "valid": 1, "test": 1}
+    wrong = CliRunner().invoke(app, ["export", str(mixed.folder), "--format", "gns-npy"])
+    assert wrong.exit_code == 2
+    assert "did you mean 'gns-npz'" in wrong.output

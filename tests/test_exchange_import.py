@@ -1,0 +1,313 @@
+"""Imports: what comes back is what was there, and nothing in a file is run."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from exchange_readers import Trajectory, gns_windows, read_gns, read_h5, straight_runs
+from typer.testing import CliRunner
+
+import lagbench
+from lagbench.cli.app import app
+from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError
+from lagbench.exchange import adopt, export, import_split
+from lagbench.generation import GenerationResult
+from lagbench.locating import locate
+from lagbench.registry import Registry
+
+SUBSETS = ("train", "valid", "test")
+METADATA: dict[str, Any] = {
+    "bounds": [[0.1, 0.9], [0.1, 0.9]],
+    "sequence_length": 12,
+    "default_connectivity_radius": 0.1,
+    "dim": 2,
+    "dt": 0.01,
+    "write_every": 5,
+    "periodic_boundary_conditions": [False, False],
+}
+
+
+def write_gns(folder: Path, runs: list[Any], kinds: Any = 5, **changes: Any) -> Path:
+    """Write runs as the GNS programs' own scripts do, with numpy.savez; one for each subset."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for subset, run in zip(SUBSETS, runs, strict=True):
+        pair = np.empty(2, dtype=object)
+        pair[0], pair[1] = run, kinds
+        np.savez(folder / f"{subset}.npz", simulation_trajectory_0=pair)
+    (folder / "metadata.json").write_text(json.dumps({**METADATA, **changes}))
+    return folder
+
+
+def write_h5(folder: Path, runs: list[Any], kinds: Any = None, **changes: Any) -> Path:
+    """Write runs as LagrangeBench's own script does; one for each subset."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for subset, run in zip(SUBSETS, runs, strict=True):
+        with h5py.File(folder / f"{subset}.h5", "w") as file:
+            file.create_dataset("00000/position", data=run, compression="gzip")
+            file["00000/particle_type"] = np.zeros(run.shape[1], int) if kinds is None else kinds
+    (folder / "metadata.json").write_text(json.dumps({**METADATA, **changes}))
+    return folder
+
+
+def positions(folder: Path, subset: str = "train") -> np.ndarray:
+    """Return the positions of a local split's subset."""
+    with lagbench.open_split(str(folder), subset=subset) as data:
+        return np.asarray(data["position"].values)
+
+
+@pytest.mark.parametrize("form", ["gns-npz", "lagrangebench-h5", "lagrangebench-h5 --from-walls"])
+def test_an_export_comes_back(
+    generated: GenerationResult, unmeasured: Registry, tmp_path: Path, form: str
+) -> None:
+    """Every subset has the stored bits again, and the task is the one that was exported."""
+    name, _, walls = form.partition(" ")
+    export(
+        generated.split,
+        "tiny",
+        format=name,
+        output=tmp_path / "out",
+        root=generated.root,
+        from_walls=bool(walls),
+        registry=unmeasured,
+    )
+    made = import_split(tmp_path / "out", format=name, output=tmp_path / "back", allow_pickle=True)
+    for subset in SUBSETS:
+        with lagbench.open_split("curl-noise", subset=subset, size="tiny", root=generated.root) as data:
+            np.testing.assert_array_equal(positions(made.folder, subset), data["position"].values)
+            mass = data["particle_mass"].values[0]
+    here, there = locate(str(made.folder)).size, unmeasured.size("curl-noise", "tiny")
+    assert here.task == there.task
+    assert here.bounds == there.bounds
+    assert here.frame_interval == there.frame_interval
+    with lagbench.open_split(str(made.folder)) as data:
+        assert data["particle_mass"].values[0] == pytest.approx(mass, rel=1e-12)
+
+
+@pytest.mark.parametrize("form", ["gns-npz", "lagrangebench-h5"])
+def test_windows_of_imported_data_equal_the_source(tmp_path: Path, form: str) -> None:
+    """Windows of 7 frames of the local split are those that a reader of the source takes."""
+    runs = straight_runs(3)
+    gns = form == "gns-npz"
+    source = (write_gns if gns else write_h5)(tmp_path / "in", runs)
+    made = import_split(source, format=form, output=tmp_path / "own", allow_pickle=gns)
+    read: list[Trajectory] = (read_gns if gns else read_h5)(source / ("train.npz" if gns else "train.h5"))
+    here = [(run, np.zeros(0)) for run in positions(made.folder)]
+    for window, wanted in zip(gns_windows(here), gns_windows(read), strict=True):
+        np.testing.assert_array_equal(window, wanted)
+    interval = 0.01 if gns else 0.05
+    assert locate(str(made.folder)).size.frame_interval == pytest.approx(interval)
+
+
+def test_imported_data_are_verified_and_scored(tmp_path: Path) -> None:
+    """An imported split has hashes of its own, a template that is valid, and scores."""
+    source = write_h5(tmp_path / "in", straight_runs(3))
+    made = import_split(source, format="lagrangebench-h5", output=tmp_path / "own")
+    assert lagbench.verify(str(made.folder), complete=True).problems == ()
+    lagbench.template(str(made.folder), output=tmp_path / "p.nc")
+    card = lagbench.score(tmp_path / "p.nc", root=tmp_path, write=False, workers=1)
+    assert np.max(card.scores["constant-velocity"]["position_rmse"].per_frame) < 1e-5
+
+
+def test_pickles_are_refused_unless_allowed(tmp_path: Path) -> None:
+    """Without --allow-pickle nothing of gns-npz is read; the message names the flag."""
+    source = write_gns(tmp_path / "in", straight_runs(3))
+    with pytest.raises(UsageError, match="--allow-pickle"):
+        import_split(source, format="gns-npz", output=tmp_path / "own")
+    assert not (tmp_path / "own").exists()
+
+
+class _Trap:
+    """Pickles as a call that writes a file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Path.write_text, (self.path, "run")
+
+
+@pytest.mark.parametrize("allow", [False, True])
+def test_a_malicious_pickle_is_never_run(tmp_path: Path, allow: bool) -> None:
+    """A pickle that calls anything but NumPy's constructors is refused even when pickles are allowed."""
+    source = write_gns(tmp_path / "in", straight_runs(3))
+    pair = np.empty(2, dtype=object)
+    pair[0], pair[1] = straight_runs(1)[0], _Trap(tmp_path / "trace")
+    np.savez(source / "train.npz", simulation_0=pair)
+    with pytest.raises(LagbenchError) as caught:
+        import_split(source, format="gns-npz", output=tmp_path / "own", allow_pickle=allow)
+    assert not (tmp_path / "trace").exists()
+    assert ("wants to call" in str(caught.value)) == allow
+    with np.load(source / "train.npz", allow_pickle=True) as file:  # numpy's own reader does run it
+        file["simulation_0"]
+    assert (tmp_path / "trace").exists()
+
+
+def test_a_force_program_is_not_run(tmp_path: Path) -> None:
+    """A force.py beside the data is left alone."""
+    source = write_h5(tmp_path / "in", straight_runs(3))
+    (source / "force.py").write_text(f"open({str(tmp_path / 'trace')!r}, 'w')")
+    import_split(source, format="lagrangebench-h5", output=tmp_path / "own")
+    assert not (tmp_path / "trace").exists()
+
+
+@pytest.mark.parametrize("protocol", range(2, pickle.HIGHEST_PROTOCOL + 1))
+def test_every_pickle_of_arrays_is_read(tmp_path: Path, protocol: int) -> None:
+    """Pairs and triples, joint and single, of every protocol, double precision rounded to float32."""
+    runs = [run.astype(np.float64) + 1e-9 for run in straight_runs(3)]
+    source = write_gns(tmp_path / "in", runs)
+    joint = np.empty(2, dtype=object)
+    joint[:] = [(runs[0], np.full(40, 6), 0.3), (runs[1], np.int64(7), 0.3)]
+    with zipfile.ZipFile(source / "train.npz", "w") as archive, archive.open("gns_data.npy", "w") as stream:
+        header = {"descr": "|O", "fortran_order": False, "shape": (2,)}
+        np.lib.format.write_array_header_1_0(stream, header)
+        pickle.dump(joint, stream, protocol=protocol)
+    made = import_split(source, format="gns-npz", output=tmp_path / "own", allow_pickle=True)
+    assert made.scenarios["train"] == 2
+    np.testing.assert_array_equal(positions(made.folder), np.stack(runs[:2]).astype(np.float32))
+    with lagbench.open_split(str(made.folder), subset="train") as data:
+        assert data["material"].values[:, 0].tolist() == [2, 1]
+        assert data.attrs["material_property"] == 0.3
+
+
+def test_kinds_without_a_material(tmp_path: Path) -> None:
+    """Walls are refused until the user says what they are; padding is left out by itself."""
+    kinds = np.array([0] * 30 + [1] * 6 + [-1] * 4)
+    source = write_h5(tmp_path / "in", straight_runs(3), kinds)
+    with pytest.raises(UnreadableFileError, match=r"1 \(solid wall\)"):
+        import_split(source, format="lagrangebench-h5", output=tmp_path / "own")
+    named = import_split(source, format="lagrangebench-h5", output=tmp_path / "a", kinds={1: "rope"})
+    dropped = import_split(source, format="lagrangebench-h5", output=tmp_path / "b", kinds={1: "drop"})
+    assert (named.particles, dropped.particles) == ((36, 36), (30, 30))
+    np.testing.assert_array_equal(positions(dropped.folder)[0], straight_runs(3)[0][:, :30])
+
+
+def test_periodic_boxes(tmp_path: Path) -> None:
+    """Periodic data come in where nothing crosses the boundary; a jump of more than half the box is told."""
+    runs = straight_runs(3)
+    periodic = {"periodic_boundary_conditions": [True, True]}
+    source = write_h5(tmp_path / "in", runs, **periodic)
+    import_split(source, format="lagrangebench-h5", output=tmp_path / "own")
+    runs[1][5:, 0, 0] += np.float32(0.42 if runs[1][5, 0, 0] < 0.5 else -0.42)
+    source = write_h5(tmp_path / "in", runs, **periodic)
+    with pytest.raises(DataError, match=r"periodic boundary\n  where: .*valid.h5.*frame 5"):
+        import_split(source, format="lagrangebench-h5", output=tmp_path / "other")
+
+
+@pytest.mark.parametrize(
+    ("fault", "error", "words"),
+    [
+        ("no metadata", UnreadableFileError, "cannot read the metadata"),
+        ("no json", UnreadableFileError, "cannot read the metadata"),
+        ("no radius", UnreadableFileError, "key radius"),
+        ("3D", UnreadableFileError, "not plane"),
+        ("no test", UnreadableFileError, "files are missing"),
+        ("half a file", UnreadableFileError, "cannot read an HDF5 file"),
+        ("no positions", UnreadableFileError, "no trajectory"),
+        ("too few kinds", UnreadableFileError, "no kinds of particles"),
+        ("empty", DataError, "a subset is empty"),
+        ("no time", UsageError, "no time between frames"),
+    ],
+)
+def test_damaged_sources_leave_nothing(
+    tmp_path: Path, fault: str, error: type[LagbenchError], words: str
+) -> None:
+    """Each fault is told by name, and no folder is made."""
+    source = write_h5(tmp_path / "in", straight_runs(3))
+    target = source / "test.h5"
+    metadata = source / "metadata.json"
+    match fault:
+        case "no metadata":
+            metadata.unlink()
+        case "no json":
+            metadata.write_text("<html>")
+        case "no radius":
+            metadata.write_text(json.dumps({**METADATA, "default_connectivity_radius": None}))
+        case "3D":
+            metadata.write_text(json.dumps({**METADATA, "dim": 3}))
+        case "no time":
+            metadata.write_text(json.dumps({**METADATA, "dt": 0}))
+        case "no test":
+            target.unlink()
+        case "half a file":
+            target.write_bytes(target.read_bytes()[:1000])
+        case _:
+            with h5py.File(target, "w") as file:
+                if fault == "no positions":
+                    file["00000/particle_type"] = np.zeros(40, int)
+                elif fault == "too few kinds":
+                    file["00000/position"] = straight_runs(1)[0]
+                    file["00000/particle_type"] = np.zeros(39, int)
+    with pytest.raises(error, match=words):
+        import_split(source, format="lagrangebench-h5", output=tmp_path / "own")
+    assert [path.name for path in tmp_path.iterdir()] == ["in"]
+
+
+def test_a_damaged_npz_is_told(tmp_path: Path) -> None:
+    """Half an npz file, and a member that is no array, are unreadable files."""
+    source = write_gns(tmp_path / "in", straight_runs(3))
+    whole = (source / "test.npz").read_bytes()
+    (source / "test.npz").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(UnreadableFileError, match="npz"):
+        import_split(source, format="gns-npz", output=tmp_path / "own", allow_pickle=True)
+    np.savez(source / "test.npz", simulation_0=np.zeros((4, 3)))
+    with pytest.raises(UnreadableFileError, match="no trajectory"):
+        import_split(source, format="gns-npz", output=tmp_path / "own", allow_pickle=True)
+    assert not (tmp_path / "own").exists()
+
+
+def test_what_the_user_says_goes_before_the_metadata(tmp_path: Path) -> None:
+    """`lagbench import` takes radius, task and box from its options where they are given."""
+    source = write_h5(tmp_path / "in", straight_runs(3, box=3.0), bounds=[[0, 3], [0, 3]], dx=0.2)
+    arguments = ["import", str(source), "--format", "lagrangebench-h5", "-o", str(tmp_path / "own")]
+    refused = CliRunner().invoke(app, arguments)
+    assert refused.exit_code == 4
+    assert "--rescale" in refused.output
+    options = ["--rescale", "--radius", "0.4", "--horizon", "4", "--input-frames", "2", "--full-box"]
+    done = CliRunner().invoke(app, [*arguments, *options])
+    assert done.exit_code == 0, done.output
+    size = locate(str(tmp_path / "own")).size
+    assert (size.task.radius, size.task.input_frames, size.task.horizon) == (0.1, 2, 4)
+    assert size.task.score_grid.placement == "cell_centres"
+    assert size.value("spacing") == 0.05
+
+
+def test_the_other_way_round(tmp_path: Path) -> None:
+    """A user's own data, adopted and exported, come back from either format with the same bits."""
+    np.save(tmp_path / "runs.npy", np.stack(straight_runs(3)))
+    own = adopt(tmp_path / "runs.npy", output=tmp_path / "own", radius=0.1, frame_interval=0.1)
+    hashes = []
+    for form in ("gns-npz", "lagrangebench-h5"):
+        export(str(own.folder), format=form, output=tmp_path / form)
+        back = import_split(
+            tmp_path / form, format=form, output=tmp_path / f"from-{form}" / "own", allow_pickle=True
+        )
+        hashes.append(back.dataset_sha256)
+    assert hashes == [own.dataset_sha256] * 2
+
+
+@pytest.mark.parametrize("way", ["soft", "external", "virtual"])
+def test_a_file_that_leads_elsewhere_is_refused(tmp_path: Path, way: str) -> None:
+    """Links, virtual data sets and external storage would let a stranger's file read others."""
+    source = write_h5(tmp_path / "in", straight_runs(3))
+    other = tmp_path / "other.h5"
+    (source / "train.h5").rename(other)
+    with h5py.File(source / "train.h5", "w") as file:
+        if way == "soft":
+            file["there"] = straight_runs(1)[0]
+            file["00000/position"] = h5py.SoftLink("/there")
+        elif way == "external":
+            file["00000"] = h5py.ExternalLink(str(other), "00000")
+        else:
+            layout = h5py.VirtualLayout(shape=(12, 40, 2), dtype="f4")
+            layout[:] = h5py.VirtualSource(str(other), "00000/position", shape=(12, 40, 2))
+            file.create_virtual_dataset("00000/position", layout)
+            file["00000/particle_type"] = np.zeros(40, int)
+    with pytest.raises(UnreadableFileError, match="leads to another file"):
+        import_split(source, format="lagrangebench-h5", output=tmp_path / "own")

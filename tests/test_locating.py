@@ -1,0 +1,133 @@
+"""Splits by name and by path: what a user names is found, what a stranger's file names is not a path."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from exchange_readers import straight_runs
+
+import lagbench
+from lagbench.errors import UnreadableFileError, UsageError
+from lagbench.exchange import adopt
+from lagbench.exchange.local_split import LocalSplit
+from lagbench.locating import home, is_name, locate, rooted
+from lagbench.registry import load
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> LocalSplit:
+    """A local split named own."""
+    folder = tmp_path_factory.mktemp("made")
+    np.save(folder / "runs.npy", np.stack(straight_runs(3)))
+    return adopt(folder / "runs.npy", output=folder / "own", radius=0.1, frame_interval=0.1)
+
+
+@pytest.fixture
+def own(made: LocalSplit, tmp_path: Path) -> Path:
+    """A copy of it that a test may change."""
+    shutil.copytree(made.folder, tmp_path / "root" / "own")
+    return tmp_path / "root" / "own"
+
+
+def test_all_ways_to_name_it(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An absolute path, a relative one, a name with its root, LAGBENCH_ROOT, and the current folder."""
+    monkeypatch.chdir(own.parent)
+    by_path = [(str(own), None), (f"{own}/", None), ("./own", None), ("own/", None)]
+    for split, root in [*by_path, ("own", own.parent), ("own", "."), ("own", None)]:
+        found = home(split, root=root)
+        assert (found.name, found.root.resolve()) == ("own", own.parent.resolve())
+    monkeypatch.chdir(own.parent.parent)
+    monkeypatch.setenv("LAGBENCH_ROOT", str(own.parent))
+    assert home("own").root == own.parent
+    assert locate("root/own").size.split == "own"
+
+
+def test_ours_are_found_as_before(tmp_path: Path) -> None:
+    """A name of the registry means that split, whatever the root holds."""
+    (tmp_path / "cavity").mkdir()
+    (tmp_path / "cavity" / "split.yaml").write_text("format: 1")
+    found = locate("cavity", "tiny", root=tmp_path)
+    assert (found.size.generator, found.root) == ("lagbench.generators.cavity", tmp_path)
+    with pytest.raises(UsageError, match="taken by another split"):
+        locate(str(tmp_path / "cavity"), "tiny")
+
+
+def test_unknown_names_list_local_ones(own: Path) -> None:
+    """The nearest known name may be that of a local split."""
+    with pytest.raises(UsageError, match="did you mean 'own'"):
+        locate("owm", root=own.parent)
+    with pytest.raises(UsageError, match="no local split there"):
+        locate(str(own.parent / "other"))
+    with pytest.raises(UsageError, match="has no size 'tiny'"):
+        locate(str(own), "tiny")
+
+
+def test_a_path_and_another_root(own: Path, tmp_path: Path) -> None:
+    """A path names its root; the same one beside it is fine, another is refused."""
+    assert locate(str(own), root=own.parent).root == own.parent
+    with pytest.raises(UsageError, match="another root"):
+        locate(str(own), root=tmp_path)
+
+
+def test_a_renamed_folder_is_told(own: Path) -> None:
+    """The name is part of every hash, so the folder must keep it."""
+    moved = own.rename(own.with_name("mine"))
+    with pytest.raises(UnreadableFileError, match="not named like its split"):
+        locate(str(moved))
+
+
+def test_a_moved_folder_is_the_same_data_set(own: Path, made: LocalSplit, tmp_path: Path) -> None:
+    """Where it lies is part of nothing."""
+    moved = shutil.move(own, tmp_path / "own")
+    result = lagbench.verify(str(moved))
+    assert result.dataset_sha256 == made.dataset_sha256
+
+
+def test_a_description_chooses_no_code(own: Path) -> None:
+    """A generator in a local description, which would be imported, is refused."""
+    path = own / "split.yaml"
+    path.write_text(path.read_text().replace("generator: none", "generator: antigravity"))
+    with pytest.raises(UnreadableFileError, match="cannot name a generator"):
+        locate(str(own))
+
+
+def test_a_damaged_description_harms_no_other_split(own: Path) -> None:
+    """It is told when it is asked for, and only then."""
+    (own / "split.yaml").write_text("splits: [")
+    assert locate("cavity", "tiny", root=own.parent).size.split == "cavity"
+    with pytest.raises(UnreadableFileError, match="not a plain YAML file"):
+        locate("own", root=own.parent)
+
+
+@pytest.mark.parametrize("name", ["../own", "/etc", "own/", ".", "..", "", "Own", "a b", "a" * 65, "own\0"])
+def test_paths_are_no_names(name: str) -> None:
+    """Whatever could leave the root folder cannot be the name of a split."""
+    assert not is_name(name)
+
+
+@pytest.mark.parametrize("path", ["relative", "absolute"])
+def test_predictions_cannot_name_paths(own: Path, tmp_path: Path, path: str) -> None:
+    """A stranger's file whose split is the path of a local split is for no known split."""
+    target = tmp_path / "predictions.nc"
+    lagbench.template(str(own), output=target)
+    assert lagbench.validate(target, root=own.parent, isolated=False).valid
+    with h5py.File(target, "a") as file:
+        file.attrs["split"] = "../root/own" if path == "relative" else str(own)
+    result = lagbench.validate(target, root=own.parent, isolated=False)
+    assert [finding.check for finding in result.errors] == ["split"]
+    assert not lagbench.validate(target, isolated=False).valid
+
+
+def test_a_rooted_registry_leaves_its_base_alone(own: Path) -> None:
+    """Looking up a local split adds it to no other registry, nor to another root's."""
+    base = load()
+    known = rooted(own.parent, base)
+    assert known.split("own").generator == "none"
+    assert "own" not in base.splits
+    assert rooted(own.parent.parent, known).local_names() == ()
+    with pytest.raises(UsageError):
+        rooted(own.parent.parent, known).split("own")

@@ -1,0 +1,215 @@
+"""Predictions: rollouts that are known in closed form, frozen ones, and what a file says."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import netCDF4
+import numpy as np
+import pytest
+import torch
+from simple_models import FACTS, Bursting, Drift, install
+
+from lagbench.baselines.batch import Batch
+from lagbench.baselines.checkpoint import Checkpoint, save
+from lagbench.baselines.facts import facts_of
+from lagbench.baselines.prediction import PredictionResult, predict
+from lagbench.baselines.rollout import roll_out, single
+from lagbench.baselines.validation import as_published, validate
+from lagbench.baselines.windows import scenario_batch
+from lagbench.errors import DataError, UnreadableFileError, UsageError, WorkFailedError
+from lagbench.generation import GenerationResult
+from lagbench.registry import Registry
+from lagbench.submission import validate as examine
+
+Predict = Callable[..., PredictionResult]
+
+
+@pytest.fixture
+def run(
+    generated: GenerationResult, unmeasured: Registry, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Predict:
+    """Predict with an untrained simple model on one thread."""
+    install(monkeypatch, drift=Drift, bursting=Bursting)
+
+    def call(baseline: str = "drift", start: float = 1.0, **options: Any) -> PredictionResult:
+        root = options.pop("root", generated.root)
+        facts = facts_of("curl-noise", "tiny", root=root, registry=unmeasured)
+        model = Drift.build({"start": start, **options.pop("model", {})}, facts)
+        stored = Checkpoint(
+            baseline=baseline,
+            options=model.options.model_dump(),
+            facts=facts,
+            weights=model.state_dict(),
+            training={"step": 9, "recipe": {"name": "curl-noise/tiny", "training": {"seed": 3}}},
+        )
+        save(tmp_path / "weights.pt", stored)
+        output = tmp_path / options.pop("name", "predictions.nc")
+        return predict(tmp_path / "weights.pt", output, root=root, threads=1, registry=unmeasured, **options)
+
+    return call
+
+
+def truth(root: Path) -> dict[int, np.ndarray]:
+    """Return the positions of the test scenarios by id, read without our code."""
+    found = {}
+    for file in sorted((root / "curl-noise/tiny/v1/test").glob("*.nc")):
+        with netCDF4.Dataset(file) as data:
+            found[int(file.stem)] = np.asarray(data["position"][:], np.float64)
+    return found
+
+
+def written(path: Path, name: str = "position") -> np.ndarray:
+    """Return a variable of a predictions.nc."""
+    with netCDF4.Dataset(path) as data:
+        return np.asarray(data[name][:])
+
+
+def test_a_drift_in_closed_form(run: Predict, generated: GenerationResult) -> None:
+    """With a = 1/2 the k-th position is x + (1 - 2^-k) u, u the last given velocity."""
+    result = run(start=0.5)
+    shares = 1 - 0.5 ** np.arange(1, 21)
+    for row, position in enumerate(truth(generated.root).values()):
+        last, velocity = position[5], position[5] - position[4]
+        expected = last + shares[:, None, None] * velocity
+        assert np.abs(written(result.path)[row] - expected).max() < 1e-6
+
+
+def test_the_file_is_valid_and_says_what_made_it(
+    run: Predict, generated: GenerationResult, unmeasured: Registry
+) -> None:
+    """The file passes every check, and holds cost, device, seed, parameters and training."""
+    result = run(method="my drift")
+    report = examine(result.path, root=generated.root, registry=unmeasured)
+    assert report.valid, report.findings
+    with netCDF4.Dataset(result.path) as data:
+        found = {name: data.getncattr(name) for name in data.ncattrs()}
+    assert (found["method"], found["seed"], found["parameters"]) == ("my drift", 3, 1)
+    assert "curl-noise/tiny, step 9" in found["training"]
+    assert "1 thread" in found["device"]
+    assert found["seconds_per_frame"] == result.seconds_per_frame > 0
+    cost = json.loads(result.path.with_suffix(".json").read_text())
+    assert cost["seconds_without_search"] == result.seconds_per_frame
+
+
+def test_batches_do_not_matter(run: Predict) -> None:
+    """Scenarios predicted side by side are those predicted one by one."""
+    alone, together = run(name="a.nc", batch=1), run(name="b.nc", batch=2)
+    assert (alone.batch, together.batch) == (1, 2)
+    assert np.array_equal(written(alone.path), written(together.path))
+
+
+def test_a_rollout_is_frozen_where_it_diverges(run: Predict, generated: GenerationResult) -> None:
+    """From frame 6 + 4 on, positions are those of frame 9, and the file says so."""
+    result = run(model={"explode_at": 5})
+    position = written(result.path)
+    assert result.diverged == dict.fromkeys(truth(generated.root), 10)
+    assert written(result.path, "diverged_at").tolist() == [10, 10]
+    assert np.isfinite(position).all()
+    assert (position[:, 4:] == position[:, 3:4]).all()
+    assert (position[:, 3] != position[:, 2]).any()
+
+
+def test_divergence_in_the_first_frame(run: Predict, generated: GenerationResult) -> None:
+    """A rollout that is never finite stays at the last given frame."""
+    result = run(model={"explode_at": 1})
+    for row, position in enumerate(truth(generated.root).values()):
+        assert (written(result.path)[row] == position[5].astype(np.float32)).all()
+    assert set(result.diverged.values()) == {6}
+
+
+def windows(firsts: list[float]) -> Batch:
+    """Return windows of three particles and two frames; the first particle stands where told."""
+    position = torch.rand((len(firsts) * 3, 2, 2), generator=torch.Generator().manual_seed(0))
+    position[::3, :, 0] = torch.tensor(firsts)[:, None]
+    return Batch(
+        position=position,
+        sample=torch.arange(len(firsts)).repeat_interleave(3),
+        material=torch.zeros(len(firsts) * 3, dtype=torch.int64),
+        wall_velocity=torch.zeros(len(firsts), 2, 4, 2),
+        scenario=torch.arange(len(firsts)) + 10,
+        frame=torch.full((len(firsts),), 4),
+    )
+
+
+def test_a_diverging_scenario_leaves_others_alone() -> None:
+    """Beside one that diverges, a scenario is predicted as it is alone."""
+    model, batch = Bursting.build({"start": 1.0}, FACTS), windows([0.9, 0.1])
+    good, bad = roll_out(model, batch, 8)
+    assert (good.scenario, good.diverged_at) == (10, None)
+    # Frames 4 and 5 are given, 6 to 8 finite.
+    assert (bad.scenario, bad.diverged_at) == (11, 9)
+    alone = roll_out(model, single(batch, 0), 8)[0]
+    assert torch.equal(good.position, alone.position)
+    assert good.position.shape == bad.position.shape == (8, 3, 2)
+
+
+def test_rollouts_keep_the_mode() -> None:
+    """A model in training is rolled out without dropout, and is in training afterwards."""
+    model = Drift.build({}, FACTS).train()
+    roll_out(model, windows([0.9]), 1)
+    assert model.training
+
+
+def test_validation_error(run: Predict, generated: GenerationResult) -> None:
+    """The RMSE is the mean over scenarios of the root of the mean squared error, with bf16 weights."""
+    folder = generated.root / "curl-noise/tiny/v1/train"
+    model = Drift.build({"start": 1 / 3}, FACTS)
+    found = validate(model, scenario_batch(sorted(folder.glob("*.nc")), slice(0, 10)))
+    a = float(torch.tensor(1 / 3).bfloat16())
+    expected = []
+    for file in sorted(folder.glob("*.nc")):
+        with netCDF4.Dataset(file) as data:
+            x = np.asarray(data["position"][:10], np.float64)
+        shares = np.cumsum(a ** np.arange(1, 5))
+        predicted = x[5] + shares[:, None, None] * (x[5] - x[4])
+        expected.append(np.sqrt(np.mean((predicted - x[6:]) ** 2)))
+    assert found == pytest.approx(np.mean(expected), rel=1e-4)
+
+
+def test_rounding_for_a_while() -> None:
+    """Weights are in bfloat16 inside and have all their bits again outside."""
+    model = torch.nn.Linear(8, 8)
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    with as_published(model):
+        assert torch.equal(model.weight, before["weight"].bfloat16().float())
+        assert not torch.equal(model.weight, before["weight"])
+    assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
+
+
+def test_only_the_given_frames_are_read(run: Predict, copied: Callable[[], Path]) -> None:
+    """With all later frames of test overwritten the predictions are the same."""
+    root = copied()
+    whole = run(name="a.nc", root=root)
+    for file in (root / "curl-noise/tiny/v1/test").glob("*.nc"):
+        file.chmod(0o644)
+        with netCDF4.Dataset(file, "r+") as data:
+            data["position"][6:] = 0.5
+    blind = run(name="b.nc", root=root)
+    assert np.array_equal(written(whole.path), written(blind.path))
+
+
+def test_mistakes(run: Predict, generated: GenerationResult, tmp_path: Path) -> None:
+    """Missing data, a missing checkpoint and a missing device have errors of their own."""
+    result = run()
+    weights = tmp_path / "weights.pt"
+    with pytest.raises(DataError, match="lagbench generate"):
+        predict(weights, result.path, root=tmp_path / "nowhere")
+    with pytest.raises(UnreadableFileError, match=r"none\.pt"):
+        predict(tmp_path / "none.pt", result.path, root=generated.root)
+    with pytest.raises(UsageError, match="no device 'tpu'"):
+        run(device="tpu")
+
+
+def test_out_of_memory(run: Predict, monkeypatch: pytest.MonkeyPatch) -> None:
+    """When memory is full, the message says what to lower, and no file appears."""
+
+    def full(self: Drift, state: object) -> object:
+        raise torch.OutOfMemoryError("no memory left")
+
+    monkeypatch.setattr(Drift, "advance", full)
+    with pytest.raises(WorkFailedError, match="lower --batch"):
+        run(name="none.nc")

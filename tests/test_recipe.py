@@ -1,0 +1,196 @@
+"""Recipes: layers, settings, schedules, and what is said about mistakes in them."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from simple_models import Drift, install
+
+from lagbench.baselines.catalogue import Entry, every_entry, find, names
+from lagbench.baselines.recipe import recipe_for, recipe_names
+from lagbench.baselines.training_options import Schedule, TrainingOptions
+from lagbench.errors import UnreadableFileError, UsageError
+from lagbench.registry import load
+
+TEXT = """
+format: 1
+model: {start: 0.5}
+training: {epochs: 3, batch: 4, schedule: {kind: exponential, factor: 0.5}}
+recipes:
+  cavity/tiny: {training: {steps: 7}}
+  cavity/tiny-long: {model: {start: 2.0}, training: {steps: 70, schedule: {every: 10}}}
+  "*/mini": {training: {learning_rate: 1.0e-2}}
+"""
+
+
+@pytest.fixture
+def entry(tmp_path: Path) -> Entry:
+    """A baseline with recipes of its own."""
+    path = tmp_path / "drift.yaml"
+    path.write_text(TEXT)
+    return Entry(name="drift", model=Drift, recipes=path)
+
+
+@pytest.mark.parametrize("name", names())
+def test_every_recipe_is_right(name: str) -> None:
+    """Every recipe of every baseline names a split and size of ours, and its options are accepted."""
+    entry, registry = find(name), load()
+    found = recipe_names(entry)
+    assert any("tiny" in one for one in found)
+    for one in found:
+        split, _, tail = one.partition("/")
+        size, _, variant = tail.partition("-")
+        for wanted in registry.splits if split == "*" else [split]:
+            registry.size(wanted, size)
+            recipe = recipe_for(entry, wanted, size, variant=variant or None)
+            assert recipe.training.steps or recipe.training.epochs or hasattr(entry.model, "closed_form")
+
+
+def test_operators_share_their_recipes() -> None:
+    """The six operators have one recipe: the same model options, steps, batch and rate."""
+    operators = ("gns", "supergat", "gat", "gatv2", "pointnet", "transformer")
+    for size in ("tiny", "mini", "full"):
+        found = [recipe_for(find(name), "cavity", size) for name in operators]
+        assert all(one.model == found[0].model and one.training == found[0].training for one in found)
+
+
+def test_layers(entry: Entry) -> None:
+    """Settings win over the recipe, and the recipe over the defaults of the file."""
+    plain = recipe_for(entry, "cavity", "tiny")
+    assert (plain.training.steps, plain.training.epochs, plain.training.batch) == (7, None, 4)
+    assert plain.model["start"] == 0.5
+    long = recipe_for(entry, "cavity", "tiny", variant="long", settings=["training.batch=9"], seed=5)
+    assert long.model["start"] == 2.0
+    assert (long.training.batch, long.training.seed) == (9, 5)
+    assert (long.training.schedule.factor, long.training.schedule.every) == (0.5, 10)
+
+
+def test_steps_and_epochs_replace_each_other(entry: Entry) -> None:
+    """A later layer that counts epochs drops the steps below it."""
+    changed = recipe_for(entry, "cavity", "tiny", settings=["training.epochs=2"]).training
+    assert (changed.steps, changed.epochs) == (None, 2)
+    # 2 epochs x 41 windows / (4 windows x 2 processes) = 10.25
+    assert changed.total_steps(41, processes=2) == 11
+
+
+def test_any_split(entry: Entry) -> None:
+    """A star stands for every split; the recipe is named after the split that was asked for."""
+    recipe = recipe_for(entry, "fluid", "mini")
+    assert (recipe.name, recipe.training.learning_rate) == ("fluid/mini", 0.01)
+
+
+def test_own_file(entry: Entry, tmp_path: Path) -> None:
+    """A file of recipes can be given in place of ours."""
+    own = tmp_path / "own.yaml"
+    own.write_text("{format: 1, recipes: {fluid/tiny: {training: {steps: 3}}}}")
+    assert recipe_for(entry, "fluid", "tiny", variant=str(own)).training.steps == 3
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (["training.learning_rat=1"], "did you mean 'learning_rate'"),
+        (["training.schedule.evry=1"], "did you mean 'every'"),
+        (["training.schedule=cosin"], "schedule"),
+        (["model.strat=1"], "did you mean 'start'"),
+        (["modle.start=1"], "model.KEY=VALUE"),
+        (["model.start"], "model.KEY=VALUE"),
+        (["training.batch=[1"], "no YAML"),
+        (["training.batch=0"], "greater than 0"),
+        (["training.windows=[test]"], "never on test"),
+        (["training.learning_rate=.inf"], "finite"),
+        (["training.steps=5", "training.epochs=5"], ""),
+    ],
+)
+def test_mistakes_in_settings(entry: Entry, settings: list[str], message: str) -> None:
+    """A wrong setting is a usage error that names key and remedy; steps and epochs replace each other."""
+    if not message:
+        assert recipe_for(entry, "cavity", "tiny", settings=settings).training.epochs == 5
+        return
+    with pytest.raises(UsageError, match=message):
+        recipe_for(entry, "cavity", "tiny", settings=settings)
+
+
+def test_no_such_recipe(entry: Entry) -> None:
+    """A split or variant without a recipe is a usage error that names the nearest."""
+    with pytest.raises(UsageError, match="did you mean 'cavity/tiny-long'"):
+        recipe_for(entry, "cavity", "tiny", variant="lon")
+    with pytest.raises(UsageError, match="cavity/tiny"):
+        recipe_for(entry, "fluid", "full")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{format: 2, recipes: {}}", "format"),
+        ("{format: 1, receipts: {}}", "did you mean 'recipes'"),
+        ("{format: 1, recipes: {a/b: {modell: {}}}}", "did you mean 'model'"),
+        ("[1, 2]", "dictionary"),
+        ("{format: 1, a: &x 1, b: *x}", "aliases"),
+    ],
+)
+def test_mistakes_in_files(entry: Entry, tmp_path: Path, text: str, message: str) -> None:
+    """A file that is none of recipes is unreadable, and the message says where."""
+    path = tmp_path / "wrong.yaml"
+    path.write_text(text)
+    with pytest.raises(UnreadableFileError, match=message):
+        recipe_for(entry, "cavity", "tiny", variant=str(path))
+
+
+def test_schedules_equal_torch() -> None:
+    """Cosine and exponential rates are those of torch's own schedulers."""
+    weight = torch.nn.Parameter(torch.zeros(1))
+    optimizer = torch.optim.SGD([weight], lr=1.0)
+    cosine = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, T_max=50, eta_min=0.01)
+    ours = Schedule(kind="cosine", floor=0.01)
+    decay = Schedule(kind="exponential", factor=0.1, every=20)
+    for step in range(50):
+        assert math.isclose(ours.at(step, steps=50), optimizer.param_groups[0]["lr"], rel_tol=1e-9)
+        assert math.isclose(decay.at(step, steps=50), 0.1 ** (step / 20), rel_tol=1e-12)
+        optimizer.step()
+        cosine.step()
+
+
+def test_warm_up() -> None:
+    """The rate rises in equal parts: with 3 warm-up steps 1/4, 2/4, 3/4, then 1."""
+    rates = [Schedule().at(step, steps=10, warmup=3) for step in range(5)]
+    assert rates == [0.25, 0.5, 0.75, 1.0, 1.0]
+
+
+def test_budget_is_one() -> None:
+    """Steps and epochs together are refused."""
+    with pytest.raises(ValueError, match="steps or epochs"):
+        TrainingOptions(steps=1, epochs=1)
+
+
+def test_unknown_baseline() -> None:
+    """An unknown name is a usage error that names the nearest."""
+    with pytest.raises(UsageError, match="did you mean 'supergat'"):
+        find("supergatt")
+
+
+def test_other_packages_add_baselines(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A class of another package is found by its name; ours cannot be replaced."""
+    install(monkeypatch, drift=Drift, gns=Drift)
+    with pytest.warns(UserWarning, match="its name is taken"):
+        assert find("drift").model is Drift
+    with pytest.warns(UserWarning, match="its name is taken"):
+        assert find("gns").model.method == "GNS"
+
+
+class NoBaseline:
+    """Neither a baseline nor an operator."""
+
+
+def test_broken_packages_only_warn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A package whose baseline cannot be loaded is named in a warning; the others are there."""
+    install(monkeypatch, broken=NoBaseline)
+    with pytest.warns(UserWarning, match="broken"):
+        found = every_entry()
+    assert "broken" not in found
+    assert "mlp" in found
+    with pytest.raises(UsageError, match="cannot be loaded"):
+        find("broken")

@@ -1,0 +1,275 @@
+"""Tables and figures of the thesis, and the page of results: from runs to Markdown, CSV and PNG."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from reproduce_bench import NOISE, SIZE, SPLIT, pretend
+from score_bench import ScoreBench
+
+from lagbench.baselines.reproduce import results
+from lagbench.baselines.reproduce.__main__ import main
+from lagbench.baselines.reproduce.catalogue import ITEMS
+from lagbench.baselines.reproduce.evidence import Evidence, Sources
+from lagbench.baselines.reproduce.plan import Plan
+from lagbench.baselines.reproduce.roster import EXPECTED, ROSTER
+from lagbench.baselines.reproduce.stage import staged
+from lagbench.generation import generate
+from lagbench.grid import fields
+from lagbench.registry import Registry, load
+from lagbench.score_file import read_statistics
+
+
+@pytest.fixture(scope="session")
+def cavity(tmp_path_factory: pytest.TempPathFactory, unmeasured: Registry) -> ScoreBench:
+    """The tiny cavity, generated once."""
+    root = tmp_path_factory.mktemp("reproduce") / "data"
+    generate(SPLIT, SIZE, root=root, workers=1, registry=unmeasured)
+    return ScoreBench(root, unmeasured, unmeasured.size(SPLIT, SIZE))
+
+
+@pytest.fixture(scope="session")
+def runs(cavity: ScoreBench) -> Path:
+    """Folders of runs that pretend to be six operators: the truth with more and more noise."""
+    return pretend(cavity, cavity.root.parent / "runs")
+
+
+@pytest.fixture
+def plan(cavity: ScoreBench, runs: Path, tmp_path: Path) -> Plan:
+    """What a user asks for who has these runs."""
+    places = {"root": cavity.root, "runs": runs, "output": tmp_path / "out"}
+    return Plan(size=SIZE, registry=cavity.registry, device="cpu", **places)
+
+
+def test_runs_are_read_with_their_costs(plan: Plan) -> None:
+    """Scores, hours, parameters and seconds are those of the files."""
+    found = plan.evidence(SPLIT)
+    assert list(found.models()) == sorted(NOISE)
+    held = found.methods["gns"]
+    direct = read_statistics(held.seeds[0].path).scores()["vorticity_mse"]
+    assert held.at("vorticity_mse", 15) == pytest.approx(float(np.mean(direct.at(15))))
+    assert (held.parameters, held.seeds[0].cpu_hours) == (123, 2.0)
+    assert held.cost is not None
+    assert held.cost.seconds_per_frame == 0.5
+    assert held.cost.speed_up is None
+
+
+def test_the_board_comes_first(plan: Plan, tmp_path: Path) -> None:
+    """A committed entry wins over a run of the same seed, brings the solver's time, and records."""
+    board, weights = tmp_path / "board", tmp_path / "weights"
+    entry = board / "submissions" / SPLIT / SIZE / "gns.yaml"
+    scores = board / "scores" / SPLIT / SIZE / "gns.nc"
+    for path in (entry, scores, weights / SPLIT / SIZE / "gns-0.json"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copy(plan.home(SPLIT) / "gat-0" / "scores.nc", scores)
+    cost = "{seconds_per_frame: 0.1, device: here, solver_seconds_per_frame: 0.05}"
+    entry.write_text(f"predictions: [{{seed: 0}}]\nparameters: 7\ncost: {cost}\n")
+    (weights / SPLIT / SIZE / "gns-0.json").write_text(json.dumps({"cpu_seconds": 3600.0}))
+    sources = Sources(board=board, weights=weights, runs=plan.runs, registry=plan.described)
+    held = Evidence(sources, SPLIT, SIZE).methods
+    assert held["gns"].seeds[0].path == scores
+    assert held["gns"].seeds[0].cpu_hours == 1.0
+    assert held["gns"].parameters == 7
+    assert held["gns"].cost is not None
+    assert held["gns"].cost.speed_up == pytest.approx(0.5)
+    # the solver's time holds for runs that are not on the board, too: 0.05 s over 0.5 s
+    assert held["gat"].cost is not None
+    assert held["gat"].cost.speed_up == pytest.approx(0.1)
+
+
+def test_scores_of_other_data_are_left_out(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the registry records another hash than the score files hold, all of them are stale."""
+    recorded = load().size(SPLIT, SIZE)
+    assert recorded.measured is not None
+    measured = recorded.measured.model_copy(update={"dataset_sha256": "0" * 64})
+    other = recorded.model_copy(update={"measured": measured})
+    monkeypatch.setattr(Sources, "size", lambda *_: other)
+    found = Evidence(Sources(board=None, runs=plan.runs), SPLIT, SIZE)
+    assert not found.methods
+    assert len(found.stale) == len(NOISE)
+
+
+@pytest.fixture
+def sources(plan: Plan, tmp_path: Path) -> Sources:
+    """Runs alone, nothing committed."""
+    return Sources(
+        board=tmp_path / "none", weights=tmp_path / "none", runs=plan.runs, registry=plan.described
+    )
+
+
+def test_the_page_tells_what_there_is_and_what_is_missing(sources: Sources) -> None:
+    """Models stand best first, the thesis's numbers beside them, and the missing ones are listed."""
+    page = results.render(sources, ("tiny",))
+    rows = [line.split(" | ")[0].removeprefix("| ") for line in page.splitlines() if line.startswith("| ")]
+    first = rows.index("model")
+    assert rows[first + 2 : first + 5] == ["SuperGAT", "GAT", "GNS"]
+    assert "0.007715" in page  # SuperGAT's MAE in Table 5.4
+    assert "- cavity tiny: 7 trainings, 14 CPU hours" in page
+    assert "- cavity tiny: SuperGAT, link loss, MLP and LSTM + MLP." in page
+    assert "- fluid tiny: all models." in page
+    assert "with fewer than 6 scenarios nothing is claimed" in page
+    assert page == results.render(sources, ("tiny",))
+
+
+def test_the_page_works_without_anything(tmp_path: Path) -> None:
+    """No board and no runs: a page that says so."""
+    page = results.render(Sources(board=tmp_path / "board", weights=tmp_path, runs=None))
+    assert "No model has been scored yet." in page
+    assert page.count("all models") == 8
+
+
+def test_a_stale_page_is_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """--check fails on a missing page and on one that differs by a byte, and writes nothing."""
+    output = tmp_path / "results.md"
+    options = ["-o", str(output), "--board", str(tmp_path / "board"), "--weights", str(tmp_path)]
+    assert results.main([*options, "--check"]) == 1
+    assert not output.exists()
+    assert results.main(options) == 0
+    assert results.main([*options, "--check"]) == 0
+    output.write_text(output.read_text() + " ")
+    assert results.main([*options, "--check"]) == 1
+    assert "stale" in capsys.readouterr().out
+
+
+def test_an_entry_that_is_none_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """An entry without predictions ends with exit code 3 and the file's name."""
+    entry = tmp_path / "board" / "submissions" / "cavity" / "mini" / "gns.yaml"
+    entry.parent.mkdir(parents=True)
+    entry.write_text("name: gns\n")
+    assert results.main(["-o", str(tmp_path / "r.md"), "--board", str(tmp_path / "board")]) == 3
+    assert "gns.yaml" in capsys.readouterr().err
+
+
+def test_a_stage_shows_truth_and_prediction(plan: Plan, cavity: ScoreBench) -> None:
+    """Positions are those of the files, velocities their differences, fields the scorer's own."""
+    scenario = cavity.size.subsets["test"][0]
+    truth = cavity.truth(scenario).astype(float)
+    with staged(plan, SPLIT, scenario, ("supergat", "gns", "mlp")) as stage:
+        assert stage.names == ("supergat", "gns")  # mlp has no run
+        assert np.array_equal(stage.position("gns", 5), truth[5])  # given
+        assert not np.array_equal(stage.position("gns", 6), truth[6])
+        assert np.array_equal(stage.position("supergat", 9), truth[9])
+        pair = stage.pair("supergat", 15)
+        assert float(np.abs(pair.vorticity_residual).max()) == 0.0
+        scene = stage.scene("supergat", 6)
+        assert np.allclose(scene.displacement, truth[6] - truth[5], atol=0)
+        again = fields(truth[15], truth[15] - truth[14], pair.truth.grid, full=pair.truth.full)
+        assert np.array_equal(again.vorticity, pair.truth.fields.vorticity, equal_nan=True)
+
+
+def test_every_figure_of_the_contract_is_there() -> None:
+    """Design section 10 lists the tables and figures; each needs models that the roster knows."""
+    figures = {"4": (4, 5, 6, 8, 11, 12, 13), "5": (5, *range(10, 20), *range(21, 29))}
+    wanted = {f"fig_{chapter}_{number}" for chapter, numbers in figures.items() for number in numbers}
+    wanted |= {f"table_4_{number}" for number in (2, 3, 4, 5, 7, 8)} | {"table_3_1", "section_4_8_3"}
+    wanted |= {f"table_5_{number}" for number in (1, 3, 4, 5)}
+    assert set(ITEMS) == wanted
+    for item in ITEMS.values():
+        for split, names in item.needs.items():
+            assert set(names) <= set(EXPECTED[split])
+    assert {name for names in EXPECTED.values() for name in names} <= set(ROSTER)
+
+
+def options(plan: Plan, *more: str) -> list[str]:
+    """Return the command line of a plan."""
+    places = ["--root", str(plan.root), "--runs", str(plan.runs), "-o", str(plan.output)]
+    return ["--size", SIZE, *places, "--device", "cpu", *more]
+
+
+DRAWN = (
+    *("table_5_3", "table_5_4", "fig_5_5", "fig_5_10", "fig_5_11", "fig_5_12", "fig_5_13"),
+    *("fig_5_14", "fig_5_15", "fig_5_16", "fig_5_17", "fig_5_19"),
+)
+
+
+def test_tables_and_figures_are_written(plan: Plan, cavity: ScoreBench) -> None:
+    """Markdown, CSV and pictures are there, with the scorer's numbers, budget and hours in them."""
+    only = ("--no-training", "--only", ",".join(DRAWN))
+    assert main(options(plan, *only), registry=cavity.registry) == 0
+    drawn = plan.output
+    for name in DRAWN:
+        text = (drawn / f"{name}.md").read_text()
+        assert "Size tiny." in text
+        for picture in drawn.glob(f"{name}*.png"):
+            assert f"]({picture.name})" in text
+            with Image.open(picture) as image:
+                assert min(image.size) > 150
+                assert len(set(np.asarray(image.convert("RGB")).reshape(-1, 3).sum(axis=1).tolist())) > 10
+    text = (drawn / "table_5_4.md").read_text()
+    assert "cavity, GNS: seeds 0; 40 x 2 steps x windows; 2 CPU hours" in text
+    with (drawn / "table_5_4-1.csv").open() as file:
+        rows = {row["model"]: row for row in csv.DictReader(file)}
+    expected = plan.evidence(SPLIT).methods["gns"].at("vorticity_mae", 15)
+    assert float(rows["GNS"]["MAE ours mean"]) == pytest.approx(expected, rel=5e-3)
+    assert rows["GNS"]["MAE thesis"] == "0.009757"
+    assert float(rows["SuperGAT"]["MAE ours mean"]) == 0.0
+
+
+def test_unknown_names_are_answered_with_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:
+    """A misspelt item, split, size or seed ends with exit code 2."""
+    for arguments, word in (
+        (["--only", "table_54"], "table_5_4"),
+        (["--split", "cavty"], "cavity"),
+        (["--size", "midi"], "mini"),
+        (["--seeds", "a"], "0,1"),
+    ):
+        assert main(arguments) == 2
+        assert word in capsys.readouterr().err
+    assert main(["--list", "--split", "fluid"]) == 0
+    assert "table_4_8" in capsys.readouterr().out
+
+
+def test_a_run_is_made_once(
+    plan: Plan, cavity: ScoreBench, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Train, predict and score what is missing; what is there keeps its time of writing."""
+    pytest.importorskip("torch")
+    folder = tmp_path / "runs" / SPLIT / SIZE / "supergat-0"
+    places = ["--root", str(plan.root), "--runs", str(tmp_path / "runs"), "--size", SIZE, "--device", "cpu"]
+    small = ["--set", "training.steps=2", "--set", "model.layers=1", "--threads", "1", "--only", "fig_5_10"]
+
+    def made(*missing: str) -> dict[str, int]:
+        for name in missing:
+            (folder / name).unlink()
+        assert main([*places, *small], registry=cavity.registry) == 0
+        names = ("weights.pt", "training.json", "predictions.nc", "scores.nc")
+        return {name: (folder / name).stat().st_mtime_ns for name in names}
+
+    first = made()
+    assert made() == first
+    again = made("scores.nc")
+    assert {n for n in first if first[n] != again[n]} == {"scores.nc"}
+    again = made("scores.nc", "predictions.nc")
+    assert {n for n in first if first[n] != again[n]} == {"scores.nc", "predictions.nc"}
+    assert "supergat-0" in capsys.readouterr().err
+
+
+def test_what_fails_is_said_and_the_rest_is_made(
+    plan: Plan, cavity: ScoreBench, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Without the data of another split its tables fail with exit code 4; others are written."""
+    code = main(options(plan, "--no-training", "--only", "table_5_1,table_5_3"), registry=cavity.registry)
+    assert code == 4
+    assert "table_5_1" in capsys.readouterr().err
+    assert (plan.output / "table_5_3.md").is_file()
+
+
+@pytest.mark.slow
+def test_everything_is_made_at_tiny(tmp_path: Path, unmeasured: Registry) -> None:
+    """One command makes every table and figure of a size from nothing but data."""
+    root = tmp_path / "data"
+    for split in EXPECTED:
+        generate(split, SIZE, root=root, workers=2, registry=unmeasured)
+    arguments = ["--size", SIZE, "--root", str(root), "--runs", str(tmp_path / "runs"), "--device", "cpu"]
+    small = ["--set", "training.steps=2", "--threads", "1"]
+    assert main([*arguments, *small], registry=unmeasured) == 0
+    folder = tmp_path / "runs" / "reproduce" / SIZE
+    for name in ITEMS:
+        assert "no run" not in (folder / f"{name}.md").read_text()
+    assert "| - |" not in (folder / "table_5_4.md").read_text().split("SciPy")[1]
