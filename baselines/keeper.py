@@ -16,6 +16,7 @@ from lagbench.progress import Meter
 from .batch import Batch
 from .checkpoint import Checkpoint, rounded_weights, save
 from .ledger import Ledger
+from .machine import return_memory
 from .module import TOTAL, TrainingModule
 from .run_folder import RunFolder
 from .validation import validate
@@ -75,6 +76,7 @@ class Keeper(Callback):
         last = step >= steps
         if last or step % recipe.log_every == 0 or step == 1:
             self._log(trainer, trained)
+            return_memory()
         self.meter.count(1, scenarios=1)
         every = max(1, steps // 10) if recipe.validate_every is None else recipe.validate_every
         if self.validation is not None and every and (last or step % every == 0):

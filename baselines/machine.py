@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,11 +15,13 @@ import torch
 from lagbench.errors import UsageError, WorkFailedError
 
 __all__ = [
+    "bound_memory",
     "chosen_device",
     "hardware",
     "is_helper",
     "memory_errors_told",
     "multiplies_bfloat16",
+    "return_memory",
     "threads_used",
 ]
 
@@ -52,6 +55,22 @@ def threads_used(count: int | None) -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+def bound_memory() -> None:
+    """Keep memory flat where every step has shapes of its own, as graphs do.
+
+    oneDNN keeps the kernels of 1024 shapes unless told otherwise before its first: hundreds of
+    megabytes of kernels that no later step will use. What the user set stays.
+    """
+    os.environ.setdefault("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "64")
+
+
+def return_memory() -> None:
+    """Give freed memory back to the system: blocks of ever new sizes leave holes behind."""
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)
 
 
 @contextmanager

@@ -27,7 +27,7 @@ from .batch import Batch
 from .checkpoint import Checkpoint, check_data, load, restore
 from .facts import Facts
 from .job import parameter_count
-from .machine import chosen_device, hardware, memory_errors_told, threads_used
+from .machine import bound_memory, chosen_device, hardware, memory_errors_told, threads_used
 from .radius_graph import radius_graph
 from .rollout import Rollout, roll_out
 from .windows import scenario_batch, scenario_paths
@@ -107,6 +107,7 @@ def predict(
     known = rooted(home, registry)
     facts = check_data(found, root=home, registry=known, where=str(checkpoint))
     machine = chosen_device(device)
+    bound_memory()
     paths = _test_files(facts, home, known)
     side = min(batch or (1 if machine == "cpu" else len(paths)), len(paths))
     with threads_used(threads), memory_errors_told("lower --batch"):

@@ -24,7 +24,7 @@ from .checkpoint import Checkpoint
 from .facts import Facts, facts_of
 from .job import Job, parameter_count
 from .ledger import Ledger
-from .machine import chosen_device, is_helper, threads_used
+from .machine import bound_memory, chosen_device, is_helper, threads_used
 from .recipe import recipe_for
 from .run_folder import RunFolder, default_folder
 
@@ -142,6 +142,7 @@ def train(
         workers=workers,
         meter=Meter(progress),
     )
+    bound_memory()
     with generators_kept(), threads_used(threads):
         reseed(seed_of(plan.training.seed))
         model = entry.model.build(plan.model, facts)

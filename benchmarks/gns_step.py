@@ -29,6 +29,8 @@ from lagbench.baselines.network import EncodeProcessDecode
 from lagbench.baselines.radius_graph import radius_graph
 
 NODE_FEATURES, EDGE_FEATURES = 30, 3
+RADIUS = 1.72
+"""Connectivity radius in cells of the lattice."""
 
 
 def plain(self: EdgeMLP, edge: Tensor, node: Tensor, edge_index: Tensor) -> Tensor:
@@ -50,14 +52,12 @@ def conventional(given: argparse.Namespace) -> None:
 
 
 def particles(count: int, windows: int) -> Tensor:
-    """Return a graph with about 8 neighbours: a full box, of side 0.875, on a shaken lattice."""
+    """Return a graph with about 8 neighbours: a box full of particles, one in each cell of a lattice."""
     side = math.ceil(math.sqrt(count))
     lattice = torch.cartesian_prod(torch.arange(side), torch.arange(side))[:count]
     source = torch.Generator().manual_seed(0)
-    shaken = lattice.repeat(windows, 1) + torch.rand(count * windows, 2, generator=source)
-    spacing = 0.875 / side
-    sample = torch.arange(windows).repeat_interleave(count)
-    return radius_graph(shaken * spacing, 0.015 * math.sqrt(8192 / count), sample)
+    position = lattice.repeat(windows, 1) + torch.rand(count * windows, 2, generator=source)
+    return radius_graph(position, RADIUS, torch.arange(windows).repeat_interleave(count))
 
 
 def one_step(given: argparse.Namespace) -> tuple[Callable[[], None], dict[str, int]]:

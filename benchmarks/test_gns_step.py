@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +46,7 @@ def measure(*options: str) -> Found:
     return found
 
 
-def best_of(benchmark: BenchmarkFixture, sides: dict[str, tuple[str, ...]]) -> dict[str, Found]:
+def best_of(benchmark: BenchmarkFixture, sides: Mapping[str, tuple[str, ...]]) -> dict[str, Found]:
     """Run the sides in turns and keep each one's fastest step and smallest peak."""
     best: dict[str, Found] = {}
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from score_bench import Floats, Predict, ScoreBench
 
-from lagbench.baselines.reproduce.evidence import Method, Seeded
+from lagbench.baselines.reproduce.method import Method, Seeded
 from lagbench.metrics import METRICS, Score
 
 SPLIT, SIZE = "cavity", "tiny"

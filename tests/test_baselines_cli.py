@@ -20,15 +20,14 @@ from lagbench.baselines.catalogue import names
 from lagbench.baselines.checkpoint import load
 from lagbench.cli.app import app
 from lagbench.generation import GenerationResult
+from lagbench.submission import validate
 
 Command = Callable[..., Result]
 
-SMALL = {
-    "mlp": "model.widths=[8]",
-    "lstm": "model.width=8",
-    "lstm-mlp": "model.width=8",
-}
-"""Settings that make a smoke test quick where the recipe's model is large."""
+FRAME_MODELS = ("mlp", "lstm", "lstm-mlp", "var", "var-stable")
+"""Models that make every position anew, where the others move particles."""
+
+TINY = ("--split", "curl-noise", "--size", "tiny", "--threads", "1")
 
 
 @pytest.fixture
@@ -47,9 +46,6 @@ def lagbench(
     return call
 
 
-TINY = ("--split", "curl-noise", "--size", "tiny", "--threads", "1")
-
-
 @pytest.mark.parametrize("baseline", names())
 def test_every_baseline_trains_predicts_and_scores(lagbench: Command, baseline: str) -> None:
     """Three commands lead from a baseline's name to its scores."""
@@ -62,8 +58,11 @@ def test_every_baseline_trains_predicts_and_scores(lagbench: Command, baseline: 
     assert predicted.exit_code == 0, predicted.output
     assert json.loads(predicted.stdout)["seconds_per_frame"] > 0
     scored = lagbench("score", "predictions.nc", "--workers", "1", "--json")
-    assert scored.exit_code == 0, scored.output
-    assert "position_rmse" in scored.stdout
+    if scored.exit_code:  # two steps do not teach where particles are, which the check "start" sees
+        assert baseline in FRAME_MODELS
+        assert {finding.check for finding in validate("predictions.nc").errors} == {"start"}
+    else:
+        assert "position_rmse" in json.loads(scored.stdout)["submission"]
 
 
 def test_words_for_people(lagbench: Command) -> None:
@@ -72,10 +71,11 @@ def test_words_for_people(lagbench: Command) -> None:
         "train", "curl-noise", "--size", "tiny", "--baseline", "gns", "--set", "training.steps=1"
     )
     assert "next: lagbench predict runs/curl-noise/tiny/gns-0/weights.pt" in trained.stdout
-    predicted = lagbench("predict", "runs/curl-noise/tiny/gns-0/weights.pt", "--no-bench")
+    predicted = lagbench("predict", "runs/curl-noise/tiny/gns-0/weights.pt", "--threads", "1", "--no-bench")
     assert "without the neighbour search" in predicted.stdout
     assert "next: lagbench score predictions.nc" in predicted.stdout
-    assert lagbench("predict", "runs/curl-noise/tiny/gns-0/checkpoint.pt", "--no-bench", "-q").stdout == ""
+    silent = ("--no-bench", "--quiet", "--threads", "1")
+    assert lagbench("predict", "runs/curl-noise/tiny/gns-0/checkpoint.pt", *silent).stdout == ""
 
 
 def test_the_speed_up_needs_the_solver(lagbench: Command, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -85,7 +85,7 @@ def test_the_speed_up_needs_the_solver(lagbench: Command, monkeypatch: pytest.Mo
     monkeypatch.setattr(
         importlib.util, "find_spec", lambda name, *rest: None if name == "taichi" else find(name, *rest)
     )
-    predicted = lagbench("predict", "runs/curl-noise/tiny/gns-0/weights.pt")
+    predicted = lagbench("predict", "runs/curl-noise/tiny/gns-0/weights.pt", "--threads", "1")
     assert predicted.exit_code == 0
     assert "no speed-up" in predicted.stderr
     assert "lagbench[generate]" in predicted.stderr

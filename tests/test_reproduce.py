@@ -95,6 +95,14 @@ def test_scores_of_other_data_are_left_out(plan: Plan, monkeypatch: pytest.Monke
     assert len(found.stale) == len(NOISE)
 
 
+def test_runs_of_another_recipe_are_a_variant(runs: Path, cavity: ScoreBench, tmp_path: Path) -> None:
+    """What lies in tiny-short/ is gns-short beside the others, and gns where that recipe is asked for."""
+    shutil.copytree(runs / SPLIT / SIZE / "gns-0", tmp_path / SPLIT / f"{SIZE}-short" / "gns-0")
+    for recipe, name in ((None, "gns-short"), ("short", "gns"), ("long", None)):
+        sources = Sources(board=None, runs=tmp_path, recipe=recipe, registry=cavity.registry)
+        assert list(Evidence(sources, SPLIT, SIZE).methods) == ([name] if name else [])
+
+
 @pytest.fixture
 def sources(plan: Plan, tmp_path: Path) -> Sources:
     """Runs alone, nothing committed."""

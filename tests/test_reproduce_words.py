@@ -12,9 +12,9 @@ import pytest
 from reproduce_bench import a_method, a_score
 
 from lagbench.baselines.reproduce import statements, thesis, wording
-from lagbench.baselines.reproduce.evidence import Method, Seeded
 from lagbench.baselines.reproduce.interpolation import cubic_vorticity, errors
 from lagbench.baselines.reproduce.learning_curves import loss_over_steps, smoothed
+from lagbench.baselines.reproduce.method import Method, Seeded
 from lagbench.baselines.reproduce.scenes import stand_in
 from lagbench.baselines.reproduce.table_4_8 import rollout_table
 from lagbench.metrics import METRICS, Score

@@ -10,126 +10,26 @@ from __future__ import annotations
 
 import json
 import re
-import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from lagbench.errors import UnreadableFileError
 from lagbench.floors import FLOORS
-from lagbench.metrics import Score
-from lagbench.metrics.reductions import mean
 from lagbench.registry import Registry, Size, load
 from lagbench.score_file import NETCDF_NAME, read_statistics
 from lagbench.yamlfile import read_yaml
 
-__all__ = ["Cost", "Evidence", "Method", "Seeded", "Sources", "read_json"]
+from .method import Cost, Method, Seeded
 
-Floats = NDArray[np.float64]
+__all__ = ["Evidence", "Sources", "read_json"]
 
 BOARD = Path("leaderboard")
 WEIGHTS = Path("baselines/weights")
 RUN = re.compile(r"([a-z0-9]+(?:-[a-z0-9]+)*?)-(\d+)")
 RECORD_NAME = "training.json"
 COST_NAME = "predictions.json"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Cost:
-    """What a predicted frame costs.
-
-    Attributes:
-        seconds_per_frame: of the model [s].
-        device: where it ran.
-        solver_seconds_per_frame: of the solver on the same machine [s]; None where not measured.
-    """
-
-    seconds_per_frame: float
-    device: str
-    solver_seconds_per_frame: float | None = None
-
-    @property
-    def speed_up(self) -> float | None:
-        """Solver time over model time; None where the solver was not measured."""
-        solver = self.solver_seconds_per_frame
-        return None if solver is None else solver / self.seconds_per_frame
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Seeded:
-    """One training of a model.
-
-    Attributes:
-        seed: its seed; None for what has none.
-        scores: scores by metric.
-        record: what training.json says; empty where it is not there.
-        path: file of the scores.
-    """
-
-    seed: int | None
-    scores: Mapping[str, Score]
-    record: Mapping[str, Any]
-    path: Path
-
-    @property
-    def cpu_hours(self) -> float | None:
-        """Processor time of the training [h]."""
-        seconds = self.record.get("cpu_seconds")
-        return None if seconds is None else float(seconds) / 3600.0
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Method:
-    """A model with all its seeds.
-
-    Attributes:
-        name: as in ``gns`` or ``gns-novorticity``.
-        seeds: one entry per training.
-        cost: of a predicted frame; None where it was not measured.
-        parameters: trained numbers; None where unknown.
-    """
-
-    name: str
-    seeds: tuple[Seeded, ...]
-    cost: Cost | None = None
-    parameters: int | None = None
-
-    @cached_property
-    def scores(self) -> Mapping[str, Score]:
-        """Scores by metric: the mean over the seeds that have a value, per scenario and frame."""
-        common = [n for n in self.seeds[0].scores if all(n in held.scores for held in self.seeds)]
-        return {name: _joined([held.scores[name] for held in self.seeds]) for name in common}
-
-    def spread(self, metric: str) -> float:
-        """Return the sample deviation over seeds of the mean over scenarios; NaN for one seed."""
-        means = [held.scores[metric].mean for held in self.seeds]
-        return float(np.std(means, ddof=1)) if len(means) > 1 else float("nan")
-
-    def at(self, metric: str, frame: int, scenario: int | None = None) -> float:
-        """Return a metric at an absolute frame, of one scenario or in the mean over all."""
-        score = self.scores[metric]
-        values = score.at(frame)
-        return mean(values) if scenario is None else float(values[score.scenarios.index(scenario)])
-
-    def frozen_at(self, metric: str, frame: int) -> Score:
-        """Return a metric's score with its values at one frame in place of those over the horizon."""
-        return replace(self.scores[metric], values=self.scores[metric].at(frame))
-
-
-def _joined(scores: Sequence[Score]) -> Score:
-    if len(scores) == 1:
-        return scores[0]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # undefined for all seeds: NaN
-        frames: Floats = np.nanmean([score.per_frame for score in scores], axis=0)
-        values: Floats = np.nanmean([score.values for score in scores], axis=0)
-    undefined = tuple(map(sum, zip(*(score.undefined for score in scores), strict=True)))
-    return replace(scores[0], per_frame=frames, values=values, undefined=undefined)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,12 +40,14 @@ class Sources:
         board: the leaderboard's folder; None to use runs alone.
         weights: folder of committed weights and what their trainings recorded.
         runs: folder of runs; None to use committed files alone.
+        recipe: variant of the recipes whose runs to read; None for the size's own.
         registry: where splits are described; ours when None.
     """
 
     board: Path | None = BOARD
     weights: Path = WEIGHTS
     runs: Path | None = None
+    recipe: str | None = None
     registry: Registry | None = None
 
     def size(self, split: str, size: str) -> Size:
@@ -153,15 +55,23 @@ class Sources:
         return (self.registry or load()).size(split, size)
 
     def run_folders(self, split: str, size: str) -> Iterator[tuple[str, int, Path]]:
-        """Yield name, seed and folder of the runs of a size, and then those of its variants."""
+        """Yield name, seed and folder of the runs of a size.
+
+        Without a recipe also those of other recipes, ``<size>-<recipe>/``, as variants.
+        """
         if self.runs is None:
             return
-        homes = [self.runs / split / size, *sorted((self.runs / split).glob(f"{size}-*"))]
-        for home in homes:
+        homes = {f"-{self.recipe}" if self.recipe else "": self.runs / split / self._home(size)}
+        if self.recipe is None:
+            homes |= {path.name[len(size) :]: path for path in sorted((self.runs / split).glob(f"{size}-*"))}
+        for recipe, home in homes.items():
             for folder in sorted(home.glob("*-*")):
                 found = RUN.fullmatch(folder.name)
                 if found:
-                    yield found[1], int(found[2]), folder
+                    yield found[1] + (recipe if self.recipe is None else ""), int(found[2]), folder
+
+    def _home(self, size: str) -> str:
+        return f"{size}-{self.recipe}" if self.recipe else size
 
 
 class Evidence:

@@ -73,7 +73,7 @@ class Plan:
     def evidence(self, split: str) -> Evidence:
         """Return scores, costs and records of a split's runs; read once, after they are made."""
         if split not in self._evidence:
-            sources = Sources(board=None, runs=self.runs, registry=self.described)
+            sources = Sources(board=None, runs=self.runs, recipe=self.recipe, registry=self.described)
             self._evidence[split] = Evidence(sources, split, self.size)
         return self._evidence[split]
 

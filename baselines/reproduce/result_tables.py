@@ -10,7 +10,8 @@ from lagbench.markdown import table
 from lagbench.metrics import Direction, Metric
 from lagbench.score_tables import ARROWS
 
-from .evidence import Evidence, Method
+from .evidence import Evidence
+from .method import Method
 from .roster import ROSTER, label
 from .scenes import case_id
 from .spending import budget, hardware

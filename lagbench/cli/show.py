@@ -21,9 +21,10 @@ def list_splits(root: RootOption = None, as_json: JsonFlag = False) -> None:
     from lagbench.layout import resolve_root
     from lagbench.locating import rooted
     from lagbench.overview import overview
+    from lagbench.registry import load
 
     folder = resolve_root(root)
-    registry = rooted(folder)
+    registry = rooted(folder, load())
     found = [
         overview(registry.size(name, size), folder)
         for name in (*registry.splits, *registry.local_names())
