@@ -44,7 +44,7 @@ def plain(self: EdgeMLP, edge: Tensor, node: Tensor, edge_index: Tensor) -> Tens
 def conventional(given: argparse.Namespace) -> None:
     """Put the conventional parts that were asked for in place of ours."""
     if given.edge_layer == "plain":
-        EdgeMLP.forward = plain  # type: ignore[method-assign]
+        EdgeMLP.forward = plain
     if given.products == "torch":
         dense._fast = lambda x, weight: False
     if given.hidden == "kept":
@@ -57,7 +57,9 @@ def particles(count: int, windows: int) -> Tensor:
     lattice = torch.cartesian_prod(torch.arange(side), torch.arange(side))[:count]
     source = torch.Generator().manual_seed(0)
     position = lattice.repeat(windows, 1) + torch.rand(count * windows, 2, generator=source)
-    return radius_graph(position, RADIUS, torch.arange(windows).repeat_interleave(count))
+    sample = torch.arange(windows).repeat_interleave(count)
+    edge_index: Tensor = radius_graph(position, RADIUS, sample)
+    return edge_index
 
 
 def one_step(given: argparse.Namespace) -> tuple[Callable[[], None], dict[str, int]]:

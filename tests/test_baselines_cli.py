@@ -62,7 +62,7 @@ def test_every_baseline_trains_predicts_and_scores(lagbench: Command, baseline: 
         assert baseline in FRAME_MODELS
         assert {finding.check for finding in validate("predictions.nc").errors} == {"start"}
     else:
-        assert "position_rmse" in json.loads(scored.stdout)["submission"]
+        assert "position_rmse" in json.loads(scored.stdout)["rows"]["submission"]
 
 
 def test_words_for_people(lagbench: Command) -> None:

@@ -194,3 +194,10 @@ def test_broken_packages_only_warn(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "mlp" in found
     with pytest.raises(UsageError, match="cannot be loaded"):
         find("broken")
+
+
+def test_the_page_of_the_baselines_is_complete() -> None:
+    """docs/baselines.md names every baseline and every option of a training."""
+    page = (Path(__file__).parents[1] / "docs/baselines.md").read_text()
+    for word in (*names(), *TrainingOptions.model_fields):
+        assert f"`{word}`" in page, word

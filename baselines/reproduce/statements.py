@@ -76,8 +76,8 @@ def _first_of_six(models: Mapping[str, Method], metric: str) -> Iterator[str]:
     complete = "" if len(six) == len(OPERATORS) else f" (of {len(OPERATORS)}; the others are missing)"
     answer = "Yes in the mean" if order[0] == OURS else "No"
     yield (
-        f"**Does SuperGAT come first (Table 5.4: on the cavity it does)?** {answer}: by `{metric}` over the horizon it is"
-        f" {ordinal(order.index(OURS) + 1)} of {len(six)} operators{complete}."
+        f"**Does SuperGAT come first (Table 5.4: on the cavity it does)?** {answer}: by `{metric}` over"
+        f" the horizon it is {ordinal(order.index(OURS) + 1)} of {len(six)} operators{complete}."
         f" From best to worst: {listed(f'{label(n)} {number(six[n].mean)}' for n in order)}."
     )
     rival = order[1] if order[0] == OURS else order[0]
