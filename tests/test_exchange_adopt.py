@@ -18,8 +18,8 @@ from lagbench.checksums import dataset_hash, subset_hash
 from lagbench.cli.app import app
 from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError
 from lagbench.exchange import adopt
-from lagbench.exchange.description import Measure, estimate_spacing
 from lagbench.exchange.local_split import LocalSplit
+from lagbench.exchange.measure import Measure, estimate_spacing
 from lagbench.layout import ScenarioKey, scenario_path
 from lagbench.locating import locate
 from lagbench.scenario_file import check_scenario, read_scenario

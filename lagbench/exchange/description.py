@@ -6,27 +6,21 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TypedDict
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any, TypedDict
 
 from lagbench.errors import UsageError
 from lagbench.locating import is_name
 from lagbench.registry import NO_GENERATOR
 from lagbench.scenario_ids import spell_ids
 
-__all__ = ["Box", "Description", "Measure", "Wishes", "estimate_spacing", "rate_of", "split_yaml"]
+from .measure import Box, Measure
 
-Box = tuple[tuple[float, float], tuple[float, float]]
+__all__ = ["Description", "Wishes", "rate_of", "split_yaml"]
 
 SIZE = "full"
 """Size of every local split."""
 
 VERSION = "1.0.0"
-WIDE = 3.0
-"""Radii within which neighbours are counted to estimate the spacing."""
-
 PER_CELL = 2.5
 """Spacings of particles across a cell of the score grid where the user gives none; the splits of
 lagbench have 1.8 to 2.6."""
@@ -42,54 +36,6 @@ _UNITS: Mapping[str, tuple[str, str]] = {
     "source_x": ("length of the source", "x in the source of the lower left corner"),
     "source_y": ("length of the source", "y in the source of the lower left corner"),
 }
-
-
-@dataclass(frozen=True, kw_only=True)
-class Measure:
-    """How lengths of the source become lengths of the unit box: ``(x - corner) / scale``.
-
-    A scale that is a power of two, with the corner 0, loses no bit.
-    """
-
-    scale: float = 1.0
-    corner: tuple[float, float] = (0.0, 0.0)
-
-    @classmethod
-    def fitting(cls, bounds: Box) -> Measure:
-        """Return the measure by which a box fits into the unit box.
-
-        The scale is the least power of two that holds it; the corner stays 0 where that is enough.
-        """
-        low, high = np.array(bounds, dtype=np.float64).T
-        corner = np.where((low >= 0.0) & (high <= _power(float(high.max()))), 0.0, low)
-        corner = corner if not corner.any() else low
-        scale = _power(float((high - corner).max()))
-        return cls(scale=scale, corner=(float(corner[0]), float(corner[1])))
-
-    @property
-    def is_plain(self) -> bool:
-        """Whether nothing changes."""
-        return self.scale == 1.0 and not any(self.corner)
-
-    def place(self, position: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Return positions in the unit box, float32."""
-        if self.is_plain:
-            return position.astype(np.float32, copy=False)
-        moved = (position.astype(np.float64) - self.corner) / self.scale
-        return moved.astype(np.float32)
-
-    def box(self, bounds: Box) -> Box:
-        """Return a box of the source in the unit box."""
-        (left, right), (bottom, top) = (
-            tuple((value - corner) / self.scale for value in pair)
-            for pair, corner in zip(bounds, self.corner, strict=True)
-        )
-        return (left, right), (bottom, top)
-
-
-def _power(length: float) -> float:
-    """Return the least power of two that is not below a length, at least 1."""
-    return 2.0 ** max(0, math.ceil(math.log2(length))) if length > 1.0 else 1.0
 
 
 class Wishes(TypedDict, total=False):
@@ -187,24 +133,6 @@ class Description:
             object.__setattr__(self, "measure", Measure.fitting(self.bounds))
 
 
-def estimate_spacing(position: NDArray[np.floating], radius: float) -> float:
-    """Return the distance of neighbouring particles ``sqrt(area / particles)``.
-
-    The density deep inside the material is that within three radii of a particle, where the
-    upper quartile over particles leaves surfaces out.
-
-    Args:
-        position: one frame, shape [particle, 2].
-        radius: connectivity radius, same unit.
-    """
-    from scipy.spatial import cKDTree
-
-    points = position.astype(np.float64)
-    reach = WIDE * radius
-    counts = cKDTree(points).query_ball_point(points, reach, return_length=True)
-    return math.sqrt(math.pi * reach**2 / float(np.quantile(counts, 0.75)))
-
-
 def split_yaml(
     about: Description,
     *,
@@ -229,25 +157,8 @@ def split_yaml(
     Raises:
         UsageError: test scenarios are too short for the task.
     """
-    shortest = min(frames[i] for i in subsets["test"])
-    horizon = about.horizon or shortest - about.input_frames
-    last = about.input_frames + horizon - 1
-    if horizon < 1 or last >= shortest:
-        raise UsageError(
-            "a test scenario is too short for the task",
-            where="--input-frames and --horizon",
-            expected=f"together at most {shortest}",
-            got=f"{about.input_frames} and {horizon}",
-        )
-    cells = about.cells or min(4096, max(4, round(1.0 / (PER_CELL * spacing))))
-    interest = (last,) if about.frames_of_interest is None else tuple(about.frames_of_interest)
-    task = {
-        "input_frames": about.input_frames,
-        "horizon": horizon,
-        "frames_of_interest": list(interest),
-        "score_grid": {"cells": cells, "placement": "cell_centres" if about.full_box else "nodes"},
-        "radius": about.radius / about.measure.scale,
-    }
+    task = _task(about, shortest=min(frames[i] for i in subsets["test"]), spacing=spacing)
+    cells = task["score_grid"]["cells"]
     values: dict[str, object] = {
         "particles": particles,
         "grid": cells,
@@ -281,6 +192,28 @@ def split_yaml(
         "sizes": {SIZE: size},
     }
     return {"format": 1, "splits": {about.name: split}, "measured": {about.name: {SIZE: dict(measured)}}}
+
+
+def _task(about: Description, *, shortest: int, spacing: float) -> dict[str, Any]:
+    """Return the task, as far as the shortest test scenario allows one."""
+    horizon = about.horizon or shortest - about.input_frames
+    last = about.input_frames + horizon - 1
+    if horizon < 1 or last >= shortest:
+        raise UsageError(
+            "a test scenario is too short for the task",
+            where="--input-frames and --horizon",
+            expected=f"together at most {shortest}",
+            got=f"{about.input_frames} and {horizon}",
+        )
+    cells = about.cells or min(4096, max(4, round(1.0 / (PER_CELL * spacing))))
+    interest = (last,) if about.frames_of_interest is None else tuple(about.frames_of_interest)
+    return {
+        "input_frames": about.input_frames,
+        "horizon": horizon,
+        "frames_of_interest": list(interest),
+        "score_grid": {"cells": cells, "placement": "cell_centres" if about.full_box else "nodes"},
+        "radius": about.radius / about.measure.scale,
+    }
 
 
 def rate_of(frame_interval: float) -> float:

@@ -8,37 +8,26 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-
-import numpy as np
-import yaml
-from numpy.typing import NDArray
 
 from lagbench.checksums import HASHED_SUBSETS
 from lagbench.errors import DataError, UsageError, WorkFailedError
-from lagbench.format import ScenarioWriter
-from lagbench.identity import environment_of
-from lagbench.layout import ScenarioKey, scenario_path
 from lagbench.locating import DESCRIPTION
-from lagbench.manifest import FileEntry, Manifest, describe_file, merge, write_manifest
+from lagbench.manifest import Manifest
 from lagbench.progress import Meter, Progress
-from lagbench.registry import NO_GENERATOR, load
-from lagbench.scenario_ids import MAX_ID
-from lagbench.statistics import file_statistics
+from lagbench.registry import load
 
-from .description import SIZE, VERSION, Box, Description, estimate_spacing, rate_of, split_yaml
+from .building import Building
+from .description import SIZE, Description
 from .trajectory import Trajectory
 
 __all__ = ["LocalSplit", "Subsets", "make_local_split", "output_name"]
 
 Subsets = Mapping[str, Iterable[Trajectory]]
 """Trajectories of train, valid and test, in order."""
-
-DEVICE = "cpu"
-HEAD = '# A local split of lagbench, written by `lagbench {}`; its hashes stand under "measured".\n'
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,143 +61,6 @@ class LocalSplit:
     bytes: int
     dataset_sha256: str
     notes: tuple[str, ...] = ()
-
-
-@dataclass
-class _Building:
-    """A local split on the way: what was written, and the box that its particles need."""
-
-    about: Description
-    root: Path
-    spacing: float = 0.0
-    entries: list[FileEntry] = field(default_factory=list)
-    low: NDArray[np.float64] = field(default_factory=lambda: np.full(2, np.inf))
-    high: NDArray[np.float64] = field(default_factory=lambda: np.full(2, -np.inf))
-
-    def add(self, subset: str, trajectory: Trajectory) -> None:
-        """Write the next scenario."""
-        scenario = len(self.entries)
-        if scenario > MAX_ID:
-            raise DataError("too many trajectories", where=trajectory.name, expected=f"at most {MAX_ID + 1}")
-        about = self.about
-        if not self.spacing:
-            first = trajectory.first()
-            own = about.spacing or estimate_spacing(np.asarray(first), about.radius)
-            self.spacing = own / about.measure.scale
-        key = ScenarioKey(split=about.name, size=SIZE, version=VERSION, scenario=scenario, subset=subset)
-        scale = about.measure.scale
-        walls = None if trajectory.wall_velocity is None else np.asarray(trajectory.wall_velocity) / scale
-        rate = rate_of(about.frame_interval)
-        with ScenarioWriter(
-            scenario_path(self.root, key),
-            key,
-            particles=trajectory.particles,
-            frames=trajectory.frames,
-            frame_interval=1.0 / rate,
-            material=trajectory.material,
-            particle_mass=about.density * self.spacing**2,
-            wall_velocity=walls,
-            parameters={"frame_rate": rate, "density": about.density, **trajectory.parameters},
-            seed=NO_GENERATOR,
-            device=DEVICE,
-            generator=NO_GENERATOR,
-            licence=about.licence,
-        ) as writer:
-            for position, velocity in self._frames(trajectory, rate):
-                writer.append(position, velocity)
-        self.entries.append(describe_file(self.root, key))
-
-    def _frames(
-        self, trajectory: Trajectory, rate: float
-    ) -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
-        """Yield positions and velocities in the unit box; without own velocities, differences.
-
-        Then ``v(f) = (x(f) - x(f-1)) / interval``, and v(0) = v(1).
-        """
-        before: NDArray[np.float32] | None = None
-        first: NDArray[np.float32] | None = None
-        for number, (raw, own) in enumerate(trajectory.read()):
-            position = self.about.measure.place(raw)
-            self._check(trajectory, number, position)
-            if own is not None:
-                yield position, (own / self.about.measure.scale).astype(np.float32)
-            elif before is None:
-                first = position
-            else:
-                velocity = ((position.astype(np.float64) - before) * rate).astype(np.float32)
-                if first is not None:
-                    yield first, velocity
-                    first = None
-                yield position, velocity
-            before = position
-
-    def _check(self, trajectory: Trajectory, number: int, position: NDArray[np.float32]) -> None:
-        """Refuse positions that are no numbers or lie outside the unit box; note their extent."""
-        where = f"{trajectory.name}, frame {number}"
-        low, high = position.min(axis=0), position.max(axis=0)
-        if not (np.isfinite(low).all() and np.isfinite(high).all()):
-            raise DataError("a position is not finite", where=where)
-        if (low < 0.0).any() or (high > 1.0).any():
-            raise DataError(
-                "particles lie outside the unit box",
-                where=where,
-                expected="[0, 1] x [0, 1]",
-                got=" x ".join(f"[{a:.6g}, {b:.6g}]" for a, b in zip(low, high, strict=True)),
-                fix="fit the box of the data into the unit box: --rescale, and --bounds if none are stated",
-            )
-        self.low, self.high = np.minimum(self.low, low), np.maximum(self.high, high)
-
-    def box(self) -> Box:
-        """Return the stated bounds in the unit box, else the extent of the positions."""
-        if self.about.bounds is not None:
-            return self.about.measure.box(self.about.bounds)
-        (left, bottom), (right, top) = self.low.tolist(), self.high.tolist()
-        return (left, right), (bottom, top)
-
-    def finish(self, command: str) -> Manifest:
-        """Write manifest and description; return the manifest."""
-        about = self.about
-        ids = {name: [e.scenario for e in self.entries if e.subset == name] for name in HASHED_SUBSETS}
-        folder = self.root / about.name
-        train = [self.root / about.name / SIZE / "v1" / e.path for e in self.entries if e.subset == "train"]
-        content = {entry.scenario: entry.content_sha256[:16] for entry in self.entries}
-        manifest = merge(
-            None,
-            self.entries,
-            split=about.name,
-            size=SIZE,
-            version=VERSION,
-            subsets=ids,
-            environment=environment_of(DEVICE),
-            recorded=content,
-            statistics=file_statistics(train),
-        )
-        write_manifest(self.root, manifest)
-        measured: dict[str, object] = {
-            "dataset_sha256": manifest.dataset_sha256,
-            "subset_sha256": manifest.subset_sha256,
-            "scenario_sha256": content,
-            "statistics": {name: list(row) for name, row in manifest.statistics.items()},
-            "twin_floor": [],
-        }
-        text = split_yaml(
-            about,
-            subsets=ids,
-            frames={entry.scenario: entry.frames for entry in self.entries},
-            particles=_particles(self.entries),
-            spacing=self.spacing,
-            bounds=self.box(),
-            measured=measured,
-        )
-        body = yaml.safe_dump(text, sort_keys=False, allow_unicode=True, width=110)
-        (folder / DESCRIPTION).write_text(HEAD.format(command) + body, encoding="utf-8")
-        return manifest
-
-
-def _particles(entries: Sequence[FileEntry]) -> int:
-    """Return how many particles test scenarios have, where all have as many; else the most of any."""
-    test = {entry.particles for entry in entries if entry.subset == "test"}
-    return test.pop() if len(test) == 1 else max(entry.particles for entry in entries)
 
 
 def output_name(output: str | Path) -> str:
@@ -249,7 +101,7 @@ def make_local_split(
         )
     meter = Meter(progress)
     with _scratch(folder) as root:
-        building = _Building(about, root)
+        building = Building(about, root)
         for subset in HASHED_SUBSETS:
             before = len(building.entries)
             meter.begin(f"writing {subset}", total=0, scenarios=0)
