@@ -38,12 +38,18 @@ class _StrictLoader(yaml.CSafeLoader):
 
 
 def _check_structure(text: str) -> None:
-    """Raise on the first alias and on deep nesting, before anything is built."""
+    """Raise on the first alias or tag and on deep nesting, before anything is built."""
     depth = 0
     for event in yaml.parse(text, Loader=yaml.CSafeLoader):
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-        if isinstance(event, yaml.AliasEvent) or depth > MAX_DEPTH:
-            what = "aliases are not allowed" if depth <= MAX_DEPTH else f"nested deeper than {MAX_DEPTH}"
+        what = None
+        if depth > MAX_DEPTH:
+            what = f"nested deeper than {MAX_DEPTH}"
+        elif isinstance(event, yaml.AliasEvent):
+            what = "aliases are not allowed"
+        elif getattr(event, "tag", None) is not None:
+            what = "tags are not allowed"
+        if what is not None:
             message = f"{what} {event.start_mark}"
             raise yaml.YAMLError(message)
 
@@ -71,7 +77,7 @@ def read_yaml(path: Path) -> Any:  # noqa: ANN401
         return yaml.load(text, Loader=_StrictLoader)
     except OSError as error:
         raise UnreadableFileError("cannot read the YAML file", where=str(path), got=error) from error
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError: a date or number that is none
         raise UnreadableFileError(
             "not a plain YAML file",
             where=str(path),

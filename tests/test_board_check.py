@@ -141,6 +141,10 @@ DAMAGE: dict[str, tuple[Callable[[BoardBench], object], set[str]]] = {
         {"folder"},
     ),
     "other files": (lambda b: (b.folder / PLACE / "evil.py").write_text("import os"), {"folder"}),
+    "name that a log would obey": (
+        lambda b: (b.folder / PLACE / "a\n::warning::x.yaml").write_text("a: 1"),
+        {"folder"},
+    ),
     "entry at another depth": (
         lambda b: b.entry("noisy").rename(b.folder / "submissions/noisy.yaml"),
         {"folder", "stray"},

@@ -53,6 +53,8 @@ def hostile(path: Path, kind: str, secret: Path) -> None:
             layout = h5py.VirtualLayout(shape, "u2")
             layout[...] = h5py.VirtualSource(str(secret), "film", shape)
             preview.create_virtual_dataset("film", layout)
+        elif kind == "strings":
+            preview.create_dataset("film", shape, h5py.string_dtype())
         elif kind == "another type":
             preview.create_dataset("film", shape, "f8")
         elif kind == "another shape":
@@ -62,7 +64,7 @@ def hostile(path: Path, kind: str, secret: Path) -> None:
 @pytest.mark.parametrize(
     "kind",
     [
-        *("external link", "soft link", "external storage", "virtual", "bomb", "extra group"),
+        *("external link", "soft link", "external storage", "virtual", "bomb", "extra group", "strings"),
         *("infinite", "another type", "another shape"),
     ],
 )

@@ -29,7 +29,10 @@ def test_plain_values_are_read(tmp_path: Path) -> None:
     [
         (BOMB, "aliases are not allowed"),
         ("a: 1\na: 2\n", "'a' is given twice"),
-        ("a: !!python/object/apply:os.system ['true']\n", "could not determine a constructor"),
+        ("a: !!python/object/apply:os.system ['true']\n", "tags are not allowed"),
+        ("a: !!set {x, y}\n", "tags are not allowed"),
+        ("date: 2026-13-45\n", "month must be in 1..12"),
+        (f"a: {'9' * 5000}\n", "not a plain YAML file"),
         ("? [a, b]\n: 1\n", "cannot be a key"),
         ("a: [1, 2\n", "not a plain YAML file"),
         (b"\xff\xfe\x00", "not a plain YAML file"),

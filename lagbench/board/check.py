@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
-from lagbench.errors import ChecksFailedError
+from lagbench.errors import LagbenchError
 from lagbench.progress import Progress
 from lagbench.registry import Registry, load
 from lagbench.submission import Finding
@@ -148,7 +148,7 @@ def _strays(folder: Folder, named: set[Path]) -> Iterator[Finding]:
 def _page_drift(folder: Folder, registry: Registry) -> Iterator[Finding]:
     try:
         build(folder.path, check=True, registry=registry)
-    except ChecksFailedError as error:
+    except LagbenchError as error:
         yield finding(
             "page",
             error.what,

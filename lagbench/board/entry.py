@@ -89,7 +89,7 @@ InnerPath = Annotated[
 Hash = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
 Version = Annotated[str, StringConstraints(pattern=r"^[1-9]\d{0,5}\.\d{1,6}\.\d{1,6}$")]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
-Seconds = Annotated[float, Field(gt=0, lt=1e9, allow_inf_nan=False)]
+Seconds = Annotated[float, Field(ge=1e-7, lt=1e9, allow_inf_nan=False)]
 Number = Annotated[float, Field(allow_inf_nan=False)]
 
 

@@ -7,6 +7,7 @@ Symbolic links are never followed: one could lead out of the folder.
 from __future__ import annotations
 
 import os
+import re
 import stat
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -20,6 +21,9 @@ PAGE_NAME = "index.html"
 
 ENDINGS = {SUBMISSIONS: ".yaml", SCORES: ".nc"}
 KEPT = ".gitkeep"
+PART = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
+"""What a folder or file may be called: nothing that a terminal or a CI log would obey."""
+
 DEPTH = 4
 """Parts of a path: submissions or scores, split, size, file name."""
 
@@ -101,6 +105,8 @@ class Folder:
         if not stat.S_ISREG((self.path / path).lstat().st_mode):
             return "no regular file"
         ending = ENDINGS.get(path.parts[0])
+        if not all(PART.fullmatch(part) for part in path.parts):
+            return "a name with other characters than letters, digits, '-', '_' and '.'"
         if path.suffix != ending or len(path.parts) != DEPTH:
             return f"not {path.parts[0]}/<split>/<size>/<name>{ending}"
         return None

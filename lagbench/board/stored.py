@@ -41,6 +41,7 @@ MAX_STATISTICS = 500
 
 GROUP = "preview"
 FILTERS = (h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE)
+NUMBERS = (h5py.h5t.INTEGER, h5py.h5t.FLOAT)
 LAYOUTS = (h5py.h5d.COMPACT, h5py.h5d.CONTIGUOUS, h5py.h5d.CHUNKED)
 
 
@@ -112,6 +113,8 @@ def _check_members(file: h5py.File) -> None:
         filters = {plist.get_filter(i)[0] for i in range(plist.get_nfilters())}
         if plist.get_layout() not in LAYOUTS or plist.get_external_count() or not filters.issubset(FILTERS):
             raise ValueError("a variable that does not lie in this file, or is packed in another way")
+        if dataset.id.get_type().get_class() not in NUMBERS:  # strings may share one long piece of heap
+            raise ValueError("a variable that holds no plain numbers")
         total += dataset.id.get_space().get_simple_extent_npoints() * dataset.id.get_type().get_size()
         if plist.get_layout() == h5py.h5d.CHUNKED:
             total += int(np.prod(plist.get_chunk(), dtype=object)) * dataset.id.get_type().get_size()

@@ -39,6 +39,8 @@ def quoted(value: object) -> str:
     >>> quoted("dot" * 50)
     "'dotdotdotdotdotdotdotdotdotdotdotdotdotdotdotdotdotdotdotdotdotdotdotdotdotd..."
     """
+    if isinstance(value, int) and value.bit_length() > 4 * MAX_TEXT:
+        return f"an integer of {value.bit_length()} bits"
     text = ascii(value[: MAX_TEXT + 1] if isinstance(value, (str, bytes)) else value)
     return text if len(text) <= MAX_TEXT else f"{text[: MAX_TEXT - 3]}..."
 

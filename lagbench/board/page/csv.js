@@ -16,8 +16,8 @@ function csvOf(tab, state) {
 
 function csvCell(value) {
   if (typeof value === "number") return Number.isNaN(value) ? "" : String(value);
-  const safe = /^[=+\-@\t\r]/.test(value) ? `'${value}` : value;
-  return /[",\r\n]/.test(safe) ? `"${safe.replaceAll('"', '""')}"` : safe;
+  const safe = value.replace(/(^|[;|\t\r\n])(\s*[=+\-@\uff1d\uff0b\uff0d\uff20\t\r])/g, "$1'$2");
+  return /[",;\r\n]/.test(safe) ? `"${safe.replaceAll('"', '""')}"` : safe;
 }
 
 function saveCsv(tab, state) {
