@@ -28,6 +28,9 @@ __all__ = ["Evidence", "Sources", "read_json"]
 BOARD = Path("leaderboard")
 WEIGHTS = Path("baselines/weights")
 RUN = re.compile(r"([a-z0-9]+(?:-[a-z0-9]+)*?)-(\d+)")
+UNDER_WAY = ("running", "interrupted")
+"""States of a training that is not over."""
+
 RECORD_NAME = "training.json"
 COST_NAME = "predictions.json"
 
