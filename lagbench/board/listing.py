@@ -201,7 +201,8 @@ def _cell(row: Row, column: Column, *, ranks: bool) -> Markup:
 def _notes(tab: Tab) -> Iterator[Markup]:
     yield escaped(
         "Mean over test scenarios and seeds; below it the 95 % bootstrap interval over scenarios."
-        " ↓ lower, ↑ higher, ◎ closer to the perfect value is better; bold is best, and the bluer a cell, the nearer to it."
+        " ↓ lower, ↑ higher, ◎ closer to the perfect value is better;"
+        " bold is best, and the bluer a cell, the nearer to it."
         " † some frames have no value. – not measured or undefined."
     )
     if tab.decided:
