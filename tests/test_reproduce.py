@@ -119,7 +119,7 @@ def test_the_page_tells_what_there_is_and_what_is_missing(sources: Sources) -> N
     assert rows[first + 2 : first + 5] == ["SuperGAT", "GAT", "GNS"]
     assert "0.007715" in page  # SuperGAT's MAE in Table 5.4
     assert "- cavity tiny: 7 trainings, 14 CPU hours" in page
-    assert "- cavity tiny: SuperGAT, link loss, MLP and LSTM + MLP." in page
+    assert "- cavity tiny: SuperGAT with link loss, MLP and LSTM + MLP." in page
     assert "- fluid tiny: all models." in page
     assert "with fewer than 6 scenarios nothing is claimed" in page
     assert page == results.render(sources, ("tiny",))

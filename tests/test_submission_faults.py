@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -18,6 +19,15 @@ from lagbench.submission import CHECKS, ValidationResult
 
 SECONDS = 10.0
 MEBIBYTES = 1000.0
+
+
+def most() -> float:
+    """Memory that no child may exceed [MiB].
+
+    Linux counts what this process held when it started a child as the child's: in a large test run
+    the bound is what this process holds, in a run of this file alone it is MEBIBYTES.
+    """
+    return max(MEBIBYTES, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024 + 1)
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +84,7 @@ def test_a_faulty_file_fails_its_check(bench: Bench, peaks: list[float], name: s
     result = bench.validate(path, isolated=fault.hostile)
     assert cpu_seconds() - started < SECONDS
     assert bool(peaks) >= fault.hostile
-    assert max(peaks, default=0.0) < MEBIBYTES
+    assert max(peaks, default=0.0) < most()
     assert fault.check in {finding.check for finding in result.errors}
     assert result.exit_code == fault.exit_code
     assert fault.says in "\n".join(map(str, result.errors))
@@ -120,7 +130,7 @@ def check_mutation(bench: Bench, peaks: list[float], changes: list[tuple[float, 
     started = cpu_seconds()
     result = bench.validate(path, isolated=True)
     assert cpu_seconds() - started < SECONDS
-    assert max(peaks, default=0.0) < MEBIBYTES
+    assert max(peaks, default=0.0) < most()
     assert "Traceback" not in str(result)
     assert_complete(result)
     assert result.exit_code in (0, 1, 3, 4)

@@ -35,7 +35,7 @@ class Model:
 
 def _changing(name: str) -> Model:
     """Return a frame model that predicts the change per frame instead of the next state."""
-    text = f"{_LABELS[name]}, predicts changes"
+    text = f"{_LABELS[name]} of changes"
     return Model(name=f"{name}-change", baseline=name, label=text, recipe="change")
 
 
@@ -46,12 +46,12 @@ _LABELS = {
     "gns": "GNS",
     "gatv2": "GATv2",
     "transformer": "graph transformer",
-    "supergat-link": "SuperGAT, link loss",
+    "supergat-link": "SuperGAT with link loss",
     "mlp": "MLP",
     "lstm": "LSTM",
     "lstm-mlp": "LSTM + MLP",
     "var": "VAR(1)",
-    "var-stable": "VAR, stable",
+    "var-stable": "stable VAR",
 }
 
 ROSTER: Mapping[str, Model] = MappingProxyType(
@@ -60,7 +60,7 @@ ROSTER: Mapping[str, Model] = MappingProxyType(
         "gns-novorticity": Model(
             name="gns-novorticity",
             baseline="gns",
-            label="GNS, no vorticity loss",
+            label="GNS without vorticity loss",
             settings=("model.loss.vorticity=0",),
         )
     }
