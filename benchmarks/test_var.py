@@ -23,7 +23,7 @@ from lagbench.baselines.var import LaggedRows
 
 TARGET_RATIO = 10.0
 LEAST_RATIO = 2.0
-"""What must hold. Both sides reach the same accuracy by dense LAPACK; ours by half the operations at best."""
+"""What must hold: both sides are dense LAPACK on the same rows."""
 
 DIMENSIONS, FRAMES = 1000, 1344
 ROUNDS = 3
