@@ -32,6 +32,7 @@ NEEDED = (
     "rich",
     "platformdirs",
     "filelock",
+    "fsspec",
 )
 OPTIONAL = {
     "taichi": "generate",
