@@ -5,12 +5,16 @@ import sys
 from collections.abc import Iterator
 from importlib.metadata import EntryPoint
 from pathlib import Path
+from types import ModuleType
 
 import pytest
+from simple_models import install
 
 import lagbench
 from lagbench import plugins, registry
-from lagbench.generation import generate
+from lagbench.baselines.prediction import predict
+from lagbench.baselines.training import train
+from lagbench.generation import GenerationResult, generate
 from lagbench.metrics import METRICS
 
 EXAMPLES = Path(__file__).parent.parent / "docs" / "examples"
@@ -40,13 +44,36 @@ def test_dam_break_is_a_split(dam_break: None, tmp_path: Path) -> None:
     assert (height.isel(frame=-1) < 0.8 * height.isel(frame=0)).all()
 
 
-def test_enstrophy_is_a_metric() -> None:
-    """The module's METRICS is a metric that ours do not have."""
-    spec = importlib.util.spec_from_file_location("enstrophy", EXAMPLES / "enstrophy" / "enstrophy.py")
+def imported(name: str) -> ModuleType:
+    """Return the module of an example."""
+    spec = importlib.util.spec_from_file_location(name, EXAMPLES / name / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    sys.modules["enstrophy"] = module
+    sys.modules[name] = module
     spec.loader.exec_module(module)
+    return module
+
+
+def test_sage_is_a_baseline(
+    monkeypatch: pytest.MonkeyPatch,
+    generated: GenerationResult,
+    unmeasured: registry.Registry,
+    tmp_path: Path,
+) -> None:
+    """Its one class is a graph network that trains with the recipes of the six and predicts."""
+    install(monkeypatch, sage=imported("sage").Sage)
+    options = {"root": generated.root, "registry": unmeasured, "threads": 1}
+    trained = train(
+        "sage", "curl-noise", "tiny", output=tmp_path / "run", settings=["training.steps=2"], **options
+    )
+    predicted = predict(trained.weights, tmp_path / "predictions.nc", **options)
+    assert predicted.method == "GNS + SAGEConv"
+    assert (tmp_path / "predictions.nc").is_file()
+
+
+def test_enstrophy_is_a_metric() -> None:
+    """The module's METRICS is a metric that ours do not have."""
+    module = imported("enstrophy")
     assert module.METRICS.name == "enstrophy_error"
     assert module.METRICS.name not in METRICS
