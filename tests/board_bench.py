@@ -95,7 +95,7 @@ class BoardBench:
             for said, path in zip(entry.score.files, entry.score_paths, strict=True)
         )
         block = entry.score.model_copy(update={"files": files})
-        block = sealed(entry.place, entry.dataset, entry.predictions, block)
+        block = sealed(entry.place, entry.dataset, entry.predictions, entry, block)
         self.entry(method).write_bytes(spell_entry(entry.model_copy(update={"score": block})))
 
     def state(self) -> dict[str, str]:

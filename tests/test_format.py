@@ -104,7 +104,8 @@ def test_independent_hash_agrees(written: tuple[Path, str]) -> None:
         st.one_of(
             st.booleans(),
             st.integers(-(2**63), 2**63 - 1),
-            st.floats(allow_nan=False, allow_infinity=False),
+            # Taichi, once started in this process, makes its thread round subnormals to zero.
+            st.floats(allow_nan=False, allow_infinity=False, allow_subnormal=False),
             st.text(st.characters(codec="utf-8", exclude_characters="\0"), min_size=1),
         ),
         max_size=4,

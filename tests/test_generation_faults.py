@@ -160,12 +160,26 @@ def test_two_generations_at_once(tmp_path: Path, unmeasured: Registry, generated
 # --- interruptions ---------------------------------------------------------------------------
 
 
-def start(root: Path, registry: Path, *options: str) -> subprocess.Popen[str]:
+CALL = "from lagbench.cli import main; main()"
+
+INTERRUPTED = f"""
+import os, signal
+from lagbench import campaign
+write = campaign.write_manifest
+def write_first(*arguments):
+    campaign.write_manifest = write
+    write(*arguments)
+    os.killpg(0, signal.SIGINT)
+campaign.write_manifest = write_first
+{CALL}
+"""
+
+
+def start(root: Path, registry: Path, *options: str, program: str = CALL) -> subprocess.Popen[str]:
     """Start a generation as a process group of its own, as a shell does."""
-    program = [sys.executable, "-c", "from lagbench.cli import main; main()"]
     command = ["generate", "--split", SPLIT, "--size", SIZE, "--root", str(root), *options]
     return subprocess.Popen(
-        [*program, *command],
+        [sys.executable, "-c", program, *command],
         env={**os.environ, "LAGBENCH_REGISTRY": str(registry)},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -198,9 +212,7 @@ def test_control_c_is_resumable(
     tmp_path: Path, unmeasured_path: Path, unmeasured: Registry, generated: GenerationResult
 ) -> None:
     """SIGINT to the whole group after the first file: exit 130, whole files and a manifest that says so."""
-    with start(tmp_path, unmeasured_path, "--workers", "1") as process:
-        wait_for(lambda: list(tmp_path.rglob("manifest.json")), process)
-        os.killpg(process.pid, signal.SIGINT)
+    with start(tmp_path, unmeasured_path, "--workers", "1", program=INTERRUPTED) as process:
         _, errors = process.communicate(timeout=60)
     assert process.returncode == 130
     assert "interrupted" in errors
