@@ -17,11 +17,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from pydantic import ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor, nn
 
 from lagbench.atomic import atomic_path
-from lagbench.errors import DataError, LagbenchError, UnreadableFileError
+from lagbench.errors import DataError, LagbenchError, UnreadableFileError, WorkFailedError
 from lagbench.registry import Registry
 
 from .baseline import Baseline
@@ -56,6 +56,27 @@ class Checkpoint:
     optimizer: Mapping[str, Any] | None = None
 
 
+class _Read(BaseModel):
+    """What a file says of a training, as far as it is read again; the rest passes as it is."""
+
+    model_config = ConfigDict(extra="allow")
+
+
+class _Options(_Read):
+    seed: int = Field(default=0, ge=0, lt=2**63)
+    windows: tuple[str, ...] = ("train",)
+
+
+class _Recipe(_Read):
+    name: str = Field(default="", max_length=200)
+    training: _Options = _Options()
+
+
+class _Training(_Read):
+    step: int = Field(default=0, ge=0)
+    recipe: _Recipe = _Recipe()
+
+
 def save(path: Path, checkpoint: Checkpoint) -> None:
     """Write a checkpoint; it appears whole or not at all.
 
@@ -76,7 +97,7 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
     if checkpoint.optimizer is not None:
         content["optimizer"] = dict(checkpoint.optimizer)
     with atomic_path(path, option="--output") as temporary:
-        torch.save(content, temporary)
+        _write(temporary, content, path)
 
 
 def load(path: str | Path) -> Checkpoint:
@@ -89,9 +110,10 @@ def load(path: str | Path) -> Checkpoint:
     file = Path(path)
     content = _content(file)
     try:
-        if content[KEY] != FORMAT:
+        if type(content[KEY]) is not int or content[KEY] != FORMAT:
             raise _unfit(file, f"format {FORMAT}", f"format {content[KEY]!r}")
         about = json.loads(content["about"])
+        _Training.model_validate(about["training"])
         return Checkpoint(
             baseline=str(about["baseline"]),
             options=dict(about["options"]),
@@ -100,7 +122,7 @@ def load(path: str | Path) -> Checkpoint:
             training=dict(about["training"]),
             optimizer=content.get("optimizer"),
         )
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
         raise _unfit(file, SAFE, f"{type(error).__name__}: {' '.join(str(error).split())[:200]}") from None
 
 
@@ -126,6 +148,10 @@ def restore(checkpoint: Checkpoint, *, where: str = "the checkpoint") -> Baselin
             where=where,
             got=first["msg"],
             fix=f"it is from another version of {checkpoint.baseline}; train anew",
+        ) from None
+    except (KeyError, TypeError, ValueError) as error:
+        raise UnreadableFileError(
+            "no model can be built from it", where=where, got=f"{type(error).__name__}: {error}"
         ) from None
     load_weights(model, checkpoint.weights, where=where)
     return model.eval()
@@ -207,13 +233,32 @@ def _content(file: Path) -> dict[str, Any]:
     return content
 
 
+def _write(path: Path, content: Mapping[str, Any], target: Path) -> None:
+    try:
+        torch.save(content, path)
+    except RuntimeError as error:  # torch's name for whatever the operating system refuses
+        raise WorkFailedError(
+            "cannot write there",
+            where=str(target),
+            got=str(error).split("\n")[0][:200],
+            fix="free disk space, or name a folder that you may write to: --output",
+        ) from error
+
+
 def _tensors(values: object) -> dict[str, Tensor]:
     if not isinstance(values, Mapping):
         raise TypeError("weights are no mapping")
     for name, value in values.items():
-        if not isinstance(name, str) or not isinstance(value, Tensor):
-            raise TypeError(f"weight {name!r} is no tensor")
+        if not isinstance(name, str) or not isinstance(value, Tensor) or not _held(value):
+            raise TypeError(f"weight {name!r} is no tensor of plain numbers that the file holds")
     return dict(values)
+
+
+def _held(value: Tensor) -> bool:
+    """Tell whether a tensor is dense and real, and no larger than the bytes behind it."""
+    if value.layout is not torch.strided or value.is_quantized or value.is_complex() or value.is_meta:
+        return False
+    return value.numel() * value.element_size() <= value.untyped_storage().nbytes()
 
 
 def _unfit(file: Path, expected: str, got: str) -> LagbenchError:

@@ -18,15 +18,14 @@ from .baseline import Baseline
 from .checkpoint import load_weights
 from .job import Job
 from .keeper import Keeper
-from .ledger import Ledger
-from .machine import memory_errors_told, multiplies_bfloat16
+from .ledger import STOPPED_EARLY, Ledger
+from .machine import multiplies_bfloat16
 from .module import TrainingModule
 from .validation import validation_windows
 from .windows import Window, WindowDataset, WindowSampler, collate
 
 __all__ = ["StepBatches", "descend", "quiet"]
 
-SMALLER = "lower --set training.batch=1, then model.latent or model.layers"
 LOGGERS = ("lightning.pytorch", "lightning.fabric", "pytorch_lightning", "lightning_fabric")
 
 
@@ -62,7 +61,7 @@ def descend(job: Job, model: Baseline) -> tuple[Ledger, int]:
     """Train a model; return the ledger and the steps of the whole training.
 
     Raises:
-        WorkFailedError: the loss is not finite, or memory is full.
+        WorkFailedError: the loss is not finite.
         KeyboardInterrupt: interrupted; the state after the last step is stored.
     """
     facts, options = job.facts, job.recipe.training
@@ -78,8 +77,9 @@ def descend(job: Job, model: Baseline) -> tuple[Ledger, int]:
     steps = options.total_steps(len(data), processes=job.processes)
     ledger = job.ledger()
     module = _module(job, model, data, ledger, steps)
-    if ledger.step >= steps:
-        ledger.state = "finished"
+    if ledger.state != STOPPED_EARLY:
+        ledger.state = "finished" if ledger.step >= steps else "running"
+    if ledger.state != "running":
         return ledger, steps
     keeper = Keeper(
         job.folder,
@@ -158,8 +158,7 @@ def _precision(name: str, device: str) -> Literal["32-true", "bf16-mixed"]:
 
 def _fit(trainer: Trainer, module: TrainingModule) -> None:
     try:
-        with memory_errors_told(SMALLER):
-            trainer.fit(module)
+        trainer.fit(module)
     except SystemExit:  # what Lightning makes of a second Ctrl-C
         raise KeyboardInterrupt from None
 

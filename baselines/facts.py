@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
-from pydantic import TypeAdapter
+from pydantic import Field, TypeAdapter
 
 from lagbench.errors import DataError
 from lagbench.layout import dataset_folder
@@ -15,10 +15,16 @@ from lagbench.locating import locate
 from lagbench.manifest import Manifest, read_manifest
 from lagbench.registry import Registry, Size
 from lagbench.scenario_file import read_scenario
+from lagbench.store.bringing import bring
 
 __all__ = ["Facts", "facts_of"]
 
-Pair = tuple[float, float]
+# Checked where facts are read from a file, which may be a stranger's: names are no paths.
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Count = Annotated[int, Field(gt=0)]
+Pair = tuple[Finite, Finite]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,18 +50,18 @@ class Facts:
             [length/frame^2], one (x, y) pair each.
     """
 
-    split: str
-    size: str
+    split: Name
+    size: Name
     version: str
     dataset_sha256: str
-    particles: int
+    particles: Count
     bounds: tuple[Pair, Pair]
-    radius: float
-    input_frames: int
-    horizon: int
-    score_cells: int
+    radius: Positive
+    input_frames: Count
+    horizon: Count
+    score_cells: Count
     score_placement: str
-    frame_interval: float
+    frame_interval: Positive
     moving_walls: bool
     statistics: Mapping[str, Pair]
 
@@ -89,6 +95,7 @@ def facts_of(
         DataError: it is not generated, or train is not complete and nothing is recorded.
     """
     tier, folder, _ = locate(split, size, root=root, registry=registry)
+    bring(tier, folder)
     manifest = read_manifest(folder, tier.split, size, tier.major)
     if manifest is None:
         raise _absent(tier, folder, "the data set is not generated")
@@ -141,5 +148,6 @@ def _moving_walls(size: Size, manifest: Manifest, root: Path) -> bool:
     if not manifest.files:
         raise _absent(size, root, "the data set is empty")
     folder = dataset_folder(root, size.split, size.name, size.major)
+    bring(size, root, [manifest.files[0].scenario])
     with read_scenario(folder / manifest.files[0].path) as file:
         return "wall_velocity" in file.variables

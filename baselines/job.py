@@ -64,10 +64,8 @@ class Job:
         )
 
     def ledger(self) -> Ledger:
-        """Return the ledger that goes on where an earlier run ended."""
-        ledger = Ledger() if self.earlier is None else Ledger.from_json(self.earlier.training)
-        ledger.state = "running"
-        return ledger
+        """Return the ledger that goes on where an earlier run ended, in the state that it ended in."""
+        return Ledger() if self.earlier is None else Ledger.from_json(self.earlier.training)
 
     def checkpoint(self, **changes: Any) -> Checkpoint:  # noqa: ANN401 (its fields)
         """Return a checkpoint with the fields that do not change."""

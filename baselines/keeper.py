@@ -15,7 +15,7 @@ from lagbench.progress import Meter
 
 from .batch import Batch
 from .checkpoint import Checkpoint, rounded_weights, save
-from .ledger import Ledger
+from .ledger import STOPPED_EARLY, Ledger
 from .machine import return_memory
 from .module import TOTAL, TrainingModule
 from .run_folder import RunFolder
@@ -83,7 +83,8 @@ class Keeper(Callback):
             self._validate(trainer, trained)
         stop = trainer.strategy.reduce_boolean_decision(self._interrupted, all=False)
         if stop or trainer.should_stop or last:
-            self.ledger.state = "interrupted" if stop and not last else self.ledger.state
+            over = last or self.ledger.state == STOPPED_EARLY
+            self.ledger.state = "interrupted" if stop and not over else self.ledger.state
             trainer.should_stop = True
         if trainer.should_stop or step % (recipe.checkpoint_every or max(1, steps // 20)) == 0:
             self._store(trainer, trained)
@@ -133,7 +134,7 @@ class Keeper(Callback):
             self._write_weights(module)
         patience = module.recipe.patience
         if patience is not None and self.ledger.since_best() >= patience and module.step < module.steps:
-            self.ledger.state = "stopped early"
+            self.ledger.state = STOPPED_EARLY
             trainer.should_stop = True
 
     def _store(self, trainer: Trainer, module: TrainingModule) -> None:

@@ -10,7 +10,10 @@ from dataclasses import dataclass, field
 from importlib.metadata import version
 from typing import Any, Self
 
-__all__ = ["Ledger", "versions"]
+__all__ = ["STOPPED_EARLY", "Ledger", "versions"]
+
+STOPPED_EARLY = "stopped early"
+"""State of a training whose validations brought nothing new; it is over."""
 
 
 @dataclass

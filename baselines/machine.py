@@ -47,10 +47,15 @@ def is_helper() -> bool:
 
 
 @contextmanager
-def threads_used(count: int | None) -> Iterator[None]:
-    """Use so many threads for a while; one per core by default."""
+def threads_used(count: int | None, *, processes: int = 1) -> Iterator[None]:
+    """Use so many threads for a while; by default one per core, shared among processes.
+
+    Args:
+        count: threads of this process.
+        processes: processes on this machine that compute at the same time.
+    """
     before = torch.get_num_threads()
-    torch.set_num_threads(count or len(os.sched_getaffinity(0)))
+    torch.set_num_threads(count or max(1, len(os.sched_getaffinity(0)) // processes))
     try:
         yield
     finally:

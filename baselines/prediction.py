@@ -32,7 +32,7 @@ from .radius_graph import radius_graph
 from .rollout import Rollout, roll_out
 from .windows import scenario_batch, scenario_paths
 
-__all__ = ["PredictionResult", "predict"]
+__all__ = ["PredictionResult", "predict", "record_cost"]
 
 SEARCHES = 5
 """Frames of a rollout on which the neighbour search is timed alone."""
@@ -52,6 +52,8 @@ class PredictionResult:
         batch: scenarios that were rolled out side by side.
         seconds_per_frame: time of one frame of one scenario [s].
         seconds_without_search: the same without the neighbour search [s].
+        clock: ``processor`` on one CPU thread, where other work on the machine then does not
+            count; ``wall`` on a GPU and on several threads.
         device: processor and threads, or GPU.
         parameters: trained numbers of the model.
         diverged: scenario id to the absolute frame from which its rollout is frozen.
@@ -66,6 +68,7 @@ class PredictionResult:
     batch: int
     seconds_per_frame: float
     seconds_without_search: float
+    clock: str
     device: str
     parameters: int
     diverged: Mapping[int, int]
@@ -136,12 +139,29 @@ def predict(
         batch=side,
         seconds_per_frame=work.seconds_per_frame,
         seconds_without_search=work.seconds_per_frame - work.search_per_frame,
+        clock=work.clock,
         device=hardware_label,
         parameters=count,
         diverged=work.diverged,
     )
-    write_atomically(result.path.with_suffix(".json"), _cost(result), option="--output")
+    record_cost(result)
     return result
+
+
+def record_cost(result: PredictionResult, *, solver: float | None = None) -> Path:
+    """Write what a prediction cost to ``<name>.json`` beside it; return that path.
+
+    Args:
+        result: the prediction.
+        solver: time of our solver for a frame on one core of the same machine [s].
+
+    Raises:
+        WorkFailedError: the disk is full or not writable.
+    """
+    plain = {**asdict(result), "path": result.path.name, "solver_seconds_per_frame": solver}
+    path = result.path.with_suffix(".json")
+    write_atomically(path, json.dumps(plain, indent=2, sort_keys=True).encode() + b"\n", option="--output")
+    return path
 
 
 def _test_files(facts: Facts, root: Path, registry: Registry) -> list[Path]:
@@ -163,12 +183,14 @@ class _Rollouts:
 
     Attributes:
         seconds: time of the rollouts [s].
-        frames: frames predicted, of all scenarios.
+        clock: the time that is taken, ``processor`` or ``wall``.
+        frames: frames that the model was asked for, of all scenarios; frozen ones cost nothing.
         diverged: scenario id to the absolute frame from which its rollout is frozen.
     """
 
     def __init__(self, model: Baseline, facts: Facts, paths: list[Path], side: int, machine: str) -> None:
         self.seconds = 0.0
+        self.clock = "processor" if machine == "cpu" and torch.get_num_threads() == 1 else "wall"
         self.frames = 0
         self.diverged: dict[int, int] = {}
         self._model, self._facts, self._machine = model, facts, machine
@@ -188,7 +210,7 @@ class _Rollouts:
             started = self._now()
             found = roll_out(self._model, given, self._facts.horizon)
             self.seconds += self._now() - started
-            self.frames += len(found) * self._facts.horizon
+            self.frames += sum(self._made(one) for one in found)
             self._time_searches(given, found)
             marks = {one.scenario: one.diverged_at for one in found if one.diverged_at is not None}
             self.diverged.update(marks)
@@ -204,6 +226,12 @@ class _Rollouts:
         """Time of the neighbour search in it [s]; 0 for a model without one."""
         return sum(self._searches) / len(self._searches) if self._searches else 0.0
 
+    def _made(self, rollout: Rollout) -> int:
+        """Return the frames that a rollout took, the first one that is not finite included."""
+        if rollout.diverged_at is None:
+            return self._facts.horizon
+        return rollout.diverged_at - self._facts.input_frames + 1
+
     def _time_searches(self, given: Batch, found: list[Rollout]) -> None:
         """Search neighbours once more in some frames of the rollouts, and take the time."""
         radius = getattr(self._model, "radius", None)
@@ -218,7 +246,7 @@ class _Rollouts:
     def _now(self) -> float:
         if self._machine == "cuda":
             torch.cuda.synchronize()
-        return time.perf_counter()
+        return time.process_time() if self.clock == "processor" else time.perf_counter()
 
 
 def _device_label(machine: str) -> str:
@@ -234,11 +262,5 @@ def _provenance(checkpoint: Checkpoint) -> dict[str, Any]:
     recipe = done.get("recipe", {})
     options = recipe.get("training", {})
     subsets = "+".join(options.get("windows", ("train",)))
-    step = done.get("best_step") or done.get("step", 0)
-    words = f"{facts.split} {facts.size} {subsets}, recipe {recipe.get('name')}, step {step}"
+    words = f"{facts.split} {facts.size} {subsets}, recipe {recipe.get('name')}, step {done.get('step', 0)}"
     return {"training": words, "seed": int(options.get("seed", 0))}
-
-
-def _cost(result: PredictionResult) -> bytes:
-    plain = {**asdict(result), "path": result.path.name}
-    return json.dumps(plain, indent=2, sort_keys=True).encode() + b"\n"

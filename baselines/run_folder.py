@@ -60,8 +60,11 @@ class RunFolder:
             UsageError: the folder holds another training, or one that must not be resumed.
             UnreadableFileError: its checkpoint is damaged.
         """
-        if fresh or not self.checkpoint.exists():
+        left = [file for file in (self.checkpoint, self.weights, self.record) if file.exists()]
+        if fresh or not left or (resume and self.checkpoint not in left):
             return None
+        if self.checkpoint not in left:
+            raise self._taken()
         found = load(self.checkpoint)
         if found.training.get("recipe") != recipe.as_json():
             raise UsageError(
@@ -71,12 +74,15 @@ class RunFolder:
                 fix="name another folder with --output, or train anew with --fresh",
             )
         if not resume:
-            raise UsageError(
-                "the folder holds a training",
-                where=str(self.path),
-                fix="go on with --resume, train anew with --fresh, or name another --output",
-            )
+            raise self._taken()
         return found
+
+    def _taken(self) -> UsageError:
+        return UsageError(
+            "the folder holds a training",
+            where=str(self.path),
+            fix="go on with --resume, train anew with --fresh, or name another --output",
+        )
 
     def clear(self) -> None:
         """Remove what an earlier training left, and nothing else."""

@@ -49,12 +49,12 @@ class Target(enum.StrEnum):
 class LossWeights(Options):
     """Weights of Eq. 5.35; a term of weight 0 is logged and not learnt from."""
 
-    acceleration: float = Field(default=1.0, ge=0.0)
-    velocity: float = Field(default=1.0, ge=0.0)
-    position: float = Field(default=1.0, ge=0.0)
-    density: float = Field(default=1.0, ge=0.0)
-    divergence: float = Field(default=1.0, ge=0.0)
-    vorticity: float = Field(default=1.0, ge=0.0)
+    acceleration: float = Field(default=1.0, ge=0.0, allow_inf_nan=False)
+    velocity: float = Field(default=1.0, ge=0.0, allow_inf_nan=False)
+    position: float = Field(default=1.0, ge=0.0, allow_inf_nan=False)
+    density: float = Field(default=1.0, ge=0.0, allow_inf_nan=False)
+    divergence: float = Field(default=1.0, ge=0.0, allow_inf_nan=False)
+    vorticity: float = Field(default=1.0, ge=0.0, allow_inf_nan=False)
 
 
 class GraphNetworkOptions(Options):
@@ -81,14 +81,14 @@ class GraphNetworkOptions(Options):
     latent: int = Field(default=128, ge=1)
     layers: int = Field(default=10, ge=1)
     target: Target = Target.ACCELERATION
-    noise_std: float = Field(default=6.7e-4, ge=0.0)
+    noise_std: float = Field(default=6.7e-4, ge=0.0, allow_inf_nan=False)
     loss: LossWeights = LossWeights()
     loss_norm: LossNorm = LossNorm.L2
-    link_weight: float | None = Field(default=None, ge=0.0)
+    link_weight: float | None = Field(default=None, ge=0.0, allow_inf_nan=False)
     rollout_loss_steps: int = Field(default=1, ge=1)
     wall_velocity: bool = False
     symmetry: Symmetry = Symmetry.NONE
-    radius: float | None = Field(default=None, gt=0.0)
+    radius: float | None = Field(default=None, gt=0.0, allow_inf_nan=False)
     clamp: bool = False
 
 

@@ -10,6 +10,7 @@ from lagbench.errors import DataError, UsageError, nearest
 from lagbench.layout import ScenarioKey, scenario_path
 from lagbench.registry import Size
 from lagbench.scenario_ids import spell_ids
+from lagbench.store.bringing import bring
 
 __all__ = ["Source", "sources_of"]
 
@@ -53,6 +54,7 @@ def sources_of(size: Size, subsets: Sequence[str], root: Path) -> dict[int, Sour
             sources[i] = Source(
                 path=scenario_path(root, key), key=key, frames=size.frame_count(i), digest=digests.get(i, "")
             )
+    bring(size, root, sources)
     missing = [i for i, source in sources.items() if not source.path.is_file()]
     if missing:
         raise DataError(

@@ -24,11 +24,13 @@ from .checkpoint import Checkpoint
 from .facts import Facts, facts_of
 from .job import Job, parameter_count
 from .ledger import Ledger
-from .machine import bound_memory, chosen_device, is_helper, threads_used
+from .machine import bound_memory, chosen_device, is_helper, memory_errors_told, threads_used
 from .recipe import recipe_for
 from .run_folder import RunFolder, default_folder
 
 __all__ = ["TrainingResult", "train"]
+
+SMALLER = "lower --set training.batch=1, then the model: model.latent, .layers, .widths or .lags"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,7 +108,7 @@ def train(
         fresh: train anew whatever is there.
         device: ``cpu``, ``cuda`` or ``auto``.
         processes: processes, one device each (torchrun's own number where that started us).
-        threads: threads of a process on the CPU; one per core by default.
+        threads: threads of a process on the CPU; by default its share of the cores.
         workers: processes that read windows ahead; 0 reads them in between.
         progress: called as the work advances.
         registry: where splits are described; ours when None.
@@ -143,7 +145,8 @@ def train(
         meter=Meter(progress),
     )
     bound_memory()
-    with generators_kept(), threads_used(threads):
+    here = int(os.environ.get("LOCAL_WORLD_SIZE", processes))
+    with generators_kept(), threads_used(threads, processes=here), memory_errors_told(SMALLER):
         reseed(seed_of(plan.training.seed))
         model = entry.model.build(plan.model, facts)
         ledger, steps = _run(job, model)

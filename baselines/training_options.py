@@ -79,13 +79,13 @@ class TrainingOptions(_Strict):
     """
 
     steps: int | None = Field(default=None, gt=0)
-    epochs: float | None = Field(default=None, gt=0)
+    epochs: float | None = Field(default=None, gt=0, allow_inf_nan=False)
     batch: int = Field(default=2, gt=0)
     learning_rate: float = Field(default=1e-4, gt=0, allow_inf_nan=False)
     weight_decay: float = Field(default=0.0, ge=0, allow_inf_nan=False)
     schedule: Annotated[Schedule, BeforeValidator(_named)] = Schedule()
     warmup_steps: int = Field(default=0, ge=0)
-    clip: float | None = Field(default=None, gt=0)
+    clip: float | None = Field(default=None, gt=0, allow_inf_nan=False)
     precision: Literal["float32", "bf16", "auto"] = "float32"
     windows: tuple[str, ...] = ("train",)
     validate_every: int | None = Field(default=None, ge=0)

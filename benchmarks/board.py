@@ -128,6 +128,7 @@ def _make(base: Entry, target: Path, number: int) -> None:
         made,
         files,
         summarise(scores),
+        about=entry,
         ranking=base.score.ranking_metric,
         scored_by="nobody",
     )

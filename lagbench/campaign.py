@@ -6,11 +6,11 @@ simulates, so that Ctrl-C reaches it at once and a crash of the solver cannot ta
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from .atomic import remove_leftovers
-from .cards import write_cards
+from .cards import card_texts, write_cards
 from .cluster import Cluster
 from .crew import Crew
 from .errors import DataError
@@ -30,6 +30,7 @@ from .registry import Size, Split
 from .scenario_ids import spell_ids
 from .shared_folder import await_file
 from .statistics import file_moments, round_digits, statistics
+from .store.publication import Publication
 from .verdict import compare
 
 __all__ = ["Campaign"]
@@ -51,6 +52,7 @@ class Campaign:
         sources: other root folders to take finished scenarios from.
 
     Attributes:
+        store: the store that the root folder is a working copy of; None for a plain folder.
         manifest: what the folder holds, as far as is known.
         kept: ids whose files were there and right.
         to_do: ids to simulate and what that takes.
@@ -70,6 +72,7 @@ class Campaign:
     ) -> None:
         self.size, self.root, self.device, self.crew = size, root, device, crew
         self.sources = sources
+        self.store: Publication | None = None
         self.manifest = self._merged(None, [])
         self.kept: list[int] = []
         self.to_do: Estimate = estimate(size, ())
@@ -81,10 +84,13 @@ class Campaign:
     def survey(self, wanted: Sequence[int], *, force: bool = False) -> None:
         """Find out what is there and what is to do; writes nothing."""
         old = self._old_manifest()
-        suspects = [i for i in self.size.scenarios if i in wanted or self._has_changed(i, old)]
+        held = self.store.held if self.store else {}
+        local = [i for i in self.size.scenarios if i not in held]
+        suspects = [i for i in local if i in wanted or self._has_changed(i, old)]
         self._meter.begin("checking", total=len(suspects), scenarios=len(suspects))
         good = [finding.entry for finding in self._examined(suspects, old) if finding.entry]
         bad = set(suspects) - {entry.scenario for entry in good}
+        good += held.values()
         kept = tuple(e for e in old.files if e.scenario not in bad)
         self.manifest = self._merged(old.model_copy(update={"files": kept}), good)
         self.kept = [i for i in wanted if i not in bad and not force]
@@ -163,6 +169,7 @@ class Campaign:
     def _simulate(self) -> None:
         """Run everything that is to do in workers, and the twins of test scenarios."""
         twins = [i for i in self.kept if self._lacks_twin(i)]
+        self._bring(twins)
         tasks = [*self._tasks(), *(self._twin(i) for i in twins)]
         if not tasks:
             return
@@ -252,6 +259,13 @@ class Campaign:
         folder = dataset_folder(self.root, self.size.split, self.size.name, self.size.major)
         if manifest.files or (folder / MANIFEST_NAME).exists():
             write_manifest(self.root, manifest)
+            if self.store:
+                self.store.follow(manifest)
+
+    def _bring(self, scenarios: Iterable[int]) -> None:
+        """Have files of scenarios here that only the store holds."""
+        if self.store:
+            self.store.bring(scenarios)
 
     def _record_statistics(self) -> None:
         """Bring the statistics of train up to date and write the manifest."""
@@ -259,6 +273,7 @@ class Campaign:
         # Those of other bits differ from datasets.yaml by right.
         doubted = measured and manifest.identity == "bitwise" and manifest.statistics != measured.statistics
         if "train" in manifest.subset_sha256 and (doubted or not manifest.statistics):
+            self._bring(train)
             self._meter.begin("statistics", total=len(train), scenarios=len(train))
             paths = {f"scenario {i}": self._path(i) for i in train}
             moments = self.crew.read(file_moments, paths, paths.values(), self._count_files)
@@ -267,4 +282,11 @@ class Campaign:
 
     def _write_cards(self) -> None:
         self._meter.begin("cards", total=1, scenarios=len(self.manifest.files))
-        write_cards(self.root, self.size, self._split, self.manifest)
+        if self.store and self.store.is_settled(
+            self.manifest, card_texts(self.size, self._split, self.manifest)
+        ):
+            return
+        self._bring(self.size.scenarios)
+        cards = write_cards(self.root, self.size, self._split, self.manifest)
+        if self.store:
+            self.store.finish(self.manifest, cards)

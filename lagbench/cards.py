@@ -19,7 +19,7 @@ from .markdown import escape, table
 from .registry import Registry, Size, Split
 from .scenario_ids import spell_ids
 
-__all__ = ["CARD_NAME", "CROISSANT_NAME", "NOTES", "PICTURES", "dataset_card", "write_cards"]
+__all__ = ["CARD_NAME", "CROISSANT_NAME", "NOTES", "PICTURES", "card_texts", "dataset_card", "write_cards"]
 
 CARD_NAME, CROISSANT_NAME = "README.md", "croissant.json"
 
@@ -72,18 +72,26 @@ def write_cards(root: Path, size: Size, split: Split, manifest: Manifest) -> lis
         WorkFailedError: the operating system refused.
     """
     folder = dataset_folder(root, size.split, size.name, size.major)
-    pictures = list(PICTURES) if manifest.files and importlib.util.find_spec("matplotlib") else []
-    texts = {
-        folder / CARD_NAME: dataset_card(size, split, manifest, pictures=pictures).encode(),
-        folder / CROISSANT_NAME: croissant_json(size, split, manifest).encode(),
-    }
-    drawn = [folder / name for name in pictures]
+    texts = {folder / name: text for name, text in card_texts(size, split, manifest).items()}
+    drawn = [folder / name for name in _pictures(manifest)]
     if not _are_there(texts, drawn):
         if drawn:
             _draw(root, size, split, manifest)
         for path, text in texts.items():
             write_atomically(path, text)
     return [*texts, *drawn]
+
+
+def card_texts(size: Size, split: Split, manifest: Manifest) -> dict[str, bytes]:
+    """Return the texts of a data set's card by name, README.md first."""
+    return {
+        CARD_NAME: dataset_card(size, split, manifest, pictures=_pictures(manifest)).encode(),
+        CROISSANT_NAME: croissant_json(size, split, manifest).encode(),
+    }
+
+
+def _pictures(manifest: Manifest) -> list[str]:
+    return list(PICTURES) if manifest.files and importlib.util.find_spec("matplotlib") else []
 
 
 def _are_there(texts: Mapping[Path, bytes], pictures: Sequence[Path]) -> bool:

@@ -158,6 +158,9 @@ class Cluster:
 def _connected(address: str) -> Iterator[Any]:
     distributed = require("distributed", extra="cluster")
     try:
+        if not address.startswith(("ucx://", "inproc://")):
+            # A client whose address cannot be one is 40 s in closing.
+            distributed.comm.addressing.get_address_host_port(address)
         client = distributed.Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
     except (OSError, ValueError) as error:
         bad = isinstance(error, ValueError)

@@ -21,6 +21,7 @@ from .palette import MUTED
 from .panels import Panel, colour_bar, draw, limit_of, material_key
 from .recording import Recording, Scene, open_recording
 from .registry import Registry, Size
+from .store.bringing import bring
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -94,6 +95,7 @@ def contact_sheet(
         DataError: no scenario is there, or a file is damaged.
     """
     tier, folder, splits = locate(split, size, root=root, registry=registry)
+    bring(tier, folder, tier.scenarios)
     files = scenario_files(tier, folder)
     if not files:
         raise DataError(

@@ -43,8 +43,10 @@ def load_manifest(split: str, *, size: str = "full", root: str | Path | None = N
         DataError: nothing is generated, or the manifest is damaged.
     """
     from .manifest import read_manifest
+    from .store.bringing import bring
 
     entry, folder, _ = locate(split, size, root=root)
+    bring(entry, folder)
     manifest = read_manifest(folder, entry.split, size, entry.major)
     if manifest is None:
         raise DataError(
@@ -83,11 +85,14 @@ def open_split(
     """
     import xarray as xr
 
+    from .store.bringing import bring
+
     entry, folder, _ = locate(split, size, root=root)
     if subset not in entry.subsets:
         where = f"{split} {size}"
         raise UsageError(f"no subset {subset!r}", where=where, fix=nearest(subset, entry.subsets))
     ids = entry.subsets[subset]
+    bring(entry, folder, ids)
     keys = [
         ScenarioKey(split=entry.split, size=size, version=entry.version, scenario=i, subset=subset)
         for i in ids

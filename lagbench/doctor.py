@@ -40,6 +40,7 @@ OPTIONAL = {
     "imageio": "plots",
     "torch": "baselines",
     "distributed": "cluster",
+    "s3fs": "s3",
 }
 
 

@@ -20,6 +20,7 @@ from .manifest import Manifest, read_manifest
 from .metrics import Scenario, Setting, Snapshot, snapshots
 from .registry import Size
 from .scenario_file import ScenarioFile
+from .store.bringing import bring
 from .submission.truth import Truth
 
 __all__ = ["Exam", "OpenScenario", "load_exam", "ranking_metric"]
@@ -107,6 +108,7 @@ def load_exam(size: Size, root: Path) -> Exam:
         DataError: files are missing, damaged, of another content hash or too short for the
             task, or the statistics of train are recorded nowhere.
     """
+    bring(size, root, size.subsets["test"])
     truth = Truth(size, root)
     truth.require()
     test = sorted(size.subsets["test"])

@@ -24,6 +24,7 @@ from .plan import Scenarios, Selection, free_bytes, select
 from .pool import worker_count
 from .progress import Meter, Progress
 from .registry import Registry
+from .store.publication import look_at, publication
 
 if TYPE_CHECKING:
     from .generators.solver import Device
@@ -100,7 +101,9 @@ def generate(
         size: name of the size.
         subset: some subsets only.
         scenarios: some ids only, as numbers or as text such as "0,3-5".
-        root: folder of all data sets; else ``LAGBENCH_ROOT``, else the user data folder.
+        root: folder of all data sets; else ``LAGBENCH_ROOT``, else the user data folder. With a
+            URL (``s3://bucket/prefix``) files are written to its working copy and put into the
+            store, see docs/scaling.md.
         workers: worker processes; one per core, or one for the parallel devices.
         device: "cpu", "parallel" or "cuda"; the bits do not depend on it.
         scheduler: address of a Dask scheduler whose workers simulate instead; they must see
@@ -116,8 +119,9 @@ def generate(
         UsageError: unknown split, size, subset, scenario or device, fewer than one worker, or
             Taichi is not installed; or nothing can be gathered from a folder.
         WorkFailedError: disk full or not writable, a scenario blew up, workers keep dying, the
-            cluster is lost or does not see the root folder.
-        DataError: the result has other hashes than datasets.yaml.
+            cluster is lost or does not see the root folder; or the store refuses, does not answer,
+            or knows no conditional put.
+        DataError: the result has other hashes than datasets.yaml, or there is no such bucket.
     """
     started = time.monotonic()
     tier, folder, splits = locate(split, size, root=root, registry=registry)
@@ -135,11 +139,15 @@ def generate(
         sources=[Path(source).expanduser().absolute() for source in gather],
     )
     if dry_run:
+        campaign.store = look_at(tier, folder)
         campaign.survey(wanted, force=force)
     else:
         if scheduler is None:
             check_installed("taichi", extra="generate")
-        with dataset_lock(folder, tier.split, size, tier.major, on_wait=on_wait):
+        with (
+            dataset_lock(folder, tier.split, size, tier.major, on_wait=on_wait),
+            publication(tier, folder, on_wait=on_wait) as campaign.store,
+        ):
             campaign.run(wanted, force=force)
     seconds = time.monotonic() - started
     return _result(campaign, bytes_free=free, seconds=seconds, dry_run=dry_run)

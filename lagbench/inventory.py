@@ -124,7 +124,10 @@ def look(order: Look, report: Callable[[int], None]) -> Finding:
 
 
 def _spelled(error: DataError | OSError, path: Path) -> str:
-    return str(error) if isinstance(error, DataError) else f"cannot read {path}: {error.strerror}"
+    if not isinstance(error, DataError):
+        return f"cannot read {path}: {error.strerror}"
+    # How to mend it depends on the split, and is said once for all files.
+    return str(DataError(error.what, where=error.where, expected=error.expected, got=error.got))
 
 
 def extra_files(root: Path, size: Size) -> dict[str, list[str]]:
@@ -186,5 +189,4 @@ def _check_known(
         where=str(path),
         expected=f"{expected} of {'datasets.yaml' if recorded else 'the manifest'}",
         got=content,
-        fix="lagbench generate writes what is missing or damaged anew",
     )

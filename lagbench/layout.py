@@ -1,7 +1,7 @@
 """Where data sets live: the root folder and the path of every scenario.
 
 ``<root>/<split>/<size>/v<MAJOR>/<subset>/<id:04d>.nc``, with ``manifest.json`` beside the
-subsets. Nothing here touches the disk.
+subsets. Nothing here touches the disk, but that a root in an object store gets its working copy.
 """
 
 from __future__ import annotations
@@ -10,6 +10,8 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+
+from .working_copy import as_url, open_copy
 
 __all__ = [
     "MANIFEST_NAME",
@@ -82,9 +84,17 @@ def resolve_root(root: str | Path | None = None) -> Path:
 
     Args:
         root: what the user gave; else ``LAGBENCH_ROOT``; else the platform's user data folder.
+            A URL (``s3://bucket/prefix``) stands for its working copy, see
+            :mod:`lagbench.working_copy`.
+
+    Raises:
+        WorkFailedError: the working copy of a URL cannot be made.
     """
     given = root or os.environ.get(ROOT_VARIABLE)
     if given:
+        url = as_url(given)
+        if url is not None:
+            return open_copy(url)
         return Path(given).expanduser().absolute()
     import platformdirs
 

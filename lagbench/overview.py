@@ -1,4 +1,4 @@
-"""What one size of a split is, costs and has on this machine; nothing is read but names."""
+"""What one size of a split is, costs and has on this machine or in a store; nothing is read but names."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from .layout import dataset_folder
 from .plan import estimate, scenario_bytes
 from .pool import available_cores
 from .registry import Size
+from .store.bringing import remote_manifest
+from .working_copy import url_of
 
 __all__ = ["Overview", "available_cores", "overview"]
 
@@ -28,7 +30,8 @@ class Overview:
         bytes: disk space before compression [bytes].
         seconds: time to generate on all cores of this machine [s], for orientation; 0 for what
             cannot be simulated.
-        present: scenario files that are there, by subset; `lagbench verify` checks them.
+        present: scenario files that are there, by subset; `lagbench verify` checks them. Of a store
+            what its manifest names.
         folder: where they are, or would be.
         picture: picture of the data set once it is generated.
         dataset_sha256: data set hash as datasets.yaml has it.
@@ -69,12 +72,20 @@ def overview(size: Size, root: Path) -> Overview:
         frames=sum(map(size.frame_count, ids)),
         bytes=sum(scenario_bytes(size, i) for i in ids),
         seconds=estimate(size, ids).seconds(available_cores()) if size.simulated else 0.0,
-        present={subset: _present(folder / subset, ids) for subset, ids in size.subsets.items()},
+        present=_present(size, root, folder),
         folder=folder,
         picture=next((folder / name for name in PICTURES if (folder / name).is_file()), None),
         dataset_sha256=size.measured.dataset_sha256 if size.measured else None,
     )
 
 
-def _present(folder: Path, ids: tuple[int, ...]) -> int:
-    return sum((folder / f"{scenario:04d}.nc").is_file() for scenario in ids)
+def _present(size: Size, root: Path, folder: Path) -> dict[str, int]:
+    url = url_of(root)
+    if url is None:
+        return {
+            subset: sum((folder / subset / f"{i:04d}.nc").is_file() for i in ids)
+            for subset, ids in size.subsets.items()
+        }
+    found = remote_manifest(size, url)
+    named = {entry.scenario for entry in found.files} if found else set()
+    return {subset: len(named & {*ids}) for subset, ids in size.subsets.items()}

@@ -111,7 +111,8 @@ class ScenarioFile:
         """
         with _damage(self.path, name):
             variable = self._file.variables[name]
-            return np.asarray(variable[frames] if variable.ndim else variable[...])
+            part = frames if variable.ndim else ...
+            return _texts(self.path, name, part) if variable.dtype is str else np.asarray(variable[part])
 
     def blocks(self, name: str) -> Iterator[NDArray[Any]]:
         """Yield a variable in order, in pieces of at most about 1 MiB.
@@ -158,6 +159,19 @@ class ScenarioFile:
                 for block in self.blocks(name):
                     hasher.update(name, block)
         return hasher
+
+
+def _texts(path: Path, name: str, part: object) -> NDArray[Any]:
+    """Return a variable of texts, read by h5py.
+
+    Texts read by netCDF4 1.7.5 from a file that is open elsewhere in this process leave the
+    HDF5 library in a state in which, once another file is written, that file opens no more.
+    h5py has a library of its own.
+    """
+    import h5py
+
+    with h5py.File(path, "r") as file:
+        return np.asarray(file[name].asstr()[part])
 
 
 def read_scenario(path: Path) -> ScenarioFile:

@@ -6,11 +6,15 @@ from collections.abc import Collection
 
 from .errors import DataError
 from .identity import may_differ
+from .locating import DESCRIPTION
 from .manifest import FileEntry, Manifest
 from .registry import Size
 from .scenario_ids import spell_ids
 
-__all__ = ["EQUAL", "TOLERATED", "UNLIKE", "compare", "hash_verdict", "unlike_measures"]
+__all__ = ["EQUAL", "TOLERATED", "UNLIKE", "compare", "hash_verdict", "told", "unlike_measures"]
+
+RECORD = "datasets.yaml"
+"""Where the hashes of our own splits are recorded, as the words here have it."""
 
 EQUAL = "equal to datasets.yaml"
 UNLIKE = "NOT that of datasets.yaml"
@@ -64,6 +68,16 @@ def hash_verdict(computed: str | None, recorded: str | None, *, tolerated: bool 
     if computed == recorded:
         return EQUAL
     return TOLERATED if tolerated else UNLIKE
+
+
+def told(words: str, size: Size) -> str:
+    """Return words about hashes that name the file which records those of a split.
+
+    >>> from lagbench.registry import load
+    >>> told(EQUAL, load().size("cavity", "tiny"))
+    'equal to datasets.yaml'
+    """
+    return words if size.simulated else words.replace(RECORD, DESCRIPTION)
 
 
 def unlike_measures(size: Size, manifest: Manifest) -> list[str]:

@@ -27,7 +27,9 @@ from .pool import Pool, Task, worker_count
 from .progress import Meter, Progress
 from .registry import Registry, Size
 from .scenario_ids import spell_ids
-from .verdict import TOLERATED, UNLIKE, hash_verdict, unlike_measures
+from .store.bringing import bring
+from .submission.truth import remedy
+from .verdict import TOLERATED, UNLIKE, hash_verdict, told, unlike_measures
 
 __all__ = ["SubsetReport", "VerificationResult", "verify"]
 
@@ -70,6 +72,7 @@ class VerificationResult:
         warnings: what a reader should know although it is no fault.
         must_be_complete: whether a missing scenario is a fault.
         verdict: how the data set hash compares with datasets.yaml, in words.
+        fix: what makes the data set whole again.
     """
 
     split: str
@@ -83,6 +86,7 @@ class VerificationResult:
     warnings: tuple[str, ...]
     must_be_complete: bool
     verdict: str
+    fix: str
 
     @property
     def complete(self) -> bool:
@@ -96,16 +100,17 @@ class VerificationResult:
             DataError: a file is damaged or of another hash, a scenario simulated anew differs,
                 nothing is there, or something is missing that must not be.
         """
-        fix = f"lagbench generate --split {self.split} --size {self.size}"
         if self.problems:
             listing = "\n  ".join(self.problems)
-            raise DataError(f"{len(self.problems)} problems\n  {listing}", where=str(self.folder), fix=fix)
+            raise DataError(
+                f"{len(self.problems)} problems\n  {listing}", where=str(self.folder), fix=self.fix
+            )
         if not any(report.present for report in self.subsets):
-            raise DataError("nothing is generated", where=str(self.folder), fix=fix)
+            raise DataError("nothing is generated", where=str(self.folder), fix=self.fix)
         if self.must_be_complete and not self.complete:
             missing = ", ".join(f"{r.name} {spell_ids(r.missing)}" for r in self.subsets if r.missing)
             where, got = str(self.folder), f"missing: {missing}"
-            raise DataError("the data set is incomplete", where=where, got=got, fix=fix)
+            raise DataError("the data set is incomplete", where=where, got=got, fix=self.fix)
 
 
 def verify(
@@ -144,6 +149,7 @@ def verify(
     meter, cores = Meter(progress), worker_count(workers)
     if regenerate:
         check_installed("taichi", extra="generate")
+    bring(tier, folder, ids, thoroughly=True)
     manifest, warnings = _manifest(folder, tier)
     findings = _examine_all(folder, tier, ids, manifest, meter)
     anew = _regenerate(tier, evenly_spaced(ids, regenerate), cores, meter)
@@ -152,8 +158,9 @@ def verify(
     problems += [f"scenario {i} differs when simulated anew" for i in anew if regenerated[i] == DIFFERENT]
     reports = _reports(folder, tier, ids, findings)
     whole, verdict = _whole(tier, findings)
-    problems += [f"{r.name}: its hash is {UNLIKE}" for r in reports if r.verdict == UNLIKE]
-    problems += [f"the data set hash is {UNLIKE}"] if verdict == UNLIKE else []
+    unlike = told(UNLIKE, tier)
+    problems += [f"{r.name}: its hash is {unlike}" for r in reports if r.verdict == unlike]
+    problems += [f"the data set hash is {unlike}"] if verdict == unlike else []
     return VerificationResult(
         split=tier.split,
         size=size,
@@ -162,10 +169,13 @@ def verify(
         identity=manifest.identity if manifest else "unknown",
         dataset_sha256=whole,
         regenerated=regenerated,
-        problems=tuple(problems),
-        warnings=(*warnings, *_gaps(reports), *_notes(tier, manifest, findings)),
+        problems=tuple(told(words, tier) for words in problems),
+        warnings=tuple(
+            told(words, tier) for words in (*warnings, *_gaps(reports), *_notes(tier, manifest, findings))
+        ),
         must_be_complete=complete,
         verdict=verdict,
+        fix=remedy(tier),
     )
 
 
@@ -204,7 +214,7 @@ def _manifest(root: Path, size: Size) -> tuple[Manifest | None, list[str]]:
     except DataError as error:
         return None, [str(error)]
     if manifest is None:
-        return None, ["there is no manifest: lagbench generate writes it"]
+        return None, [f"there is no manifest: {remedy(size)}"]
     tolerance = "identity: tolerance - a device wrote these files that does not promise equal bits"
     return manifest, [tolerance] if manifest.identity == "tolerance" else []
 
@@ -272,7 +282,7 @@ def _subset_digest(size: Size, name: str, findings: Mapping[int, Finding]) -> st
 def _subset_verdict(size: Size, name: str, findings: Mapping[int, Finding]) -> str:
     recorded = size.measured.subset_sha256.get(name) if size.measured else None
     tolerated = any(findings[i].tolerated for i in size.subsets[name] if i in findings)
-    return hash_verdict(_subset_digest(size, name, findings), recorded, tolerated=tolerated)
+    return told(hash_verdict(_subset_digest(size, name, findings), recorded, tolerated=tolerated), size)
 
 
 def _whole(size: Size, findings: Mapping[int, Finding]) -> tuple[str | None, str]:
@@ -282,7 +292,7 @@ def _whole(size: Size, findings: Mapping[int, Finding]) -> tuple[str | None, str
     whole = dataset_hash(size.split, size.name, size.major, known) if len(known) == len(digests) else None
     recorded = size.measured.dataset_sha256 if size.measured else None
     tolerated = any(finding.tolerated for finding in findings.values())
-    return whole, hash_verdict(whole, recorded, tolerated=tolerated)
+    return whole, told(hash_verdict(whole, recorded, tolerated=tolerated), size)
 
 
 def _gaps(reports: Sequence[SubsetReport]) -> list[str]:

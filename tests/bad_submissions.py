@@ -3,17 +3,17 @@
     python tests/bad_submissions.py [FOLDER]
 
 writes a small data set and one file per fault into FOLDER (a temporary one by default),
-validates each in a child process with limits, and prints check, exit code, seconds and the
+validates each in a child process with limits, and prints check, exit code, computing time and the
 child's peak memory. Exit code 1 if any file is not recognised, crashes or breaks a limit.
 """
 
 from __future__ import annotations
 
 import importlib
+import os
 import resource
 import sys
 import tempfile
-import time
 from pathlib import Path
 
 from faulty import FAULTS
@@ -32,9 +32,9 @@ def main() -> int:
     failures = 0
     for name, entry in FAULTS.items():
         path = entry.make(bench)
-        started = time.perf_counter()
+        started = _cpu_seconds()
         result = bench.validate(path, isolated=True)
-        seconds = time.perf_counter() - started
+        seconds = _cpu_seconds() - started
         checks = sorted({finding.check for finding in result.errors})
         peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
         good = entry.check in checks and result.exit_code == entry.exit_code and seconds < 10 and peak < 1000
@@ -43,6 +43,12 @@ def main() -> int:
         print(f"{text} {'ok' if good else 'NOT RECOGNISED'}")  # noqa: T201
     print(f"{len(FAULTS)} faulty files, {failures} not recognised; they lie in {target}")  # noqa: T201
     return 1 if failures else 0
+
+
+def _cpu_seconds() -> float:
+    """Computing time of this process and its children: unlike wall time, no matter of the load [s]."""
+    used = os.times()
+    return used.user + used.system + used.children_user + used.children_system
 
 
 if __name__ == "__main__":

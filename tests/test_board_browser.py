@@ -7,6 +7,7 @@ import io
 import json
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -70,6 +71,36 @@ def test_page_opens_in_silence(running: Browser, file: Path, width: int, dark: b
     assert page.messages == []
     assert page.requests == [file.absolute().as_uri()]
     close(page)
+
+
+def test_long_author_lines_clip_no_column(running: Browser, board: Board, tmp_path: Path) -> None:
+    """At 1280 pixels all main columns are in view, whatever the names; the title has the whole line."""
+    authors = tuple(f"A. Rather Long Name of Somebody {i}" for i in range(4))
+    tab = board.tabs[0]
+    rows = tuple(replace(row, authors=authors, affiliation="An institute " * 12) for row in tab.rows)
+    columns = (*tab.columns, "velocity_rmse", "mse_avg")
+    path = tmp_path / "long.html"
+    path.write_text(render(replace(board, tabs=(replace(tab, rows=rows, columns=columns),))), "utf-8")
+    page = running.open(path, width=1280)
+    table = "document.querySelector('section:not([hidden]) .table')"
+    assert page.value(f"{table}.scrollWidth") <= page.value(f"{table}.clientWidth")
+    heads = page.value(f"[...{table}.querySelectorAll('thead th')].map(th => th.textContent)")
+    assert len(heads) == 2 + 7 + 2
+    assert heads[-1] == "parametersself\u2011reported"
+    titles = page.value(f"[...{table}.querySelectorAll('.entries .sub')].map(e => e.title)")
+    assert all(", ".join(authors) in title for title in titles)
+    close(page)
+
+
+def test_badges_say_what_is_wrong(page: Page, board: Board) -> None:
+    """A warning is called by the fault, not by the check that failed; its title says more."""
+    flags = "document.querySelectorAll('section:not([hidden]) .entries .flag')"
+    chips = dict(page.value(f"[...{flags}].map(e => [e.textContent, e.title])"))
+    assert "in domain" not in chips
+    assert chips["leaves the box"].startswith("Predicted particles lie outside the box")
+    assert chips["unphysical"].endswith("14 times the truth's kinetic energy.")
+    run(page, "document.querySelector('section:not([hidden]) .entries .flag.warn').closest('tr').click()")
+    assert "leaves the box" in page.value("document.querySelector('#panel .flags').textContent")
 
 
 def test_script_writes_what_the_html_holds(running: Browser, file: Path, page: Page) -> None:

@@ -134,7 +134,7 @@ DAMAGE: dict[str, tuple[Callable[[BoardBench], object], set[str]]] = {
     ),
     "entry that is a link": (
         lambda b: link(b.entry("noisy"), Path("/etc/passwd")),
-        {"folder", "stray"},
+        {"folder"},
     ),
     "folder that is a link": (
         lambda b: (b.folder / "submissions" / "fluid").symlink_to("/etc", target_is_directory=True),
@@ -149,20 +149,20 @@ DAMAGE: dict[str, tuple[Callable[[BoardBench], object], set[str]]] = {
         lambda b: b.entry("noisy").rename(b.folder / "submissions/noisy.yaml"),
         {"folder", "stray"},
     ),
-    "unknown key": (lambda b: b.edit("noisy", lambda h: h.update(lisence="MIT")), {"schema", "stray"}),
+    "unknown key": (lambda b: b.edit("noisy", lambda h: h.update(lisence="MIT")), {"schema"}),
     "link that is not http": (
         lambda b: b.edit("noisy", lambda h: h.update(code="javascript:alert(1)")),
-        {"schema", "stray"},
+        {"schema"},
     ),
-    "name of 10 kB": (lambda b: b.edit("noisy", lambda h: h.update(name="n" * 10_000)), {"schema", "stray"}),
+    "name of 10 kB": (lambda b: b.edit("noisy", lambda h: h.update(name="n" * 10_000)), {"schema"}),
     "path outside": (
         lambda b: b.edit("noisy", lambda h: h["predictions"][0].update(path="../../secret")),
-        {"schema", "stray"},
+        {"schema"},
     ),
-    "entry of 100 MB": (lambda b: os.truncate(b.entry("noisy"), 100_000_000), {"readable", "stray"}),
+    "entry of 100 MB": (lambda b: os.truncate(b.entry("noisy"), 100_000_000), {"readable"}),
     "YAML with aliases": (
         lambda b: b.entry("noisy").write_text("a: &a [x]\nb: *a\n"),
-        {"readable", "stray"},
+        {"readable"},
     ),
     "place": (
         lambda b: b.entry("noisy").rename(b.folder / PLACE / "other.yaml"),
@@ -173,7 +173,7 @@ DAMAGE: dict[str, tuple[Callable[[BoardBench], object], set[str]]] = {
             (b.folder / "submissions/cavty/tiny").mkdir(parents=True),
             b.edit("noisy", lambda h: h.update(split="cavty")),
         ),
-        {"split", "stray"},
+        {"split"},
     ),
     "old data set": (
         lambda b: (b.edit("noisy", lambda h: h["dataset"].update(sha256="0" * 64)), b.reseal("noisy")),
@@ -187,6 +187,21 @@ DAMAGE: dict[str, tuple[Callable[[BoardBench], object], set[str]]] = {
         lambda b: b.edit("noisy", lambda h: h.update(status="superseded", superseded_by="noisy")),
         {"lifecycle"},
     ),
+    "superseded in a circle": (
+        lambda b: [
+            b.edit(one, lambda h, two=two: h.update(status="superseded", superseded_by=two))
+            for one, two in (("noisy", "damped"), ("damped", "noisy"))
+        ],
+        {"lifecycle"},
+    ),
+    "cost edited": (
+        lambda b: b.edit("damped", lambda h: h["cost"].update(seconds_per_frame=1e-3)),
+        {"score"},
+    ),
+    "cost removed": (lambda b: b.edit("damped", lambda h: h.pop("cost")), {"score"}),
+    "parameters edited": (lambda b: b.edit("noisy", lambda h: h.update(parameters=4)), {"score"}),
+    "hardware edited": (lambda b: b.edit("noisy", lambda h: h.update(hardware="1 min")), {"score"}),
+    "notes edited": (lambda b: b.edit("noisy", lambda h: h.update(notes="new")), set()),
     "predictions that are not there": (
         lambda b: b.edit("noisy", lambda h: h["predictions"][0].update(path="predictions/x.nc")),
         {"predictions"},
@@ -210,9 +225,9 @@ def test_damage_is_found(name: str, own: BoardBench) -> None:
 
 
 def test_all_checks_have_damage() -> None:
-    """No check is without a test; the page has its own."""
+    """No check is without a test; the page and forgeries have their own."""
     tested = {check for _, checks in DAMAGE.values() for check in checks}
-    assert tested | {"page", "rescored"} == set(CHECKS)
+    assert tested | {"page", "rescored", "statistics", "truth"} == set(CHECKS)
 
 
 def test_scoring_again_finds_what_a_forger_hid(own: BoardBench) -> None:

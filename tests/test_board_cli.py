@@ -68,6 +68,7 @@ def test_a_strangers_path(run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: P
     checked = run("leaderboard", "check", "--predictions", "predictions.nc")
     assert checked.exit_code == 0, checked.output
     assert "1 entries, nothing wrong" in checked.stdout
+    assert "floors" not in checked.stdout
     shown = run("leaderboard", "show", SPLIT, "--size", SIZE)
     assert "toy-model" in shown.stdout
     assert "Toy model" in (tmp_path / "leaderboard" / "index.html").read_text()
@@ -81,6 +82,14 @@ def test_machines_are_answered_in_json(run: Run, monkeypatch: pytest.MonkeyPatch
     built = json.loads(run("leaderboard", "build", "--json").stdout)
     assert (built["rows"], built["tabs"]) == (1, 1)
     assert json.loads(run("leaderboard", "check", "--json").stdout)["findings"] == []
+    trusted = run("leaderboard", "check")
+    assert f"aggregated again only, not scored again: {SPLIT} {SIZE}" in trusted.stdout
+    seen = json.loads(run("leaderboard", "check", "--floors", "--json").stdout)
+    assert (seen["findings"], seen["floors_rescored"], seen["floors_trusted"]) == (
+        [],
+        [f"{SPLIT} {SIZE}"],
+        [],
+    )
     shown = json.loads(run("leaderboard", "show", "--json").stdout)
     assert shown["tabs"][0]["rows"][0]["floor"] is True
     Path("leaderboard/index.html").write_text("stale")
@@ -100,7 +109,11 @@ def test_machines_are_answered_in_json(run: Run, monkeypatch: pytest.MonkeyPatch
         (["submit"], 2, "nothing to submit"),
         (["submit", "none.nc", "--author", "A", "--command", "x"], 3, "none.nc"),
         (["submit", "x.nc", "--split", "cavity"], 2, "name split and size themselves"),
-        (["submit", "x.nc", "--code", "javascript:alert(1)"], 2, "code: String should match pattern"),
+        (
+            ["submit", "x.nc", "--code", "javascript:alert(1)"],
+            2,
+            "is not an http:// or https:// address",
+        ),
         (["submit", "x.nc", "--from", "none.yaml"], 3, "none.yaml"),
         (["submit", "--floor", "median", "--split", SPLIT, "--size", SIZE], 2, "no floor 'median'"),
         (["leaderboard", "build"], 2, "no leaderboard here"),

@@ -140,6 +140,22 @@ def test_unknown_keys_name_the_nearest(changes: dict[str, Any], where: str, fix:
 
 
 @pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"code": "javascript:alert(1)"}, "is not an http:// or https:// address"),
+        ({"method": "My Model"}, "small letters, digits and single hyphens"),
+        ({"dataset": {"version": "1", "sha256": HASH}}, "a version, as in 1.0.0"),
+        ({"dataset": {"version": "1.0.0", "sha256": "abc"}}, "64 hexadecimal digits"),
+    ],
+)
+def test_mistakes_are_told_in_words(changes: dict[str, Any], said: str) -> None:
+    """No regular expression is shown to people."""
+    _, (mistake,) = examine(Entry, plain(**changes))
+    assert said in mistake.what
+    assert "^" not in mistake.what
+
+
+@pytest.mark.parametrize(
     "name",
     [
         "<script>alert(1)</script>",

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from lagbench.board.embedding import embedded
-from lagbench.board.model import Board
+from lagbench.board.model import Board, Cost
 from lagbench.board.packing import LEVELS, coarse, pack
 from lagbench.board.page import BUDGET, FEWEST, render
 from lagbench.board.payload import FINENESS, payload
@@ -131,6 +131,35 @@ def test_tables_need_no_script(board: Board, page: str) -> None:
             assert (row.name in table.text) is (row.status == "active")
             if row.status == "active":
                 assert text(row.values[tab.ranking].mean) in table.text
+
+
+def test_costs_are_marked_as_self_reported(board: Board, page: str) -> None:
+    """Headings of what nothing can compute again say so, with and without the script; scores do not."""
+    reported = {"speed_up", "seconds_per_frame", "solver_seconds_per_frame", "parameters", "device"}
+    columns = held_by(page)["columns"]
+    assert {key for key, held in columns.items() if held["reported"]} == reported
+    assert all("Self-reported" in columns[key]["meaning"] for key in reported)
+    heads = [e.text for e in read_html(page).named("th") if e.attributes.get("scope") == "col"]
+    marked = [head for head in heads if "self\u2011reported" in head]
+    assert len(marked) == 2 * len(board.tabs)
+    assert all("speed" in head or "parameters" in head for head in marked)
+
+
+@pytest.mark.parametrize(
+    ("speed", "said"), [(0.1, "slower than the solver"), (17.25, "faster than the solver")]
+)
+def test_speed_is_told_against_the_solver(board: Board, speed: float, said: str) -> None:
+    """The tile of the fastest entry says what 1 stands for, and on which side of it the entry is."""
+    tab = board.tabs[0]
+    row = replace(
+        tab.rows[0],
+        cost=Cost(seconds_per_frame=2.0, device="a machine", solver_seconds_per_frame=0.2, speed_up=speed),
+    )
+    page = render(replace(board, tabs=(replace(tab, rows=(row, *tab.rows[-2:])),)))
+    (tile,) = [e.text for e in read_html(page).named("li") if "fastest" in e.text]
+    assert "solver = 1×" in tile
+    assert said in tile
+    assert "self-reported" in tile
 
 
 def test_policy_allows_only_our_script_and_style(page: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import h5py
@@ -100,3 +101,33 @@ def test_the_child_is_limited_and_started_anew(own: BoardBench, monkeypatch: pyt
     stopped = unreadable_in_child([good, bad, good])
     assert set(stopped) == {bad}
     assert "had to be stopped" in stopped[bad]
+
+
+def use_child(monkeypatch: pytest.MonkeyPatch, folder: Path, program: str) -> None:
+    """Put another program in place of the child's."""
+    (folder / "other_child.py").write_text(program)
+    monkeypatch.setenv("PYTHONPATH", str(folder))
+    monkeypatch.setattr(isolation, "CHILD", "other_child")
+
+
+def test_many_files_that_stop_the_child_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After a few stops the rest is left unread, and every file has its finding."""
+    use_child(monkeypatch, tmp_path, "open('starts', 'a').write('x'); import os; os.abort()")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(isolation, "MOST_STOPS", 2)
+    files = [tmp_path / f"{i}.nc" for i in range(9)]
+    found = unreadable_in_child(files)
+    assert Path("starts").read_text() == "xx"
+    assert list(found) == files
+    assert ["stopped: exit" in said for said in found.values()] == [True] * 2 + [False] * 7
+    assert found[files[-1]] == isolation.UNREAD
+
+
+def test_waiting_files_share_one_deadline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Children that wait cost the time of all files once, not once each."""
+    use_child(monkeypatch, tmp_path, "import time; time.sleep(60)")
+    monkeypatch.setattr(isolation, "WALL_SECONDS", 0.5)
+    started = time.monotonic()
+    found = unreadable_in_child([tmp_path / f"{i}.nc" for i in range(9)])
+    assert time.monotonic() - started < 20.0
+    assert [said == isolation.UNREAD for said in found.values()] == [False] + [True] * 8

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import os
 import pickle
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -140,6 +142,64 @@ def test_other_files_are_unreadable(tmp_path: Path, content: object) -> None:
         load(file)
 
 
+def _put(content: dict[str, Any], *place: object) -> None:
+    """Put the last value where the keys before it lead."""
+    *path, key, value = place
+    for step in path:
+        content = content[step]
+    content[key] = value
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        ("training", "recipe", []),
+        ("training", "recipe", "training", []),
+        ("training", "recipe", "training", "seed", "three"),
+        ("training", "recipe", "training", "seed", 10**30),
+        ("training", "recipe", "training", "windows", [1]),
+        ("training", "recipe", "name", "x" * 10**6),
+        ("training", "step", "last"),
+        ("facts", "split", "../curl-noise"),
+        ("facts", "size", "../tiny"),
+        ("facts", "particles", -3),
+        ("facts", "radius", float("inf")),
+        ("facts", "statistics", "velocity_std", [float("nan"), 1.0]),
+    ],
+)
+def test_strange_words_are_refused(tmp_path: Path, place: tuple[object, ...]) -> None:
+    """Whatever a stranger writes about a model is read as what it should be, or not at all."""
+    file = tmp_path / "strange.pt"
+    save(file, example())
+    content = torch.load(file, weights_only=True)
+    about = json.loads(content["about"])
+    _put(about, *place)
+    torch.save({**content, "about": json.dumps(about)}, file)
+    with pytest.raises(UnreadableFileError, match=r"strange\.pt"):
+        load(file)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"about": "[" * 10**5},
+        {"lagbench_checkpoint": torch.ones(2)},
+        {"lagbench_checkpoint": True},
+        {"weights": {"a": torch.zeros(1).expand(10**12)}},
+        {"weights": {"a": torch.ones(1).to_sparse()}},
+        {"weights": {"a": torch.zeros(1, dtype=torch.complex64)}},
+        {"weights": {"a": torch.zeros(1, device="meta")}},
+    ],
+)
+def test_strange_tensors_are_refused(tmp_path: Path, changes: dict[str, Any]) -> None:
+    """Weights are plain numbers that the file really holds."""
+    file = tmp_path / "strange.pt"
+    save(file, example())
+    torch.save({**torch.load(file, weights_only=True), **changes}, file)
+    with pytest.raises(UnreadableFileError, match=r"strange\.pt"):
+        load(file)
+
+
 def test_missing_and_cut(tmp_path: Path) -> None:
     """A missing file and one that was cut short are unreadable."""
     with pytest.raises(UnreadableFileError, match="No such file"):
@@ -158,6 +218,11 @@ def test_missing_and_cut(tmp_path: Path) -> None:
         ({"weights": {"a": torch.zeros(2), "calls": torch.tensor(0)}}, "do not fit the model"),
         ({"weights": {"a": torch.zeros(1)}}, "do not fit the model"),
         ({"options": {"sart": 1}}, "sart"),
+        ({"baseline": "mlp", "options": {}, "facts": replace(FACTS, statistics={})}, "position_mean"),
+        (
+            {"baseline": "gns", "options": {}, "facts": replace(FACTS, score_placement="edges")},
+            "statistics|edges|acceleration",
+        ),
     ],
 )
 def test_unfit_weights(changes: dict[str, Any], message: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -149,6 +149,15 @@ def test_no_scheduler_there(tmp_path: Path, unmeasured: Registry, monkeypatch: p
     assert not list(tmp_path.rglob("*.nc"))
 
 
+def test_no_client_is_made_for_what_is_no_address(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A client with half an address waits 40 s at the end of the process: none is made."""
+    import distributed
+
+    monkeypatch.setattr(distributed, "Client", lambda *_, **__: pytest.fail("a client was made"))
+    with pytest.raises(UsageError, match="missing port"), cluster.Cluster("nonsense"):
+        pass
+
+
 @pytest.mark.slow
 def test_mini_on_a_cluster(workers: Any, tmp_path: Path) -> None:
     """By the command, at mini, one worker killed and one slowed: the hash that datasets.yaml has."""

@@ -17,6 +17,7 @@ from lagbench import registry
 from lagbench.dataset import list_splits, load_manifest, open_split
 from lagbench.errors import DataError, UsageError
 from lagbench.manifest import merge, write_manifest
+from lagbench.scenario_file import check_scenario, read_scenario
 
 TEST_IDS = registry.load().size("cavity", "tiny").subsets["test"]
 
@@ -120,6 +121,21 @@ def test_root_comes_from_the_environment(ragged: Path, monkeypatch: pytest.Monke
     monkeypatch.setenv("LAGBENCH_ROOT", str(ragged))
     with open_split("cavity", size="tiny") as data:
         assert data.sizes["scenario"] == len(TEST_IDS)
+
+
+def test_a_split_left_open_spoils_nothing(ragged: Path, tmp_path: Path) -> None:
+    """Files open elsewhere are checked and, after another file was written, opened again."""
+    data = open_split("cavity", size="tiny", root=ragged)
+    paths = sorted(ragged.rglob("*.nc"))
+    for path in paths:
+        check_scenario(path)
+    with netCDF4.Dataset(tmp_path / "other.nc", "w") as other:
+        other.createDimension("n", 3)
+        other.createVariable("x", "f4", ("n",))
+        for path in paths:
+            with read_scenario(path) as file:
+                assert file.read("space").tolist() == ["x", "y"]
+    data.close()
 
 
 def test_load_manifest(tmp_path: Path) -> None:

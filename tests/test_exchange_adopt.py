@@ -16,8 +16,8 @@ from typer.testing import CliRunner
 import lagbench
 from lagbench.checksums import dataset_hash, subset_hash
 from lagbench.cli.app import app
-from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError
-from lagbench.exchange import adopt
+from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError, WorkFailedError
+from lagbench.exchange import adopt, local_split
 from lagbench.exchange.local_split import LocalSplit
 from lagbench.exchange.measure import Measure, estimate_spacing
 from lagbench.layout import ScenarioKey, scenario_path
@@ -99,7 +99,7 @@ def test_the_same_arrays_give_the_same_hash(tmp_path: Path, runs: list[NDArray[n
 def test_a_local_split_is_verified_templated_and_scored(own: LocalSplit, tmp_path: Path) -> None:
     """Commands take its folder; straight flight is what the constant-velocity floor predicts."""
     path = str(own.folder)
-    assert lagbench.verify(path).verdict == "equal to datasets.yaml"
+    assert lagbench.verify(path).verdict == "equal to split.yaml"
     target = tmp_path / "predictions.nc"
     lagbench.template(path, output=target)
     card = lagbench.score(target, root=own.folder.parent, output_dir=tmp_path, workers=1)
@@ -113,8 +113,10 @@ def test_damage_is_told(tmp_path: Path, runs: list[NDArray[np.float32]]) -> None
     """A scenario put in the place of another is found by its hash."""
     made = adopt(save_runs(tmp_path / "in", runs), output=tmp_path / "mine", **BASIC)
     scenario(made, 0).write_bytes(scenario(made, 1).read_bytes())
-    with pytest.raises(DataError, match="another scenario"):
+    with pytest.raises(DataError, match="another scenario") as caught:
         lagbench.verify(str(made.folder)).check()
+    assert "lagbench adopt" in str(caught.value)
+    assert "lagbench generate" not in str(caught.value)
 
 
 def test_named_arrays(tmp_path: Path, runs: list[NDArray[np.float32]]) -> None:
@@ -145,6 +147,31 @@ def test_netcdf(tmp_path: Path, runs: list[NDArray[np.float32]]) -> None:
     with read_scenario(scenario(made, 2)) as file:
         wanted = (runs[2].astype(np.float64) + 1e-9).astype(np.float32)
         np.testing.assert_array_equal(file.read("position"), wanted)
+
+
+def test_packed_netcdf_is_refused(tmp_path: Path, runs: list[NDArray[np.float32]]) -> None:
+    """Values that stand for others by scale_factor would be taken for positions: the file is named."""
+    for number, run in enumerate(runs[:3]):
+        with netCDF4.Dataset(tmp_path / f"{number}.nc", "w") as file:
+            for name, length in zip(("time", "point", "axis"), run.shape, strict=True):
+                file.createDimension(name, length)
+            position = file.createVariable("position", "f4", ("time", "point", "axis"))
+            position.scale_factor = 2.0
+            position[:] = run
+    with pytest.raises(UnreadableFileError, match="packed"):
+        adopt([tmp_path / f"{n}.nc" for n in range(3)], output=tmp_path / "mine", **BASIC)
+
+
+def test_the_folder_of_another_writer_is_left_alone(
+    tmp_path: Path, runs: list[NDArray[np.float32]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A temporary folder of the same name, as of another machine, is neither used nor removed."""
+    theirs = tmp_path / ".mine.partial"
+    theirs.mkdir()
+    monkeypatch.setattr(local_split, "temporary_name", lambda _: theirs)
+    with pytest.raises(WorkFailedError, match="cannot write there"):
+        adopt(save_runs(tmp_path / "in", runs), output=tmp_path / "mine", **BASIC)
+    assert theirs.is_dir()
 
 
 def test_scenarios_may_differ_in_length_and_particles(tmp_path: Path) -> None:
@@ -224,6 +251,10 @@ def broken(kind: str) -> NDArray[Any]:
             return run[:1]
         case "missing":
             run[3, 5, 0] = np.nan
+        case "missing at once":
+            run[0, 5, 0] = np.nan
+        case "beyond float32":
+            return run.astype(np.float64) * 1e300
         case "outside":
             run[3, 5, 0] = 1.5
         case "objects":
@@ -239,6 +270,8 @@ def broken(kind: str) -> NDArray[Any]:
         ("integer", UnreadableFileError, "no positions"),
         ("single", DataError, "too little"),
         ("missing", DataError, "not finite"),
+        ("missing at once", DataError, "not finite"),
+        ("beyond float32", DataError, "not finite"),
         ("outside", DataError, "outside the unit box"),
         ("objects", UnreadableFileError, "pickled"),
     ],

@@ -16,9 +16,10 @@ from typer.testing import CliRunner
 import lagbench
 from lagbench.cli.app import app
 from lagbench.errors import LagbenchError, UsageError
-from lagbench.exchange import adopt, download, mirror, mirror_errors
+from lagbench.exchange import adopt, download
 from lagbench.exchange.local_split import LocalSplit
 from lagbench.generation import GenerationResult
+from lagbench.store import mirror, mirror_errors
 
 FIRST = "train/0000.nc"
 

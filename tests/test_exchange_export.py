@@ -26,8 +26,8 @@ from typer.testing import CliRunner
 
 import lagbench
 from lagbench.cli.app import app
-from lagbench.errors import DataError, UsageError
-from lagbench.exchange import adopt, export
+from lagbench.errors import DataError, UsageError, WorkFailedError
+from lagbench.exchange import adopt, export, gns_npz
 from lagbench.exchange.local_split import LocalSplit
 from lagbench.generation import GenerationResult
 from lagbench.registry import Registry
@@ -209,6 +209,18 @@ def test_unequal_lengths(mixed: LocalSplit, tmp_path: Path) -> None:
     assert [len(run) for run, _ in runs] == [12, 12, 12]
     np.testing.assert_array_equal(runs[2][0], whole[12:24])
     assert h5.left_out == 6
+
+
+def test_an_export_that_breaks_off_is_not_whole(
+    mixed: LocalSplit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Written over by one that fails, an export has no metadata.json, which comes last."""
+    export(str(mixed.folder), format="gns-npz", output=tmp_path)
+    monkeypatch.setattr(gns_npz, "write_pair", lambda *_: (_ for _ in ()).throw(OSError(28, "full")))
+    with pytest.raises(WorkFailedError, match="full"):
+        export(str(mixed.folder), format="gns-npz", output=tmp_path, force=True)
+    assert not (tmp_path / "metadata.json").exists()
+    assert not list(tmp_path.glob(".*"))
 
 
 @pytest.mark.parametrize("form", ["gns-npz", "lagrangebench-h5"])

@@ -2,58 +2,23 @@
 
 from __future__ import annotations
 
-import json
 import pickle
 import zipfile
 from pathlib import Path
-from typing import Any
 
-import h5py
 import numpy as np
 import pytest
 from exchange_readers import Trajectory, gns_windows, read_gns, read_h5, straight_runs
+from exchange_writers import SUBSETS, write_gns, write_h5
 from typer.testing import CliRunner
 
 import lagbench
 from lagbench.cli.app import app
-from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError
+from lagbench.errors import DataError, UnreadableFileError, UsageError
 from lagbench.exchange import adopt, export, import_split
 from lagbench.generation import GenerationResult
 from lagbench.locating import locate
 from lagbench.registry import Registry
-
-SUBSETS = ("train", "valid", "test")
-METADATA: dict[str, Any] = {
-    "bounds": [[0.1, 0.9], [0.1, 0.9]],
-    "sequence_length": 12,
-    "default_connectivity_radius": 0.1,
-    "dim": 2,
-    "dt": 0.01,
-    "write_every": 5,
-    "periodic_boundary_conditions": [False, False],
-}
-
-
-def write_gns(folder: Path, runs: list[Any], kinds: Any = 5, **changes: Any) -> Path:
-    """Write runs as the GNS programs' own scripts do, with numpy.savez; one for each subset."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for subset, run in zip(SUBSETS, runs, strict=True):
-        pair = np.empty(2, dtype=object)
-        pair[0], pair[1] = run, kinds
-        np.savez(folder / f"{subset}.npz", simulation_trajectory_0=pair)
-    (folder / "metadata.json").write_text(json.dumps({**METADATA, **changes}))
-    return folder
-
-
-def write_h5(folder: Path, runs: list[Any], kinds: Any = None, **changes: Any) -> Path:
-    """Write runs as LagrangeBench's own script does; one for each subset."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for subset, run in zip(SUBSETS, runs, strict=True):
-        with h5py.File(folder / f"{subset}.h5", "w") as file:
-            file.create_dataset("00000/position", data=run, compression="gzip")
-            file["00000/particle_type"] = np.zeros(run.shape[1], int) if kinds is None else kinds
-    (folder / "metadata.json").write_text(json.dumps({**METADATA, **changes}))
-    return folder
 
 
 def positions(folder: Path, subset: str = "train") -> np.ndarray:
@@ -123,30 +88,14 @@ def test_pickles_are_refused_unless_allowed(tmp_path: Path) -> None:
     assert not (tmp_path / "own").exists()
 
 
-class _Trap:
-    """Pickles as a call that writes a file."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return Path.write_text, (self.path, "run")
-
-
-@pytest.mark.parametrize("allow", [False, True])
-def test_a_malicious_pickle_is_never_run(tmp_path: Path, allow: bool) -> None:
-    """A pickle that calls anything but NumPy's constructors is refused even when pickles are allowed."""
-    source = write_gns(tmp_path / "in", straight_runs(3))
-    pair = np.empty(2, dtype=object)
-    pair[0], pair[1] = straight_runs(1)[0], _Trap(tmp_path / "trace")
-    np.savez(source / "train.npz", simulation_0=pair)
-    with pytest.raises(LagbenchError) as caught:
-        import_split(source, format="gns-npz", output=tmp_path / "own", allow_pickle=allow)
-    assert not (tmp_path / "trace").exists()
-    assert ("wants to call" in str(caught.value)) == allow
-    with np.load(source / "train.npz", allow_pickle=True) as file:  # numpy's own reader does run it
-        file["simulation_0"]
-    assert (tmp_path / "trace").exists()
+def test_another_horizon_drops_the_frames_of_the_exported_task(tmp_path: Path) -> None:
+    """With a horizon of the user's own the frame of interest is again the last predicted one."""
+    hints = {"lagbench": {"horizon": 6, "frames_of_interest": [10]}}
+    source = write_gns(tmp_path / "in", straight_runs(3), **hints)
+    kept = import_split(source, format="gns-npz", output=tmp_path / "a", allow_pickle=True)
+    own = import_split(source, format="gns-npz", output=tmp_path / "b", allow_pickle=True, horizon=3)
+    interest = [locate(str(made.folder)).size.task.frames_of_interest for made in (kept, own)]
+    assert interest == [(10,), (8,)]
 
 
 def test_a_force_program_is_not_run(tmp_path: Path) -> None:
@@ -200,68 +149,6 @@ def test_periodic_boxes(tmp_path: Path) -> None:
         import_split(source, format="lagrangebench-h5", output=tmp_path / "other")
 
 
-@pytest.mark.parametrize(
-    ("fault", "error", "words"),
-    [
-        ("no metadata", UnreadableFileError, "cannot read the metadata"),
-        ("no json", UnreadableFileError, "cannot read the metadata"),
-        ("no radius", UnreadableFileError, "key radius"),
-        ("3D", UnreadableFileError, "not plane"),
-        ("no test", UnreadableFileError, "files are missing"),
-        ("half a file", UnreadableFileError, "cannot read an HDF5 file"),
-        ("no positions", UnreadableFileError, "no trajectory"),
-        ("too few kinds", UnreadableFileError, "no kinds of particles"),
-        ("empty", DataError, "a subset is empty"),
-        ("no time", UsageError, "no time between frames"),
-    ],
-)
-def test_damaged_sources_leave_nothing(
-    tmp_path: Path, fault: str, error: type[LagbenchError], words: str
-) -> None:
-    """Each fault is told by name, and no folder is made."""
-    source = write_h5(tmp_path / "in", straight_runs(3))
-    target = source / "test.h5"
-    metadata = source / "metadata.json"
-    match fault:
-        case "no metadata":
-            metadata.unlink()
-        case "no json":
-            metadata.write_text("<html>")
-        case "no radius":
-            metadata.write_text(json.dumps({**METADATA, "default_connectivity_radius": None}))
-        case "3D":
-            metadata.write_text(json.dumps({**METADATA, "dim": 3}))
-        case "no time":
-            metadata.write_text(json.dumps({**METADATA, "dt": 0}))
-        case "no test":
-            target.unlink()
-        case "half a file":
-            target.write_bytes(target.read_bytes()[:1000])
-        case _:
-            with h5py.File(target, "w") as file:
-                if fault == "no positions":
-                    file["00000/particle_type"] = np.zeros(40, int)
-                elif fault == "too few kinds":
-                    file["00000/position"] = straight_runs(1)[0]
-                    file["00000/particle_type"] = np.zeros(39, int)
-    with pytest.raises(error, match=words):
-        import_split(source, format="lagrangebench-h5", output=tmp_path / "own")
-    assert [path.name for path in tmp_path.iterdir()] == ["in"]
-
-
-def test_a_damaged_npz_is_told(tmp_path: Path) -> None:
-    """Half an npz file, and a member that is no array, are unreadable files."""
-    source = write_gns(tmp_path / "in", straight_runs(3))
-    whole = (source / "test.npz").read_bytes()
-    (source / "test.npz").write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(UnreadableFileError, match="npz"):
-        import_split(source, format="gns-npz", output=tmp_path / "own", allow_pickle=True)
-    np.savez(source / "test.npz", simulation_0=np.zeros((4, 3)))
-    with pytest.raises(UnreadableFileError, match="no trajectory"):
-        import_split(source, format="gns-npz", output=tmp_path / "own", allow_pickle=True)
-    assert not (tmp_path / "own").exists()
-
-
 def test_what_the_user_says_goes_before_the_metadata(tmp_path: Path) -> None:
     """`lagbench import` takes radius, task and box from its options where they are given."""
     source = write_h5(tmp_path / "in", straight_runs(3, box=3.0), bounds=[[0, 3], [0, 3]], dx=0.2)
@@ -290,24 +177,3 @@ def test_the_other_way_round(tmp_path: Path) -> None:
         )
         hashes.append(back.dataset_sha256)
     assert hashes == [own.dataset_sha256] * 2
-
-
-@pytest.mark.parametrize("way", ["soft", "external", "virtual"])
-def test_a_file_that_leads_elsewhere_is_refused(tmp_path: Path, way: str) -> None:
-    """Links, virtual data sets and external storage would let a stranger's file read others."""
-    source = write_h5(tmp_path / "in", straight_runs(3))
-    other = tmp_path / "other.h5"
-    (source / "train.h5").rename(other)
-    with h5py.File(source / "train.h5", "w") as file:
-        if way == "soft":
-            file["there"] = straight_runs(1)[0]
-            file["00000/position"] = h5py.SoftLink("/there")
-        elif way == "external":
-            file["00000"] = h5py.ExternalLink(str(other), "00000")
-        else:
-            layout = h5py.VirtualLayout(shape=(12, 40, 2), dtype="f4")
-            layout[:] = h5py.VirtualSource(str(other), "00000/position", shape=(12, 40, 2))
-            file.create_virtual_dataset("00000/position", layout)
-            file["00000/particle_type"] = np.zeros(40, int)
-    with pytest.raises(UnreadableFileError, match="leads to another file"):
-        import_split(source, format="lagrangebench-h5", output=tmp_path / "own")

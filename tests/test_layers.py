@@ -26,6 +26,7 @@ HEAVY = ("taichi", "torch", "matplotlib", "xarray", "pandas", "scipy", "dask", "
 FILES = (
     "errors",
     "atomic",
+    "working_copy",
     "layout",
     "checksums",
     "scenario_ids",
@@ -47,6 +48,7 @@ REGISTRY = (
     "statistics",
     "manifest",
     "extras",
+    "store",
     "plugins",
     "progress",
     "pool",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import netCDF4
@@ -13,6 +14,7 @@ import pytest
 import torch
 from simple_models import FACTS, Bursting, Drift, install
 
+from lagbench.baselines import prediction
 from lagbench.baselines.batch import Batch
 from lagbench.baselines.checkpoint import Checkpoint, save
 from lagbench.baselines.facts import facts_of
@@ -44,7 +46,11 @@ def run(
             options=model.options.model_dump(),
             facts=facts,
             weights=model.state_dict(),
-            training={"step": 9, "recipe": {"name": "curl-noise/tiny", "training": {"seed": 3}}},
+            training={
+                "step": 9,
+                "recipe": {"name": "curl-noise/tiny", "training": {"seed": 3}},
+                **options.pop("training", {}),
+            },
         )
         save(tmp_path / "weights.pt", stored)
         output = tmp_path / options.pop("name", "predictions.nc")
@@ -111,6 +117,33 @@ def test_a_rollout_is_frozen_where_it_diverges(run: Predict, generated: Generati
     assert np.isfinite(position).all()
     assert (position[:, 4:] == position[:, 3:4]).all()
     assert (position[:, 3] != position[:, 2]).any()
+
+
+@pytest.mark.parametrize(("batch", "seconds"), [(1, 1.0), (2, 1.5)])
+def test_frozen_frames_are_not_timed(
+    run: Predict, monkeypatch: pytest.MonkeyPatch, batch: int, seconds: float
+) -> None:
+    """With a second per step, 4 of 20 frames before a burst cost 4 s, side by side 4 s in vain before."""
+    ticks = []
+    step = Drift.advance
+
+    def slow(self: Drift, state: Any) -> Any:
+        ticks.append(1)
+        return step(self, state)
+
+    monkeypatch.setattr(Drift, "advance", slow)
+    monkeypatch.setattr(prediction, "time", SimpleNamespace(process_time=lambda: float(len(ticks))))
+    result = run(model={"explode_at": 4}, batch=batch)
+    assert list(result.diverged.values()) == [9, 9]
+    assert result.seconds_per_frame == seconds
+    assert result.clock == "processor"  # one thread: what else runs here does not count
+
+
+def test_the_last_state_is_called_by_its_own_step(run: Predict) -> None:
+    """Of checkpoint.pt, which is not the best, the file says the step that it was stored at."""
+    result = run(training={"best_step": 4})
+    with netCDF4.Dataset(result.path) as data:
+        assert "step 9" in data.getncattr("training")
 
 
 def test_divergence_in_the_first_frame(run: Predict, generated: GenerationResult) -> None:

@@ -123,6 +123,25 @@ def test_the_vorticity_loss_is_judged_by_the_test(without: float, verdict: str) 
     assert "p = 0.0078" in said
 
 
+def test_link_loss_is_judged_by_equal_seeds_and_start() -> None:
+    """A seed that only one of the two has does not count; the plain SuperGAT has another start."""
+    models = {
+        "supergat": a_method("supergat", [0.1] * 8),
+        "supergat-link": a_method("supergat-link", [0.5] * 8, [99.0] * 8),
+        "supergat-unlinked": a_method("supergat-unlinked", [0.9] * 8),
+    }
+    said = " ".join(statements._link_loss(models, "vorticity_rmse", 54))
+    assert "0.5 against 0.9, better in 8 of 8 scenarios" in said
+    assert "0.1" not in said.split("`vorticity_pearson`")[0].split("lead")[0]
+
+
+def test_absent_frame_models_are_named() -> None:
+    """A first place among two of three is not said to be one among three."""
+    models = {"mlp": a_method("mlp", [0.9] * 8), "lstm-mlp": a_method("lstm-mlp", [0.5] * 8)}
+    said = " ".join(statements._frame_models(models, "mse_avg"))
+    assert "Yes in the mean (LSTM missing)" in said
+
+
 def test_floors_are_compared_one_by_one() -> None:
     """Better, worse and untold models are told apart."""
     models = {"gns": a_method("gns", [0.1] * 8), "gat": a_method("gat", [0.9] * 8)}

@@ -72,6 +72,22 @@ def test_a_sparse_file_gets_no_more_time(
         bench.validate(path, isolated=True)
 
 
+def test_a_slow_start_costs_a_sound_file_nothing(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Computing time counts from the start of the work, wall time hardly: as on a busy machine."""
+    burn = "import time\nwhile time.process_time() < 1.2: pass\n"
+    use_child(monkeypatch, tmp_path, f"{burn}from lagbench.submission.child import main\nmain()")
+    monkeypatch.setattr(sandbox, "WALL_SECONDS", 600.0)
+    monkeypatch.setattr(sandbox, "CPU_SECONDS", 1.0)
+    assert bench.validate(bench.valid, isolated=True).exit_code == 0
+
+
+def test_waiting_is_granted_far_more_than_computing() -> None:
+    """What computes is stopped by the kernel's count, so the clock need not be near."""
+    assert sandbox.WALL_SECONDS >= 100.0 * sandbox.CPU_SECONDS
+
+
 def test_a_stray_module_in_the_current_folder_is_not_run(
     bench: Bench, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -14,7 +14,7 @@ __all__ = ["SuperGAT", "SuperGATDot", "SuperGATLink", "unlinked_pairs"]
 
 
 START = 4.0
-"""Theta starts smaller than Glorot's by this times the root of the latent's width.
+"""Where links are learnt, Theta starts smaller than Glorot's by this times the root of its width.
 
 Logits of links then start near 1, not near 2000, where the sigmoid is flat and the link loss
 drowns the others; the scale of values is the LayerNorm's, which follows.
@@ -64,8 +64,6 @@ class SuperGAT(Operator):
     def __init__(self, latent: int, hidden: int) -> None:
         super().__init__(latent, hidden)
         self.conv = SuperGATConv(2 * latent, latent, attention_type=self.attention)
-        with torch.no_grad():
-            self.conv.lin.weight /= START * latent**0.5
 
     def forward(
         self,
@@ -99,7 +97,15 @@ class SuperGATDot(SuperGAT):
 
 
 class SuperGATLink(SuperGAT):
-    """SuperGAT with its link prediction in the loss, weight 1."""
+    """SuperGAT with its link prediction in the loss, weight 1, and a smaller start.
+
+    With ``link_weight`` 0 only the start differs from :class:`SuperGAT`.
+    """
 
     method = "GNS + SuperGATConv + link loss"
     weights: ClassVar[dict[str, float]] = {"link": 1.0}
+
+    def __init__(self, latent: int, hidden: int) -> None:
+        super().__init__(latent, hidden)
+        with torch.no_grad():
+            self.conv.lin.weight /= START * latent**0.5

@@ -23,6 +23,7 @@ __all__ = ["COLOURS", "Line", "TRUTH", "charts", "colour", "named", "panel_rows"
 COLOURS: Mapping[str, str] = {
     "supergat": "#d55e00",
     "supergat-link": "#8c3b00",
+    "supergat-unlinked": "#d9a46a",
     "gat": "#56b4e9",
     "gatv2": "#0072b2",
     "gns": "#b0569a",

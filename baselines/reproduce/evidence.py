@@ -109,14 +109,13 @@ class Evidence:
             for seed, path in _score_files(Path(board or ""), split, size, name, entry):
                 self._add(found, name, seed, path, self._record(name, seed))
             costs |= _board_cost(name, entry)
-        solver = next((c.solver_seconds_per_frame for c in costs.values() if c.speed_up), None)
         for name, seed, folder in sources.run_folders(split, size):
             path = folder / NETCDF_NAME
             if path.is_file() and not {seed, None} & found.get(name, {}).keys():
                 self._add(
                     found, name, seed, path, read_json(folder / RECORD_NAME) or self._record(name, seed)
                 )
-                costs = _run_cost(name, folder, solver) | costs
+                costs = _run_cost(name, folder) | costs
         self.methods = {
             name: Method(
                 name=name,
@@ -177,11 +176,12 @@ def _board_cost(name: str, entry: Mapping[str, Any]) -> dict[str, Cost]:
     return {name: Cost(**entry["cost"])} if entry.get("cost") else {}
 
 
-def _run_cost(name: str, folder: Path, solver: float | None) -> dict[str, Cost]:
+def _run_cost(name: str, folder: Path) -> dict[str, Cost]:
     said = read_json(folder / COST_NAME)
     if "seconds_per_frame" not in said:
         return {}
     seconds, device = float(said["seconds_per_frame"]), str(said.get("device", ""))
+    solver = said.get("solver_seconds_per_frame")
     return {name: Cost(seconds_per_frame=seconds, device=device, solver_seconds_per_frame=solver)}
 
 

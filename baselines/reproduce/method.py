@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -85,6 +85,10 @@ class Method:
         """Scores by metric: the mean over the seeds that have a value, per scenario and frame."""
         common = [n for n in self.seeds[0].scores if all(n in held.scores for held in self.seeds)]
         return {name: _joined([held.scores[name] for held in self.seeds]) for name in common}
+
+    def of_seeds(self, seeds: Collection[int | None]) -> Method:
+        """Return this model with the trainings of some seeds only."""
+        return replace(self, seeds=tuple(held for held in self.seeds if held.seed in seeds))
 
     def spread(self, metric: str) -> float:
         """Return the sample deviation over seeds of the mean over scenarios; NaN for one seed."""

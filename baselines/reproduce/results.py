@@ -55,7 +55,9 @@ lagbench score runs/cavity/mini/supergat-0/predictions.nc
 
 All models, tables and figures of a size, resumable: `python -m lagbench.baselines.reproduce --size mini
 --root DATA --runs runs`. Variants change one option: `gns-novorticity` is `--baseline gns --set
-model.loss.vorticity=0`."""
+model.loss.vorticity=0`, `supergat-unlinked` is `--baseline supergat-link --set model.link_weight=0`
+(SuperGAT with link loss starts from smaller weights, so that the loss of links does not drown the
+others), `mlp-change` is `--baseline mlp --recipe change`."""
 
 
 def render(sources: Sources, sizes: Sequence[str] = SIZES) -> str:
@@ -149,7 +151,8 @@ def _missing(found: Sequence[Evidence]) -> str:
         absent = [name for name in EXPECTED[split] if name not in evidence.methods]
         if absent:
             what = "all models" if len(absent) == len(EXPECTED[split]) else listed(map(label, absent))
-            command = f"python -m lagbench.baselines.reproduce --size {size} --split {split}"
+            short = " --recipe short" if size == "full" and "gns" in EXPECTED[split] else ""
+            command = f"python -m lagbench.baselines.reproduce --size {size} --split {split}{short}"
             lines.append(f"- {split} {size}: {what}. `{command}` makes what is missing.")
         if evidence.stale:
             lines.append(f"- {split} {size}: {len(evidence.stale)} score files of other data, left out.")

@@ -62,18 +62,24 @@ ROSTER: Mapping[str, Model] = MappingProxyType(
             baseline="gns",
             label="GNS without vorticity loss",
             settings=("model.loss.vorticity=0",),
-        )
+        ),
+        "supergat-unlinked": Model(
+            name="supergat-unlinked",
+            baseline="supergat-link",
+            label="SuperGAT with link loss of weight 0",
+            settings=("model.link_weight=0",),
+        ),
     }
     | {f"{name}-change": _changing(name) for name in ("mlp", "lstm", "lstm-mlp")}
 )
 """Models by name."""
 
-_GRAPHS = (*OPERATORS, "supergat-link")
+_GRAPHS = (*OPERATORS, "supergat-link", "supergat-unlinked", "gns-novorticity")
 _FRAMES = ("mlp", "lstm", "lstm-mlp", "var", "var-stable")
 
 EXPECTED: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
-        "cavity": (*_GRAPHS, "gns-novorticity", "mlp", "lstm-mlp"),
+        "cavity": (*_GRAPHS, "mlp", "lstm-mlp"),
         "curl-noise": (*_GRAPHS, "mlp", "lstm-mlp"),
         "fluid": _FRAMES,
         "multimaterial": _FRAMES,

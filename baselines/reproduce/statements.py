@@ -25,8 +25,8 @@ __all__ = ["key_frame", "statements"]
 KEY_FRAMES = {"cavity": 54, "curl-noise": 40}
 """Frames at which the thesis compares models: 54; and 35 after the last of six given ones."""
 
-OURS, LINK, PLAIN = "supergat", "supergat-link", "gns"
-WITHOUT = "gns-novorticity"
+OURS, PLAIN, WITHOUT = "supergat", "gns", "gns-novorticity"
+LINK, UNLINKED = "supergat-link", "supergat-unlinked"
 
 DIVERGED = 10.0
 """A rollout whose last error is that many times that of standing still has diverged."""
@@ -150,25 +150,35 @@ def _first_at_frame(models: Mapping[str, Method], frame: int) -> Iterator[str]:
 
 
 def _link_loss(models: Mapping[str, Method], metric: str, frame: int) -> Iterator[str]:
-    if not {OURS, LINK} <= models.keys():
-        return
-    over = {name: models[name].scores[metric] for name in (LINK, OURS)}
-    at = {name: models[name].frozen_at("vorticity_pearson", frame) for name in (LINK, OURS)}
-    yield (
-        f"**Does SuperGAT's link loss help?** With it against without, `{metric}`:"
-        f" {pair(over[LINK], over[OURS])}: {_verdict(over, LINK, OURS)}."
-        f" `vorticity_pearson` at frame {frame}: {pair(at[LINK], at[OURS])}: {_verdict(at, LINK, OURS)}."
-    )
+    two = _same_seeds(models, LINK, UNLINKED)
+    if two:
+        over = {name: method.scores[metric] for name, method in two.items()}
+        at = {name: method.frozen_at("vorticity_pearson", frame) for name, method in two.items()}
+        yield (
+            "**Does SuperGAT's link loss help?** With weight 1 against weight 0, the same start and seeds,"
+            f" `{metric}`: {pair(over[LINK], over[UNLINKED])}: {_verdict(over, LINK, UNLINKED)}."
+            f" `vorticity_pearson` at frame {frame}: {pair(at[LINK], at[UNLINKED])}:"
+            f" {_verdict(at, LINK, UNLINKED)}."
+        )
     six = {name: models[name].scores[metric] for name in (*OPERATORS, LINK) if name in models}
-    six.pop(OURS)
-    if len(six) > 1:
+    six.pop(OURS, None)
+    if LINK in six and len(six) > 1:
         order = ordered(six)
         place = ordinal(order.index(LINK) + 1)
         yield f"With its link loss in place of the plain one SuperGAT is {place} of {len(six)} operators."
 
 
+def _same_seeds(models: Mapping[str, Method], first: str, second: str) -> dict[str, Method]:
+    """Return two models with the seeds that both have; nothing where there are none."""
+    if not {first, second} <= models.keys():
+        return {}
+    common = {held.seed for held in models[first].seeds} & {held.seed for held in models[second].seeds}
+    return {name: models[name].of_seeds(common) for name in (first, second)} if common else {}
+
+
 def _vorticity_loss(models: Mapping[str, Method], frame: int) -> Iterator[str]:
-    if not {PLAIN, WITHOUT} <= models.keys():
+    two = _same_seeds(models, PLAIN, WITHOUT)
+    if not two:
         return
     parts = []
     for metric, where in (
@@ -178,16 +188,16 @@ def _vorticity_loss(models: Mapping[str, Method], frame: int) -> Iterator[str]:
         ("energy_error", None),
     ):
         scores = {
-            name: models[name].scores[metric] if where is None else models[name].frozen_at(metric, where)
-            for name in (PLAIN, WITHOUT)
+            name: method.scores[metric] if where is None else method.frozen_at(metric, where)
+            for name, method in two.items()
         }
         text = f"`{metric}`" if where is None else f"`{metric}` at frame {where}"
         parts.append(f"{text} {pair(scores[PLAIN], scores[WITHOUT])}: {_verdict(scores, PLAIN, WITHOUT)}")
     yield (
         "**Does the vorticity loss help (Fig. 5.5)?** GNS with weight 1 against the same with weight 0,"
-        f" equal budget: {'; '.join(parts)}."
+        f" equal budget and seeds: {'; '.join(parts)}."
     )
-    yield from _seeds_say(models, "vorticity_rmse", (PLAIN, WITHOUT))
+    yield from _seeds_say(two, "vorticity_rmse", (PLAIN, WITHOUT))
 
 
 def _frame_models(models: Mapping[str, Method], metric: str) -> Iterator[str]:
@@ -196,8 +206,10 @@ def _frame_models(models: Mapping[str, Method], metric: str) -> Iterator[str]:
         return
     order = ordered(found)
     answer = "Yes in the mean" if order[0] == "lstm-mlp" else "No"
+    absent = [label(name) for name in FRAME_MODELS if name not in found]
+    complete = f" ({listed(absent)} missing)" if absent else ""
     yield (
-        f"**Does LSTM + MLP come first (Table 4.8)?** {answer}: by `{metric}`, from best to worst,"
+        f"**Does LSTM + MLP come first (Table 4.8)?** {answer}{complete}: by `{metric}`, from best to worst,"
         f" {listed(f'{label(n)} {number(found[n].mean)}' for n in order)}."
     )
     for rival in [name for name in order if name != "lstm-mlp"]:

@@ -12,16 +12,21 @@ from pathlib import Path
 from types import MappingProxyType
 
 from lagbench.errors import LagbenchError
+from lagbench.floors import FLOORS
+from lagbench.layout import resolve_root
 from lagbench.progress import Progress
-from lagbench.registry import Registry, load
+from lagbench.registry import Registry, Size, load
 from lagbench.submission import Finding
 
 from .build import build
+from .entry import Entry, Status
 from .entry_checks import check_entry, finding, parsed, size_of
 from .folder import Folder
 from .isolation import unreadable_in_child
-from .rescoring import check_predictions
-from .score_checks import check_scores
+from .lives import check_lives
+from .rescoring import Rescoring, within_reach
+from .score_checks import ScoreChecks
+from .standing import is_current
 
 __all__ = ["CHECKS", "CheckResult", "check_board"]
 
@@ -33,18 +38,22 @@ CHECKS: Mapping[str, str] = MappingProxyType(
         "split": "a split or size that datasets.yaml does not have",
         "place": "an entry whose split, size or method is not that of its path",
         "version": "an active entry that was scored on another data set than that of today",
-        "lifecycle": "an entry that is superseded by one that is not there, or by itself",
+        "lifecycle": "an entry that is superseded by one that is not there, or in the end by itself",
         "predictions": "predictions said to lie in the folder that do not, or of another length",
         "missing": "a score file that is not there",
         "oversize": "a score file of more than 300 kB",
         "score_file": "a score file that was edited, cannot be read, or belongs to something else",
-        "score": "a score block that was edited, or is not what the score files give",
+        "statistics": "a score file without a statistic, or without frames, that the scorer measures",
+        "truth": "score files of one data set that disagree about what the truth alone decides",
+        "score": "a score block or cost that was edited, or a block that the score files do not give",
         "stray": "a score file that no entry has",
-        "rescored": "predictions that, scored again, give something else (with --predictions)",
+        "rescored": "predictions or floors that, scored again, give something else",
         "page": "a page or schema.json that is not what the submissions give",
     }
 )
 """Checks by name."""
+
+Known = tuple[Entry, Size]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,12 +65,16 @@ class CheckResult:
         entries: entries that were looked at.
         findings: all that is wrong.
         page_checked: whether the page was compared; it is not while anything else is wrong.
+        floors_rescored: splits and sizes whose floors were predicted and scored anew.
+        floors_trusted: those whose floors' numbers were only aggregated again.
     """
 
     folder: Path
     entries: int
     findings: tuple[Finding, ...]
     page_checked: bool
+    floors_rescored: tuple[str, ...] = ()
+    floors_trusted: tuple[str, ...] = ()
 
     @property
     def exit_code(self) -> int:
@@ -76,6 +89,7 @@ def check_board(
     page: bool = True,
     isolated: bool = True,
     predictions: Sequence[str | Path] = (),
+    floors: bool = False,
     root: str | Path | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> CheckResult:
@@ -87,37 +101,77 @@ def check_board(
         page: whether to compare the page too, once nothing else is wrong.
         isolated: whether to read score files in a child process first.
         predictions: predictions of entries to score again.
-        root: folder of all data sets, for these.
+        floors: whether to predict and score the floors again, where the data are there.
+        root: folder of all data sets, for both.
         progress: told how far that scoring is.
 
     Raises:
         UsageError: no leaderboard there.
-        UnreadableFileError: predictions cannot be read.
-        ChecksFailedError: they are not valid.
-        DataError: the test subset is missing, or they were made from another data set.
+        DataError: the test subset is missing, or predictions were made from another data set.
     """
     folder, described = Folder(board), registry or load()
     folder.require()
     files = [folder.path / path for path in folder.score_files()]
-    broken = unreadable_in_child(files) if isolated else {}
-    found, named = list(_oddities(folder)), set[Path]()
-    paths = folder.entries()
-    for path in paths:
-        entry = parsed(folder, path, found)
-        if entry is None:
-            continue
-        named.update(entry.score_paths)
-        size = size_of(entry, described, found)
-        if size is not None:
-            found += check_entry(folder, path, entry, size)
-            found += check_scores(folder, entry, size, broken)
-    found += _strays(folder, named)
-    if predictions:
-        found += check_predictions(folder, predictions, root=root, registry=described, progress=progress)
+    scores = ScoreChecks(folder, unreadable_in_child(files) if isolated else {})
+    found = list(_oddities(folder))
+    known = _entries(folder, described, scores, found)
+    again = Rescoring(
+        folder=folder,
+        entries=[entry for entry, _ in known],
+        sound=scores.sound,
+        registry=described,
+        root=root,
+        progress=progress,
+    )
+    found += again.of_files(predictions)
+    rescored, trusted = _floors(known, again, found, wanted=floors)
     looked = page and not found
     if looked:
         found += _page_drift(folder, described)
-    return CheckResult(folder=folder.path, entries=len(paths), findings=tuple(found), page_checked=looked)
+    return CheckResult(
+        folder=folder.path,
+        entries=len(folder.entries()),
+        findings=tuple(found),
+        page_checked=looked,
+        floors_rescored=rescored,
+        floors_trusted=trusted,
+    )
+
+
+def _entries(folder: Folder, registry: Registry, scores: ScoreChecks, found: list[Finding]) -> list[Known]:
+    """Return the entries that can be read and their sizes; add what is wrong with any."""
+    known: list[Known] = []
+    paths = folder.entries()
+    # floors first: what other entries say of the truth is compared with them
+    for path in sorted(paths, key=lambda path: (path.stem not in FLOORS, path.parts)):
+        entry = parsed(folder, path, found)
+        size = None if entry is None else size_of(entry, registry, found)
+        if entry is None or size is None:
+            continue
+        known.append((entry, size))
+        found += check_entry(folder, path, entry, size)
+        found += scores.of(entry, size)
+    found += check_lives(folder, [entry for entry, _ in known])
+    found += _strays(folder, known)
+    return known
+
+
+def _floors(
+    known: Sequence[Known], again: Rescoring, found: list[Finding], *, wanted: bool
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Score floors again where wanted and possible; return the sizes where it was done, and others."""
+    floors = [
+        (entry, size)
+        for entry, size in known
+        if entry.floor and entry.status is Status.ACTIVE and is_current(entry.dataset, size)
+    ]
+    done: dict[str, bool] = {}
+    for entry, size in sorted(floors, key=lambda pair: pair[0].place):
+        near = wanted and within_reach(size, resolve_root(again.root))
+        done[f"{size.split} {size.name}"] = near
+        if near:
+            found += again.of_floor(entry)
+    return tuple(name for name in done if done[name]), tuple(name for name in done if not done[name])
 
 
 def _oddities(folder: Folder) -> Iterator[Finding]:
@@ -132,9 +186,13 @@ def _oddities(folder: Folder) -> Iterator[Finding]:
         )
 
 
-def _strays(folder: Folder, named: set[Path]) -> Iterator[Finding]:
+def _strays(folder: Folder, known: Sequence[Known]) -> Iterator[Finding]:
+    """Yield score files that belong to nothing, those of entries that cannot be read aside."""
+    named = {path for entry, _ in known for path in entry.score_paths}
+    unread = folder.claims() - {entry.place for entry, _ in known}
     for path in folder.score_files():
-        if path not in named:
+        split, size, name = *path.parts[1:3], path.stem
+        if path not in named and (split, size, name.partition("_")[0]) not in unread:
             yield finding(
                 "stray",
                 "a score file that no entry has",

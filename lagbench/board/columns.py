@@ -56,7 +56,8 @@ class Column:
         direction: what better means.
         perfect: value of a perfect prediction, None where it depends.
         form: how cells are written: "number", "count", "factor" or "text".
-        meaning: what it says, one sentence.
+        reported: whether the submitter says it and nothing can compute it again.
+        meaning: what it says, one or two sentences.
     """
 
     key: str
@@ -65,8 +66,11 @@ class Column:
     direction: Direction = Direction.NONE
     perfect: float | None = None
     form: str = "number"
+    reported: bool = False
     meaning: str
 
+
+REPORTED = "Self-reported: said by the submitter, computed again by nobody."
 
 COSTS = (
     Column(
@@ -74,24 +78,40 @@ COSTS = (
         label="speed\u2011up",
         direction=Direction.HIGHER,
         form="factor",
-        meaning="Time of the solver over time of the model per frame, both on the same machine.",
+        reported=True,
+        meaning=f"Time of the solver over time of the model per frame, both on the same machine: below 1×"
+        f" the model is slower than the solver. {REPORTED}",
     ),
     Column(
         key="seconds_per_frame",
         label="time per frame",
         unit="s",
         direction=Direction.LOWER,
-        meaning="Wall time of one predicted frame of one scenario.",
+        reported=True,
+        meaning=f"Wall time of one predicted frame of one scenario. {REPORTED}",
     ),
     Column(
         key="solver_seconds_per_frame",
         label="solver time per frame",
         unit="s",
-        meaning="Wall time of one frame of the solver on the same machine.",
+        reported=True,
+        meaning=f"Wall time of one frame of the solver on the same machine. {REPORTED}",
     ),
-    Column(key="parameters", label="parameters", form="count", meaning="Trainable parameters of the model."),
+    Column(
+        key="parameters",
+        label="parameters",
+        form="count",
+        reported=True,
+        meaning=f"Trainable parameters of the model. {REPORTED}",
+    ),
     Column(key="seeds", label="seeds", form="count", meaning="Trainings behind the row."),
-    Column(key="device", label="device", form="text", meaning="Machine of both times."),
+    Column(
+        key="device",
+        label="device",
+        form="text",
+        reported=True,
+        meaning=f"Machine of both times. {REPORTED}",
+    ),
     Column(key="date", label="date", form="text", meaning="When the entry was submitted."),
 )
 """Columns that no metric stands behind."""

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from lagbench.errors import LagbenchError, UsageError
+from lagbench.errors import UsageError
 from lagbench.floors import FLOORS
 from lagbench.registry import Registry
 from lagbench.submission import Header, ValidationResult, open_predictions, validate
@@ -17,7 +17,7 @@ from .entry import ID, LONGEST_ID, MOST_SEEDS, About, CostEntry
 from .folder import Folder, entry_path
 from .meta import Meta
 
-__all__ = ["Draft", "draft_of", "headers_of"]
+__all__ = ["Draft", "check_needed", "draft_of", "headers_of"]
 
 NEEDED = {"authors": "--author NAME", "command": "--command 'what makes the predictions again'"}
 """Keys without a default, and the options that give them."""
@@ -49,9 +49,7 @@ def headers_of(
     registry: Registry | None,
     examined: Callable[[ValidationResult], None] | None,
 ) -> list[Header]:
-    """Return what files say about themselves; validate several before any is scored.
-
-    A single file is left to the scorer, which validates it as well.
+    """Return what files say about themselves, each validated in a child process before it is opened.
 
     Raises:
         UnreadableFileError: a file cannot be read.
@@ -60,31 +58,20 @@ def headers_of(
     """
     headers = []
     for path in paths:
-        if len(paths) > 1 or not _opens(path):
-            result = validate(path, root=root, require_truth=True, registry=registry)
-            if examined is not None:
-                examined(result)
-            result.check()
+        result = validate(path, root=root, require_truth=True, registry=registry)
+        if examined is not None:
+            examined(result)
+        result.check()
         with open_predictions(path) as opened:
             headers.append(opened.header)
     return headers
 
 
-def _opens(path: Path) -> bool:
-    """Tell whether a file has the layout of predictions; if not, the validation says all that is wrong."""
-    try:
-        open_predictions(path).close()
-    except LagbenchError:
-        return False
-    return True
-
-
-def draft_of(headers: Sequence[Header], meta: Meta, folder: Folder, *, replace: bool) -> Draft:
-    """Return the entry as far as it is known before the scoring.
+def check_needed(meta: Meta) -> None:
+    """Refuse a description that lacks what readers need.
 
     Raises:
-        UsageError: keys are missing, the files do not belong together, the entry is there
-            already, or the method has the name of a floor.
+        UsageError: keys are missing.
     """
     missing = [option for key, option in NEEDED.items() if not getattr(meta, key)]
     if missing:
@@ -93,6 +80,15 @@ def draft_of(headers: Sequence[Header], meta: Meta, folder: Folder, *, replace: 
             expected=" and ".join(missing),
             fix="give them as options, or authors and command in a file: --from meta.yaml",
         )
+
+
+def draft_of(headers: Sequence[Header], meta: Meta, folder: Folder, *, replace: bool) -> Draft:
+    """Return the entry as far as it is known before the scoring.
+
+    Raises:
+        UsageError: the files do not belong together, the entry is there already, or the method
+            has the name of a floor.
+    """
     seeds, urls = _seeds(headers), _urls(headers, meta)
     place = (headers[0].split, headers[0].size, _method(headers[0], meta))
     path = folder.path / entry_path(place)

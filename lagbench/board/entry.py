@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import datetime
 import enum
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
@@ -30,6 +32,7 @@ __all__ = [
     "ID",
     "LONGEST_TEXT",
     "MOST_SEEDS",
+    "PATTERNS",
     "About",
     "CostEntry",
     "DataSet",
@@ -44,6 +47,24 @@ __all__ = [
 
 ID = r"^[a-z0-9]+(-[a-z0-9]+)*$"
 """What names a method: in file names, addresses and the page."""
+
+WEB = r"^https?://[A-Za-z0-9][!#-&(-;=?-\[\]_a-z~]*$"
+"""An address of the web, without spaces, quotes and what could end an HTML attribute."""
+
+SHA256 = r"^[0-9a-f]{64}$"
+RELEASE = r"^[1-9]\d{0,5}\.\d{1,6}\.\d{1,6}$"
+LABEL = r"^[a-z0-9_]+$"
+
+PATTERNS: Mapping[str, str] = MappingProxyType(
+    {
+        ID: "small letters, digits and single hyphens, as in my-model",
+        WEB: "an http:// or https:// address, without spaces and quotes",
+        SHA256: "64 hexadecimal digits",
+        RELEASE: "a version, as in 1.0.0",
+        LABEL: "small letters, digits and underscores",
+    }
+)
+"""What texts have to be, in words; people do not read regular expressions."""
 
 LONGEST_ID = 60
 LONGEST_TEXT = 1000
@@ -80,14 +101,12 @@ def _date(value: object) -> object:
 Name = Annotated[str, StringConstraints(pattern=ID, max_length=LONGEST_ID)]
 Short = Annotated[str, StringConstraints(min_length=1, max_length=100), AfterValidator(_line)]
 Long = Annotated[str, StringConstraints(max_length=LONGEST_TEXT), AfterValidator(_lines)]
-Link = Annotated[
-    str, StringConstraints(pattern=r"^https?://[A-Za-z0-9][!#-&(-;=?-\[\]_a-z~]*$", max_length=300)
-]
+Link = Annotated[str, StringConstraints(pattern=WEB, max_length=300)]
 InnerPath = Annotated[
     str, StringConstraints(min_length=1, max_length=200), AfterValidator(_line), AfterValidator(_inside)
 ]
-Hash = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
-Version = Annotated[str, StringConstraints(pattern=r"^[1-9]\d{0,5}\.\d{1,6}\.\d{1,6}$")]
+Hash = Annotated[str, StringConstraints(pattern=SHA256)]
+Version = Annotated[str, StringConstraints(pattern=RELEASE)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Seconds = Annotated[float, Field(ge=1e-7, lt=1e9, allow_inf_nan=False)]
 Number = Annotated[float, Field(allow_inf_nan=False)]
@@ -133,7 +152,7 @@ class CostEntry(_Strict):
 class FlagEntry(_Strict):
     """A flag of the scorer or a warning of the validation."""
 
-    name: Annotated[str, StringConstraints(pattern=r"^[a-z0-9_]+$", max_length=LONGEST_ID)]
+    name: Annotated[str, StringConstraints(pattern=LABEL, max_length=LONGEST_ID)]
     reasons: Annotated[tuple[Long, ...], Field(max_length=20, strict=False)] = ()
 
 
@@ -162,7 +181,7 @@ class ScoreBlock(_Strict):
     scored_by: Short
     lagbench: Short = Field(description="version of the scorer")
     dataset_sha256: Hash
-    ranking_metric: Annotated[str, StringConstraints(pattern=r"^[a-z0-9_]+$", max_length=LONGEST_ID)]
+    ranking_metric: Annotated[str, StringConstraints(pattern=LABEL, max_length=LONGEST_ID)]
     files: Annotated[tuple[ScoredFile, ...], Field(min_length=1, max_length=MOST_SEEDS, strict=False)]
     metrics: Annotated[dict[str, Summary], Field(max_length=500)]
     digest: Hash = Field(description="of this block and the predictions it belongs to")

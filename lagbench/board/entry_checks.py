@@ -12,7 +12,7 @@ from lagbench.submission import Finding, Severity
 
 from .entry import Entry, PredictionEntry, Status
 from .entry_file import examine, load_plain
-from .folder import Folder, entry_path
+from .folder import Folder
 from .standing import is_current
 
 __all__ = ["check_entry", "finding", "parsed", "size_of"]
@@ -80,7 +80,7 @@ def size_of(entry: Entry, registry: Registry, found: list[Finding]) -> Size | No
 
 
 def check_entry(folder: Folder, path: Path, entry: Entry, size: Size) -> Iterator[Finding]:
-    """Yield what is wrong with the place, data set, life and predictions of an entry."""
+    """Yield what is wrong with the place, data set and predictions of an entry."""
     if entry.yaml_path != path:
         yield finding(
             "place",
@@ -100,25 +100,9 @@ def check_entry(folder: Folder, path: Path, entry: Entry, size: Size) -> Iterato
             got=f"version {entry.dataset.version}, {entry.dataset.sha256[:16]}",
             fix="predict from the new data and submit again, or set status: withdrawn",
         )
-    if entry.superseded_by is not None:
-        yield from _check_successor(folder, path, entry)
     for number, made in enumerate(entry.predictions):
         if made.path is not None:
             yield from _check_prediction(folder, f"{path}, predictions.{number}", made.path, made)
-
-
-def _check_successor(folder: Folder, path: Path, entry: Entry) -> Iterator[Finding]:
-    successor = str(entry.superseded_by)
-    there = (folder.path / entry_path((entry.split, entry.size, successor))).is_file()
-    if successor == entry.method or not there:
-        yield finding(
-            "lifecycle",
-            "the entry is superseded by one that is not there",
-            where=path,
-            expected=f"another entry of {entry.split} {entry.size}",
-            got=successor,
-            fix="name an entry that is there, or set status: withdrawn",
-        )
 
 
 def _check_prediction(folder: Folder, where: str, inner: str, made: PredictionEntry) -> Iterator[Finding]:

@@ -8,12 +8,13 @@ from typing import Any, TypeVar, get_args
 
 import yaml
 from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
 
 from lagbench.errors import ChecksFailedError, UnreadableFileError, nearest
 from lagbench.submission.findings import quoted
 from lagbench.yamlfile import read_yaml
 
-from .entry import Entry
+from .entry import PATTERNS, Entry
 
 __all__ = ["MAX_ENTRY_BYTES", "Mistake", "examine", "load_plain", "read_entry", "spell_entry"]
 
@@ -79,7 +80,7 @@ def examine(kind: type[Model], value: object) -> tuple[Model | None, tuple[Mista
     # a list with a faulty member is said to be too short as well
     inner = {item["loc"][:depth] for item in found for depth in range(1, len(item["loc"]))}
     told = [item for item in found if item["loc"] not in inner][:MOST_MISTAKES]
-    return None, tuple(_mistake(kind, it["loc"], it["type"], it["msg"], it["input"]) for it in told)
+    return None, tuple(_mistake(kind, it["loc"], it["type"], _said(it), it["input"]) for it in told)
 
 
 def read_entry(path: Path) -> Entry:
@@ -131,7 +132,13 @@ def _mistake(
         )
     if code == "missing":
         return Mistake(where=where, what="this key is missing", got="no such key")
-    return Mistake(where=where, what=message.removeprefix("Value error, "), got=quoted(given))
+    return Mistake(where=where, what=message, got=quoted(given))
+
+
+def _said(item: ErrorDetails) -> str:
+    """Return what is wrong in words, without a regular expression."""
+    wanted = PATTERNS.get(item.get("ctx", {}).get("pattern", ""))
+    return item["msg"].removeprefix("Value error, ") if wanted is None else f"is not {wanted}"
 
 
 def _fields(kind: type[BaseModel], place: tuple[int | str, ...]) -> list[str]:

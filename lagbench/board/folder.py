@@ -89,6 +89,14 @@ class Folder:
         """Return the score files, relative to the folder, in the order of their names."""
         return tuple(path for path in self._files(SCORES) if self.oddity(path) is None)
 
+    def claims(self) -> set[tuple[str, str, str]]:
+        """Return split, size and method of all that lies where an entry would, whatever it is."""
+        ends = ENDINGS[SUBMISSIONS]
+        files = [
+            path for path in self._files(SUBMISSIONS) if len(path.parts) == DEPTH and path.suffix == ends
+        ]
+        return {(path.parts[1], path.parts[2], path.stem) for path in files}
+
     def odd(self) -> Iterator[tuple[Path, str]]:
         """Yield what should not lie under submissions and scores, and why."""
         for top in (SUBMISSIONS, SCORES):

@@ -20,18 +20,34 @@ from .payload import MEAN_DIGITS, tab_id
 
 __all__ = ["EXPLAINED", "lede", "navigation", "sections"]
 
-EXPLAINED: Mapping[str, str] = MappingProxyType(
+EXPLAINED: Mapping[str, tuple[str, str]] = MappingProxyType(
     {
-        "copy_suspect": "The error moves from frame to frame as that of no rollout does.",
-        "below_twin_floor": "Closer to the truth than the solver itself after a nudge of 2⁻²⁰.",
-        "physics": "Kinetic energy or filled area are far from the truth's.",
-        "in_domain": "Particles leave the box; outside they carry no weight on the grid.",
-        "max_displacement": "Particles move farther in a frame than any of the truth.",
+        "copy_suspect": (
+            "copy suspected",
+            "The error moves from frame to frame as that of no rollout does.",
+        ),
+        "below_twin_floor": (
+            "closer than a twin",
+            "Closer to the truth than the solver itself after a nudge of 2⁻²⁰.",
+        ),
+        "physics": ("unphysical", "Kinetic energy or filled area are far from the truth's."),
+        "in_domain": (
+            "leaves the box",
+            "Predicted particles lie outside the box; there they carry no weight on the grid.",
+        ),
+        "max_displacement": (
+            "jumps",
+            "Predicted particles move farther in a frame than any of the truth.",
+        ),
     }
 )
-"""What flags and warnings mean."""
+"""What flags and warnings are called on the page, which shows what is wrong, and what they mean."""
 
 ARROWS = {Direction.LOWER: "↓", Direction.HIGHER: "↑", Direction.TARGET: "◎", Direction.NONE: ""}
+
+
+REPORTED_MARK = "self\u2011reported"
+"""Stands in the heading of what nothing can compute again."""
 
 
 def lede(board: Board) -> Markup:
@@ -40,7 +56,7 @@ def lede(board: Board) -> Markup:
     return escaped(
         "Neural surrogates of Lagrangian continuum simulators on data that anyone regenerates bit for bit:"
         f" {_counted(entries, 'entry', 'entries')} on {_counted(len(board.tabs), 'data set', 'data sets')}."
-        " Every number follows from a score file."
+        " Every score follows from a score file; costs are self-reported."
     )
 
 
@@ -110,10 +126,12 @@ def _tiles(tab: Tab, metrics: Mapping[str, Metric]) -> Iterator[Markup]:
     fast = [(row.cost.speed_up, row) for row in ranked if row.cost is not None and row.cost.speed_up]
     if fast:
         speed, row = max(fast, key=lambda pair: pair[0])
+        beside = "slower" if speed < 1.0 else "faster"
+        device = f", {row.cost.device}" if row.cost else ""
         yield _tile(
-            "fastest, over the solver",
+            "speed of the fastest entry, solver = 1×",
             written(speed, "factor"),
-            f"{_short(row)}, {row.cost.device}" if row.cost else "",
+            f"{beside} than the solver: {_short(row)}{device}; self-reported",
         )
     rest = len(entries) - len(ranked)
     yield _tile("entries", str(len(ranked)), f"and {rest} not ranked" if rest else "all ranked")
@@ -168,25 +186,38 @@ def _table(tab: Tab, metrics: Mapping[str, Metric]) -> Markup:
 
 def _heading(column: Column) -> Markup:
     unit = f"{column.unit} {ARROWS[column.direction]}".strip()
-    below = tag("span", unit, class_="unit") if unit else ""
-    return tag("th", tag("span", column.label, class_="metric"), below, scope="col", title=column.meaning)
+    parts = [
+        tag("span", column.label, class_="metric"),
+        tag("span", unit, class_="unit") if unit else "",
+        tag("span", REPORTED_MARK, class_="unit") if column.reported else "",
+    ]
+    return tag("th", *parts, scope="col", title=column.meaning)
 
 
 def _row(row: Row, columns: Sequence[Column], tab: Tab) -> Markup:
     rank = "" if row.rank is None else f"{'=' if row.shared else ''}{row.rank}"
-    flags = [*((flag.name, "bad") for flag in row.flags), *((flag.name, "warn") for flag in row.warnings)]
-    chips = [tag("span", clean(name).replace("_", " "), class_=f"flag {kind}") for name, kind in flags]
-    by = " · ".join(filter(None, (", ".join(row.authors), row.affiliation)))
+    chips = [
+        *(_chip(flag.name, "flag bad") for flag in row.flags),
+        *(_chip(flag.name, "flag warn") for flag in row.warnings),
+    ]
+    by = clean(" · ".join(filter(None, (", ".join(row.authors), row.affiliation))))
     method = tag(
         "th",
         tag("span", clean(row.name), class_="name"),
         *chips,
-        tag("span", clean("floor, computed by the scorer" if row.floor else by), class_="sub"),
+        tag(
+            "span", clean("floor, computed by the scorer" if row.floor else by), class_="sub", title=clean(by)
+        ),
         scope="row",
         class_="method",
     )
     cells = [_cell(row, column, ranks=column.key == tab.ranking) for column in columns]
     return tag("tr", tag("td", rank, class_="rank"), method, *cells, class_="floor" if row.floor else None)
+
+
+def _chip(name: str, kind: str) -> Markup:
+    label, meaning = EXPLAINED.get(name, (clean(name).replace("_", " "), None))
+    return tag("span", label, class_=kind, title=meaning)
 
 
 def _cell(row: Row, column: Column, *, ranks: bool) -> Markup:
@@ -214,6 +245,11 @@ def _notes(tab: Tab) -> Iterator[Markup]:
             "There are too few test scenarios for a claim: all share a rank, and the intervals speak alone."
         )
     yield escaped(f"{test} Grey rows are floors that cost nothing.")
+    yield escaped(
+        "Times, speed-up, parameters and hardware are self-reported: submitters say them and nobody computes"
+        " them again. A speed-up below 1× means slower than the solver."
+    )
     raised = {flag.name for row in tab.rows for flag in (*row.flags, *row.warnings)}
     for name in sorted(raised & EXPLAINED.keys()):
-        yield join([tag("strong", name.replace("_", " ")), ": ", EXPLAINED[name]])
+        label, meaning = EXPLAINED[name]
+        yield join([tag("strong", label), ": ", meaning])

@@ -85,6 +85,7 @@ def _column(column: Column) -> dict[str, Any]:
         "direction": str(column.direction),
         "perfect": column.perfect,
         "form": column.form,
+        "reported": column.reported,
         "meaning": clean(column.meaning),
     }
 

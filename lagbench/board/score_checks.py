@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from lagbench.checksums import file_sha256
@@ -11,48 +11,112 @@ from lagbench.errors import UnreadableFileError
 from lagbench.registry import Size
 from lagbench.submission import Finding
 
+from .coverage import gaps
 from .entry import Entry, Summary
 from .entry_checks import finding
 from .folder import Folder
+from .likeness import TOLERANCE, untrue
 from .seal import digest_of
 from .seeds import combine, summarise
 from .standing import is_current
 from .stored import MAX_SCORE_BYTES, Stored, read_stored
 
-__all__ = ["RESCORE", "TOLERANCE", "check_scores"]
-
-TOLERANCE = 1e-6
-"""Relative difference up to which two aggregates are equal; NumPy versions may differ in the last bits."""
+__all__ = ["RESCORE", "ScoreChecks"]
 
 RESCORE = "submit the predictions again: lagbench submit; the score block is not for editing"
 
 
-def check_scores(folder: Folder, entry: Entry, size: Size, broken: Mapping[Path, str]) -> Iterator[Finding]:
-    """Yield what is wrong with the scores of an entry.
+class ScoreChecks:
+    """Checks on the scores of entries, one after the other.
 
     Args:
         folder: the leaderboard's folder.
-        entry: the entry.
-        size: its split and size.
         broken: score files that cannot be read, and why, as a child process found.
+
+    Attributes:
+        sound: score files that were read.
     """
-    task = size if is_current(entry.dataset, size) else None
-    stored: list[Stored] = []
-    for path, said, made in zip(entry.score_paths, entry.score.files, entry.predictions, strict=True):
-        wrong = _file_mistake(folder, path, said.sha256, broken)
+
+    def __init__(self, folder: Folder, broken: Mapping[Path, str]) -> None:
+        self.sound: set[Path] = set()
+        self._folder, self._broken = folder, broken
+        self._witnesses: dict[tuple[str, str, str], tuple[Path, Stored]] = {}
+
+    def of(self, entry: Entry, size: Size) -> Iterator[Finding]:
+        """Yield what is wrong with the scores of an entry.
+
+        Args:
+            entry: the entry.
+            size: its split and size.
+        """
+        task = size if is_current(entry.dataset, size) else None
+        stored: list[Stored] = []
+        for path, said, made in zip(entry.score_paths, entry.score.files, entry.predictions, strict=True):
+            held = yield from self._read(path, said.sha256, task)
+            if held is not None:
+                yield from _check_identity(path, entry, made.sha256, held)
+                yield from self._check_truth(path, held)
+                stored.append(held)
+        yield from _check_block(entry)
+        if len(stored) == len(entry.predictions) and (yield from _check_alike(entry, stored)):
+            yield from _check_numbers(entry, stored)
+
+    def _read(self, path: Path, sha256: str, task: Size | None) -> Generator[Finding, None, Stored | None]:
+        """Return a score file; None, and findings, where it cannot be one."""
+        wrong = _file_mistake(self._folder, path, sha256, self._broken)
         if wrong is not None:
             yield wrong
-            continue
+            return None
         try:
-            held = read_stored(folder.path / path, task)
+            held = read_stored(self._folder.path / path, task)
         except UnreadableFileError as error:
             yield _odd(path, f"{error.what}: {error.got}")
-            continue
-        yield from _check_identity(path, entry, made.sha256, held)
-        stored.append(held)
-    yield from _check_block(entry)
-    if len(stored) == len(entry.predictions):
-        yield from _check_numbers(entry, stored)
+            return None
+        self.sound.add(path)
+        if task is not None:
+            for expected, got in gaps(held.scores, task):
+                yield finding(
+                    "statistics",
+                    "a score file has gaps that the scorer does not leave",
+                    where=path,
+                    expected=expected,
+                    got=got,
+                    fix=RESCORE,
+                )
+        return held
+
+    def _check_truth(self, path: Path, held: Stored) -> Iterator[Finding]:
+        """Compare what the truth alone decides with the first score file of the same data set."""
+        identity = held.scores.identity
+        key = (identity["split"], identity["size"], identity["dataset_sha256"])
+        witness, first = self._witnesses.setdefault(key, (path, held))
+        differing = list(untrue(first, held)) if first is not held else []
+        if differing:
+            yield finding(
+                "truth",
+                "two score files of one data set disagree about the truth",
+                where=path,
+                expected=f"that of {witness}",
+                got=f"other {', '.join(differing[:5])}",
+                fix=f"submit again whichever was edited: {path.stem} or {witness.stem}",
+            )
+
+
+def _check_alike(entry: Entry, stored: Sequence[Stored]) -> Generator[Finding, None, bool]:
+    """Tell whether seeds are of the same scenarios and frames, so that they have a mean."""
+    first = _extent(stored[0])
+    for path, held in zip(entry.score_paths, stored, strict=True):
+        if _extent(held) != first:
+            yield _odd(
+                path, f"other scenarios, frames or ranking metric than {entry.score_paths[0].name} has"
+            )
+            return False
+    return True
+
+
+def _extent(held: Stored) -> tuple[object, ...]:
+    tallies = held.scores.tallies
+    return sorted(tallies), next(iter(tallies.values())).frames, held.scores.ranking
 
 
 def _file_mistake(folder: Folder, path: Path, sha256: str, broken: Mapping[Path, str]) -> Finding | None:
@@ -110,7 +174,7 @@ def _check_identity(path: Path, entry: Entry, predictions_sha256: str, held: Sto
 
 def _check_block(entry: Entry) -> Iterator[Finding]:
     block = entry.score
-    if block.digest != digest_of(entry.place, entry.dataset, entry.predictions, block):
+    if block.digest != digest_of(entry.place, entry.dataset, entry.predictions, entry, block):
         yield _edited(entry, "a score block and data set as `lagbench submit` wrote them", "another digest")
     if block.dataset_sha256 != entry.dataset.sha256:
         yield _edited(entry, entry.dataset.sha256, block.dataset_sha256)

@@ -15,6 +15,7 @@ from lagbench.score_card import ScoreCard
 
 from .entry import (
     LONGEST_TEXT,
+    About,
     DataSet,
     FlagEntry,
     PredictionEntry,
@@ -54,6 +55,7 @@ def score_block(
     files: Sequence[ScoredFile],
     metrics: Mapping[str, Summary],
     *,
+    about: About,
     ranking: str,
     scored_by: str,
 ) -> ScoreBlock:
@@ -65,6 +67,7 @@ def score_block(
         predictions: the predictions, in the order of ``files``.
         files: what is said of each score file.
         metrics: metrics of all seeds together.
+        about: what the submitter says, whose claims are sealed too.
         ranking: name of the metric that ranks.
         scored_by: who ran the scorer.
     """
@@ -77,4 +80,4 @@ def score_block(
         metrics=dict(metrics),
         digest=UNSEALED,
     )
-    return sealed(place, dataset, predictions, block)
+    return sealed(place, dataset, predictions, about, block)

@@ -82,7 +82,8 @@ def _plain_row(row: Row) -> dict[str, Any]:
 
 def _table(tab: Tab, names: list[str]) -> Table:
     claim = "" if tab.decided else ", too few scenarios to tell ranks apart"
-    title = f"{tab.split} {tab.size} {tab.dataset_version}, by {tab.ranking}{claim}"
+    cost = "; cost self-reported" if any(row.cost for row in tab.rows) else ""
+    title = f"{tab.split} {tab.size} {tab.dataset_version}, by {tab.ranking}{claim}{cost}"
     columns = ("rank", "method", *names, "s/frame", "speed-up", "remarks")
     return Table(title, columns, tuple(_cells(row, names) for row in tab.rows))
 

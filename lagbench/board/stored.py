@@ -28,6 +28,8 @@ from lagbench.score_file import FILM_RANGE, StoredScores, read_statistics
 from lagbench.submission.opening import opened
 from lagbench.submission.task_checks import frames_to_predict
 
+from .coverage import reported_frames
+
 __all__ = ["MAX_SCORE_BYTES", "Stored", "read_stored"]
 
 MAX_SCORE_BYTES = 300_000
@@ -92,7 +94,11 @@ def _check_length(path: Path) -> None:
         status = path.lstat()
     except OSError as error:
         raise UnreadableFileError(
-            "cannot read the score file", where=str(path), got=error.strerror
+            "cannot read the score file",
+            where=str(path),
+            expected="the file that `lagbench submit` wrote beside the entry",
+            got=error.strerror,
+            fix="bring it back, or submit the predictions again; `lagbench leaderboard check` names all such",
         ) from error
     regular = stat.S_ISREG(status.st_mode)
     if not regular or status.st_size > MAX_SCORE_BYTES:
@@ -216,8 +222,7 @@ def _check_task(scores: StoredScores, preview: Preview, size: Size) -> None:
         raise ValueError("another ranking metric or another pictured scenario")
     task = size.task
     grid = Grid(task.score_grid.cells, Placement(task.score_grid.placement))
-    reported = tuple(sorted({*task.frames_of_interest, frames[-1]}.intersection(frames)))
-    if preview.vorticity.shape[-1] != grid.nodes or preview.map_frames != reported:
+    if preview.vorticity.shape[-1] != grid.nodes or preview.map_frames != reported_frames(size):
         raise ValueError("maps of another grid or of other frames")
     if not set(preview.film_frames).issubset(frames) or preview.film_frames != tuple(
         sorted(preview.film_frames)

@@ -20,7 +20,7 @@ from lagbench.score_file import write_statistics
 from lagbench.scoring import score
 from lagbench.submission import ValidationResult
 
-from .draft import Draft, draft_of, headers_of
+from .draft import Draft, check_needed, draft_of, headers_of
 from .entry import About, DataSet, Entry, PredictionEntry
 from .entry_file import examine, read_entry, spell_entry
 from .floor_predictions import write_floor
@@ -95,6 +95,7 @@ def submit(
         DataError: the test subset is missing, or they were made from another data set.
         WorkFailedError: the disk is full or not writable, or a score file became too long.
     """
+    check_needed(meta)
     folder, paths = Folder(board), [Path(path) for path in predictions]
     headers = headers_of(paths, root=root, registry=registry, examined=examined)
     draft = draft_of(headers, meta, folder, replace=replace)
@@ -204,6 +205,7 @@ def _entry(
         made,
         [scored_file(card, target) for card, target in zip(cards, staged, strict=True)],
         summarise(combine([read_stored(target).scores for target in staged])),
+        about=draft.about,
         ranking=cards[0].ranking,
         scored_by=draft.scored_by,
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -9,12 +10,15 @@ import typer
 
 from lagbench.errors import UsageError
 
+from . import entry_options as it
+from .entry_options import option
 from .options import JsonFlag, QuietFlag, RootOption, SplitArgument, SplitOption, WorkersOption, chosen
 from .output import print_json, print_table, say, spell_bytes
 from .progress import progress_bar
 
 if TYPE_CHECKING:
     from lagbench.board.check import CheckResult
+    from lagbench.board.meta import Meta
     from lagbench.board.submit import SubmitResult
     from lagbench.submission import ValidationResult
 
@@ -24,42 +28,29 @@ BoardOption = Annotated[Path, typer.Option("--board", metavar="FOLDER", help="Th
 BOARD = Path("leaderboard")
 
 
-def _text(name: str, metavar: str, text: str) -> Any:  # noqa: ANN401 (what typer says of it)
-    return typer.Option(name, metavar=metavar, help=text)
-
-
 def submit(
-    predictions: Annotated[
-        list[Path] | None, typer.Argument(metavar="FILE...", help="A predictions.nc; one per seed.")
-    ] = None,
-    source: Annotated[
-        Path | None, typer.Option("--from", metavar="FILE", help="YAML of the keys below; options win.")
-    ] = None,
-    method: Annotated[str | None, _text("--method", "ID", "Names the entry, as in my-model.")] = None,
-    name: Annotated[str | None, _text("--name", "TEXT", "What the method is called.")] = None,
-    authors: Annotated[list[str] | None, _text("--author", "NAME", "Repeatable.")] = None,
-    affiliation: Annotated[str | None, _text("--affiliation", "TEXT", "Of the authors.")] = None,
-    licence: Annotated[str | None, _text("--licence", "NAME", "Of the code, as in MIT.")] = None,
-    code: Annotated[str | None, _text("--code", "URL", "Where the code is.")] = None,
-    paper: Annotated[str | None, _text("--paper", "URL", "Where the paper is.")] = None,
-    date: Annotated[str | None, _text("--date", "YYYY-MM-DD", "Of the submission; today by default.")] = None,
-    notes: Annotated[str | None, _text("--notes", "TEXT", "What readers should know.")] = None,
-    training: Annotated[str | None, _text("--training", "TEXT", "What it was trained on.")] = None,
-    parameters: Annotated[int | None, _text("--parameters", "N", "Trainable parameters.")] = None,
-    hardware: Annotated[str | None, _text("--hardware", "TEXT", "Machine of the training.")] = None,
-    command: Annotated[str | None, _text("--command", "TEXT", "What makes the predictions again.")] = None,
-    solver: Annotated[
-        float | None,
-        _text("--solver-seconds-per-frame", "S", "Of our solver on the same machine: lagbench bench solver."),
-    ] = None,
-    urls: Annotated[list[str] | None, _text("--url", "URL", "Where FILE can be had; one per FILE.")] = None,
-    scored_by: Annotated[str | None, _text("--scored-by", "NAME", "Who runs this; else the author.")] = None,
-    floor: Annotated[
-        str | None, _text("--floor", "NAME", "Instead of FILE: persistence or constant-velocity.")
-    ] = None,
+    predictions: it.FilesArgument = None,
+    source: it.SourceOption = None,
+    method: it.MethodOption = None,
+    name: it.NameOption = None,
+    authors: it.AuthorsOption = None,
+    affiliation: it.AffiliationOption = None,
+    licence: it.LicenceOption = None,
+    code: it.CodeOption = None,
+    paper: it.PaperOption = None,
+    date: it.DateOption = None,
+    notes: it.NotesOption = None,
+    training: it.TrainingOption = None,
+    parameters: it.ParametersOption = None,
+    hardware: it.HardwareOption = None,
+    command: it.CommandOption = None,
+    solver_seconds_per_frame: it.SolverOption = None,
+    urls: it.UrlsOption = None,
+    scored_by: it.ScoredByOption = None,
+    floor: it.FloorOption = None,
     split: SplitOption = None,
-    size: Annotated[str | None, _text("--size", "NAME", "With --floor: tiny, mini or full.")] = None,
-    replace: Annotated[bool, typer.Option("--replace", help="Replace the entry of that name.")] = False,
+    size: it.FloorSizeOption = None,
+    replace: it.ReplaceFlag = False,
     board: BoardOption = BOARD,
     root: RootOption = None,
     workers: WorkersOption = None,
@@ -67,52 +58,59 @@ def submit(
     quiet: QuietFlag = False,
 ) -> None:
     """Score predictions and write their entry and score files into the leaderboard's folder."""
+    given = {
+        "method": method,
+        "name": name,
+        "authors": authors,
+        "affiliation": affiliation,
+        "licence": licence,
+        "code": code,
+        "paper": paper,
+        "notes": notes,
+        "training": training,
+        "parameters": parameters,
+        "hardware": hardware,
+        "command": command,
+        "solver_seconds_per_frame": solver_seconds_per_frame,
+        "urls": urls,
+        "scored_by": scored_by,
+    }
+    _check_choice(predictions, floor, [split, size], [source, replace or None, *given.values()])
+    meta, where = _described(source, given, date), {"board": board, "root": root, "workers": workers}
+    with progress_bar(quiet=quiet or as_json) as draw:
+        if floor is None:
+            result = _of_files(predictions or [], meta, replace=replace, progress=draw, **where)
+        else:
+            result = _of_floor(floor, chosen(None, split), size, meta, progress=draw, **where)
+    _submitted(result, as_json=as_json, quiet=quiet)
+
+
+def _described(source: Path | None, given: Mapping[str, object], date: str | None) -> Meta:
     from lagbench.board.meta import read_meta
+
+    return read_meta(source, {**given, "date": date})
+
+
+def _of_files(predictions: list[Path], meta: Meta, *, replace: bool, **where: Any) -> SubmitResult:  # noqa: ANN401
     from lagbench.board.submit import submit as run
+
+    return run(predictions, meta, replace=replace, examined=_complain, **where)
+
+
+def _of_floor(name: str, split: str, size: str | None, meta: Meta, **where: Any) -> SubmitResult:  # noqa: ANN401
     from lagbench.board.submit import submit_floor
 
-    given = {
-        **{"method": method, "name": name, "authors": authors, "affiliation": affiliation},
-        **{"licence": licence, "code": code, "paper": paper, "notes": notes, "training": training},
-        **{"parameters": parameters, "hardware": hardware, "command": command, "urls": urls},
-        **{"solver_seconds_per_frame": solver, "scored_by": scored_by},
-    }
-    _check_choice(predictions, floor, [source, split, size, replace or None, *given.values()])
-    meta = read_meta(source, {**given, "date": date})
-    with progress_bar(quiet=quiet or as_json) as draw:
-        if floor is not None:
-            result = submit_floor(
-                floor,
-                split=chosen(None, split),
-                size=size or "full",
-                date=meta.date,
-                progress=draw,
-                board=board,
-                root=root,
-                workers=workers,
-            )
-        else:
-            result = run(
-                predictions or [],
-                meta,
-                replace=replace,
-                progress=draw,
-                examined=_complain,
-                board=board,
-                root=root,
-                workers=workers,
-            )
-    if as_json:
-        print_json(result)
-    else:
-        _submitted(result, quiet=quiet)
+    return submit_floor(name, split=split, size=size or "full", date=meta.date, **where)
 
 
-def _check_choice(predictions: list[Path] | None, floor: str | None, described: list[object]) -> None:
+def _check_choice(
+    predictions: list[Path] | None,
+    floor: str | None,
+    place: list[str | None],
+    described: list[object],
+) -> None:
     """Refuse options of files with --floor and the other way round."""
-    _, split, size, *_ = described
-    rest = [value for value in described if value and value not in (split, size)]
-    if floor is not None and (predictions or rest):
+    if floor is not None and (predictions or any(described)):
         raise UsageError(
             "a floor is predicted and described by lagbench itself",
             where="--floor",
@@ -120,7 +118,7 @@ def _check_choice(predictions: list[Path] | None, floor: str | None, described: 
         )
     if floor is None and not predictions:
         raise UsageError("nothing to submit", expected="FILE..., or --floor NAME")
-    if floor is None and (split or size):
+    if floor is None and any(place):
         raise UsageError(
             "predictions name split and size themselves", where="--split, --size", fix="leave out"
         )
@@ -132,7 +130,10 @@ def _complain(result: ValidationResult) -> None:
         typer.echo("\n".join(str(finding) for finding in result.errors), err=True)
 
 
-def _submitted(result: SubmitResult, *, quiet: bool) -> None:
+def _submitted(result: SubmitResult, *, as_json: bool, quiet: bool) -> None:
+    if as_json:
+        print_json(result)
+        return
     mean = "undefined" if result.mean is None else f"{result.mean:.4g}"
     spread = "" if result.std is None else f" ± {result.std:.2g} over seeds"
     say(f"{result.method} on {result.split} {result.size}: {result.ranking} {mean}{spread}", quiet=quiet)
@@ -171,7 +172,14 @@ def check(
     board: BoardOption = BOARD,
     page: Annotated[bool, typer.Option("--page/--no-page", help="Whether to compare the page.")] = True,
     predictions: Annotated[
-        list[Path] | None, _text("--predictions", "FILE", "Score an entry's predictions again; repeatable.")
+        list[Path] | None, option("--predictions", "FILE", "Score an entry's predictions again; repeatable.")
+    ] = None,
+    floors: Annotated[
+        bool | None,
+        typer.Option(
+            "--floors/--no-floors",
+            help="Whether to score the floors again where the data are there; by default with --root.",
+        ),
     ] = None,
     root: RootOption = None,
     as_json: JsonFlag = False,
@@ -181,7 +189,14 @@ def check(
     from lagbench.board.check import check_board
 
     with progress_bar(quiet=quiet or as_json) as draw:
-        result = check_board(board, page=page, predictions=predictions or (), root=root, progress=draw)
+        result = check_board(
+            board,
+            page=page,
+            predictions=predictions or (),
+            floors=root is not None if floors is None else floors,
+            root=root,
+            progress=draw,
+        )
     if as_json:
         print_json(result)
     else:
@@ -195,14 +210,23 @@ def _checked(result: CheckResult, *, quiet: bool) -> None:
     state = f"{len(result.findings)} findings" if result.findings else "nothing wrong"
     looked = "" if result.page_checked else ", page not compared"
     say(f"{result.folder}: {result.entries} entries, {state}{looked}", quiet=quiet)
+    if result.floors_rescored:
+        say(f"floors scored again: {', '.join(result.floors_rescored)}", quiet=quiet)
+    if result.floors_trusted:
+        which = ", ".join(result.floors_trusted)
+        say(f"floors aggregated again only, not scored again: {which}", quiet=quiet)
+        say(
+            "--root FOLDER with the test data scores them again: seconds for a mini, long for a full",
+            quiet=quiet,
+        )
 
 
 @leaderboard.command("show", epilog="Example: lagbench leaderboard show cavity --size mini")
 def show(
     name: SplitArgument = None,
     split: SplitOption = None,
-    size: Annotated[str | None, _text("--size", "NAME", "tiny, mini or full; all by default.")] = None,
-    metric: Annotated[list[str] | None, _text("--metric", "NAME", "Metric to show; repeatable.")] = None,
+    size: Annotated[str | None, option("--size", "NAME", "tiny, mini or full; all by default.")] = None,
+    metric: Annotated[list[str] | None, option("--metric", "NAME", "Metric to show; repeatable.")] = None,
     board: BoardOption = BOARD,
     as_json: JsonFlag = False,
 ) -> None:

@@ -79,6 +79,7 @@ def generate(
 
 def _generated(result: GenerationResult) -> list[str]:
     from lagbench.scenario_ids import spell_ids
+    from lagbench.working_copy import url_of
 
     to_do = len(result.simulated)
     if result.dry_run:
@@ -93,6 +94,8 @@ def _generated(result: GenerationResult) -> list[str]:
         f" {len(result.kept)} kept",
         f"  folder  {result.folder}",
     ]
+    if (url := url_of(result.root)) is not None:
+        lines.append(f"  store   {url}/{result.folder.relative_to(result.root).as_posix()}")
     if result.missing:
         lines.append(f"  missing {spell_ids(result.missing)}: the data set is incomplete")
     if result.dataset_sha256:

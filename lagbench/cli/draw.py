@@ -32,12 +32,14 @@ def _source(name: str | None, split: str | None, size: str, scenario: int | None
     """Return the scenario file that a user means by its path or by split, size and id."""
     from lagbench.layout import ScenarioKey, scenario_path
     from lagbench.locating import locate
+    from lagbench.store.bringing import bring
 
     if name is not None and name.endswith(".nc"):
         return Path(name)
     tier, folder, _ = locate(chosen(name, split), size, root=root)
     wanted = tier.subsets["test"][0] if scenario is None else scenario
     subset = tier.subset_of(wanted)
+    bring(tier, folder, [wanted])
     key = ScenarioKey(split=tier.split, size=size, version=tier.version, scenario=wanted, subset=subset)
     return scenario_path(folder, key)
 

@@ -39,7 +39,9 @@ ScenariosOption = Annotated[
 RootOption = Annotated[
     Path | None,
     typer.Option(
-        "--root", metavar="FOLDER", help="Where data sets live; else LAGBENCH_ROOT, else user data."
+        "--root",
+        metavar="FOLDER",
+        help="Where data sets live, or s3://bucket/prefix; else LAGBENCH_ROOT, else user data.",
     ),
 ]
 WorkersOption = Annotated[

@@ -24,7 +24,13 @@ def progress_bar(*, quiet: bool, counted: str = "scenarios") -> Iterator[Callabl
     Yields:
         A function to hand to ``generate``; None where stderr is no terminal or silence is wanted.
     """
-    if quiet or not sys.stderr.isatty():
+    if quiet:
+        from lagbench.store.fetching import quietly
+
+        with quietly():
+            yield None
+        return
+    if not sys.stderr.isatty():
         yield None
         return
     from rich.console import Console

@@ -22,6 +22,7 @@ def list_splits(root: RootOption = None, as_json: JsonFlag = False) -> None:
     from lagbench.locating import rooted
     from lagbench.overview import overview
     from lagbench.registry import load
+    from lagbench.working_copy import url_of
 
     folder = resolve_root(root)
     registry = rooted(folder, load())
@@ -35,7 +36,7 @@ def list_splits(root: RootOption = None, as_json: JsonFlag = False) -> None:
         return
     rows = [_row(entry) for entry in found]
     print_table("", ("split", "size", *_COLUMNS), rows)
-    say(f"data sets live in {folder}")
+    say(f"data sets live in {url_of(folder) or folder}")
 
 
 _COLUMNS = ("scenarios", "particles", "frames", "disk", "time", "here")

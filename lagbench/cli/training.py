@@ -138,6 +138,7 @@ def predict(
     for module in ("torch", "torch_geometric"):
         check_installed(module, extra=EXTRA)
     from lagbench.baselines.prediction import predict as run
+    from lagbench.baselines.prediction import record_cost
 
     with progress_bar(quiet=quiet) as draw:
         result = run(
@@ -151,6 +152,8 @@ def predict(
             progress=draw,
         )
     timed = _solver_time(result, quiet=quiet) if solver else None
+    if timed is not None:
+        record_cost(result, solver=timed.seconds_per_frame)
     if as_json:
         print_json({**vars(result), "solver": timed})
     else:
@@ -176,10 +179,14 @@ def _predicted(result: PredictionResult, solver: SolverBench | None) -> list[str
         f" without the neighbour search) on {result.device}",
     ]
     if solver is not None:
-        ratio = solver.seconds_per_frame / result.seconds_per_frame
+        ratio = result.seconds_per_frame / solver.seconds_per_frame
         lines.append(
-            f"  solver  {solver.seconds_per_frame:.3g} s per frame on one core of this machine:"
-            f" the model is {ratio:.2g} times as fast"
+            f"  solver  {solver.seconds_per_frame:.3g} s per frame on one core of this machine: "
+            + (
+                f"{ratio:.2g} times as fast as the model"
+                if ratio > 1
+                else f"the model is {1 / ratio:.2g} times as fast"
+            )
         )
     if result.diverged:
         marks = ", ".join(f"scenario {i} at frame {frame}" for i, frame in result.diverged.items())
@@ -195,7 +202,7 @@ def bench(
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
-    """Time our solver on this machine: seconds per frame of one scenario on one core."""
+    """Time our solver on this machine: processor seconds per frame of one scenario on one core."""
     from lagbench.bench import bench_solver
 
     if what != "solver":

@@ -5,7 +5,7 @@ from __future__ import annotations
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Unpack
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +16,12 @@ from lagbench.progress import Progress
 from lagbench.variables import MATERIALS
 
 from .description import Description, Wishes
+from .inflation import check_inflation
 from .local_split import LocalSplit, make_local_split, output_name
 from .trajectory import Frame, Trajectory, check_array, frames_of
+
+if TYPE_CHECKING:
+    import netCDF4
 
 __all__ = ["ENDINGS", "adopt"]
 
@@ -177,6 +181,11 @@ def _array(path: Path) -> NDArray[Any]:
 def _arrays(path: Path) -> dict[str, NDArray[Any]]:
     """Return the arrays of a .npz file that a trajectory may have."""
     try:
+        with zipfile.ZipFile(path) as archive:
+            for member in archive.infolist():
+                check_inflation(
+                    f"{path}, {member.filename}", packed=member.compress_size, unpacked=member.file_size
+                )
         with np.load(path, allow_pickle=False) as held:
             return {name: held[name] for name in (POSITION, VELOCITY, MATERIAL, WALLS) if name in held}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
@@ -188,9 +197,10 @@ def _netcdf(path: Path) -> Trajectory:
 
     try:
         file = netCDF4.Dataset(path, "r")
-    except OSError as error:
+    except (OSError, RuntimeError) as error:
         raise _unreadable(path, error) from error
     file.set_auto_maskandscale(False)
+    _check_plain(path, file)
     held = {
         name: file.variables[name] for name in (POSITION, VELOCITY, MATERIAL, WALLS) if name in file.variables
     }
@@ -205,6 +215,19 @@ def _netcdf(path: Path) -> Trajectory:
             yield frame, velocity
 
     return _trajectory(str(path), held, read)
+
+
+def _check_plain(path: Path, file: netCDF4.Dataset) -> None:
+    """Refuse values that stand for others: they are read as they are stored."""
+    for name in (POSITION, VELOCITY, WALLS):
+        packed = name in file.variables and {"scale_factor", "add_offset"} & set(file[name].ncattrs())
+        if packed:
+            raise UnreadableFileError(
+                "the values are packed",
+                where=f"{path}, {name}, {', '.join(sorted(packed))}",
+                expected="positions as they are, float32 or float64",
+                fix="write them again without scale_factor and add_offset",
+            )
 
 
 def _unreadable(path: Path, error: Exception) -> UnreadableFileError:

@@ -58,8 +58,9 @@ class Building:
             raise DataError("too many trajectories", where=trajectory.name, expected=f"at most {MAX_ID + 1}")
         about = self.about
         if not self.spacing:
-            first = trajectory.first()
-            own = about.spacing or estimate_spacing(np.asarray(first), about.radius)
+            first = np.asarray(trajectory.first())
+            self._check(trajectory, 0, about.measure.place(first))
+            own = about.spacing or estimate_spacing(first, about.radius)
             self.spacing = own / about.measure.scale
         key = ScenarioKey(split=about.name, size=SIZE, version=VERSION, scenario=scenario, subset=subset)
         scale = about.measure.scale

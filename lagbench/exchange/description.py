@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -21,6 +20,12 @@ SIZE = "full"
 """Size of every local split."""
 
 VERSION = "1.0.0"
+LEAST, MOST = 1e-30, 1e30
+"""Least and greatest number that a length, a time or a density may be: squares of them are floats."""
+
+FEWEST_CELLS, MOST_CELLS = 4, 4096
+"""Cells across of a score grid."""
+
 PER_CELL = 2.5
 """Spacings of particles across a cell of the score grid where the user gives none; the splits of
 lagbench have 1.8 to 2.6."""
@@ -123,10 +128,13 @@ class Description:
         }
         positive |= {"--spacing": 1.0 if self.spacing is None else self.spacing}
         for option, value in positive.items():
-            if not (math.isfinite(value) and value > 0.0):
-                raise UsageError("not a number above 0", where=option, got=value)
-        if self.bounds is not None and any(not low < high for low, high in self.bounds):
+            if not (LEAST <= value <= MOST):
+                raise UsageError("not a number above 0 that computes", where=option, got=value)
+        if self.bounds is not None and any(not -MOST <= low < high <= MOST for low, high in self.bounds):
             raise UsageError("bounds run from low to high", where="--bounds", got=self.bounds)
+        if self.cells is not None and not FEWEST_CELLS <= self.cells <= MOST_CELLS:
+            expected = f"{FEWEST_CELLS} to {MOST_CELLS}"
+            raise UsageError("no such score grid", where="--cells", expected=expected, got=self.cells)
         if self.rescale:
             if self.bounds is None:
                 raise UsageError("what is to fit the unit box?", where="--rescale", fix="add --bounds")
@@ -155,7 +163,8 @@ def split_yaml(
         measured: hashes and statistics.
 
     Raises:
-        UsageError: test scenarios are too short for the task.
+        UsageError: test scenarios are too short for the task, or a frame of interest is not
+            predicted.
     """
     task = _task(about, shortest=min(frames[i] for i in subsets["test"]), spacing=spacing)
     cells = task["score_grid"]["cells"]
@@ -205,12 +214,19 @@ def _task(about: Description, *, shortest: int, spacing: float) -> dict[str, Any
             expected=f"together at most {shortest}",
             got=f"{about.input_frames} and {horizon}",
         )
-    cells = about.cells or min(4096, max(4, round(1.0 / (PER_CELL * spacing))))
-    interest = (last,) if about.frames_of_interest is None else tuple(about.frames_of_interest)
+    cells = about.cells or min(MOST_CELLS, max(FEWEST_CELLS, round(1.0 / (PER_CELL * spacing))))
+    interest = sorted(set(about.frames_of_interest or (last,)))
+    if not about.input_frames <= interest[0] <= interest[-1] <= last:
+        raise UsageError(
+            "a frame of interest is not predicted",
+            where="--frames-of-interest",
+            expected=f"frames {about.input_frames} to {last}",
+            got=spell_ids(interest) if interest[0] >= 0 else interest,
+        )
     return {
         "input_frames": about.input_frames,
         "horizon": horizon,
-        "frames_of_interest": list(interest),
+        "frames_of_interest": interest,
         "score_grid": {"cells": cells, "placement": "cell_centres" if about.full_box else "nodes"},
         "radius": about.radius / about.measure.scale,
     }

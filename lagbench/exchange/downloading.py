@@ -18,6 +18,7 @@ from lagbench.plan import Scenarios, Selection, select
 from lagbench.progress import Meter, Progress
 from lagbench.registry import Registry
 from lagbench.scenario_ids import spell_ids
+from lagbench.store.publication import publication
 from lagbench.verdict import compare
 
 from .errand import Errand, Reason
@@ -99,7 +100,7 @@ def download(
         UsageError: unknown split, size, subset or scenario, or no mirror is known and nothing
             may be simulated.
         DataError: the mirror sent what is no data or has another length or content, see
-            :mod:`lagbench.exchange.mirror`; the file is gone, all that were right stay.
+            :mod:`lagbench.store.mirror`; the file is gone, all that were right stay.
         WorkFailedError: the connection kept breaking, the disk is full, no mirror answers and
             nothing may be simulated.
     """
@@ -109,16 +110,27 @@ def download(
     tier, folder, splits = locate(split, size, root=root, registry=registry)
     wanted = select(tier, subset=subset, scenarios=scenarios)
     bases = (mirror,) if mirror else splits.split(tier.split).mirrors
-    with dataset_lock(folder, tier.split, tier.name, tier.major):
-        errand = Errand(tier, folder, wanted, Meter(progress), connections)
+    with (
+        dataset_lock(folder, tier.split, tier.name, tier.major),
+        publication(tier, folder) as store,
+    ):
+        held = [i for i in wanted if store and i in store.held]
+        lacking = [i for i in wanted if i not in held]
+        errand = Errand(tier, folder, lacking, Meter(progress), connections)
         try:
             reason = errand.run(bases)
         finally:
             manifest = errand.record()
+            if store:
+                store.follow(manifest, at_once=True)
         if not errand.missing:
             verdict = compare(tier, manifest)
             if errand.downloaded and tier.simulated:
-                write_cards(folder, tier, splits.split(tier.split), manifest)
+                if store:
+                    store.bring(held)
+                cards = write_cards(folder, tier, splits.split(tier.split), manifest)
+                if store:
+                    store.finish(manifest, cards)
     if errand.missing:
         if not or_generate:
             raise reason
@@ -141,7 +153,7 @@ def download(
         folder=dataset_folder(folder, tier.split, tier.name, tier.major),
         mirror=errand.mirror,
         downloaded=tuple(sorted(errand.downloaded)),
-        kept=tuple(errand.kept),
+        kept=tuple(sorted((*held, *errand.kept))),
         generated=tuple(errand.missing),
         bytes=errand.bytes,
         seconds=time.monotonic() - started,

@@ -22,9 +22,8 @@ from lagbench.progress import Meter
 from lagbench.registry import Size
 from lagbench.scenario_file import check_scenario
 from lagbench.scenario_ids import spell_ids
-
-from .mirror import Fetch, fetch, fetch_text
-from .mirror_errors import (
+from lagbench.store.mirror import Fetch, fetch, fetch_text
+from lagbench.store.mirror_errors import (
     ConnectionLostError,
     MirrorUnreachableError,
     NotDataError,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from lagbench.progress import Meter, Progress
 from lagbench.registry import Registry, Size
 from lagbench.scenario_file import read_scenario
 from lagbench.scenario_ids import spell_ids
+from lagbench.store.bringing import bring
 
 from . import gns_npz, lagrangebench_h5
 from .kinds import Format
@@ -102,7 +104,8 @@ def export(
     form = parse_format(format)
     tier, home, splits = locate(split, size, root=root, registry=registry)
     folder, ending = Path(output), _ENDINGS[form]
-    _check_target(folder, [f"{subset}{ending}" for subset in HASHED_SUBSETS], force=force)
+    _claim_target(folder, [f"{subset}{ending}" for subset in HASHED_SUBSETS], force=force)
+    bring(tier, home, [i for subset in HASHED_SUBSETS for i in tier.subsets[subset]])
     statistics, digest = _recorded(tier, home)
     paths = {subset: _paths(tier, home, subset) for subset in HASHED_SUBSETS}
     origin = _origin(tier, form, from_walls=from_walls)
@@ -146,7 +149,12 @@ def export(
 _ENDINGS = {Format.GNS_NPZ: gns_npz.ENDING, Format.LAGRANGEBENCH_H5: lagrangebench_h5.ENDING}
 
 
-def _check_target(folder: Path, names: Sequence[str], *, force: bool) -> None:
+def _claim_target(folder: Path, names: Sequence[str], *, force: bool) -> None:
+    """Refuse a folder that must not be written to; begin to write over an earlier export.
+
+    Raises:
+        UsageError: files are there already, or a program that readers of the format run.
+    """
     if (folder / lagrangebench_h5.FORCE).exists():
         raise UsageError(
             "the folder holds a program that readers of this format run",
@@ -161,6 +169,8 @@ def _check_target(folder: Path, names: Sequence[str], *, force: bool) -> None:
             got=", ".join(there),
             fix="name another folder, or write over them: --force",
         )
+    with contextlib.suppress(OSError):  # written last, it says that an export is whole
+        (folder / NAME).unlink()
 
 
 def _recorded(size: Size, root: Path) -> tuple[dict[str, tuple[float, ...]], str]:

@@ -19,6 +19,7 @@ from lagbench.atomic import atomic_path
 from lagbench.errors import UnreadableFileError, UsageError
 from lagbench.scenario_file import ScenarioFile, read_scenario
 
+from .inflation import check_inflation
 from .kinds import Format, materials_of, numbers_of
 from .object_array import read_objects, write_pair
 from .trajectory import Trajectory, check_array, frames_of
@@ -110,13 +111,15 @@ def _items(archive: zipfile.ZipFile, path: Path) -> Iterator[tuple[str, object]]
         name = f"{path}, key {key!r}"
         with _member(archive, member, name) as stream:
             array = read_objects(stream, name)
-        if key == JOINT:
+        if key == JOINT and array.ndim:
             yield from ((f"{name}, item {i}", item) for i, item in enumerate(array))
         else:
             yield name, array
 
 
 def _member(archive: zipfile.ZipFile, member: str, name: str) -> io.BufferedReader:
+    about = archive.getinfo(member)
+    check_inflation(name, packed=about.compress_size, unpacked=about.file_size)
     try:
         return io.BufferedReader(archive.open(member))  # type: ignore[arg-type]
     except (OSError, RuntimeError, zipfile.BadZipFile, NotImplementedError) as error:
@@ -125,7 +128,8 @@ def _member(archive: zipfile.ZipFile, member: str, name: str) -> io.BufferedRead
 
 def _trajectory(name: str, item: object, given: Mapping[int, str]) -> Trajectory:
     """Return the trajectory of a pair (positions, kinds) or a triple with a material property."""
-    parts = list(item) if isinstance(item, np.ndarray | tuple | list) else []
+    several = isinstance(item, tuple) or (isinstance(item, np.ndarray) and item.ndim == 1)
+    parts = list(item) if several else []  # type: ignore[call-overload]
     if len(parts) not in (2, 3) or not isinstance(parts[0], np.ndarray):
         raise UnreadableFileError(
             "this is no trajectory", where=name, expected="positions, kinds[, a material property]", got=item

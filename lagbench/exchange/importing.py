@@ -95,6 +95,8 @@ def import_split(
 def _stated(stated: Source, wishes: Wishes) -> dict[str, Any]:
     """Return the facts of the metadata, those of our own exports, and over both the user's."""
     hints = stated.hints
+    if wishes.keys() & {"input_frames", "horizon"}:  # the frames belong to the exported task
+        hints = hints.model_copy(update={"frames_of_interest": None})
     found: dict[str, Any] = {
         "radius": stated.radius,
         "frame_interval": stated.frame_interval,

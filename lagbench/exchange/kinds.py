@@ -70,11 +70,12 @@ def materials_of(
         Material of each particle kept, and a mask over all particles.
 
     Raises:
+        UsageError: what a number is mapped to is no material.
         UnreadableFileError: a number that no material has and the user did not map, or no
             particle is left.
     """
     known = {number: name for name, number in NUMBERS[form].items()} | {PADDING: DROP} | dict(given)
-    codes = {number: _DROPPED if name == DROP else MATERIALS.index(name) for number, name in known.items()}
+    codes = {number: _DROPPED if name == DROP else _code(name) for number, name in known.items()}
     found = np.unique(numbers).tolist()
     strange = [number for number in found if number not in codes]
     if strange:
@@ -94,6 +95,13 @@ def materials_of(
     return material[kept], kept
 
 
+def _code(name: str) -> int:
+    if name not in MATERIALS:
+        fix = nearest(name, (*MATERIALS, DROP))
+        raise UsageError(f"no material {name!r}", where="--kinds", fix=fix)
+    return MATERIALS.index(name)
+
+
 def parse_kinds(text: str | None) -> dict[int, str]:
     """Return what a user says about numbers of particles.
 
@@ -108,8 +116,7 @@ def parse_kinds(text: str | None) -> dict[int, str]:
         number, _, name = part.strip().partition("=")
         if not number.lstrip("-").isdecimal():
             raise UsageError("bad kinds", where="--kinds", expected="as in 3=jelly,0=drop", got=text)
-        if name not in (*MATERIALS, DROP):
-            fix = nearest(name, (*MATERIALS, DROP))
-            raise UsageError(f"no material {name!r}", where="--kinds", fix=fix)
+        if name != DROP:
+            _code(name)
         kinds[int(number)] = name
     return kinds

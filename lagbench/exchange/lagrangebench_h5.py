@@ -9,6 +9,7 @@ write none and run none.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,6 +20,7 @@ from lagbench.atomic import atomic_path
 from lagbench.errors import UnreadableFileError
 from lagbench.scenario_file import ScenarioFile, read_scenario
 
+from .inflation import check_inflation
 from .kinds import Format, materials_of, numbers_of
 from .trajectory import Frame, Trajectory, check_array
 
@@ -111,10 +113,23 @@ def trajectories(
     except OSError as error:
         raise UnreadableFileError("cannot read an HDF5 file", where=str(path), got=error) from error
     with file:
-        for key in sorted(file):
+        with _whole(str(path)):
+            keys = sorted(file)
+        for key in keys:
             name = f"{path}, group {key!r}"
-            _check_links(name, file, key)
-            yield _trajectory(name, file[key], kinds, np.asarray(origin, np.float32))
+            with _whole(name):
+                _check_links(name, file, key)
+                found = _trajectory(name, file[key], kinds, np.asarray(origin, np.float32))
+            yield found
+
+
+@contextmanager
+def _whole(name: str) -> Iterator[None]:
+    """Tell what HDF5 says of damaged files, which it does by errors of many types, as one of ours."""
+    try:
+        yield
+    except (OSError, RuntimeError, LookupError, TypeError, ValueError, MemoryError) as error:
+        raise UnreadableFileError("a file is damaged", where=name, got=error) from error
 
 
 def _check_links(name: str, file: h5py.File, key: str) -> None:
@@ -136,17 +151,24 @@ def _check_links(name: str, file: h5py.File, key: str) -> None:
             )
 
 
+def _array(name: str, group: h5py.Group, part: str) -> h5py.Dataset:
+    """Return an array of a trajectory that is one, and no larger than the file bears out."""
+    import h5py
+
+    found = group.get(part) if isinstance(group, h5py.Group) else None
+    if not isinstance(found, h5py.Dataset) or found.shape is None:
+        raise UnreadableFileError("this is no trajectory", where=name, expected="position and particle_type")
+    check_inflation(f"{name}, {part}", packed=found.id.get_storage_size(), unpacked=found.nbytes)
+    return found
+
+
 def _trajectory(
     name: str, group: h5py.Group, given: Mapping[int, str], origin: NDArray[np.float32]
 ) -> Trajectory:
-    try:
-        position, numbers = group["position"], np.asarray(group["particle_type"])
-        shape, dtype = position.shape, position.dtype
-    except (KeyError, TypeError, OSError, AttributeError) as error:
-        raise UnreadableFileError(
-            "this is no trajectory", where=name, expected="position and particle_type", got=error
-        ) from error
-    check_array(name, shape, dtype)
+    position, kinds = (_array(name, group, part) for part in ("position", "particle_type"))
+    shape = position.shape
+    check_array(name, shape, position.dtype)
+    numbers = np.asarray(kinds)
     if numbers.shape != shape[1:2] or numbers.dtype.kind not in "iu":
         raise UnreadableFileError(
             "these are no kinds of particles",
@@ -158,10 +180,8 @@ def _trajectory(
 
     def read() -> Iterator[Frame]:
         for number in range(shape[0]):
-            try:
+            with _whole(f"{name}, frame {number}"):
                 frame = position[number]
-            except OSError as error:
-                raise UnreadableFileError("a trajectory is damaged", where=name, got=error) from error
             yield (frame[kept] + origin if origin.any() else frame[kept]), None
 
     return Trajectory(name=name, frames=shape[0], material=material, read=read)

@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from lagbench.atomic import temporary_name
 from lagbench.checksums import HASHED_SUBSETS
 from lagbench.errors import DataError, UsageError, WorkFailedError
 from lagbench.locating import DESCRIPTION
@@ -143,16 +144,17 @@ def _notes(manifest: Manifest) -> Iterator[str]:
 @contextmanager
 def _scratch(folder: Path) -> Iterator[Path]:
     """Yield a folder beside the target that vanishes at the end."""
-    root = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
+    root = temporary_name(folder)
     try:
         root.mkdir(parents=True)
-        yield root
-    except OSError as error:
+        try:
+            yield root
+        finally:
+            shutil.rmtree(root, ignore_errors=True)
+    except (OSError, WorkFailedError) as error:
         raise WorkFailedError(
             "cannot write there",
             where=str(folder),
-            got=error.strerror or error,
-            fix="name another folder: --output",
+            got=error.got if isinstance(error, WorkFailedError) else error.strerror or error,
+            fix="free disk space, or name another folder: --output",
         ) from error
-    finally:
-        shutil.rmtree(root, ignore_errors=True)

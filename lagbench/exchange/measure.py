@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.errors import UsageError
+
 __all__ = ["Box", "Measure", "estimate_spacing"]
 
 Box = tuple[tuple[float, float], tuple[float, float]]
@@ -45,10 +47,11 @@ class Measure:
 
     def place(self, position: NDArray[np.floating]) -> NDArray[np.float32]:
         """Return positions in the unit box, float32."""
-        if self.is_plain:
-            return position.astype(np.float32, copy=False)
-        moved = (position.astype(np.float64) - self.corner) / self.scale
-        return moved.astype(np.float32)
+        moved = position
+        if not self.is_plain:
+            moved = (position.astype(np.float64) - self.corner) / self.scale
+        with np.errstate(over="ignore"):  # what is beyond float32 becomes infinite
+            return moved.astype(np.float32, copy=False)
 
     def box(self, bounds: Box) -> Box:
         """Return a box of the source in the unit box."""
@@ -73,10 +76,22 @@ def estimate_spacing(position: NDArray[np.floating], radius: float) -> float:
     Args:
         position: one frame, shape [particle, 2].
         radius: connectivity radius, same unit.
+
+    Raises:
+        UsageError: most particles have no neighbour there.
     """
     from scipy.spatial import cKDTree
 
     points = position.astype(np.float64)
     reach = WIDE * radius
     counts = cKDTree(points).query_ball_point(points, reach, return_length=True)
-    return math.sqrt(math.pi * reach**2 / float(np.quantile(counts, 0.75)))
+    inside = float(np.quantile(counts, 0.75))
+    if inside < 2.0 and len(points) > 1:  # a particle counts itself
+        raise UsageError(
+            "particles have no neighbours: their spacing cannot be estimated",
+            where="--radius",
+            expected=f"neighbours within {WIDE:g} radii",
+            got=radius,
+            fix="a larger --radius, or say how far particles are apart: --spacing",
+        )
+    return math.sqrt(math.pi * reach**2 / inside)

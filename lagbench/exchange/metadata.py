@@ -210,7 +210,7 @@ def read_source(folder: Path, form: Format) -> Source:
     values = block if isinstance(block, dict) else values
     if values.get("dim", 2) != 2:
         raise UnreadableFileError(
-            "the data are not plane", where=f"{path}, key dim", expected=2, got=values["dim"]
+            "the data are not plane", where=f"{path}, key dim", expected=2, got=repr(values["dim"])
         )
     every = values.get("write_every", 1) if form is Format.LAGRANGEBENCH_H5 else 1
     try:
@@ -250,11 +250,22 @@ def _values(path: Path) -> dict[str, object]:
     return values
 
 
+_KEYS = {
+    "radius": "default_connectivity_radius",
+    "frame_interval": "dt",
+    "spacing": "dx",
+    "periodic": "periodic_boundary_conditions",
+    "hints": OWN_KEY,
+}
+"""Key of what :class:`Source` holds, where it has another name."""
+
+
 def _mistaken(path: Path, error: ValidationError) -> UnreadableFileError:
     first = error.errors()[0]
+    name, *inner = map(str, first["loc"] or ("frame_interval",))
     return UnreadableFileError(
         "the metadata lack what a split needs, or state it otherwise",
-        where=f"{path}, key {'.'.join(map(str, first['loc']))}",
+        where=f"{path}, key {'.'.join((_KEYS.get(name, name), *inner))}",
         expected=first["msg"],
         got=first["input"],
     )

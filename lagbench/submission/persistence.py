@@ -9,6 +9,7 @@ import numpy as np
 
 from lagbench.locating import locate
 from lagbench.registry import Registry
+from lagbench.store.bringing import bring
 
 from .truth import Truth
 from .writer import PredictionsWriter
@@ -62,6 +63,7 @@ def template(
         WorkFailedError: the disk is full or not writable.
     """
     entry, folder, described = locate(split, size, root=root, registry=registry)
+    bring(entry, folder, entry.subsets["test"])
     truth = Truth(entry, folder)
     truth.require()
     writer = PredictionsWriter(

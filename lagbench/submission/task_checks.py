@@ -15,6 +15,7 @@ from lagbench.registry import Registry, Size
 from .anatomy import Anatomy
 from .findings import Findings, quoted
 from .guesses import guess_frames, guess_scenarios, spell_numbers
+from .truth import remedy
 
 __all__ = [
     "check_dataset",
@@ -47,7 +48,7 @@ def check_split(anatomy: Anatomy, registry: Registry, out: Findings) -> Size | N
         where="attributes 'split' and 'size'",
         expected="a split and size that `lagbench list` shows",
         got=f"{quoted(split)}, {quoted(size)}",
-        fix=known.split("\n")[0],
+        fix=f"{known.splitlines()[0]}; or say where a split of your own lies: --split PATH, --root FOLDER",
     )
     return None
 
@@ -59,7 +60,9 @@ def check_dataset(anatomy: Anatomy, size: Size, root: Path, out: Findings) -> No
         out.skip("the file does not name its data set", "dataset")
         return
     out.made("dataset")
-    remake = f"generate {size.split} {size.name} anew and predict from that"
+    remake = "predict from the data set that is here"
+    if size.simulated:
+        remake = f"generate {size.split} {size.name} anew and predict from that"
     if not _VERSION.fullmatch(version) or major_of(version) != size.major:
         out.error(
             "dataset",
@@ -77,7 +80,7 @@ def check_dataset(anatomy: Anatomy, size: Size, root: Path, out: Findings) -> No
             where="attribute 'dataset_sha256'",
             expected=f"a recorded hash of {size.split} {size.name}",
             got="neither datasets.yaml nor a complete manifest has one",
-            fix=f"lagbench generate --split {size.split} --size {size.name}",
+            fix=remedy(size),
         )
     elif got != expected:
         out.error(

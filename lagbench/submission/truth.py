@@ -13,10 +13,22 @@ from lagbench.registry import Size
 from lagbench.scenario_file import ScenarioFile, read_scenario
 from lagbench.scenario_ids import spell_ids
 
-__all__ = ["Truth"]
+__all__ = ["Truth", "remedy"]
 
 BLOCK = 16
 """Frames that are read at a time."""
+
+
+def remedy(size: Size, *options: str) -> str:
+    """Return what makes a data set whole again; options narrow down what is simulated.
+
+    >>> from lagbench.registry import load
+    >>> remedy(load().size("cavity", "tiny"), "--subset test")
+    'lagbench generate --split cavity --size tiny --subset test'
+    """
+    if size.simulated:
+        return " ".join((f"lagbench generate --split {size.split} --size {size.name}", *options))
+    return "remove the folder and make the local split again: lagbench adopt, or lagbench import"
 
 
 class Truth:
@@ -40,13 +52,12 @@ class Truth:
         ids = self.size.subsets["test"]
         missing = [i for i in ids if not self.path(i).is_file()]
         if missing:
-            options = f"--split {self.size.split} --size {self.size.name} --subset test --root {self.root}"
             raise DataError(
                 f"{len(missing)} of {len(ids)} test scenarios are not generated",
                 where=str(self.path(ids[0]).parent),
                 expected=f"scenarios {spell_ids(ids)}",
                 got=f"missing: {spell_ids(missing)}",
-                fix=f"lagbench generate {options}",
+                fix=remedy(self.size, "--subset test", f"--root {self.root}"),
             )
 
     def path(self, scenario: int) -> Path:
@@ -73,7 +84,7 @@ class Truth:
             where=str(path),
             expected=f"{expected}, content hash {short or 'any'}",
             got=f"{found}, content hash {header.content_sha256[:16]}",
-            fix=f"lagbench generate --split {key.split} --size {key.size} --subset test",
+            fix=remedy(self.size, "--subset test"),
         )
 
     def given(self, scenario: int) -> NDArray[np.float32]:

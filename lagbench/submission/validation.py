@@ -12,7 +12,7 @@ from pathlib import Path
 
 import h5py
 
-from lagbench.errors import DataError, UnreadableFileError
+from lagbench.errors import DataError, UnreadableFileError, UsageError
 from lagbench.layout import resolve_root
 from lagbench.locating import rooted
 from lagbench.registry import Registry
@@ -72,13 +72,28 @@ def validate(
         require_truth=require_truth,
         registry=rooted(folder, registry),
     )
-    if not isolated:
-        return examine(request)
+    if isolated:
+        try:
+            check_file(request.path)
+        except UnreadableFileError as error:
+            return _unreadable(request.path, error)
+    look = run_isolated if isolated else examine
+    result = look(request)
+    # Only the file says which test subset it needs; the child that reads it fetches nothing.
+    return look(request) if _brought(result, request) else result
+
+
+def _brought(result: ValidationResult, request: Request) -> bool:
+    """Bring the test subset that a file is for, where data live in a store; return whether any came."""
+    if result.split is None or result.size is None:
+        return False
     try:
-        check_file(request.path)
-    except UnreadableFileError as error:
-        return _unreadable(request.path, error)
-    return run_isolated(request)
+        size = request.registry.size(result.split, result.size)
+    except UsageError:
+        return False
+    from lagbench.store.bringing import bring
+
+    return bring(size, request.root, size.subsets["test"])
 
 
 def examine(request: Request) -> ValidationResult:

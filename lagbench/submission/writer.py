@@ -16,9 +16,11 @@ from lagbench.errors import DataError, UsageError, WorkFailedError, nearest
 from lagbench.locating import locate
 from lagbench.registry import Registry, Size
 from lagbench.scenario_ids import spell_ids
+from lagbench.store.bringing import bring
 
 from .header import DIMS, FORMAT, NEVER, OPTIONAL, SPACE, fits, kind_of
 from .task_checks import dataset_hash_of, frames_to_predict
+from .truth import remedy
 
 __all__ = ["Label", "PredictionsWriter"]
 
@@ -268,12 +270,13 @@ _ATTRIBUTES: Mapping[str, Mapping[str, str]] = {
 
 
 def _known_hash(size: Size, root: Path) -> str:
+    bring(size, root)
     known = dataset_hash_of(size, root)
     if known is None:
         raise DataError(
             "the hash of the data set is not known",
             where=f"{size.split} {size.name}",
             expected="a hash in datasets.yaml, or a complete data set here",
-            fix=f"lagbench generate --split {size.split} --size {size.name}, or give dataset_sha256",
+            fix=f"{remedy(size)}, or give dataset_sha256",
         )
     return known

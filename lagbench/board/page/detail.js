@@ -30,16 +30,16 @@ function drawTiles(tab, row) {
     const seeds = std ? `, ± ${written(std)} over ${row.seeds} seeds` : "";
     return tile(withUnit(name), cellText(valueOf(tab, row, name), "number"), interval + seeds);
   });
-  if (row.cost?.speed_up) tiles.push(tile("speed-up over the solver", cellText(row.cost.speed_up, "factor"), row.cost.device));
-  else if (row.cost) tiles.push(tile("time per frame [s]", written(row.cost.seconds_per_frame), row.cost.device));
-  if (row.parameters) tiles.push(tile("parameters", cellText(row.parameters, "count"), row.hardware));
+  if (row.cost?.speed_up) tiles.push(tile("speed, solver = 1×; self-reported", cellText(row.cost.speed_up, "factor"), `${row.cost.speed_up < 1 ? "slower" : "faster"} than the solver, ${row.cost.device}`));
+  else if (row.cost) tiles.push(tile("time per frame [s], self-reported", written(row.cost.seconds_per_frame), row.cost.device));
+  if (row.parameters) tiles.push(tile("parameters, self-reported", cellText(row.parameters, "count"), row.hardware));
   return el("ul", { class: "tiles" }, tiles);
 }
 
 function drawFlags(row) {
   const items = [
-    ...row.flags.map(([name, reasons]) => ["bad", "flag", words(name), flagText(name, reasons)]),
-    ...row.warnings.map(([name, reasons]) => ["warn", "warning", words(name), flagText(name, reasons)]),
+    ...row.flags.map(([name, reasons]) => ["bad", "flag", labelOf(name), flagText(name, reasons)]),
+    ...row.warnings.map(([name, reasons]) => ["warn", "warning", labelOf(name), flagText(name, reasons)]),
   ];
   if (row.diverged) items.push(["warn", "warning", "diverged", `${row.diverged} rollouts are frozen at their last finite frame.`]);
   if (row.status !== "active") {

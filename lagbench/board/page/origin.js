@@ -3,7 +3,7 @@
 function drawOrigin(tab, row) {
   const about = [
     ["training", row.training],
-    ["hardware", row.hardware],
+    ["hardware, self-reported", row.hardware],
     ["seeds", row.floor ? "" : String(row.seeds)],
     ["licence", row.licence],
     ["submitted", row.date],

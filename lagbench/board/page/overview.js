@@ -25,7 +25,8 @@ function drawScatter(tab, state, floors, entries, act) {
   const without = entries.length - points.length;
   const caption = [
     "Each dot is an entry; the line joins those that no other beats in both. ",
-    by === "speed_up" ? "Speed-up is the time of the solver over that of the model, both on the same machine. " : "",
+    by === "speed_up" ? "Speed-up is the time of the solver over that of the model, both on the same machine; below 1× the model is slower. " : "",
+    "Costs are self-reported. ",
     without ? `${without} ${without === 1 ? "entry says" : "entries say"} nothing about ${columnOf(by).label}.` : "",
   ].join("");
   const body = points.length ? scatter(tab, state, by, points, floors) : el("p", { class: "muted" }, "No entry to show.");

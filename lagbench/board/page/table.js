@@ -79,11 +79,12 @@ function drawTable(tab, state, act) {
     { class: "board" },
     el("caption", { class: "unseen" }, `${tab.split} ${tab.size}: methods and scores`),
     el("thead", {}, el("tr", {}, [
-      heading("rank", "#", "", "Rank by the ranking metric", state, act, "rank"),
-      heading("name", "method", "", "Name of the method", state, act, "method"),
+      heading("rank", "#", [], "Rank by the ranking metric", state, act, "rank"),
+      heading("name", "method", [], "Name of the method", state, act, "method"),
       keys.map((name) => {
-        const { label, unit, direction, meaning, form } = columnOf(name);
-        return heading(name, label, `${unit} ${ARROWS[direction]}`.trim(), meaning, state, act, form === "text" ? "words" : null);
+        const { label, unit, direction, meaning, form, reported } = columnOf(name);
+        const below = [`${unit} ${ARROWS[direction]}`.trim(), reported ? "self\u2011reported" : ""];
+        return heading(name, label, below, meaning, state, act, form === "text" ? "words" : null);
       }),
     ])),
     el("tbody", { class: "floors" }, floors.map(line)),
@@ -93,9 +94,9 @@ function drawTable(tab, state, act) {
 
 const ARROWS = { lower: "↓", higher: "↑", target: "◎", none: "" };
 
-function heading(by, label, unit, meaning, state, act, kind) {
+function heading(by, label, below, meaning, state, act, kind) {
   const sorted = state.sort.key === by ? (state.sort.down ? "descending" : "ascending") : null;
-  const sorter = button([el("span", { class: "metric" }, label), unit ? el("span", { class: "unit" }, unit) : null], () => act.sort(by), {
+  const sorter = button([el("span", { class: "metric" }, label), below.filter(Boolean).map((text) => el("span", { class: "unit" }, text))], () => act.sort(by), {
     class: "sorter",
     title: meaning,
     "data-sort": by,
@@ -104,6 +105,7 @@ function heading(by, label, unit, meaning, state, act, kind) {
 }
 
 function drawRow(tab, state, row, keys, shades) {
+  const by = [row.authors, row.affiliation].filter(Boolean).join(" · ");
   const kind = [row.floor ? "floor" : "", isActive(row) || row.floor ? "" : "inactive"].join(" ").trim();
   return el(
     "tr",
@@ -112,7 +114,7 @@ function drawRow(tab, state, row, keys, shades) {
     el("th", { scope: "row", class: "method" }, [
       el("a", { href: addressOf({ ...state, entry: row.id }), class: "name" }, row.name),
       chips(row),
-      el("span", { class: "sub" }, row.floor ? "floor, computed by the scorer" : [row.authors, row.affiliation].filter(Boolean).join(" · ")),
+      el("span", { class: "sub", title: by }, row.floor ? "floor, computed by the scorer" : by),
     ]),
     keys.map((name) => drawCell(tab, row, name, shades.get(name))),
   );
@@ -161,8 +163,8 @@ function chips(row) {
   const said = [];
   if (row.status !== "active") said.push(["unknown", row.status, row.reason || `This entry is ${row.status}.`]);
   if (!row.current) said.push(["unknown", `data ${row.version}`, "Scored on a data set version that is no longer current."]);
-  for (const [name, reasons] of row.flags) said.push(["bad", words(name), flagText(name, reasons)]);
-  for (const [name, reasons] of row.warnings) said.push(["warn", words(name), flagText(name, reasons)]);
+  for (const [name, reasons] of row.flags) said.push(["bad", labelOf(name), flagText(name, reasons)]);
+  for (const [name, reasons] of row.warnings) said.push(["warn", labelOf(name), flagText(name, reasons)]);
   if (row.diverged) said.push(["warn", "diverged", `${row.diverged} rollouts are frozen at their last finite frame.`]);
   return said.map(([kind, label, text]) => el("span", { class: `flag ${kind}`, title: text }, label));
 }
@@ -171,8 +173,17 @@ function words(name) {
   return name.replaceAll("_", " ");
 }
 
+/** Return label and meaning of a flag or warning; an unknown one is called as the scorer does. */
+function explained(name) {
+  return Object.hasOwn(BOARD.explained, name) ? BOARD.explained[name] : [words(name), ""];
+}
+
+function labelOf(name) {
+  return explained(name)[0];
+}
+
 function flagText(name, reasons) {
-  const meaning = Object.hasOwn(BOARD.explained, name) ? BOARD.explained[name] : "";
+  const meaning = explained(name)[1];
   if (!reasons.length) return meaning;
   return `${meaning && `${meaning.replace(/\.$/, "")}: `}${reasons.join("; ")}.`;
 }

@@ -1,7 +1,7 @@
 """Fetch a file from a mirror: resumed by HTTP range, bounded in length, under a temporary name.
 
 A mirror is a plain copy of a root folder behind a base URL. Whatever it does wrong has an error
-of its own name, see :mod:`lagbench.exchange.mirror_errors`.
+of its own name, see :mod:`lagbench.store.mirror_errors`.
 """
 
 from __future__ import annotations

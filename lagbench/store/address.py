@@ -24,6 +24,7 @@ from .mirror_errors import (
     NotOnMirrorError,
     TruncatedError,
 )
+from .remote import FIX_RIGHTS, file_system, translated
 
 __all__ = ["BLOCK", "Answer", "ask"]
 
@@ -166,23 +167,50 @@ _OPENER = _build_opener()
 
 def _ask_fsspec(url: str, offset: int) -> Answer:
     """Ask a file system that fsspec knows."""
-    import fsspec  # type: ignore[import-untyped]
-
     try:
-        system, path = fsspec.core.url_to_fs(url)
+        system, path = file_system(url)
         total = system.info(path)["size"]
         stream: IO[bytes] = system.open(path, "rb")
-    except (ImportError, ValueError) as error:
-        raise UsageError("no such kind of address", where="--from", got=url, fix=str(error)) from error
+    except UsageError:
+        raise
     except FileNotFoundError:
         raise NotOnMirrorError("the mirror does not have the file", where=url) from None
-    except OSError as error:
-        raise BrokenError(
-            MirrorUnreachableError(
-                "the mirror does not answer", where=url, got=f"{type(error).__name__}: {error}"
-            )
-        ) from error
+    except Exception as error:  # file systems raise what their libraries raise
+        raise _fsspec_refusal(error, url) from error
     if offset > total:
         offset = 0
     stream.seek(offset)
-    return Answer(stream, offset, total)
+    return Answer(_Stream(stream), offset, total)
+
+
+def _fsspec_refusal(error: Exception, url: str) -> Exception:
+    """Return the error that an exception of a file system means; a busy line may be tried again."""
+    found = translated(error, url)
+    if isinstance(found, UsageError):
+        return found
+    what = "the mirror refuses" if found.fix == FIX_RIGHTS else "the mirror does not answer"
+    told = MirrorUnreachableError(what, where=url, got=found.got, fix=found.fix)
+    # botocore has tried again by itself.
+    final = found.fix == FIX_RIGHTS or not isinstance(error, OSError)
+    return told if final else BrokenError(told)
+
+
+class _Stream:
+    """A file of a file system, whose every fault is one of the line."""
+
+    def __init__(self, stream: IO[bytes]) -> None:
+        self._stream = stream
+
+    def read(self, size: int, /) -> bytes:
+        """Return at most so many bytes; none at the end."""
+        try:
+            return self._stream.read(size)
+        except OSError:
+            raise
+        except Exception as error:  # see above
+            message = f"{type(error).__name__}: {error}"
+            raise OSError(message) from error
+
+    def close(self) -> None:
+        """Close it."""
+        self._stream.close()

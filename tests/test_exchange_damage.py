@@ -1,0 +1,236 @@
+"""Imports of what is damaged, made to do harm, or out of range: an error by name, and nothing left."""
+
+from __future__ import annotations
+
+import codecs
+import contextlib
+import json
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from exchange_readers import straight_runs
+from exchange_writers import METADATA, write_gns, write_h5
+
+from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError
+from lagbench.exchange import import_split, inflation
+
+
+class _Trap:
+    """Pickles as a call that writes a file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Path.write_text, (self.path, "run")
+
+
+@pytest.mark.parametrize("allow", [False, True])
+def test_a_malicious_pickle_is_never_run(tmp_path: Path, allow: bool) -> None:
+    """A pickle that calls anything but NumPy's constructors is refused even when pickles are allowed."""
+    source = write_gns(tmp_path / "in", straight_runs(3))
+    pair = np.empty(2, dtype=object)
+    pair[0], pair[1] = straight_runs(1)[0], _Trap(tmp_path / "trace")
+    np.savez(source / "train.npz", simulation_0=pair)
+    with pytest.raises(LagbenchError) as caught:
+        import_split(source, format="gns-npz", output=tmp_path / "own", allow_pickle=allow)
+    assert not (tmp_path / "trace").exists()
+    assert ("wants to call" in str(caught.value)) == allow
+    with np.load(source / "train.npz", allow_pickle=True) as file:  # numpy's own reader does run it
+        file["simulation_0"]
+    assert (tmp_path / "trace").exists()
+
+
+class _Reduced:
+    """Pickles as a call with a state."""
+
+    def __init__(self, *reduced: Any) -> None:
+        self.reduced = reduced
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return self.reduced
+
+
+ADDRESSES = b"A" * 16
+OBJECTS_WITHOUT_FLAGS = _Reduced(
+    np.dtype, ("O8", False, True), (3, "|", None, None, None, -1, -1, 0)
+)  # NumPy takes the values of such a type for addresses of objects
+MANY = [np.zeros(1)] * 4
+
+
+@pytest.mark.parametrize(
+    ("item", "words"),
+    [
+        (
+            _Reduced(
+                np.zeros(0).__reduce__()[0],
+                (np.ndarray, (0,), b"b"),
+                (1, (2,), OBJECTS_WITHOUT_FLAGS, False, ADDRESSES),
+            ),
+            "bytes for the objects",
+        ),
+        (
+            _Reduced(np.float64(0).__reduce__()[0], (OBJECTS_WITHOUT_FLAGS, ADDRESSES[:8])),
+            "values of type 'O8'",
+        ),
+        (_Reduced(np.ndarray, ((1 << 45,), np.dtype("f8"))), "make an array by itself"),
+        (_Reduced(codecs.encode, ("x", "punycode")), "encode a text as punycode"),
+        ("text", "holds a str"),
+        (MANY, "holds a list"),
+    ],
+)
+def test_no_pickle_gets_at_memory(tmp_path: Path, item: Any, words: str) -> None:
+    """Made-up objects, addresses, giant arrays and codecs are refused before NumPy sees them."""
+    source = write_gns(tmp_path / "in", straight_runs(3), kinds=5)
+    pair = np.empty(2, dtype=object)
+    pair[0], pair[1] = straight_runs(1)[0], item
+    np.savez(source / "train.npz", simulation_0=pair)
+    with pytest.raises(UnreadableFileError, match=words):
+        import_split(source, format="gns-npz", output=tmp_path / "own", allow_pickle=True)
+
+
+def test_a_file_that_unpacks_to_far_more_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A member of 8 MB of zeros in 8 kB of npz, and arrays of 10^11 particles in an empty HDF5 file."""
+    monkeypatch.setattr(inflation, "HARMLESS", 1 << 20)
+    source = write_gns(tmp_path / "in", straight_runs(3))
+    with (
+        zipfile.ZipFile(source / "train.npz", "w", zipfile.ZIP_DEFLATED) as archive,
+        archive.open("simulation_0.npy", "w") as stream,
+    ):
+        stream.write(bytes(1 << 23))
+    with pytest.raises(UnreadableFileError, match="far more than it holds"):
+        import_split(source, format="gns-npz", output=tmp_path / "own", allow_pickle=True)
+    write_h5(source, straight_runs(3))
+    with h5py.File(source / "train.h5", "w") as file:
+        file.create_dataset("00000/position", shape=(12, 10**11, 2), dtype="f4", chunks=(1, 1000, 2))
+        file.create_dataset("00000/particle_type", shape=(10**11,), dtype="i8", chunks=(1000,))
+    with pytest.raises(UnreadableFileError, match="far more than it holds"):
+        import_split(source, format="lagrangebench-h5", output=tmp_path / "own")
+
+
+@pytest.mark.parametrize("place", [5, 6, 7])
+def test_damaged_bytes_of_hdf5_are_told(tmp_path: Path, place: int) -> None:
+    """Whatever HDF5 raises where its structures are overwritten, it becomes an error of ours."""
+    source = write_h5(tmp_path / "in", straight_runs(3))
+    whole = (source / "train.h5").read_bytes()
+    start = 96 + 100 * place  # past the superblock: headers, heaps and trees
+    (source / "train.h5").write_bytes(whole[:start] + b"\xad" * 100 + whole[start + 100 :])
+    with contextlib.suppress(UnreadableFileError, DataError):
+        import_split(source, format="lagrangebench-h5", output=tmp_path / "own")
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"lagbench": {"frames_of_interest": [99]}}, "frame of interest is not predicted"),
+        ({"lagbench": {"frames_of_interest": [-1]}}, "frame of interest is not predicted"),
+        ({"lagbench": {"cells": 10**9}}, "--cells"),
+        ({"bounds": [[-1e308, 1e308], [0, 1]]}, "--bounds"),
+        ({"default_connectivity_radius": 1e300}, "--radius"),
+        ({"default_connectivity_radius": 1e-20}, "have no neighbours"),
+        ({"dt": 1e-320}, "--frame-interval"),
+    ],
+)
+def test_numbers_that_do_not_compute(tmp_path: Path, changes: dict[str, Any], words: str) -> None:
+    """Metadata out of range are usage errors that name the option which overrules them."""
+    source = write_gns(tmp_path / "in", straight_runs(3), **changes)
+    with pytest.raises(UsageError, match=words):
+        import_split(source, format="gns-npz", output=tmp_path / "own", allow_pickle=True)
+    assert not (tmp_path / "own").exists()
+
+
+@pytest.mark.parametrize(
+    ("fault", "error", "words"),
+    [
+        ("no metadata", UnreadableFileError, "cannot read the metadata"),
+        ("no json", UnreadableFileError, "cannot read the metadata"),
+        ("no radius", UnreadableFileError, "key default_connectivity_radius"),
+        ("array for a group", UnreadableFileError, "no trajectory"),
+        ("nothing in an array", UnreadableFileError, "no trajectory"),
+        ("3D", UnreadableFileError, "not plane"),
+        ("no test", UnreadableFileError, "files are missing"),
+        ("half a file", UnreadableFileError, "cannot read an HDF5 file"),
+        ("no positions", UnreadableFileError, "no trajectory"),
+        ("too few kinds", UnreadableFileError, "no kinds of particles"),
+        ("empty", DataError, "a subset is empty"),
+        ("no time", UsageError, "no time between frames"),
+    ],
+)
+def test_damaged_sources_leave_nothing(
+    tmp_path: Path, fault: str, error: type[LagbenchError], words: str
+) -> None:
+    """Each fault is told by name, and no folder is made."""
+    source = write_h5(tmp_path / "in", straight_runs(3))
+    target = source / "test.h5"
+    metadata = source / "metadata.json"
+    match fault:
+        case "no metadata":
+            metadata.unlink()
+        case "no json":
+            metadata.write_text("<html>")
+        case "no radius":
+            metadata.write_text(json.dumps({**METADATA, "default_connectivity_radius": None}))
+        case "3D":
+            metadata.write_text(json.dumps({**METADATA, "dim": 3}))
+        case "no time":
+            metadata.write_text(json.dumps({**METADATA, "dt": 0}))
+        case "no test":
+            target.unlink()
+        case "half a file":
+            target.write_bytes(target.read_bytes()[:1000])
+        case _:
+            with h5py.File(target, "w") as file:
+                if fault == "array for a group":
+                    file["00000"] = np.zeros(3)
+                elif fault == "nothing in an array":
+                    file["00000/position"] = h5py.Empty("f4")
+                    file["00000/particle_type"] = np.zeros(40, int)
+                elif fault == "no positions":
+                    file["00000/particle_type"] = np.zeros(40, int)
+                elif fault == "too few kinds":
+                    file["00000/position"] = straight_runs(1)[0]
+                    file["00000/particle_type"] = np.zeros(39, int)
+    with pytest.raises(error, match=words):
+        import_split(source, format="lagrangebench-h5", output=tmp_path / "own")
+    assert [path.name for path in tmp_path.iterdir()] == ["in"]
+
+
+def test_a_damaged_npz_is_told(tmp_path: Path) -> None:
+    """Half an npz file, and a member that is no array, are unreadable files."""
+    source = write_gns(tmp_path / "in", straight_runs(3))
+    whole = (source / "test.npz").read_bytes()
+    (source / "test.npz").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(UnreadableFileError, match="npz"):
+        import_split(source, format="gns-npz", output=tmp_path / "own", allow_pickle=True)
+    np.savez(source / "test.npz", note=np.array("no trajectory, but a note"))
+    with pytest.raises(UnreadableFileError, match="no trajectory"):
+        import_split(source, format="gns-npz", output=tmp_path / "own", allow_pickle=True)
+    np.savez(source / "test.npz", simulation_0=np.zeros((4, 3)))
+    with pytest.raises(UnreadableFileError, match="no trajectory"):
+        import_split(source, format="gns-npz", output=tmp_path / "own", allow_pickle=True)
+    assert not (tmp_path / "own").exists()
+
+
+@pytest.mark.parametrize("way", ["soft", "external", "virtual"])
+def test_a_file_that_leads_elsewhere_is_refused(tmp_path: Path, way: str) -> None:
+    """Links, virtual data sets and external storage would let a stranger's file read others."""
+    source = write_h5(tmp_path / "in", straight_runs(3))
+    other = tmp_path / "other.h5"
+    (source / "train.h5").rename(other)
+    with h5py.File(source / "train.h5", "w") as file:
+        if way == "soft":
+            file["there"] = straight_runs(1)[0]
+            file["00000/position"] = h5py.SoftLink("/there")
+        elif way == "external":
+            file["00000"] = h5py.ExternalLink(str(other), "00000")
+        else:
+            layout = h5py.VirtualLayout(shape=(12, 40, 2), dtype="f4")
+            layout[:] = h5py.VirtualSource(str(other), "00000/position", shape=(12, 40, 2))
+            file.create_virtual_dataset("00000/position", layout)
+            file["00000/particle_type"] = np.zeros(40, int)
+    with pytest.raises(UnreadableFileError, match="leads to another file"):
+        import_split(source, format="lagrangebench-h5", output=tmp_path / "own")

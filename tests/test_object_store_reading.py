@@ -1,0 +1,246 @@
+"""Reading from a store: only what is needed comes, it is checked, and then all is as in a folder."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+import xarray as xr
+from conftest import SIZE, SPLIT
+from object_stores import files, machine, objects, put, remove, stored
+from typer.testing import CliRunner
+
+import lagbench
+from lagbench.baselines.facts import facts_of
+from lagbench.baselines.sources import sources_of
+from lagbench.cli.app import app
+from lagbench.errors import DataError
+from lagbench.exchange import export
+from lagbench.generation import GenerationResult
+from lagbench.layout import resolve_root
+from lagbench.overview import overview
+from lagbench.registry import Registry
+from lagbench.store import address, bringing
+from lagbench.store.fetching import quietly
+from lagbench.store.mirror import partial_name
+from lagbench.store.mirror_errors import WrongContentError, WrongLengthError
+from lagbench.submission import template
+from lagbench.verification import verify
+from lagbench.working_copy import as_url, url_of
+
+FOLDER = f"{SPLIT}/{SIZE}/v1"
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Be a machine of its own, that asks for the manifest each time."""
+    monkeypatch.setattr(bringing, "FRESH", 0.0)
+    return machine(monkeypatch, tmp_path / "cache")
+
+
+@pytest.fixture
+def url(generated: GenerationResult) -> str:
+    """A store that holds the tiny data set."""
+    return stored(generated.root)
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:
+    """Name and offset of every scenario that is asked for."""
+    seen: list[tuple[str, int]] = []
+    ask = address._ask_fsspec
+
+    def asking(url: str, offset: int) -> address.Answer:
+        if url.endswith(".nc"):
+            seen.append((url.split("/v1/")[1], offset))
+        return ask(url, offset)
+
+    monkeypatch.setattr(address, "_ask_fsspec", asking)
+    return seen
+
+
+@pytest.fixture
+def tiny(unmeasured: Registry, monkeypatch: pytest.MonkeyPatch, unmeasured_path: Path) -> Registry:
+    """Our splits without hashes, for functions too that take no registry."""
+    monkeypatch.setenv("LAGBENCH_REGISTRY", str(unmeasured_path))
+    return unmeasured
+
+
+def here(url: str) -> list[str]:
+    """Return the names of the working copy's files."""
+    return sorted(name.removeprefix(f"{FOLDER}/") for name in files(resolve_root(url)))
+
+
+def test_a_subset_comes_and_nothing_else(
+    url: str, generated: GenerationResult, tiny: Registry, asked: list[tuple[str, int]]
+) -> None:
+    """The arrays are those of the folder; a second look fetches nothing."""
+    with (
+        lagbench.open_split(SPLIT, size=SIZE, root=url) as far,
+        lagbench.open_split(SPLIT, size=SIZE, root=generated.root) as near,
+    ):
+        xr.testing.assert_identical(far.compute(), near.compute())
+    assert here(url) == ["manifest.json", "test/0003.nc", "test/0004.nc"]
+    lagbench.open_split(SPLIT, size=SIZE, root=url).close()
+    assert sorted(asked) == [("test/0003.nc", 0), ("test/0004.nc", 0)]
+
+
+def test_scores_are_those_of_the_folder(
+    url: str, generated: GenerationResult, tiny: Registry, tmp_path: Path
+) -> None:
+    """Template, validation and scores need test alone, also where only the file says which."""
+    written = template(SPLIT, SIZE, output=tmp_path / "p.nc", root=generated.root, registry=tiny).path
+    result = lagbench.validate(written, root=url, require_truth=True, registry=tiny)
+    assert (result.valid, dict(result.skipped)) == (True, {})
+    assert here(url) == ["manifest.json", "test/0003.nc", "test/0004.nc"]
+    far, near = (
+        lagbench.score(written, root=root, write=False, registry=tiny).as_json()
+        for root in (url, generated.root)
+    )
+    assert far == near
+
+
+def test_baselines_read_from_a_store(url: str, generated: GenerationResult, tiny: Registry) -> None:
+    """Facts and training files are those of the folder."""
+    assert facts_of(SPLIT, SIZE, root=url) == facts_of(SPLIT, SIZE, root=generated.root)
+    assert here(url) == ["manifest.json", "train/0000.nc"]
+    found = sources_of(tiny.size(SPLIT, SIZE), ("train", "valid"), resolve_root(url))
+    assert [source.path.read_bytes() for source in found.values()] == [
+        (generated.folder / name).read_bytes() for name in ("train/0000.nc", "train/0001.nc", "valid/0002.nc")
+    ]
+
+
+def test_exports_are_those_of_the_folder(
+    url: str, generated: GenerationResult, tiny: Registry, tmp_path: Path
+) -> None:
+    """All three subsets come, and give the same bytes."""
+    made = [
+        export(SPLIT, SIZE, format="gns-npz", output=tmp_path / name, root=root, registry=tiny)
+        for name, root in (("far", url), ("near", generated.root))
+    ]
+    assert files(made[0].folder) == files(made[1].folder)
+
+
+def test_a_listing_counts_what_the_store_has(url: str, tiny: Registry) -> None:
+    """Of a store the manifest counts, not the working copy; nothing is fetched."""
+    found = overview(tiny.size(SPLIT, SIZE), resolve_root(url))
+    assert (found.state, found.present) == ("yes", {"train": 2, "valid": 1, "test": 2})
+    assert here(url) == []
+    empty = stored(resolve_root("memory://nothing"))
+    assert overview(tiny.size(SPLIT, SIZE), resolve_root(empty)).state == "no"
+
+
+def test_what_the_store_lacks_is_missed(url: str, tiny: Registry) -> None:
+    """As in a folder: the error names the scenarios and the command."""
+    with pytest.raises(DataError, match=r"missing: 0-1\n  fix: lagbench generate"):
+        lagbench.open_split(SPLIT, size=SIZE, subset="train", root="memory://nothing/here")
+
+
+def test_verify_mends_the_copy_and_tells_of_the_store(url: str, tiny: Registry) -> None:
+    """A damaged file comes again; an object that is gone is named."""
+    verify(SPLIT, SIZE, root=url, complete=True, registry=tiny).check()
+    path = resolve_root(url) / FOLDER / "valid/0002.nc"
+    path.write_bytes(path.read_bytes()[:-9] + bytes(9))
+    verify(SPLIT, SIZE, root=url, complete=True, registry=tiny).check()
+    remove(url, f"{FOLDER}/valid/0002.nc")
+    with pytest.raises(DataError, match=r"not there(.*\n)*.*scenarios 2\n"):
+        verify(SPLIT, SIZE, root=url, registry=tiny)
+
+
+@pytest.mark.parametrize("change", ["flipped", "shorter", "other scenario"])
+def test_other_content_is_refused(url: str, tiny: Registry, change: str) -> None:
+    """The error names the object, and no file of it is left."""
+    good = objects(url)[f"{FOLDER}/test/0003.nc"]
+    other = objects(url)[f"{FOLDER}/test/0004.nc"]
+    bad = {
+        "flipped": good[:-9] + bytes([good[-9] ^ 1]) + good[-8:],
+        "shorter": good[:-1],
+        "other scenario": other,
+    }
+    put(url, f"{FOLDER}/test/0003.nc", bad[change])
+    with pytest.raises((WrongContentError, WrongLengthError)) as caught:
+        lagbench.open_split(SPLIT, size=SIZE, root=url)
+    assert caught.value.where == f"{url}/{FOLDER}/test/0003.nc"
+    assert "mirror" not in str(caught.value)
+    assert {*here(url)} <= {"test/0004.nc"}
+
+
+def test_another_data_set_is_refused(url: str, unmeasured: Registry, generated: GenerationResult) -> None:
+    """A manifest whose hashes are not those of datasets.yaml brings nothing."""
+    text = json.loads(objects(url)[f"{FOLDER}/manifest.json"])
+    for entry in text["files"]:
+        entry["content_sha256"] = "0" * 64
+    put(url, f"{FOLDER}/manifest.json", json.dumps(text).encode())
+    with pytest.raises(WrongContentError, match="holds another data set"):
+        lagbench.open_split(SPLIT, size=SIZE, root=url)
+    assert here(url) == []
+
+
+def test_fetching_goes_on_where_it_stopped(
+    url: str, tiny: Registry, generated: GenerationResult, asked: list[tuple[str, int]]
+) -> None:
+    """Half a file under its temporary name is completed from there."""
+    whole = (generated.folder / "test/0003.nc").read_bytes()
+    half = partial_name(resolve_root(url) / FOLDER / "test/0003.nc")
+    half.parent.mkdir(parents=True)
+    half.write_bytes(whole[: len(whole) // 2])
+    lagbench.open_split(SPLIT, size=SIZE, root=url).close()
+    assert ("test/0003.nc", len(whole) // 2) in asked
+    assert here(url) == ["manifest.json", "test/0003.nc", "test/0004.nc"]
+
+
+def test_who_watches_is_told_how_far_it_is(
+    url: str, tiny: Registry, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """On a terminal a line on stderr counts files and bytes; with --quiet it does not."""
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    lagbench.open_split(SPLIT, size=SIZE, root=url).close()
+    assert f"fetching from {url}: 2 of 2 files" in capsys.readouterr().err
+    with quietly():
+        lagbench.open_split(SPLIT, size=SIZE, subset="valid", root=url).close()
+    assert capsys.readouterr() == ("", "")
+
+
+def test_what_only_the_copy_has_stays_known(url: str, tiny: Registry, generated: GenerationResult) -> None:
+    """Reading loses nothing of a generation that could not put its files yet."""
+    shutil.copytree(generated.root, resolve_root(url), dirs_exist_ok=True)
+    (resolve_root(url) / FOLDER / "test/0003.nc").unlink()
+    full = objects(url)[f"{FOLDER}/manifest.json"]
+    less = json.loads(full)
+    less["files"] = [entry for entry in less["files"] if entry["subset"] != "train"]
+    put(url, f"{FOLDER}/manifest.json", json.dumps(less).encode())
+    lagbench.open_split(SPLIT, size=SIZE, root=url).close()
+    assert (resolve_root(url) / FOLDER / "manifest.json").read_bytes() == full
+
+
+def test_urls_and_paths_are_told_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A Path takes a slash away and means the same; LAGBENCH_ROOT may be a URL; a stranger's mark is none."""
+    copy = resolve_root("s3://bucket/some/where/")
+    assert copy == resolve_root(Path("s3://bucket/some/where"))
+    assert copy.name.startswith("s3-bucket-some-where-")
+    assert url_of(copy) == "s3://bucket/some/where"
+    assert resolve_root(copy) == copy
+    monkeypatch.setenv("LAGBENCH_ROOT", "memory://x/y")
+    assert url_of(resolve_root()) == "memory://x/y"
+    shutil.copytree(copy, tmp_path / copy.name)
+    assert url_of(tmp_path / copy.name) is None
+    assert as_url(Path("file:///tmp/x")) == "file:///tmp/x"
+    assert [as_url(path) for path in ("data", "/data", "C:/data", "./s3:", tmp_path)] == [None] * 5
+
+
+def test_the_command_line_takes_a_url(url: str, tiny: Registry, tmp_path: Path) -> None:
+    """List, template, verify and info work on a store as on a folder; the list says where it is."""
+    runner = CliRunner()
+
+    def call(*words: str) -> str:
+        done = runner.invoke(app, [*words, "--root", url], catch_exceptions=False)
+        assert done.exit_code == 0, done.output
+        return done.output
+
+    assert url in call("list").replace("\n", "")
+    assert "2 scenarios" in call("template", SPLIT, "--size", SIZE, "--output", str(tmp_path / "p.nc"))
+    assert "data set hash:" in call("verify", SPLIT, "--size", SIZE)
+    assert "Path" not in call("info", SPLIT, "--size", SIZE)

@@ -1,0 +1,136 @@
+"""How a training ends: early, for good; and on a full disk or with a model that memory cannot hold."""
+
+from __future__ import annotations
+
+import os
+import resource
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from simple_models import Drift, install
+
+from lagbench.baselines.checkpoint import load, save
+from lagbench.baselines.machine import threads_used
+from lagbench.baselines.training import TrainingResult, train
+from lagbench.errors import UsageError, WorkFailedError
+from lagbench.generation import GenerationResult
+from lagbench.registry import Registry
+
+Run = Callable[..., TrainingResult]
+
+GREEDY = (1.0, 0.5)
+"""Start and learning rate of a Drift that its second step takes past the best coefficient, for good."""
+
+
+@pytest.fixture
+def run(
+    generated: GenerationResult, unmeasured: Registry, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Run:
+    """Train on tiny curl-noise data on one thread."""
+    install(monkeypatch, drift=Drift)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+
+    def call(baseline: str, *settings: str, **options: Any) -> TrainingResult:
+        return train(
+            baseline,
+            "curl-noise",
+            "tiny",
+            settings=settings,
+            output=tmp_path / "run",
+            threads=1,
+            registry=unmeasured,
+            root=generated.root,
+            **options,
+        )
+
+    return call
+
+
+def test_a_training_that_stopped_early_is_over(run: Run) -> None:
+    """The same command again changes no byte of what an early stop left."""
+    settings = (f"model.start={GREEDY[0]}", f"training.learning_rate={GREEDY[1]}", "training.steps=50")
+    settings += ("training.validate_every=1", "training.patience=2")
+    first = run("drift", *settings)
+    files = (first.checkpoint, first.weights, first.folder / "training.json")
+    before = [file.read_bytes() for file in files]
+    again = run("drift", *settings)
+    assert (again.state, again.step) == (first.state, first.step) == ("stopped early", first.step)
+    assert first.step < 50
+    assert (again.best_step, again.best_rmse) == (first.best_step, first.best_rmse)
+    assert [file.read_bytes() for file in files] == before
+
+
+def test_weights_without_a_checkpoint_are_a_training_too(run: Run) -> None:
+    """``--no-resume`` refuses a folder that holds weights alone, and leaves them."""
+    first = run("drift", "training.steps=1")
+    first.checkpoint.unlink()
+    before = first.weights.read_bytes()
+    with pytest.raises(UsageError, match="holds a training"):
+        run("drift", "training.steps=1", resume=False)
+    assert first.weights.read_bytes() == before
+
+
+@contextmanager
+def largest_file(size: int) -> Iterator[None]:
+    """Let the system refuse files above a size, as it refuses them on a full disk [byte]."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_a_full_disk(run: Run) -> None:
+    """Where a checkpoint does not fit on the disk, that is said, and the one before stays."""
+    path = run("drift", "training.steps=1").checkpoint
+    before, found = path.read_bytes(), load(path)
+    larger = replace(found, weights={**found.weights, "more": torch.ones(10**5)})
+    with largest_file(10**5), pytest.raises(WorkFailedError, match="free disk space") as caught:
+        save(path, larger)
+    assert "checkpoint.pt" in str(caught.value)
+    left = {file.name for file in path.parent.iterdir() if file.is_file()}
+    assert left == {"checkpoint.pt", "training.json", "weights.pt"}
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize("baseline", ["gns", "var"])
+def test_a_model_that_memory_cannot_hold(run: Run, baseline: str) -> None:
+    """A model of 10^15 numbers ends with what to lower, before any step."""
+    setting = "model.lags=1000000000" if baseline == "var" else "model.latent=10000000"
+    with pytest.raises(WorkFailedError, match="out of memory") as caught:
+        run(baseline, setting)
+    assert setting.partition("=")[0].partition(".")[2] in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [
+        "training.epochs=.inf",
+        "training.clip=.inf",
+        "model.noise_std=.inf",
+        "model.radius=.inf",
+        "model.loss.vorticity=.inf",
+        "model.link_weight=.inf",
+    ],
+)
+def test_numbers_without_end_are_refused(run: Run, setting: str) -> None:
+    """No option is infinite; the message names it."""
+    with pytest.raises(UsageError, match=setting.partition("=")[0].replace(".", r"\.")):
+        run("gns", setting)
+
+
+def test_processes_share_the_cores() -> None:
+    """Unless told otherwise, each of several processes on a machine takes its share of the threads."""
+    cores, before = len(os.sched_getaffinity(0)), torch.get_num_threads()
+    for processes, expected in ((1, cores), (cores, 1), (cores + 1, 1)):
+        with threads_used(None, processes=processes):
+            assert torch.get_num_threads() == expected
+    with threads_used(3, processes=cores):
+        assert torch.get_num_threads() == 3
+    assert torch.get_num_threads() == before
