@@ -27,6 +27,7 @@ from lagbench.registry import Registry
 from .baseline import Baseline
 from .catalogue import find
 from .facts import Facts, facts_of
+from .footprint import check_footprint
 
 __all__ = ["Checkpoint", "check_data", "load", "load_weights", "restore", "rounded_weights", "save"]
 
@@ -135,11 +136,13 @@ def restore(checkpoint: Checkpoint, *, where: str = "the checkpoint") -> Baselin
 
     Raises:
         UsageError: no such baseline is installed.
-        UnreadableFileError: options or weights do not fit the baseline.
+        UnreadableFileError: options or weights do not fit the baseline, or each other.
     """
     entry = find(checkpoint.baseline)
+    options, facts = checkpoint.options, checkpoint.facts
     try:
-        model = entry.model.build(checkpoint.options, checkpoint.facts)
+        check_footprint(entry.model, options, facts, checkpoint.weights, where=where)
+        model = entry.model.build(options, facts)
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(map(str, first["loc"]))

@@ -14,6 +14,7 @@ from lagbench.layout import dataset_folder
 from lagbench.locating import locate
 from lagbench.manifest import Manifest, read_manifest
 from lagbench.registry import Registry, Size
+from lagbench.remedy import remedy
 from lagbench.scenario_file import read_scenario
 from lagbench.store.bringing import bring
 
@@ -122,7 +123,7 @@ def _absent(size: Size, root: Path, what: str) -> DataError:
     return DataError(
         what,
         where=str(dataset_folder(root, size.split, size.name, size.major)),
-        fix=f"lagbench generate --split {size.split} --size {size.name} --root {root}",
+        fix=remedy(size, f"--root {root}"),
     )
 
 

@@ -15,7 +15,6 @@ Later layers win: defaults, recipe, ``--set``. ``steps`` and ``epochs`` replace 
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -57,11 +56,6 @@ class Recipe:
         """Return plain values."""
         training = self.training.model_dump(mode="json")
         return {"baseline": self.baseline, "name": self.name, "model": dict(self.model), "training": training}
-
-    @property
-    def fingerprint(self) -> str:
-        """Canonical text: two runs with the same one are the same training."""
-        return json.dumps(self.as_json(), sort_keys=True)
 
 
 class _Part(BaseModel):

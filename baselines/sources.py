@@ -9,6 +9,7 @@ from pathlib import Path
 from lagbench.errors import DataError, UsageError, nearest
 from lagbench.layout import ScenarioKey, scenario_path
 from lagbench.registry import Size
+from lagbench.remedy import remedy
 from lagbench.scenario_ids import spell_ids
 from lagbench.store.bringing import bring
 
@@ -24,18 +25,14 @@ class Source:
         key: what names the scenario.
         frames: frames that it holds.
         digest: first digits of its content hash; empty when none is known.
+        remedy: what writes the file anew, in words.
     """
 
     path: Path
     key: ScenarioKey
     frames: int
     digest: str = ""
-
-    @property
-    def remedy(self) -> str:
-        """The command that writes the file anew."""
-        key = self.key
-        return f"lagbench generate --split {key.split} --size {key.size} --subset {key.subset}"
+    remedy: str = ""
 
 
 def sources_of(size: Size, subsets: Sequence[str], root: Path) -> dict[int, Source]:
@@ -52,15 +49,19 @@ def sources_of(size: Size, subsets: Sequence[str], root: Path) -> dict[int, Sour
                 split=size.split, size=size.name, version=size.version, scenario=i, subset=subset
             )
             sources[i] = Source(
-                path=scenario_path(root, key), key=key, frames=size.frame_count(i), digest=digests.get(i, "")
+                path=scenario_path(root, key),
+                key=key,
+                frames=size.frame_count(i),
+                digest=digests.get(i, ""),
+                remedy=remedy(size, f"--subset {subset}"),
             )
     bring(size, root, sources)
     missing = [i for i, source in sources.items() if not source.path.is_file()]
     if missing:
         raise DataError(
-            f"{len(missing)} of {len(sources)} scenarios are not generated",
+            f"{len(missing)} of {len(sources)} scenarios are not there",
             where=str(root / size.split / size.name),
             got=f"missing: {spell_ids(missing)}",
-            fix=f"lagbench generate --split {size.split} --size {size.name} --root {root}",
+            fix=remedy(size, f"--root {root}"),
         )
     return sources

@@ -105,9 +105,12 @@ class TrainingOptions(_Strict):
         return data
 
     @model_validator(mode="after")
-    def _never_test(self) -> TrainingOptions:
-        if "test" in self.windows or not self.windows:
-            message = f"windows={self.windows}: a model is trained on train (and extra), never on test"
+    def _own_subsets(self) -> TrainingOptions:
+        if {"test", "valid"} & set(self.windows) or not self.windows:
+            message = (
+                f"windows={self.windows}: a model is trained on train (and extra), never on test, and not on"
+                " valid, by which its weights are chosen"
+            )
             raise ValueError(message)
         return self
 

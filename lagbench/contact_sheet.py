@@ -21,6 +21,7 @@ from .palette import MUTED
 from .panels import Panel, colour_bar, draw, limit_of, material_key
 from .recording import Recording, Scene, open_recording
 from .registry import Registry, Size
+from .remedy import remedy
 from .store.bringing import bring
 
 if TYPE_CHECKING:
@@ -101,7 +102,7 @@ def contact_sheet(
         raise DataError(
             "nothing to draw",
             where=f"{tier.split} {size} under {folder}",
-            fix=f"lagbench generate --split {split} --size {size}",
+            fix=remedy(tier),
         )
     panel = None if kind is None else Panel(kind)
     kinds = _first_of_each_kind(files, splits)

@@ -9,12 +9,14 @@ from . import registry
 from .errors import DataError, UsageError, nearest
 from .layout import ScenarioKey, dataset_folder, scenario_path
 from .locating import locate
+from .remedy import remedy
 from .scenario_ids import spell_ids
 
 if TYPE_CHECKING:
     import xarray as xr
 
     from .manifest import Manifest
+    from .registry import Size
 
 __all__ = ["list_splits", "load_manifest", "open_split"]
 
@@ -52,7 +54,7 @@ def load_manifest(split: str, *, size: str = "full", root: str | Path | None = N
         raise DataError(
             "the data set has no manifest",
             where=str(dataset_folder(folder, entry.split, size, entry.major)),
-            fix=f"lagbench generate --split {split} --size {size}",
+            fix=remedy(entry),
         )
     return manifest
 
@@ -97,26 +99,24 @@ def open_split(
         ScenarioKey(split=entry.split, size=size, version=entry.version, scenario=i, subset=subset)
         for i in ids
     ]
-    _require(folder, keys)
-    scenarios = [_open_scenario(scenario_path(folder, key), key) for key in keys]
+    _require(entry, folder, keys)
+    scenarios = [_open_scenario(scenario_path(folder, key), key, remedy(entry)) for key in keys]
     return _join(scenarios, xr.Variable("scenario", list(ids), {"long_name": "scenario id", "units": "1"}))
 
 
-def _require(root: Path, keys: list[ScenarioKey]) -> None:
-    """Say which scenarios are missing and the command that makes them."""
+def _require(size: Size, root: Path, keys: list[ScenarioKey]) -> None:
+    """Say which scenarios are missing and what makes them."""
     missing = [key.scenario for key in keys if not scenario_path(root, key).is_file()]
     if missing:
-        key = keys[0]
-        options = f"--split {key.split} --size {key.size} --subset {key.subset} --root {root}"
         raise DataError(
-            f"{len(missing)} of {len(keys)} scenarios are not generated",
-            where=str(scenario_path(root, key).parent),
+            f"{len(missing)} of {len(keys)} scenarios are not there",
+            where=str(scenario_path(root, keys[0]).parent),
             got=f"missing: {spell_ids(missing)}",
-            fix=f"lagbench generate {options}",
+            fix=remedy(size, f"--subset {keys[0].subset}", f"--root {root}"),
         )
 
 
-def _open_scenario(path: Path, key: ScenarioKey) -> xr.Dataset:
+def _open_scenario(path: Path, key: ScenarioKey, fix: str) -> xr.Dataset:
     """Open one file lazily and check that it is the scenario that its path says."""
     import xarray as xr
 
@@ -131,7 +131,7 @@ def _open_scenario(path: Path, key: ScenarioKey) -> xr.Dataset:
             "a scenario file is damaged or not one of lagbench",
             where=str(path),
             got=f"{type(error).__name__}: {error}",
-            fix=f"lagbench generate --split {key.split} --size {key.size}",
+            fix=fix,
         ) from error
     same_major = str(found["version"]).split(".")[0] == str(key.major)
     if not same_major or (found["split"], found["size"], int(found["scenario"])) != (

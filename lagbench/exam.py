@@ -19,6 +19,7 @@ from .grid import Grid, Placement
 from .manifest import Manifest, read_manifest
 from .metrics import Scenario, Setting, Snapshot, snapshots
 from .registry import Size
+from .remedy import remedy
 from .scenario_file import ScenarioFile
 from .store.bringing import bring
 from .submission.truth import Truth
@@ -156,7 +157,7 @@ def _attribute_std(size: Size, root: Path, manifest: Manifest | None) -> tuple[f
             where=f"datasets.yaml, and the manifest of {size.split} {size.name} in {root}",
             expected="position_std and velocity_std, two numbers each",
             got=", ".join(known) or "nothing",
-            fix=f"lagbench generate --split {size.split} --size {size.name} --root {root}",
+            fix=remedy(size, f"--root {root}"),
         ) from None
     return x, y, u, v
 

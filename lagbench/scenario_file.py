@@ -34,7 +34,7 @@ CHUNK_CACHE = 1 << 20
 DEFLATE_RATIO = 1032
 """No zlib stream unpacks to more than this many times its length."""
 
-_REPAIR = "lagbench generate writes what is missing or damaged anew"
+_REPAIR = "lagbench generate writes it anew; a local split is made again by lagbench adopt or import"
 
 
 @dataclass(frozen=True, kw_only=True)

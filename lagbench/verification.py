@@ -26,9 +26,9 @@ from .plan import Scenarios, Selection, estimate, select
 from .pool import Pool, Task, worker_count
 from .progress import Meter, Progress
 from .registry import Registry, Size
+from .remedy import remedy
 from .scenario_ids import spell_ids
 from .store.bringing import bring
-from .submission.truth import remedy
 from .verdict import TOLERATED, UNLIKE, hash_verdict, told, unlike_measures
 
 __all__ = ["SubsetReport", "VerificationResult", "verify"]

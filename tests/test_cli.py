@@ -80,7 +80,7 @@ def test_info_shows_parameters_with_units_and_state(run: Run, generated: Generat
     assert re.search(r"velocity_scale +\S+ +\S+ +\S+ +length/s", text)
     assert str(generated.folder) in text
     assert "pictures/scenarios.png" in text
-    assert "generated: yes" in text
+    assert "(there: yes)" in text
     data = json.loads(run("info", SPLIT, "--size", SIZE, "--json").stdout)
     assert data["sizes"][SIZE]["parameters"]["modulus"]["unit"] == "mass/s^2"
     assert data["sizes"][SIZE]["subsets"]["test"] == [3, 4]

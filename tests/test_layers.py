@@ -43,6 +43,7 @@ FILES = (
 REGISTRY = (
     *FILES,
     "registry",
+    "remedy",
     "locating",
     "locking",
     "statistics",

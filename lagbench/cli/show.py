@@ -106,8 +106,8 @@ def _details(entry: Overview, size: Size) -> list[str]:
         f"  task       {task.input_frames} frames given, {task.horizon} to predict, radius {task.radius}",
         f"  frame      {size.frame_interval:.6g} s, {size.substeps_per_frame} substeps of {size.dt:.6g} s",
         f"  hash       {entry.dataset_sha256 or 'not measured yet'}",
-        f"  folder     {entry.folder} (generated: {entry.state})",
-        f"  picture    {entry.picture or 'none: lagbench generate draws it'}",
+        f"  folder     {entry.folder} (there: {entry.state})",
+        f"  picture    {entry.picture or 'none'}",
     ]
 
 

@@ -19,7 +19,7 @@ from lagbench.progress import Meter, Progress
 from lagbench.registry import Registry
 from lagbench.scenario_ids import spell_ids
 from lagbench.store.publication import publication
-from lagbench.verdict import compare
+from lagbench.verdict import compare, told
 
 from .errand import Errand, Reason
 
@@ -124,7 +124,7 @@ def download(
             if store:
                 store.follow(manifest, at_once=True)
         if not errand.missing:
-            verdict = compare(tier, manifest)
+            verdict = told(compare(tier, manifest), tier)
             if errand.downloaded and tier.simulated:
                 if store:
                     store.bring(held)

@@ -11,11 +11,11 @@ from lagbench.errors import DataError, UnreadableFileError, UsageError
 from lagbench.layout import major_of
 from lagbench.manifest import read_manifest
 from lagbench.registry import Registry, Size
+from lagbench.remedy import remedy
 
 from .anatomy import Anatomy
 from .findings import Findings, quoted
 from .guesses import guess_frames, guess_scenarios, spell_numbers
-from .truth import remedy
 
 __all__ = [
     "check_dataset",

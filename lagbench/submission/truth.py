@@ -10,25 +10,14 @@ from numpy.typing import NDArray
 from lagbench.errors import DataError
 from lagbench.layout import ScenarioKey, scenario_path
 from lagbench.registry import Size
+from lagbench.remedy import remedy
 from lagbench.scenario_file import ScenarioFile, read_scenario
 from lagbench.scenario_ids import spell_ids
 
-__all__ = ["Truth", "remedy"]
+__all__ = ["Truth"]
 
 BLOCK = 16
 """Frames that are read at a time."""
-
-
-def remedy(size: Size, *options: str) -> str:
-    """Return what makes a data set whole again; options narrow down what is simulated.
-
-    >>> from lagbench.registry import load
-    >>> remedy(load().size("cavity", "tiny"), "--subset test")
-    'lagbench generate --split cavity --size tiny --subset test'
-    """
-    if size.simulated:
-        return " ".join((f"lagbench generate --split {size.split} --size {size.name}", *options))
-    return "remove the folder and make the local split again: lagbench adopt, or lagbench import"
 
 
 class Truth:

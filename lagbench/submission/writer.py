@@ -15,12 +15,12 @@ from lagbench.atomic import atomic_path
 from lagbench.errors import DataError, UsageError, WorkFailedError, nearest
 from lagbench.locating import locate
 from lagbench.registry import Registry, Size
+from lagbench.remedy import remedy
 from lagbench.scenario_ids import spell_ids
 from lagbench.store.bringing import bring
 
 from .header import DIMS, FORMAT, NEVER, OPTIONAL, SPACE, fits, kind_of
 from .task_checks import dataset_hash_of, frames_to_predict
-from .truth import remedy
 
 __all__ = ["Label", "PredictionsWriter"]
 
