@@ -58,7 +58,7 @@ def check_footprint(
         asked = _numbers(built)
     except _TooManyPartsError as error:
         raise _too_large(where, f"weights for {len(weights)} tensors", f"options for {error}") from None
-    except RuntimeError as error:
+    except (RuntimeError, TypeError) as error:
         if "overflow" not in str(error):
             return
         raise _too_large(where, f"weights of {held} numbers", str(error).split("\n")[0][:200]) from None

@@ -63,8 +63,7 @@ class Keeper(Callback):
             for number in (signal.SIGINT, signal.SIGTERM):
                 self._handlers[number] = signal.signal(number, self._interrupt)
         steps = _of(module).steps
-        self.meter.begin("training", total=steps, scenarios=steps)
-        self.meter.count(_of(module).step, scenarios=_of(module).step)
+        self.meter.begin("training", total=steps, scenarios=steps, done=_of(module).step)
 
     def on_train_batch_end(
         self, trainer: Trainer, module: LightningModule, outputs: object, batch: object, batch_idx: int

@@ -10,10 +10,13 @@ from dataclasses import dataclass, field
 from importlib.metadata import version
 from typing import Any, Self
 
-__all__ = ["STOPPED_EARLY", "Ledger", "versions"]
+__all__ = ["OVER", "STOPPED_EARLY", "Ledger", "versions"]
 
 STOPPED_EARLY = "stopped early"
 """State of a training whose validations brought nothing new; it is over."""
+
+OVER = ("finished", STOPPED_EARLY)
+"""States of a training that is not to be gone on with."""
 
 
 @dataclass

@@ -12,9 +12,10 @@ from lagbench.atomic import write_atomically
 from lagbench.errors import UsageError
 
 from .checkpoint import Checkpoint, load
+from .ledger import OVER
 from .recipe import Recipe
 
-__all__ = ["RunFolder", "default_folder"]
+__all__ = ["RunFolder", "default_folder", "first_difference"]
 
 
 def default_folder(recipe: Recipe) -> Path:
@@ -61,16 +62,18 @@ class RunFolder:
             UnreadableFileError: its checkpoint is damaged.
         """
         left = [file for file in (self.checkpoint, self.weights, self.record) if file.exists()]
-        if fresh or not left or (resume and self.checkpoint not in left):
+        if fresh or not left:
             return None
         if self.checkpoint not in left:
-            raise self._taken()
+            if resume and self.weights not in left:  # it failed before there was anything to keep
+                return None
+            raise self._without_checkpoint(recipe) if resume else self._taken()
         found = load(self.checkpoint)
         if found.training.get("recipe") != recipe.as_json():
             raise UsageError(
                 "the folder holds a training with another recipe",
                 where=str(self.path),
-                expected=_first_difference(recipe.as_json(), found.training.get("recipe")),
+                expected=first_difference(recipe.as_json(), found.training.get("recipe")),
                 fix="name another folder with --output, or train anew with --fresh",
             )
         if not resume:
@@ -84,6 +87,26 @@ class RunFolder:
             fix="go on with --resume, train anew with --fresh, or name another --output",
         )
 
+    def _without_checkpoint(self, recipe: Recipe) -> UsageError:
+        """Return the error for weights that no training can go on from, and that none may replace."""
+        said = self._recorded()
+        over = said.get("recipe") == recipe.as_json() and said.get("state") in OVER
+        return UsageError(
+            "the training is finished" if over else "the folder holds weights, and no checkpoint to go on from",
+            where=str(self.path),
+            got=f"{self.weights.name} without {self.checkpoint.name}",
+            fix=("predict from its weights, " if over else "name another folder with --output, ")
+            + "or train anew with --fresh",
+        )
+
+    def _recorded(self) -> dict[str, Any]:
+        """Return what training.json says; nothing where it is not there or no record."""
+        try:
+            said = json.loads(self.record.read_bytes())
+        except (OSError, ValueError, RecursionError):
+            return {}
+        return said if isinstance(said, dict) else {}
+
     def clear(self) -> None:
         """Remove what an earlier training left, and nothing else."""
         for file in (self.checkpoint, self.weights, self.record):
@@ -96,13 +119,13 @@ class RunFolder:
         write_atomically(self.record, text.encode() + b"\n", option="--output")
 
 
-def _first_difference(wanted: dict[str, Any], found: object, path: str = "") -> str:
+def first_difference(wanted: dict[str, Any], found: object, path: str = "") -> str:
     """Return the first key whose value differs, with both values."""
     theirs = found if isinstance(found, dict) else {}
     for key in sorted({*wanted, *theirs}):
         mine, other = wanted.get(key), theirs.get(key)
         if mine != other:
             if isinstance(mine, dict) and isinstance(other, dict):
-                return _first_difference(mine, other, f"{path}{key}.")
+                return first_difference(mine, other, f"{path}{key}.")
             return f"{path}{key} = {mine!r}, as asked for; the folder has {other!r}"
     return "the same recipe"

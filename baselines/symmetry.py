@@ -14,11 +14,12 @@ import torch
 from torch import Tensor
 
 from lagbench.errors import UsageError
+from lagbench.registry import Size
 
 from .batch import Batch
 from .facts import Pair
 
-__all__ = ["Symmetry", "draw", "image"]
+__all__ = ["Symmetry", "check_symmetry", "draw", "image"]
 
 _NORMALS = torch.tensor([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])
 """Outward normals of the walls left, right, bottom, top."""
@@ -32,6 +33,30 @@ class Symmetry(enum.StrEnum):
     """x -> -x about the middle of the box: any split."""
     SQUARE = "square"
     """All eight images of the square: splits without gravity."""
+
+
+def check_symmetry(symmetry: object, size: Size) -> None:
+    """Refuse images that fall in another direction than their windows.
+
+    A split whose description names no gravity, as an imported one may, passes.
+
+    Args:
+        symmetry: name of the images that training may draw; None for a model without the option.
+        size: what the registry says of the split.
+
+    Raises:
+        UsageError: all images of the square, in a split with gravity.
+    """
+    described = size.parameters.get("gravity")
+    gravity = described.value if described else None
+    if symmetry == Symmetry.SQUARE and gravity:
+        raise UsageError(
+            f"gravity in {size.split} points down, and its images of the square fall sideways and up",
+            where="model.symmetry",
+            expected=f"{Symmetry.NONE} or {Symmetry.MIRROR} where gravity is {gravity}",
+            got=str(symmetry),
+            fix="set model.symmetry=mirror",
+        )
 
 
 def draw(symmetry: Symmetry, windows: int, generator: torch.Generator) -> Tensor:

@@ -27,6 +27,7 @@ from .ledger import Ledger
 from .machine import bound_memory, chosen_device, is_helper, memory_errors_told, threads_used
 from .recipe import recipe_for
 from .run_folder import RunFolder, default_folder
+from .symmetry import check_symmetry
 
 __all__ = ["TrainingResult", "train"]
 
@@ -114,8 +115,8 @@ def train(
         registry: where splits are described; ours when None.
 
     Raises:
-        UsageError: unknown baseline, split, size, recipe or key; or the folder holds another
-            training.
+        UsageError: unknown baseline, split, size, recipe or key; images that gravity forbids; or
+            the folder holds another training, or weights without their checkpoint.
         DataError: the data set is missing or damaged.
         UnreadableFileError: the checkpoint in the folder is damaged.
         WorkFailedError: the loss is not finite, memory or disk is full.
@@ -124,6 +125,7 @@ def train(
     entry = find(baseline)
     tier, home, known = locate(split, size, root=root, registry=registry)
     plan = recipe_for(entry, tier.split, size, variant=recipe, settings=settings, seed=seed)
+    check_symmetry(plan.model.get("symmetry"), tier)
     facts = facts_of(tier.split, size, root=home, registry=known)
     folder = RunFolder(Path(output) if output else default_folder(plan))
     check_writable(folder.path, option="--output")

@@ -20,6 +20,7 @@ class Progress:
         scenarios_done: scenarios that are finished.
         scenarios: scenarios to finish.
         seconds: time since the start [s].
+        before: scenarios that an earlier run had finished; they took none of that time.
     """
 
     stage: str
@@ -28,11 +29,12 @@ class Progress:
     scenarios_done: int
     scenarios: int
     seconds: float
+    before: int = 0
 
     @property
     def rate(self) -> float:
-        """Scenarios finished per second [1/s]."""
-        return self.scenarios_done / self.seconds if self.seconds > 0.0 else 0.0
+        """Scenarios finished per second since the start [1/s]."""
+        return (self.scenarios_done - self.before) / self.seconds if self.seconds > 0.0 else 0.0
 
 
 @dataclass
@@ -54,12 +56,20 @@ class Meter:
     scenarios: int = 0
     done: int = 0
     finished: int = 0
+    _before: int = field(default=0, init=False)
     _started: float = field(default_factory=time.monotonic, init=False)
 
-    def begin(self, stage: str, *, total: int, scenarios: int) -> None:
-        """Start a stage with counts at zero."""
+    def begin(self, stage: str, *, total: int, scenarios: int, done: int = 0) -> None:
+        """Start a stage with counts at zero, or at what an earlier run had done.
+
+        Args:
+            stage: what happens now.
+            total: units to do.
+            scenarios: scenarios to finish.
+            done: units done before, each of them a scenario.
+        """
         self.stage, self.total, self.scenarios = stage, total, scenarios
-        self.done = self.finished = 0
+        self.done = self.finished = self._before = done
         self._started = time.monotonic()
         self.count()
 
@@ -76,5 +86,6 @@ class Meter:
                     scenarios_done=self.finished,
                     scenarios=self.scenarios,
                     seconds=time.monotonic() - self._started,
+                    before=self._before,
                 )
             )

@@ -206,11 +206,12 @@ def test_losses_are_read_back_from_tensorboard(tmp_path: Path) -> None:
     assert loss_over_steps(tmp_path / "none")[0].size == 0
 
 
-def test_smoothing_is_a_running_mean() -> None:
-    """Each value is the mean of the last 25, fewer at the start, by brute force."""
+def test_smoothing_is_a_centred_mean() -> None:
+    """Each value is the mean of 12 before it to 12 after, fewer at both ends, by brute force; lines stay."""
     values = np.random.default_rng(2).random(60)
-    brute = [values[max(0, i - 24) : i + 1].mean() for i in range(60)]
-    assert smoothed(values) == pytest.approx(brute)
+    reach = [min(12, i, 59 - i) for i in range(60)]
+    assert smoothed(values) == pytest.approx([values[i - k : i + k + 1].mean() for i, k in enumerate(reach)])
+    assert smoothed(np.arange(60.0)) == pytest.approx(np.arange(60.0))
 
 
 def test_a_table_of_rollouts_puts_ours_beside_theirs() -> None:

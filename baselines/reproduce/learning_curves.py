@@ -30,7 +30,7 @@ __all__ = ["draw_figure", "loss_over_steps"]
 Floats = NDArray[np.float64]
 
 SMOOTHED = 25
-"""Entries of the log that a drawn point is the mean of; fewer at the start."""
+"""Entries of the log that a drawn point is the mean of, as many before it as after; fewer at both ends."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,11 +73,11 @@ def loss_over_steps(folder: Path, term: str = "total") -> tuple[Floats, Floats]:
 
 
 def smoothed(values: Floats) -> Floats:
-    """Return the mean of each value and up to :data:`SMOOTHED` - 1 before it."""
+    """Return the mean of each value and its neighbours, :data:`SMOOTHED` in all where there are."""
     total = np.concatenate([[0.0], np.cumsum(values)])
-    end = np.arange(1, len(values) + 1)
-    start = np.maximum(0, end - SMOOTHED)
-    mean: Floats = (total[end] - total[start]) / (end - start)
+    place = np.arange(len(values))
+    reach = np.minimum(SMOOTHED // 2, np.minimum(place, place[::-1]))
+    mean: Floats = (total[place + reach + 1] - total[place - reach]) / (2 * reach + 1)
     return mean
 
 
@@ -169,7 +169,7 @@ def _loss(folder: Path) -> Mapping[str, Floats]:
 
 
 def _last(curve: Curve) -> float | None:
-    return float(smoothed(curve.loss)[-1]) if curve.loss.size else None
+    return float(curve.loss[-SMOOTHED:].mean()) if curve.loss.size else None
 
 
 def _plot(axes: Axes, curves: list[Curve], axis: str) -> None:
@@ -178,4 +178,4 @@ def _plot(axes: Axes, curves: list[Curve], axis: str) -> None:
             axes.plot(curve.steps, smoothed(curve.loss), lw=1.1, label=curve.name, color=curve.colour)
     if any(curve.loss.size for curve in curves):
         axes.set_yscale("log")
-    tidy(axes, f"running mean of {SMOOTHED} entries", "optimiser step", axis)
+    tidy(axes, f"mean of {SMOOTHED} entries", "optimiser step", axis)

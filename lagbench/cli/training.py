@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -74,7 +78,7 @@ def train(
     from lagbench.baselines.training import train as run
 
     quiet = quiet or is_helper()
-    with progress_bar(quiet=quiet, counted="steps") as draw:
+    with _told_once(), progress_bar(quiet=quiet, counted="steps") as draw:
         result = run(
             baseline,
             chosen(name, split),
@@ -96,6 +100,26 @@ def train(
         print_json(result)
     else:
         say("\n".join(_trained(result)), quiet=quiet)
+
+
+@contextmanager
+def _told_once() -> Iterator[None]:
+    """Let one process of each machine tell an error, and the first alone an interrupt.
+
+    What befell one process only, as where its memory is full, it tells itself.
+    """
+    from lagbench.baselines.machine import is_helper
+
+    try:
+        yield
+    except KeyboardInterrupt:
+        if is_helper():
+            raise typer.Exit(128 + signal.SIGINT) from None
+        raise
+    except LagbenchError as error:
+        if os.environ.get("LOCAL_RANK", "0") != "0" and error.__cause__ is None:
+            raise typer.Exit(error.exit_code) from error
+        raise
 
 
 def _trained(result: TrainingResult) -> list[str]:
