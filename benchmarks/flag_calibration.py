@@ -8,6 +8,9 @@ one-step predictions from true frames, shifts in time, resets every few frames, 
 between true frames, a moving average.
 
     python benchmarks/flag_calibration.py --size mini --root DATA [--splits cavity,fluid]
+        [--trained runs/cavity/mini/gns-0/predictions.nc ...]
+
+``--trained`` adds predictions of trained models to the honest ones.
 
 The thresholds in lagbench/flags.py lie between the extremes that this prints.
 """
@@ -27,6 +30,7 @@ from lagbench.grid import Grid, fields
 from lagbench.layout import resolve_root
 from lagbench.metrics import FramePair, Scenario, snapshots
 from lagbench.registry import load
+from lagbench.submission import Predictions, open_predictions
 from lagbench.trace import Trace, Tracer
 
 Floats = NDArray[np.float64]
@@ -148,14 +152,22 @@ def trace_of(case: Case, predicted: Floats) -> Trace:
     return tracer.result()
 
 
-def cases(exam: Exam) -> Iterator[Case]:
-    """Yield the test scenarios of a split."""
+def cases(exam: Exam) -> dict[int, Case]:
+    """Return the test scenarios of a split by id."""
     held = []
     for number in exam.scenarios:
         with exam.opened(number) as opened:
             held.append((opened.scenario, opened.file.read("position").astype(np.float64)))
-    for i, (scenario, positions) in enumerate(held):
-        yield Case(scenario, positions, held[i - 1][1])
+    found = [Case(scenario, positions, held[i - 1][1]) for i, (scenario, positions) in enumerate(held)]
+    return dict(zip(exam.scenarios, found, strict=True))
+
+
+def trained(paths: Sequence[Path], split: str, size: str) -> Iterator[tuple[str, Predictions]]:
+    """Yield the predictions of trained models on a split, opened."""
+    for path in paths:
+        with open_predictions(path) as predictions:
+            if (predictions.header.split, predictions.header.size) == (split, size):
+                yield path.parent.name, predictions
 
 
 def main() -> int:
@@ -164,24 +176,37 @@ def main() -> int:
     parser.add_argument("--size", default="mini")
     parser.add_argument("--root", type=Path)
     parser.add_argument("--splits", default=",".join(SPLITS))
+    parser.add_argument("--trained", type=Path, nargs="*", default=[])
     options = parser.parse_args()
     names = "".join(f"{name:>17s}" for name in (*COLUMNS, "energy", "area"))
     print(f"{'prediction':32s} {'split':14s}{names}  copy_suspect")
-    seen: dict[str, list[list[float]]] = {"honest": [], "made from the truth": []}
+    seen: dict[str, list[list[float]]] = {"honest": [], "made from the truth": [], "trained": []}
     for split in options.splits.split(","):
         exam = load_exam(load().size(split, options.size), resolve_root(options.root))
-        held = list(cases(exam))
+        by_id = cases(exam)
+        held = list(by_id.values())
         for kind, table in (("honest", HONEST), ("made from the truth", DISHONEST)):
             print(f"-- {split} {options.size}, {kind}")
             for name, predict in table.items():
-                traces = [trace_of(case, predict(case)) for case in held]
-                numbers = [numbers_of(trace) for trace in traces]
-                seen[kind] += numbers
-                raised = "raised" if copy_suspect(traces).raised else "-"
-                print(f"{name:32s} {split:14s}{ranges(numbers)}  {raised}")
+                seen[kind] += tell(name, split, [trace_of(case, predict(case)) for case in held])
+        print(f"-- {split} {options.size}, trained")
+        for name, predictions in trained(options.trained, split, options.size):
+            rolled = {
+                i: np.concatenate([block for _, block in predictions.blocks(i)]).astype(float) for i in by_id
+            }
+            seen["trained"] += tell(name, split, [trace_of(case, rolled[i]) for i, case in by_id.items()])
     for kind, numbers in seen.items():
-        print(f"{'all splits, ' + kind:47s}{ranges(numbers)}")
+        if numbers:
+            print(f"{'all splits, ' + kind:47s}{ranges(numbers)}")
     return 0
+
+
+def tell(name: str, split: str, traces: Sequence[Trace]) -> list[list[float]]:
+    """Print the line of a prediction; return its numbers by scenario."""
+    numbers = [numbers_of(trace) for trace in traces]
+    raised = "raised" if copy_suspect(traces).raised else "-"
+    print(f"{name:32s} {split:14s}{ranges(numbers)}  {raised}", flush=True)
+    return numbers
 
 
 def numbers_of(trace: Trace) -> list[float]:
