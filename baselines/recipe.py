@@ -143,8 +143,17 @@ def _choose(entry: Entry, file: _File, split: str, size: str) -> tuple[str, _Par
     raise UsageError(
         f"{entry.name} has no recipe {f'{split}/{size}'!r}",
         where="--split, --size, --recipe",
-        fix=nearest(f"{split}/{size}", file.recipes) + "; or write your own: --recipe FILE.yaml",
+        fix=_closest(f"{split}/{size}", file.recipes),
     )
+
+
+def _closest(wanted: str, known: Iterable[str]) -> str:
+    """Return what to do without a recipe: that of another split would not fit."""
+    split = wanted.split("/")[0]
+    own = [name for name in known if name.split("/")[0] in {split, ANY}]
+    return (
+        nearest(wanted, own) + "; or " if own else ""
+    ) + "write your own: --recipe FILE.yaml, see docs/baselines.md"
 
 
 def _merge(below: Layer, above: Layer) -> Layer:

@@ -92,7 +92,9 @@ class RunFolder:
         said = self._recorded()
         over = said.get("recipe") == recipe.as_json() and said.get("state") in OVER
         return UsageError(
-            "the training is finished" if over else "the folder holds weights, and no checkpoint to go on from",
+            "the training is finished"
+            if over
+            else "the folder holds weights, and no checkpoint to go on from",
             where=str(self.path),
             got=f"{self.weights.name} without {self.checkpoint.name}",
             fix=("predict from its weights, " if over else "name another folder with --output, ")

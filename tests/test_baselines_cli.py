@@ -10,6 +10,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -19,6 +20,7 @@ from typer.testing import CliRunner
 from lagbench.baselines.catalogue import names
 from lagbench.baselines.checkpoint import load
 from lagbench.cli.app import app
+from lagbench.errors import DataError, WorkFailedError
 from lagbench.generation import GenerationResult
 from lagbench.submission import validate
 
@@ -177,10 +179,57 @@ def test_two_processes_keep_one_model(lagbench: Command, tmp_path: Path) -> None
 
 
 def test_the_second_process_says_nothing(lagbench: Command, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A helper of a training over several processes prints and writes nothing."""
-    monkeypatch.setenv("LOCAL_RANK", "1")
+    """A helper of a training over several processes prints and writes nothing, no error either."""
+    from lagbench.baselines import training
     from lagbench.baselines.machine import is_helper
 
-    assert is_helper()
-    monkeypatch.setenv("LOCAL_RANK", "0")
-    assert not is_helper()
+    def told(error: BaseException, **ranks: str) -> tuple[int, str]:
+        for name in ("RANK", "LOCAL_RANK"):
+            monkeypatch.setenv(name, ranks.get(name, "0"))
+        assert is_helper() == bool(ranks)
+        monkeypatch.setattr(training, "train", Mock(side_effect=error))
+        result = lagbench("train", "--baseline", "gns", *TINY)
+        return result.exit_code, result.output
+
+    full = WorkFailedError("out of memory")
+    full.__cause__ = MemoryError()
+    for error, code in ((KeyboardInterrupt(), 130), (WorkFailedError("the loss is not finite"), 5)):
+        assert told(error)[0] == code
+        assert told(error)[1] != ""
+        assert told(error, RANK="1", LOCAL_RANK="1") == (code, "")
+    # What befell one process alone, and what another machine lacks, no other process tells.
+    assert "out of memory" in told(full, RANK="1", LOCAL_RANK="1")[1]
+    assert "no data" in told(DataError("no data"), RANK="1")[1]
+    assert told(KeyboardInterrupt(), RANK="1") == (130, "")
+
+
+@pytest.mark.slow
+def test_two_processes_tell_an_error_once(lagbench: Command) -> None:
+    """A loss that overflows ends both processes, and one of them says so."""
+    settings = [word for key in SHARED for word in ("--set", key)]
+    settings += ["--set", "training.steps=9", "--set", "training.learning_rate=1e30"]
+    ended = command("train", "--baseline", "mlp", *TINY, *settings, "--processes", "2")
+    assert ended.returncode == 5
+    assert ended.stderr.count("the loss is not finite") == 1
+
+
+SHARED = ("model.widths=[8]", "training.steps=2", "training.validate_every=0")
+"""A training that takes no time."""
+
+
+def test_two_processes_make_the_step_of_one(lagbench: Command, tmp_path: Path) -> None:
+    """Three windows on each of two processes give the weights of six on one, at twice the rate."""
+
+    def options(folder: str, batch: int, rate: float) -> tuple[str, ...]:
+        keys = (*SHARED, f"training.batch={batch}", f"training.learning_rate={rate}")
+        settings = [word for key in keys for word in ("--set", key)]
+        return "train", "--baseline", "mlp", *TINY, "-o", folder, *settings
+
+    shared = command(*options("shared", 3, 1e-3), "--processes", "2")
+    assert shared.returncode == 0, shared.stderr
+    assert shared.stdout.count("finished, step 2 of 2") == 1
+    assert lagbench(*options("alone", 6, 2e-3)).exit_code == 0
+    one, other = (load(tmp_path / name / "checkpoint.pt").weights for name in ("shared", "alone"))
+    assert one.keys() == other.keys()
+    for name, value in one.items():
+        assert torch.allclose(value, other[name], rtol=0, atol=1e-6), name

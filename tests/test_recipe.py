@@ -101,6 +101,7 @@ def test_own_file(entry: Entry, tmp_path: Path) -> None:
         (["training.batch=[1"], "no YAML"),
         (["training.batch=0"], "greater than 0"),
         (["training.windows=[test]"], "never on test"),
+        (["training.windows=[train, valid]"], "not on valid"),
         (["training.learning_rate=.inf"], "finite"),
         (["training.steps=5", "training.epochs=5"], ""),
     ],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -15,6 +16,13 @@ from lagbench.generation import GenerationResult
 torch = pytest.importorskip("torch", reason="the extra 'baselines' is not installed")
 
 TRAIN = ("-m", "lagbench", "train", "--baseline", "mlp", "--split", "curl-noise", "--size", "tiny")
+
+
+def free_port() -> int:
+    """Return a port that nobody listens on."""
+    with socket.socket() as held:
+        held.bind(("127.0.0.1", 0))
+        return int(held.getsockname()[1])
 
 
 @pytest.mark.slow
@@ -46,7 +54,8 @@ def test_two_nodes_make_the_weights_of_one_process(
             [sys.executable, *words], env=there, cwd=tmp_path, stdout=pipe, stderr=pipe, text=True
         )
 
-    rendezvous = ["--rdzv-backend", "c10d", "--rdzv-endpoint", "127.0.0.1:29431", "--rdzv-id", "lagbench"]
+    address = f"127.0.0.1:{free_port()}"
+    rendezvous = ["--rdzv-backend", "c10d", "--rdzv-endpoint", address, "--rdzv-id", "lagbench"]
     nodes = [
         start(
             *("-m", "torch.distributed.run", "--nnodes", "2", "--nproc-per-node", "1", *rendezvous),

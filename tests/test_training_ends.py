@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import resource
+import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -17,8 +18,9 @@ from simple_models import Drift, install
 from lagbench.baselines.checkpoint import load, save
 from lagbench.baselines.machine import threads_used
 from lagbench.baselines.training import TrainingResult, train
-from lagbench.errors import UsageError, WorkFailedError
+from lagbench.errors import DataError, UsageError, WorkFailedError
 from lagbench.generation import GenerationResult
+from lagbench.progress import Progress
 from lagbench.registry import Registry
 
 Run = Callable[..., TrainingResult]
@@ -73,6 +75,61 @@ def test_weights_without_a_checkpoint_are_a_training_too(run: Run) -> None:
     with pytest.raises(UsageError, match="holds a training"):
         run("drift", "training.steps=1", resume=False)
     assert first.weights.read_bytes() == before
+
+
+def test_weights_without_a_checkpoint_are_not_replaced(run: Run) -> None:
+    """Going on is refused where only weights are left: it is said whether that training is finished."""
+    first = run("drift", "training.steps=1")
+    first.checkpoint.unlink()
+    before = {file: file.read_bytes() for file in (first.weights, first.folder / "training.json")}
+    with pytest.raises(UsageError, match=r"the training is finished(.|\n)*--fresh"):
+        run("drift", "training.steps=1")
+    with pytest.raises(UsageError, match=r"no checkpoint to go on from(.|\n)*--fresh"):
+        run("drift", "training.steps=2")
+    assert {file: file.read_bytes() for file in before} == before
+    for content in (b"{", b"[]"):
+        (first.folder / "training.json").write_bytes(content)
+        with pytest.raises(UsageError, match="no checkpoint to go on from"):
+            run("drift", "training.steps=1")
+    assert run("drift", "training.steps=2", fresh=True).step == 2
+
+
+def test_a_record_alone_is_no_training(run: Run) -> None:
+    """What failed before it stored any weights is trained again."""
+    first = run("drift", "training.steps=1")
+    first.checkpoint.unlink()
+    first.weights.unlink()
+    assert run("drift", "training.steps=2").step == 2
+
+
+def test_resumed_steps_are_not_counted_in_the_rate(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run that goes on at step 3 tells 0 steps per second at first, and 1 after one step in one second."""
+    settings = ("training.steps=5", "training.validate_every=0", "training.checkpoint_every=1")
+
+    def stop(news: Progress) -> None:
+        if news.stage != "predicting" and news.done == 3:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt):
+        run("drift", *settings, progress=stop)
+    heard: list[Progress] = []
+    run("drift", *settings, progress=heard.append)
+    assert [news.done for news in heard] == [3, 4, 5]
+    assert {news.total for news in heard} == {5}
+    rates = [replace(news, seconds=1.0 + i).rate for i, news in enumerate(heard)]
+    assert rates == [0.0, 1 / 2, 2 / 3]
+
+
+@pytest.mark.parametrize("split", ["fluid", "multimaterial"])
+def test_gravity_has_no_square_of_images(split: str, tmp_path: Path) -> None:
+    """Where gravity acts, only a mirror image is drawn; a box without it has all eight."""
+    there = {"root": tmp_path, "settings": ("model.symmetry=square",)}
+    with pytest.raises(UsageError, match=r"gravity in(.|\n)*model\.symmetry=mirror"):
+        train("gns", split, "tiny", **there)
+    with pytest.raises(DataError):  # no data are there: what comes next is looked at
+        train("gns", split, "tiny", root=tmp_path, settings=("model.symmetry=mirror",))
+    with pytest.raises(DataError):
+        train("gns", "cavity", "tiny", **there)
 
 
 @contextmanager

@@ -3,8 +3,8 @@
     python -m lagbench.baselines.reproduce --size mini --root DATA --runs runs [--only table_5_4,fig_5_5]
 
 What is there is not made again; interrupted, it goes on. Writes Markdown, CSV and PNG to
-``RUNS/reproduce/<size>/`` and prints the Markdown. ``--list`` says what there is; ``--no-training``
-shows what the runs that are there allow.
+``RUNS/reproduce/<size>/`` and prints the Markdown. ``--list`` says what there is, ``--dry-run`` what
+would be trained; ``--no-training`` shows what the runs that are there allow.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from lagbench.layout import resolve_root
 from lagbench.registry import Registry, load
 
 from .catalogue import ITEMS, Item
-from .making import make_run
-from .mlp_studies import make_studies
+from .making import make_run, outlook
+from .mlp_studies import TABLES, make_studies
 from .plan import Plan
-from .roster import EXPECTED, ROSTER, label
+from .roster import EXPECTED, ROSTER, Model, label
 from .sheet import write_sheet
 from .spending import budget
 
@@ -57,6 +57,8 @@ def main(arguments: Sequence[str] | None = None, *, registry: Registry | None = 
             threads=given.threads,
             registry=registry,
         )
+        if given.dry_run:
+            return rehearse(plan, items, split=given.split)
         return reproduce(plan, items, training=not given.no_training, split=given.split)
     except LagbenchError as error:
         _complain(error)
@@ -84,26 +86,67 @@ def reproduce(plan: Plan, items: Sequence[Item], *, training: bool = True, split
         except LagbenchError as error:
             _complain(error, item.name)
             code = error.exit_code
+    for path in plan.stale:
+        _note(f"{path}: scores of another version of the data; left out")
+    return code
+
+
+def rehearse(plan: Plan, items: Sequence[Item], *, split: str | None = None) -> int:
+    """Say what :func:`reproduce` would train, predict and score; return 0, or the last error's code."""
+    code = 0
+    for where, model, seed in _runs(plan, items, split):
+        try:
+            _say(f"{where} {plan.size} {model.name}-{seed}: {outlook(plan, where, model, seed)}")
+        except LagbenchError as error:
+            _complain(error)
+            code = error.exit_code
+    for study in _studies(plan, items):
+        _say(f"studies of {study}")
     return code
 
 
 def _make_all(plan: Plan, items: Sequence[Item], split: str | None) -> Iterator[LagbenchError]:
     """Make every run that items need, one seed after the other; yield what went wrong."""
-    wanted = {(where, name): None for item in items for where, names in item.needs.items() for name in names}
-    wanted |= {(split, name): None for name in EXPECTED.get(split or "", ()) if split}
-    for seed in plan.seeds:
-        for where, name in wanted:
-            try:
-                _note(f"{where} {plan.size} {name}-{seed}")
-                make_run(plan, where, ROSTER[name], seed)
-            except LagbenchError as error:
-                yield error
-    for study in dict.fromkeys(study for item in items for study in item.studies):
+    for where, model, seed in _runs(plan, items, split):
+        try:
+            _note(f"{where} {plan.size} {model.name}-{seed}")
+            make_run(plan, where, model, seed, say=_note)
+        except LagbenchError as error:
+            yield error
+    for study in _studies(plan, items):
         try:
             _note(f"studies of {study}")
             make_studies(plan, study)
         except LagbenchError as error:
             yield error
+
+
+def _runs(plan: Plan, items: Sequence[Item], split: str | None) -> list[tuple[str, Model, int]]:
+    """Return split, model and seed of every run that items need, one seed after the other.
+
+    Models without the variant of the recipes are left out, with a note: their plain recipe may take
+    days where the variant takes minutes. A variant that no model has is a mistake, which training tells.
+    """
+    wanted = {(where, name): None for item in items for where, names in item.needs.items() for name in names}
+    wanted |= {(split, name): None for name in EXPECTED.get(split or "", ()) if split}
+    having = [(where, name) for where, name in wanted if plan.has_recipe(where, ROSTER[name])]
+    for where, name in wanted if having else ():
+        if (where, name) not in having:
+            _leave_out(plan, f"{where} {plan.size} {name}", ROSTER[name].baseline)
+    return [(where, ROSTER[name], seed) for seed in plan.seeds for where, name in having or wanted]
+
+
+def _studies(plan: Plan, items: Sequence[Item]) -> Iterator[str]:
+    """Yield the tables of MLPs to train; all are left out where MLPs have no such variant."""
+    for study in dict.fromkeys(study for item in items for study in item.studies):
+        if plan.has_recipe(TABLES[study][1], ROSTER["mlp"]):
+            yield study
+        else:
+            _leave_out(plan, f"studies of {study}", "mlp")
+
+
+def _leave_out(plan: Plan, what: str, baseline: str) -> None:
+    _note(f"{what}: left out, {baseline} has no recipe {plan.recipe!r} for it; without --recipe it is made")
 
 
 def _head(plan: Plan, item: Item) -> str:
@@ -188,6 +231,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--device", default="auto", help="cpu, cuda or auto")
     add("--threads", type=int, help="CPU threads; one per core by default")
     add("--no-training", action="store_true", help="make no run, show what is there")
+    add("--dry-run", action="store_true", help="make nothing, say what would be trained")
     add("--list", action="store_true", help="list tables and figures, and what they need")
     return parser
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from lagbench.errors import DataError, UsageError
 from lagbench.progress import Progress
@@ -16,7 +17,10 @@ from .evidence import RECORD_NAME, read_json
 from .plan import Plan
 from .roster import Model
 
-__all__ = ["check_training", "make_run", "make_training"]
+if TYPE_CHECKING:
+    from ..recipe import Recipe
+
+__all__ = ["check_training", "make_run", "make_training", "outlook"]
 
 PREDICTIONS = "predictions.nc"
 
@@ -53,7 +57,9 @@ def make_run(
     folder = plan.folder(split, model, seed)
     predictions, scores = folder / PREDICTIONS, folder / NETCDF_NAME
     check_training(plan, split, model, seed, folder=folder)
-    _drop_stale(plan.hash(split), folder, say)
+    for path in _stale(plan.hash(split), folder):
+        say(f"{path}: of another version of the data; made again")
+        path.unlink()
     if scores.is_file() and (folder / JSON_NAME).is_file():
         return folder
     if not predictions.is_file():
@@ -135,37 +141,68 @@ def check_training(plan: Plan, split: str, model: Model, seed: int, *, folder: P
     record = read_json(folder / RECORD_NAME)
     if not record:
         return
-    from ..catalogue import find
-    from ..recipe import recipe_for
     from ..run_folder import first_difference
 
-    settings, variant = (*model.settings, *plan.settings), model.recipe or plan.recipe
-    entry = find(model.baseline)
-    asked = recipe_for(entry, split, plan.size, variant=variant, settings=settings, seed=seed).as_json()
+    asked = _recipe(plan, split, model, seed).as_json()
     if record.get("recipe") != asked:
         difference = first_difference(asked, record.get("recipe"))
         raise UsageError("the run has another recipe", where=str(folder), expected=difference, fix=OTHER)
     data = plan.hash(split)
     if data is not None and record.get("dataset_sha256") != data:
         got = record.get("dataset_sha256")
-        raise DataError("the run was trained on other data", where=str(folder), expected=data, got=got, fix=OTHER)
+        raise DataError(
+            "the run was trained on other data", where=str(folder), expected=data, got=got, fix=OTHER
+        )
 
 
-def _drop_stale(data: str | None, folder: Path, say: Callable[[str], None]) -> None:
-    """Remove scores of other data than those of a hash, and the predictions that they are of."""
-    for path in (folder / NETCDF_NAME, folder / PREDICTIONS):
-        if data is None or not path.is_file():
-            continue
-        held = read_statistics(path).identity["dataset_sha256"] if path.name == NETCDF_NAME else _made_on(path)
-        if held != data:
-            say(f"{path}: of another version of the data; made again")
-            path.unlink()
+def outlook(plan: Plan, split: str, model: Model, seed: int) -> str:
+    """Return what :func:`make_run` would do, in words; nothing is made.
+
+    Raises:
+        LagbenchError: as :func:`make_run` does before it makes anything.
+    """
+    folder = plan.folder(split, model, seed)
+    check_training(plan, split, model, seed, folder=folder)
+    stale = _stale(plan.hash(split), folder)
+    there = {path.name for path in folder.glob("*") if path not in stale}
+    if {NETCDF_NAME, JSON_NAME} <= there:
+        return "there"
+    if PREDICTIONS in there:
+        return "to score"
+    if _complete(folder):
+        return "to predict and score"
+    recipe = _recipe(plan, split, model, seed)
+    training = recipe.training
+    passes = "closed form" if training.epochs is None else f"{training.epochs:g} epochs"
+    return f"to train, {recipe.name}: {passes if training.steps is None else f'{training.steps:,} steps'}"
 
 
-def _made_on(predictions: Path) -> str:
-    """Return the hash of the data that predictions are for."""
+def _recipe(plan: Plan, split: str, model: Model, seed: int) -> Recipe:
+    """Return the recipe that was asked for."""
+    from ..catalogue import find
+    from ..recipe import recipe_for
+
+    settings, variant = (*model.settings, *plan.settings), model.recipe or plan.recipe
+    return recipe_for(find(model.baseline), split, plan.size, variant=variant, settings=settings, seed=seed)
+
+
+def _stale(data: str | None, folder: Path) -> list[Path]:
+    """Return the predictions and scores of a run that are of other data than those of a hash."""
+    predictions, scores = (folder / name for name in (PREDICTIONS, NETCDF_NAME))
+    if data is None:
+        return []
+    if predictions.is_file() and _predicted_on(predictions) != data:
+        return [path for path in (predictions, scores) if path.is_file()]
+    return [scores] if scores.is_file() and _scored_on(scores) != data else []
+
+
+def _predicted_on(predictions: Path) -> str:
     with open_predictions(predictions) as found:
-        return found.dataset_sha256
+        return found.header.dataset_sha256
+
+
+def _scored_on(scores: Path) -> str:
+    return read_statistics(scores).identity["dataset_sha256"]
 
 
 def _complete(folder: Path) -> bool:

@@ -17,7 +17,7 @@ from lagbench.progress import Progress
 from lagbench.score_tables import Table
 
 from .evidence import read_json
-from .making import make_training
+from .making import check_training, make_training
 from .plan import Plan
 from .roster import Model
 from .sheet import Sheet
@@ -82,11 +82,14 @@ def make_studies(plan: Plan, name: str, progress: Callable[[Progress], None] | N
     """Train the rows of a table and measure their errors, unless that was done.
 
     Raises:
+        UsageError: a folder holds a training with another recipe.
+        DataError: a folder holds a training on other data.
         LagbenchError: as training does.
     """
     split = TABLES[name][1]
     for study in study_rows(name):
         folder, model = study_folder(plan, name, study), study_model(plan, study)
+        check_training(plan, split, model, plan.seeds[0], folder=folder)
         if not (folder / FILE).is_file():
             make_training(plan, split, model, plan.seeds[0], folder=folder, progress=progress)
             found = {subset: one_step_error(plan, split, folder, subset) for subset in ("train", "valid")}

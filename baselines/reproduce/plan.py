@@ -6,8 +6,10 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
+from lagbench.errors import UsageError
 from lagbench.exam import Exam, load_exam
 from lagbench.locating import rooted
+from lagbench.manifest import read_manifest
 from lagbench.registry import Registry, Size
 
 from .evidence import Evidence, Sources
@@ -55,6 +57,30 @@ class Plan:
         """Return what the registry says of a split at this size."""
         return self.described.size(split, self.size)
 
+    def hash(self, split: str) -> str | None:
+        """Return the hash of a split's data, those at hand before those recorded; None where unknown.
+
+        Raises:
+            DataError: the manifest is damaged.
+        """
+        tier = self.tier(split)
+        manifest = read_manifest(self.root, tier.split, tier.name, tier.major)
+        recorded = tier.measured.dataset_sha256 if tier.measured else None
+        return (manifest.dataset_sha256 if manifest else None) or recorded
+
+    def has_recipe(self, split: str, model: Model) -> bool:
+        """Return whether a model has the variant of the recipes that was asked for."""
+        if self.recipe is None or self.recipe.endswith((".yaml", ".yml")):
+            return True
+        from ..catalogue import find
+        from ..recipe import recipe_names
+
+        try:
+            known = recipe_names(find(model.baseline))
+        except UsageError:  # it cannot be loaded: training says why
+            return True
+        return any(f"{where}/{self.size}-{self.recipe}" in known for where in (split, "*"))
+
     def home(self, split: str) -> Path:
         """Return the folder of a split's runs: ``runs/<split>/<size>[-<recipe>]``."""
         return self.runs / split / (f"{self.size}-{self.recipe}" if self.recipe else self.size)
@@ -76,6 +102,11 @@ class Plan:
             sources = Sources(board=None, runs=self.runs, recipe=self.recipe, registry=self.described)
             self._evidence[split] = Evidence(sources, split, self.size)
         return self._evidence[split]
+
+    @property
+    def stale(self) -> list[Path]:
+        """Score files of other data among the evidence that was read; they are left out."""
+        return [path for evidence in self._evidence.values() for path in evidence.stale]
 
     def exam(self, split: str) -> Exam:
         """Return the test subset of a split.
