@@ -148,12 +148,11 @@ def _choose(entry: Entry, file: _File, split: str, size: str) -> tuple[str, _Par
 
 
 def _closest(wanted: str, known: Iterable[str]) -> str:
-    """Return what to do without a recipe: that of another split would not fit."""
-    split = wanted.split("/")[0]
-    own = [name for name in known if name.split("/")[0] in {split, ANY}]
-    return (
-        nearest(wanted, own) + "; or " if own else ""
-    ) + "write your own: --recipe FILE.yaml, see docs/baselines.md"
+    """Return what to do without a recipe: the nearest of the same split, or one's own."""
+    names = sorted(known)
+    own = [name for name in names if name.split("/")[0] == wanted.split("/")[0]]
+    write = "write your own: --recipe FILE.yaml, see docs/baselines.md"
+    return f"{nearest(wanted, own)}; or {write}" if own else f"{write}; known: {', '.join(names)}"
 
 
 def _merge(below: Layer, above: Layer) -> Layer:
