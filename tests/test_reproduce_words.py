@@ -110,15 +110,17 @@ def test_an_undefined_seed_is_left_out() -> None:
 
 
 @pytest.mark.parametrize(
-    ("without", "verdict"), [(0.9, "GNS is better than"), (0.1, "loss is better than GNS")]
+    ("without", "answer", "verdict"),
+    [(0.9, "Yes", "GNS is better than"), (0.1, "No, it harms", "loss is better than GNS")],
 )
-def test_the_vorticity_loss_is_judged_by_the_test(without: float, verdict: str) -> None:
+def test_the_vorticity_loss_is_judged_by_the_test(without: float, answer: str, verdict: str) -> None:
     """Weight 1 wins, or loses, in all of eight scenarios; the correlation's direction is the other way."""
     models = {
         "gns": a_method("gns", [0.5] * 8),
         "gns-novorticity": a_method("gns-novorticity", [without] * 8),
     }
     said = " ".join(statements._vorticity_loss(models, 54))
+    assert said.startswith(f"**Does the vorticity loss help (Fig. 5.5)?** {answer}, at 5 %. GNS")
     assert said.split("`vorticity_pearson`")[0].count(verdict) == 1
     assert "p = 0.0078" in said
 
@@ -131,6 +133,7 @@ def test_link_loss_is_judged_by_equal_seeds_and_start() -> None:
         "supergat-unlinked": a_method("supergat-unlinked", [0.9] * 8),
     }
     said = " ".join(statements._link_loss(models, "vorticity_rmse", 54))
+    assert "**Does SuperGAT's link loss help?** Yes, at 5 %. With weight 1" in said
     assert "0.5 against 0.9, better in 8 of 8 scenarios" in said
     assert "0.1" not in said.split("`vorticity_pearson`")[0].split("lead")[0]
 
