@@ -155,8 +155,8 @@ def _link_loss(models: Mapping[str, Method], metric: str, frame: int) -> Iterato
         over = {name: method.scores[metric] for name, method in two.items()}
         at = {name: method.frozen_at("vorticity_pearson", frame) for name, method in two.items()}
         yield (
-            f"**Does SuperGAT's link loss help?** {_helps(over[LINK], over[UNLINKED])}. With weight 1 against weight"
-            " 0, the same start and seeds,"
+            f"**Does SuperGAT's link loss help?** {_helps(over[LINK], over[UNLINKED])}. With weight 1"
+            " against weight 0, the same start and seeds,"
             f" `{metric}`: {pair(over[LINK], over[UNLINKED])}: {_verdict(over, LINK, UNLINKED)}."
             f" `vorticity_pearson` at frame {frame}: {pair(at[LINK], at[UNLINKED])}:"
             f" {_verdict(at, LINK, UNLINKED)}."
@@ -204,8 +204,8 @@ def _vorticity_loss(models: Mapping[str, Method], frame: int) -> Iterator[str]:
         text = f"`{metric}`" if where is None else f"`{metric}` at frame {where}"
         parts.append(f"{text} {pair(scores[PLAIN], scores[WITHOUT])}: {_verdict(scores, PLAIN, WITHOUT)}")
     yield (
-        f"**Does the vorticity loss help (Fig. 5.5)?** {_helps(judged[PLAIN], judged[WITHOUT])}. GNS with weight"
-        " 1 against the same with weight 0,"
+        f"**Does the vorticity loss help (Fig. 5.5)?** {_helps(judged[PLAIN], judged[WITHOUT])}. GNS with"
+        " weight 1 against the same with weight 0,"
         f" equal budget and seeds: {'; '.join(parts)}."
     )
     yield from _seeds_say(two, "vorticity_rmse", (PLAIN, WITHOUT))
