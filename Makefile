@@ -32,10 +32,12 @@ $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(VENV)/.demo: $(BIN)/python pyproject.toml constraints.txt
+	@echo 'installing into $(VENV): about 1 GB, some minutes'
 	$(PIP) install --quiet -c constraints.txt -e '.[generate,plots,baselines]'
 	touch $@
 
 $(VENV)/.dev: $(BIN)/python pyproject.toml constraints.txt
+	@echo 'installing into $(VENV): more than 1 GB, some minutes'
 	$(PIP) install --quiet -c constraints.txt -e '.[dev]'
 	touch $@ $(VENV)/.demo
 

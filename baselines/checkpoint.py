@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import pickle
+import re
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -34,6 +35,9 @@ __all__ = ["Checkpoint", "check_data", "load", "load_weights", "restore", "round
 FORMAT = 1
 KEY = "lagbench_checkpoint"
 SAFE = "a checkpoint that lagbench train wrote"
+
+_FOREIGN = re.compile(r"GLOBAL ([\w.]+)")
+"""How torch's refusal names what a pickle would call."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -212,21 +216,31 @@ def check_data(checkpoint: Checkpoint, *, root: Path, registry: Registry | None 
     return here
 
 
+def _is_pickle(file: Path) -> bool:
+    """Tell whether a file begins as pickles, or archives of them, do."""
+    with file.open("rb") as stream:
+        return stream.read(2)[:2] in {b"PK", *(b"\x80" + bytes([protocol]) for protocol in range(2, 6))}
+
+
 def _content(file: Path) -> dict[str, Any]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             content = torch.load(file, map_location="cpu", weights_only=True)
     except OSError as error:
+        inside = f"name the file: {file / 'weights.pt'}" if file.is_dir() else None
         raise UnreadableFileError(
-            "cannot read the checkpoint", where=str(file), got=error.strerror or error
+            "cannot read the checkpoint", where=str(file), got=error.strerror or error, fix=inside
         ) from None
     except pickle.UnpicklingError as error:
+        named = _FOREIGN.search(str(error))
+        if named is None and not _is_pickle(file):
+            raise _unfit(file, SAFE, "something else") from None
         raise UnreadableFileError(
             "the file holds more than tensors and plain values, and was not opened",
             where=str(file),
             expected=SAFE,
-            got=str(error).split("\n")[0][:200],
+            got=f"a pickle that names {named[1][:100]!a}" if named else "a pickle of something else",
             fix="do not load it otherwise either: such a file can run code",
         ) from None
     except Exception as error:  # damaged archives raise nearly any type

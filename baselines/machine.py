@@ -48,14 +48,16 @@ def is_helper() -> bool:
 
 @contextmanager
 def threads_used(count: int | None, *, processes: int = 1) -> Iterator[None]:
-    """Use so many threads for a while; by default one per core, shared among processes.
+    """Use so many threads for a while.
 
     Args:
-        count: threads of this process.
+        count: threads of this process; else ``OMP_NUM_THREADS``, else its share of the cores.
         processes: processes on this machine that compute at the same time.
     """
     before = torch.get_num_threads()
-    torch.set_num_threads(count or max(1, len(os.sched_getaffinity(0)) // processes))
+    asked = os.environ.get("OMP_NUM_THREADS", "")
+    share = max(1, len(os.sched_getaffinity(0)) // processes)
+    torch.set_num_threads(count or (max(1, int(asked)) if asked.isdecimal() else share))
     try:
         yield
     finally:

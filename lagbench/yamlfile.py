@@ -76,7 +76,9 @@ def read_yaml(path: Path) -> Any:  # noqa: ANN401
         _check_structure(text)
         return yaml.load(text, Loader=_StrictLoader)
     except OSError as error:
-        raise UnreadableFileError("cannot read the YAML file", where=str(path), got=error) from error
+        raise UnreadableFileError(
+            "cannot read the YAML file", where=str(path), got=error.strerror or error
+        ) from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError: a date or number that is none
         raise UnreadableFileError(
             "not a plain YAML file",

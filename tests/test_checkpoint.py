@@ -101,11 +101,22 @@ def test_a_pickle_is_refused_and_not_run(tmp_path: Path, writer: str) -> None:
         torch.save({"lagbench_checkpoint": 1, "about": "{}", "weights": {}, "optimizer": bomb}, file)
     else:
         torch.save(bomb, file, _use_new_zipfile_serialization=writer == "torch")
-    with pytest.raises(UnreadableFileError, match="more than tensors"):
+    with pytest.raises(UnreadableFileError, match="more than tensors") as caught:
         load(file)
+    assert "weights_only" not in str(caught.value)  # torch's own words advise to load it unsafely
     assert not target.exists()
     pickle.loads(pickle.dumps(bomb))  # the bomb is a real one
     assert target.exists()
+
+
+def test_text_is_no_pickle(tmp_path: Path) -> None:
+    """Of any other file it is said that it is no checkpoint; of a folder, which file to name."""
+    (tmp_path / "notes.md").write_text("# hello\n")
+    with pytest.raises(UnreadableFileError, match="lagbench train") as caught:
+        load(tmp_path / "notes.md")
+    assert "more than tensors" not in str(caught.value)
+    with pytest.raises(UnreadableFileError, match=r"weights\.pt"):
+        load(tmp_path)
 
 
 def test_scripts_are_refused(tmp_path: Path) -> None:

@@ -155,6 +155,16 @@ def test_floors_are_compared_one_by_one() -> None:
     )
 
 
+def test_floors_that_no_model_beats_are_named() -> None:
+    """Where standing still has the least error in the mean, the best model stands beside it."""
+    models = {"gns": a_method("gns", [0.5] * 8), "gat": a_method("gat", [0.9] * 8)}
+    floors = {"persistence": a_method("persistence", [0.1] * 8)}
+    said = " ".join(statements._unbeaten(models, floors))
+    assert "`vorticity_rmse` (persistence 0.1 against 0.5 of GNS)" in said
+    floors = {"persistence": a_method("persistence", [0.6] * 8)}
+    assert "`vorticity_rmse`" not in " ".join(statements._unbeaten(models, floors))
+
+
 def test_scenes_stand_for_their_own_kind() -> None:
     """At full size ids are the thesis's; elsewhere family (id % 4) and pair (id % 6) are the same."""
     registry = load()

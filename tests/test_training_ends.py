@@ -16,7 +16,6 @@ import torch
 from simple_models import Drift, install
 
 from lagbench.baselines.checkpoint import load, save
-from lagbench.baselines.machine import threads_used
 from lagbench.baselines.training import TrainingResult, train
 from lagbench.errors import DataError, UsageError, WorkFailedError
 from lagbench.generation import GenerationResult
@@ -180,14 +179,3 @@ def test_numbers_without_end_are_refused(run: Run, setting: str) -> None:
     """No option is infinite; the message names it."""
     with pytest.raises(UsageError, match=setting.partition("=")[0].replace(".", r"\.")):
         run("gns", setting)
-
-
-def test_processes_share_the_cores() -> None:
-    """Unless told otherwise, each of several processes on a machine takes its share of the threads."""
-    cores, before = len(os.sched_getaffinity(0)), torch.get_num_threads()
-    for processes, expected in ((1, cores), (cores, 1), (cores + 1, 1)):
-        with threads_used(None, processes=processes):
-            assert torch.get_num_threads() == expected
-    with threads_used(3, processes=cores):
-        assert torch.get_num_threads() == 3
-    assert torch.get_num_threads() == before

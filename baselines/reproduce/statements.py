@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 from lagbench.exam import ranking_metric
 from lagbench.metrics import Score, compare
@@ -33,6 +34,12 @@ DIVERGED = 10.0
 
 STILL = "persistence"
 
+TELLING = (
+    *("vorticity_rmse", "mse_avg", "mse_end", "position_rmse", "velocity_rmse", "energy_error"),
+    *("density_rmse", "shape_error", "connectivity", "sliced_w2"),
+)
+"""Metrics by which a floor is held against the models."""
+
 
 def key_frame(evidence: Evidence) -> int:
     """Return the frame of interest nearest to the one at which the thesis compares models."""
@@ -55,6 +62,7 @@ def statements(evidence: Evidence) -> Iterator[str]:
     else:
         yield from _frame_models(models, ranking)
     yield from _against_floors(models, evidence.floors(), ranking)
+    yield from _unbeaten(models, evidence.floors())
     yield from _diverging(models, evidence.floors())
 
 
@@ -75,9 +83,11 @@ def _first_of_six(models: Mapping[str, Method], metric: str) -> Iterator[str]:
     order = ordered(six)
     complete = "" if len(six) == len(OPERATORS) else f" (of {len(OPERATORS)}; the others are missing)"
     answer = "Yes in the mean" if order[0] == OURS else "No"
+    spent = _spent([models[name] for name in order])
+    after = f", after {spent[0]} steps x windows" if len(spent) == 1 else ""
     yield (
-        f"**Does SuperGAT come first (Table 5.4: on the cavity it does)?** {answer}: by `{metric}` over"
-        f" the horizon it is {ordinal(order.index(OURS) + 1)} of {len(six)} operators{complete}."
+        f"**Does SuperGAT come first (Table 5.4: on the cavity it does)?** {answer}{after}: by `{metric}`"
+        f" over the horizon it is {ordinal(order.index(OURS) + 1)} of {len(six)} operators{complete}."
         f" From best to worst: {listed(f'{label(n)} {number(six[n].mean)}' for n in order)}."
     )
     rival = order[1] if order[0] == OURS else order[0]
@@ -102,17 +112,23 @@ def _tied_with(scores: Mapping[str, Score], order: Sequence[str]) -> Iterator[st
 
 def _budgets(methods: Sequence[Method]) -> Iterator[str]:
     """Say whether the budgets were equal, and whose validation still improved at the end."""
-    records = [
-        (held.name, seed.record) for held in methods for seed in held.seeds if "windows" in seed.record
-    ]
-    spent = dict.fromkeys(budget(record) for _, record in records)
+    records, spent = _records(methods), _spent(methods)
     if len(spent) == 1:
-        yield f"Equal budgets, steps x windows: {next(iter(spent))} each."
+        yield f"Equal budgets, steps x windows: {spent[0]} each; parameters differ (table below)."
     elif spent:
         yield f"Budgets differ: {listed(f'{label(name)} {budget(record)}' for name, record in records)}."
     rising = dict.fromkeys(name for name, record in records if record.get("best_step") == record["step"])
     if rising:
         yield f"Still improving in validation at the last step: {listed(map(label, rising))}."
+
+
+def _records(methods: Sequence[Method]) -> list[tuple[str, Mapping[str, Any]]]:
+    return [(held.name, seed.record) for held in methods for seed in held.seeds if "windows" in seed.record]
+
+
+def _spent(methods: Sequence[Method]) -> list[str]:
+    """Return the different budgets of some models."""
+    return list(dict.fromkeys(budget(record) for _, record in _records(methods)))
 
 
 def _seeds_say(models: Mapping[str, Method], metric: str, names: Sequence[str]) -> Iterator[str]:
@@ -240,6 +256,22 @@ def _against_floors(models: Mapping[str, Method], floors: Mapping[str, Method], 
         parts += [f"worse: {listed(map(label, worse))}"] if worse else []
         mean = number(floor.scores[metric].mean)
         yield f"**Against the floor {name}** ({mean}) by `{metric}`: {'; '.join(parts)}."
+
+
+def _unbeaten(models: Mapping[str, Method], floors: Mapping[str, Method]) -> Iterator[str]:
+    """Name the metrics of the table in which a floor's mean is better than every model's."""
+    if not models:
+        return
+    parts = []
+    for metric in TELLING:
+        held = {n: m.scores[metric] for n, m in (models | floors).items() if metric in m.scores}
+        defined = [name for name in ordered(held) if not math.isnan(held[name].mean)]
+        if defined and defined[0] in floors:
+            best = next((name for name in defined if name in models), None)
+            rival = f" against {number(held[best].mean)} of {label(best)}" if best else ""
+            parts.append(f"`{metric}` ({defined[0]} {number(held[defined[0]].mean)}{rival})")
+    if parts:
+        yield f"**Where a floor is better than every model, in the mean**: {listed(parts)}."
 
 
 def _differs(score: Score, floor: Score, sign: int) -> bool:

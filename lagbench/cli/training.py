@@ -27,7 +27,13 @@ __all__ = ["bench", "predict", "train"]
 EXTRA = "baselines"
 DeviceOption = Annotated[str, typer.Option("--device", metavar="NAME", help="cpu, cuda, or auto.")]
 ThreadsOption = Annotated[
-    int | None, typer.Option("--threads", metavar="N", help="CPU threads; one per core by default.", min=1)
+    int | None,
+    typer.Option(
+        "--threads",
+        metavar="N",
+        help="CPU threads; else OMP_NUM_THREADS, else its share of the cores.",
+        min=1,
+    ),
 ]
 
 
@@ -99,7 +105,7 @@ def train(
     if as_json and not is_helper():
         print_json(result)
     else:
-        say("\n".join(_trained(result)), quiet=quiet)
+        say("\n".join(_trained(result, _where(chosen(name, split), root))), quiet=quiet)
 
 
 @contextmanager
@@ -122,7 +128,17 @@ def _told_once() -> Iterator[None]:
         raise
 
 
-def _trained(result: TrainingResult) -> list[str]:
+def _where(split: str, root: Path | None) -> str:
+    """Return the option that tells the next command where the data are."""
+    from lagbench.locating import home
+    from lagbench.registry import NO_GENERATOR
+
+    found = home(split, root=root)
+    local = found.registry.split(found.name).generator == NO_GENERATOR
+    return f" --root {root or found.root}" if root or local else ""
+
+
+def _trained(result: TrainingResult, where: str) -> list[str]:
     time = f"{spell_seconds(result.wall_seconds)}, {spell_seconds(result.cpu_seconds)} of processor time"
     lines = [
         f"{result.baseline} on {result.recipe}: {result.state}, step {result.step} of {result.steps}, {time}",
@@ -132,7 +148,7 @@ def _trained(result: TrainingResult) -> list[str]:
     if result.best_rmse is not None:
         lines.append(f"  best       position RMSE {result.best_rmse:.4g} on valid, step {result.best_step}")
     lines.append(f"  weights    {result.weights}")
-    return [*lines, f"next: lagbench predict {result.weights} -o predictions.nc"]
+    return [*lines, f"next: lagbench predict {result.weights}{where} -o predictions.nc"]
 
 
 def predict(
@@ -181,13 +197,19 @@ def predict(
     if as_json:
         print_json({**vars(result), "solver": timed})
     else:
-        say("\n".join(_predicted(result, timed)), quiet=quiet)
+        say("\n".join(_predicted(result, timed, f" --root {root}" if root else "")), quiet=quiet)
 
 
 def _solver_time(result: PredictionResult, *, quiet: bool) -> SolverBench | None:
-    """Return what the solver takes here; None, with the reason on stderr, where it cannot run."""
-    from lagbench.bench import bench_apart
+    """Return what the solver takes here; None, with the reason on stderr, where it cannot run.
 
+    Local splits have no solver of ours.
+    """
+    from lagbench.bench import bench_apart
+    from lagbench.registry import load
+
+    if result.split not in load().splits:
+        return None
     try:
         return bench_apart(result.split, result.size)
     except LagbenchError as error:
@@ -196,7 +218,7 @@ def _solver_time(result: PredictionResult, *, quiet: bool) -> SolverBench | None
         return None
 
 
-def _predicted(result: PredictionResult, solver: SolverBench | None) -> list[str]:
+def _predicted(result: PredictionResult, solver: SolverBench | None, where: str) -> list[str]:
     lines = [
         f"{result.path}: {result.method}, {result.scenarios} scenarios, {result.frames} frames",
         f"  model   {result.seconds_per_frame:.3g} s per frame ({result.seconds_without_search:.3g} s"
@@ -215,7 +237,7 @@ def _predicted(result: PredictionResult, solver: SolverBench | None) -> list[str
     if result.diverged:
         marks = ", ".join(f"scenario {i} at frame {frame}" for i, frame in result.diverged.items())
         lines.append(f"  frozen  {marks}: not finite from there on")
-    return [*lines, f"next: lagbench score {result.path}"]
+    return [*lines, f"next: lagbench score {result.path}{where}"]
 
 
 def bench(
