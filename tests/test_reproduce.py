@@ -134,6 +134,19 @@ def test_the_page_tells_what_there_is_and_what_is_missing(sources: Sources) -> N
     assert page == results.render(sources, ("tiny",))
 
 
+def test_a_training_without_scores_is_not_called_missing(plan: Plan, tmp_path: Path) -> None:
+    """A model whose record is committed and whose predictions were refused is told apart."""
+    (tmp_path / SPLIT / SIZE).mkdir(parents=True)
+    (tmp_path / SPLIT / SIZE / "mlp-0.json").write_text("{}")
+    sources = Sources(board=None, weights=tmp_path, runs=plan.runs, registry=plan.described)
+    page = results.render(sources, (SIZE,))
+    assert f"- {SPLIT} {SIZE}: MLP: trained, and refused by the scorer" in page
+    assert (
+        f"- {SPLIT} {SIZE}: SuperGAT with link loss, SuperGAT with link loss of weight 0 and LSTM + MLP."
+        in page
+    )
+
+
 def test_the_page_works_without_anything(tmp_path: Path) -> None:
     """No board and no runs: a page that says so."""
     page = results.render(Sources(board=tmp_path / "board", weights=tmp_path, runs=None))

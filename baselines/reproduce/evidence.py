@@ -134,6 +134,11 @@ class Evidence:
         """Return everything else, in the order of names."""
         return {name: self.methods[name] for name in sorted(self.methods) if name not in FLOORS}
 
+    def trained(self, name: str) -> bool:
+        """Return whether there is a record of a training, with scores or without."""
+        folder = self._sources.weights / self.size.split / self.size.name
+        return any(folder.glob(f"{name}-[0-9]*.json"))
+
     def _entries(self, board: Path) -> list[Path]:
         return sorted((board / "submissions" / self.size.split / self.size.name).glob("*.yaml"))
 

@@ -149,6 +149,13 @@ def _missing(found: Sequence[Evidence]) -> str:
     for evidence in found:
         split, size = evidence.size.split, evidence.size.name
         absent = [name for name in EXPECTED[split] if name not in evidence.methods]
+        refused = [name for name in absent if evidence.trained(name)]
+        if refused:
+            names = listed(map(label, refused))
+            lines.append(
+                f"- {split} {size}: {names}: trained, and refused by the scorer (baselines.md says why)."
+            )
+        absent = [name for name in absent if name not in refused]
         if absent:
             what = "all models" if len(absent) == len(EXPECTED[split]) else listed(map(label, absent))
             short = " --recipe short" if size == "full" and "gns" in EXPECTED[split] else ""
