@@ -18,6 +18,7 @@ from lagbench.checksums import dataset_hash, subset_hash
 from lagbench.cli.app import app
 from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError, WorkFailedError
 from lagbench.exchange import adopt, local_split
+from lagbench.exchange.adoption import _by_subset
 from lagbench.exchange.local_split import LocalSplit
 from lagbench.exchange.measure import Measure, estimate_spacing
 from lagbench.layout import ScenarioKey, scenario_path
@@ -117,6 +118,20 @@ def test_damage_is_told(tmp_path: Path, runs: list[NDArray[np.float32]]) -> None
         lagbench.verify(str(made.folder)).check()
     assert "lagbench adopt" in str(caught.value)
     assert "lagbench generate" not in str(caught.value)
+
+
+def test_ten_comes_after_two(tmp_path: Path) -> None:
+    """Files count by the numbers in their names, as a shell lists them or in a folder; others stay."""
+    names = [f"run{n}.npz" for n in (0, 1, 10, 11, 2)]
+    for name in names:
+        (tmp_path / name).touch()
+    given = [tmp_path / name for name in names]
+    wanted = {"train": ["run0", "run1", "run2"], "valid": ["run10"], "test": ["run11"]}
+    for paths in (given, [tmp_path]):
+        found = _by_subset(paths, valid=1, test=1)
+        assert {subset: [path.stem for path, _ in rows] for subset, rows in found.items()} == wanted
+    found = _by_subset(given[::-1], valid=1, test=1)
+    assert [path.stem for path, _ in found["test"]] == ["run0"]
 
 
 def test_named_arrays(tmp_path: Path, runs: list[NDArray[np.float32]]) -> None:

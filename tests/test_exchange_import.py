@@ -177,3 +177,12 @@ def test_the_other_way_round(tmp_path: Path) -> None:
         )
         hashes.append(back.dataset_sha256)
     assert hashes == [own.dataset_sha256] * 2
+
+
+def test_the_other_format_is_recognised(tmp_path: Path) -> None:
+    """Where the files are those of the other format, the message names it."""
+    for subset in SUBSETS:
+        (tmp_path / f"{subset}.h5").touch()
+    with pytest.raises(UnreadableFileError, match=r"no train\.npz") as caught:
+        import_split(tmp_path, format="gns-npz", output=tmp_path / "own", allow_pickle=True)
+    assert "--format lagrangebench-h5" in str(caught.value)

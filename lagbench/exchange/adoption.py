@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -88,7 +89,9 @@ def _by_subset(given: Sequence[Path], *, valid: int | None, test: int | None) ->
         if valid is not None or test is not None:
             raise UsageError("the folders say what is valid and test", where="--valid and --test")
         return {subset: _rows(given[0] / subset) for subset in HASHED_SUBSETS}
-    rows = [row for path in given for row in _rows(path)]
+    # A shell lists run10 before run2; an order that is not the shell's is the user's own.
+    in_order = _natural(given) if list(given) == sorted(given) else given
+    rows = [row for path in in_order for row in _rows(path)]
     tenth = max(1, len(rows) // 10)
     for_valid, for_test = (tenth if n is None else n for n in (valid, test))
     for_train = len(rows) - for_valid - for_test
@@ -106,10 +109,20 @@ def _by_subset(given: Sequence[Path], *, valid: int | None, test: int | None) ->
     }
 
 
+def _natural(paths: Sequence[Path]) -> list[Path]:
+    """Return paths in the order of their names, numbers in them by value."""
+
+    def key(path: Path) -> tuple[list[tuple[int, str]], str]:
+        parts = re.split(r"(\d+)", str(path))
+        return [(int(part) if part.isdecimal() else -1, part) for part in parts], str(path)
+
+    return sorted(paths, key=key)
+
+
 def _rows(path: Path) -> list[Row]:
     """Return the trajectories of a file, or of the files of a folder by name."""
     if path.is_dir():
-        found = sorted(file for file in path.iterdir() if file.suffix in ENDINGS and file.is_file())
+        found = _natural([file for file in path.iterdir() if file.suffix in ENDINGS and file.is_file()])
         return [row for file in found for row in _rows(file)]
     if path.suffix not in ENDINGS or not path.is_file():
         raise UnreadableFileError(

@@ -70,7 +70,8 @@ def import_split(
             "files are missing",
             where=str(folder),
             expected=", ".join(p.name for p in files.values()),
-            got=missing,
+            got=f"no {', no '.join(missing)}",
+            fix=_other_format(folder, form),
         )
     if form is Format.GNS_NPZ and not allow_pickle:
         next(gns_npz.trajectories(files["train"], allow_pickle=False, kinds={}))
@@ -90,6 +91,14 @@ def import_split(
 
     subsets = {subset: read(path) for subset, path in files.items()}
     return make_local_split(about, subsets, output, command="import", progress=progress)
+
+
+def _other_format(folder: Path, form: Format) -> str | None:
+    """Return the format that the files of a folder do have, as a remedy; None where none fits."""
+    for other, ending in _ENDINGS.items():
+        if other is not form and all((folder / f"{subset}{ending}").is_file() for subset in HASHED_SUBSETS):
+            return f"the folder holds {HASHED_SUBSETS[0]}{ending}: --format {other.value}"
+    return None
 
 
 def _stated(stated: Source, wishes: Wishes) -> dict[str, Any]:
