@@ -264,7 +264,7 @@ def _unbeaten(models: Mapping[str, Method], floors: Mapping[str, Method]) -> Ite
         return
     parts = []
     for metric in TELLING:
-        held = {n: m.scores[metric] for n, m in (models | floors).items() if metric in m.scores}
+        held = {n: m.scores[metric] for n, m in {**models, **floors}.items() if metric in m.scores}
         defined = [name for name in ordered(held) if not math.isnan(held[name].mean)]
         if defined and defined[0] in floors:
             best = next((name for name in defined if name in models), None)
