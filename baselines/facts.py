@@ -123,7 +123,7 @@ def _absent(size: Size, root: Path, what: str) -> DataError:
     return DataError(
         what,
         where=str(dataset_folder(root, size.split, size.name, size.major)),
-        fix=remedy(size, f"--root {root}"),
+        fix=remedy(size, root=root),
     )
 
 

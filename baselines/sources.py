@@ -62,6 +62,6 @@ def sources_of(size: Size, subsets: Sequence[str], root: Path) -> dict[int, Sour
             f"{len(missing)} of {len(sources)} scenarios are not there",
             where=str(root / size.split / size.name),
             got=f"missing: {spell_ids(missing)}",
-            fix=remedy(size, f"--root {root}"),
+            fix=remedy(size, root=root),
         )
     return sources

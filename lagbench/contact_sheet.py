@@ -102,7 +102,7 @@ def contact_sheet(
         raise DataError(
             "nothing to draw",
             where=f"{tier.split} {size} under {folder}",
-            fix=remedy(tier),
+            fix=remedy(tier, root=folder),
         )
     panel = None if kind is None else Panel(kind)
     kinds = _first_of_each_kind(files, splits)

@@ -54,7 +54,7 @@ def load_manifest(split: str, *, size: str = "full", root: str | Path | None = N
         raise DataError(
             "the data set has no manifest",
             where=str(dataset_folder(folder, entry.split, size, entry.major)),
-            fix=remedy(entry),
+            fix=remedy(entry, root=folder),
         )
     return manifest
 
@@ -100,7 +100,7 @@ def open_split(
         for i in ids
     ]
     _require(entry, folder, keys)
-    scenarios = [_open_scenario(scenario_path(folder, key), key, remedy(entry)) for key in keys]
+    scenarios = [_open_scenario(scenario_path(folder, key), key, remedy(entry, root=folder)) for key in keys]
     return _join(scenarios, xr.Variable("scenario", list(ids), {"long_name": "scenario id", "units": "1"}))
 
 
@@ -112,7 +112,7 @@ def _require(size: Size, root: Path, keys: list[ScenarioKey]) -> None:
             f"{len(missing)} of {len(keys)} scenarios are not there",
             where=str(scenario_path(root, keys[0]).parent),
             got=f"missing: {spell_ids(missing)}",
-            fix=remedy(size, f"--subset {keys[0].subset}", f"--root {root}"),
+            fix=remedy(size, f"--subset {keys[0].subset}", root=root),
         )
 
 

@@ -157,7 +157,7 @@ def _attribute_std(size: Size, root: Path, manifest: Manifest | None) -> tuple[f
             where=f"datasets.yaml, and the manifest of {size.split} {size.name} in {root}",
             expected="position_std and velocity_std, two numbers each",
             got=", ".join(known) or "nothing",
-            fix=remedy(size, f"--root {root}"),
+            fix=remedy(size, root=root),
         ) from None
     return x, y, u, v
 

@@ -175,7 +175,7 @@ def verify(
         ),
         must_be_complete=complete,
         verdict=verdict,
-        fix=remedy(tier),
+        fix=remedy(tier, root=folder),
     )
 
 
@@ -214,7 +214,7 @@ def _manifest(root: Path, size: Size) -> tuple[Manifest | None, list[str]]:
     except DataError as error:
         return None, [str(error)]
     if manifest is None:
-        return None, [f"there is no manifest: {remedy(size)}"]
+        return None, [f"there is no manifest: {remedy(size, root=root)}"]
     tolerance = "identity: tolerance - a device wrote these files that does not promise equal bits"
     return manifest, [tolerance] if manifest.identity == "tolerance" else []
 

@@ -346,7 +346,7 @@ def test_frames_that_do_not_exist_are_refused(root: Path) -> None:
         ({"split": "cavty"}, "did you mean 'cavity'"),
         ({"history": 40}, "no scenario holds a window"),
         ({"history": 0}, "no scenario holds a window"),
-        ({"subset": "valid"}, "1 of 1 scenarios are not generated.*missing: 3.*lagbench generate"),
+        ({"subset": "valid"}, "1 of 1 scenarios are not there.*missing: 3.*lagbench generate"),
     ],
 )
 def test_what_is_not_there_is_said(

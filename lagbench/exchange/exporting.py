@@ -183,7 +183,7 @@ def _recorded(size: Size, root: Path) -> tuple[dict[str, tuple[float, ...]], str
         raise DataError(
             "the data set is not complete: the statistics of train are recorded nowhere",
             where=f"{size.split} {size.name} in {root}",
-            fix=remedy(size, f"--root {root}"),
+            fix=remedy(size, root=root),
         )
     return dict(manifest.statistics), manifest.dataset_sha256
 
@@ -202,7 +202,7 @@ def _paths(size: Size, root: Path, subset: str) -> list[Path]:
             f"{len(missing)} of {len(ids)} scenarios of {subset} are not there",
             where=str(paths[0].parent),
             got=f"missing: {spell_ids(missing)}",
-            fix=remedy(size, f"--subset {subset}", f"--root {root}"),
+            fix=remedy(size, f"--subset {subset}", root=root),
         )
     known = size.measured.scenario_sha256 if size.measured else {}
     for key, path in zip(keys, paths, strict=True):

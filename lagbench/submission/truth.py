@@ -46,7 +46,7 @@ class Truth:
                 where=str(self.path(ids[0]).parent),
                 expected=f"scenarios {spell_ids(ids)}",
                 got=f"missing: {spell_ids(missing)}",
-                fix=remedy(self.size, "--subset test", f"--root {self.root}"),
+                fix=remedy(self.size, "--subset test", root=self.root),
             )
 
     def path(self, scenario: int) -> Path:
