@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import shutil
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -111,9 +111,11 @@ class RunFolder:
 
     def clear(self) -> None:
         """Remove what an earlier training left, and nothing else."""
-        for file in (self.checkpoint, self.weights, self.record):
+        logs = (*self.logs.glob("events.out.tfevents.*"), self.logs / "hparams.yaml")
+        for file in (self.checkpoint, self.weights, self.record, *logs):
             file.unlink(missing_ok=True)
-        shutil.rmtree(self.logs, ignore_errors=True)
+        with suppress(OSError):  # what is not ours stays
+            self.logs.rmdir()
 
     def write_record(self, record: dict[str, Any]) -> None:
         """Write training.json; it appears whole or not at all."""

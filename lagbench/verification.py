@@ -28,7 +28,7 @@ from .progress import Meter, Progress
 from .registry import Registry, Size
 from .remedy import remedy
 from .scenario_ids import spell_ids
-from .store.bringing import bring
+from .store.bringing import bring, unstored
 from .verdict import TOLERATED, UNLIKE, hash_verdict, told, unlike_measures
 
 __all__ = ["SubsetReport", "VerificationResult", "verify"]
@@ -156,6 +156,9 @@ def verify(
     regenerated = {i: _likeness(tier, findings[i], content) for i, content in anew.items()}
     problems = [f.problem for f in findings.values() if f.problem]
     problems += [f"scenario {i} differs when simulated anew" for i in anew if regenerated[i] == DIFFERENT]
+    # A killed writer leaves files here that the store never got.
+    alone = unstored(tier, folder, [i for i in ids if findings[i].state is State.GOOD])
+    problems += [f"scenario {i} is in the working copy alone, not in the store" for i in alone]
     reports = _reports(folder, tier, ids, findings)
     whole, verdict = _whole(tier, findings)
     unlike = told(UNLIKE, tier)

@@ -150,6 +150,20 @@ def test_verify_mends_the_copy_and_tells_of_the_store(url: str, tiny: Registry) 
         verify(SPLIT, SIZE, root=url, registry=tiny)
 
 
+def test_an_emptied_store_is_not_whole(url: str, tiny: Registry) -> None:
+    """Files that are in the working copy alone make no data set of the store whole, be it one or all."""
+    whole = verify(SPLIT, SIZE, root=url, complete=True, registry=tiny)
+    assert not whole.problems
+    manifest = json.loads(objects(url)[f"{FOLDER}/manifest.json"])
+    manifest["files"] = [entry for entry in manifest["files"] if entry["scenario"] != 3]
+    put(url, f"{FOLDER}/manifest.json", json.dumps(manifest).encode())
+    lost = verify(SPLIT, SIZE, root=url, registry=tiny)
+    assert "scenario 3 is in the working copy alone, not in the store" in lost.problems
+    remove(url, f"{FOLDER}/manifest.json")
+    emptied = verify(SPLIT, SIZE, root=url, registry=tiny)
+    assert sum("in the working copy alone" in words for words in emptied.problems) == 5
+
+
 @pytest.mark.parametrize("change", ["flipped", "shorter", "other scenario"])
 def test_other_content_is_refused(url: str, tiny: Registry, change: str) -> None:
     """The error names the object, and no file of it is left."""

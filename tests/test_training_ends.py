@@ -16,6 +16,7 @@ import torch
 from simple_models import Drift, install
 
 from lagbench.baselines.checkpoint import load, save
+from lagbench.baselines.run_folder import RunFolder
 from lagbench.baselines.training import TrainingResult, train
 from lagbench.errors import DataError, UsageError, WorkFailedError
 from lagbench.generation import GenerationResult
@@ -179,3 +180,18 @@ def test_numbers_without_end_are_refused(run: Run, setting: str) -> None:
     """No option is infinite; the message names it."""
     with pytest.raises(UsageError, match=setting.partition("=")[0].replace(".", r"\.")):
         run("gns", setting)
+
+
+def test_only_our_own_logs_are_cleared(tmp_path: Path) -> None:
+    """A tensorboard folder that holds somebody else's runs keeps them; one of ours goes."""
+    theirs, ours = tmp_path / "theirs", tmp_path / "ours"
+    (theirs / "tensorboard" / "my-runs").mkdir(parents=True)
+    (theirs / "tensorboard" / "my-runs" / "notes.txt").write_text("precious")
+    (ours / "tensorboard").mkdir(parents=True)
+    for name in ("events.out.tfevents.1.host.2.0", "hparams.yaml"):
+        (ours / "tensorboard" / name).touch()
+        (theirs / "tensorboard" / name).touch()
+    for folder in (theirs, ours):
+        RunFolder(folder).clear()
+    assert [path.name for path in theirs.rglob("*") if path.is_file()] == ["notes.txt"]
+    assert list(ours.iterdir()) == []

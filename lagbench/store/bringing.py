@@ -30,7 +30,7 @@ from .mirror import fetch_text
 from .mirror_errors import NotDataError, NotOnMirrorError, WrongContentError
 from .remote import Remote, check_bucket
 
-__all__ = ["bring", "is_right", "local_manifest", "merged", "remote_manifest", "writing"]
+__all__ = ["bring", "is_right", "local_manifest", "merged", "remote_manifest", "unstored", "writing"]
 
 FRESH = 30.0
 """How long a store's manifest is not asked for again by this process [s]."""
@@ -111,6 +111,24 @@ def remote_manifest(size: Size, url: str, *, fresh: float | None = None) -> Mani
         found = _parsed(text, place)
     _asked[url, place] = (time.monotonic(), found)
     return found
+
+
+def unstored(size: Size, root: Path, scenarios: Iterable[int]) -> tuple[int, ...]:
+    """Return scenarios that the manifest of a working copy's store lacks.
+
+    Args:
+        size: one size of a split.
+        root: folder of all data sets; a plain folder has no store, and lacks nothing.
+        scenarios: ids.
+
+    Raises:
+        DataError, WorkFailedError: see :func:`remote_manifest`.
+    """
+    url = url_of(root)
+    if url is None:
+        return ()
+    found = remote_manifest(size, url)
+    return tuple(i for i in scenarios if found is None or found.entry(i) is None)
 
 
 def is_right(entry: FileEntry, size: Size, manifest: Manifest) -> bool:
