@@ -164,6 +164,7 @@ CALL = "from lagbench.cli import main; main()"
 
 INTERRUPTED = f"""
 import os, signal
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
 from lagbench import campaign
 write = campaign.write_manifest
 def write_first(*arguments):
