@@ -58,7 +58,8 @@ def held_by(page: str) -> Any:
 
 
 @given(
-    st.lists(st.floats(-1e6, 1e6) | st.just(float("nan")), min_size=1, max_size=40),
+    # Taichi, once started in this process, makes its thread round subnormals to zero.
+    st.lists(st.floats(-1e6, 1e6, allow_subnormal=False) | st.just(float("nan")), min_size=1, max_size=40),
     st.booleans(),
 )
 def test_packed_numbers_come_back(values: list[float], log: bool) -> None:
