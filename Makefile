@@ -21,7 +21,7 @@ lint: $(VENV)/.dev
 	$(BIN)/ruff format --check .
 
 types: $(VENV)/.dev
-	$(BIN)/mypy lagbench generators baselines
+	$(BIN)/mypy lagbench
 
 bench: $(VENV)/.dev
 	$(BIN)/pytest benchmarks
@@ -33,12 +33,12 @@ $(BIN)/python:
 
 $(VENV)/.demo: $(BIN)/python pyproject.toml constraints.txt
 	@echo 'installing into $(VENV): about 1 GB, some minutes'
-	$(PIP) install --quiet -c constraints.txt -e '.[generate,plots,baselines]'
+	$(PIP) install --quiet -c constraints.txt -e '.[generate,plots,baselines]' --config-settings editable_mode=compat
 	touch $@
 
 $(VENV)/.dev: $(BIN)/python pyproject.toml constraints.txt
 	@echo 'installing into $(VENV): more than 1 GB, some minutes'
-	$(PIP) install --quiet -c constraints.txt -e '.[dev]'
+	$(PIP) install --quiet -c constraints.txt -e '.[dev]' --config-settings editable_mode=compat
 	touch $@ $(VENV)/.demo
 
 clean:

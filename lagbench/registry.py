@@ -326,10 +326,8 @@ class _File(_Strict):
 
 
 def default_path() -> Path:
-    """Return the registry that ships with lagbench: in the package, else beside it."""
-    here = Path(__file__).resolve().parent
-    inside = here / "datasets.yaml"
-    return inside if inside.exists() else here.parent / "datasets.yaml"
+    """Return the registry that ships with lagbench."""
+    return Path(__file__).parent / "datasets.yaml"
 
 
 def load(path: Path | None = None) -> Registry:
