@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 
+from lagbench.data.registry import PluginWarning
 from lagbench.errors import LagbenchError, UsageError, nearest
-from lagbench.plugins import PluginWarning
 
 from .baseline import Baseline
 
@@ -99,7 +99,8 @@ def _entry(point: EntryPoint) -> Entry:
         raise UsageError(f"{point.value} is no class", expected="a subclass of Baseline or Operator")
     if issubclass(loaded, Baseline):
         return Entry(name=point.name, model=loaded, recipes=_recipes(loaded, point.name))
-    from .operators.operator import Operator
+    from lagbench.baselines.operators.operator import Operator
+
     from .simulator import GraphNetwork
 
     if not issubclass(loaded, Operator):

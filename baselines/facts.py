@@ -9,13 +9,12 @@ from typing import Annotated, Any, Self
 
 from pydantic import Field, TypeAdapter
 
+from lagbench.data.layout import dataset_folder
+from lagbench.data.local import locate, remedy
+from lagbench.data.manifest import Manifest, read_manifest
+from lagbench.data.registry import Registry, Size
+from lagbench.data.scenario import read_scenario
 from lagbench.errors import DataError
-from lagbench.layout import dataset_folder
-from lagbench.locating import locate
-from lagbench.manifest import Manifest, read_manifest
-from lagbench.registry import Registry, Size
-from lagbench.remedy import remedy
-from lagbench.scenario_file import read_scenario
 from lagbench.store.bringing import bring
 
 __all__ = ["Facts", "facts_of"]

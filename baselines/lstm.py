@@ -9,14 +9,13 @@ import torch
 from pydantic import Field, PositiveInt
 from torch import Tensor, nn
 
-from lagbench.grid import Grid, Placement
+from lagbench.data.grid import Grid, Placement
 
-from .batch import Batch
+from .baseline import Batch
 from .facts import Facts
-from .frame_model import FrameWindow, squared_errors
-from .frame_network import FrameNetwork, FrameNetworkOptions
-from .grid_fields import transfer
+from .frame_model import FrameNetwork, FrameNetworkOptions, FrameWindow, squared_errors
 from .mlp import Activation, dense
+from .torch_grid import transfer
 
 __all__ = ["LSTM", "LSTMWithMLP"]
 

@@ -10,8 +10,7 @@ from pydantic import PositiveInt
 from torch import Tensor, nn
 
 from .facts import Facts
-from .frame_model import FrameWindow
-from .frame_network import FrameNetwork, FrameNetworkOptions
+from .frame_model import FrameNetwork, FrameNetworkOptions, FrameWindow
 
 __all__ = ["Activation", "MLP", "dense"]
 

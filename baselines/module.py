@@ -14,10 +14,9 @@ from torch.utils.data import DataLoader
 
 from lagbench.errors import WorkFailedError
 
-from .baseline import Baseline
-from .batch import Batch
-from .chance import reseed, seed_of
-from .training_options import TrainingOptions
+from .baseline import Baseline, Batch
+from .recipe import TrainingOptions
+from .seeding import reseed, seed_of
 from .windows import Window
 
 __all__ = ["TOTAL", "TrainingModule", "weighted_sum"]

@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from .blocks import EdgeMLP, mlp
-from .dense import LayerNorm
-from .operators.operator import Losses, Operator
+from lagbench.baselines.operators.operator import Losses, Operator
+
+from .layers import EdgeMLP, LayerNorm, mlp
 
 __all__ = ["EncodeProcessDecode", "ProcessorLayer"]
 

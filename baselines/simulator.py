@@ -19,19 +19,16 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
+from lagbench.baselines.operators.operator import Losses, Operator
+from lagbench.data.grid import Grid, Placement
 from lagbench.errors import UsageError
-from lagbench.grid import Grid, Placement
 
-from .baseline import Baseline, Options
-from .batch import Batch
+from .baseline import Baseline, Batch, Options
 from .facts import Facts
-from .features import EDGE_FEATURES, VELOCITIES, NodeFeatures, Scale, edge_features
-from .loss import LossNorm, Scales, loss_terms
-from .motion import Motion, State, integrate
+from .graph import EDGE_FEATURES, VELOCITIES, NodeFeatures, Scale, edge_features, radius_graph
+from .loss import LossNorm, Motion, Scales, State, integrate, loss_terms
 from .network import EncodeProcessDecode
-from .noise import noisy
-from .operators.operator import Losses, Operator
-from .radius_graph import radius_graph
+from .seeding import noisy
 from .symmetry import Symmetry, draw, image
 
 __all__ = ["GraphNetwork", "GraphNetworkOptions", "LossWeights", "Target"]

@@ -13,10 +13,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from lagbench.data.registry import Size
 from lagbench.errors import UsageError
-from lagbench.registry import Size
 
-from .batch import Batch
+from .baseline import Batch
 from .facts import Pair
 
 __all__ = ["Symmetry", "check_symmetry", "draw", "image"]

@@ -17,8 +17,7 @@ from lagbench.errors import WorkFailedError
 from . import baseline
 from .facts import Facts
 from .frame_model import FrameModel, FrameWindow
-from .normal_equations import LeastSquares, solve
-from .principal import principal_directions
+from .least_squares import LeastSquares, principal_directions, solve
 
 __all__ = ["Fitted", "LaggedRows", "StableVAR", "VAR"]
 

@@ -12,18 +12,23 @@ import os
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from lagbench.errors import UsageError
-from lagbench.extras import require
-from lagbench.pool import available_cores
+from lagbench.errors import UsageError, require
+from lagbench.work.pool import available_cores
 
 from .solver import Device
+
+__all__ = [
+    "HARMLESS",
+    "place",
+    "start",
+]
+
 
 # Taichi greets on stdout as it is imported, which would spoil `--json`, and asks the network.
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
 ti = require("taichi", extra="generate")
 
-__all__ = ["HARMLESS", "place", "start"]
 
 HARMLESS = frozenset(
     {

@@ -19,15 +19,24 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.data.registry import Size
 from lagbench.errors import UsageError, WorkFailedError
-from lagbench.registry import Size
 
-from .base import ClosedBoxParameters, FreeSurfaceParameters, InitialState, Split
+from .constants import blamed_on_parameters
 from .draws import generator
-from .preflight import blamed_on_parameters
 from .solver import Device, Solver, build
+from .split import ClosedBoxParameters, FreeSurfaceParameters, InitialState, Split
 
-__all__ = ["Batch", "Extremes", "Job", "Report", "draw", "solver_constants", "split_module", "substeps_of"]
+__all__ = [
+    "Batch",
+    "Extremes",
+    "SimulationJob",
+    "Report",
+    "draw",
+    "solver_constants",
+    "split_module",
+    "substeps_of",
+]
 
 STRIDE = 4_000_000
 """Particle-substeps between two reports: about a tenth of a second on a core."""
@@ -37,7 +46,7 @@ Report = Callable[[int], None]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Job:
+class SimulationJob:
     """What a worker simulates in one go; picklable.
 
     Attributes:
@@ -138,7 +147,7 @@ class Batch:
         solver: holds the scenarios in the order of the job.
     """
 
-    def __init__(self, job: Job, report: Report, frames: Sequence[int] | None = None) -> None:
+    def __init__(self, job: SimulationJob, report: Report, frames: Sequence[int] | None = None) -> None:
         self.job = job
         self.states = [draw(job.size, scenario) for scenario in job.scenarios]
         self.extremes = [Extremes() for _ in job.scenarios]

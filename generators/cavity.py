@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from .base import WALLS, ClosedBoxParameters, InitialState, Material
+from .constants import closed_box_walls, constants
 from .draws import RandomSource, choice, log_uniform, quantise, uniform
 from .lattice import fill
-from .parameters import closed_box_walls, constants
+from .split import WALLS, ClosedBoxParameters, InitialState, Material
 
 if TYPE_CHECKING:
-    from lagbench.registry import Size
+    from lagbench.data.registry import Size
 
 __all__ = ["DRIVEN", "initial_state", "solver_parameters"]
 

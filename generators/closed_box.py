@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from lagbench.errors import UsageError
 
-from .base import WALLS, ClosedBoxParameters, InitialState
 from .driver import Driver, stack
 from .nodal_stress import JACOBIAN_BOUND, NodalStress
 from .solver import Health
+from .split import WALLS, ClosedBoxParameters, InitialState
 
 __all__ = ["ClosedBox"]
 

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from lagbench.errors import UsageError, WorkFailedError
 
 from . import backend
-from .base import ClosedBoxParameters, FreeSurfaceParameters, InitialState
 from .solver import Device, Health
+from .split import ClosedBoxParameters, FreeSurfaceParameters, InitialState
 
 __all__ = ["Driver", "Kernels", "stack"]
 

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import constitutive
-from .base import FreeSurfaceParameters, InitialState, Material
 from .driver import Driver, stack
 from .particle_stress import ParticleStress
 from .solver import Health
+from .split import FreeSurfaceParameters, InitialState, Material
 
 __all__ = ["Energy", "FreeSurface", "courant"]
 

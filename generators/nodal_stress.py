@@ -25,7 +25,7 @@ Valid while max abs(v) dt <= dx, which also bounds every fixed-point sum, and wh
 import taichi as ti
 
 from . import backend
-from .base import ClosedBoxParameters
+from .split import ClosedBoxParameters
 from .transfer import (
     Nothing,
     Template,

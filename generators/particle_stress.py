@@ -23,7 +23,6 @@ it a settled liquid loses a fifth of its depth.
 import taichi as ti
 
 from . import backend
-from .base import FreeSurfaceParameters, Material
 from .constitutive import (
     corotated_stress,
     hardening,
@@ -33,6 +32,7 @@ from .constitutive import (
     plastic_return,
     viscous_stress,
 )
+from .split import FreeSurfaceParameters, Material
 from .transfer import Nothing, Value, accumulate, bounded, fixed_point_scale, from_fixed, stencil
 
 __all__ = ["ParticleStress"]

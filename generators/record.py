@@ -19,12 +19,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from lagbench.atomic import write_atomically
-from lagbench.checksums import file_sha256
+from lagbench.data.checksums import file_sha256
+from lagbench.data.layout import dataset_folder, resolve_root
+from lagbench.data.manifest import Manifest, read_manifest
+from lagbench.data.registry import Measured, Size, default_path, load
+from lagbench.data.statistics import file_statistics
 from lagbench.errors import DataError, LagbenchError
-from lagbench.layout import dataset_folder, resolve_root
-from lagbench.manifest import Manifest, read_manifest
-from lagbench.registry import Measured, Size, default_path, load
-from lagbench.statistics import file_statistics
 
 __all__ = [
     "check_files",

@@ -14,9 +14,14 @@ from typing import Protocol, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from .base import ClosedBoxParameters, FreeSurfaceParameters, InitialState
+from .split import ClosedBoxParameters, FreeSurfaceParameters, InitialState
 
-__all__ = ["Device", "Health", "Solver", "build"]
+__all__ = [
+    "Device",
+    "Health",
+    "Solver",
+    "build",
+]
 
 
 class Device(enum.StrEnum):

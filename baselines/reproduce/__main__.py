@@ -14,9 +14,9 @@ import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from lagbench.data.layout import resolve_root
+from lagbench.data.registry import Registry, load
 from lagbench.errors import LagbenchError, UsageError, nearest
-from lagbench.layout import resolve_root
-from lagbench.registry import Registry, load
 
 from .catalogue import ITEMS, Item
 from .making import make_run, outlook

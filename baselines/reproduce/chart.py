@@ -7,9 +7,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from lagbench.canvas import figure, pixels_of, png_bytes
-from lagbench.palette import INK, MUTED
-from lagbench.panels import Panel, colour_bar, draw, limit_of
+from lagbench.draw.panels import Panel, colour_bar, draw, limit_of
+from lagbench.draw.style import INK, MUTED, figure, pixels_of, png_bytes
 
 from .roster import label
 from .stage import Stage

@@ -15,11 +15,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from lagbench.data.registry import Registry, Size, load
+from lagbench.data.yamlfile import read_yaml
 from lagbench.errors import UnreadableFileError
-from lagbench.floors import FLOORS
-from lagbench.registry import Registry, Size, load
-from lagbench.score_file import NETCDF_NAME, read_statistics
-from lagbench.yamlfile import read_yaml
+from lagbench.scoring.floors import FLOORS
+from lagbench.scoring.score_file import NETCDF_NAME, read_statistics
 
 from .method import Cost, Method, Seeded
 

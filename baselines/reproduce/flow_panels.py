@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lagbench.panels import Panel, colour_scale, draw_walls
-from lagbench.score_tables import Table
+from lagbench.draw.panels import Panel, colour_scale, draw_walls
+from lagbench.scoring.tables import Table
 
 from .chart import Drawing, Line, named, panel_rows
 from .plan import Plan

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lagbench.metrics import Score
 from lagbench.metrics.reductions import mean
-from lagbench.score_tables import Table
+from lagbench.scoring.tables import Table
 
 from .chart import TRUTH, charts, colour, tidy
 from .evidence import Evidence

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.extras import require
-from lagbench.score_tables import Table
+from lagbench.errors import require
+from lagbench.scoring.tables import Table
 
 from .chart import charts, colour, tidy
 from .evidence import read_json

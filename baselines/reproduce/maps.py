@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from lagbench.panels import Panel
-from lagbench.score_tables import Table
+from lagbench.draw.panels import Panel
+from lagbench.scoring.tables import Table
 
 from .chart import Line, named, panel_rows
 from .evidence import Evidence

@@ -7,8 +7,8 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from lagbench.panels import Panel, draw
-from lagbench.score_tables import Table
+from lagbench.draw.panels import Panel, draw
+from lagbench.scoring.tables import Table
 
 from .chart import Line, named, panel_rows
 from .evidence import Evidence

@@ -6,11 +6,11 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
+from lagbench.data.local import rooted
+from lagbench.data.manifest import read_manifest
+from lagbench.data.registry import Registry, Size
 from lagbench.errors import UsageError
-from lagbench.exam import Exam, load_exam
-from lagbench.locating import rooted
-from lagbench.manifest import read_manifest
-from lagbench.registry import Registry, Size
+from lagbench.scoring.task import ScoredTask, load_scored_task
 
 from .evidence import Evidence, Sources
 from .roster import Model
@@ -46,7 +46,7 @@ class Plan:
     threads: int | None = None
     registry: Registry | None = None
     _evidence: dict[str, Evidence] = field(default_factory=dict, compare=False, repr=False)
-    _exams: dict[str, Exam] = field(default_factory=dict, compare=False, repr=False)
+    _exams: dict[str, ScoredTask] = field(default_factory=dict, compare=False, repr=False)
 
     @cached_property
     def described(self) -> Registry:
@@ -72,8 +72,8 @@ class Plan:
         """Return whether a model has the variant of the recipes that was asked for."""
         if self.recipe is None or self.recipe.endswith((".yaml", ".yml")):
             return True
-        from ..catalogue import find
-        from ..recipe import recipe_names
+        from lagbench.baselines.catalogue import find
+        from lagbench.baselines.recipe import recipe_names
 
         try:
             known = recipe_names(find(model.baseline))
@@ -108,12 +108,12 @@ class Plan:
         """Score files of other data among the evidence that was read; they are left out."""
         return [path for evidence in self._evidence.values() for path in evidence.stale]
 
-    def exam(self, split: str) -> Exam:
+    def exam(self, split: str) -> ScoredTask:
         """Return the test subset of a split.
 
         Raises:
             DataError: it is missing or damaged.
         """
         if split not in self._exams:
-            self._exams[split] = load_exam(self.tier(split), self.root)
+            self._exams[split] = load_scored_task(self.tier(split), self.root)
         return self._exams[split]

@@ -16,9 +16,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from lagbench.atomic import write_atomically
+from lagbench.draw.markdown import table
 from lagbench.errors import LagbenchError
-from lagbench.exam import ranking_metric
-from lagbench.markdown import table
+from lagbench.scoring.task import ranking_metric
 
 from .evidence import BOARD, WEIGHTS, Evidence, Sources, read_json
 from .result_tables import costs, horizon, rollout_errors, totals, vorticity_at

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from lagbench.atomic import write_atomically
-from lagbench.markdown import table
-from lagbench.score_tables import Table
+from lagbench.draw.markdown import table
+from lagbench.scoring.tables import Table
 
 __all__ = ["Sheet", "write_sheet"]
 

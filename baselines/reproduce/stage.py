@@ -8,9 +8,9 @@ from contextlib import ExitStack, contextmanager
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.data.scenario import ScenarioFile
+from lagbench.draw.recording import Recording, Scene, open_recording
 from lagbench.metrics import FramePair, Scenario, Snapshot
-from lagbench.recording import Recording, Scene, open_recording
-from lagbench.scenario_file import ScenarioFile
 from lagbench.submission import Predictions, open_predictions
 
 from .plan import Plan

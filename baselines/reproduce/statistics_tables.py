@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from lagbench.data.manifest import read_manifest
 from lagbench.errors import DataError
-from lagbench.manifest import read_manifest
-from lagbench.score_tables import Table
+from lagbench.scoring.tables import Table
 
 from .plan import Plan
 from .sheet import Sheet

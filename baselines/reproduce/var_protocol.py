@@ -25,11 +25,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.baselines.normal_equations import LeastSquares, solve
+from lagbench.baselines.least_squares import LeastSquares, solve
 from lagbench.baselines.var import LaggedRows
 from lagbench.baselines.windows import scenario_paths
-from lagbench.registry import load
-from lagbench.scenario_file import read_scenario
+from lagbench.data.registry import load
+from lagbench.data.scenario import read_scenario
 
 __all__ = ["ProtocolResult", "forecast_errors", "measure"]
 
@@ -55,7 +55,7 @@ class ProtocolResult:
         cpu_seconds: CPU time of the fit, all threads [s].
         peak_gb: largest resident memory of the process [GB].
         condition: condition number of the regressors.
-        floor: see :class:`~lagbench.baselines.normal_equations.LeastSquares`.
+        floor: see :class:`~lagbench.baselines.least_squares.LeastSquares`.
         fit_mse: mean squared error of one step over the frames fitted [standardised^2].
         forecast_frames: frames forecast.
         forecast_mse: mean over them [standardised^2]; infinite once a forecast overflows.

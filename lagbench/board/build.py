@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lagbench.atomic import write_atomically
+from lagbench.data.registry import Registry
 from lagbench.errors import ChecksFailedError
-from lagbench.registry import Registry
 
 from .collect import collect
 from .folder import Folder

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
+from lagbench.data.layout import resolve_root
+from lagbench.data.registry import Registry, Size, load
 from lagbench.errors import LagbenchError
-from lagbench.floors import FLOORS
-from lagbench.layout import resolve_root
-from lagbench.progress import Progress
-from lagbench.registry import Registry, Size, load
+from lagbench.scoring.floors import FLOORS
 from lagbench.submission import Finding
+from lagbench.work.progress import Progress
 
 from .build import build
 from .entry import Entry, Status

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 from lagbench.metrics import Direction, Metric
-from lagbench.report.numbers import text
-from lagbench.report.wording import sentence, words
+from lagbench.report.html import sentence, text, words
 
 from .model import Row, Tab
 

@@ -11,10 +11,10 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.format import MATERIALS
+from lagbench.data.registry import Size
+from lagbench.data.writer import MATERIALS
 from lagbench.metrics import METRICS, Metric, Tally, always, at_slow_frames
-from lagbench.registry import Size
-from lagbench.score_file import StoredScores
+from lagbench.scoring.score_file import StoredScores
 from lagbench.submission.task_checks import frames_to_predict
 
 __all__ = ["gaps", "reported_frames"]

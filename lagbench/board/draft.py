@@ -8,9 +8,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
-from lagbench.floors import FLOORS
-from lagbench.registry import Registry
+from lagbench.scoring.floors import FLOORS
 from lagbench.submission import Header, ValidationResult, open_predictions, validate
 
 from .entry import ID, LONGEST_ID, MOST_SEEDS, About, CostEntry

@@ -10,9 +10,9 @@ import yaml
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
+from lagbench.data.yamlfile import read_yaml
 from lagbench.errors import ChecksFailedError, UnreadableFileError, nearest
 from lagbench.submission.findings import quoted
-from lagbench.yamlfile import read_yaml
 
 from .entry import PATTERNS, Entry
 

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
+from lagbench.data.layout import resolve_root
+from lagbench.data.registry import Registry, load
 from lagbench.errors import UsageError, nearest
-from lagbench.exam import load_exam
-from lagbench.floors import FLOORS
-from lagbench.layout import resolve_root
-from lagbench.registry import Registry, load
+from lagbench.scoring.floors import FLOORS
+from lagbench.scoring.task import load_scored_task
 from lagbench.submission import PredictionsWriter
 
 __all__ = ["write_floor"]
@@ -43,7 +43,7 @@ def write_floor(
     if name not in FLOORS:
         raise UsageError(f"no floor {name!r}", where="--floor", fix=nearest(name, FLOORS))
     described, folder = registry or load(), resolve_root(root)
-    exam = load_exam(described.size(split, size), folder)
+    exam = load_scored_task(described.size(split, size), folder)
     writer = PredictionsWriter(
         path, split=split, size=size, method=name, root=folder, registry=described, parameters=0
     )

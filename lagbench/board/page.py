@@ -14,7 +14,7 @@ import hashlib
 import re
 from importlib.resources import files
 
-from lagbench.report.markup import tag
+from lagbench.report.html import tag
 
 from .embedding import embedded
 from .listing import EXPLAINED, lede, navigation, sections

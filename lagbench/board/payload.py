@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lagbench.report.wording import words
+from lagbench.report.html import words
 
 from .columns import COSTS, Column, columns_of, metric_column, presets_of
 from .embedding import clean

@@ -7,15 +7,15 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from lagbench.data.registry import Registry, Size
 from lagbench.errors import ChecksFailedError, UnreadableFileError, UsageError
 from lagbench.metrics import METRICS
-from lagbench.progress import Progress
-from lagbench.registry import Registry, Size
-from lagbench.score_card import ScoreCard
-from lagbench.score_file import write_statistics
-from lagbench.scoring import score
+from lagbench.scoring.card import ScoreCard
+from lagbench.scoring.score import score
+from lagbench.scoring.score_file import write_statistics
 from lagbench.submission import Finding
 from lagbench.submission.truth import Truth
+from lagbench.work.progress import Progress
 
 from .entry import Entry, ScoredFile
 from .entry_checks import finding

@@ -6,8 +6,8 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from lagbench.data.registry import Size
 from lagbench.metrics.reductions import mean
-from lagbench.registry import Size
 
 from .entry import Entry, FlagEntry
 from .model import Cost, Detail, Prediction, RaisedFlag, Row, Value

@@ -6,9 +6,9 @@ import math
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from pathlib import Path
 
-from lagbench.checksums import file_sha256
+from lagbench.data.checksums import file_sha256
+from lagbench.data.registry import Size
 from lagbench.errors import UnreadableFileError
-from lagbench.registry import Size
 from lagbench.submission import Finding
 
 from .coverage import gaps

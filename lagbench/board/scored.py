@@ -10,19 +10,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from lagbench import __version__
-from lagbench.checksums import file_sha256
-from lagbench.score_card import ScoreCard
+from lagbench.data.checksums import file_sha256
+from lagbench.scoring.card import ScoreCard
 
-from .entry import (
-    LONGEST_TEXT,
-    About,
-    DataSet,
-    FlagEntry,
-    PredictionEntry,
-    ScoreBlock,
-    ScoredFile,
-    Summary,
-)
+from .entry import LONGEST_TEXT, About, DataSet, FlagEntry, PredictionEntry, ScoreBlock, ScoredFile, Summary
 from .seal import UNSEALED, sealed
 
 __all__ = ["score_block", "scored_file"]

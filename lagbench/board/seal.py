@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 
-from lagbench.checksums import canonical_json
+from lagbench.data.checksums import canonical_json
 
 from .entry import About, DataSet, PredictionEntry, ScoreBlock
 

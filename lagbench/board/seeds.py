@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.metrics import METRICS, Score, aggregate
-from lagbench.score_card import digits
-from lagbench.score_file import StoredScores
+from lagbench.scoring.card import digits
+from lagbench.scoring.score_file import StoredScores
 
 from .entry import Summary
 

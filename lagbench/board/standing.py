@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lagbench.layout import major_of
+from lagbench.data.layout import major_of
+from lagbench.data.registry import Size
 from lagbench.metrics import Score, compare, shared_ranks
-from lagbench.registry import Size
 
 from .entry import DataSet, Entry, Status
 

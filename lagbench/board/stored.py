@@ -17,14 +17,14 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.data.grid import Grid, Placement
+from lagbench.data.registry import Size
 from lagbench.errors import UnreadableFileError
-from lagbench.exam import ranking_metric
-from lagbench.grid import Grid, Placement
 from lagbench.metrics.distributions import BINS
-from lagbench.preview import FRAMES, PARTICLES, Preview
-from lagbench.published import unreadable_scores
-from lagbench.registry import Size
-from lagbench.score_file import FILM_RANGE, StoredScores, read_statistics
+from lagbench.scoring.card import unreadable_scores
+from lagbench.scoring.scenario import FRAMES, PARTICLES, Preview
+from lagbench.scoring.score_file import FILM_RANGE, StoredScores, read_statistics
+from lagbench.scoring.task import ranking_metric
 from lagbench.submission.opening import opened
 from lagbench.submission.task_checks import frames_to_predict
 

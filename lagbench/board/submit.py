@@ -12,13 +12,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from lagbench.data.registry import Registry
 from lagbench.errors import ChecksFailedError, WorkFailedError
-from lagbench.progress import Progress
-from lagbench.registry import Registry
-from lagbench.score_card import ScoreCard
-from lagbench.score_file import write_statistics
-from lagbench.scoring import score
+from lagbench.scoring.card import ScoreCard
+from lagbench.scoring.score import score
+from lagbench.scoring.score_file import write_statistics
 from lagbench.submission import ValidationResult
+from lagbench.work.progress import Progress
 
 from .draft import Draft, check_needed, draft_of, headers_of
 from .entry import About, DataSet, Entry, PredictionEntry

@@ -10,16 +10,15 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from lagbench.checksums import HASHED_SUBSETS
+from lagbench.data.checksums import HASHED_SUBSETS
+from lagbench.data.layout import ScenarioKey, scenario_path
+from lagbench.data.local import DESCRIPTION
+from lagbench.data.manifest import FileEntry, Manifest, describe_file, merge, write_manifest
+from lagbench.data.registry import MAX_ID, NO_GENERATOR
+from lagbench.data.statistics import file_statistics
+from lagbench.data.writer import ScenarioWriter
 from lagbench.errors import DataError
-from lagbench.format import ScenarioWriter
-from lagbench.identity import environment_of
-from lagbench.layout import ScenarioKey, scenario_path
-from lagbench.locating import DESCRIPTION
-from lagbench.manifest import FileEntry, Manifest, describe_file, merge, write_manifest
-from lagbench.registry import NO_GENERATOR
-from lagbench.scenario_ids import MAX_ID
-from lagbench.statistics import file_statistics
+from lagbench.work.machine import environment_of
 
 from .description import SIZE, VERSION, Description, rate_of, split_yaml
 from .measure import Box, estimate_spacing

@@ -7,10 +7,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypedDict
 
+from lagbench.data.local import is_name
+from lagbench.data.registry import NO_GENERATOR, spell_ids
 from lagbench.errors import UsageError
-from lagbench.locating import is_name
-from lagbench.registry import NO_GENERATOR
-from lagbench.scenario_ids import spell_ids
 
 from .measure import Box, Measure
 

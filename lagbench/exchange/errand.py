@@ -12,16 +12,14 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from lagbench.atomic import remove_leftovers
-from lagbench.checksums import file_sha256
+from lagbench.data.checksums import file_sha256
+from lagbench.data.layout import MANIFEST_NAME, ScenarioKey, dataset_folder, scenario_path
+from lagbench.data.manifest import FileEntry, Manifest, describe_file, merge, read_manifest, write_manifest
+from lagbench.data.registry import Size, spell_ids
+from lagbench.data.scenario import check_scenario
 from lagbench.errors import DataError, UsageError, WorkFailedError
-from lagbench.inventory import State, examine
-from lagbench.layout import MANIFEST_NAME, ScenarioKey, dataset_folder, scenario_path
-from lagbench.manifest import FileEntry, Manifest, describe_file, merge, read_manifest, write_manifest
-from lagbench.plan import check_disk, scenario_bytes
-from lagbench.progress import Meter
-from lagbench.registry import Size
-from lagbench.scenario_file import check_scenario
-from lagbench.scenario_ids import spell_ids
+from lagbench.make.plan import check_disk, scenario_bytes
+from lagbench.make.verify import State, examine
 from lagbench.store.mirror import Fetch, fetch, fetch_text
 from lagbench.store.mirror_errors import (
     ConnectionLostError,
@@ -30,6 +28,7 @@ from lagbench.store.mirror_errors import (
     NotOnMirrorError,
     WrongContentError,
 )
+from lagbench.work.progress import Meter
 
 __all__ = ["Errand", "Reason"]
 

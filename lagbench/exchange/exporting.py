@@ -8,18 +8,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from lagbench.checksums import HASHED_SUBSETS
+from lagbench.data.checksums import HASHED_SUBSETS
+from lagbench.data.layout import ScenarioKey, scenario_path
+from lagbench.data.local import locate, remedy
+from lagbench.data.manifest import read_manifest
+from lagbench.data.registry import Registry, Size, spell_ids
+from lagbench.data.scenario import read_scenario
 from lagbench.errors import DataError, UsageError, nearest
 from lagbench.generators.batch import solver_constants
-from lagbench.layout import ScenarioKey, scenario_path
-from lagbench.locating import locate
-from lagbench.manifest import read_manifest
-from lagbench.progress import Meter, Progress
-from lagbench.registry import Registry, Size
-from lagbench.remedy import remedy
-from lagbench.scenario_file import read_scenario
-from lagbench.scenario_ids import spell_ids
 from lagbench.store.bringing import bring
+from lagbench.work.progress import Meter, Progress
 
 from . import gns_npz, lagrangebench_h5
 from .kinds import Format
@@ -88,7 +86,7 @@ def export(
         size: name of the size.
         format: "gns-npz" or "lagrangebench-h5".
         output: folder for the files.
-        root: folder of all data sets, see :func:`lagbench.layout.resolve_root`.
+        root: folder of all data sets, see :func:`lagbench.data.layout.resolve_root`.
         from_walls: lagrangebench-h5 only: measure positions from the lower walls, so that the
             bounds that its models see are the walls; no bit is lost. Else positions are ours,
             and the bounds those of the unit box, which that program's neighbour search needs.

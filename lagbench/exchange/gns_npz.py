@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.atomic import atomic_path
+from lagbench.data.scenario import ScenarioFile, read_scenario
 from lagbench.errors import UnreadableFileError, UsageError
-from lagbench.scenario_file import ScenarioFile, read_scenario
 
 from .inflation import check_inflation
 from .kinds import Format, materials_of, numbers_of

@@ -14,12 +14,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lagbench.atomic import temporary_name
-from lagbench.checksums import HASHED_SUBSETS
+from lagbench.data.checksums import HASHED_SUBSETS
+from lagbench.data.local import DESCRIPTION
+from lagbench.data.manifest import Manifest
+from lagbench.data.registry import load
 from lagbench.errors import DataError, UsageError, WorkFailedError
-from lagbench.locating import DESCRIPTION
-from lagbench.manifest import Manifest
-from lagbench.progress import Meter, Progress
-from lagbench.registry import load
+from lagbench.work.progress import Meter, Progress
 
 from .building import Building
 from .description import SIZE, Description

@@ -15,9 +15,9 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter, ValidationError
 
 from lagbench.atomic import write_atomically
+from lagbench.data.registry import Size
+from lagbench.data.scenario import MATERIALS
 from lagbench.errors import UnreadableFileError
-from lagbench.registry import Size
-from lagbench.variables import MATERIALS
 
 from .kinds import NUMBERS, Format
 
@@ -107,7 +107,7 @@ def describe(
         size: tier of a split.
         form: format of the export.
         shapes: what was written.
-        statistics: mean and std over train, per frame, see ``lagbench.statistics``.
+        statistics: mean and std over train, per frame, see ``lagbench.data.statistics``.
         title: title of the split.
         dataset_sha256: hash of the data set.
         spacing: distance of neighbouring particles at first [length].

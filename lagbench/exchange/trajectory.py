@@ -27,7 +27,7 @@ class Trajectory:
     Attributes:
         name: file and key, for messages.
         frames: recorded frames.
-        material: value of ``lagbench.variables.MATERIALS`` of each particle, int8, shape [particle].
+        material: value of ``lagbench.data.scenario.MATERIALS`` of each particle, int8, shape [particle].
         read: returns the frames in order, one at a time.
         wall_velocity: [length/s], shape [wall, 2] or [frame, wall, 2]; None where there is none.
         parameters: facts that the scenario's file states and hashes.

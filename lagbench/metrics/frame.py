@@ -14,9 +14,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lagbench.data.grid import Fields, Grid, fields
+from lagbench.data.writer import MATERIALS
 from lagbench.errors import ChecksFailedError, UsageError
-from lagbench.format import MATERIALS
-from lagbench.grid import Fields, Grid, fields
 
 from .bonds import Bonds
 from .projections import sorted_projections
@@ -103,7 +103,7 @@ class Scenario:
         setting: the split and size.
         given: true positions from frame 0 to the last given frame [length], shape
             [frame, particle, 2]; at least two frames.
-        material: index into :data:`lagbench.format.MATERIALS`, shape [particle].
+        material: index into :data:`lagbench.data.writer.MATERIALS`, shape [particle].
         particle_mass: mass of every particle [mass].
         area: area that the particles cover at first [length^2].
 

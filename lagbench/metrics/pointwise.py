@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lagbench.format import MATERIALS
+from lagbench.data.writer import MATERIALS
 
 from .frame import Floats, FramePair
 from .metric import Direction, Metric

@@ -15,15 +15,13 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from lagbench.checksums import file_sha256
+from lagbench.data.checksums import file_sha256
+from lagbench.data.layout import MANIFEST_NAME, dataset_folder, url_of
+from lagbench.data.lock import dataset_lock
+from lagbench.data.manifest import FileEntry, Manifest, merge, read_manifest, write_manifest
+from lagbench.data.registry import Size, spell_ids
 from lagbench.errors import DataError
-from lagbench.identity import may_differ
-from lagbench.layout import MANIFEST_NAME, dataset_folder
-from lagbench.locking import dataset_lock
-from lagbench.manifest import FileEntry, Manifest, merge, read_manifest, write_manifest
-from lagbench.registry import Size
-from lagbench.scenario_ids import spell_ids
-from lagbench.working_copy import url_of
+from lagbench.work.machine import may_differ
 
 from .fetching import address_of, called_store, fetch_scenarios
 from .mirror import fetch_text

@@ -12,12 +12,12 @@ from contextvars import ContextVar
 from pathlib import Path
 
 from lagbench.atomic import remove_leftovers
-from lagbench.checksums import file_sha256
+from lagbench.data.checksums import file_sha256
+from lagbench.data.layout import dataset_folder
+from lagbench.data.manifest import FileEntry
+from lagbench.data.registry import Size
+from lagbench.data.scenario import check_scenario
 from lagbench.errors import DataError, WorkFailedError
-from lagbench.layout import dataset_folder
-from lagbench.manifest import FileEntry
-from lagbench.registry import Size
-from lagbench.scenario_file import check_scenario
 
 from .mirror import Fetch, fetch
 from .mirror_errors import NotDataError, NotOnMirrorError, WrongContentError

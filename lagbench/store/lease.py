@@ -20,8 +20,8 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 
+from lagbench.data.lock import Holder
 from lagbench.errors import LagbenchError, WorkFailedError
-from lagbench.locking import Holder
 
 from .remote import Remote
 

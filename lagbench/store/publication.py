@@ -13,12 +13,11 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from lagbench.checksums import file_sha256
+from lagbench.data.checksums import file_sha256
+from lagbench.data.layout import MANIFEST_NAME, dataset_folder, url_of
+from lagbench.data.manifest import FileEntry, Manifest, merge, write_manifest
+from lagbench.data.registry import Size
 from lagbench.errors import DataError, LagbenchError
-from lagbench.layout import MANIFEST_NAME, dataset_folder
-from lagbench.manifest import FileEntry, Manifest, merge, write_manifest
-from lagbench.registry import Size
-from lagbench.working_copy import url_of
 
 from .bringing import is_right, local_manifest, merged, remote_manifest, writing
 from .fetching import fetch_scenarios

@@ -9,8 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from lagbench.errors import DataError, LagbenchError, UsageError, WorkFailedError
-from lagbench.extras import require
+from lagbench.errors import DataError, LagbenchError, UsageError, WorkFailedError, require
 
 __all__ = ["Remote", "check_bucket", "refusals_told", "translated"]
 

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.scenario_ids import spell_ids
+from lagbench.data.registry import spell_ids
 
 __all__ = ["guess_frames", "guess_scenarios", "guess_start", "spell_numbers"]
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lagbench.locating import locate
-from lagbench.registry import Registry
+from lagbench.data.local import locate
+from lagbench.data.registry import Registry
 from lagbench.store.bringing import bring
 
 from .truth import Truth
@@ -54,7 +54,7 @@ def template(
         split: name of the split.
         size: name of the size.
         output: file to write.
-        root: folder of all data sets, see :func:`lagbench.layout.resolve_root`.
+        root: folder of all data sets, see :func:`lagbench.data.layout.resolve_root`.
         registry: where splits are described; ours when None.
 
     Raises:

@@ -11,9 +11,9 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.checksums import ContentHasher
+from lagbench.data.checksums import ContentHasher
+from lagbench.data.registry import spell_ids
 from lagbench.errors import UsageError
-from lagbench.scenario_ids import spell_ids
 
 from .anatomy import Anatomy, dissect
 from .findings import Findings

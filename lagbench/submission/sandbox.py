@@ -17,8 +17,8 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+from lagbench.data.registry import Registry
 from lagbench.errors import WorkFailedError
-from lagbench.registry import Registry
 
 from .findings import CHECKS, Finding, Findings, Severity, ValidationResult
 

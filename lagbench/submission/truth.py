@@ -7,12 +7,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.data.layout import ScenarioKey, scenario_path
+from lagbench.data.local import remedy
+from lagbench.data.registry import Size, spell_ids
+from lagbench.data.scenario import ScenarioFile, read_scenario
 from lagbench.errors import DataError
-from lagbench.layout import ScenarioKey, scenario_path
-from lagbench.registry import Size
-from lagbench.remedy import remedy
-from lagbench.scenario_file import ScenarioFile, read_scenario
-from lagbench.scenario_ids import spell_ids
 
 __all__ = ["Truth"]
 

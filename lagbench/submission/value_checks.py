@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.registry import Size
+from lagbench.data.registry import Size
 
 from .findings import Findings
 from .guesses import guess_start
