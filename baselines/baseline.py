@@ -29,24 +29,16 @@ __all__ = [
 
 @dataclass(frozen=True, kw_only=True)
 class Batch:
-    """Several windows of consecutive frames, their particles in one row.
+    """Several windows of consecutive frames, their particles in one row."""
 
-    Attributes:
-        position: particle positions [length], float32, shape [particle, frame, 2].
-        sample: window that each particle belongs to, ascending, int64, shape [particle].
-        material: 0 liquid, 1 jelly, 2 snow, 3 rope, int64, shape [particle].
-        wall_velocity: velocity of the walls over the frames of the windows [length/s], shape
-            [window, frame, wall, 2]; None in a split without moving walls.
-        scenario: scenario id of each window, int64, shape [window].
-        frame: absolute number of each window's first frame, int64, shape [window].
-    """
-
-    position: Tensor
-    sample: Tensor
-    material: Tensor
+    position: Tensor  # particle positions [length], float32, shape [particle, frame, 2]
+    sample: Tensor  # window that each particle belongs to, ascending, int64, shape [particle]
+    material: Tensor  # 0 liquid, 1 jelly, 2 snow, 3 rope, int64, shape [particle]
+    # velocity of the walls over the frames of the windows [length/s], shape [window, frame, wall, 2]; None in
+    # a split without moving walls
     wall_velocity: Tensor | None
-    scenario: Tensor
-    frame: Tensor
+    scenario: Tensor  # scenario id of each window, int64, shape [window]
+    frame: Tensor  # absolute number of each window's first frame, int64, shape [window]
 
     @property
     def windows(self) -> int:

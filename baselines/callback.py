@@ -29,14 +29,6 @@ class TrainingCallback(Callback):
     """Logs, validates and stores a training, and stops it early or when a user interrupts.
 
     An interrupt lets the running step end and stores the state; a second one stops at once.
-
-    Args:
-        folder: where files go.
-        ledger: what the training has done so far.
-        about: fields of the checkpoint that do not change.
-        record: entries of training.json that do not change.
-        validation: windows of ``valid`` with their truth; None validates never.
-        meter: counts steps.
     """
 
     def __init__(
@@ -49,12 +41,12 @@ class TrainingCallback(Callback):
         validation: Batch | None,
         meter: Meter,
     ) -> None:
-        self.folder = folder
-        self.ledger = ledger
-        self.about = about
-        self.record = record
-        self.validation = validation
-        self.meter = meter
+        self.folder = folder  # where files go
+        self.ledger = ledger  # what the training has done so far
+        self.about = about  # fields of the checkpoint that do not change
+        self.record = record  # entries of training.json that do not change
+        self.validation = validation  # windows of 'valid' with their truth; None validates never
+        self.meter = meter  # counts steps
         self._interrupted = False
         self._handlers: dict[int, Any] = {}
 

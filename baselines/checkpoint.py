@@ -68,16 +68,6 @@ def check_footprint(
     """Refuse to build a model that is larger than the weights that are meant for it.
 
     A model that cannot be built without numbers, as a stranger's baseline may be, passes.
-
-    Args:
-        model: the baseline.
-        options: its options, plain values.
-        facts: public figures of the data set.
-        weights: parameters and buffers of the file.
-        where: what to call the file in messages.
-
-    Raises:
-        UnreadableFileError: the options ask for more than the file holds.
     """
     held = _bytes_held(weights)
     try:
@@ -150,22 +140,14 @@ _FOREIGN = re.compile(r"GLOBAL ([\w.]+)")
 
 @dataclass(frozen=True, kw_only=True)
 class Checkpoint:
-    """A model with all that it needs to predict, and to be trained on.
+    """A model with all that it needs to predict, and to be trained on."""
 
-    Attributes:
-        baseline: name of the baseline.
-        options: options of the model, plain values.
-        facts: public figures of the data set that it was trained on.
-        weights: parameters and buffers by name.
-        training: what training has done so far, plain values.
-        optimizer: state of the optimiser; None in a file that is for predictions only.
-    """
-
-    baseline: str
-    options: Mapping[str, Any]
-    facts: Facts
-    weights: Mapping[str, Tensor]
-    training: Mapping[str, Any] = field(default_factory=dict)
+    baseline: str  # name of the baseline
+    options: Mapping[str, Any]  # options of the model, plain values
+    facts: Facts  # public figures of the data set that it was trained on
+    weights: Mapping[str, Tensor]  # parameters and buffers by name
+    training: Mapping[str, Any] = field(default_factory=dict)  # what training has done so far, plain values
+    # state of the optimiser; None in a file that is for predictions only
     optimizer: Mapping[str, Any] | None = None
 
 
@@ -191,11 +173,7 @@ class _Training(_Read):
 
 
 def save(path: Path, checkpoint: Checkpoint) -> None:
-    """Write a checkpoint; it appears whole or not at all.
-
-    Raises:
-        WorkFailedError: the operating system refused.
-    """
+    """Write a checkpoint; it appears whole or not at all."""
     about = {
         "baseline": checkpoint.baseline,
         "options": dict(checkpoint.options),
@@ -214,12 +192,7 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
 
 
 def load(path: str | Path) -> Checkpoint:
-    """Read a checkpoint; nothing in the file is run.
-
-    Raises:
-        UnreadableFileError: the file is missing, damaged, no checkpoint, or holds objects other
-            than tensors and plain values.
-    """
+    """Read a checkpoint; nothing in the file is run."""
     file = Path(path)
     content = _content(file)
     try:
@@ -240,16 +213,7 @@ def load(path: str | Path) -> Checkpoint:
 
 
 def restore(checkpoint: Checkpoint, *, where: str = "the checkpoint") -> Baseline:
-    """Return the model of a checkpoint, in float32, ready to predict.
-
-    Args:
-        checkpoint: what :func:`load` returned.
-        where: what to call it in messages.
-
-    Raises:
-        UsageError: no such baseline is installed.
-        UnreadableFileError: options or weights do not fit the baseline, or each other.
-    """
+    """Return the model of a checkpoint, in float32, ready to predict."""
     entry = find(checkpoint.baseline)
     options, facts = checkpoint.options, checkpoint.facts
     try:
@@ -273,11 +237,7 @@ def restore(checkpoint: Checkpoint, *, where: str = "the checkpoint") -> Baselin
 
 
 def load_weights(model: nn.Module, weights: Mapping[str, Tensor], *, where: str) -> None:
-    """Copy weights into a model; those in bfloat16 become float32.
-
-    Raises:
-        UnreadableFileError: names, shapes or values do not fit.
-    """
+    """Copy weights into a model; those in bfloat16 become float32."""
     broken = [name for name, value in weights.items() if not torch.isfinite(value).all()]
     if broken:
         raise UnreadableFileError("weights are not finite", where=where, got=", ".join(broken[:3]))
@@ -299,18 +259,7 @@ def rounded_weights(model: nn.Module) -> dict[str, Tensor]:
 
 
 def check_data(checkpoint: Checkpoint, *, root: Path, registry: Registry | None = None, where: str) -> Facts:
-    """Check that the data at hand are those that the model was trained on; return their facts.
-
-    Args:
-        checkpoint: what :func:`load` returned.
-        root: folder of all data sets.
-        registry: where splits are described; ours when None.
-        where: what to call the checkpoint in messages.
-
-    Raises:
-        UsageError: no such split is known.
-        DataError: they are missing, or of another hash.
-    """
+    """Check that the data at hand are those that the model was trained on; return their facts."""
     trained = checkpoint.facts
     here = facts_of(trained.split, trained.size, root=root, registry=registry)
     if here.dataset_sha256 != trained.dataset_sha256:

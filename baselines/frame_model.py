@@ -49,11 +49,7 @@ FEATURES = 4
 
 
 class FrameState(nn.Module):
-    """Turns positions into standardised states, and back.
-
-    Args:
-        facts: public figures of the data set; its statistics are kept as buffers.
-    """
+    """Turns positions into standardised states, and back."""
 
     mean: Tensor
     std: Tensor
@@ -117,15 +113,10 @@ def side_by_side(batch: Batch, particles: int) -> tuple[Tensor, Tensor]:
 
 @dataclass(frozen=True)
 class FrameWindow:
-    """The state of a rollout: what :meth:`FrameModel.next_state` is given.
+    """The state of a rollout: what :meth:`FrameModel.next_state` is given."""
 
-    Attributes:
-        state: the last standardised states [1], shape [window, frame, particle, 4].
-        material: material of each particle, shape [window, particle].
-    """
-
-    state: Tensor
-    material: Tensor
+    state: Tensor  # the last standardised states [1], shape [window, frame, particle, 4]
+    material: Tensor  # material of each particle, shape [window, particle]
 
 
 def squared_errors(truth: Tensor, predicted: Tensor) -> dict[str, Tensor]:
@@ -170,12 +161,7 @@ class FrameModel(Baseline):
         return FEATURES * self.facts.particles
 
     def forward(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
-        """Return the mean squared errors of position and velocity after one step [1].
-
-        Args:
-            batch: windows of ``history + 1`` frames.
-            generator: source of noise.
-        """
+        """Return the mean squared errors of position and velocity after one step [1]."""
         return squared_errors(*self._one_step(batch, generator))
 
     def _one_step(self, batch: Batch, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
@@ -225,15 +211,12 @@ class FrameNetworkOptions(baseline.Options):
     The thesis's networks predict the next state itself, without noise; ``target: change`` and
     ``noise_std`` are ours. A state is made anew in every frame, so that even the first step is off by
     the error of the whole state; a change keeps what it does not know.
-
-    Attributes:
-        target: the next state, or its change in units of the change's deviation over train.
-        material: give the material as a fifth, constant feature of every particle.
-        noise_std: of the noise on the states that training gives to the network [standardised].
     """
 
+    # the next state, or its change in units of the change's deviation over train
     target: Target = Target.STATE
-    material: bool = False
+    material: bool = False  # give the material as a fifth, constant feature of every particle
+    # of the noise on the states that training gives to the network [standardised]
     noise_std: float = Field(default=0.0, ge=0, allow_inf_nan=False)
 
 

@@ -35,21 +35,13 @@ __all__ = [
 
 @dataclass(frozen=True, kw_only=True)
 class Source:
-    """A scenario file and what the registry says that it is.
+    """A scenario file and what the registry says that it is."""
 
-    Attributes:
-        path: path of the file.
-        key: what names the scenario.
-        frames: frames that it holds.
-        digest: first digits of its content hash; empty when none is known.
-        remedy: what writes the file anew, in words.
-    """
-
-    path: Path
-    key: ScenarioKey
-    frames: int
-    digest: str = ""
-    remedy: str = ""
+    path: Path  # path of the file
+    key: ScenarioKey  # what names the scenario
+    frames: int  # frames that it holds
+    digest: str = ""  # first digits of its content hash; empty when none is known
+    remedy: str = ""  # what writes the file anew, in words
 
 
 def sources_of(size: Size, subsets: Sequence[str], root: Path) -> dict[int, Source]:
@@ -137,9 +129,6 @@ class FrameStore:
         """Return positions of consecutive frames [length], each of shape [particle, 2].
 
         The arrays are those of the cache: copy them, never write to them.
-
-        Raises:
-            DataError: the file is missing, damaged or not the scenario that was meant.
         """
         self._own()
         found = {frame: self._frames.get((scenario, frame)) for frame in range(start, stop)}
@@ -155,9 +144,6 @@ class FrameStore:
         """Return material, shape [particle], and wall velocity [length/s], [frame, wall, 2].
 
         Material is 0, liquid, in files without it; wall velocity is None where no wall moves.
-
-        Raises:
-            DataError: the file is missing, damaged or not the scenario that was meant.
         """
         self._own()
         opened = self._opened(scenario)

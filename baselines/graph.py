@@ -209,16 +209,10 @@ _WALLS = 4  # left, right, bottom, top, the order of wall_velocity in scenario f
 
 
 class Scale(nn.Module):
-    """Standardisation by train statistics: ``(x - mean) / sqrt(std^2 + noise^2)``.
+    """Standardisation by train statistics: ``(x - mean) / sqrt(std^2 + noise^2)``."""
 
-    Args:
-        mean: mean over train, (x, y).
-        std: standard deviation over train, (x, y).
-        noise: standard deviation of the noise added in training, same unit; it widens the data.
-    """
-
-    mean: Tensor
-    std: Tensor
+    mean: Tensor  # mean over train, (x, y)
+    std: Tensor  # standard deviation over train, (x, y)
 
     def __init__(self, mean: Sequence[float], std: Sequence[float], *, noise: float = 0.0) -> None:
         super().__init__()

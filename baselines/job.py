@@ -52,27 +52,18 @@ OVER = ("finished", STOPPED_EARLY)
 
 @dataclass
 class TrainingRecord:
-    """What a training has done so far; it goes into checkpoints and training.json.
+    """What a training has done so far; it goes into checkpoints and training.json."""
 
-    Attributes:
-        state: running, interrupted, finished, stopped early or failed.
-        step: optimiser steps made.
-        loss: raw loss terms of the last step looked at, and their weighted sum ``total``.
-        validation: step and position RMSE of every validation [length].
-        best_step: step of the best validation; None before the first.
-        best_rmse: its RMSE [length].
-        cpu_seconds: processor time of all processes, in all runs [s].
-        wall_seconds: time of all runs [s].
-    """
-
-    state: str = "running"
-    step: int = 0
+    state: str = "running"  # running, interrupted, finished, stopped early or failed
+    step: int = 0  # optimiser steps made
+    # raw loss terms of the last step looked at, and their weighted sum 'total'
     loss: dict[str, float] = field(default_factory=dict)
+    # step and position RMSE of every validation [length]
     validation: list[dict[str, float]] = field(default_factory=list)
-    best_step: int | None = None
-    best_rmse: float | None = None
-    cpu_seconds: float = 0.0
-    wall_seconds: float = 0.0
+    best_step: int | None = None  # step of the best validation; None before the first
+    best_rmse: float | None = None  # its RMSE [length]
+    cpu_seconds: float = 0.0  # processor time of all processes, in all runs [s]
+    wall_seconds: float = 0.0  # time of all runs [s]
 
     def __post_init__(self) -> None:
         """Start the clocks."""
@@ -152,17 +143,7 @@ class RunFolder:
         return self.path / "tensorboard"
 
     def earlier(self, recipe: Recipe, *, resume: bool, fresh: bool) -> Checkpoint | None:
-        """Return the checkpoint to go on from; None for a training from the start.
-
-        Args:
-            recipe: the recipe of the training.
-            resume: go on from what is there; else anything there is an error.
-            fresh: train anew whatever is there.
-
-        Raises:
-            UsageError: the folder holds another training, or one that must not be resumed.
-            UnreadableFileError: its checkpoint is damaged.
-        """
+        """Return the checkpoint to go on from; None for a training from the start."""
         left = [file for file in (self.checkpoint, self.weights, self.record) if file.exists()]
         if fresh or not left:
             return None
@@ -242,39 +223,21 @@ FORMAT = 1
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingJob:
-    """A training to do.
+    """A training to do."""
 
-    Attributes:
-        recipe: model and training options.
-        facts: public figures of the data set.
-        folder: where files go.
-        earlier: checkpoint to go on from; None at the start.
-        root: folder of all data sets.
-        registry: where the split is described.
-        device: ``cpu`` or ``cuda``.
-        processes: processes that share the training.
-        workers: processes that read windows ahead.
-        meter: counts steps.
-    """
-
-    recipe: Recipe
-    facts: Facts
-    folder: RunFolder
-    earlier: Checkpoint | None
-    root: Path
-    registry: Registry
-    device: str = "cpu"
-    processes: int = 1
-    workers: int = 0
-    meter: Meter = field(default_factory=Meter)
+    recipe: Recipe  # model and training options
+    facts: Facts  # public figures of the data set
+    folder: RunFolder  # where files go
+    earlier: Checkpoint | None  # checkpoint to go on from; None at the start
+    root: Path  # folder of all data sets
+    registry: Registry  # where the split is described
+    device: str = "cpu"  # 'cpu' or 'cuda'
+    processes: int = 1  # processes that share the training
+    workers: int = 0  # processes that read windows ahead
+    meter: Meter = field(default_factory=Meter)  # counts steps
 
     def files(self, subset: str) -> dict[int, Path]:
-        """Return the scenario files of a subset by id.
-
-        Raises:
-            UsageError: there is no such subset.
-            DataError: files are missing.
-        """
+        """Return the scenario files of a subset by id."""
         facts = self.facts
         return scenario_paths(
             facts.split, subset=subset, size=facts.size, root=self.root, registry=self.registry

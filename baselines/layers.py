@@ -179,12 +179,7 @@ LARGEST_KEPT = 24e6
 
 
 def mlp(widths: list[int], *, norm: bool = True) -> nn.Sequential:
-    """Return linear layers with ReLU between them, LayerNorm after the last.
-
-    Args:
-        widths: width of the input, of each hidden layer, of the output.
-        norm: whether the output passes a LayerNorm; a decoder's does not.
-    """
+    """Return linear layers with ReLU between them, LayerNorm after the last."""
     layers: list[nn.Module] = []
     for width, following in pairwise(widths):
         layers += [Linear(width, following), nn.ReLU(inplace=True)]
@@ -204,10 +199,6 @@ class EdgeMLP(nn.Module):
     layers are computed again in the backward pass, edges by pieces that fit the cache: a
     little time for half of the memory. Above 32 MB, glibc would also hand every tensor back to
     the system and pay for its pages again.
-
-    Args:
-        latent: width of nodes, edges and output.
-        hidden: width of the two hidden layers.
     """
 
     def __init__(self, latent: int, hidden: int) -> None:

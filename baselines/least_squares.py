@@ -55,20 +55,14 @@ class Blocks(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class LeastSquares:
-    """The solution and how well it is determined.
+    """The solution and how well it is determined."""
 
-    Attributes:
-        coefficients: B, shape [regressor, response].
-        condition: largest over smallest singular value of X; a lower bound where ``floor`` > 0.
-        floor: added to the Gram matrix since it was singular to rounding, as a share of its largest
-            eigenvalue; 0 if it was not.
-        rows: rows that went in.
-    """
-
-    coefficients: Matrix
-    condition: float
+    coefficients: Matrix  # B, shape [regressor, response]
+    condition: float  # largest over smallest singular value of X; a lower bound where 'floor' > 0
+    # added to the Gram matrix since it was singular to rounding, as a share of its largest
+    # eigenvalue; 0 if it was not
     floor: float
-    rows: int
+    rows: int  # rows that went in
 
 
 @dataclass(frozen=True)
@@ -86,14 +80,7 @@ class _Factor:
 
 
 def solve(blocks: Blocks) -> LeastSquares:
-    """Return the least-squares solution of X B = Y, that of least norm if there are many.
-
-    Args:
-        blocks: rows of X and Y; read three times or four.
-
-    Raises:
-        WorkFailedError: no rows, or values that are not finite.
-    """
+    """Return the least-squares solution of X B = Y, that of least norm if there are many."""
     shape = next(((x.shape[1], y.shape[1]) for x, y in blocks), None)
     if shape is None:
         raise WorkFailedError("nothing to fit", expected="scenarios longer than the lags", got="no rows")

@@ -36,37 +36,25 @@ __all__ = [
 
 
 class Motion(NamedTuple):
-    """One frame of particles.
+    """One frame of particles."""
 
-    Attributes:
-        position: x(f) [length], shape [particle, 2].
-        velocity: x(f) - x(f-1) [length/frame], shape [particle, 2].
-        acceleration: velocity less that of the frame before, in target and prediction the same
-            frame, which is the model's input [length/frame^2], shape [particle, 2].
-    """
-
-    position: Tensor
-    velocity: Tensor
+    position: Tensor  # x(f) [length], shape [particle, 2]
+    velocity: Tensor  # x(f) - x(f-1) [length/frame], shape [particle, 2]
+    # velocity less that of the frame before, in target and prediction the same frame, which is the model's
+    # input [length/frame^2], shape [particle, 2]
     acceleration: Tensor
 
 
 @dataclass(frozen=True, kw_only=True)
 class State:
-    """What a step starts from.
+    """What a step starts from."""
 
-    Attributes:
-        position: last positions [length], shape [particle, 2].
-        velocity: last velocities, oldest first [length/frame], shape [particle, 5, 2].
-        material: material of each particle, int64, shape [particle].
-        sample: window of each particle, ascending, int64, shape [particle].
-        wall_velocity: velocity of the walls in the last given frame, as each particle sees them
-            [length/frame], shape [particle, 4, 2]; None where walls rest or do not matter.
-    """
-
-    position: Tensor
-    velocity: Tensor
-    material: Tensor
-    sample: Tensor
+    position: Tensor  # last positions [length], shape [particle, 2]
+    velocity: Tensor  # last velocities, oldest first [length/frame], shape [particle, 5, 2]
+    material: Tensor  # material of each particle, int64, shape [particle]
+    sample: Tensor  # window of each particle, ascending, int64, shape [particle]
+    # velocity of the walls in the last given frame, as each particle sees them [length/frame], shape
+    # [particle, 4, 2]; None where walls rest or do not matter
     wall_velocity: Tensor | None
 
     def moved(self, position: Tensor, velocity: Tensor) -> Self:

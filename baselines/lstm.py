@@ -35,21 +35,14 @@ class LSTM(FrameNetwork):
     interleaved: ClassVar[bool] = False
 
     class Options(FrameNetworkOptions):
-        """Options of both LSTMs.
+        """Options of both LSTMs."""
 
-        Attributes:
-            latent: length of the latent vector of a frame and width of both LSTM layers.
-            encoder: widths of pointwise layers before the latent one.
-            decoder: widths of hidden layers after the second LSTM layer.
-            dropout: after the first and after the second LSTM layer.
-            density_weight: of the density term in the loss. The thesis states none; with 1 the
-                gradient within a cell drowns that of the positions, which then are not learned.
-        """
-
-        latent: PositiveInt = 1250
-        encoder: tuple[PositiveInt, ...] = ()
-        decoder: tuple[PositiveInt, ...] = (1250,)
-        dropout: tuple[Share, Share] = (0.2, 0.1)
+        latent: PositiveInt = 1250  # length of the latent vector of a frame and width of both LSTM layers
+        encoder: tuple[PositiveInt, ...] = ()  # widths of pointwise layers before the latent one
+        decoder: tuple[PositiveInt, ...] = (1250,)  # widths of hidden layers after the second LSTM layer
+        dropout: tuple[Share, Share] = (0.2, 0.1)  # after the first and after the second LSTM layer
+        # of the density term in the loss. The thesis states none; with 1 the gradient within a cell drowns
+        # that of the positions, which then are not learned.
         density_weight: float = Field(default=0.03, ge=0, allow_inf_nan=False)
 
     options: Options

@@ -44,38 +44,23 @@ SEARCHES = 5
 
 @dataclass(frozen=True, kw_only=True)
 class PredictionResult:
-    """What a prediction made and cost.
+    """What a prediction made and cost."""
 
-    Attributes:
-        path: the predictions.nc.
-        split: name of the split.
-        size: name of the size.
-        method: what made it.
-        scenarios: scenarios predicted.
-        frames: frames of each.
-        batch: scenarios that were rolled out side by side.
-        seconds_per_frame: time of one frame of one scenario [s].
-        seconds_without_search: the same without the neighbour search [s].
-        clock: ``processor`` on one CPU thread, where other work on the machine then does not
-            count; ``wall`` on a GPU and on several threads.
-        device: processor and threads, or GPU.
-        parameters: trained numbers of the model.
-        diverged: scenario id to the absolute frame from which its rollout is frozen.
-    """
-
-    path: Path
-    split: str
-    size: str
-    method: str
-    scenarios: int
-    frames: int
-    batch: int
-    seconds_per_frame: float
-    seconds_without_search: float
+    path: Path  # the predictions.nc
+    split: str  # name of the split
+    size: str  # name of the size
+    method: str  # what made it
+    scenarios: int  # scenarios predicted
+    frames: int  # frames of each
+    batch: int  # scenarios that were rolled out side by side
+    seconds_per_frame: float  # time of one frame of one scenario [s]
+    seconds_without_search: float  # the same without the neighbour search [s]
+    # 'processor' on one CPU thread, where other work on the machine then does not count; 'wall' on
+    # a GPU and on several threads
     clock: str
-    device: str
-    parameters: int
-    diverged: Mapping[int, int]
+    device: str  # processor and threads, or GPU
+    parameters: int  # trained numbers of the model
+    diverged: Mapping[int, int]  # scenario id to the absolute frame from which its rollout is frozen
 
 
 def predict(
@@ -183,19 +168,14 @@ def _write(writer: PredictionsWriter, work: _Rollouts, meter: Meter) -> None:
 
 
 class _Rollouts:
-    """Rolls scenarios out, some side by side, and takes the time.
-
-    Attributes:
-        seconds: time of the rollouts [s].
-        clock: the time that is taken, ``processor`` or ``wall``.
-        frames: frames that the model was asked for, of all scenarios; frozen ones cost nothing.
-        diverged: scenario id to the absolute frame from which its rollout is frozen.
-    """
+    """Rolls scenarios out, some side by side, and takes the time."""
 
     def __init__(self, model: Baseline, facts: Facts, paths: list[Path], side: int, machine: str) -> None:
-        self.seconds = 0.0
+        self.seconds = 0.0  # time of the rollouts [s]
+        # the time that is taken, 'processor' or 'wall'
         self.clock = "processor" if machine == "cpu" and torch.get_num_threads() == 1 else "wall"
-        self.frames = 0
+        self.frames = 0  # frames that the model was asked for, of all scenarios; frozen ones cost nothing
+        # scenario id to the absolute frame from which its rollout is frozen
         self.diverged: dict[int, int] = {}
         self._model, self._facts, self._machine = model, facts, machine
         self._groups = [paths[first : first + side] for first in range(0, len(paths), side)]

@@ -30,17 +30,11 @@ __all__ = [
 
 @dataclass(frozen=True, kw_only=True)
 class Rollout:
-    """Predicted positions of one window.
+    """Predicted positions of one window."""
 
-    Attributes:
-        scenario: scenario id.
-        position: positions [length], float32, on the CPU, shape [frame, particle, 2].
-        diverged_at: absolute frame from which the positions are frozen; None where none is.
-    """
-
-    scenario: int
-    position: Tensor
-    diverged_at: int | None
+    scenario: int  # scenario id
+    position: Tensor  # positions [length], float32, on the CPU, shape [frame, particle, 2]
+    diverged_at: int | None  # absolute frame from which the positions are frozen; None where none is
 
 
 @torch.no_grad()
@@ -50,11 +44,6 @@ def roll_out(model: Baseline, given: Batch, frames: int) -> list[Rollout]:
     A window that ceases to be finite is frozen at its last finite frame (the last given one if
     need be). Where that happens beside other windows, all are predicted again one by one, so
     that no window can disturb another.
-
-    Args:
-        model: the model, on the device of the batch.
-        given: the frames that the model may see.
-        frames: frames to predict.
     """
     was_training = model.training
     model.eval()
@@ -136,10 +125,6 @@ def validate(model: Baseline, truth: Batch) -> float:
 
     The model is rolled out with its weights rounded to bfloat16, as predictions use them. A
     rollout that diverges counts with its frozen frames.
-
-    Args:
-        model: the model.
-        truth: windows of ``input_frames`` given frames and those to predict.
     """
     given = model.facts.input_frames
     rmse = []

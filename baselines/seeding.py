@@ -31,12 +31,7 @@ __all__ = [
 
 
 def seed_of(seed: int, *place: int) -> int:
-    """Return a seed of 63 bits for a place in a training, such as (step, process).
-
-    Args:
-        seed: seed of the whole training.
-        place: numbers >= 0 that name the place.
-    """
+    """Return a seed of 63 bits for a place in a training, such as (step, process)."""
     return int(np.random.SeedSequence((seed, *place)).generate_state(1, np.uint64)[0] >> np.uint64(1))
 
 

@@ -39,34 +39,21 @@ _LOW, _HIGH = 1, 2  # rows that the stencil of a particle in the unit box can re
 
 @dataclass(frozen=True)
 class Transfer:
-    """Sums over the particles around each node.
+    """Sums over the particles around each node."""
 
-    Attributes:
-        weight: ``sum(w)`` [1], shape [..., x node, y node].
-        momentum: ``sum(w u)`` [unit of u], shape [..., x node, y node, 2].
-    """
-
-    weight: Tensor
-    momentum: Tensor
+    weight: Tensor  # sum(w) [1], shape [..., x node, y node]
+    momentum: Tensor  # sum(w u) [unit of u], shape [..., x node, y node, 2]
 
 
 @dataclass(frozen=True)
 class Fields:
-    """Grid fields with gradients.
+    """Grid fields with gradients."""
 
-    Attributes:
-        grid: where the nodes lie.
-        weight: ``sum(w)`` [1], shape [..., x node, y node].
-        velocity: node velocity, 0 at empty nodes [unit of u], shape [..., x node, y node, 2].
-        counted: nodes that count, bool, shape [..., x node, y node].
-        full: weight of a full interior node [1].
-    """
-
-    grid: Grid
-    weight: Tensor
-    velocity: Tensor
-    counted: Tensor
-    full: float
+    grid: Grid  # where the nodes lie
+    weight: Tensor  # sum(w) [1], shape [..., x node, y node]
+    velocity: Tensor  # node velocity, 0 at empty nodes [unit of u], shape [..., x node, y node, 2]
+    counted: Tensor  # nodes that count, bool, shape [..., x node, y node]
+    full: float  # weight of a full interior node [1]
 
     @property
     def density(self) -> Tensor:
@@ -189,11 +176,7 @@ def _scatter(x: Tensor, u: Tensor, grid: Grid, sample: Tensor, windows: int) -> 
 
 
 def _spline(s: Tensor) -> Tensor:
-    """Return the weights of the three nodes of each axis, shape [particle, node, 2].
-
-    Args:
-        s: distance past the base node along each axis, in [1/2, 3/2) [h], shape [particle, 2].
-    """
+    """Return the weights of the three nodes of each axis, shape [particle, node, 2]."""
     return torch.stack([0.5 * (1.5 - s) ** 2, 0.75 - (s - 1.0) ** 2, 0.5 * (s - 0.5) ** 2], dim=1)
 
 

@@ -69,43 +69,24 @@ SMALLER = "lower --set training.batch=1, then the model: model.latent, .layers, 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingResult:
-    """What a training made.
+    """What a training made."""
 
-    Attributes:
-        baseline: name of the baseline.
-        split: name of the split.
-        size: name of the size.
-        recipe: name of the recipe.
-        folder: folder of the run.
-        weights: weights to predict from.
-        checkpoint: last state, to go on from.
-        state: finished, stopped early or interrupted.
-        step: optimiser steps made.
-        steps: steps of the whole training.
-        parameters: trainable parameters.
-        loss: raw loss terms of the last step, and their weighted sum ``total``.
-        best_rmse: position RMSE of the best validation [length]; None without one.
-        best_step: its step.
-        cpu_seconds: processor time in all runs [s].
-        wall_seconds: time of all runs [s].
-    """
-
-    baseline: str
-    split: str
-    size: str
-    recipe: str
-    folder: Path
-    weights: Path
-    checkpoint: Path
-    state: str
-    step: int
-    steps: int
-    parameters: int
-    loss: dict[str, float]
-    best_rmse: float | None
+    baseline: str  # name of the baseline
+    split: str  # name of the split
+    size: str  # name of the size
+    recipe: str  # name of the recipe
+    folder: Path  # folder of the run
+    weights: Path  # weights to predict from
+    checkpoint: Path  # last state, to go on from
+    state: str  # finished, stopped early or interrupted
+    step: int  # optimiser steps made
+    steps: int  # steps of the whole training
+    parameters: int  # trainable parameters
+    loss: dict[str, float]  # raw loss terms of the last step, and their weighted sum 'total'
+    best_rmse: float | None  # position RMSE of the best validation [length]; None without one
     best_step: int | None
-    cpu_seconds: float
-    wall_seconds: float
+    cpu_seconds: float  # processor time in all runs [s]
+    wall_seconds: float  # time of all runs [s]
 
 
 def train(
@@ -243,18 +224,11 @@ LOGGERS = ("lightning.pytorch", "lightning.fabric", "pytorch_lightning", "lightn
 
 
 class StepBatches(Sampler[list[int]]):
-    """Windows of each step of a training, from any step on.
-
-    Args:
-        sampler: draws the windows of one process, epoch after epoch.
-        batch: windows of a step.
-        first: step to begin with, from 0.
-        last: step to end before.
-    """
+    """Windows of each step of a training, from any step on."""
 
     def __init__(self, sampler: WindowSampler, batch: int, *, first: int, last: int) -> None:
-        self.sampler = sampler
-        self.batch = batch
+        self.sampler = sampler  # draws the windows of one process, epoch after epoch
+        self.batch = batch  # windows of a step
         self.steps = range(first, last)
 
     def __len__(self) -> int:
@@ -271,12 +245,7 @@ class StepBatches(Sampler[list[int]]):
 
 
 def descend(job: TrainingJob, model: Baseline) -> tuple[TrainingRecord, int]:
-    """Train a model; return the ledger and the steps of the whole training.
-
-    Raises:
-        WorkFailedError: the loss is not finite.
-        KeyboardInterrupt: interrupted; the state after the last step is stored.
-    """
+    """Train a model; return the ledger and the steps of the whole training."""
     facts, options = job.facts, job.recipe.training
     data = WindowDataset(
         facts.split,

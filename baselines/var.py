@@ -98,13 +98,9 @@ class VAR(Fitted):
     method = "var"
 
     class Options(baseline.Options):
-        """Options of the VAR.
+        """Options of the VAR."""
 
-        Attributes:
-            lags: order p.
-        """
-
-        lags: PositiveInt = 1
+        lags: PositiveInt = 1  # order p
 
     precision = torch.float64
     options: Options
@@ -153,14 +149,10 @@ class StableVAR(Fitted):
     method = "var-stable"
 
     class Options(baseline.Options):
-        """Options of the stable VAR.
+        """Options of the stable VAR."""
 
-        Attributes:
-            rank: principal directions kept; all there are if they are fewer.
-            ridge: added to the variance of each direction [standardised^2].
-        """
-
-        rank: PositiveInt = 200
+        rank: PositiveInt = 200  # principal directions kept; all there are if they are fewer
+        # added to the variance of each direction [standardised^2]
         ridge: float = Field(default=0.1, ge=0, allow_inf_nan=False)
 
     precision = torch.float32

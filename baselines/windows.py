@@ -57,16 +57,6 @@ class WindowSampler(Sampler[int]):
 
     With several ranks each takes every ranks-th window of the one order, and the last few windows
     that do not go round are left out.
-
-    Args:
-        data: what is drawn from.
-        seed: seed of all epochs.
-        rank: which part to draw; by default that of torch.distributed, else 0.
-        ranks: number of parts; by default that of torch.distributed, else 1.
-
-    Attributes:
-        epoch: epoch that is drawn from.
-        position: windows of its order that the ranks together have drawn.
     """
 
     def __init__(
@@ -82,10 +72,10 @@ class WindowSampler(Sampler[int]):
                 expected=f"0 <= rank < ranks <= {len(data)}",
                 got=f"rank {self.rank} of {self.ranks}",
             )
-        self.data = data
-        self.seed = seed
-        self.epoch = 0
-        self.position = 0
+        self.data = data  # what is drawn from
+        self.seed = seed  # seed of all epochs
+        self.epoch = 0  # epoch that is drawn from
+        self.position = 0  # windows of its order that the ranks together have drawn
 
     def __len__(self) -> int:
         """Return the windows of a whole epoch for one rank."""
@@ -115,10 +105,6 @@ class WindowSampler(Sampler[int]):
 
         Loaders with worker processes draw ahead of the training: give the position that follows
         from the steps taken.
-
-        Args:
-            epoch: epoch, from 0.
-            position: windows of its order that the ranks together have used.
         """
         self.epoch, self.position = epoch, position
 
@@ -143,22 +129,14 @@ def _permutation(rng: np.random.Generator, length: int) -> NDArray[np.intp]:
 
 
 class Window(NamedTuple):
-    """Consecutive frames of one scenario.
+    """Consecutive frames of one scenario."""
 
-    Attributes:
-        position: particle positions [length], float32, shape [particle, frame, 2].
-        material: 0 liquid, 1 jelly, 2 snow, 3 rope, int64, shape [particle].
-        wall_velocity: velocity of the walls [length/s], float32, shape [frame, wall, 2]; None in
-            a split without moving walls.
-        scenario: scenario id.
-        frame: absolute number of the first frame.
-    """
-
-    position: Tensor
-    material: Tensor
+    position: Tensor  # particle positions [length], float32, shape [particle, frame, 2]
+    material: Tensor  # 0 liquid, 1 jelly, 2 snow, 3 rope, int64, shape [particle]
+    # velocity of the walls [length/s], float32, shape [frame, wall, 2]; None in a split without moving walls
     wall_velocity: Tensor | None
-    scenario: int
-    frame: int
+    scenario: int  # scenario id
+    frame: int  # absolute number of the first frame
 
 
 class WindowDataset(Dataset[Window]):
@@ -177,10 +155,6 @@ class WindowDataset(Dataset[Window]):
         future: frames after them.
         registry: what describes the data set; ours by default.
         cache_bytes: frames kept decompressed [bytes]; with less, reading is slower, never different.
-
-    Attributes:
-        length: frames in a window.
-        starts: number of the first window of each scenario, and the number of all windows.
 
     Raises:
         UsageError: unknown split, size or subset, or no scenario is long enough.
@@ -202,10 +176,11 @@ class WindowDataset(Dataset[Window]):
         entry, folder, _ = locate(split, size, root=root, registry=registry)
         names = (subset,) if isinstance(subset, str) else tuple(subset)
         sources = sources_of(entry, names, folder)
-        self.length = history + future
+        self.length = history + future  # frames in a window
         self.scenarios = tuple(sources)
         self.frame_bytes = 8 * entry.particles
         counts = [max(0, source.frames - self.length + 1) for source in sources.values()]
+        # number of the first window of each scenario, and the number of all windows
         self.starts = (0, *accumulate(counts))
         if history < 1 or future < 0 or not len(self):
             longest = max(source.frames for source in sources.values())
@@ -222,11 +197,7 @@ class WindowDataset(Dataset[Window]):
         return self.starts[-1]
 
     def place(self, index: int) -> tuple[int, int]:
-        """Return scenario id and first frame of a window.
-
-        Raises:
-            IndexError: there is no such window.
-        """
+        """Return scenario id and first frame of a window."""
         if not -len(self) <= index < len(self):
             message = f"no window {index} among {len(self)}"
             raise IndexError(message)
@@ -235,12 +206,7 @@ class WindowDataset(Dataset[Window]):
         return self.scenarios[row], index - self.starts[row]
 
     def __getitem__(self, index: int) -> Window:
-        """Return a window.
-
-        Raises:
-            IndexError: there is no such window.
-            DataError: the file is damaged or not that of the registry.
-        """
+        """Return a window."""
         scenario, frame = self.place(index)
         frames = self._store.frames(scenario, frame, frame + self.length)
         material, walls = self._store.constants(scenario)
@@ -250,11 +216,7 @@ class WindowDataset(Dataset[Window]):
 
 
 def collate(windows: Sequence[Window]) -> Batch:
-    """Put windows side by side.
-
-    Raises:
-        UsageError: no window, windows of unequal lengths, or only some with moving walls.
-    """
+    """Put windows side by side."""
     walls = [window.wall_velocity for window in windows if window.wall_velocity is not None]
     frames = {window.position.shape[1] for window in windows}
     if len(frames) != 1 or len(walls) not in (0, len(windows)):
@@ -276,16 +238,7 @@ def collate(windows: Sequence[Window]) -> Batch:
 
 
 def scenario_batch(paths: Path | Sequence[Path], frames: slice = slice(None)) -> Batch:
-    """Return the same frames of one or several whole scenarios, for rollouts and validation.
-
-    Args:
-        paths: scenario files, see :func:`scenario_paths`.
-        frames: consecutive frames, all by default.
-
-    Raises:
-        DataError: a file is missing or damaged.
-        UsageError: the scenarios have unequal numbers of these frames.
-    """
+    """Return the same frames of one or several whole scenarios, for rollouts and validation."""
     return collate([_read(path, frames) for path in ([paths] if isinstance(paths, Path) else paths)])
 
 
@@ -297,12 +250,7 @@ def scenario_paths(
     root: str | Path | None = None,
     registry: Registry | None = None,
 ) -> dict[int, Path]:
-    """Return the files of a subset by scenario id; all of them exist.
-
-    Raises:
-        UsageError: unknown split, size or subset.
-        DataError: scenarios are missing; the message has the command that makes them.
-    """
+    """Return the files of a subset by scenario id; all of them exist."""
     entry, folder, _ = locate(split, size, root=root, registry=registry)
     return {i: source.path for i, source in sources_of(entry, (subset,), folder).items()}
 

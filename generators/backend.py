@@ -50,15 +50,6 @@ def start(device: Device, *, scenarios: int = 1, threads: int | None = None) -> 
     """Start Taichi for a device unless it runs, and return the threads for parallel loops.
 
     The first call in a process fixes the size of the thread pool; idle threads sleep.
-
-    Args:
-        device: where the kernels will run.
-        scenarios: scenarios advanced together.
-        threads: threads that parallel loops use; None for all of the pool.
-
-    Raises:
-        UsageError: no Taichi, CPU and CUDA in one process, more threads than the pool has, or several
-            scenarios on the serial device.
     """
     if device is Device.CPU and scenarios != 1:
         raise UsageError(
@@ -115,11 +106,7 @@ def _initialise(on_gpu: bool, pool: int) -> None:
 
 
 def place(*groups: tuple[tuple[int, ...], Sequence[Any]]) -> Any:  # noqa: ANN401 (Taichi is untyped)
-    """Give fields their memory: each group (shape, fields) is one array of structs.
-
-    Returns:
-        Taichi's SNode tree, whose ``destroy()`` releases the memory.
-    """
+    """Give fields their memory: each group (shape, fields) is one array of structs."""
     builder = ti.FieldsBuilder()
     for shape, fields in groups:
         axes = (ti.i, ti.ij, ti.ijk, ti.ijkl)[len(shape) - 1]

@@ -39,11 +39,7 @@ def solver_parameters(size: Size) -> ClosedBoxParameters:
 def _wall_motion(
     rng: RandomSource, walls: tuple[str, ...], speed: float
 ) -> tuple[NDArray[np.float64], str, str]:
-    """Draw which way the walls move.
-
-    Returns:
-        Velocity of each wall [length/s], shape [4, 2]; the walls and directions in words.
-    """
+    """Draw which way the walls move."""
     signs = [2 * choice(rng, 2) - 1 for _ in walls]
     velocity = np.zeros((len(WALLS), 2))
     for wall, sign in zip(walls, signs, strict=True):

@@ -72,16 +72,7 @@ LIMITS = {
 
 
 def check_constants(kind: ParametersType, given: Mapping[str, object], size: Size) -> None:
-    """Refuse constants that a solver cannot use.
-
-    Args:
-        kind: the solver's constants.
-        given: value of each constant that is settled.
-        size: where they come from; for the message.
-
-    Raises:
-        UnreadableFileError: a constant is missing or has no possible value.
-    """
+    """Refuse constants that a solver cannot use."""
     for field in fields(kind):
         if field.name not in given:
             if field.default is MISSING:
@@ -126,15 +117,7 @@ def _missing(name: str, kind: ParametersType, size: Size) -> UnreadableFileError
 
 @contextmanager
 def blamed_on_parameters(size: Size, work: str) -> Iterator[None]:
-    """Turn what a split's module raises over its parameters into an error that names their file.
-
-    Args:
-        size: where the parameters come from.
-        work: what the module is doing.
-
-    Raises:
-        UnreadableFileError: instead of what Python raises on a wrong type or value.
-    """
+    """Turn what a split's module raises over its parameters into an error that names their file."""
     where = f"{size.file}, splits.{size.split}, size {size.name}"
     try:
         yield
@@ -158,16 +141,7 @@ Kind = TypeVar("Kind", ClosedBoxParameters, FreeSurfaceParameters)
 
 
 def constants(kind: type[Kind], size: Size, **fixed: object) -> Kind:
-    """Return the solver constants that a size names; others keep their defaults.
-
-    Args:
-        kind: which solver's constants.
-        size: source of every constant of the same name, and of dt.
-        **fixed: what the split settles itself, such as ``no_slip``.
-
-    Raises:
-        UnreadableFileError: the size lacks a constant, or its value is none that a solver can use.
-    """
+    """Return the solver constants that a size names; others keep their defaults."""
     given = {f.name: size.value(f.name) for f in fields(kind) if f.name in size.parameters}
     settled = {"dt": size.dt, **given, **fixed}
     check_constants(kind, settled, size)

@@ -53,12 +53,6 @@ _LIQUID, _SNOW, _ROPE = int(Material.LIQUID), int(Material.SNOW), int(Material.R
 class ParticleStress:
     """Fields of a batch of scenarios and the kernels that advance them.
 
-    Args:
-        parameters: constants that the scenarios share.
-        scenarios: scenarios advanced together.
-        atomic: whether several threads run the phases.
-        threads: threads of the parallel loops on a CPU.
-
     Attributes:
         x: particle positions [length].
         v: particle velocities [length/s].
@@ -80,10 +74,10 @@ class ParticleStress:
         self, parameters: FreeSurfaceParameters, *, scenarios: int, atomic: bool, threads: int
     ) -> None:
         """Round the constants and take the memory."""
-        self.parameters = parameters
-        self.scenarios = scenarios
-        self.atomic = atomic
-        self.threads = threads
+        self.parameters = parameters  # constants that the scenarios share
+        self.scenarios = scenarios  # scenarios advanced together
+        self.atomic = atomic  # whether several threads run the phases
+        self.threads = threads  # threads of the parallel loops on a CPU
         self._set_constants()
         self._make_fields()
 

@@ -49,46 +49,27 @@ _FILE_NAMES = {"reynolds": "reynolds_number"}
 
 @dataclass(frozen=True, kw_only=True)
 class Facts:
-    """What one simulated scenario went through; the manifest states it.
+    """What one simulated scenario went through; the manifest states it."""
 
-    Attributes:
-        start_substep: substeps before frame 0.
-        kinetic_energy_first: sum of m v^2 / 2 at frame 0.
-        kinetic_energy_last: the same at the last frame.
-        kinetic_energy_max: the largest of any frame.
-        kinetic_energy_mean: the mean over frames.
-        energy_last_over_max: last over largest; small where the motion has died down.
-        max_speed: largest velocity component at any substep [length/s].
-        cfl: cells that this speed crosses per substep [1].
-        jacobian_min: smallest J of any particle at any substep [1].
-        jacobian_max: largest J of any particle at any substep [1].
-    """
-
-    start_substep: int
-    kinetic_energy_first: float
-    kinetic_energy_last: float
-    kinetic_energy_max: float
-    kinetic_energy_mean: float
-    energy_last_over_max: float
-    max_speed: float
-    cfl: float
-    jacobian_min: float
-    jacobian_max: float
+    start_substep: int  # substeps before frame 0
+    kinetic_energy_first: float  # sum of m v^2 / 2 at frame 0
+    kinetic_energy_last: float  # the same at the last frame
+    kinetic_energy_max: float  # the largest of any frame
+    kinetic_energy_mean: float  # the mean over frames
+    energy_last_over_max: float  # last over largest; small where the motion has died down
+    max_speed: float  # largest velocity component at any substep [length/s]
+    cfl: float  # cells that this speed crosses per substep [1]
+    jacobian_min: float  # smallest J of any particle at any substep [1]
+    jacobian_max: float  # largest J of any particle at any substep [1]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Simulated:
-    """A scenario that was simulated and written.
+    """A scenario that was simulated and written."""
 
-    Attributes:
-        scenario: its id.
-        content_sha256: content hash of its file.
-        facts: see :class:`Facts`, as a plain mapping.
-    """
-
-    scenario: int
-    content_sha256: str
-    facts: dict[str, int | float]
+    scenario: int  # its id
+    content_sha256: str  # content hash of its file
+    facts: dict[str, int | float]  # see Facts, as a plain mapping
 
 
 def scenario_key(size: Size, scenario: int) -> ScenarioKey:
@@ -166,16 +147,7 @@ def _facts(batch: Batch, index: int, energies: list[float]) -> Facts:
 
 
 def simulate(job: SimulationJob, report: Report) -> list[Simulated]:
-    """Simulate the scenarios of a job and write their files, all or none of them.
-
-    Args:
-        job: what to simulate and where to write it.
-        report: told the substeps done.
-
-    Raises:
-        WorkFailedError: a scenario blew up (which one, at which substep, which bound), or a
-            file cannot be written; then no file of the job appears.
-    """
+    """Simulate the scenarios of a job and write their files, all or none of them."""
     batch = Batch(job, report)
     with ExitStack() as stack:
         recordings = [

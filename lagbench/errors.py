@@ -30,15 +30,7 @@ __all__ = [
 
 
 class LagbenchError(Exception):
-    """Base of every error that lagbench raises on purpose.
-
-    Args:
-        what: what is wrong, one clause without a full stop.
-        where: file, key, variable or flag concerned.
-        expected: what would have been right.
-        got: what was found.
-        fix: what the user can do about it.
-    """
+    """Base of every error that lagbench raises on purpose."""
 
     exit_code: ClassVar[int] = 1
 
@@ -51,11 +43,11 @@ class LagbenchError(Exception):
         got: object = None,
         fix: str | None = None,
     ) -> None:
-        self.what = what
-        self.where = where
-        self.expected = expected
-        self.got = got
-        self.fix = fix
+        self.what = what  # what is wrong, one clause without a full stop
+        self.where = where  # file, key, variable or flag concerned
+        self.expected = expected  # what would have been right
+        self.got = got  # what was found
+        self.fix = fix  # what the user can do about it
         super().__init__(self._compose())
 
     def _compose(self) -> str:
@@ -123,15 +115,7 @@ def nearest(name: str, known: Iterable[str]) -> str:
 
 
 def require(module: str, *, extra: str) -> ModuleType:
-    """Import an optional module.
-
-    Args:
-        module: dotted name of the module.
-        extra: extra of lagbench that installs it.
-
-    Raises:
-        UsageError: it is not installed; the message holds the command that installs it.
-    """
+    """Import an optional module."""
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:

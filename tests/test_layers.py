@@ -29,7 +29,11 @@ LAYERS = (
 )
 """The folders of the package, lowest first: each may import its own layer's and those before it."""
 
-NEVER = {"baselines": {"generators", "make"}, "generators": {"metrics", "draw"}, "metrics": {"draw", "generators"}}
+NEVER = {
+    "baselines": {"generators", "make"},
+    "generators": {"metrics", "draw"},
+    "metrics": {"draw", "generators"},
+}
 """What stays apart although a layer would allow it: models learn from files, the solver knows no score."""
 
 HEAVY = ("taichi", "torch", "matplotlib", "xarray", "pandas", "scipy", "dask", "netCDF4", "numpy")
@@ -132,7 +136,9 @@ def test_a_script_beside_the_clone_imports_the_package(tmp_path: Path, editable:
     script.write_text("import lagbench; print(lagbench.list_splits()[0])", encoding="utf-8")
     # What both installs come to: a path entry after the script's own folder.
     start = f"import sys, runpy; sys.path[0] = {str(tmp_path)!r}; sys.path.insert(1, {str(source)!r}); runpy.run_path({str(script)!r})"
-    done = subprocess.run([sys.executable, "-c", start], cwd=tmp_path, capture_output=True, text=True, check=True, timeout=60)
+    done = subprocess.run(
+        [sys.executable, "-c", start], cwd=tmp_path, capture_output=True, text=True, check=True, timeout=60
+    )
     assert done.stdout.strip() == "cavity"
 
 

@@ -31,15 +31,10 @@ AFTER = (1, 5, 10, 20, 30, 40)
 
 @dataclass(frozen=True, kw_only=True)
 class Figure:
-    """A figure of truth above prediction for some test cases.
+    """A figure of truth above prediction for some test cases."""
 
-    Attributes:
-        cases: numbers of the test cases, T0 first.
-        styles: quiver, streamlines: one picture each.
-    """
-
-    cases: tuple[int, ...]
-    styles: tuple[str, ...]
+    cases: tuple[int, ...]  # numbers of the test cases, T0 first
+    styles: tuple[str, ...]  # quiver, streamlines: one picture each
 
 
 FIGURES: Mapping[str, Figure] = {

@@ -40,19 +40,6 @@ def make_run(
 
     An interrupted training goes on where it stopped; predictions and scores of other data are
     made again.
-
-    Args:
-        plan: what was asked for.
-        split: name of the split.
-        model: what to train.
-        seed: seed of the training.
-        progress: called as the work advances.
-        say: called with what is made again, and why.
-
-    Raises:
-        UsageError: the folder holds a training with another recipe.
-        DataError: it holds a training on other data.
-        LagbenchError: as training, prediction and scoring do.
     """
     folder = plan.folder(split, model, seed)
     predictions, scores = folder / PREDICTIONS, folder / NETCDF_NAME
@@ -91,19 +78,7 @@ def make_training(
     folder: Path,
     progress: Callable[[Progress], None] | None = None,
 ) -> None:
-    """Train a model unless its training is complete.
-
-    Args:
-        plan: what was asked for.
-        split: name of the split.
-        model: what to train.
-        seed: seed of the training.
-        folder: folder of the run.
-        progress: called as the work advances.
-
-    Raises:
-        LagbenchError: as :func:`lagbench.baselines.train.train` does.
-    """
+    """Train a model unless its training is complete."""
     if _complete(folder):
         return
     from lagbench.baselines.train import train
@@ -125,19 +100,7 @@ def make_training(
 
 
 def check_training(plan: Plan, split: str, model: Model, seed: int, *, folder: Path) -> None:
-    """Refuse a folder whose training is not the one that was asked for.
-
-    Args:
-        plan: what was asked for.
-        split: name of the split.
-        model: what to train.
-        seed: seed of the training.
-        folder: folder of the run; one without a record passes.
-
-    Raises:
-        UsageError: it was trained with another recipe.
-        DataError: it was trained on other data.
-    """
+    """Refuse a folder whose training is not the one that was asked for."""
     record = read_json(folder / RECORD_NAME)
     if not record:
         return
@@ -156,11 +119,7 @@ def check_training(plan: Plan, split: str, model: Model, seed: int, *, folder: P
 
 
 def outlook(plan: Plan, split: str, model: Model, seed: int) -> str:
-    """Return what :func:`make_run` would do, in words; nothing is made.
-
-    Raises:
-        LagbenchError: as :func:`make_run` does before it makes anything.
-    """
+    """Return what :func:`make_run` would do, in words; nothing is made."""
     folder = plan.folder(split, model, seed)
     check_training(plan, split, model, seed, folder=folder)
     stale = _stale(plan.hash(split), folder)

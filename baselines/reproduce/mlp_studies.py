@@ -79,13 +79,7 @@ def study_folder(plan: Plan, name: str, study: Study) -> Path:
 
 
 def make_studies(plan: Plan, name: str, progress: Callable[[Progress], None] | None = None) -> None:
-    """Train the rows of a table and measure their errors, unless that was done.
-
-    Raises:
-        UsageError: a folder holds a training with another recipe.
-        DataError: a folder holds a training on other data.
-        LagbenchError: as training does.
-    """
+    """Train the rows of a table and measure their errors, unless that was done."""
     split = TABLES[name][1]
     for study in study_rows(name):
         folder, model = study_folder(plan, name, study), study_model(plan, study)

@@ -18,11 +18,7 @@ SPLITS = {"table_5_1": "curl-noise", "table_5_3": "cavity"}
 
 
 def table(plan: Plan, name: str) -> Sheet:
-    """Return the statistics of one split.
-
-    Raises:
-        DataError: they are recorded nowhere.
-    """
+    """Return the statistics of one split."""
     split = SPLITS[name]
     tier = plan.tier(split)
     manifest = read_manifest(plan.root, split, plan.size, tier.major)

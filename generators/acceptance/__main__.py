@@ -78,11 +78,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def settings(given: argparse.Namespace) -> Experiment:
-    """Return the experiment that the options ask for.
-
-    Raises:
-        UsageError: an option does not fit.
-    """
+    """Return the experiment that the options ask for."""
     default = 100_000 if given.case is Case.CAVITY else 30_000 * given.grid // 40
     return plan(
         given.case,
@@ -99,11 +95,7 @@ def settings(given: argparse.Namespace) -> Experiment:
 
 
 def check_outputs(given: argparse.Namespace) -> None:
-    """Make sure that the files can be written, before the long run.
-
-    Raises:
-        UsageError: one cannot, or curl noise is asked for its centre lines.
-    """
+    """Make sure that the files can be written, before the long run."""
     if given.profiles is not None and given.case is not Case.CAVITY:
         raise UsageError("curl noise has no centre-line profiles", where="--profiles", fix="leave it out")
     if given.profiles is not None and given.profiles.suffix.lower() not in {".png", ".pdf", ".svg"}:

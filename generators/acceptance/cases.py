@@ -54,60 +54,36 @@ Report = Callable[[int], None]
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Check:
-    """State of the box at one substep.
+    """State of the box at one substep."""
 
-    Attributes:
-        substep: when.
-        jacobian_min: smallest J of any particle [1].
-        jacobian_max: largest J of any particle [1].
-        jacobian_min_outside_lid_corners: the same without the 5 x 5 cells at either end of a
-            lid [1].
-        jacobian_max_outside_lid_corners: likewise [1].
-        empty_cells: cells without a particle.
-        particles_per_cell_min: particles in the emptiest cell.
-        particles_per_cell_max: particles in the fullest cell.
-        divergence_rms: of the nodal velocity [1/s].
-        vorticity_rms: of the nodal velocity [1/s].
-        divergence_over_vorticity: their ratio [1]; NaN for a fluid at rest.
-    """
-
-    substep: int
-    jacobian_min: float
-    jacobian_max: float
-    jacobian_min_outside_lid_corners: float
-    jacobian_max_outside_lid_corners: float
-    empty_cells: int
-    particles_per_cell_min: int
-    particles_per_cell_max: int
-    divergence_rms: float
-    vorticity_rms: float
-    divergence_over_vorticity: float
+    substep: int  # when
+    jacobian_min: float  # smallest J of any particle [1]
+    jacobian_max: float  # largest J of any particle [1]
+    jacobian_min_outside_lid_corners: float  # the same without the 5 x 5 cells at either end of a lid [1]
+    jacobian_max_outside_lid_corners: float  # likewise [1]
+    empty_cells: int  # cells without a particle
+    particles_per_cell_min: int  # particles in the emptiest cell
+    particles_per_cell_max: int  # particles in the fullest cell
+    divergence_rms: float  # of the nodal velocity [1/s]
+    vorticity_rms: float  # of the nodal velocity [1/s]
+    divergence_over_vorticity: float  # their ratio [1]; NaN for a fluid at rest
 
 
 @dataclasses.dataclass(kw_only=True)
 class Result:
-    """What a run has shown so far.
+    """What a run has shown so far."""
 
-    Attributes:
-        experiment: the settings.
-        checks: one per check, in time order.
-        frame_substeps: substep of each record of the energy, 0 first.
-        kinetic_energy: E = sum m v_p^2 / 2 at each of them [mass length^2/s^2].
-        displacement_energy: sum m (x(f) - x(f-1))^2 / 2 of each whole frame from the first
-            [mass length^2].
-        averaged_from: first substep of the velocity average.
-        profiles: centre lines; None in curl noise.
-        seconds: wall time spent in the solver [s].
-    """
-
-    experiment: Experiment
-    checks: list[Check] = dataclasses.field(default_factory=list)
+    experiment: Experiment  # the settings
+    checks: list[Check] = dataclasses.field(default_factory=list)  # one per check, in time order
+    # substep of each record of the energy, 0 first
     frame_substeps: list[int] = dataclasses.field(default_factory=list)
+    # E = sum m v_p^2 / 2 at each of them [mass length^2/s^2]
     kinetic_energy: list[float] = dataclasses.field(default_factory=list)
+    # sum m (x(f) - x(f-1))^2 / 2 of each whole frame from the first [mass length^2]
     displacement_energy: list[float] = dataclasses.field(default_factory=list)
-    averaged_from: int
-    profiles: Profiles | None = None
-    seconds: float = 0.0
+    averaged_from: int  # first substep of the velocity average
+    profiles: Profiles | None = None  # centre lines; None in curl noise
+    seconds: float = 0.0  # wall time spent in the solver [s]
 
     @property
     def retention(self) -> float | None:
@@ -214,16 +190,7 @@ def averaged(experiment: Experiment) -> int:
 
 
 def run(experiment: Experiment, *, device: Device = Device.CPU, report: Report = lambda _: None) -> Result:
-    """Simulate an experiment and measure it.
-
-    Args:
-        experiment: what to simulate.
-        device: where.
-        report: told the substeps done so far.
-
-    Raises:
-        WorkFailedError: the solver left the range in which it is valid.
-    """
+    """Simulate an experiment and measure it."""
     running = _Run(experiment, device)
     running.record_frame(0)
     done = 0

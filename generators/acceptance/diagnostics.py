@@ -41,17 +41,11 @@ Reals = NDArray[np.floating]
 
 @dataclass(frozen=True, kw_only=True)
 class Box:
-    """A square box whose walls lie half-way between nodes.
+    """A square box whose walls lie half-way between nodes."""
 
-    Attributes:
-        low: coordinate of the left and bottom walls [length].
-        high: coordinate of the right and top walls [length].
-        cells: whole cells between two walls; each is centred at a node.
-    """
-
-    low: float
-    high: float
-    cells: int
+    low: float  # coordinate of the left and bottom walls [length]
+    high: float  # coordinate of the right and top walls [length]
+    cells: int  # whole cells between two walls; each is centred at a node
 
     @property
     def width(self) -> float:
@@ -110,15 +104,10 @@ def displacement_energy(after: Reals, before: Reals, mass: float) -> float:
 
 @dataclass(frozen=True)
 class Rates:
-    """Velocity gradients of a flow.
+    """Velocity gradients of a flow."""
 
-    Attributes:
-        divergence: RMS of u_x + v_y [1/s].
-        vorticity: RMS of v_x - u_y [1/s].
-    """
-
-    divergence: float
-    vorticity: float
+    divergence: float  # RMS of u_x + v_y [1/s]
+    vorticity: float  # RMS of v_x - u_y [1/s]
 
     @property
     def ratio(self) -> float:
@@ -150,15 +139,10 @@ _DRAWN_POINTS = 201
 
 @dataclass(frozen=True)
 class Profiles:
-    """Velocity on the two centre lines, as splines in units of box width and lid speed.
+    """Velocity on the two centre lines, as splines in units of box width and lid speed."""
 
-    Attributes:
-        u: u/U against height on x = 1/2.
-        v: v/U against abscissa on y = 1/2.
-    """
-
-    u: CubicSpline
-    v: CubicSpline
+    u: CubicSpline  # u/U against height on x = 1/2
+    v: CubicSpline  # v/U against abscissa on y = 1/2
 
     def at_reference_points(self) -> ghia.CentreLines:
         """Return both profiles where Ghia, Ghia & Shin tabulate theirs."""
@@ -189,14 +173,7 @@ def _spline(nodes: Array, values: Array, at_low: float, at_high: float) -> Cubic
 
 
 def draw(profiles: Profiles, reference: ghia.CentreLines | None, title: str, path: Path) -> None:
-    """Draw u against height and v against abscissa, Ghia's points over them.
-
-    Args:
-        profiles: what was computed.
-        reference: what is tabulated at this Reynolds number, if anything is.
-        title: what the figure shows.
-        path: picture to write; its ending chooses the format.
-    """
+    """Draw u against height and v against abscissa, Ghia's points over them."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9.0, 4.2), layout="constrained")

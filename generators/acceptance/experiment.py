@@ -53,32 +53,19 @@ class Case(enum.StrEnum):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Experiment:
-    """Settings of one run, checked and complete; :func:`plan` makes them.
+    """Settings of one run, checked and complete; :func:`plan` makes them."""
 
-    Attributes:
-        case: which box.
-        reynolds: U L / nu with the lid speed U, or the initial RMS speed in curl noise [1];
-            None for an inviscid fluid.
-        grid: cells across the unit box.
-        particles: particles.
-        substeps: solver steps.
-        dt: substep [s].
-        lid_speed: speed of the top wall [length/s]; 0 in curl noise.
-        lid_off_after: substep after which the lid stands still, None for never.
-        frequency: Perlin lattice cells across the box; 0 in the cavity.
-        seed: seed of the particle lattice and of the stirring.
-    """
-
-    case: Case
+    case: Case  # which box
+    # U L / nu with the lid speed U, or the initial RMS speed in curl noise [1]; None for an inviscid fluid
     reynolds: float | None
-    grid: int
+    grid: int  # cells across the unit box
     particles: int
-    substeps: int
-    dt: float
-    lid_speed: float
-    lid_off_after: int | None
-    frequency: int
-    seed: int
+    substeps: int  # solver steps
+    dt: float  # substep [s]
+    lid_speed: float  # speed of the top wall [length/s]; 0 in curl noise
+    lid_off_after: int | None  # substep after which the lid stands still, None for never
+    frequency: int  # Perlin lattice cells across the box; 0 in the cavity
+    seed: int  # seed of the particle lattice and of the stirring
 
     @property
     def frame_substeps(self) -> int:
@@ -103,12 +90,7 @@ def plan(
     frequency: int | None = None,
     seed: int = 0,
 ) -> Experiment:
-    """Complete and check the settings of a run; attributes as in :class:`Experiment`.
-
-    Raises:
-        UsageError: a setting outside the range in which the solver is valid, or one that the
-            case does not have.
-    """
+    """Complete and check the settings of a run; attributes as in :class:`Experiment`."""
     full = _full(case)
     _check_case(case, reynolds=reynolds, lid=(lid_speed, lid_off_after), frequency=frequency)
     _check(grid >= _LEAST_GRID, "the grid is too small", "--grid", f"at least {_LEAST_GRID}", grid)

@@ -93,28 +93,18 @@ REYNOLDS = tuple(_U)
 
 @dataclass(frozen=True)
 class CentreLines:
-    """Velocities on the two centre lines.
+    """Velocities on the two centre lines."""
 
-    Attributes:
-        u: u/U at (1/2, :data:`Y`) [1], shape [15]; NaN where there is no value.
-        v: v/U at (:data:`X`, 1/2) [1], shape [15]; NaN where there is no value.
-    """
-
-    u: NDArray[np.float64]
-    v: NDArray[np.float64]
+    u: NDArray[np.float64]  # u/U at (1/2, Y) [1], shape [15]; NaN where there is no value
+    v: NDArray[np.float64]  # v/U at (X, 1/2) [1], shape [15]; NaN where there is no value
 
 
 @dataclass(frozen=True)
 class Deviation:
-    """How far one profile lies from another.
+    """How far one profile lies from another."""
 
-    Attributes:
-        rmse: root of the mean squared difference [1]; 0 is perfect.
-        maximum: largest absolute difference [1]; 0 is perfect.
-    """
-
-    rmse: float
-    maximum: float
+    rmse: float  # root of the mean squared difference [1]; 0 is perfect
+    maximum: float  # largest absolute difference [1]; 0 is perfect
 
 
 def centre_lines(reynolds: float) -> CentreLines | None:

@@ -30,12 +30,7 @@ def reported_frames(size: Size) -> tuple[int, ...]:
 
 
 def gaps(scores: StoredScores, size: Size) -> Iterator[tuple[str, str]]:
-    """Yield what the score file of a split and size should hold and does not: expected, got.
-
-    Args:
-        scores: the statistics, of the scenarios and frames of the size.
-        size: its split and size.
-    """
+    """Yield what the score file of a split and size should hold and does not: expected, got."""
     held = next(iter(scores.tallies.values())).names
     known = [metric for metric in METRICS.values() if metric.statistic is not None]
     lacking = [metric.name for metric in known if metric.extra is None and metric.name not in held]

@@ -25,21 +25,7 @@ def write_floor(
     root: str | Path | None = None,
     registry: Registry | None = None,
 ) -> Path:
-    """Write the predictions of a floor.
-
-    Args:
-        name: name of the floor.
-        path: file to write.
-        split: name of the split.
-        size: name of the size.
-        root: folder of all data sets.
-        registry: where splits are described; ours when None.
-
-    Raises:
-        UsageError: unknown floor, split or size.
-        DataError: the test subset is missing or damaged.
-        WorkFailedError: the disk is full or not writable.
-    """
+    """Write the predictions of a floor."""
     if name not in FLOORS:
         raise UsageError(f"no floor {name!r}", where="--floor", fix=nearest(name, FLOORS))
     described, folder = registry or load(), resolve_root(root)

@@ -44,11 +44,7 @@ FOOT = (
 
 
 def render(board: Board) -> str:
-    """Return the page.
-
-    Args:
-        board: what it shows.
-    """
+    """Return the page."""
     style, theme, script = _style(), _part("theme.js"), _script()
     held = {
         "policy": _policy(style, theme, script),

@@ -39,27 +39,16 @@ BOARD = Path("leaderboard")
 
 @dataclass(frozen=True, kw_only=True)
 class SubmitResult:
-    """An entry that was written.
+    """An entry that was written."""
 
-    Attributes:
-        split: name of the split.
-        size: name of the size.
-        method: id of the method.
-        ranking: name of the ranking metric.
-        mean: of the ranking metric over scenarios and seeds; None where undefined.
-        std: over seeds; None for one seed.
-        flags: names of flags that were raised.
-        files: what was written, the YAML file first.
-    """
-
-    split: str
-    size: str
-    method: str
-    ranking: str
-    mean: float | None
-    std: float | None
-    flags: tuple[str, ...]
-    files: tuple[Path, ...]
+    split: str  # name of the split
+    size: str  # name of the size
+    method: str  # id of the method
+    ranking: str  # name of the ranking metric
+    mean: float | None  # of the ranking metric over scenarios and seeds; None where undefined
+    std: float | None  # over seeds; None for one seed
+    flags: tuple[str, ...]  # names of flags that were raised
+    files: tuple[Path, ...]  # what was written, the YAML file first
 
 
 def submit(

@@ -56,38 +56,23 @@ SETTINGS = (
 
 @dataclass(frozen=True, kw_only=True)
 class DemoResult:
-    """One split of the demo: what was generated, how it verified, and its picture.
+    """One split of the demo: what was generated, how it verified, and its picture."""
 
-    Attributes:
-        generation: result of :func:`~lagbench.make.generate.generate`.
-        verification: result of :func:`~lagbench.make.verify.verify`.
-        picture: PNG of the first test scenario at its last frame of interest.
-    """
-
-    generation: GenerationResult
-    verification: VerificationResult
-    picture: Path
+    generation: GenerationResult  # result of generate
+    verification: VerificationResult  # result of verify
+    picture: Path  # PNG of the first test scenario at its last frame of interest
 
 
 @dataclass(frozen=True, kw_only=True)
 class ModelResult:
-    """The model of the demo: how it was trained, what it predicted, how it scored, the page.
+    """The model of the demo: how it was trained, what it predicted, how it scored, the page."""
 
-    Attributes:
-        training: result of :func:`~lagbench.baselines.train.train`.
-        prediction: result of :func:`~lagbench.baselines.predict.predict`.
-        card: its scores beside those of the floors.
-        solver: what our solver takes here; None where it cannot be timed.
-        entries: entries of the leaderboard: the floors, then the model.
-        page: the leaderboard's page.
-    """
-
-    training: TrainingResult
-    prediction: PredictionResult
-    card: ScoreCard
-    solver: SolverBench | None
-    entries: tuple[SubmitResult, ...]
-    page: BuildResult
+    training: TrainingResult  # result of train
+    prediction: PredictionResult  # result of predict
+    card: ScoreCard  # its scores beside those of the floors
+    solver: SolverBench | None  # what our solver takes here; None where it cannot be timed
+    entries: tuple[SubmitResult, ...]  # entries of the leaderboard: the floors, then the model
+    page: BuildResult  # the leaderboard's page
 
     def as_json(self) -> dict[str, Any]:
         """Return the fields by name, the card as what scores.json holds."""

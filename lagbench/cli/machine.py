@@ -61,28 +61,18 @@ OPTIONAL = {
 
 @dataclass(frozen=True, kw_only=True)
 class Check:
-    """One thing looked at.
+    """One thing looked at."""
 
-    Attributes:
-        name: what it is.
-        state: "ok", "missing" (something optional) or "broken".
-        detail: what was found, and how to mend it.
-    """
-
-    name: str
-    state: str
-    detail: str
+    name: str  # what it is
+    state: str  # "ok", "missing" (something optional) or "broken"
+    detail: str  # what was found, and how to mend it
 
 
 @dataclass(frozen=True, kw_only=True)
 class Diagnosis:
-    """All that was looked at.
+    """All that was looked at."""
 
-    Attributes:
-        checks: in the order of looking.
-    """
-
-    checks: tuple[Check, ...]
+    checks: tuple[Check, ...]  # in the order of looking
 
     @property
     def healthy(self) -> bool:
@@ -162,23 +152,15 @@ LEAST = 0.5
 
 @dataclass(frozen=True, kw_only=True)
 class SolverBench:
-    """What a frame costs the solver, one scenario on one core.
+    """What a frame costs the solver, one scenario on one core."""
 
-    Attributes:
-        split: name of the split.
-        size: name of the size.
-        particles: particles of the scenario.
-        substeps: solver steps of a frame.
-        frames: frames that were timed.
-        seconds_per_frame: mean processor time of a frame [s], so that other work on the machine
-            does not count; writing it to disk is not part of it.
-    """
-
-    split: str
-    size: str
-    particles: int
-    substeps: int
-    frames: int
+    split: str  # name of the split
+    size: str  # name of the size
+    particles: int  # particles of the scenario
+    substeps: int  # solver steps of a frame
+    frames: int  # frames that were timed
+    # mean processor time of a frame [s], so that other work on the machine does not count; writing
+    # it to disk is not part of it
     seconds_per_frame: float
 
 

@@ -64,9 +64,6 @@ def plain(value: object) -> object:
 
     Booleans become 0 and 1, because netCDF has none; NumPy scalars and arrays of one element
     become Python numbers; -0.0 becomes 0.0.
-
-    Raises:
-        DataError: not a finite number, a string without NUL, or a mapping or list of such.
     """
     if isinstance(value, np.ndarray):
         value = value.item() if value.size == 1 else value.tolist()
@@ -97,9 +94,6 @@ def canonical_json(value: object) -> bytes:
     Keys sorted by code point, no white space, no escapes beyond what JSON demands, floats in
     the shortest form that reads back equal (``repr``), integers without a point.
 
-    Raises:
-        DataError: see :func:`plain`.
-
     >>> canonical_json({"b": 1, "a": [-0.0, 1e-7]})
     b'{"a":[0.0,1e-07],"b":1}'
     """
@@ -111,9 +105,6 @@ def canonical_json(value: object) -> bytes:
 
 def dtype_name(dtype: object) -> str:
     """Return the name by which a type enters the hash, byte order left out.
-
-    Raises:
-        DataError: neither integer, float nor string.
 
     >>> dtype_name(np.dtype(">f4")), dtype_name(str)
     ('float32', 'string')
@@ -127,17 +118,10 @@ def dtype_name(dtype: object) -> str:
 
 
 class VariableHasher:
-    """SHA-256 of one variable whose values arrive in C order, piece by piece.
-
-    Args:
-        name: name of the variable.
-        dtype: type of its values; byte order does not matter.
-        dims: names of its dimensions.
-        shape: its whole shape.
-    """
+    """SHA-256 of one variable whose values arrive in C order, piece by piece."""
 
     def __init__(self, name: str, dtype: object, dims: Sequence[object], shape: Sequence[int]) -> None:
-        self.name = name
+        self.name = name  # name of the variable
         self.dtype = dtype_name(dtype)
         self._missing = math.prod(shape)
         self._sha = hashlib.sha256()
@@ -146,11 +130,7 @@ class VariableHasher:
         self._sha.update(canonical_json(header) + b"\n")
 
     def update(self, values: ArrayLike) -> None:
-        """Add the next values.
-
-        Raises:
-            DataError: they are of another type, or more than the shape holds.
-        """
+        """Add the next values."""
         array = np.asarray(values)
         if dtype_name(array.dtype) != self.dtype:
             raise self._wrong("values have another type", self.dtype, array.dtype)
@@ -163,11 +143,7 @@ class VariableHasher:
             self._update_numbers(array)
 
     def hexdigest(self) -> str:
-        """Return the hash, 64 hex digits.
-
-        Raises:
-            DataError: fewer values came than the shape holds.
-        """
+        """Return the hash, 64 hex digits."""
         if self._missing:
             raise self._wrong("values are missing", "as many as the shape holds", f"{self._missing} fewer")
         return self._sha.hexdigest()
@@ -207,11 +183,7 @@ def _canonical(block: NDArray[np.generic]) -> NDArray[np.generic]:
 
 
 class ContentHasher:
-    """Content hash of a scenario whose variables arrive side by side.
-
-    Args:
-        identity: split, size, major, scenario, subset, seed and the mapping ``parameters``.
-    """
+    """Content hash of a scenario whose variables arrive side by side."""
 
     def __init__(self, identity: Mapping[str, object]) -> None:
         self._identity = dict(identity)
@@ -222,41 +194,21 @@ class ContentHasher:
         self._variables[name] = VariableHasher(name, dtype, dims, shape)
 
     def update(self, name: str, values: ArrayLike) -> None:
-        """Add the next values of a variable, in C order.
-
-        Raises:
-            DataError: they do not fit what was declared.
-        """
+        """Add the next values of a variable, in C order."""
         self._variables[name].update(values)
 
     def digests(self) -> dict[str, str]:
-        """Return the hash of every variable, sorted by name.
-
-        Raises:
-            DataError: a variable is incomplete; the message names it.
-        """
+        """Return the hash of every variable, sorted by name."""
         return {name: self._variables[name].hexdigest() for name in sorted(self._variables)}
 
     def hexdigest(self) -> str:
-        """Return the content hash, 64 hex digits.
-
-        Raises:
-            DataError: a variable is incomplete; the message names it.
-        """
+        """Return the content hash, 64 hex digits."""
         whole = {**self._identity, "variables": self.digests()}
         return hashlib.sha256(canonical_json(whole)).hexdigest()
 
 
 def content_hash(variables: Mapping[Any, Variable], identity: Mapping[str, object]) -> str:
-    """Return the content hash of variables held in memory.
-
-    Args:
-        variables: name to variable, as in ``xarray.Dataset.variables``.
-        identity: see :class:`ContentHasher`.
-
-    Raises:
-        DataError: a value or type that no scenario file has.
-    """
+    """Return the content hash of variables held in memory."""
     hasher = ContentHasher(identity)
     for name, variable in variables.items():
         values = np.asarray(variable.values)
@@ -272,27 +224,13 @@ def file_sha256(path: Path) -> str:
 
 
 def subset_hash(hashes: Mapping[int, str]) -> str:
-    """Return the SHA-256 of the lines ``{id:04d} {content hash}``, by id.
-
-    Args:
-        hashes: scenario id to content hash, in any order.
-    """
+    """Return the SHA-256 of the lines ``{id:04d} {content hash}``, by id."""
     lines = "".join(f"{scenario:04d} {hashes[scenario]}\n" for scenario in sorted(hashes))
     return hashlib.sha256(lines.encode("ascii")).hexdigest()
 
 
 def dataset_hash(split: str, size: str, major: int, subsets: Mapping[str, str]) -> str:
-    """Return the data set hash over train, valid and test; other subsets are left out.
-
-    Args:
-        split: name of the split.
-        size: name of the size.
-        major: MAJOR of its version.
-        subsets: subset to subset hash.
-
-    Raises:
-        DataError: train, valid or test is missing.
-    """
+    """Return the data set hash over train, valid and test; other subsets are left out."""
     missing = [subset for subset in HASHED_SUBSETS if subset not in subsets]
     if missing:
         raise DataError("the data set hash needs every subset", where=f"{split} {size}", got=f"no {missing}")

@@ -62,18 +62,12 @@ class Placement(enum.StrEnum):
 class Grid:
     """Square grid of nodes over the unit box.
 
-    Attributes:
-        cells: cells across the box.
-        placement: nodes at ``(i + 1/2) / cells`` (cell centres) or at ``i / cells`` (nodes).
-
-    Raises:
-        UsageError: fewer than two cells.
-
     >>> Grid(4, Placement.CELL_CENTRES).axis
     array([0.125, 0.375, 0.625, 0.875])
     """
 
-    cells: int
+    cells: int  # cells across the box
+    # nodes at (i + 1/2) / cells (cell centres) or at i / cells (nodes)
     placement: Placement = Placement.CELL_CENTRES
 
     def __post_init__(self) -> None:
@@ -114,34 +108,21 @@ class Grid:
 
 @dataclass(frozen=True)
 class Transfer:
-    """Sums over the particles around each node.
+    """Sums over the particles around each node."""
 
-    Attributes:
-        weight: ``sum(w)`` [1], shape [..., x node, y node].
-        momentum: ``sum(w u)`` [unit of u], shape [..., x node, y node, 2].
-    """
-
-    weight: Floats
-    momentum: Floats
+    weight: Floats  # sum(w) [1], shape [..., x node, y node]
+    momentum: Floats  # sum(w u) [unit of u], shape [..., x node, y node, 2]
 
 
 @dataclass(frozen=True)
 class Fields:
-    """Grid fields of one frame or a batch of frames.
+    """Grid fields of one frame or a batch of frames."""
 
-    Attributes:
-        grid: where the nodes lie.
-        weight: ``sum(w)`` [1], shape [..., x node, y node].
-        velocity: node velocity, 0 at empty nodes [unit of u], shape [..., x node, y node, 2].
-        counted: nodes that count, shape [..., x node, y node].
-        full: weight of a full interior node [1].
-    """
-
-    grid: Grid
-    weight: Floats
-    velocity: Floats
-    counted: Mask
-    full: float
+    grid: Grid  # where the nodes lie
+    weight: Floats  # sum(w) [1], shape [..., x node, y node]
+    velocity: Floats  # node velocity, 0 at empty nodes [unit of u], shape [..., x node, y node, 2]
+    counted: Mask  # nodes that count, shape [..., x node, y node]
+    full: float  # weight of a full interior node [1]
 
     @property
     def density(self) -> Floats:
@@ -239,11 +220,7 @@ def _scatter(x: Floats, u: Floats, grid: Grid) -> tuple[Floats, Floats]:
 
 
 def _spline(s: Floats) -> Floats:
-    """Return the weights of the three nodes of each axis, shape [2, node, particle].
-
-    Args:
-        s: distance past the base node along each axis, in [1/2, 3/2) [h], shape [2, particle].
-    """
+    """Return the weights of the three nodes of each axis, shape [2, node, particle]."""
     return np.stack([0.5 * (1.5 - s) ** 2, 0.75 - (s - 1.0) ** 2, 0.5 * (s - 0.5) ** 2], axis=1)
 
 

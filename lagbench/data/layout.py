@@ -64,11 +64,7 @@ def as_url(root: str | Path) -> str | None:
 
 
 def open_copy(url: str) -> Path:
-    """Return the working copy of a root in a store; make and mark it where it is not there.
-
-    Raises:
-        WorkFailedError: the cache cannot be written; ``LAGBENCH_CACHE`` names another place.
-    """
+    """Return the working copy of a root in a store; make and mark it where it is not there."""
     folder = _place(url)
     if url_of(folder) != url:
         text = json.dumps({"url": url}, indent=1) + "\n"
@@ -119,21 +115,13 @@ MANIFEST_NAME = "manifest.json"
 
 @dataclass(frozen=True, kw_only=True)
 class ScenarioKey:
-    """What names one scenario.
+    """What names one scenario."""
 
-    Attributes:
-        split: name of the split.
-        size: name of the size.
-        version: semantic version of the split, as in "1.0.0".
-        scenario: id within the size.
-        subset: subset that holds the scenario.
-    """
-
-    split: str
-    size: str
-    version: str
-    scenario: int
-    subset: str
+    split: str  # name of the split
+    size: str  # name of the size
+    version: str  # semantic version of the split, as in "1.0.0"
+    scenario: int  # id within the size
+    subset: str  # subset that holds the scenario
 
     @property
     def major(self) -> int:
@@ -141,12 +129,7 @@ class ScenarioKey:
         return major_of(self.version)
 
     def identity(self, seed: str, parameters: Mapping[str, object]) -> dict[str, object]:
-        """Return what enters the content hash beside the variables.
-
-        Args:
-            seed: how the random numbers were seeded.
-            parameters: physical parameters by name.
-        """
+        """Return what enters the content hash beside the variables."""
         return {
             "split": self.split,
             "size": self.size,

@@ -29,21 +29,13 @@ SUBSETS = ("train", "valid", "test", "extra")
 
 @dataclass(frozen=True, kw_only=True)
 class Limit:
-    """The numbers that a parameter may be.
+    """The numbers that a parameter may be."""
 
-    Attributes:
-        low: least value.
-        high: greatest value.
-        whole: whether it must be an integer.
-        open_low: whether ``low`` itself is too small.
-        open_high: whether ``high`` itself is too large.
-    """
-
-    low: float = -math.inf
-    high: float = math.inf
-    whole: bool = False
-    open_low: bool = False
-    open_high: bool = False
+    low: float = -math.inf  # least value
+    high: float = math.inf  # greatest value
+    whole: bool = False  # whether it must be an integer
+    open_low: bool = False  # whether 'low' itself is too small
+    open_high: bool = False  # whether 'high' itself is too large
 
     def holds(self, value: object) -> bool:
         """Tell whether a value is a finite number within the limit."""
@@ -83,16 +75,7 @@ _NUMBER = Limit()
 
 
 def check_parameters(size: str, given: Mapping[str, Value], declared: Mapping[str, Value | None]) -> None:
-    """Refuse unknown, missing and impossible parameters of a size.
-
-    Args:
-        size: name of the size.
-        given: values that the size gives.
-        declared: values that the split gives; None where each size must.
-
-    Raises:
-        ValueError: says which key, expected, got and the nearest known name.
-    """
+    """Refuse unknown, missing and impossible parameters of a size."""
     for name in given:
         if name not in declared:
             message = f"size {size}: undeclared parameter {name!r}: {nearest(name, declared)}"
@@ -121,11 +104,7 @@ def _check_value(key: str, value: Value | None, limit: Limit | None) -> None:
 
 
 def check_subsets(size: str, subsets: Mapping[str, Sequence[int]]) -> None:
-    """Refuse unknown subsets and ids that stand in two of them.
-
-    Raises:
-        ValueError: says what is wrong.
-    """
+    """Refuse unknown subsets and ids that stand in two of them."""
     unknown = set(subsets) - set(SUBSETS)
     if unknown:
         message = f"size {size}: no subset {min(unknown)!r}: {nearest(min(unknown), SUBSETS)}"
@@ -143,17 +122,7 @@ def check_frames(
     *,
     task_frames: int,
 ) -> None:
-    """Refuse impossible frame counts, and test scenarios shorter than their task.
-
-    Args:
-        size: name of the size.
-        frames: one count for all scenarios, or ids for each count.
-        subsets: ids of each subset.
-        task_frames: frames given and frames to predict together.
-
-    Raises:
-        ValueError: says which key, expected and got.
-    """
+    """Refuse impossible frame counts, and test scenarios shorter than their task."""
     key = f"sizes.{size}.frames"
     ids = sorted(i for subset in subsets.values() for i in subset)
     counts = dict.fromkeys(ids, frames) if isinstance(frames, int) else _counts(size, frames, ids)

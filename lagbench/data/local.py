@@ -62,10 +62,6 @@ class RootedRegistry(Registry):
 
     A local split never replaces one of the same name, and its description is read when it is
     first asked for.
-
-    Args:
-        base: the other splits.
-        root: folder of all data sets.
     """
 
     def __init__(self, base: Registry, root: Path) -> None:
@@ -73,12 +69,7 @@ class RootedRegistry(Registry):
         self.base, self.root = base, root
 
     def split(self, name: str) -> Split:
-        """Return a split by name.
-
-        Raises:
-            UsageError: there is none; the message names the nearest known one.
-            UnreadableFileError: the description of the local split is not right.
-        """
+        """Return a split by name."""
         if name not in self.splits and name in self.local_names():
             self._add(name)
         if name not in self.splits:
@@ -219,11 +210,6 @@ def _described(path: Path, name: str) -> tuple[Split, Mapping[str, Measured]]:
 
 def remedy(size: Size, *options: str, root: Path | None = None) -> str:
     """Return what makes a data set whole again.
-
-    Args:
-        size: the data set.
-        options: what narrows down what is simulated.
-        root: folder of all data sets; of a working copy its store is named.
 
     >>> from lagbench.data.registry import load
     >>> remedy(load().size("cavity", "tiny"), "--subset test")

@@ -38,17 +38,11 @@ HOLDER_NAME = ".lock.holder.json"
 
 @dataclass(frozen=True)
 class Holder:
-    """Who holds a lock.
+    """Who holds a lock."""
 
-    Attributes:
-        pid: process id.
-        host: name of its machine.
-        since: when it took the lock, ISO 8601 in UTC.
-    """
-
-    pid: int
-    host: str
-    since: str
+    pid: int  # process id
+    host: str  # name of its machine
+    since: str  # when it took the lock, ISO 8601 in UTC
 
     def __str__(self) -> str:
         """Return the holder in words."""
@@ -65,20 +59,7 @@ def dataset_lock(
     timeout: float | None = None,
     on_wait: Callable[[str], None] | None = None,
 ) -> Iterator[None]:
-    """Hold the lock of one data set version.
-
-    Args:
-        root: folder of all data sets.
-        split: name of the split.
-        size: name of the size.
-        major: MAJOR of its version.
-        timeout: how long to wait for another writer [s]; None waits for ever, 0 not at all.
-        on_wait: called once with the holder in words before waiting.
-
-    Raises:
-        WorkFailedError: another process still holds the lock after the timeout, or the folder
-            cannot be written.
-    """
+    """Hold the lock of one data set version."""
     import filelock
 
     folder = dataset_folder(root, split, size, major)

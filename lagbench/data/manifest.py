@@ -42,33 +42,20 @@ class _Strict(BaseModel):
 
 
 class FileEntry(_Strict):
-    """One scenario file.
+    """One scenario file."""
 
-    Attributes:
-        scenario: id of the scenario.
-        subset: subset that holds it.
-        path: file relative to the manifest's folder: ``<subset>/<id:04d>.nc`` and nothing else.
-        frames: recorded frames.
-        particles: particles in every frame.
-        content_sha256: content hash.
-        bytes: length of the file.
-        file_sha256: SHA-256 of its bytes; differs between library versions.
-        device: device that simulated it.
-        facts: further numbers by name, such as the energy of the last frame over the largest.
-        twin_floor: position RMSE of the nudged twin at each predicted frame [length]; test only.
-    """
-
-    scenario: int
-    subset: Name
-    path: str
-    frames: int
-    particles: int
-    content_sha256: Hash
-    bytes: int
-    file_sha256: Hash
-    device: str
+    scenario: int  # id of the scenario
+    subset: Name  # subset that holds it
+    path: str  # file relative to the manifest's folder: <subset>/<id:04d>.nc and nothing else
+    frames: int  # recorded frames
+    particles: int  # particles in every frame
+    content_sha256: Hash  # content hash
+    bytes: int  # length of the file
+    file_sha256: Hash  # SHA-256 of its bytes; differs between library versions
+    device: str  # device that simulated it
+    # further numbers by name, such as the energy of the last frame over the largest
     facts: dict[str, float] = Field(default_factory=dict)
-    twin_floor: Row = ()
+    twin_floor: Row = ()  # position RMSE of the nudged twin at each predicted frame [length]; test only
 
     @field_validator("path")
     @classmethod
@@ -87,35 +74,23 @@ class FileEntry(_Strict):
 
 
 class Manifest(_Strict):
-    """All that is recorded about a data set folder.
+    """All that is recorded about a data set folder."""
 
-    Attributes:
-        format: number of this layout.
-        split: name of the split.
-        size: name of the size.
-        version: semantic version of the split.
-        complete: whether every scenario of train, valid and test is there.
-        identity: "bitwise" where every file comes from a machine that promises equal bits or
-            has the hash of datasets.yaml, else "tolerance"; see ``lagbench.work.machine``.
-        dataset_sha256: data set hash; None until complete.
-        subset_sha256: hash of every complete subset.
-        statistics: mean and std per component over train, see ``lagbench.data.statistics``; empty
-            until train is complete.
-        environments: the distinct machines and library versions that wrote files, oldest first.
-        files: scenario files by ascending id.
-    """
-
-    format: Literal[1] = 1
-    split: str
-    size: str
-    version: str
-    complete: bool = False
+    format: Literal[1] = 1  # number of this layout
+    split: str  # name of the split
+    size: str  # name of the size
+    version: str  # semantic version of the split
+    complete: bool = False  # whether every scenario of train, valid and test is there
+    # "bitwise" where every file comes from a machine that promises equal bits or has the hash of
+    # datasets.yaml, else "tolerance"; see lagbench.work.machine
     identity: Literal["bitwise", "tolerance"] = "bitwise"
-    dataset_sha256: Hash | None = None
-    subset_sha256: dict[str, Hash] = Field(default_factory=dict)
+    dataset_sha256: Hash | None = None  # data set hash; None until complete
+    subset_sha256: dict[str, Hash] = Field(default_factory=dict)  # hash of every complete subset
+    # mean and std per component over train, see lagbench.data.statistics; empty until train is complete
     statistics: dict[str, Row] = Field(default_factory=dict)
+    # the distinct machines and library versions that wrote files, oldest first
     environments: Annotated[tuple[dict[str, str], ...], Field(strict=False)] = ()
-    files: Annotated[tuple[FileEntry, ...], Field(strict=False)] = ()
+    files: Annotated[tuple[FileEntry, ...], Field(strict=False)] = ()  # scenario files by ascending id
 
     def entry(self, scenario: int) -> FileEntry | None:
         """Return the entry of a scenario; None where it is not generated."""
@@ -139,17 +114,7 @@ class Manifest(_Strict):
 def describe_file(
     root: Path, key: ScenarioKey, facts: Mapping[str, float] | None = None, *, digest: str | None = None
 ) -> FileEntry:
-    """Return the manifest entry of a scenario file on disk; its content is not re-hashed.
-
-    Args:
-        root: folder that holds all data sets.
-        key: what names the scenario.
-        facts: further numbers by name.
-        digest: SHA-256 of the file's bytes where it is known already.
-
-    Raises:
-        DataError: the file is missing or unreadable.
-    """
+    """Return the manifest entry of a scenario file on disk; its content is not re-hashed."""
     path = scenario_path(root, key)
     with read_scenario(path) as file:
         header = file.header
@@ -179,21 +144,7 @@ def merge(
     recorded: Mapping[int, str] | None = None,
     statistics: Mapping[str, Sequence[float]] | None = None,
 ) -> Manifest:
-    """Return a manifest with new files put in; new entries replace old ones of the same id.
-
-    Args:
-        old: manifest found in the same folder; None where there is none.
-        files: entries of the files just written.
-        split: name of the split.
-        size: name of the size.
-        version: semantic version of the split.
-        subsets: subset to the scenario ids that it must hold.
-        environment: machine and library versions that wrote the new files; None where they
-            were found on disk.
-        recorded: scenario to the first digits of its content hash in datasets.yaml.
-        statistics: statistics over train; when None those of the old manifest, where train
-            is still the same.
-    """
+    """Return a manifest with new files put in; new entries replace old ones of the same id."""
     kept = [entry for entry in old.files if entry.scenario in subsets.get(entry.subset, ())] if old else []
     entries = {entry.scenario: entry for entry in (*kept, *files)}
     hashes = _subset_hashes(entries, subsets)
@@ -218,11 +169,7 @@ def merge(
 
 
 def read_manifest(root: Path, split: str, size: str, major: int) -> Manifest | None:
-    """Return the manifest of a data set folder; None where there is none.
-
-    Raises:
-        DataError: the manifest is unreadable; the message names the key.
-    """
+    """Return the manifest of a data set folder; None where there is none."""
     path = dataset_folder(root, split, size, major) / MANIFEST_NAME
     try:
         text = path.read_bytes()
@@ -243,11 +190,7 @@ def read_manifest(root: Path, split: str, size: str, major: int) -> Manifest | N
 
 
 def write_manifest(root: Path, manifest: Manifest) -> Path:
-    """Write a manifest beside its subsets, whole or not at all; return its path.
-
-    Raises:
-        WorkFailedError: the operating system refused.
-    """
+    """Write a manifest beside its subsets, whole or not at all; return its path."""
     folder = dataset_folder(root, manifest.split, manifest.size, major_of(manifest.version))
     path = folder / MANIFEST_NAME
     write_atomically(path, (manifest.model_dump_json(indent=1) + "\n").encode())

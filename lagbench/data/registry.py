@@ -127,10 +127,6 @@ def added_splits(own: Mapping[str, str], read: Callable[[Path, str], Found]) -> 
 
     A package that cannot be imported or read, or wants a name that is taken, is left out with
     a :class:`PluginWarning`.
-
-    Args:
-        own: our splits and the module of each.
-        read: returns what a datasets.yaml says about one split.
     """
     added: dict[str, Found] = {}
     for point in dict.fromkeys(entry_points(group=GROUP)):
@@ -219,38 +215,24 @@ class ScoreGrid(_Strict):
 
 
 class Task(_Strict):
-    """What a model is given and what it must predict.
+    """What a model is given and what it must predict."""
 
-    Attributes:
-        input_frames: frames given at the start of a test scenario.
-        horizon: frames to predict after them.
-        frames_of_interest: absolute frames at which the scorer reports.
-        score_grid: grid of the scorer's fields.
-        radius: connectivity radius for graph models [length].
-    """
-
-    input_frames: int = Field(gt=1)
-    horizon: int = Field(gt=0)
-    frames_of_interest: tuple[int, ...] = Field(strict=False)
-    score_grid: ScoreGrid
-    radius: float = Field(gt=0, allow_inf_nan=False)
+    input_frames: int = Field(gt=1)  # frames given at the start of a test scenario
+    horizon: int = Field(gt=0)  # frames to predict after them
+    frames_of_interest: tuple[int, ...] = Field(strict=False)  # absolute frames at which the scorer reports
+    score_grid: ScoreGrid  # grid of the scorer's fields
+    radius: float = Field(gt=0, allow_inf_nan=False)  # connectivity radius for graph models [length]
 
 
 class Measured(_Strict):
-    """What follows from the parameters: hashes, statistics of train, twin floor.
+    """What follows from the parameters: hashes, statistics of train, twin floor."""
 
-    Attributes:
-        dataset_sha256: data set hash over train, valid and test.
-        subset_sha256: hash of each subset.
-        scenario_sha256: content hash of each scenario, first 16 hex digits.
-        statistics: mean and standard deviation per component over train.
-        twin_floor: position RMSE of the perturbed twin per predicted frame, mean over test [length].
-    """
-
-    dataset_sha256: Hash
-    subset_sha256: dict[str, Hash]
-    scenario_sha256: dict[int, ShortHash]
+    dataset_sha256: Hash  # data set hash over train, valid and test
+    subset_sha256: dict[str, Hash]  # hash of each subset
+    scenario_sha256: dict[int, ShortHash]  # content hash of each scenario, first 16 hex digits
+    # mean and standard deviation per component over train
     statistics: dict[str, Annotated[tuple[float, ...], Field(strict=False)]]
+    # position RMSE of the perturbed twin per predicted frame, mean over test [length]
     twin_floor: tuple[float, ...] = Field(strict=False)
 
 
@@ -295,11 +277,7 @@ class Size(BaseModel):
         return self.generator != NO_GENERATOR
 
     def value(self, name: str) -> Any:  # noqa: ANN401
-        """Return a parameter's value.
-
-        Raises:
-            UsageError: this split has no such parameter.
-        """
+        """Return a parameter's value."""
         try:
             return self.parameters[name].value
         except KeyError:
@@ -340,11 +318,7 @@ class Size(BaseModel):
         return tuple(sorted(i for ids in self.subsets.values() for i in ids))
 
     def subset_of(self, scenario: int) -> str:
-        """Return the subset that a scenario belongs to.
-
-        Raises:
-            UsageError: no subset has this id.
-        """
+        """Return the subset that a scenario belongs to."""
         for subset, ids in self.subsets.items():
             if scenario in ids:
                 return subset
@@ -399,21 +373,13 @@ class Registry:
         self.files = dict(files or {})
 
     def split(self, name: str) -> Split:
-        """Return a split by name.
-
-        Raises:
-            UsageError: there is none; the message names the nearest known one.
-        """
+        """Return a split by name."""
         if name not in self.splits:
             raise UsageError(f"no split {name!r}", where="--split", fix=nearest(name, self.splits))
         return self.splits[name]
 
     def size(self, split: str, name: str) -> Size:
-        """Return one size of a split with its merged parameters and measured values.
-
-        Raises:
-            UsageError: unknown split or size; the message names the nearest known one.
-        """
+        """Return one size of a split with its merged parameters and measured values."""
         parent = self.split(split)
         if name not in parent.sizes:
             raise UsageError(

@@ -73,25 +73,14 @@ _FREE = {"content_sha256", "long_name"}
 
 
 def attributes_of(name: str, dims: Sequence[str]) -> dict[str, object]:
-    """Return the attributes that a variable is written with.
-
-    Args:
-        name: one of :data:`ATTRIBUTES`.
-        dims: its dimensions.
-    """
+    """Return the attributes that a variable is written with."""
     # xarray makes a coordinate only of what the CF attribute `coordinates` names.
     extra = {"coordinates": "time"} if "frame" in dims and len(dims) > 1 else {}
     return {**ATTRIBUTES[name], **extra}
 
 
 def differing_attributes(name: str, dims: Sequence[str], found: Mapping[str, object]) -> list[str]:
-    """Return the names of attributes that are missing, unknown or say something else.
-
-    Args:
-        name: name of the variable.
-        dims: its dimensions.
-        found: its attributes as read from a file.
-    """
+    """Return the names of attributes that are missing, unknown or say something else."""
     wanted = attributes_of(name, dims) if name in ATTRIBUTES else {}
     names = (wanted.keys() | found.keys()) - _FREE
     return sorted(n for n in names if not _equal(wanted.get(n), found.get(n)))
@@ -117,31 +106,18 @@ _REPAIR = "lagbench generate writes it anew; a local split is made again by lagb
 
 @dataclass(frozen=True, kw_only=True)
 class ScenarioHeader:
-    """What a scenario file says about itself.
+    """What a scenario file says about itself."""
 
-    Attributes:
-        key: what names the scenario.
-        seed: how the random numbers were seeded.
-        parameters: physical parameters by name, those that enter the content hash.
-        content_sha256: content hash as stored; see :func:`rehash` for the true one.
-        variable_sha256: stored hash of each variable.
-        frames: recorded frames.
-        particles: particles in every frame.
-        device: device that simulated.
-        generator: dotted path of the split's module.
-        lagbench_version: version that wrote the file.
-    """
-
-    key: ScenarioKey
-    seed: str
-    parameters: Mapping[str, object]
-    content_sha256: str
-    variable_sha256: Mapping[str, str]
-    frames: int
-    particles: int
-    device: str
-    generator: str
-    lagbench_version: str
+    key: ScenarioKey  # what names the scenario
+    seed: str  # how the random numbers were seeded
+    parameters: Mapping[str, object]  # physical parameters by name, those that enter the content hash
+    content_sha256: str  # content hash as stored; see rehash for the true one
+    variable_sha256: Mapping[str, str]  # stored hash of each variable
+    frames: int  # recorded frames
+    particles: int  # particles in every frame
+    device: str  # device that simulated
+    generator: str  # dotted path of the split's module
+    lagbench_version: str  # version that wrote the file
 
 
 class ScenarioFile:
@@ -182,22 +158,14 @@ class ScenarioFile:
             return tuple(sorted(self._file.variables))
 
     def read(self, name: str, frames: slice | int = slice(None)) -> NDArray[Any]:
-        """Return a variable, or some of its frames (entries along the first dimension).
-
-        Raises:
-            DataError: no such variable, or the file is damaged.
-        """
+        """Return a variable, or some of its frames (entries along the first dimension)."""
         with _damage(self.path, name):
             variable = self._file.variables[name]
             part = frames if variable.ndim else ...
             return _texts(self.path, name, part) if variable.dtype is str else np.asarray(variable[part])
 
     def blocks(self, name: str) -> Iterator[NDArray[Any]]:
-        """Yield a variable in order, in pieces of at most about 1 MiB.
-
-        Raises:
-            DataError: no such variable, or the file is damaged.
-        """
+        """Yield a variable in order, in pieces of at most about 1 MiB."""
         with _damage(self.path, name):
             shape = self._file.variables[name].shape
             item = np.dtype(np.float64).itemsize * int(np.prod(shape[1:], dtype=np.int64))
@@ -207,11 +175,7 @@ class ScenarioFile:
             yield self.read(name, slice(start, start + step))
 
     def check_attributes(self) -> None:
-        """Refuse attributes that make other readers read other values.
-
-        Raises:
-            DataError: a variable has not the attributes of the format.
-        """
+        """Refuse attributes that make other readers read other values."""
         for name in self.variables:
             with _damage(self.path, name):
                 variable = self._file.variables[name]
@@ -253,11 +217,7 @@ def _texts(path: Path, name: str, part: object) -> NDArray[Any]:
 
 
 def read_scenario(path: Path) -> ScenarioFile:
-    """Open a scenario file.
-
-    Raises:
-        DataError: the file is missing, truncated, damaged, or no scenario file.
-    """
+    """Open a scenario file."""
     import netCDF4
 
     if not path.is_file():
@@ -276,30 +236,13 @@ def read_scenario(path: Path) -> ScenarioFile:
 
 
 def rehash(path: Path) -> str:
-    """Return the content hash computed from a file's values.
-
-    Raises:
-        DataError: the file is missing or damaged; the message names file and variable.
-    """
+    """Return the content hash computed from a file's values."""
     with read_scenario(path) as file:
         return file.computed_hasher().hexdigest()
 
 
 def check_scenario(path: Path, expected: str | None = None) -> str:
-    """Recompute a file's content hash, compare it, and check what is not hashed.
-
-    Args:
-        path: scenario file.
-        expected: content hash from a manifest or datasets.yaml, whole or its first digits.
-
-    Returns:
-        The content hash.
-
-    Raises:
-        DataError: the file is missing or damaged, its hash is another, or its attributes
-            change what readers make of it; the message names file and, where one can be told,
-            variable.
-    """
+    """Recompute a file's content hash, compare it, and check what is not hashed."""
     with read_scenario(path) as file:
         stored = file.header
         hasher = file.computed_hasher()

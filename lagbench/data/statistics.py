@@ -49,17 +49,11 @@ DIGITS = 9
 
 @dataclass(frozen=True)
 class Moments:
-    """Count, sum and sum of squares of one quantity.
+    """Count, sum and sum of squares of one quantity."""
 
-    Attributes:
-        count: values per component.
-        total: sum of the values of each component.
-        squares: sum of their squares.
-    """
-
-    count: int
-    total: tuple[float, ...]
-    squares: tuple[float, ...]
+    count: int  # values per component
+    total: tuple[float, ...]  # sum of the values of each component
+    squares: tuple[float, ...]  # sum of their squares
 
 
 class MomentStream:
@@ -120,15 +114,7 @@ def combine(scenarios: Iterable[dict[str, Moments]]) -> dict[str, Moments]:
 
 
 def statistics(scenarios: Iterable[dict[str, Moments]]) -> dict[str, tuple[float, ...]]:
-    """Return mean and std per component, to nine significant digits.
-
-    Args:
-        scenarios: moments of each scenario of the subset, in any order.
-
-    Returns:
-        ``position_mean``, ``position_std``, ``velocity_mean``, ... with one value per
-        component; a quantity that no scenario has frames for is left out.
-    """
+    """Return mean and std per component, to nine significant digits."""
     result: dict[str, tuple[float, ...]] = {}
     for name, moments in combine(scenarios).items():
         if moments.count:
@@ -141,11 +127,7 @@ def statistics(scenarios: Iterable[dict[str, Moments]]) -> dict[str, tuple[float
 
 
 def file_statistics(paths: Sequence[Path]) -> dict[str, tuple[float, ...]]:
-    """Return the statistics of scenario files, read one frame at a time.
-
-    Raises:
-        DataError: no file is given, or one is missing or damaged.
-    """
+    """Return the statistics of scenario files, read one frame at a time."""
     if not paths:
         raise DataError("no scenario files", expected="at least one file for statistics")
     return statistics([file_moments(path) for path in paths])
@@ -161,15 +143,7 @@ def round_digits(value: float) -> float:
 
 
 def file_moments(path: Path, report: Callable[[int], None] = lambda _: None) -> dict[str, Moments]:
-    """Return the moments of one scenario file, read one frame at a time.
-
-    Args:
-        path: scenario file.
-        report: told one unit of work at the end.
-
-    Raises:
-        DataError: the file is missing or damaged.
-    """
+    """Return the moments of one scenario file, read one frame at a time."""
     with read_scenario(path) as file:
         moments = scenario_moments(frame for block in file.blocks("position") for frame in block)
     report(1)

@@ -86,9 +86,6 @@ class ScenarioWriter:
         generator: dotted path of the split's module; not hashed.
         reynolds: Reynolds number, the parameter ``reynolds_number``; None where there is none.
         licence: licence of the data; not hashed.
-
-    Attributes:
-        content_sha256: content hash, set by the clean exit.
     """
 
     def __init__(
@@ -111,7 +108,7 @@ class ScenarioWriter:
     ) -> None:
         self.path = path
         self.key = key
-        self.content_sha256 = ""
+        self.content_sha256 = ""  # content hash, set by the clean exit
         extra = {} if reynolds is None else {"reynolds_number": reynolds}
         self._parameters = _checked({**parameters, **extra}, path)
         self._labels = {"seed": seed, "device": device, "generator": generator, "license": licence}

@@ -60,14 +60,7 @@ def _check_structure(text: str) -> None:
 
 
 def read_yaml(path: Path) -> Any:  # noqa: ANN401
-    """Return the plain Python value of a YAML file.
-
-    Args:
-        path: file to read, at most :data:`MAX_BYTES` long.
-
-    Raises:
-        UnreadableFileError: the file is missing, too large, no UTF-8, or no plain YAML.
-    """
+    """Return the plain Python value of a YAML file."""
     try:
         size = path.stat().st_size
         if size > MAX_BYTES:

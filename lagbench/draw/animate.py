@@ -115,19 +115,12 @@ class _Disc:
 
 
 class Painter:
-    """Paints one recording, frame by frame.
-
-    Args:
-        recording: scenario to paint.
-        panel: speed, material or vorticity.
-        side: side of the square panel [pixel].
-        limit: top of the colour scale.
-    """
+    """Paints one recording, frame by frame."""
 
     def __init__(self, recording: Recording, panel: Panel, *, side: int, limit: float) -> None:
         """Paint what does not move."""
-        self.panel = panel
-        self.limit = limit
+        self.panel = panel  # speed, material or vorticity
+        self.limit = limit  # top of the colour scale
         self._side = side * OVERSAMPLING
         self._disc = _Disc.of(DOT * recording.spacing * self._side)
         self._margin = int(self._disc.rows.max(initial=0)) + 1
@@ -206,17 +199,7 @@ _NO_DATES = ["-fflags", "+bitexact", "-flags:v", "+bitexact"]
 
 @contextmanager
 def open_video(path: Path, size: tuple[int, int], frames_per_second: float) -> Iterator[Write]:
-    """Yield a function that appends a frame; the file appears when the body ends well.
-
-    Args:
-        path: target, ending in .mp4 or .gif.
-        size: width and height of every frame, both even [pixel].
-        frames_per_second: frames shown per second.
-
-    Raises:
-        UsageError: imageio or Pillow is not installed.
-        WorkFailedError: the frames cannot be encoded or written.
-    """
+    """Yield a function that appends a frame; the file appears when the body ends well."""
     with atomic_path(path) as temporary:
         gif = path.suffix.lower() == ".gif"
         coder = _gif(temporary, frames_per_second) if gif else _mp4(temporary, size, frames_per_second)
@@ -439,19 +422,12 @@ def _background(
 
 @dataclass(frozen=True)
 class _Counter:
-    """Frame number and time at the bottom right, put together from digits drawn once.
+    """Frame number and time at the bottom right, put together from digits drawn once."""
 
-    Attributes:
-        digits: picture of each character, all of one size.
-        right: right end [pixel].
-        interval: time between frames [s].
-        places: characters of the longest frame number and of the longest time.
-    """
-
-    digits: dict[str, NDArray[np.uint8]]
-    right: int
-    interval: float
-    places: tuple[int, int]
+    digits: dict[str, NDArray[np.uint8]]  # picture of each character, all of one size
+    right: int  # right end [pixel]
+    interval: float  # time between frames [s]
+    places: tuple[int, int]  # characters of the longest frame number and of the longest time
 
     @staticmethod
     def of(recording: Recording, *, right: int) -> _Counter:

@@ -89,15 +89,7 @@ def limit_of(panel: Panel, scene: Scene) -> float:
 
 
 def draw(axes: Axes, panel: Panel, scene: Scene, *, limit: float, detail: float = 1.0) -> None:
-    """Draw one frame inside its box.
-
-    Args:
-        axes: square axes to draw into.
-        panel: what to show.
-        scene: the frame.
-        limit: top of the colour scale.
-        detail: 1 in a picture of its own, less in a small panel: thinner and fewer lines.
-    """
+    """Draw one frame inside its box."""
     draw_walls(axes, scene.recording)
     scale = colour_scale(panel, limit)
     if panel is Panel.MATERIAL:
@@ -237,14 +229,7 @@ def colour_scale(panel: Panel, limit: float) -> ScalarMappable:
 
 
 def colour_bar(axes: Axes, panel: Panel, limit: float, *, label: str | None = None) -> None:
-    """Draw a horizontal colour bar with its unit; pointed where values lie beyond it.
-
-    Args:
-        axes: axes of the bar.
-        panel: what the colours mean.
-        limit: top of the colour scale.
-        label: text below, in place of the panel's quantity and unit.
-    """
+    """Draw a horizontal colour bar with its unit; pointed where values lie beyond it."""
     drawn = axes.get_figure()
     extend = "both" if panel is Panel.VORTICITY else "max"
     bar = drawn.colorbar(colour_scale(panel, limit), cax=axes, orientation="horizontal", extend=extend)  # type: ignore[union-attr]

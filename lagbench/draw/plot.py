@@ -64,21 +64,13 @@ class _Cell:
 
 @dataclass(frozen=True, kw_only=True)
 class _Sheet:
-    """What is on a page.
+    """What is on a page."""
 
-    Attributes:
-        rows: the small panels.
-        panel: what they show.
-        subtitle: second line of the title.
-        limit: top of the colour bar.
-        unit: label of the colour bar where it is not the panel's own.
-    """
-
-    rows: Sequence[Sequence[_Cell]]
-    panel: Panel
-    subtitle: str
-    limit: float
-    unit: str | None = None
+    rows: Sequence[Sequence[_Cell]]  # the small panels
+    panel: Panel  # what they show
+    subtitle: str  # second line of the title
+    limit: float  # top of the colour bar
+    unit: str | None = None  # label of the colour bar where it is not the panel's own
 
 
 def contact_sheet(

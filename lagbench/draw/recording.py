@@ -37,20 +37,13 @@ Read = Callable[[str, slice | int], NDArray[Any]]
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """One frame of a scenario.
+    """One frame of a scenario."""
 
-    Attributes:
-        recording: scenario that the frame belongs to.
-        frame: absolute frame number.
-        position: [length], shape [particle, 2].
-        velocity: velocity of the solver [length/s], shape [particle, 2].
-        displacement: x(f) - x(f-1), at frame 0 velocity times frame interval [length/frame].
-    """
-
-    recording: Recording
-    frame: int
-    position: NDArray[np.float64]
-    velocity: NDArray[np.float64]
+    recording: Recording  # scenario that the frame belongs to
+    frame: int  # absolute frame number
+    position: NDArray[np.float64]  # [length], shape [particle, 2]
+    velocity: NDArray[np.float64]  # velocity of the solver [length/s], shape [particle, 2]
+    # x(f) - x(f-1), at frame 0 velocity times frame interval [length/frame]
     displacement: NDArray[np.float64]
 
     @property
@@ -74,18 +67,7 @@ class Scene:
 
 
 class Recording:
-    """A scenario whose frames are read one at a time.
-
-    Attributes:
-        size: tier of the split, from the registry.
-        title: title of the split.
-        scenario: id.
-        subset: subset that holds the scenario.
-        frames: recorded frames.
-        material: material of each particle, shape [particle].
-        wall_velocity: [length/s], shape [wall, 2]; zeros where the file has none.
-        parameters: physical parameters by name.
-    """
+    """A scenario whose frames are read one at a time."""
 
     def __init__(
         self,
@@ -96,26 +78,20 @@ class Recording:
         read: Read,
         registry: Registry,
     ) -> None:
-        """Read what holds for all frames.
-
-        Args:
-            identity: split, size, scenario and subset.
-            parameters: physical parameters by name.
-            frames: recorded frames.
-            variables: names of the variables there.
-            read: returns a variable, or one of its frames.
-            registry: where the split is described.
-        """
+        """Read what holds for all frames."""
+        # tier of the split, from the registry
         self.size: Size = registry.size(str(identity["split"]), str(identity["size"]))
-        self.title = registry.split(self.size.split).title
-        self.scenario = int(identity["scenario"])
-        self.subset = str(identity["subset"])
-        self.parameters = parameters
-        self.frames = frames
+        self.title = registry.split(self.size.split).title  # title of the split
+        self.scenario = int(identity["scenario"])  # id
+        self.subset = str(identity["subset"])  # subset that holds the scenario
+        self.parameters = parameters  # physical parameters by name
+        self.frames = frames  # recorded frames
         self._read = read
         self._present = np.isfinite(read("position", 0)).all(axis=-1)
+        # material of each particle, shape [particle]
         self.material = read("material", slice(None))[self._present].astype(np.int8)
         moving = "wall_velocity" in variables
+        # [length/s], shape [wall, 2]; zeros where the file has none
         self.wall_velocity = read("wall_velocity", 0).astype(np.float64) if moving else np.zeros((4, 2))
         self._mass = float(read("particle_mass", slice(None)))
 
@@ -141,11 +117,7 @@ class Recording:
         return None if value is None else float(value)
 
     def frame_number(self, frame: int) -> int:
-        """Return an absolute frame number; negative ones count from the end.
-
-        Raises:
-            UsageError: the scenario has no such frame.
-        """
+        """Return an absolute frame number; negative ones count from the end."""
         if not -self.frames <= frame < self.frames:
             raise UsageError(
                 f"no frame {frame}",
@@ -156,11 +128,7 @@ class Recording:
         return frame % self.frames
 
     def scene(self, frame: int) -> Scene:
-        """Return one frame; negative numbers count from the end.
-
-        Raises:
-            UsageError: the scenario has no such frame.
-        """
+        """Return one frame; negative numbers count from the end."""
         number = self.frame_number(frame)
         position, velocity = self._particles("position", number), self._particles("velocity", number)
         if number:
@@ -179,16 +147,7 @@ class Recording:
 def open_recording(
     source: str | Path | xr.Dataset, *, registry: Registry | None = None
 ) -> Iterator[Recording]:
-    """Open a scenario file, or a data set of one scenario, for drawing.
-
-    Args:
-        source: scenario file, or a data set of one scenario.
-        registry: where splits are described; ours when None.
-
-    Raises:
-        DataError: the file is missing or damaged.
-        UsageError: the data set holds several scenarios, or its split is unknown.
-    """
+    """Open a scenario file, or a data set of one scenario, for drawing."""
     if not isinstance(source, str | Path):
         yield _of_dataset(source, registry or load())
         return

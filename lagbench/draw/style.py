@@ -157,13 +157,6 @@ def figure(width: float, height: float) -> Iterator[Figure]:
     """Yield an empty figure in lagbench's style, whatever the user's matplotlibrc says.
 
     Draw and save it inside the context.
-
-    Args:
-        width: width [inch].
-        height: height [inch].
-
-    Raises:
-        UsageError: matplotlib is not installed.
     """
     matplotlib = require("matplotlib", extra="plots")
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -178,14 +171,7 @@ def figure(width: float, height: float) -> Iterator[Figure]:
 
 
 def header(drawn: Figure, title: str, subtitle: str, *, left: float) -> None:
-    """Write a title and a second, quieter line at the top left.
-
-    Args:
-        drawn: the figure.
-        title: first line.
-        subtitle: second line.
-        left: distance from the left edge [inch].
-    """
+    """Write a title and a second, quieter line at the top left."""
     width, height = drawn.get_size_inches()
     drawn.text(left / width, 1 - 0.16 / height, title, fontsize=13, fontweight="bold", va="top")
     drawn.text(left / width, 1 - 0.43 / height, subtitle, fontsize=9.5, color=MUTED, va="top")
@@ -209,11 +195,7 @@ def png_bytes(drawn: Figure) -> bytes:
 
 
 def save_png(drawn: Figure, output: str | Path) -> Path:
-    """Write the figure to a file that appears whole or not at all; return its path.
-
-    Raises:
-        UsageError: the name does not end in .png.
-    """
+    """Write the figure to a file that appears whole or not at all; return its path."""
     path = Path(output)
     if path.suffix.lower() != ".png":
         raise UsageError("pictures are PNG files", where="output", expected="a name ending in .png", got=path)

@@ -32,22 +32,16 @@ HEAD = '# A local split of lagbench, written by `lagbench {}`; its hashes stand 
 
 @dataclass
 class Building:
-    """A local split on the way.
+    """A local split on the way."""
 
-    Attributes:
-        about: what is known of the data.
-        root: root folder in which the split's folder is built.
-        spacing: distance of neighbouring particles at first [length]; 0 before the first scenario.
-        entries: manifest entries of the scenarios written so far, by id.
-        low: least coordinates of any particle [length].
-        high: greatest coordinates of any particle [length].
-    """
-
-    about: Description
-    root: Path
-    spacing: float = 0.0
+    about: Description  # what is known of the data
+    root: Path  # root folder in which the split's folder is built
+    spacing: float = 0.0  # distance of neighbouring particles at first [length]; 0 before the first scenario
+    # manifest entries of the scenarios written so far, by id
     entries: list[FileEntry] = field(default_factory=list)
+    # least coordinates of any particle [length]
     low: NDArray[np.float64] = field(default_factory=lambda: np.full(2, np.inf))
+    # greatest coordinates of any particle [length]
     high: NDArray[np.float64] = field(default_factory=lambda: np.full(2, -np.inf))
 
     def add(self, subset: str, trajectory: Trajectory) -> None:

@@ -30,35 +30,20 @@ CONNECTIONS = 4
 
 @dataclass(frozen=True, kw_only=True)
 class DownloadResult:
-    """What a download did.
+    """What a download did."""
 
-    Attributes:
-        split: name of the split.
-        size: name of the size.
-        folder: folder of the data set.
-        mirror: base URL that files came from; None where none was needed or reached.
-        downloaded: ids that were downloaded.
-        kept: ids whose files were there and right.
-        generated: ids that were simulated instead.
-        bytes: bytes that came from the mirror.
-        seconds: time that it took [s].
-        complete: whether train, valid and test are all there.
-        dataset_sha256: data set hash, once complete.
-        verdict: how the hashes compare with datasets.yaml, in words.
-    """
-
-    split: str
-    size: str
-    folder: Path
-    mirror: str | None
-    downloaded: tuple[int, ...]
-    kept: tuple[int, ...]
-    generated: tuple[int, ...]
-    bytes: int
-    seconds: float
-    complete: bool
-    dataset_sha256: str | None
-    verdict: str
+    split: str  # name of the split
+    size: str  # name of the size
+    folder: Path  # folder of the data set
+    mirror: str | None  # base URL that files came from; None where none was needed or reached
+    downloaded: tuple[int, ...]  # ids that were downloaded
+    kept: tuple[int, ...]  # ids whose files were there and right
+    generated: tuple[int, ...]  # ids that were simulated instead
+    bytes: int  # bytes that came from the mirror
+    seconds: float  # time that it took [s]
+    complete: bool  # whether train, valid and test are all there
+    dataset_sha256: str | None  # data set hash, once complete
+    verdict: str  # how the hashes compare with datasets.yaml, in words
 
 
 def download(

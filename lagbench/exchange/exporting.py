@@ -28,37 +28,21 @@ __all__ = ["ExportResult", "export", "parse_format"]
 
 @dataclass(frozen=True, kw_only=True)
 class ExportResult:
-    """What was written.
+    """What was written."""
 
-    Attributes:
-        format: name of the format.
-        split: name of the split.
-        size: name of the size.
-        folder: folder of the files.
-        files: the files.
-        trajectories: number of trajectories by subset.
-        frames: frames by subset, over all trajectories.
-        left_out: frames that are not in the files, because that format needs equal lengths.
-        bytes: length of the files together [bytes].
-    """
-
-    format: str
-    split: str
-    size: str
-    folder: Path
+    format: str  # name of the format
+    split: str  # name of the split
+    size: str  # name of the size
+    folder: Path  # folder of the files
     files: tuple[Path, ...]
-    trajectories: dict[str, int]
-    frames: dict[str, int]
-    left_out: int
-    bytes: int
+    trajectories: dict[str, int]  # number of trajectories by subset
+    frames: dict[str, int]  # frames by subset, over all trajectories
+    left_out: int  # frames that are not in the files, because that format needs equal lengths
+    bytes: int  # length of the files together [bytes]
 
 
 def parse_format(name: str) -> Format:
-    """Return a format by name.
-
-    Raises:
-        UsageError: there is none; the message names the nearest.
-    """
+    """Return a format by name."""
     known = [form.value for form in Format]
     if name not in known:
         raise UsageError(f"no format {name!r}", where="--format", fix=nearest(name, known))
@@ -149,11 +133,7 @@ _ENDINGS = {Format.GNS_NPZ: gns_npz.ENDING, Format.LAGRANGEBENCH_H5: lagrangeben
 
 
 def _claim_target(folder: Path, names: Sequence[str], *, force: bool) -> None:
-    """Refuse a folder that must not be written to; begin to write over an earlier export.
-
-    Raises:
-        UsageError: files are there already, or a program that readers of the format run.
-    """
+    """Refuse a folder that must not be written to; begin to write over an earlier export."""
     if (folder / lagrangebench_h5.FORCE).exists():
         raise UsageError(
             "the folder holds a program that readers of this format run",

@@ -76,13 +76,7 @@ _FIELDS: Mapping[str, tuple[str, str]] = {
 
 
 def croissant_json(size: Size, split: Split, manifest: Manifest) -> str:
-    """Return the Croissant document of a data set folder.
-
-    Args:
-        size: tier of the split.
-        split: the split itself.
-        manifest: what the folder holds.
-    """
+    """Return the Croissant document of a data set folder."""
     return json.dumps(describe_dataset(size, split, manifest), indent=1, ensure_ascii=False) + "\n"
 
 
@@ -179,16 +173,6 @@ def write_cards(root: Path, size: Size, split: Split, manifest: Manifest) -> lis
 
     Each file appears whole or not at all. Where the text is already there and the pictures
     too, nothing is written: the card names every content hash, so the data are the same.
-
-    Args:
-        root: folder that holds all data sets.
-        size: tier of the split.
-        split: the split itself.
-        manifest: what the folder of the data set holds.
-
-    Raises:
-        DataError: a scenario file that is drawn is damaged.
-        WorkFailedError: the operating system refused.
     """
     folder = dataset_folder(root, size.split, size.name, size.major)
     texts = {folder / name: text for name, text in card_texts(size, split, manifest).items()}
@@ -233,14 +217,7 @@ def _draw(root: Path, size: Size, split: Split, manifest: Manifest) -> None:
 
 
 def dataset_card(size: Size, split: Split, manifest: Manifest, *, pictures: list[str]) -> str:
-    """Return the card of a data set as Markdown with a YAML head.
-
-    Args:
-        size: tier of the split.
-        split: the split itself.
-        manifest: what the folder holds.
-        pictures: names of the pictures to show, from :data:`PICTURES`.
-    """
+    """Return the card of a data set as Markdown with a YAML head."""
     parts = [
         _head(size, split, manifest),
         f"# {escape(split.title)} · {size.split} {size.name}",

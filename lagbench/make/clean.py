@@ -28,17 +28,11 @@ CARDS = (MANIFEST_NAME, CARD_NAME, CROISSANT_NAME, *PICTURES)
 
 @dataclass(frozen=True, kw_only=True)
 class CleanResult:
-    """What was, or with ``dry_run`` would be, removed.
+    """What was, or with ``dry_run`` would be, removed."""
 
-    Attributes:
-        removed: the files.
-        bytes: their length together [bytes].
-        dry_run: whether they are still there.
-    """
-
-    removed: tuple[Path, ...]
-    bytes: int
-    dry_run: bool
+    removed: tuple[Path, ...]  # the files
+    bytes: int  # their length together [bytes]
+    dry_run: bool  # whether they are still there
 
 
 def clean(

@@ -34,24 +34,13 @@ ENVIRONMENT: Mapping[Device, Mapping[str, str]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Crew:
-    """Who does the work.
+    """Who does the work."""
 
-    Attributes:
-        workers: worker processes of this machine.
-        scheduler: address of a Dask scheduler whose workers do it instead.
-    """
-
-    workers: int
-    scheduler: str | None = None
+    workers: int  # worker processes of this machine
+    scheduler: str | None = None  # address of a Dask scheduler whose workers do it instead
 
     def simulating(self, tasks: int, device: Device, folder: Path) -> Pool | Cluster:
-        """Return those who simulate.
-
-        Args:
-            tasks: tasks that they begin with.
-            device: where the solver runs.
-            folder: folder that they write to.
-        """
+        """Return those who simulate."""
         if self.scheduler is None:
             return Pool(min(self.workers, tasks), ENVIRONMENT[device])
         return Cluster(self.scheduler, ENVIRONMENT[device], folder=folder)
@@ -63,14 +52,7 @@ class Crew:
         files: Iterable[Path],
         report: Report,
     ) -> list[Result]:
-        """Run a function that reads files, here where they hold little.
-
-        Args:
-            function: see :func:`.spread`.
-            jobs: see :func:`.spread`.
-            files: what the jobs read.
-            report: told the units of work done.
-        """
+        """Run a function that reads files, here where they hold little."""
         if sum(path.stat().st_size for path in files if path.exists()) < WORTH_WORKERS:
             return run_all(function, jobs, report=report)
         return run_all(function, jobs, workers=self.workers, scheduler=self.scheduler, report=report)

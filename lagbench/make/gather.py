@@ -26,22 +26,7 @@ __all__ = [
 
 
 def gather(size: Size, root: Path, source: Path, manifest: Manifest) -> Manifest:
-    """Take over what a source has finished and the folder does not hold.
-
-    Args:
-        size: tier of a split.
-        root: folder of all data sets, which is written to; hold its lock.
-        source: another such folder.
-        manifest: what the folder holds.
-
-    Returns:
-        The manifest with the source's entries; it is not written.
-
-    Raises:
-        UsageError: both are one folder, or the source holds nothing of the size.
-        DataError: a file of the source is damaged or not the one of its manifest.
-        WorkFailedError: a file cannot be written.
-    """
+    """Take over what a source has finished and the folder does not hold."""
     there = dataset_folder(source, size.split, size.name, size.major)
     here = dataset_folder(root, size.split, size.name, size.major)
     found = read_manifest(source, size.split, size.name, size.major)

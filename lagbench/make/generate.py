@@ -54,24 +54,7 @@ BATCH_PARTICLES = 1 << 19
 
 
 class Generation:
-    """Brings a data set folder to the state that its size describes.
-
-    Args:
-        size: tier of a split.
-        root: folder that holds all data sets.
-        device: where the solver runs.
-        crew: who simulates.
-        meter: counts the work.
-        split: the split that the size belongs to.
-        sources: other root folders to take finished scenarios from.
-
-    Attributes:
-        store: the store that the root folder is a working copy of; None for a plain folder.
-        manifest: what the folder holds, as far as is known.
-        kept: ids whose files were there and right.
-        to_do: ids to simulate and what that takes.
-        verdict: how the hashes compare with datasets.yaml, in words.
-    """
+    """Brings a data set folder to the state that its size describes."""
 
     def __init__(
         self,
@@ -85,14 +68,15 @@ class Generation:
         sources: Sequence[Path] = (),
     ) -> None:
         self.size, self.root, self.device, self.crew = size, root, device, crew
-        self.sources = sources
+        self.sources = sources  # other root folders to take finished scenarios from
+        # the store that the root folder is a working copy of; None for a plain folder
         self.store: Publication | None = None
-        self.manifest = self._merged(None, [])
-        self.kept: list[int] = []
-        self.to_do: Estimate = estimate(size, ())
-        self.verdict = ""
-        self._meter = meter
-        self._split = split
+        self.manifest = self._merged(None, [])  # what the folder holds, as far as is known
+        self.kept: list[int] = []  # ids whose files were there and right
+        self.to_do: Estimate = estimate(size, ())  # ids to simulate and what that takes
+        self.verdict = ""  # how the hashes compare with datasets.yaml, in words
+        self._meter = meter  # counts the work
+        self._split = split  # the split that the size belongs to
         self._promised: list[int] = []
 
     def survey(self, wanted: Sequence[int], *, force: bool = False) -> None:
@@ -111,12 +95,7 @@ class Generation:
         self.to_do = estimate(self.size, [i for i in wanted if i not in self.kept])
 
     def run(self, wanted: Sequence[int], *, force: bool = False) -> None:
-        """Simulate what is missing or wrong; write the manifest, compare, write cards.
-
-        Raises:
-            WorkFailedError: no space, a scenario blew up, workers keep dying.
-            DataError: the result has other hashes than datasets.yaml.
-        """
+        """Simulate what is missing or wrong; write the manifest, compare, write cards."""
         folder = dataset_folder(self.root, self.size.split, self.size.name, self.size.major)
         remove_leftovers(folder)
         for source in self.sources:
@@ -308,47 +287,26 @@ class Generation:
 
 @dataclass(frozen=True, kw_only=True)
 class GenerationResult:
-    """What a generation did, or would do.
+    """What a generation did, or would do."""
 
-    Attributes:
-        split: name of the split.
-        size: name of the size.
-        version: semantic version.
-        root: folder of all data sets.
-        folder: folder of this one.
-        device: where the solver ran.
-        workers: worker processes.
-        simulated: ids that were (dry run: would be) simulated.
-        kept: ids whose files were there and right.
-        missing: ids of the size that are still not there.
-        bytes_needed: disk space of ``simulated`` before compression [bytes].
-        bytes_free: free disk space before the start [bytes].
-        seconds_expected: expected time [s], for orientation.
-        seconds: time that it took [s].
-        complete: whether train, valid and test are all there.
-        dataset_sha256: data set hash, once complete.
-        verdict: how the hashes compare with datasets.yaml, in words.
-        dry_run: whether nothing was done.
-    """
-
-    split: str
-    size: str
-    version: str
-    root: Path
-    folder: Path
-    device: str
-    workers: int
-    simulated: tuple[int, ...]
-    kept: tuple[int, ...]
-    missing: tuple[int, ...]
-    bytes_needed: int
-    bytes_free: int
-    seconds_expected: float
-    seconds: float = 0.0
-    complete: bool = False
-    dataset_sha256: str | None = None
-    verdict: str = ""
-    dry_run: bool = False
+    split: str  # name of the split
+    size: str  # name of the size
+    version: str  # semantic version
+    root: Path  # folder of all data sets
+    folder: Path  # folder of this one
+    device: str  # where the solver ran
+    workers: int  # worker processes
+    simulated: tuple[int, ...]  # ids that were (dry run: would be) simulated
+    kept: tuple[int, ...]  # ids whose files were there and right
+    missing: tuple[int, ...]  # ids of the size that are still not there
+    bytes_needed: int  # disk space of 'simulated' before compression [bytes]
+    bytes_free: int  # free disk space before the start [bytes]
+    seconds_expected: float  # expected time [s], for orientation
+    seconds: float = 0.0  # time that it took [s]
+    complete: bool = False  # whether train, valid and test are all there
+    dataset_sha256: str | None = None  # data set hash, once complete
+    verdict: str = ""  # how the hashes compare with datasets.yaml, in words
+    dry_run: bool = False  # whether nothing was done
 
 
 def generate(
@@ -452,11 +410,7 @@ def _result(campaign: Generation, *, bytes_free: int, seconds: float, dry_run: b
 
 
 def parse_device(name: str) -> Device:
-    """Return a device by name.
-
-    Raises:
-        UsageError: there is none; the message names the nearest.
-    """
+    """Return a device by name."""
     from lagbench.generators.solver import Device
 
     names = [device.value for device in Device]

@@ -22,37 +22,23 @@ __all__ = [
 
 @dataclass(frozen=True, kw_only=True)
 class Overview:
-    """What tables say about one size of a split.
+    """What tables say about one size of a split."""
 
-    Attributes:
-        split: name of the split.
-        size: name of the size.
-        version: semantic version.
-        scenarios: number of scenarios by subset.
-        particles: particles in one scenario.
-        frames: recorded frames of all scenarios.
-        bytes: disk space before compression [bytes].
-        seconds: time to generate on all cores of this machine [s], for orientation; 0 for what
-            cannot be simulated.
-        present: scenario files that are there, by subset; `lagbench verify` checks them. Of a store
-            what its manifest names.
-        folder: where they are, or would be.
-        picture: picture of the data set once it is generated.
-        dataset_sha256: data set hash as datasets.yaml has it.
-    """
-
-    split: str
-    size: str
-    version: str
-    scenarios: dict[str, int]
-    particles: int
-    frames: int
-    bytes: int
+    split: str  # name of the split
+    size: str  # name of the size
+    version: str  # semantic version
+    scenarios: dict[str, int]  # number of scenarios by subset
+    particles: int  # particles in one scenario
+    frames: int  # recorded frames of all scenarios
+    bytes: int  # disk space before compression [bytes]
+    # time to generate on all cores of this machine [s], for orientation; 0 for what cannot be simulated
     seconds: float
+    # scenario files that are there, by subset; 'lagbench verify' checks them. Of a store
+    # what its manifest names.
     present: dict[str, int]
-    folder: Path
-    picture: Path | None
-    dataset_sha256: str | None
+    folder: Path  # where they are, or would be
+    picture: Path | None  # picture of the data set once it is generated
+    dataset_sha256: str | None  # data set hash as datasets.yaml has it
 
     @property
     def state(self) -> str:

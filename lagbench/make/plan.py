@@ -47,16 +47,7 @@ def _names(subset: Selection) -> tuple[str, ...]:
 
 
 def select(size: Size, *, subset: Selection = None, scenarios: Scenarios = None) -> tuple[int, ...]:
-    """Return the scenario ids that a user means, ascending.
-
-    Args:
-        size: tier of a split.
-        subset: one or several subsets, as a list or separated by commas; all when None.
-        scenarios: ids, or a text such as "0,3-5"; all of the subsets when None.
-
-    Raises:
-        UsageError: no such subset, or an id that the subsets do not hold.
-    """
+    """Return the scenario ids that a user means, ascending."""
     names = _names(subset) or tuple(size.subsets)
     for name in names:
         if name not in size.subsets:
@@ -82,21 +73,13 @@ def select(size: Size, *, subset: Selection = None, scenarios: Scenarios = None)
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
-    """What simulating some scenarios takes.
+    """What simulating some scenarios takes."""
 
-    Attributes:
-        scenarios: their ids, ascending.
-        substeps: substeps of each, in the same order.
-        frames: frames that they record together.
-        bytes: disk space, before compression [bytes]; files come out a little smaller.
-        core_seconds: time on one core [s], for orientation.
-    """
-
-    scenarios: tuple[int, ...]
-    substeps: tuple[int, ...]
-    frames: int
-    bytes: int
-    core_seconds: float
+    scenarios: tuple[int, ...]  # their ids, ascending
+    substeps: tuple[int, ...]  # substeps of each, in the same order
+    frames: int  # frames that they record together
+    bytes: int  # disk space, before compression [bytes]; files come out a little smaller
+    core_seconds: float  # time on one core [s], for orientation
 
     def seconds(self, workers: int) -> float:
         """Return the time with some workers [s]: shared evenly, but never below the longest."""
@@ -112,12 +95,7 @@ def scenario_bytes(size: Size, scenario: int) -> int:
 
 
 def estimate(size: Size, scenarios: Sequence[int]) -> Estimate:
-    """Return what simulating these scenarios takes.
-
-    Raises:
-        UnreadableFileError: the solver or the draws cannot use a parameter of the size.
-        UsageError: the data of a local split were not simulated.
-    """
+    """Return what simulating these scenarios takes."""
     if not size.simulated:
         raise UsageError(
             "a local split cannot be simulated",
@@ -159,11 +137,7 @@ def free_bytes(folder: Path) -> int:
 
 
 def check_disk(root: Path, needed: int) -> None:
-    """Refuse to start what cannot fit.
-
-    Raises:
-        WorkFailedError: fewer bytes are free than needed.
-    """
+    """Refuse to start what cannot fit."""
     free = free_bytes(root)
     if free < needed:
         raise WorkFailedError(

@@ -70,23 +70,14 @@ class State(enum.StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """What a look at one scenario's file showed.
+    """What a look at one scenario's file showed."""
 
-    Attributes:
-        scenario: its id.
-        state: whether the file is there and right.
-        content_sha256: content hash of a good file.
-        problem: what is wrong, naming file and, where it can be told, variable.
-        entry: manifest entry of a good file, where one was asked for.
-        tolerated: whether a good file has other bits than datasets.yaml.
-    """
-
-    scenario: int
-    state: State
-    content_sha256: str | None = None
-    problem: str | None = None
-    entry: FileEntry | None = None
-    tolerated: bool = False
+    scenario: int  # its id
+    state: State  # whether the file is there and right
+    content_sha256: str | None = None  # content hash of a good file
+    problem: str | None = None  # what is wrong, naming file and, where it can be told, variable
+    entry: FileEntry | None = None  # manifest entry of a good file, where one was asked for
+    tolerated: bool = False  # whether a good file has other bits than datasets.yaml
 
 
 def recorded_hash(size: Size, scenario: int) -> str | None:
@@ -97,16 +88,7 @@ def recorded_hash(size: Size, scenario: int) -> str | None:
 def examine(
     root: Path, size: Size, scenario: int, *, manifest: Manifest | None = None, quick: bool = False
 ) -> Finding:
-    """Look at the file of one scenario.
-
-    Args:
-        root: folder that holds all data sets.
-        size: tier of a split.
-        scenario: id.
-        manifest: what the folder's manifest says, see above.
-        quick: do not hash a file value by value that has the very bytes which the manifest
-            describes; the finding then has a manifest entry.
-    """
+    """Look at the file of one scenario."""
     from lagbench.generators.simulate import scenario_key
 
     key = scenario_key(size, scenario)
@@ -137,19 +119,12 @@ def examine(
 
 @dataclass(frozen=True, kw_only=True)
 class Look:
-    """The arguments of a quick :func:`examine`, for a worker.
+    """The arguments of a quick :func:`examine`, for a worker."""
 
-    Attributes:
-        root: folder that holds all data sets.
-        size: tier of a split.
-        scenario: id.
-        manifest: what the folder's manifest says of this scenario.
-    """
-
-    root: Path
-    size: Size
-    scenario: int
-    manifest: Manifest
+    root: Path  # folder that holds all data sets
+    size: Size  # tier of a split
+    scenario: int  # id
+    manifest: Manifest  # what the folder's manifest says of this scenario
 
 
 def look(order: Look, report: Callable[[int], None]) -> Finding:
@@ -237,16 +212,7 @@ TOLERATED = "other bits than datasets.yaml (identity: tolerance)"
 
 
 def compare(size: Size, manifest: Manifest, *, promised: Collection[int] = ()) -> str:
-    """Return how the hashes of a manifest compare with datasets.yaml, in words.
-
-    Args:
-        size: tier of a split with its recorded hashes.
-        manifest: what the folder of the data set holds.
-        promised: ids just simulated by a machine that promises equal bits.
-
-    Raises:
-        DataError: a hash differs, and not for a machine that promises no equal bits.
-    """
+    """Return how the hashes of a manifest compare with datasets.yaml, in words."""
     measured = size.measured
     if measured is None:
         return "datasets.yaml holds no hash of this size yet: nothing to compare with"
@@ -269,13 +235,7 @@ def compare(size: Size, manifest: Manifest, *, promised: Collection[int] = ()) -
 
 
 def hash_verdict(computed: str | None, recorded: str | None, *, tolerated: bool = False) -> str:
-    """Return how one subset or data set hash compares with datasets.yaml, in words.
-
-    Args:
-        computed: hash of the files; None unless all are there and right.
-        recorded: hash in datasets.yaml; None where there is none.
-        tolerated: whether files of machines that promise no equal bits are among them.
-    """
+    """Return how one subset or data set hash compares with datasets.yaml, in words."""
     if recorded is None:
         return "no hash in datasets.yaml yet"
     if computed is None:
@@ -323,57 +283,34 @@ def _broken(what: str, where: str) -> DataError:
 
 @dataclass(frozen=True, kw_only=True)
 class SubsetReport:
-    """What was found of one subset.
+    """What was found of one subset."""
 
-    Attributes:
-        name: name of the subset.
-        present: scenarios that are there and right.
-        missing: ids that are not there.
-        wrong: ids whose file is damaged or has another hash.
-        extra: files in the subset's folder that belong to no scenario.
-        verdict: how its hash compares with datasets.yaml, in words.
-    """
-
-    name: str
-    present: int
-    missing: tuple[int, ...]
-    wrong: tuple[int, ...]
-    extra: tuple[str, ...]
-    verdict: str
+    name: str  # name of the subset
+    present: int  # scenarios that are there and right
+    missing: tuple[int, ...]  # ids that are not there
+    wrong: tuple[int, ...]  # ids whose file is damaged or has another hash
+    extra: tuple[str, ...]  # files in the subset's folder that belong to no scenario
+    verdict: str  # how its hash compares with datasets.yaml, in words
 
 
 @dataclass(frozen=True, kw_only=True)
 class VerificationResult:
-    """What a verification found.
+    """What a verification found."""
 
-    Attributes:
-        split: name of the split.
-        size: name of the size.
-        folder: folder of the data set.
-        subsets: a report on each subset looked at.
-        identity: "bitwise", or "tolerance" where a device wrote files that does not keep the
-            promise of equal bits; "unknown" without a manifest.
-        dataset_sha256: data set hash of the files, where all of them are there and right.
-        regenerated: id to "identical", "different" or "nothing to compare with".
-        problems: what is wrong, each naming file and, where it can be told, variable.
-        warnings: what a reader should know although it is no fault.
-        must_be_complete: whether a missing scenario is a fault.
-        verdict: how the data set hash compares with datasets.yaml, in words.
-        fix: what makes the data set whole again.
-    """
-
-    split: str
-    size: str
-    folder: Path
-    subsets: tuple[SubsetReport, ...]
+    split: str  # name of the split
+    size: str  # name of the size
+    folder: Path  # folder of the data set
+    subsets: tuple[SubsetReport, ...]  # a report on each subset looked at
+    # "bitwise", or "tolerance" where a device wrote files that does not keep the promise of equal bits;
+    # "unknown" without a manifest
     identity: str
-    dataset_sha256: str | None
-    regenerated: Mapping[int, str]
-    problems: tuple[str, ...]
-    warnings: tuple[str, ...]
-    must_be_complete: bool
-    verdict: str
-    fix: str
+    dataset_sha256: str | None  # data set hash of the files, where all of them are there and right
+    regenerated: Mapping[int, str]  # id to "identical", "different" or "nothing to compare with"
+    problems: tuple[str, ...]  # what is wrong, each naming file and, where it can be told, variable
+    warnings: tuple[str, ...]  # what a reader should know although it is no fault
+    must_be_complete: bool  # whether a missing scenario is a fault
+    verdict: str  # how the data set hash compares with datasets.yaml, in words
+    fix: str  # what makes the data set whole again
 
     @property
     def complete(self) -> bool:
@@ -381,12 +318,7 @@ class VerificationResult:
         return not any(report.missing for report in self.subsets)
 
     def check(self) -> None:
-        """Raise unless everything that has to hold does.
-
-        Raises:
-            DataError: a file is damaged or of another hash, a scenario simulated anew differs,
-                nothing is there, or something is missing that must not be.
-        """
+        """Raise unless everything that has to hold does."""
         if self.problems:
             listing = "\n  ".join(self.problems)
             raise DataError(

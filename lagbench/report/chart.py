@@ -42,34 +42,21 @@ _STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)
 
 @dataclass(frozen=True)
 class Tick:
-    """A mark of an axis.
+    """A mark of an axis."""
 
-    Attributes:
-        value: where it stands.
-        label: its text.
-    """
-
-    value: float
-    label: str
+    value: float  # where it stands
+    label: str  # its text
 
 
 @dataclass(frozen=True)
 class Scale:
-    """One axis.
+    """One axis."""
 
-    Attributes:
-        low: value at its start.
-        high: value at its end.
-        log: whether it is logarithmic.
-        exponent: the labels are in units of this power of ten.
-        ticks: its marks.
-    """
-
-    low: float
-    high: float
-    log: bool
-    exponent: int
-    ticks: tuple[Tick, ...]
+    low: float  # value at its start
+    high: float  # value at its end
+    log: bool  # whether it is logarithmic
+    exponent: int  # the labels are in units of this power of ten
+    ticks: tuple[Tick, ...]  # its marks
 
     def share(self, values: ArrayLike) -> Floats:
         """Return where values lie between low (0) and high (1); NaN where they have no place."""
@@ -88,14 +75,7 @@ class Scale:
 
 
 def linear(low: float, high: float, *, count: int = 5, tight: bool = False) -> Scale:
-    """Return a linear axis that covers a range.
-
-    Args:
-        low: least value.
-        high: greatest value.
-        count: about how many ticks.
-        tight: end at the range itself, not at the next tick.
-    """
+    """Return a linear axis that covers a range."""
     if not high > low:
         middle = abs(low) or 1.0
         low, high = low - 0.5 * middle, low + 0.5 * middle
@@ -132,13 +112,7 @@ def logarithmic(low: float, high: float) -> Scale:
 
 
 def spanning(series: Sequence[ArrayLike], *, zero: bool = True, log: bool | None = None) -> Scale:
-    """Return an axis for series of values; what is not finite is left out.
-
-    Args:
-        series: arrays of values.
-        zero: whether a linear axis starts at 0.
-        log: whether it is logarithmic; when None, if all is at least 0 and the range is wide.
-    """
+    """Return an axis for series of values; what is not finite is left out."""
     values = np.concatenate([np.asarray(s, np.float64).ravel() for s in series] or [np.zeros(0)])
     values = values[np.isfinite(values) & (np.abs(values) < 1e300)]
     if not values.size:
@@ -165,20 +139,12 @@ ROW, BAR = 40, 11
 
 
 class Plot:
-    """One chart, built mark by mark.
-
-    Args:
-        x: horizontal axis.
-        y: vertical axis.
-        x_label: quantity and unit of the horizontal axis.
-        y_label: quantity and unit of the vertical axis; it stands above the plot.
-        height: height [pixel]; the width is 460.
-    """
+    """One chart, built mark by mark."""
 
     def __init__(self, x: Scale, y: Scale, *, x_label: str, y_label: str, height: int = HEIGHT) -> None:
         self._x, self._y = x, y
         self._labels = (x_label, y_label)
-        self._height = height
+        self._height = height  # height [pixel]; the width is 460
         self._across, self._up = WIDTH - LEFT - RIGHT, height - TOP - BOTTOM
         self._marks: list[Markup] = []
 
@@ -222,12 +188,7 @@ class Plot:
         self._marks.append(tag("text", label, x=self._across, y=f"{place:.1f}", class_="note end"))
 
     def svg(self, title: str, description: str) -> Markup:
-        """Return the chart.
-
-        Args:
-            title: what it shows.
-            description: what is to be seen, for those who do not see it.
-        """
+        """Return the chart."""
         area = tag(
             "svg",
             tag("g", *self._marks, transform=f"translate({MARGIN} {MARGIN})"),
@@ -268,35 +229,18 @@ class Plot:
 
 @dataclass(frozen=True, kw_only=True)
 class Bar:
-    """One bar of a chart.
+    """One bar of a chart."""
 
-    Attributes:
-        label: what it stands for.
-        value: its length; NaN leaves it out.
-        written: the value as text.
-        dots: values of the scenarios, drawn on the bar.
-        kind: classes of the mark.
-        bold: whether it is the best.
-    """
-
-    label: str
-    value: float
-    written: str
-    dots: Sequence[float]
-    kind: str
-    bold: bool = False
+    label: str  # what it stands for
+    value: float  # its length; NaN leaves it out
+    written: str  # the value as text
+    dots: Sequence[float]  # values of the scenarios, drawn on the bar
+    kind: str  # classes of the mark
+    bold: bool = False  # whether it is the best
 
 
 def bar_chart(bars: Sequence[Bar], scale: Scale, label: str, title: str, description: str) -> Markup:
-    """Return horizontal bars with their names above them.
-
-    Args:
-        bars: the bars from top to bottom.
-        scale: axis of the values.
-        label: quantity and unit of the axis.
-        title: what the chart shows.
-        description: for those who do not see it.
-    """
+    """Return horizontal bars with their names above them."""
     left, right = 8, 14
     across, bottom = WIDTH - left - right, ROW * len(bars) + 6
 

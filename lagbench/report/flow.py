@@ -48,17 +48,11 @@ MOST_STEPS = 400
 
 @dataclass(frozen=True)
 class Stream:
-    """One streamline.
+    """One streamline."""
 
-    Attributes:
-        x: places in node numbers, shape [point].
-        y: places in node numbers, shape [point].
-        speed: speed there, shape [point].
-    """
-
-    x: Floats
-    y: Floats
-    speed: Floats
+    x: Floats  # places in node numbers, shape [point]
+    y: Floats  # places in node numbers, shape [point]
+    speed: Floats  # speed there, shape [point]
 
 
 class _Flow:

@@ -75,14 +75,7 @@ def join(parts: Iterable[object], separator: object = "") -> Markup:
 
 
 def tag(name: str, /, *children: object, **attributes: object) -> Markup:
-    """Return an element; children and values that are no markup are escaped.
-
-    Args:
-        name: name of the element.
-        *children: its content.
-        **attributes: ``class_`` stands for class, ``aria_label`` for aria-label; None is left
-            out, True stands without a value.
-    """
+    """Return an element; children and values that are no markup are escaped."""
     spelled = "".join(_attribute(key, value) for key, value in attributes.items())
     if name in VOID:
         return Markup(f"<{name}{spelled}>")

@@ -35,53 +35,29 @@ POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; base-uri
 
 @dataclass(frozen=True, kw_only=True)
 class Figure:
-    """One figure.
+    """One figure."""
 
-    Attributes:
-        name: identifier, unique on the page.
-        title: what it shows, a few words.
-        thesis: the figure of the thesis that it corresponds to, as in "Fig. 5.10".
-        body: the drawing, with its key.
-        caption: what it shows, units, how to read it.
-        wide: whether it takes the whole width.
-        data: its numbers as a table, where that is cheap.
-    """
-
-    name: str
-    title: str
-    thesis: str
-    body: Markup
-    caption: Markup
-    wide: bool = False
-    data: Markup | None = None
+    name: str  # identifier, unique on the page
+    title: str  # what it shows, a few words
+    thesis: str  # the figure of the thesis that it corresponds to, as in "Fig. 5.10"
+    body: Markup  # the drawing, with its key
+    caption: Markup  # what it shows, units, how to read it
+    wide: bool = False  # whether it takes the whole width
+    data: Markup | None = None  # its numbers as a table, where that is cheap
 
 
 @dataclass(frozen=True, kw_only=True)
 class Section:
-    """A stretch of the page.
+    """A stretch of the page."""
 
-    Attributes:
-        name: identifier, unique on the page.
-        title: its heading.
-        lead: what stands before the figures.
-        figures: its figures.
-    """
-
-    name: str
-    title: str
-    lead: Markup
+    name: str  # identifier, unique on the page
+    title: str  # its heading
+    lead: Markup  # what stands before the figures
     figures: Sequence[Figure] = ()
 
 
 def document(title: str, head: Markup, sections: Sequence[Section], foot: Markup) -> str:
-    """Return the page.
-
-    Args:
-        title: title of the window.
-        head: top of the page.
-        sections: its sections; figures are numbered through all of them.
-        foot: last lines.
-    """
+    """Return the page."""
     links = [tag("li", tag("a", section.title, href=f"#part-{section.name}")) for section in sections]
     contents = tag("nav", tag("ol", *links), class_="contents", aria_label="Contents")
     first = 1
@@ -131,12 +107,7 @@ def _figure(figure: Figure, number: int) -> Markup:
 
 
 def key(items: Sequence[tuple[str, str]], *, kind: str = "line") -> Markup:
-    """Return what the marks of a figure mean.
-
-    Args:
-        items: classes of the mark and its name.
-        kind: class of the marks themselves, "line" or "square".
-    """
+    """Return what the marks of a figure mean."""
     return tag(
         "ul", *(tag("li", _swatch(mark, kind), tag("span", name)) for mark, name in items), class_="key"
     )
@@ -153,14 +124,7 @@ def _swatch(mark: str, kind: str) -> Markup:
 def table(
     head: Sequence[object], rows: Sequence[Sequence[object]], *, kind: str = "", label: str = ""
 ) -> Markup:
-    """Return a table in a box of its own that scrolls when it is wider than the page.
-
-    Args:
-        head: headings of the columns.
-        rows: cells of each row, the first one its heading.
-        kind: further classes.
-        label: what it holds, for those who do not see it.
-    """
+    """Return a table in a box of its own that scrolls when it is wider than the page."""
     headings = tag("tr", *(tag("th", cell, scope="col") for cell in head))
     body = [tag("tr", tag("th", row[0], scope="row"), *(tag("td", cell) for cell in row[1:])) for row in rows]
     drawn = tag("table", tag("thead", headings), tag("tbody", *body), class_=kind or None)
@@ -179,13 +143,7 @@ SIDE = 200
 def grid(
     columns: Sequence[object], rows: Sequence[tuple[str, Sequence[Markup]]], *, width: float = 6.6
 ) -> Markup:
-    """Return panels in a grid that scrolls sideways on narrow screens.
-
-    Args:
-        columns: what stands above each column.
-        rows: name of each row and its panels.
-        width: least width of a panel [rem].
-    """
+    """Return panels in a grid that scrolls sideways on narrow screens."""
     cells = [tag("span"), *(tag("span", column, class_="time") for column in columns)]
     for name, panels in rows:
         cells += [tag("span", name, class_="side"), *panels]
@@ -210,14 +168,7 @@ def _classes(walls: Walls) -> str:
 
 
 def ramp(kind: str, limit: float, unit: str, *, signed: bool = False) -> Markup:
-    """Return the key of a colour scale.
-
-    Args:
-        kind: "diverging", "sequential" or "flow".
-        limit: value of full colour.
-        unit: quantity and unit.
-        signed: whether the scale starts at minus the limit.
-    """
+    """Return the key of a colour scale."""
     low = f"−{text(limit)}" if signed else "0"
     bar = tag("span", class_=f"ramp {kind}")
     return tag("p", join([low, bar, text(limit)], " "), tag("span", unit, class_="muted"), class_="scale")

@@ -55,19 +55,12 @@ SAME = ("split", "size", "dataset_version", "dataset_sha256")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Entry:
-    """One submission of the report.
+    """One submission of the report."""
 
-    Attributes:
-        number: its place in the order in which the files were given, from 0.
-        name: its method, told apart from others of that name.
-        card: what the scorer says of it.
-        predictions: its file.
-    """
-
-    number: int
-    name: str
-    card: ScoreCard
-    predictions: Path
+    number: int  # its place in the order in which the files were given, from 0
+    name: str  # its method, told apart from others of that name
+    card: ScoreCard  # what the scorer says of it
+    predictions: Path  # its file
 
     @property
     def kind(self) -> str:
@@ -77,34 +70,21 @@ class Entry:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Row:
-    """What stands beside each other in tables and charts: an entry or a floor.
-
-    Attributes:
-        name: its name.
-        kind: classes of its marks.
-        scores: its scores by metric.
-        entry: the entry, None for a floor.
-    """
+    """What stands beside each other in tables and charts: an entry or a floor."""
 
     name: str
-    kind: str
-    scores: Mapping[str, Score]
-    entry: Entry | None = None
+    kind: str  # classes of its marks
+    scores: Mapping[str, Score]  # its scores by metric
+    entry: Entry | None = None  # the entry, None for a floor
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Subject:
-    """Everything that the figures are drawn from.
+    """Everything that the figures are drawn from."""
 
-    Attributes:
-        exam: the test subset.
-        title: title of the split.
-        entries: the submissions in the order in which they were given.
-    """
-
-    exam: ScoredTask
-    title: str
-    entries: tuple[Entry, ...]
+    exam: ScoredTask  # the test subset
+    title: str  # title of the split
+    entries: tuple[Entry, ...]  # the submissions in the order in which they were given
 
     @cached_property
     def rows(self) -> tuple[Row, ...]:
@@ -204,18 +184,7 @@ def subject_of(
     root: str | Path | None = None,
     registry: Registry | None = None,
 ) -> Subject:
-    """Return the subject of a report.
-
-    Args:
-        cards: score cards.
-        predictions: their files, in the same order.
-        root: folder of all data sets.
-        registry: where splits are described; ours when None.
-
-    Raises:
-        UsageError: nothing to report, or cards of different splits, sizes or data sets.
-        DataError: the test subset is missing or damaged.
-    """
+    """Return the subject of a report."""
     if not cards or len(cards) != len(predictions):
         raise UsageError(
             "a report needs score cards and their predictions",
@@ -254,17 +223,11 @@ _ALONG = ((0.0, 1.0), (0.0, 1.0), (1.0, 0.0), (1.0, 0.0))
 
 @dataclass(frozen=True)
 class Walls:
-    """Which walls of a scenario move, and its Reynolds number.
+    """Which walls of a scenario move, and its Reynolds number."""
 
-    Attributes:
-        moving: names of the walls that slide.
-        reynolds: Reynolds number, None where there is none.
-        mark: what sets the scenario apart, as in "falling circle"; empty where nothing does.
-    """
-
-    moving: tuple[str, ...]
-    reynolds: float | None
-    mark: str
+    moving: tuple[str, ...]  # names of the walls that slide
+    reynolds: float | None  # Reynolds number, None where there is none
+    mark: str  # what sets the scenario apart, as in "falling circle"; empty where nothing does
 
     @property
     def classes(self) -> str:
@@ -274,17 +237,11 @@ class Walls:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Moment:
-    """One frame of one scenario: the truth and every entry's prediction.
+    """One frame of one scenario: the truth and every entry's prediction."""
 
-    Attributes:
-        scenario: id of the scenario.
-        frame: absolute frame number.
-        pairs: truth and prediction of each entry, in their order.
-    """
-
-    scenario: int
-    frame: int
-    pairs: tuple[FramePair, ...]
+    scenario: int  # id of the scenario
+    frame: int  # absolute frame number
+    pairs: tuple[FramePair, ...]  # truth and prediction of each entry, in their order
 
     @property
     def truth(self) -> Snapshot:
@@ -304,15 +261,10 @@ class Moment:
 
 @dataclass(frozen=True, eq=False)
 class Gallery:
-    """All frames that the pictures of a report show.
+    """All frames that the pictures of a report show."""
 
-    Attributes:
-        moments: moments by scenario id and frame.
-        walls: walls by scenario id.
-    """
-
-    moments: Mapping[tuple[int, int], Moment]
-    walls: Mapping[int, Walls]
+    moments: Mapping[tuple[int, int], Moment]  # moments by scenario id and frame
+    walls: Mapping[int, Walls]  # walls by scenario id
 
     def at(self, scenario: int, frames: Collection[int]) -> list[Moment]:
         """Return the moments of a scenario at some frames."""
@@ -320,12 +272,7 @@ class Gallery:
 
 
 def open_gallery(subject: Subject) -> Gallery:
-    """Read the frames that the pictures of a report show.
-
-    Raises:
-        DataError: the truth is damaged.
-        UnreadableFileError: predictions are.
-    """
+    """Read the frames that the pictures of a report show."""
     moments: dict[tuple[int, int], Moment] = {}
     walls: dict[int, Walls] = {}
     with ExitStack() as stack:

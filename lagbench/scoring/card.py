@@ -55,31 +55,19 @@ LABELS = ("seconds_per_frame", "device", "seed", "parameters", "training")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ScoreCard:
-    """What the scorer says of one submission.
+    """What the scorer says of one submission."""
 
-    Attributes:
-        header: what the predictions say about themselves.
-        predictions_sha256: content hash of the predicted positions.
-        setting: the task, as metrics see it.
-        ranking: name of the metric that ranks.
-        tallies: statistics by row (submission, persistence, constant-velocity) and scenario.
-        scores: scores by row and metric.
-        flags: what a reader should know.
-        warnings: findings of the validation that do not reject.
-        preview: pictures of the first scenario.
-        files: scores.json and scores.nc, where they were written.
-    """
-
-    header: Header
-    predictions_sha256: str
-    setting: Setting
-    ranking: str
+    header: Header  # what the predictions say about themselves
+    predictions_sha256: str  # content hash of the predicted positions
+    setting: Setting  # the task, as metrics see it
+    ranking: str  # name of the metric that ranks
+    # statistics by row (submission, persistence, constant-velocity) and scenario
     tallies: Mapping[str, Mapping[int, Tally]]
-    scores: Mapping[str, Mapping[str, Score]]
-    flags: tuple[Flag, ...]
-    warnings: tuple[Finding, ...]
-    preview: Preview
-    files: tuple[Path, ...] = ()
+    scores: Mapping[str, Mapping[str, Score]]  # scores by row and metric
+    flags: tuple[Flag, ...]  # what a reader should know
+    warnings: tuple[Finding, ...]  # findings of the validation that do not reject
+    preview: Preview  # pictures of the first scenario
+    files: tuple[Path, ...] = ()  # scores.json and scores.nc, where they were written
 
     @property
     def scenarios(self) -> tuple[int, ...]:
@@ -187,38 +175,24 @@ def _flag(flag: Flag) -> dict[str, Any]:
 
 
 def write_json(card: ScoreCard, path: Path) -> None:
-    """Write scores.json, whole or not at all.
-
-    Raises:
-        WorkFailedError: the operating system refused.
-    """
+    """Write scores.json, whole or not at all."""
     text = json.dumps(card.as_json(), indent=1, allow_nan=False, ensure_ascii=False)
     write_atomically(path, f"{text}\n".encode(), option="--output")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PublishedScores:
-    """What a scores.json says, as far as another submission can be compared with it.
+    """What a scores.json says, as far as another submission can be compared with it."""
 
-    Attributes:
-        identity: split, size, version and hash of the data set, and the method.
-        predictions_sha256: content hash of the predicted positions.
-        ranking: name of the metric that ranks.
-        scores: scores by row and metric, over the horizon; values per frame are not in the file.
-    """
-
-    identity: Mapping[str, str]
-    predictions_sha256: str
-    ranking: str
+    identity: Mapping[str, str]  # split, size, version and hash of the data set, and the method
+    predictions_sha256: str  # content hash of the predicted positions
+    ranking: str  # name of the metric that ranks
+    # scores by row and metric, over the horizon; values per frame are not in the file
     scores: Mapping[str, Mapping[str, Score]]
 
 
 def read_scores(path: Path) -> PublishedScores:
-    """Read a scores.json; metrics that are not installed here are left out.
-
-    Raises:
-        UnreadableFileError: it is not one.
-    """
+    """Read a scores.json; metrics that are not installed here are left out."""
     try:
         return parse_scores(json.loads(path.read_bytes()))
     except (OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError) as error:
@@ -229,12 +203,7 @@ def read_scores(path: Path) -> PublishedScores:
 
 
 def unreadable_scores(path: Path, error: Exception) -> UnreadableFileError:
-    """Return the error for a file that is not the scores.json or scores.nc that its name promises.
-
-    Args:
-        path: the file.
-        error: what went wrong when it was read.
-    """
+    """Return the error for a file that is not the scores.json or scores.nc that its name promises."""
     return UnreadableFileError(
         f"not a scores{path.suffix} of lagbench",
         where=str(path),
@@ -245,13 +214,7 @@ def unreadable_scores(path: Path, error: Exception) -> UnreadableFileError:
 
 
 def parse_scores(held: Mapping[str, Any]) -> PublishedScores:
-    """Return what a score card as JSON says: :meth:`ScoreCard.as_json`, or a scores.json.
-
-    Raises:
-        ValueError: another layout, text that no terminal should print, or ids and values that
-            do not fit; likewise LookupError, TypeError, AttributeError and ArithmeticError where
-            keys are missing or of another kind.
-    """
+    """Return what a score card as JSON says: :meth:`ScoreCard.as_json`, or a scores.json."""
     if held["lagbench_scores"] != FORMAT:
         raise ValueError(f"layout {str(held['lagbench_scores'])[:MAX_NAME]!r}, not {FORMAT}")
     ids = tuple(_integer(i, "an id") for i in held["task"]["scenarios"])

@@ -37,10 +37,6 @@ __all__ = [
 def told_apart(methods: Sequence[str], taken: Collection[str] = ()) -> list[str]:
     """Return the methods; those that occur twice, or have a taken name, with a number.
 
-    Args:
-        methods: what the submissions call themselves.
-        taken: names that are not theirs to use, as those of floors.
-
     >>> told_apart(["gns", "gat", "gns"])
     ['gns (1)', 'gat', 'gns (2)']
     """
@@ -58,62 +54,37 @@ SAME = ("split", "size", "dataset_sha256")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Contestant:
-    """One side of a comparison.
+    """One side of a comparison."""
 
-    Attributes:
-        name: what the user called it.
-        identity: split, size, version and hash of the data set, and the method.
-        predictions_sha256: content hash of the predicted positions.
-        ranking: name of the metric that ranks.
-        scores: scores by metric.
-    """
-
-    name: str
-    identity: Mapping[str, str]
-    predictions_sha256: str
-    ranking: str
-    scores: Mapping[str, Score]
+    name: str  # what the user called it
+    identity: Mapping[str, str]  # split, size, version and hash of the data set, and the method
+    predictions_sha256: str  # content hash of the predicted positions
+    ranking: str  # name of the metric that ranks
+    scores: Mapping[str, Score]  # scores by metric
 
 
 @dataclass(frozen=True, kw_only=True)
 class MetricComparison:
-    """Two submissions in one metric.
+    """Two submissions in one metric."""
 
-    Attributes:
-        unit: unit of the means.
-        first: mean of the first over scenarios.
-        second: mean of the second.
-        test: difference, interval and p-value, in the metric's loss.
-    """
-
-    unit: str
-    first: float
-    second: float
-    test: Comparison
+    unit: str  # unit of the means
+    first: float  # mean of the first over scenarios
+    second: float  # mean of the second
+    test: Comparison  # difference, interval and p-value, in the metric's loss
 
 
 @dataclass(frozen=True, kw_only=True)
 class ComparisonResult:
-    """How two submissions compare.
+    """How two submissions compare."""
 
-    Attributes:
-        split: split of both.
-        size: size of both.
-        first: method of the first, told apart from that of the second.
-        second: method of the second, likewise, or the name of the floor.
-        same_predictions: whether both hold the same positions.
-        ranking: name of the metric that ranks.
-        scenarios: how many scenarios both have in that metric.
-        metrics: comparison by metric, the ranking one first; observables are left out.
-    """
-
-    split: str
-    size: str
-    first: str
-    second: str
-    same_predictions: bool
-    ranking: str
-    scenarios: int
+    split: str  # split of both
+    size: str  # size of both
+    first: str  # method of the first, told apart from that of the second
+    second: str  # method of the second, likewise, or the name of the floor
+    same_predictions: bool  # whether both hold the same positions
+    ranking: str  # name of the metric that ranks
+    scenarios: int  # how many scenarios both have in that metric
+    # comparison by metric, the ranking one first; observables are left out
     metrics: Mapping[str, MetricComparison]
 
     @property

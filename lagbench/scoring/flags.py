@@ -50,27 +50,17 @@ SHIFTS = (-2, -1, 1, 2)
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """Means over particles and components, at each predicted frame of one scenario.
+    """Means over particles and components, at each predicted frame of one scenario."""
 
-    Attributes:
-        error: ``e(f)^2`` [length^2], shape [frame].
-        overlap: ``e(f) e(f-1)`` [length^2], NaN at the first frame, shape [frame].
-        motion: ``u_true(f)^2`` [length^2/frame^2], shape [frame].
-        predicted_motion: ``u_pred(f)^2`` [length^2/frame^2], shape [frame].
-        shifted: ``(x_pred(f) - x_true(f+s))^2`` by shift s [length^2], NaN where frame f+s is
-            not predicted yet nor given, shape [frame].
-        occupancy: nodes that the prediction fills over those that the truth fills [1], shape
-            [frame].
-        outside: share of particles outside the unit box [1], shape [frame].
-    """
-
-    error: Floats
-    overlap: Floats
-    motion: Floats
-    predicted_motion: Floats
+    error: Floats  # e(f)^2 [length^2], shape [frame]
+    overlap: Floats  # e(f) e(f-1) [length^2], NaN at the first frame, shape [frame]
+    motion: Floats  # u_true(f)^2 [length^2/frame^2], shape [frame]
+    predicted_motion: Floats  # u_pred(f)^2 [length^2/frame^2], shape [frame]
+    # (x_pred(f) - x_true(f+s))^2 by shift s [length^2], NaN where frame f+s is not predicted yet
+    # nor given, shape [frame]
     shifted: Mapping[int, Floats]
-    occupancy: Floats
-    outside: Floats
+    occupancy: Floats  # nodes that the prediction fills over those that the truth fills [1], shape [frame]
+    outside: Floats  # share of particles outside the unit box [1], shape [frame]
 
     def __reduce__(self) -> tuple[object, ...]:
         """Cross process borders, which a mapping proxy does not."""
@@ -79,11 +69,7 @@ class Trace:
 
 
 class Tracer:
-    """Collects the trace of one scenario, frame pair by frame pair.
-
-    Args:
-        scenario: the scenario; its given frames count as true history.
-    """
+    """Collects the trace of one scenario, frame pair by frame pair."""
 
     def __init__(self, scenario: Scenario) -> None:
         frames = scenario.setting.horizon
@@ -153,42 +139,25 @@ ROUNDING = 2.0**-20
 
 @dataclass(frozen=True, kw_only=True)
 class Flag:
-    """One flag of a submission.
-
-    Attributes:
-        name: its name.
-        raised: whether it is raised; None where that cannot be told.
-        reasons: why, one clause each.
-        evidence: the numbers behind it.
-    """
+    """One flag of a submission."""
 
     name: str
-    raised: bool | None
-    reasons: tuple[str, ...]
-    evidence: Mapping[str, float]
+    raised: bool | None  # whether it is raised; None where that cannot be told
+    reasons: tuple[str, ...]  # why, one clause each
+    evidence: Mapping[str, float]  # the numbers behind it
 
 
 @dataclass(frozen=True, kw_only=True)
 class Evidence:
-    """What the error of one scenario does from frame to frame; NaN where it is 0.
+    """What the error of one scenario does from frame to frame; NaN where it is 0."""
 
-    Attributes:
-        autocorrelation: mean over frames of the cosine between e(f) and e(f-1) [1].
-        drop: least ratio of the RMS errors of two consecutive frames [1].
-        shift: shift of the truth that fits the prediction best [frame].
-        shift_gain: RMS error at that shift over the RMS error without it, same frames [1].
-        growth: RMS error of the last quarter of the frames over that of the first frame [1].
-        steps: largest RMS error over the RMS of the truth's per-frame displacement [1].
-        exact: frames in which the truth moves and the error is 0.
-    """
-
-    autocorrelation: float
-    drop: float
-    shift: int
-    shift_gain: float
-    growth: float
-    steps: float
-    exact: int
+    autocorrelation: float  # mean over frames of the cosine between e(f) and e(f-1) [1]
+    drop: float  # least ratio of the RMS errors of two consecutive frames [1]
+    shift: int  # shift of the truth that fits the prediction best [frame]
+    shift_gain: float  # RMS error at that shift over the RMS error without it, same frames [1]
+    growth: float  # RMS error of the last quarter of the frames over that of the first frame [1]
+    steps: float  # largest RMS error over the RMS of the truth's per-frame displacement [1]
+    exact: int  # frames in which the truth moves and the error is 0
 
 
 def evidence(trace: Trace) -> Evidence:
@@ -216,9 +185,6 @@ def copy_suspect(traces: Sequence[Trace]) -> Flag:
 
     A constant offset beyond a frame's motion, or a share of the truth mixed into a rollout, is
     not seen.
-
-    Args:
-        traces: traces of the scenarios.
     """
     found = [evidence(trace) for trace in traces]
     reasons = []
@@ -274,11 +240,7 @@ def below_twin_floor(error: Floats, persistence: Floats, floor: Sequence[float])
 
 
 def physics(traces: Sequence[Trace]) -> Flag:
-    """Judge whether energy and filled area stay near the truth's.
-
-    Args:
-        traces: traces of the scenarios.
-    """
+    """Judge whether energy and filled area stay near the truth's."""
     energy = _ratio(sum(np.sum(t.predicted_motion) for t in traces), sum(np.sum(t.motion) for t in traces))
     occupancy = float(np.mean([np.mean(t.occupancy) for t in traces]))
     outside = float(np.mean([np.mean(t.outside) for t in traces]))

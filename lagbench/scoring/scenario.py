@@ -47,40 +47,24 @@ PARTICLES = 200
 
 @dataclass(frozen=True, eq=False)
 class Preview:
-    """Pictures of one scenario; index 0 of ``side`` is the truth, 1 the prediction.
+    """Pictures of one scenario; index 0 of ``side`` is the truth, 1 the prediction."""
 
-    Attributes:
-        scenario: id of the scenario.
-        map_frames: frames of interest and the last one.
-        vorticity: at the compared nodes, NaN elsewhere [1/frame], shape [side, map frame,
-            x node, y node].
-        histogram: shares of 64 bins over the truth's range of omega, NaN where there is none
-            [1], shape [side, map frame, bin].
-        histogram_range: that range [1/frame], shape [map frame, 2].
-        film_frames: frames of the film.
-        particles: numbers of the particles in the film.
-        material: their materials, shape [film particle].
-        film: their positions [length], shape [side, film frame, film particle, 2].
-    """
-
-    scenario: int
-    map_frames: tuple[int, ...]
+    scenario: int  # id of the scenario
+    map_frames: tuple[int, ...]  # frames of interest and the last one
+    # at the compared nodes, NaN elsewhere [1/frame], shape [side, map frame, x node, y node]
     vorticity: NDArray[np.float32]
+    # shares of 64 bins over the truth's range of omega, NaN where there is none [1], shape
+    # [side, map frame, bin]
     histogram: NDArray[np.float32]
-    histogram_range: NDArray[np.float32]
+    histogram_range: NDArray[np.float32]  # that range [1/frame], shape [map frame, 2]
     film_frames: tuple[int, ...]
-    particles: tuple[int, ...]
-    material: NDArray[np.int8]
-    film: NDArray[np.float32]
+    particles: tuple[int, ...]  # numbers of the particles in the film
+    material: NDArray[np.int8]  # their materials, shape [film particle]
+    film: NDArray[np.float32]  # their positions [length], shape [side, film frame, film particle, 2]
 
 
 class PreviewRecorder:
-    """Takes the pictures of one scenario, frame pair by frame pair.
-
-    Args:
-        number: id of the scenario.
-        scenario: the scenario.
-    """
+    """Takes the pictures of one scenario, frame pair by frame pair."""
 
     def __init__(self, number: int, scenario: Scenario) -> None:
         setting = scenario.setting
@@ -154,51 +138,27 @@ LONG_BITS = 11
 
 @dataclass(frozen=True, kw_only=True)
 class ScenarioJob:
-    """What a worker needs to score one scenario.
+    """What a worker needs to score one scenario."""
 
-    Attributes:
-        exam: the test subset.
-        scenario: id of the scenario.
-        predictions: a predictions.nc that has been validated.
-        metrics: names of the metrics.
-        pictured: whether to take the preview.
-    """
-
-    exam: ScoredTask
-    scenario: int
-    predictions: Path
-    metrics: tuple[str, ...]
-    pictured: bool = False
+    exam: ScoredTask  # the test subset
+    scenario: int  # id of the scenario
+    predictions: Path  # a predictions.nc that has been validated
+    metrics: tuple[str, ...]  # names of the metrics
+    pictured: bool = False  # whether to take the preview
 
 
 @dataclass(frozen=True, eq=False)
 class ScenarioScores:
-    """What was measured of one scenario.
+    """What was measured of one scenario."""
 
-    Attributes:
-        scenario: id of the scenario.
-        tallies: statistics by row.
-        trace: how the submission's error moves.
-        preview: pictures, if they were asked for.
-    """
-
-    scenario: int
-    tallies: Mapping[str, Tally]
-    trace: Trace
-    preview: Preview | None
+    scenario: int  # id of the scenario
+    tallies: Mapping[str, Tally]  # statistics by row
+    trace: Trace  # how the submission's error moves
+    preview: Preview | None  # pictures, if they were asked for
 
 
 def score_scenario(job: ScenarioJob, report: Report) -> ScenarioScores:
-    """Score one scenario of a submission and of the floors.
-
-    Args:
-        job: what to score.
-        report: told the frames done.
-
-    Raises:
-        DataError: the truth is damaged.
-        UnreadableFileError: the predictions are.
-    """
+    """Score one scenario of a submission and of the floors."""
     metrics = select(job.metrics)
     with job.exam.opened(job.scenario) as truth, open_predictions(job.predictions) as predictions:
         scenario = truth.scenario
@@ -217,19 +177,7 @@ def measure_rows(
     photographer: PreviewRecorder | None = None,
     report: Report = lambda _: None,
 ) -> tuple[dict[str, Tally], Trace]:
-    """Measure rows of predictions of one scenario side by side, frame by frame.
-
-    Args:
-        scenario: the scenario.
-        truth: true snapshots of the predicted frames.
-        rows: predicted snapshots of the same frames, by row; the first is traced and pictured.
-        metrics: metrics to measure.
-        photographer: takes the preview.
-        report: told the frames done.
-
-    Returns:
-        Tally of each row as it is stored, and the trace of the first row.
-    """
+    """Measure rows of predictions of one scenario side by side, frame by frame."""
     frames = scenario.setting.predicted_frames
     tracer, first = Tracer(scenario), next(iter(rows))
     measured: dict[str, dict[int, dict[str, float]]] = {name: {} for name in rows}

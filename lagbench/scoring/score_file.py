@@ -51,11 +51,7 @@ _PREVIEW: Mapping[str, tuple[tuple[str, ...], str]] = {
 
 
 def write_statistics(card: ScoreCard, path: Path) -> None:
-    """Write scores.nc, whole or not at all; equal cards give equal bytes.
-
-    Raises:
-        WorkFailedError: the operating system refused.
-    """
+    """Write scores.nc, whole or not at all; equal cards give equal bytes."""
     import netCDF4
 
     with atomic_path(path, option="--output") as temporary, ExitStack() as stack:
@@ -156,19 +152,12 @@ def _store(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StoredScores:
-    """What a scores.nc holds beside its preview.
+    """What a scores.nc holds beside its preview."""
 
-    Attributes:
-        identity: split, size, version and hash of the data set, and the method.
-        predictions_sha256: content hash of the predicted positions.
-        ranking: name of the metric that ranks.
-        tallies: statistics of the submission by scenario.
-    """
-
-    identity: Mapping[str, str]
-    predictions_sha256: str
-    ranking: str
-    tallies: Mapping[int, Tally]
+    identity: Mapping[str, str]  # split, size, version and hash of the data set, and the method
+    predictions_sha256: str  # content hash of the predicted positions
+    ranking: str  # name of the metric that ranks
+    tallies: Mapping[int, Tally]  # statistics of the submission by scenario
 
     def scores(self) -> dict[str, Score]:
         """Return the scores of all installed metrics whose statistics are here, by name."""
@@ -178,11 +167,7 @@ class StoredScores:
 
 
 def read_statistics(path: Path) -> StoredScores:
-    """Read the statistics of a scores.nc.
-
-    Raises:
-        UnreadableFileError: it is not one.
-    """
+    """Read the statistics of a scores.nc."""
     import netCDF4
 
     try:

@@ -41,17 +41,11 @@ ARROWS = {Direction.LOWER: "lower", Direction.HIGHER: "higher", Direction.TARGET
 
 @dataclass(frozen=True)
 class Table:
-    """A table of text.
+    """A table of text."""
 
-    Attributes:
-        title: what it shows.
-        columns: names of the columns.
-        rows: cells, row by row.
-    """
-
-    title: str
-    columns: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
+    title: str  # what it shows
+    columns: tuple[str, ...]  # names of the columns
+    rows: tuple[tuple[str, ...], ...]  # cells, row by row
 
 
 def card_tables(card: ScoreCard, *, every: bool = False) -> Iterator[Table]:

@@ -34,14 +34,9 @@ __all__ = [
 
 @dataclass(frozen=True)
 class OpenScenario:
-    """A test scenario whose file is open.
+    """A test scenario whose file is open."""
 
-    Attributes:
-        scenario: what holds in all its frames.
-        file: its file.
-    """
-
-    scenario: Scenario
+    scenario: Scenario  # what holds in all its frames
     file: ScenarioFile
 
     def snapshots(self) -> Iterator[Snapshot]:
@@ -52,19 +47,12 @@ class OpenScenario:
 
 @dataclass(frozen=True, kw_only=True)
 class ScoredTask:
-    """The test subset of one split and size.
+    """The test subset of one split and size."""
 
-    Attributes:
-        truth: its files.
-        setting: the split and size, as metrics see it.
-        density: rest density [mass/length^2].
-        twin_floor: position RMSE of the nudged twin per predicted frame [length]; empty where
-            it is recorded nowhere.
-    """
-
-    truth: Truth
-    setting: Setting
-    density: float
+    truth: Truth  # its files
+    setting: Setting  # the split and size, as metrics see it
+    density: float  # rest density [mass/length^2]
+    # position RMSE of the nudged twin per predicted frame [length]; empty where it is recorded nowhere
     twin_floor: tuple[float, ...] = ()
 
     @property
@@ -79,11 +67,7 @@ class ScoredTask:
 
     @contextmanager
     def opened(self, scenario: int) -> Iterator[OpenScenario]:
-        """Yield a scenario while its file is open.
-
-        Raises:
-            DataError: the file is missing, damaged or another one than the registry means.
-        """
+        """Yield a scenario while its file is open."""
         with self.truth.open(scenario) as file:
             material = file.read("material")
             mass = float(file.read("particle_mass"))
@@ -104,16 +88,7 @@ def ranking_metric(size: Size) -> str:
 
 
 def load_scored_task(size: Size, root: Path) -> ScoredTask:
-    """Check that the test subset is there and gather what the metrics need to know.
-
-    Args:
-        size: split and size.
-        root: folder of all data sets.
-
-    Raises:
-        DataError: files are missing, damaged, of another content hash or too short for the
-            task, or the statistics of train are recorded nowhere.
-    """
+    """Check that the test subset is there and gather what the metrics need to know."""
     bring(size, root, size.subsets["test"])
     truth = Truth(size, root)
     truth.require()

@@ -61,12 +61,7 @@ def quietly() -> Iterator[None]:
 
 
 def fetch_scenarios(size: Size, root: Path, url: str, entries: Collection[FileEntry]) -> None:
-    """Fetch objects into the working copy, whose lock is held; each appears whole and right.
-
-    Raises:
-        DataError: an object is not there, no data, or of another length or content.
-        WorkFailedError: the store refuses or does not answer, or the disk is full.
-    """
+    """Fetch objects into the working copy, whose lock is held; each appears whole and right."""
     if not entries:
         return
     told = _Ticker(url, len(entries), sum(entry.bytes for entry in entries))

@@ -64,27 +64,14 @@ PAUSE = 0.1
 
 @dataclass(frozen=True)
 class Mark:
-    """A file by which a worker knows the client's folder.
+    """A file by which a worker knows the client's folder."""
 
-    Attributes:
-        path: where it stands.
-        word: what it holds.
-        patience: how long it may take to appear [s].
-    """
-
-    path: Path
-    word: str
-    patience: float
+    path: Path  # where it stands
+    word: str  # what it holds
+    patience: float  # how long it may take to appear [s]
 
     def check(self, worker: str) -> None:
-        """See that the folder is here and can be written to.
-
-        Args:
-            worker: name of this machine for the message.
-
-        Raises:
-            WorkFailedError: the client's folder is another one, or write-protected.
-        """
+        """See that the folder is here and can be written to."""
         folder = self.path.parent
         if not _appears(self.path, self.patience) or self.path.read_text(encoding="utf-8") != self.word:
             raise WorkFailedError(
@@ -102,11 +89,7 @@ class Mark:
 
 @contextmanager
 def marked(folder: Path) -> Iterator[Mark]:
-    """Keep a mark in a folder.
-
-    Raises:
-        WorkFailedError: the operating system refused.
-    """
+    """Keep a mark in a folder."""
     mark = Mark(temporary_name(folder / "mark"), secrets.token_hex(16), PATIENCE)
     write_atomically(mark.path, mark.word.encode())
     try:
@@ -116,11 +99,7 @@ def marked(folder: Path) -> Iterator[Mark]:
 
 
 def await_file(path: Path) -> None:
-    """Wait until a file that another machine has written is seen here.
-
-    Raises:
-        WorkFailedError: it does not appear.
-    """
+    """Wait until a file that another machine has written is seen here."""
     if not _appears(path, PATIENCE):
         raise WorkFailedError(
             "a worker's file does not appear",
@@ -152,38 +131,23 @@ TELL_SECONDS = 0.5
 
 @dataclass(frozen=True, kw_only=True)
 class Order:
-    """A task on its way to a worker.
+    """A task on its way to a worker."""
 
-    Attributes:
-        task: what to do.
-        number: number of the order.
-        client: word that the orders of one client share; Dask events carry it too.
-        version: version of lagbench that the client runs.
-        environment: variables added to the environment of the process.
-        mark: what shows that the worker sees the client's folder; None where none is needed.
-    """
-
-    task: Task
-    number: int
-    client: str
-    version: str
-    environment: Mapping[str, str]
-    mark: Mark | None = None
+    task: Task  # what to do
+    number: int  # number of the order
+    client: str  # word that the orders of one client share; Dask events carry it too
+    version: str  # version of lagbench that the client runs
+    environment: Mapping[str, str]  # variables added to the environment of the process
+    mark: Mark | None = None  # what shows that the worker sees the client's folder; None where none is needed
 
 
 @dataclass(frozen=True, kw_only=True)
 class Delivery:
-    """What became of an order.
+    """What became of an order."""
 
-    Attributes:
-        value: result of the task.
-        units: units of work done.
-        machine: what :mod:`.identity` says of the machine that did it.
-    """
-
-    value: Any
-    units: int
-    machine: dict[str, str]
+    value: Any  # result of the task
+    units: int  # units of work done
+    machine: dict[str, str]  # what identity says of the machine that did it
 
 
 @dataclass
@@ -203,13 +167,7 @@ _STOPPED: set[str] = set()
 
 
 def fulfil(order: Order) -> Delivery:
-    """Run a task in this thread's process, started now or kept from the last order.
-
-    Raises:
-        LagbenchError: what the task raised.
-        WorkFailedError: another version of lagbench, a folder that is not shared, or the process
-            died too often.
-    """
+    """Run a task in this thread's process, started now or kept from the last order."""
     name = socket.gethostname()
     if version("lagbench") != order.version:
         raise WorkFailedError(
@@ -304,17 +262,7 @@ LOGGERS = ("distributed", "distributed.client", "distributed.comm", "distributed
 
 
 class Cluster:
-    """The workers of a Dask cluster; use it as a context manager.
-
-    Args:
-        address: address of the scheduler, as in tcp://10.0.0.5:8786.
-        environment: variables added to the environment of the processes that work.
-        folder: folder that all workers must share with this machine; None for none.
-
-    Raises (on entry):
-        UsageError: Dask's distributed is not installed, or the address cannot be one.
-        WorkFailedError: the scheduler does not answer.
-    """
+    """The workers of a Dask cluster; use it as a context manager."""
 
     def __init__(
         self, address: str, environment: Mapping[str, str] | None = None, *, folder: Path | None = None
@@ -361,12 +309,7 @@ class Cluster:
         self._pending[number] = task, self._client.submit(fulfil, order, **options)
 
     def events(self) -> Iterator[Event]:
-        """Yield news until all tasks are done; lost work counts as negative progress.
-
-        Raises:
-            LagbenchError: what a task raised.
-            WorkFailedError: workers died too often, or the cluster is lost.
-        """
+        """Yield news until all tasks are done; lost work counts as negative progress."""
         looked = alive = time.monotonic()
         while self._pending:
             yield from self._progress()

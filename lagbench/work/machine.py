@@ -24,11 +24,7 @@ _LIBRARIES = ("lagbench", "numpy", "netCDF4", "taichi")
 
 
 def environment_of(device: str) -> dict[str, str]:
-    """Return what the manifest says about the machine at hand.
-
-    Args:
-        device: where the solver runs: "cpu", "parallel" or "cuda".
-    """
+    """Return what the manifest says about the machine at hand."""
     libraries = {name: version(name) for name in _LIBRARIES if importlib.util.find_spec(name)}
     system = {"python": platform.python_version(), "machine": platform.machine(), "system": platform.system()}
     return {**system, **libraries, "device": device}
@@ -48,10 +44,5 @@ def promises_bits(environment: Mapping[str, str]) -> bool:
 
 
 def may_differ(device: str, environments: Iterable[Mapping[str, str]]) -> bool:
-    """Return whether a file of a device may come from a machine that promises no equal bits.
-
-    Args:
-        device: what the file says about where it was simulated.
-        environments: machines that wrote files of the data set.
-    """
+    """Return whether a file of a device may come from a machine that promises no equal bits."""
     return any(e.get("device") == device and not promises_bits(e) for e in environments)

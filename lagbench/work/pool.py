@@ -63,11 +63,7 @@ def available_cores() -> int:
 
 
 def worker_count(wanted: int | None, *, default: int | None = None) -> int:
-    """Return how many workers to start: those wanted, else the default, else one per core.
-
-    Raises:
-        UsageError: fewer than one is wanted.
-    """
+    """Return how many workers to start: those wanted, else the default, else one per core."""
     if wanted is None:
         return default or available_cores()
     if wanted < 1:
@@ -77,36 +73,24 @@ def worker_count(wanted: int | None, *, default: int | None = None) -> int:
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """Something to run in a worker: ``function(*arguments, report)``, all of it picklable.
+    """Something to run in a worker: ``function(*arguments, report)``, all of it picklable."""
 
-    Attributes:
-        name: what messages call it, as in "cavity tiny scenario 3".
-        function: importable by its name from a module.
-        arguments: its arguments; a :data:`Report` is added as the last one.
-        cost: expected work in any unit; the costliest tasks start first.
-    """
-
-    name: str
-    function: Callable[..., Any]
-    arguments: tuple[Any, ...] = ()
-    cost: float = 0.0
+    name: str  # what messages call it, as in "cavity tiny scenario 3"
+    function: Callable[..., Any]  # importable by its name from a module
+    arguments: tuple[Any, ...] = ()  # its arguments; a Report is added as the last one
+    cost: float = 0.0  # expected work in any unit; the costliest tasks start first
 
 
 @dataclass(frozen=True, kw_only=True)
 class Event:
-    """News from a worker.
+    """News from a worker."""
 
-    Attributes:
-        task: the task concerned.
-        kind: "progress" (value: units done since the last news), "lost" (its worker died and
-            it starts anew; value: units that were done in vain) or "done" (value: its result).
-        value: see ``kind``.
-        machine: what :mod:`.identity` says of another machine that did it; None for this one.
-    """
-
-    task: Task
+    task: Task  # the task concerned
+    # "progress" (value: units done since the last news), "lost" (its worker died and it starts anew; value:
+    # units that were done in vain) or "done" (value: its result)
     kind: str
-    value: Any
+    value: Any  # see 'kind'
+    # what identity says of another machine that did it; None for this one
     machine: Mapping[str, str] | None = None
 
 
@@ -130,17 +114,10 @@ class _Worker:
 
 @dataclass
 class Pool:
-    """A set of workers; use it as a context manager, which ends them.
+    """A set of workers; use it as a context manager, which ends them."""
 
-    Args:
-        size: workers at the most; they start when there is work for them.
-        environment: variables added to the environment of the workers.
-
-    Raises:
-        UsageError: a size below one, with which no task would ever run.
-    """
-
-    size: int
+    size: int  # workers at the most; they start when there is work for them
+    # variables added to the environment of the workers
     environment: Mapping[str, str] = field(default_factory=dict)
     _workers: list[_Worker] = field(default_factory=list, init=False)
     _waiting: list[tuple[float, int, _Attempt]] = field(default_factory=list, init=False)
@@ -167,12 +144,7 @@ class Pool:
         self._queue(_Attempt(task))
 
     def events(self) -> Iterator[Event]:
-        """Run every queued task and yield news until all are done.
-
-        Raises:
-            LagbenchError: what a task raised.
-            WorkFailedError: a task crashed, or its worker died :data:`ATTEMPTS` times.
-        """
+        """Run every queued task and yield news until all are done."""
         while self._waiting or any(worker.attempt for worker in self._workers):
             self._assign()
             for worker in self._ready():
@@ -275,11 +247,7 @@ def _last_words(code: int) -> str:
 
 
 def serve(descriptor: int) -> None:
-    """Run the tasks that arrive on a socket until the other end closes.
-
-    Args:
-        descriptor: inherited file descriptor of the socket.
-    """
+    """Run the tasks that arrive on a socket until the other end closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     channel = Connection(descriptor)
     inbox: queue.SimpleQueue[bytes] = queue.SimpleQueue()

@@ -14,25 +14,15 @@ __all__ = [
 
 @dataclass(frozen=True, kw_only=True)
 class Progress:
-    """How far a generation or verification is.
+    """How far a generation or verification is."""
 
-    Attributes:
-        stage: what happens now, in a word or two.
-        done: units of work done: substeps, summed over scenarios, or files.
-        total: units to do.
-        scenarios_done: scenarios that are finished.
-        scenarios: scenarios to finish.
-        seconds: time since the start [s].
-        before: scenarios that an earlier run had finished; they took none of that time.
-    """
-
-    stage: str
-    done: int
-    total: int
-    scenarios_done: int
-    scenarios: int
-    seconds: float
-    before: int = 0
+    stage: str  # what happens now, in a word or two
+    done: int  # units of work done: substeps, summed over scenarios, or files
+    total: int  # units to do
+    scenarios_done: int  # scenarios that are finished
+    scenarios: int  # scenarios to finish
+    seconds: float  # time since the start [s]
+    before: int = 0  # scenarios that an earlier run had finished; they took none of that time
 
     @property
     def rate(self) -> float:
@@ -42,35 +32,20 @@ class Progress:
 
 @dataclass
 class Meter:
-    """Counts work and tells a listener at every count.
+    """Counts work and tells a listener at every count."""
 
-    Attributes:
-        listener: called with the state after every count; nobody when None.
-        stage: what happens now.
-        total: units to do.
-        scenarios: scenarios to finish.
-        done: units done.
-        finished: scenarios finished.
-    """
-
+    # called with the state after every count; nobody when None
     listener: Callable[[Progress], None] | None = None
-    stage: str = ""
-    total: int = 0
-    scenarios: int = 0
-    done: int = 0
-    finished: int = 0
+    stage: str = ""  # what happens now
+    total: int = 0  # units to do
+    scenarios: int = 0  # scenarios to finish
+    done: int = 0  # units done
+    finished: int = 0  # scenarios finished
     _before: int = field(default=0, init=False)
     _started: float = field(default_factory=time.monotonic, init=False)
 
     def begin(self, stage: str, *, total: int, scenarios: int, done: int = 0) -> None:
-        """Start a stage with counts at zero, or at what an earlier run had done.
-
-        Args:
-            stage: what happens now.
-            total: units to do.
-            scenarios: scenarios to finish.
-            done: units done before, each of them a scenario.
-        """
+        """Start a stage with counts at zero, or at what an earlier run had done."""
         self.stage, self.total, self.scenarios = stage, total, scenarios
         self.done = self.finished = self._before = done
         self._started = time.monotonic()

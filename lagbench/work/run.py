@@ -32,21 +32,7 @@ def run_all(
     scheduler: str | None = None,
     report: Report = lambda _: None,
 ) -> list[Result]:
-    """Run a function on jobs and return the results in the order of the jobs.
-
-    Args:
-        function: importable by its name; takes a job and what to tell of units of work done.
-        jobs: jobs by the name that messages call them.
-        workers: worker processes; with one, or one job, all is done in this process.
-        scheduler: address of a Dask scheduler, instead of worker processes; its workers must
-            see the same files under the same paths.
-        report: told the units of work done, negative where they were lost with a worker.
-
-    Raises:
-        LagbenchError: what a job raised.
-        UsageError: Dask's distributed is not installed, or the address cannot be one.
-        WorkFailedError: workers died too often, or the cluster cannot be reached or is lost.
-    """
+    """Run a function on jobs and return the results in the order of the jobs."""
     if scheduler is not None:
         return _with(Cluster(scheduler, ENVIRONMENT), function, jobs, report)
     if workers > 1 and len(jobs) > 1:
