@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 
+from lagbench.data.registry import PluginWarning
 from lagbench.errors import LagbenchError, UsageError, nearest
-from lagbench.plugins import PluginWarning
 
 from .baseline import Baseline
 
@@ -32,17 +32,11 @@ OPERATOR_RECIPES = "gns"
 
 @dataclass(frozen=True, kw_only=True)
 class Entry:
-    """A baseline as an entry point names it.
+    """A baseline as an entry point names it."""
 
-    Attributes:
-        name: name on the command line.
-        model: its class.
-        recipes: YAML file of its recipes; None where there is none.
-    """
-
-    name: str
-    model: type[Baseline]
-    recipes: Path | None
+    name: str  # name on the command line
+    model: type[Baseline]  # its class
+    recipes: Path | None  # YAML file of its recipes; None where there is none
 
 
 def names() -> tuple[str, ...]:
@@ -51,11 +45,7 @@ def names() -> tuple[str, ...]:
 
 
 def find(name: str) -> Entry:
-    """Return a baseline by name.
-
-    Raises:
-        UsageError: there is none (the message names the nearest), or its package is broken.
-    """
+    """Return a baseline by name."""
     points = _points()
     if name not in points:
         raise UsageError(f"no baseline {name!r}", where="--baseline", fix=nearest(name, points))
@@ -99,7 +89,8 @@ def _entry(point: EntryPoint) -> Entry:
         raise UsageError(f"{point.value} is no class", expected="a subclass of Baseline or Operator")
     if issubclass(loaded, Baseline):
         return Entry(name=point.name, model=loaded, recipes=_recipes(loaded, point.name))
-    from .operators.operator import Operator
+    from lagbench.baselines.operators.operator import Operator
+
     from .simulator import GraphNetwork
 
     if not issubclass(loaded, Operator):

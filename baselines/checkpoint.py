@@ -4,6 +4,11 @@ A file of ``torch.save`` with plain entries: ``lagbench_checkpoint`` (format num
 ``about`` (JSON: baseline, model options, facts of the data set, training so far), ``weights``,
 and, for resuming, ``optimizer``. It is read with ``weights_only=True``: a file with any other
 object in it, which unpickling would run, is refused.
+
+How large a model would be, told before it takes any memory.
+
+Options come with a checkpoint, which may be a stranger's: a few bytes of text can ask for a model
+of any size. Built on torch's device ``meta``, it has shapes and no numbers.
 """
 
 from __future__ import annotations
@@ -12,25 +17,118 @@ import json
 import pickle
 import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import torch
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor, nn
+from torch.nn.modules.module import register_module_parameter_registration_hook
+from torch.nn.parameter import is_lazy
 
 from lagbench.atomic import atomic_path
+from lagbench.data.registry import Registry
 from lagbench.errors import DataError, LagbenchError, UnreadableFileError, WorkFailedError
-from lagbench.registry import Registry
 
 from .baseline import Baseline
 from .catalogue import find
 from .facts import Facts, facts_of
-from .footprint import check_footprint
 
-__all__ = ["Checkpoint", "check_data", "load", "load_weights", "restore", "rounded_weights", "save"]
+__all__ = [
+    "check_footprint",
+    "Checkpoint",
+    "check_data",
+    "load",
+    "load_weights",
+    "restore",
+    "rounded_weights",
+    "save",
+]
+
+
+SPARE = 2**20
+"""Numbers that a model may have beside those of its file: buffers that are not stored."""
+
+PARTS = 1000
+"""Tensors that it may have beside those of its file."""
+
+
+def check_footprint(
+    model: type[Baseline],
+    options: Mapping[str, object],
+    facts: Facts,
+    weights: Mapping[str, Tensor],
+    *,
+    where: str,
+) -> None:
+    """Refuse to build a model that is larger than the weights that are meant for it.
+
+    A model that cannot be built without numbers, as a stranger's baseline may be, passes.
+    """
+    held = _bytes_held(weights)
+    try:
+        with _parts_bound(len(weights) + PARTS), torch.device("meta"):
+            built = model.build(options, facts)
+        asked = _numbers(built)
+    except _TooManyPartsError as error:
+        raise _too_large(where, f"weights for {len(weights)} tensors", f"options for {error}") from None
+    except (RuntimeError, TypeError) as error:
+        if "overflow" not in str(error):
+            return
+        raise _too_large(where, f"weights of {held} numbers", str(error).split("\n")[0][:200]) from None
+    if asked > held + SPARE:
+        raise _too_large(where, f"weights of {held} numbers", f"options for {asked}")
+
+
+class _TooManyPartsError(Exception):
+    """More parameters than the file has tensors."""
+
+
+def _bytes_held(weights: Mapping[str, Tensor]) -> int:
+    """Return how many numbers a file holds: tensors that share their bytes count once."""
+    stored = {
+        value.untyped_storage().data_ptr(): value.untyped_storage().nbytes() // value.element_size()
+        for value in weights.values()
+    }
+    return sum(stored.values())
+
+
+def _numbers(model: nn.Module) -> int:
+    tensors = chain(model.parameters(), model.buffers())
+    return sum(tensor.numel() for tensor in tensors if not is_lazy(tensor))
+
+
+@contextmanager
+def _parts_bound(most: int) -> Iterator[None]:
+    """Stop whoever registers more parameters than so many: layers without number take memory too."""
+    count = 0
+
+    def counted(module: nn.Module, name: str, parameter: nn.Parameter | None) -> None:
+        nonlocal count
+        count += parameter is not None
+        if count > most:
+            raise _TooManyPartsError(f"more than {most}")
+
+    hook = register_module_parameter_registration_hook(counted)
+    try:
+        yield
+    finally:
+        hook.remove()
+
+
+def _too_large(where: str, expected: str, got: str) -> UnreadableFileError:
+    return UnreadableFileError(
+        "the options ask for a larger model than the weights that come with them",
+        where=where,
+        expected=expected,
+        got=got,
+        fix="do not trust the file, or train anew",
+    )
+
 
 FORMAT = 1
 KEY = "lagbench_checkpoint"
@@ -42,22 +140,14 @@ _FOREIGN = re.compile(r"GLOBAL ([\w.]+)")
 
 @dataclass(frozen=True, kw_only=True)
 class Checkpoint:
-    """A model with all that it needs to predict, and to be trained on.
+    """A model with all that it needs to predict, and to be trained on."""
 
-    Attributes:
-        baseline: name of the baseline.
-        options: options of the model, plain values.
-        facts: public figures of the data set that it was trained on.
-        weights: parameters and buffers by name.
-        training: what training has done so far, plain values.
-        optimizer: state of the optimiser; None in a file that is for predictions only.
-    """
-
-    baseline: str
-    options: Mapping[str, Any]
-    facts: Facts
-    weights: Mapping[str, Tensor]
-    training: Mapping[str, Any] = field(default_factory=dict)
+    baseline: str  # name of the baseline
+    options: Mapping[str, Any]  # options of the model, plain values
+    facts: Facts  # public figures of the data set that it was trained on
+    weights: Mapping[str, Tensor]  # parameters and buffers by name
+    training: Mapping[str, Any] = field(default_factory=dict)  # what training has done so far, plain values
+    # state of the optimiser; None in a file that is for predictions only
     optimizer: Mapping[str, Any] | None = None
 
 
@@ -83,11 +173,7 @@ class _Training(_Read):
 
 
 def save(path: Path, checkpoint: Checkpoint) -> None:
-    """Write a checkpoint; it appears whole or not at all.
-
-    Raises:
-        WorkFailedError: the operating system refused.
-    """
+    """Write a checkpoint; it appears whole or not at all."""
     about = {
         "baseline": checkpoint.baseline,
         "options": dict(checkpoint.options),
@@ -106,12 +192,7 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
 
 
 def load(path: str | Path) -> Checkpoint:
-    """Read a checkpoint; nothing in the file is run.
-
-    Raises:
-        UnreadableFileError: the file is missing, damaged, no checkpoint, or holds objects other
-            than tensors and plain values.
-    """
+    """Read a checkpoint; nothing in the file is run."""
     file = Path(path)
     content = _content(file)
     try:
@@ -132,16 +213,7 @@ def load(path: str | Path) -> Checkpoint:
 
 
 def restore(checkpoint: Checkpoint, *, where: str = "the checkpoint") -> Baseline:
-    """Return the model of a checkpoint, in float32, ready to predict.
-
-    Args:
-        checkpoint: what :func:`load` returned.
-        where: what to call it in messages.
-
-    Raises:
-        UsageError: no such baseline is installed.
-        UnreadableFileError: options or weights do not fit the baseline, or each other.
-    """
+    """Return the model of a checkpoint, in float32, ready to predict."""
     entry = find(checkpoint.baseline)
     options, facts = checkpoint.options, checkpoint.facts
     try:
@@ -165,11 +237,7 @@ def restore(checkpoint: Checkpoint, *, where: str = "the checkpoint") -> Baselin
 
 
 def load_weights(model: nn.Module, weights: Mapping[str, Tensor], *, where: str) -> None:
-    """Copy weights into a model; those in bfloat16 become float32.
-
-    Raises:
-        UnreadableFileError: names, shapes or values do not fit.
-    """
+    """Copy weights into a model; those in bfloat16 become float32."""
     broken = [name for name, value in weights.items() if not torch.isfinite(value).all()]
     if broken:
         raise UnreadableFileError("weights are not finite", where=where, got=", ".join(broken[:3]))
@@ -191,18 +259,7 @@ def rounded_weights(model: nn.Module) -> dict[str, Tensor]:
 
 
 def check_data(checkpoint: Checkpoint, *, root: Path, registry: Registry | None = None, where: str) -> Facts:
-    """Check that the data at hand are those that the model was trained on; return their facts.
-
-    Args:
-        checkpoint: what :func:`load` returned.
-        root: folder of all data sets.
-        registry: where splits are described; ours when None.
-        where: what to call the checkpoint in messages.
-
-    Raises:
-        UsageError: no such split is known.
-        DataError: they are missing, or of another hash.
-    """
+    """Check that the data at hand are those that the model was trained on; return their facts."""
     trained = checkpoint.facts
     here = facts_of(trained.split, trained.size, root=root, registry=registry)
     if here.dataset_sha256 != trained.dataset_sha256:

@@ -9,13 +9,12 @@ from typing import Annotated, Any, Self
 
 from pydantic import Field, TypeAdapter
 
+from lagbench.data.layout import dataset_folder
+from lagbench.data.local import locate, remedy
+from lagbench.data.manifest import Manifest, read_manifest
+from lagbench.data.registry import Registry, Size
+from lagbench.data.scenario import read_scenario
 from lagbench.errors import DataError
-from lagbench.layout import dataset_folder
-from lagbench.locating import locate
-from lagbench.manifest import Manifest, read_manifest
-from lagbench.registry import Registry, Size
-from lagbench.remedy import remedy
-from lagbench.scenario_file import read_scenario
 from lagbench.store.bringing import bring
 
 __all__ = ["Facts", "facts_of"]
@@ -30,40 +29,23 @@ Pair = tuple[Finite, Finite]
 
 @dataclass(frozen=True, kw_only=True)
 class Facts:
-    """Public figures of one size of a split; they travel in every checkpoint.
+    """Public figures of one size of a split; they travel in every checkpoint."""
 
-    Attributes:
-        split: name of the split.
-        size: name of the size.
-        version: semantic version of the split.
-        dataset_sha256: hash of the data set.
-        particles: particles in one scenario.
-        bounds: box that holds the particles, (low, high) along x and y [length].
-        radius: connectivity radius [length].
-        input_frames: frames given at the start of a test scenario.
-        horizon: frames to predict after them.
-        score_cells: cells across of the scorer's grid.
-        score_placement: ``cell_centres`` or ``nodes``, where that grid's nodes lie.
-        frame_interval: time between frames [s].
-        moving_walls: whether scenario files hold ``wall_velocity``.
-        statistics: over train: ``position_mean``, ``position_std`` [length], ``velocity_mean``,
-            ``velocity_std`` [length/frame], ``acceleration_mean``, ``acceleration_std``
-            [length/frame^2], one (x, y) pair each.
-    """
-
-    split: Name
-    size: Name
-    version: str
-    dataset_sha256: str
-    particles: Count
-    bounds: tuple[Pair, Pair]
-    radius: Positive
-    input_frames: Count
-    horizon: Count
-    score_cells: Count
-    score_placement: str
-    frame_interval: Positive
-    moving_walls: bool
+    split: Name  # name of the split
+    size: Name  # name of the size
+    version: str  # semantic version of the split
+    dataset_sha256: str  # hash of the data set
+    particles: Count  # particles in one scenario
+    bounds: tuple[Pair, Pair]  # box that holds the particles, (low, high) along x and y [length]
+    radius: Positive  # connectivity radius [length]
+    input_frames: Count  # frames given at the start of a test scenario
+    horizon: Count  # frames to predict after them
+    score_cells: Count  # cells across of the scorer's grid
+    score_placement: str  # 'cell_centres' or 'nodes', where that grid's nodes lie
+    frame_interval: Positive  # time between frames [s]
+    moving_walls: bool  # whether scenario files hold wall_velocity
+    # over train: position_mean, position_std [length], velocity_mean, velocity_std [length/frame],
+    # acceleration_mean, acceleration_std [length/frame^2], one (x, y) pair each
     statistics: Mapping[str, Pair]
 
     def as_json(self) -> dict[str, Any]:
@@ -72,29 +54,14 @@ class Facts:
 
     @classmethod
     def from_json(cls, values: object) -> Self:
-        """Return the facts that :meth:`as_json` gave.
-
-        Raises:
-            pydantic.ValidationError: they are none.
-        """
+        """Return the facts that :meth:`as_json` gave."""
         return TypeAdapter(cls).validate_python(values)
 
 
 def facts_of(
     split: str, size: str = "full", *, root: str | Path | None = None, registry: Registry | None = None
 ) -> Facts:
-    """Return the public figures of a generated data set.
-
-    Args:
-        split: name of the split.
-        size: name of the size.
-        root: folder of all data sets; else ``LAGBENCH_ROOT``, else the user data folder.
-        registry: where splits are described; ours when None.
-
-    Raises:
-        UsageError: unknown split or size.
-        DataError: it is not generated, or train is not complete and nothing is recorded.
-    """
+    """Return the public figures of a generated data set."""
     tier, folder, _ = locate(split, size, root=root, registry=registry)
     bring(tier, folder)
     manifest = read_manifest(folder, tier.split, size, tier.major)

@@ -2,36 +2,121 @@
 
 Training and rollouts call the same :meth:`FrameModel.next_state`; a model is a file with its
 layers and that one method.
+
+The state of a whole frame: positions and velocities of all particles, standardised.
+
+    z = (q - mean) / std,   q = (x, y, u, v),   u(f) = x(f) - x(f-1)          (Eq. 4.15)
+
+with the public statistics of the training scenarios, one figure per feature. The first frame of
+a window has no frame before it: it takes the velocity of the second.
+
+What MLP and LSTM share: material as an input, what the output means, noise in training.
 """
 
 from __future__ import annotations
 
+import enum
 from abc import abstractmethod
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
-from torch import Tensor
+from pydantic import Field
+from torch import Tensor, nn
 
-from .baseline import Baseline
-from .batch import Batch
+from lagbench.errors import DataError
+
+from . import baseline
+from .baseline import Baseline, Batch
 from .facts import Facts
-from .frame_state import FEATURES, FrameState, side_by_side
 
-__all__ = ["FrameModel", "FrameWindow", "squared_errors"]
+__all__ = [
+    "FEATURES",
+    "FrameState",
+    "side_by_side",
+    "FrameModel",
+    "FrameWindow",
+    "squared_errors",
+    "FrameNetwork",
+    "FrameNetworkOptions",
+    "Target",
+    "material_feature",
+]
+
+
+FEATURES = 4
+"""x, y and the two components of the velocity per frame."""
+
+
+class FrameState(nn.Module):
+    """Turns positions into standardised states, and back."""
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, facts: Facts) -> None:
+        super().__init__()
+        known = facts.statistics
+        mean = (*known["position_mean"], *known["velocity_mean"])
+        std = (*known["position_std"], *known["velocity_std"])
+        self.register_buffer("mean", torch.tensor(mean, dtype=torch.float64), persistent=False)
+        self.register_buffer("std", torch.tensor(std, dtype=torch.float64), persistent=False)
+
+    def of(self, position: Tensor) -> Tensor:
+        """Return the states of consecutive frames [1], shape [..., frame, particle, 4].
+
+        Args:
+            position: positions of two frames or more [length], shape [..., frame, particle, 2].
+
+        Raises:
+            DataError: fewer than two frames, so that there is no velocity.
+        """
+        if position.shape[-3] < 2:
+            raise DataError("a velocity needs two frames", expected="2 or more", got=position.shape[-3])
+        later = position[..., 1:, :, :] - position[..., :-1, :, :]
+        velocity = torch.cat([later[..., :1, :, :], later], dim=-3)
+        state = torch.cat([position, velocity], dim=-1)
+        return (state - self.mean.to(state.dtype)) / self.std.to(state.dtype)
+
+    def position(self, state: Tensor) -> Tensor:
+        """Return the positions of states [length], shape [..., 2] from [..., 4]."""
+        return state[..., :2] * self.std[:2].to(state.dtype) + self.mean[:2].to(state.dtype)
+
+
+def side_by_side(batch: Batch, particles: int) -> tuple[Tensor, Tensor]:
+    """Return positions and materials window by window.
+
+    Args:
+        batch: windows with the same particles each.
+        particles: particles in one scenario.
+
+    Returns:
+        Positions [length], shape [window, frame, particle, 2], and materials, shape
+        [window, particle].
+
+    Raises:
+        DataError: a window with another number of particles: these models know no other.
+    """
+    count = torch.bincount(batch.sample, minlength=batch.windows)
+    if not bool((count == particles).all()):
+        got = ", ".join(map(str, sorted(set(count.tolist()))))
+        raise DataError(
+            "a model of whole frames needs every particle",
+            where="batch",
+            expected=f"{particles} particles in each window",
+            got=got,
+            fix="use a graph network for scenarios of other sizes",
+        )
+    position = batch.position.view(batch.windows, particles, batch.frames, -1)
+    return position.transpose(1, 2), batch.material.view(batch.windows, particles)
 
 
 @dataclass(frozen=True)
 class FrameWindow:
-    """The state of a rollout: what :meth:`FrameModel.next_state` is given.
+    """The state of a rollout: what :meth:`FrameModel.next_state` is given."""
 
-    Attributes:
-        state: the last standardised states [1], shape [window, frame, particle, 4].
-        material: material of each particle, shape [window, particle].
-    """
-
-    state: Tensor
-    material: Tensor
+    state: Tensor  # the last standardised states [1], shape [window, frame, particle, 4]
+    material: Tensor  # material of each particle, shape [window, particle]
 
 
 def squared_errors(truth: Tensor, predicted: Tensor) -> dict[str, Tensor]:
@@ -76,12 +161,7 @@ class FrameModel(Baseline):
         return FEATURES * self.facts.particles
 
     def forward(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
-        """Return the mean squared errors of position and velocity after one step [1].
-
-        Args:
-            batch: windows of ``history + 1`` frames.
-            generator: source of noise.
-        """
+        """Return the mean squared errors of position and velocity after one step [1]."""
         return squared_errors(*self._one_step(batch, generator))
 
     def _one_step(self, batch: Batch, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
@@ -112,3 +192,74 @@ class FrameModel(Baseline):
         new = self.next_state(state)
         window = FrameWindow(torch.cat([state.state[:, 1:], new.unsqueeze(1)], dim=1), state.material)
         return window, self.frame_state.position(new).flatten(0, 1).to(torch.float32)
+
+
+MATERIALS = 4
+"""Materials that datasets.yaml knows: 0 liquid, 1 jelly, 2 snow, 3 rope."""
+
+
+class Target(enum.StrEnum):
+    """What the output of a network means."""
+
+    STATE = "state"
+    CHANGE = "change"
+
+
+class FrameNetworkOptions(baseline.Options):
+    """Options of a network of whole frames.
+
+    The thesis's networks predict the next state itself, without noise; ``target: change`` and
+    ``noise_std`` are ours. A state is made anew in every frame, so that even the first step is off by
+    the error of the whole state; a change keeps what it does not know.
+    """
+
+    # the next state, or its change in units of the change's deviation over train
+    target: Target = Target.STATE
+    material: bool = False  # give the material as a fifth, constant feature of every particle
+    # of the noise on the states that training gives to the network [standardised]
+    noise_std: float = Field(default=0.0, ge=0, allow_inf_nan=False)
+
+
+def material_feature(material: Tensor) -> Tensor:
+    """Return the constant fifth feature: 0, 1, 2, 3 mapped to -1 ... 1, shape [..., 1]."""
+    return (material.to(torch.float32) * (2.0 / (MATERIALS - 1)) - 1.0).unsqueeze(-1)
+
+
+class FrameNetwork(FrameModel):
+    """Base of the networks: their inputs are states, with the material where the recipe wants it."""
+
+    options: FrameNetworkOptions
+    typical_change: Tensor
+
+    def __init__(self, options: FrameNetworkOptions, facts: Facts) -> None:
+        super().__init__(options, facts)
+        self.input_features = FEATURES + options.material
+        self.register_buffer("typical_change", _typical_change(facts), persistent=False)
+
+    def disturbed(self, state: Tensor, generator: torch.Generator | None) -> Tensor:
+        """Return the states with independent normal noise; unchanged without a generator."""
+        if generator is None or self.options.noise_std == 0.0:
+            return state
+        noise = torch.randn(state.shape, generator=generator, device=state.device, dtype=state.dtype)
+        return state + self.options.noise_std * noise
+
+    def given(self, window: FrameWindow) -> Tensor:
+        """Return the inputs of the network [1], shape [window, frame, particle, 4 or 5]."""
+        if not self.options.material:
+            return window.state
+        constant = material_feature(window.material).unsqueeze(1)
+        return torch.cat([window.state, constant.expand(-1, window.state.shape[1], -1, -1)], dim=-1)
+
+    def meant(self, output: Tensor, window: FrameWindow) -> Tensor:
+        """Return the state that an output of shape [window, feature] means, shape [window, particle, 4]."""
+        last = window.state[:, -1]
+        output = output.view(last.shape).to(last.dtype)
+        return output if self.options.target is Target.STATE else last + self.typical_change * output
+
+
+def _typical_change(facts: Facts) -> Tensor:
+    """Return the standard deviation of a state's change per frame [standardised], shape [4]."""
+    known = facts.statistics
+    moved = zip(known["velocity_std"], known["position_std"], strict=True)
+    pushed = zip(known["acceleration_std"], known["velocity_std"], strict=True)
+    return torch.tensor([change / spread for change, spread in (*moved, *pushed)])

@@ -1,26 +1,80 @@
-"""Frames of many scenario files, read when asked for and kept in bounded memory."""
+"""Frames of many scenario files, read when asked for and kept in bounded memory.
+
+Scenario files of a data set's subsets, as the registry names them.
+"""
 
 from __future__ import annotations
 
 import os
 from collections import OrderedDict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.errors import DataError, LagbenchError
-from lagbench.layout import major_of
-
-from .sources import Source
+from lagbench.data.layout import ScenarioKey, major_of, scenario_path
+from lagbench.data.local import remedy
+from lagbench.data.registry import Size, spell_ids
+from lagbench.errors import DataError, LagbenchError, UsageError, nearest
+from lagbench.store.bringing import bring
 
 if TYPE_CHECKING:
     import h5py
 
-__all__ = ["CACHE_BYTES", "FrameStore"]
+__all__ = [
+    "Source",
+    "sources_of",
+    "CACHE_BYTES",
+    "FrameStore",
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Source:
+    """A scenario file and what the registry says that it is."""
+
+    path: Path  # path of the file
+    key: ScenarioKey  # what names the scenario
+    frames: int  # frames that it holds
+    digest: str = ""  # first digits of its content hash; empty when none is known
+    remedy: str = ""  # what writes the file anew, in words
+
+
+def sources_of(size: Size, subsets: Sequence[str], root: Path) -> dict[int, Source]:
+    """Return the scenario files of subsets by id; say which are missing."""
+    digests = size.measured.scenario_sha256 if size.measured else {}
+    sources: dict[int, Source] = {}
+    for subset in subsets:
+        if subset not in size.subsets:
+            raise UsageError(
+                f"no subset {subset!r}", where=f"{size.split} {size.name}", fix=nearest(subset, size.subsets)
+            )
+        for i in size.subsets[subset]:
+            key = ScenarioKey(
+                split=size.split, size=size.name, version=size.version, scenario=i, subset=subset
+            )
+            sources[i] = Source(
+                path=scenario_path(root, key),
+                key=key,
+                frames=size.frame_count(i),
+                digest=digests.get(i, ""),
+                remedy=remedy(size, f"--subset {subset}"),
+            )
+    bring(size, root, sources)
+    missing = [i for i, source in sources.items() if not source.path.is_file()]
+    if missing:
+        raise DataError(
+            f"{len(missing)} of {len(sources)} scenarios are not there",
+            where=str(root / size.split / size.name),
+            got=f"missing: {spell_ids(missing)}",
+            fix=remedy(size, root=root),
+        )
+    return sources
+
 
 Floats = NDArray[np.float32]
 
@@ -75,9 +129,6 @@ class FrameStore:
         """Return positions of consecutive frames [length], each of shape [particle, 2].
 
         The arrays are those of the cache: copy them, never write to them.
-
-        Raises:
-            DataError: the file is missing, damaged or not the scenario that was meant.
         """
         self._own()
         found = {frame: self._frames.get((scenario, frame)) for frame in range(start, stop)}
@@ -93,9 +144,6 @@ class FrameStore:
         """Return material, shape [particle], and wall velocity [length/s], [frame, wall, 2].
 
         Material is 0, liquid, in files without it; wall velocity is None where no wall moves.
-
-        Raises:
-            DataError: the file is missing, damaged or not the scenario that was meant.
         """
         self._own()
         opened = self._opened(scenario)

@@ -1,71 +1,251 @@
-"""A training as it was asked for: recipe, data, folder, machine."""
+"""A training as it was asked for: recipe, data, folder, machine.
+
+The folder of a training: checkpoint.pt, weights.pt, training.json, tensorboard/.
+
+The ledger of a training: what it did, what it cost, on what machine.
+"""
 
 from __future__ import annotations
 
+import json
+import platform
+import resource
+import time
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
+from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
-from lagbench.progress import Meter
-from lagbench.registry import Registry
+from lagbench.atomic import write_atomically
+from lagbench.data.registry import Registry
+from lagbench.errors import UsageError
+from lagbench.work.progress import Meter
 
 from .baseline import Baseline
-from .checkpoint import Checkpoint
+from .checkpoint import Checkpoint, load
 from .facts import Facts
-from .ledger import Ledger, versions
 from .machine import hardware
 from .recipe import Recipe
-from .run_folder import RunFolder
 from .windows import scenario_paths
 
-__all__ = ["Job", "parameter_count"]
+__all__ = [
+    "OVER",
+    "STOPPED_EARLY",
+    "TrainingRecord",
+    "versions",
+    "RunFolder",
+    "default_folder",
+    "first_difference",
+    "TrainingJob",
+    "parameter_count",
+]
+
+
+STOPPED_EARLY = "stopped early"
+"""State of a training whose validations brought nothing new; it is over."""
+
+OVER = ("finished", STOPPED_EARLY)
+"""States of a training that is not to be gone on with."""
+
+
+@dataclass
+class TrainingRecord:
+    """What a training has done so far; it goes into checkpoints and training.json."""
+
+    state: str = "running"  # running, interrupted, finished, stopped early or failed
+    step: int = 0  # optimiser steps made
+    # raw loss terms of the last step looked at, and their weighted sum 'total'
+    loss: dict[str, float] = field(default_factory=dict)
+    # step and position RMSE of every validation [length]
+    validation: list[dict[str, float]] = field(default_factory=list)
+    best_step: int | None = None  # step of the best validation; None before the first
+    best_rmse: float | None = None  # its RMSE [length]
+    cpu_seconds: float = 0.0  # processor time of all processes, in all runs [s]
+    wall_seconds: float = 0.0  # time of all runs [s]
+
+    def __post_init__(self) -> None:
+        """Start the clocks."""
+        self._cpu, self._wall = _processor_seconds(), time.monotonic()
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> Self:
+        """Return a ledger that goes on where stored values end."""
+        known = {name: values[name] for name in cls.__dataclass_fields__ if name in values}
+        return cls(**known)
+
+    def as_json(self) -> dict[str, Any]:
+        """Return plain values."""
+        return {name: getattr(self, name) for name in self.__dataclass_fields__}
+
+    def read_clocks(self, processes: int = 1) -> None:
+        """Add the time since the last reading, of as many processes as train alike."""
+        cpu, wall = _processor_seconds(), time.monotonic()
+        self.cpu_seconds += (cpu - self._cpu) * processes
+        self.wall_seconds += wall - self._wall
+        self._cpu, self._wall = cpu, wall
+
+    def validated(self, rmse: float) -> bool:
+        """Enter a validation at the present step; return whether it is the best so far."""
+        self.validation.append({"step": self.step, "rmse": rmse})
+        if self.best_rmse is not None and not rmse < self.best_rmse:
+            return False
+        self.best_step, self.best_rmse = self.step, rmse
+        return True
+
+    def since_best(self) -> int:
+        """Return how many validations came after the best one."""
+        steps = [int(entry["step"]) for entry in self.validation]
+        return sum(step > (self.best_step or 0) for step in steps)
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of the libraries that decide the result."""
+    packages = ("lagbench", "torch", "torch-geometric", "pytorch-lightning", "numpy", "scipy")
+    return {"python": platform.python_version(), **{name: version(name) for name in packages}}
+
+
+def _processor_seconds() -> float:
+    own, children = resource.getrusage(resource.RUSAGE_SELF), resource.getrusage(resource.RUSAGE_CHILDREN)
+    return sum(usage.ru_utime + usage.ru_stime for usage in (own, children))
+
+
+def default_folder(recipe: Recipe) -> Path:
+    """Return ``runs/<split>/<size>/<baseline>-<seed>`` in the present folder."""
+    return Path("runs") / recipe.name / f"{recipe.baseline}-{recipe.training.seed}"
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """Paths of a training's files, and what an earlier run left there."""
+
+    path: Path
+
+    @property
+    def checkpoint(self) -> Path:
+        """The last state, to go on from."""
+        return self.path / "checkpoint.pt"
+
+    @property
+    def weights(self) -> Path:
+        """The best weights in bfloat16, to predict from."""
+        return self.path / "weights.pt"
+
+    @property
+    def record(self) -> Path:
+        """What the training did and cost, as JSON."""
+        return self.path / "training.json"
+
+    @property
+    def logs(self) -> Path:
+        """Folder of TensorBoard's files."""
+        return self.path / "tensorboard"
+
+    def earlier(self, recipe: Recipe, *, resume: bool, fresh: bool) -> Checkpoint | None:
+        """Return the checkpoint to go on from; None for a training from the start."""
+        left = [file for file in (self.checkpoint, self.weights, self.record) if file.exists()]
+        if fresh or not left:
+            return None
+        if self.checkpoint not in left:
+            if resume and self.weights not in left:  # it failed before there was anything to keep
+                return None
+            raise self._without_checkpoint(recipe) if resume else self._taken()
+        found = load(self.checkpoint)
+        if found.training.get("recipe") != recipe.as_json():
+            raise UsageError(
+                "the folder holds a training with another recipe",
+                where=str(self.path),
+                expected=first_difference(recipe.as_json(), found.training.get("recipe")),
+                fix="name another folder with --output, or train anew with --fresh",
+            )
+        if not resume:
+            raise self._taken()
+        return found
+
+    def _taken(self) -> UsageError:
+        return UsageError(
+            "the folder holds a training",
+            where=str(self.path),
+            fix="go on with --resume, train anew with --fresh, or name another --output",
+        )
+
+    def _without_checkpoint(self, recipe: Recipe) -> UsageError:
+        """Return the error for weights that no training can go on from, and that none may replace."""
+        said = self._recorded()
+        over = said.get("recipe") == recipe.as_json() and said.get("state") in OVER
+        return UsageError(
+            "the training is finished"
+            if over
+            else "the folder holds weights, and no checkpoint to go on from",
+            where=str(self.path),
+            got=f"{self.weights.name} without {self.checkpoint.name}",
+            fix=("predict from its weights, " if over else "name another folder with --output, ")
+            + "or train anew with --fresh",
+        )
+
+    def _recorded(self) -> dict[str, Any]:
+        """Return what training.json says; nothing where it is not there or no record."""
+        try:
+            said = json.loads(self.record.read_bytes())
+        except (OSError, ValueError, RecursionError):
+            return {}
+        return said if isinstance(said, dict) else {}
+
+    def clear(self) -> None:
+        """Remove what an earlier training left, and nothing else."""
+        logs = (*self.logs.glob("events.out.tfevents.*"), self.logs / "hparams.yaml")
+        for file in (self.checkpoint, self.weights, self.record, *logs):
+            file.unlink(missing_ok=True)
+        with suppress(OSError):  # what is not ours stays
+            self.logs.rmdir()
+
+    def write_record(self, record: dict[str, Any]) -> None:
+        """Write training.json; it appears whole or not at all."""
+        text = json.dumps(record, indent=2, sort_keys=True)
+        write_atomically(self.record, text.encode() + b"\n", option="--output")
+
+
+def first_difference(wanted: dict[str, Any], found: object, path: str = "") -> str:
+    """Return the first key whose value differs, with both values."""
+    theirs = found if isinstance(found, dict) else {}
+    for key in sorted({*wanted, *theirs}):
+        mine, other = wanted.get(key), theirs.get(key)
+        if mine != other:
+            if isinstance(mine, dict) and isinstance(other, dict):
+                return first_difference(mine, other, f"{path}{key}.")
+            return f"{path}{key} = {mine!r}, as asked for; the folder has {other!r}"
+    return "the same recipe"
+
 
 FORMAT = 1
 
 
 @dataclass(frozen=True, kw_only=True)
-class Job:
-    """A training to do.
+class TrainingJob:
+    """A training to do."""
 
-    Attributes:
-        recipe: model and training options.
-        facts: public figures of the data set.
-        folder: where files go.
-        earlier: checkpoint to go on from; None at the start.
-        root: folder of all data sets.
-        registry: where the split is described.
-        device: ``cpu`` or ``cuda``.
-        processes: processes that share the training.
-        workers: processes that read windows ahead.
-        meter: counts steps.
-    """
-
-    recipe: Recipe
-    facts: Facts
-    folder: RunFolder
-    earlier: Checkpoint | None
-    root: Path
-    registry: Registry
-    device: str = "cpu"
-    processes: int = 1
-    workers: int = 0
-    meter: Meter = field(default_factory=Meter)
+    recipe: Recipe  # model and training options
+    facts: Facts  # public figures of the data set
+    folder: RunFolder  # where files go
+    earlier: Checkpoint | None  # checkpoint to go on from; None at the start
+    root: Path  # folder of all data sets
+    registry: Registry  # where the split is described
+    device: str = "cpu"  # 'cpu' or 'cuda'
+    processes: int = 1  # processes that share the training
+    workers: int = 0  # processes that read windows ahead
+    meter: Meter = field(default_factory=Meter)  # counts steps
 
     def files(self, subset: str) -> dict[int, Path]:
-        """Return the scenario files of a subset by id.
-
-        Raises:
-            UsageError: there is no such subset.
-            DataError: files are missing.
-        """
+        """Return the scenario files of a subset by id."""
         facts = self.facts
         return scenario_paths(
             facts.split, subset=subset, size=facts.size, root=self.root, registry=self.registry
         )
 
-    def ledger(self) -> Ledger:
+    def ledger(self) -> TrainingRecord:
         """Return the ledger that goes on where an earlier run ended, in the state that it ended in."""
-        return Ledger() if self.earlier is None else Ledger.from_json(self.earlier.training)
+        return TrainingRecord() if self.earlier is None else TrainingRecord.from_json(self.earlier.training)
 
     def checkpoint(self, **changes: Any) -> Checkpoint:  # noqa: ANN401 (its fields)
         """Return a checkpoint with the fields that do not change."""

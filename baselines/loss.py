@@ -3,23 +3,80 @@
 All terms are in normalised units, as in the thesis: accelerations, velocities and positions
 over their deviations in train; the grid's velocities too, so that vorticity and divergence
 have the unit 1/length; density over that around a particle. Weights are applied by the trainer.
+
+Particles in motion: the frame of a loss, the state of a rollout, the step between two.
 """
 
 from __future__ import annotations
 
 import enum
 from collections.abc import Mapping
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import NamedTuple, Self
 
 import torch
 from torch import Tensor
 
-from lagbench.grid import Grid
+from lagbench.data.grid import Grid
 
-from .grid_fields import Fields, counted_nodes, fields, node_velocity, transfer
-from .motion import Motion
+from .torch_grid import Fields, counted_nodes, fields, node_velocity, transfer
 
-__all__ = ["GRID_TERMS", "PARTICLE_TERMS", "TERMS", "LossNorm", "Scales", "loss_terms", "mean_norm"]
+__all__ = [
+    "Motion",
+    "State",
+    "integrate",
+    "GRID_TERMS",
+    "PARTICLE_TERMS",
+    "TERMS",
+    "LossNorm",
+    "Scales",
+    "loss_terms",
+    "mean_norm",
+]
+
+
+class Motion(NamedTuple):
+    """One frame of particles."""
+
+    position: Tensor  # x(f) [length], shape [particle, 2]
+    velocity: Tensor  # x(f) - x(f-1) [length/frame], shape [particle, 2]
+    # velocity less that of the frame before, in target and prediction the same frame, which is the model's
+    # input [length/frame^2], shape [particle, 2]
+    acceleration: Tensor
+
+
+@dataclass(frozen=True, kw_only=True)
+class State:
+    """What a step starts from."""
+
+    position: Tensor  # last positions [length], shape [particle, 2]
+    velocity: Tensor  # last velocities, oldest first [length/frame], shape [particle, 5, 2]
+    material: Tensor  # material of each particle, int64, shape [particle]
+    sample: Tensor  # window of each particle, ascending, int64, shape [particle]
+    # velocity of the walls in the last given frame, as each particle sees them [length/frame], shape
+    # [particle, 4, 2]; None where walls rest or do not matter
+    wall_velocity: Tensor | None
+
+    def moved(self, position: Tensor, velocity: Tensor) -> Self:
+        """Return the state one frame on."""
+        last = torch.cat([self.velocity[:, 1:], velocity.unsqueeze(1)], dim=1)
+        return replace(self, position=position, velocity=last)
+
+
+def integrate(position: Tensor, velocity: Tensor, acceleration: Tensor) -> tuple[Tensor, Tensor]:
+    """Advance by semi-implicit Euler: ``v' = v + a, x' = x + v'``, time in frames.
+
+    Args:
+        position: x [length], shape [particle, 2].
+        velocity: v [length/frame], shape [particle, 2].
+        acceleration: a [length/frame^2], shape [particle, 2].
+
+    Returns:
+        x' and v'.
+    """
+    velocity = velocity + acceleration
+    return position + velocity, velocity
+
 
 PARTICLE_TERMS = ("acceleration", "velocity", "position")
 GRID_TERMS = ("density", "divergence", "vorticity")

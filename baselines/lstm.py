@@ -9,14 +9,13 @@ import torch
 from pydantic import Field, PositiveInt
 from torch import Tensor, nn
 
-from lagbench.grid import Grid, Placement
+from lagbench.data.grid import Grid, Placement
 
-from .batch import Batch
+from .baseline import Batch
 from .facts import Facts
-from .frame_model import FrameWindow, squared_errors
-from .frame_network import FrameNetwork, FrameNetworkOptions
-from .grid_fields import transfer
+from .frame_model import FrameNetwork, FrameNetworkOptions, FrameWindow, squared_errors
 from .mlp import Activation, dense
+from .torch_grid import transfer
 
 __all__ = ["LSTM", "LSTMWithMLP"]
 
@@ -36,21 +35,14 @@ class LSTM(FrameNetwork):
     interleaved: ClassVar[bool] = False
 
     class Options(FrameNetworkOptions):
-        """Options of both LSTMs.
+        """Options of both LSTMs."""
 
-        Attributes:
-            latent: length of the latent vector of a frame and width of both LSTM layers.
-            encoder: widths of pointwise layers before the latent one.
-            decoder: widths of hidden layers after the second LSTM layer.
-            dropout: after the first and after the second LSTM layer.
-            density_weight: of the density term in the loss. The thesis states none; with 1 the
-                gradient within a cell drowns that of the positions, which then are not learned.
-        """
-
-        latent: PositiveInt = 1250
-        encoder: tuple[PositiveInt, ...] = ()
-        decoder: tuple[PositiveInt, ...] = (1250,)
-        dropout: tuple[Share, Share] = (0.2, 0.1)
+        latent: PositiveInt = 1250  # length of the latent vector of a frame and width of both LSTM layers
+        encoder: tuple[PositiveInt, ...] = ()  # widths of pointwise layers before the latent one
+        decoder: tuple[PositiveInt, ...] = (1250,)  # widths of hidden layers after the second LSTM layer
+        dropout: tuple[Share, Share] = (0.2, 0.1)  # after the first and after the second LSTM layer
+        # of the density term in the loss. The thesis states none; with 1 the gradient within a cell drowns
+        # that of the positions, which then are not learned.
         density_weight: float = Field(default=0.03, ge=0, allow_inf_nan=False)
 
     options: Options

@@ -27,11 +27,7 @@ __all__ = [
 
 
 def chosen_device(name: str) -> str:
-    """Return ``cpu`` or ``cuda``; ``auto`` takes a GPU that is there.
-
-    Raises:
-        UsageError: no such device, or it is not there.
-    """
+    """Return ``cpu`` or ``cuda``; ``auto`` takes a GPU that is there."""
     there = torch.cuda.is_available()
     if name == "auto":
         return "cuda" if there else "cpu"
@@ -48,12 +44,7 @@ def is_helper() -> bool:
 
 @contextmanager
 def threads_used(count: int | None, *, processes: int = 1) -> Iterator[None]:
-    """Use so many threads for a while.
-
-    Args:
-        count: threads of this process; else ``OMP_NUM_THREADS``, else its share of the cores.
-        processes: processes on this machine that compute at the same time.
-    """
+    """Use so many threads for a while."""
     before = torch.get_num_threads()
     asked = os.environ.get("OMP_NUM_THREADS", "")
     share = max(1, len(os.sched_getaffinity(0)) // processes)
@@ -82,14 +73,7 @@ def return_memory() -> None:
 
 @contextmanager
 def memory_errors_told(fix: str) -> Iterator[None]:
-    """Turn whatever torch raises when memory is full into an error that says what to lower.
-
-    Args:
-        fix: what to lower.
-
-    Raises:
-        WorkFailedError: memory is full.
-    """
+    """Turn whatever torch raises when memory is full into an error that says what to lower."""
     try:
         yield
     except (MemoryError, RuntimeError) as error:

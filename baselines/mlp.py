@@ -10,8 +10,7 @@ from pydantic import PositiveInt
 from torch import Tensor, nn
 
 from .facts import Facts
-from .frame_model import FrameWindow
-from .frame_network import FrameNetwork, FrameNetworkOptions
+from .frame_model import FrameNetwork, FrameNetworkOptions, FrameWindow
 
 __all__ = ["Activation", "MLP", "dense"]
 
@@ -50,15 +49,10 @@ class MLP(FrameNetwork):
     method = "mlp"
 
     class Options(FrameNetworkOptions):
-        """Options of the MLP.
+        """Options of the MLP."""
 
-        Attributes:
-            widths: units of each hidden layer.
-            activation: elu, relu, tanh or sigmoid.
-        """
-
-        widths: tuple[PositiveInt, ...] = (2500, 1250, 1250, 2500)
-        activation: Activation = Activation.ELU
+        widths: tuple[PositiveInt, ...] = (2500, 1250, 1250, 2500)  # units of each hidden layer
+        activation: Activation = Activation.ELU  # elu, relu, tanh or sigmoid
 
     options: Options
 

@@ -14,10 +14,9 @@ from torch.utils.data import DataLoader
 
 from lagbench.errors import WorkFailedError
 
-from .baseline import Baseline
-from .batch import Batch
-from .chance import reseed, seed_of
-from .training_options import TrainingOptions
+from .baseline import Baseline, Batch
+from .recipe import TrainingOptions
+from .seeding import reseed, seed_of
 from .windows import Window
 
 __all__ = ["TOTAL", "TrainingModule", "weighted_sum"]
@@ -27,11 +26,7 @@ TOTAL = "total"
 
 
 def weighted_sum(terms: Mapping[str, Tensor], weights: Mapping[str, float]) -> Tensor:
-    """Return sum_i w_i L_i; terms that no weight is given for have 1, those of weight 0 are left out.
-
-    Raises:
-        WorkFailedError: no term is left.
-    """
+    """Return sum_i w_i L_i; terms that no weight is given for have 1, those of weight 0 are left out."""
     parts = [value * weights.get(name, 1.0) for name, value in terms.items() if weights.get(name, 1.0) != 0]
     if not parts:
         raise WorkFailedError("every term of the loss has weight 0", got=", ".join(terms))
@@ -39,22 +34,7 @@ def weighted_sum(terms: Mapping[str, Tensor], weights: Mapping[str, float]) -> T
 
 
 class TrainingModule(LightningModule):
-    """Trains a baseline.
-
-    Attributes:
-        model: the baseline.
-        step: optimiser steps made.
-        terms: raw loss terms of the last step, and their weighted sum as ``total``.
-
-    Args:
-        model: the baseline.
-        options: options of the training.
-        loader: returns the batches of a process, by its rank among so many.
-        steps: steps of the whole training.
-        processes: processes that share it.
-        step: steps already made.
-        optimizer: state of the optimiser after those.
-    """
+    """Trains a baseline."""
 
     def __init__(
         self,
@@ -68,13 +48,14 @@ class TrainingModule(LightningModule):
         optimizer: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__()
-        self.model = model
+        self.model = model  # the baseline
         self.recipe = options
-        self.steps = steps
-        self.step = step
+        self.steps = steps  # steps of the whole training
+        self.step = step  # optimiser steps made
+        # raw loss terms of the last step, and their weighted sum as 'total'
         self.terms: dict[str, Tensor] = {}
         self._rate = options.learning_rate * processes
-        self._loader = loader
+        self._loader = loader  # returns the batches of a process, by its rank among so many
         self._resumed = optimizer
         self._noise: torch.Generator | None = None
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from .blocks import EdgeMLP, mlp
-from .dense import LayerNorm
-from .operators.operator import Losses, Operator
+from lagbench.baselines.operators.operator import Losses, Operator
+
+from .layers import EdgeMLP, LayerNorm, mlp
 
 __all__ = ["EncodeProcessDecode", "ProcessorLayer"]
 
@@ -21,11 +21,6 @@ class ProcessorLayer(nn.Module):
         e_{ij} &\leftarrow e_{ij} + m_{ij} \\
         x_i &\leftarrow x_i + \mathrm{LayerNorm}(\mathrm{Operator}
             ([x_i \Vert \textstyle\sum_j m_{ij}], m_{ij}))
-
-    Args:
-        operator: node update.
-        latent: width of nodes and edges.
-        hidden: width of hidden layers.
     """
 
     def __init__(self, operator: type[Operator], *, latent: int, hidden: int) -> None:
@@ -58,15 +53,6 @@ class EncodeProcessDecode(nn.Module):
 
     Two MLPs encode nodes and edges, processor layers of their own weights update both, an
     MLP decodes the nodes. With latent 128 and 10 layers it has about 1.6 M parameters.
-
-    Args:
-        operator: node update of the processor layers.
-        node_features: features of a particle.
-        edge_features: features of an edge.
-        outputs: numbers predicted for a particle.
-        latent: width of nodes and edges.
-        layers: processor layers.
-        hidden: width of hidden layers; ``latent`` by default.
     """
 
     def __init__(

@@ -11,25 +11,125 @@ A file of recipes holds defaults and what differs from them::
       "*/tiny": {model: {latent: 16}, training: {steps: 50}}
 
 Later layers win: defaults, recipe, ``--set``. ``steps`` and ``epochs`` replace each other.
+
+How a model is trained: the budget, the optimiser, and how often it is looked at.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
+from lagbench.data.yamlfile import read_yaml
 from lagbench.errors import LagbenchError, UnreadableFileError, UsageError, nearest
-from lagbench.yamlfile import read_yaml
 
 from .catalogue import Entry
-from .training_options import TrainingOptions
 
-__all__ = ["Recipe", "recipe_for", "recipe_names"]
+__all__ = [
+    "Schedule",
+    "TrainingOptions",
+    "Recipe",
+    "recipe_for",
+    "recipe_names",
+]
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Schedule(_Strict):
+    """Learning rate over the steps, as a factor on the recipe's rate.
+
+    ``constant`` 1; ``cosine`` (1 + cos(pi t)) / 2 falling to ``floor``, t from 0 to 1 after the
+    warm-up; ``exponential`` factor^(step / every). A warm-up rises linearly before.
+    """
+
+    kind: Literal["constant", "cosine", "exponential"] = "constant"  # its name; a recipe may give it alone
+    factor: float = Field(default=0.1, gt=0, le=1)  # of the exponential decay
+    every: int = Field(default=5_000_000, gt=0)  # steps in which it decays by the factor
+    floor: float = Field(default=0.01, ge=0, le=1)  # share of the rate that the cosine ends at
+
+    def at(self, step: int, *, steps: int, warmup: int = 0) -> float:
+        """Return the factor on the learning rate at a step, counted from 0.
+
+        >>> [Schedule(kind="cosine", floor=0).at(step, steps=4) for step in (0, 2, 4)]
+        [1.0, 0.5, 0.0]
+        >>> Schedule(kind="exponential", factor=0.1, every=100).at(200, steps=1000)
+        0.010000000000000002
+        """
+        rise = min(1.0, (step + 1) / (warmup + 1))
+        if self.kind == "exponential":
+            return float(rise * self.factor ** (step / self.every))
+        if self.kind == "constant":
+            return rise
+        done = min(1.0, max(0, step - warmup) / max(1, steps - warmup))
+        return rise * (self.floor + (1 - self.floor) * (1 + math.cos(math.pi * done)) / 2)
+
+
+def _named(value: object) -> object:
+    return {"kind": value} if isinstance(value, str) else value
+
+
+class TrainingOptions(_Strict):
+    """Options of a training; recipes fill them."""
+
+    steps: int | None = Field(default=None, gt=0)  # optimiser steps; or give 'epochs'
+    epochs: float | None = Field(default=None, gt=0, allow_inf_nan=False)  # passes over all windows
+    batch: int = Field(default=2, gt=0)  # windows of a step, in every process
+    # of Adam, times the number of processes (thesis section 5.7.3)
+    learning_rate: float = Field(default=1e-4, gt=0, allow_inf_nan=False)
+    # decoupled (AdamW) where it is above 0
+    weight_decay: float = Field(default=0.0, ge=0, allow_inf_nan=False)
+    schedule: Annotated[Schedule, BeforeValidator(_named)] = Schedule()  # the rate over the steps
+    warmup_steps: int = Field(default=0, ge=0)  # steps over which the rate rises from 0
+    # largest norm of the gradient; None clips nothing
+    clip: float | None = Field(default=None, gt=0, allow_inf_nan=False)
+    # 'bf16' runs matrix products in bfloat16, weights stay float32; 'auto' does so where the
+    # hardware multiplies in it
+    precision: Literal["float32", "bf16", "auto"] = "float32"
+    windows: tuple[str, ...] = ("train",)  # subsets to train on
+    # steps between validations; a tenth of all by default, 0 never
+    validate_every: int | None = Field(default=None, ge=0)
+    validation_frames: int = Field(default=20, gt=0)  # frames of a validation rollout
+    validation_scenarios: int = Field(default=2, gt=0)  # scenarios of 'valid' that are rolled out
+    # validations without a new best before training stops; None never
+    patience: int | None = Field(default=None, gt=0)
+    # steps between checkpoints; a twentieth of all by default
+    checkpoint_every: int | None = Field(default=None, gt=0)
+    log_every: int = Field(default=10, gt=0)  # steps between entries in TensorBoard
+    seed: int = Field(default=0, ge=0, lt=2**63)  # seed of weights, order of windows, and noise
+
+    @model_validator(mode="before")
+    @classmethod
+    def _one_budget(cls, data: object) -> object:
+        if isinstance(data, Mapping) and data.get("steps") and data.get("epochs"):
+            message = "give steps or epochs, not both"
+            raise ValueError(message)
+        return data
+
+    @model_validator(mode="after")
+    def _own_subsets(self) -> TrainingOptions:
+        if {"test", "valid"} & set(self.windows) or not self.windows:
+            message = (
+                f"windows={self.windows}: a model is trained on train (and extra), never on test, and not on"
+                " valid, by which its weights are chosen"
+            )
+            raise ValueError(message)
+        return self
+
+    def total_steps(self, windows: int, *, processes: int = 1) -> int:
+        """Return the optimiser steps of the training."""
+        if self.steps is not None:
+            return self.steps
+        return max(1, math.ceil((self.epochs or 1.0) * windows / (self.batch * processes)))
+
 
 Layer = dict[str, Any]
 ANY = "*"
@@ -38,19 +138,12 @@ Checked = TypeVar("Checked", bound=BaseModel)
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
-    """What a model is and how it is trained; checked, with every default filled in.
+    """What a model is and how it is trained; checked, with every default filled in."""
 
-    Attributes:
-        baseline: name of the baseline.
-        name: name of the recipe, as in ``cavity/mini``.
-        model: options of the model, plain values.
-        training: options of the training.
-    """
-
-    baseline: str
-    name: str
-    model: Mapping[str, Any]
-    training: TrainingOptions
+    baseline: str  # name of the baseline
+    name: str  # name of the recipe, as in cavity/mini
+    model: Mapping[str, Any]  # options of the model, plain values
+    training: TrainingOptions  # options of the training
 
     def as_json(self) -> dict[str, Any]:
         """Return plain values."""
@@ -88,21 +181,7 @@ def recipe_for(
     settings: Iterable[str] = (),
     seed: int | None = None,
 ) -> Recipe:
-    """Return the recipe of a baseline for a split and size.
-
-    Args:
-        entry: the baseline.
-        split: name of the split.
-        size: name of the size.
-        variant: ``short`` for the recipe ``<split>/<size>-short``; or a YAML file of recipes to
-            read in place of ours.
-        settings: changes, as in ``model.latent=64``; values are YAML.
-        seed: seed in place of the recipe's.
-
-    Raises:
-        UsageError: there is no such recipe or key; the message names the nearest.
-        UnreadableFileError: the file is no file of recipes.
-    """
+    """Return the recipe of a baseline for a split and size."""
     own_file = variant is not None and variant.endswith((".yaml", ".yml"))
     path = Path(str(variant)) if own_file else entry.recipes
     file = _read(path) if path else _File(format=1)

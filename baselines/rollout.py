@@ -1,34 +1,40 @@
 """Rollouts: a model fed with its own predictions, frozen where it ceases to be finite.
 
 One function serves validation during training and the predictions that are scored.
+
+Rollouts of a few scenarios of ``valid`` while a model is trained; ``test`` is never read.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from .baseline import Baseline
-from .batch import Batch
+from .baseline import Baseline, Batch
+from .job import TrainingJob
+from .windows import scenario_batch
 
-__all__ = ["Rollout", "roll_out", "single"]
+__all__ = [
+    "Rollout",
+    "roll_out",
+    "single",
+    "as_published",
+    "validate",
+    "validation_windows",
+]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rollout:
-    """Predicted positions of one window.
+    """Predicted positions of one window."""
 
-    Attributes:
-        scenario: scenario id.
-        position: positions [length], float32, on the CPU, shape [frame, particle, 2].
-        diverged_at: absolute frame from which the positions are frozen; None where none is.
-    """
-
-    scenario: int
-    position: Tensor
-    diverged_at: int | None
+    scenario: int  # scenario id
+    position: Tensor  # positions [length], float32, on the CPU, shape [frame, particle, 2]
+    diverged_at: int | None  # absolute frame from which the positions are frozen; None where none is
 
 
 @torch.no_grad()
@@ -38,11 +44,6 @@ def roll_out(model: Baseline, given: Batch, frames: int) -> list[Rollout]:
     A window that ceases to be finite is frozen at its last finite frame (the last given one if
     need be). Where that happens beside other windows, all are predicted again one by one, so
     that no window can disturb another.
-
-    Args:
-        model: the model, on the device of the batch.
-        given: the frames that the model may see.
-        frames: frames to predict.
     """
     was_training = model.training
     model.eval()
@@ -106,3 +107,48 @@ def _advance(model: Baseline, given: Batch, frames: int) -> tuple[Tensor, int]:
         if not torch.isfinite(predicted[frame]).all():
             return predicted, frame
     return predicted, frames
+
+
+def validation_windows(job: TrainingJob) -> Batch | None:
+    """Return the windows of ``valid`` that are rolled out; None where the recipe wants none."""
+    options, facts = job.recipe.training, job.facts
+    if options.validate_every == 0:
+        return None
+    paths = job.files("valid")
+    chosen = [paths[scenario] for scenario in sorted(paths)[: options.validation_scenarios]]
+    frames = facts.input_frames + min(options.validation_frames, facts.horizon)
+    return scenario_batch(chosen, slice(0, frames))
+
+
+def validate(model: Baseline, truth: Batch) -> float:
+    """Return the position RMSE of rollouts, the mean over windows [length].
+
+    The model is rolled out with its weights rounded to bfloat16, as predictions use them. A
+    rollout that diverges counts with its frozen frames.
+    """
+    given = model.facts.input_frames
+    rmse = []
+    with as_published(model):
+        device = next((p.device for p in model.parameters()), torch.device("cpu"))
+        for window in range(truth.windows):
+            part = single(truth, window)
+            found = roll_out(model, part.part(slice(0, given)).to(device), part.frames - given)[0]
+            error = found.position - part.position[:, given:].transpose(0, 1)
+            rmse.append(float(error.double().square().mean().sqrt()))
+    return sum(rmse) / len(rmse)
+
+
+@contextmanager
+def as_published(model: nn.Module) -> Iterator[None]:
+    """Round the parameters to bfloat16 for a while."""
+    kept: list[tuple[Tensor, Tensor]] = []
+    with torch.no_grad():
+        for parameter in model.parameters():
+            kept.append((parameter, parameter.detach().clone()))
+            parameter.copy_(parameter.to(torch.bfloat16))
+    try:
+        yield
+    finally:
+        with torch.no_grad():
+            for tensor, value in kept:
+                tensor.copy_(value)

@@ -19,19 +19,16 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
+from lagbench.baselines.operators.operator import Losses, Operator
+from lagbench.data.grid import Grid, Placement
 from lagbench.errors import UsageError
-from lagbench.grid import Grid, Placement
 
-from .baseline import Baseline, Options
-from .batch import Batch
+from .baseline import Baseline, Batch, Options
 from .facts import Facts
-from .features import EDGE_FEATURES, VELOCITIES, NodeFeatures, Scale, edge_features
-from .loss import LossNorm, Scales, loss_terms
-from .motion import Motion, State, integrate
+from .graph import EDGE_FEATURES, VELOCITIES, NodeFeatures, Scale, edge_features, radius_graph
+from .loss import LossNorm, Motion, Scales, State, integrate, loss_terms
 from .network import EncodeProcessDecode
-from .noise import noisy
-from .operators.operator import Losses, Operator
-from .radius_graph import radius_graph
+from .seeding import noisy
 from .symmetry import Symmetry, draw, image
 
 __all__ = ["GraphNetwork", "GraphNetworkOptions", "LossWeights", "Target"]
@@ -58,37 +55,26 @@ class LossWeights(Options):
 
 
 class GraphNetworkOptions(Options):
-    """Options of a graph network.
+    """Options of a graph network."""
 
-    Attributes:
-        latent: width of nodes, edges and hidden layers.
-        layers: processor layers.
-        target: what the network predicts.
-        noise_std: deviation of the noise on the last given velocity, per component
-            [length/frame]; near the error of one predicted step is good, far above it training
-            learns to remove noise and little else.
-        loss: weights of the six terms.
-        loss_norm: L2 or L1.
-        link_weight: weight of an operator's link prediction; the operator's own when None.
-        rollout_loss_steps: own steps that the loss is averaged over; gradients pass through all.
-        wall_velocity: whether the velocities of moving walls are features.
-        symmetry: images that training windows are replaced by at random.
-        radius: connectivity radius [length]; the data set's when None.
-        clamp: keep particles of a rollout in the box, and their velocities true to that; else
-            they may leave it. Training never clamps.
-    """
-
-    latent: int = Field(default=128, ge=1)
-    layers: int = Field(default=10, ge=1)
-    target: Target = Target.ACCELERATION
+    latent: int = Field(default=128, ge=1)  # width of nodes, edges and hidden layers
+    layers: int = Field(default=10, ge=1)  # processor layers
+    target: Target = Target.ACCELERATION  # what the network predicts
+    # deviation of the noise on the last given velocity, per component [length/frame]; near the error of one
+    # predicted step is good, far above it training learns to remove noise and little else
     noise_std: float = Field(default=6.7e-4, ge=0.0, allow_inf_nan=False)
-    loss: LossWeights = LossWeights()
-    loss_norm: LossNorm = LossNorm.L2
+    loss: LossWeights = LossWeights()  # weights of the six terms
+    loss_norm: LossNorm = LossNorm.L2  # L2 or L1
+    # weight of an operator's link prediction; the operator's own when None
     link_weight: float | None = Field(default=None, ge=0.0, allow_inf_nan=False)
+    # own steps that the loss is averaged over; gradients pass through all
     rollout_loss_steps: int = Field(default=1, ge=1)
-    wall_velocity: bool = False
-    symmetry: Symmetry = Symmetry.NONE
+    wall_velocity: bool = False  # whether the velocities of moving walls are features
+    symmetry: Symmetry = Symmetry.NONE  # images that training windows are replaced by at random
+    # connectivity radius [length]; the data set's when None
     radius: float | None = Field(default=None, gt=0.0, allow_inf_nan=False)
+    # keep particles of a rollout in the box, and their velocities true to that; else they may leave it.
+    # Training never clamps.
     clamp: bool = False
 
 
@@ -163,13 +149,7 @@ class GraphNetwork(Baseline):
         return self.options.loss.model_dump() | own
 
     def forward(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
-        """Return the six terms of Eq. 5.35 and the operator's own, raw, means over the steps.
-
-        Args:
-            batch: windows of ``history + future`` frames; left unchanged.
-            generator: source of noise, images and the operator's draws; without one there is no
-                noise and no image.
-        """
+        """Return the six terms of Eq. 5.35 and the operator's own, raw, means over the steps."""
         batch = batch if generator is None else self._disturbed(batch, generator)
         state = self.start(batch.part(slice(HISTORY)))
         steps = []
@@ -206,10 +186,9 @@ class GraphNetwork(Baseline):
         )
 
     def start(self, given: Batch) -> State:
-        """Return the state after the given frames; where they are fewer than six, the first velocity repeats.
+        """Return the state after the given frames.
 
-        Raises:
-            UsageError: fewer than two frames.
+        Where they are fewer than six, the first velocity repeats.
         """
         if given.frames < 2:
             raise UsageError(
@@ -238,12 +217,7 @@ class GraphNetwork(Baseline):
         return following, following.position
 
     def step(self, state: State, generator: torch.Generator | None = None) -> tuple[State, Losses]:
-        """Return the state one frame on and the operator's own losses.
-
-        Args:
-            state: where the particles are.
-            generator: source of the operator's draws.
-        """
+        """Return the state one frame on and the operator's own losses."""
         output, own = self.predict(state, self.edges(state), generator)
         last = state.velocity[:, -1]
         if self.options.target is Target.VELOCITY:

@@ -13,10 +13,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from lagbench.data.registry import Size
 from lagbench.errors import UsageError
-from lagbench.registry import Size
 
-from .batch import Batch
+from .baseline import Batch
 from .facts import Pair
 
 __all__ = ["Symmetry", "check_symmetry", "draw", "image"]
@@ -39,13 +39,6 @@ def check_symmetry(symmetry: object, size: Size) -> None:
     """Refuse images that fall in another direction than their windows.
 
     A split whose description names no gravity, as an imported one may, passes.
-
-    Args:
-        symmetry: name of the images that training may draw; None for a model without the option.
-        size: what the registry says of the split.
-
-    Raises:
-        UsageError: all images of the square, in a split with gravity.
     """
     described = size.parameters.get("gravity")
     gravity = described.value if described else None
@@ -60,13 +53,7 @@ def check_symmetry(symmetry: object, size: Size) -> None:
 
 
 def draw(symmetry: Symmetry, windows: int, generator: torch.Generator) -> Tensor:
-    """Return one image per window, drawn evenly, as matrices of shape [window, 2, 2].
-
-    Args:
-        symmetry: which images may be drawn.
-        windows: windows W of the batch.
-        generator: source of randomness.
-    """
+    """Return one image per window, drawn evenly, as matrices of shape [window, 2, 2]."""
     device = generator.device
     bits = torch.randint(2, (3, windows), generator=generator, device=device)
     mirror_x, mirror_y, swap = bits * (symmetry is Symmetry.SQUARE)

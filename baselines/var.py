@@ -17,8 +17,7 @@ from lagbench.errors import WorkFailedError
 from . import baseline
 from .facts import Facts
 from .frame_model import FrameModel, FrameWindow
-from .normal_equations import LeastSquares, solve
-from .principal import principal_directions
+from .least_squares import LeastSquares, principal_directions, solve
 
 __all__ = ["Fitted", "LaggedRows", "StableVAR", "VAR"]
 
@@ -99,13 +98,9 @@ class VAR(Fitted):
     method = "var"
 
     class Options(baseline.Options):
-        """Options of the VAR.
+        """Options of the VAR."""
 
-        Attributes:
-            lags: order p.
-        """
-
-        lags: PositiveInt = 1
+        lags: PositiveInt = 1  # order p
 
     precision = torch.float64
     options: Options
@@ -154,14 +149,10 @@ class StableVAR(Fitted):
     method = "var-stable"
 
     class Options(baseline.Options):
-        """Options of the stable VAR.
+        """Options of the stable VAR."""
 
-        Attributes:
-            rank: principal directions kept; all there are if they are fewer.
-            ridge: added to the variance of each direction [standardised^2].
-        """
-
-        rank: PositiveInt = 200
+        rank: PositiveInt = 200  # principal directions kept; all there are if they are fewer
+        # added to the variance of each direction [standardised^2]
         ridge: float = Field(default=0.1, ge=0, allow_inf_nan=False)
 
     precision = torch.float32

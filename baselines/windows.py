@@ -2,52 +2,141 @@
 
 data = WindowDataset("cavity", size="mini", history=6)
 loader = DataLoader(data, 2, sampler=WindowSampler(data, seed=0), collate_fn=collate)
+
+The order in which training windows are drawn: seeded, resumable, shared out among ranks.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import accumulate
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.utils.data import Dataset
+from torch.utils.data import Dataset, Sampler
 
+from lagbench.data.local import locate
+from lagbench.data.registry import Registry
+from lagbench.data.scenario import read_scenario
 from lagbench.errors import UsageError
-from lagbench.locating import locate
-from lagbench.registry import Registry
-from lagbench.scenario_file import read_scenario
 
-from .batch import Batch
-from .frame_store import CACHE_BYTES, FrameStore
-from .sources import sources_of
-from .window_sampler import WindowSampler
+from .baseline import Batch
+from .frame_store import CACHE_BYTES, FrameStore, sources_of
 
-__all__ = ["Window", "WindowDataset", "WindowSampler", "collate", "scenario_batch", "scenario_paths"]
+__all__ = [
+    "POOL_BYTES",
+    "RUN",
+    "WindowSampler",
+    "Window",
+    "WindowDataset",
+    "collate",
+    "scenario_batch",
+    "scenario_paths",
+]
+
+
+RUN = 32
+"""Windows that follow each other in a scenario and are drawn from one pool, to share their frames."""
+
+POOL_BYTES = CACHE_BYTES
+"""Frames of the windows that are shuffled together [bytes]."""
+
+
+class WindowSampler(Sampler[int]):
+    """Draw every window once an epoch, in an order that follows from seed and epoch alone.
+
+    Windows of one scenario that follow each other are cut into runs of 32. An epoch is a random
+    order of all runs, taken in pools whose frames fill 256 MiB; the windows of a pool are shuffled.
+    So a frame is decompressed about once, not once for each window that holds it; where all frames
+    fit one pool, every order is equally likely.
+
+    With several ranks each takes every ranks-th window of the one order, and the last few windows
+    that do not go round are left out.
+    """
+
+    def __init__(
+        self, data: WindowDataset, *, seed: int, rank: int | None = None, ranks: int | None = None
+    ) -> None:
+        grouped = torch.distributed.is_available() and torch.distributed.is_initialized()
+        self.rank = rank if rank is not None else torch.distributed.get_rank() if grouped else 0
+        self.ranks = ranks if ranks is not None else torch.distributed.get_world_size() if grouped else 1
+        if not 0 <= self.rank < self.ranks <= len(data):
+            raise UsageError(
+                "no window for a rank",
+                where="WindowSampler",
+                expected=f"0 <= rank < ranks <= {len(data)}",
+                got=f"rank {self.rank} of {self.ranks}",
+            )
+        self.data = data  # what is drawn from
+        self.seed = seed  # seed of all epochs
+        self.epoch = 0  # epoch that is drawn from
+        self.position = 0  # windows of its order that the ranks together have drawn
+
+    def __len__(self) -> int:
+        """Return the windows of a whole epoch for one rank."""
+        return len(self.data) // self.ranks
+
+    def order(self, epoch: int) -> NDArray[np.int64]:
+        """Return the windows of an epoch in the order of all ranks together, shape [window]."""
+        rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence([self.seed, epoch])))
+        runs = [
+            run for ends in zip(self.data.starts, self.data.starts[1:], strict=False) for run in _cut(*ends)
+        ]
+        shuffled = [runs[i] for i in _permutation(rng, len(runs))]
+        pool = max(1, POOL_BYTES // (self.data.frame_bytes * (RUN + self.data.length - 1)))
+        pools = [np.concatenate(shuffled[i : i + pool]) for i in range(0, len(shuffled), pool)]
+        return np.concatenate([windows[_permutation(rng, len(windows))] for windows in pools])
+
+    def __iter__(self) -> Iterator[int]:
+        """Yield this rank's windows from the position to the end of the epoch; begin the next one."""
+        order = self.order(self.epoch)
+        for turn in range(self.position // self.ranks, len(self)):
+            self.position = (turn + 1) * self.ranks
+            yield int(order[turn * self.ranks + self.rank])
+        self.seek(self.epoch + 1)
+
+    def seek(self, epoch: int, position: int = 0) -> None:
+        """Continue at a place of an epoch.
+
+        Loaders with worker processes draw ahead of the training: give the position that follows
+        from the steps taken.
+        """
+        self.epoch, self.position = epoch, position
+
+    def state_dict(self) -> dict[str, int]:
+        """Return what :meth:`load_state_dict` takes to continue here, in mid-epoch too."""
+        return {"seed": self.seed, "epoch": self.epoch, "position": self.position}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue where another sampler of the same data stood."""
+        self.seed = int(state["seed"])
+        self.seek(int(state["epoch"]), int(state["position"]))
+
+
+def _cut(start: int, stop: int) -> list[NDArray[np.int64]]:
+    """Return the windows from start to stop in runs."""
+    return [np.arange(first, min(first + RUN, stop)) for first in range(start, stop, RUN)]
+
+
+def _permutation(rng: np.random.Generator, length: int) -> NDArray[np.intp]:
+    """Return a random order; NumPy promises the same bits for `random` alone."""
+    return np.argsort(rng.random(length), kind="stable")
 
 
 class Window(NamedTuple):
-    """Consecutive frames of one scenario.
+    """Consecutive frames of one scenario."""
 
-    Attributes:
-        position: particle positions [length], float32, shape [particle, frame, 2].
-        material: 0 liquid, 1 jelly, 2 snow, 3 rope, int64, shape [particle].
-        wall_velocity: velocity of the walls [length/s], float32, shape [frame, wall, 2]; None in
-            a split without moving walls.
-        scenario: scenario id.
-        frame: absolute number of the first frame.
-    """
-
-    position: Tensor
-    material: Tensor
+    position: Tensor  # particle positions [length], float32, shape [particle, frame, 2]
+    material: Tensor  # 0 liquid, 1 jelly, 2 snow, 3 rope, int64, shape [particle]
+    # velocity of the walls [length/s], float32, shape [frame, wall, 2]; None in a split without moving walls
     wall_velocity: Tensor | None
-    scenario: int
-    frame: int
+    scenario: int  # scenario id
+    frame: int  # absolute number of the first frame
 
 
 class WindowDataset(Dataset[Window]):
@@ -61,15 +150,11 @@ class WindowDataset(Dataset[Window]):
         split: name of the split, or path of a local split's folder.
         subset: train, valid, test or, for multimaterial, extra; or several of them.
         size: name of the size.
-        root: folder of all data sets, see :func:`lagbench.layout.resolve_root`.
+        root: folder of all data sets, see :func:`lagbench.data.layout.resolve_root`.
         history: frames that a model is given.
         future: frames after them.
         registry: what describes the data set; ours by default.
         cache_bytes: frames kept decompressed [bytes]; with less, reading is slower, never different.
-
-    Attributes:
-        length: frames in a window.
-        starts: number of the first window of each scenario, and the number of all windows.
 
     Raises:
         UsageError: unknown split, size or subset, or no scenario is long enough.
@@ -91,10 +176,11 @@ class WindowDataset(Dataset[Window]):
         entry, folder, _ = locate(split, size, root=root, registry=registry)
         names = (subset,) if isinstance(subset, str) else tuple(subset)
         sources = sources_of(entry, names, folder)
-        self.length = history + future
+        self.length = history + future  # frames in a window
         self.scenarios = tuple(sources)
         self.frame_bytes = 8 * entry.particles
         counts = [max(0, source.frames - self.length + 1) for source in sources.values()]
+        # number of the first window of each scenario, and the number of all windows
         self.starts = (0, *accumulate(counts))
         if history < 1 or future < 0 or not len(self):
             longest = max(source.frames for source in sources.values())
@@ -111,11 +197,7 @@ class WindowDataset(Dataset[Window]):
         return self.starts[-1]
 
     def place(self, index: int) -> tuple[int, int]:
-        """Return scenario id and first frame of a window.
-
-        Raises:
-            IndexError: there is no such window.
-        """
+        """Return scenario id and first frame of a window."""
         if not -len(self) <= index < len(self):
             message = f"no window {index} among {len(self)}"
             raise IndexError(message)
@@ -124,12 +206,7 @@ class WindowDataset(Dataset[Window]):
         return self.scenarios[row], index - self.starts[row]
 
     def __getitem__(self, index: int) -> Window:
-        """Return a window.
-
-        Raises:
-            IndexError: there is no such window.
-            DataError: the file is damaged or not that of the registry.
-        """
+        """Return a window."""
         scenario, frame = self.place(index)
         frames = self._store.frames(scenario, frame, frame + self.length)
         material, walls = self._store.constants(scenario)
@@ -139,11 +216,7 @@ class WindowDataset(Dataset[Window]):
 
 
 def collate(windows: Sequence[Window]) -> Batch:
-    """Put windows side by side.
-
-    Raises:
-        UsageError: no window, windows of unequal lengths, or only some with moving walls.
-    """
+    """Put windows side by side."""
     walls = [window.wall_velocity for window in windows if window.wall_velocity is not None]
     frames = {window.position.shape[1] for window in windows}
     if len(frames) != 1 or len(walls) not in (0, len(windows)):
@@ -165,16 +238,7 @@ def collate(windows: Sequence[Window]) -> Batch:
 
 
 def scenario_batch(paths: Path | Sequence[Path], frames: slice = slice(None)) -> Batch:
-    """Return the same frames of one or several whole scenarios, for rollouts and validation.
-
-    Args:
-        paths: scenario files, see :func:`scenario_paths`.
-        frames: consecutive frames, all by default.
-
-    Raises:
-        DataError: a file is missing or damaged.
-        UsageError: the scenarios have unequal numbers of these frames.
-    """
+    """Return the same frames of one or several whole scenarios, for rollouts and validation."""
     return collate([_read(path, frames) for path in ([paths] if isinstance(paths, Path) else paths)])
 
 
@@ -186,12 +250,7 @@ def scenario_paths(
     root: str | Path | None = None,
     registry: Registry | None = None,
 ) -> dict[int, Path]:
-    """Return the files of a subset by scenario id; all of them exist.
-
-    Raises:
-        UsageError: unknown split, size or subset.
-        DataError: scenarios are missing; the message has the command that makes them.
-    """
+    """Return the files of a subset by scenario id; all of them exist."""
     entry, folder, _ = locate(split, size, root=root, registry=registry)
     return {i: source.path for i, source in sources_of(entry, (subset,), folder).items()}
 

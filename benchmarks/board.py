@@ -34,11 +34,11 @@ from lagbench.board.folder import Folder, score_paths
 from lagbench.board.scored import score_block
 from lagbench.board.seeds import combine, summarise
 from lagbench.board.stored import read_stored
-from lagbench.checksums import file_sha256
 from lagbench.cli.output import spell_bytes
-from lagbench.floors import CONSTANT_VELOCITY, PERSISTENCE
-from lagbench.score_file import write_statistics
-from lagbench.sitting import SUBMISSION, as_stored
+from lagbench.data.checksums import file_sha256
+from lagbench.scoring.floors import CONSTANT_VELOCITY, PERSISTENCE
+from lagbench.scoring.scenario import SUBMISSION, as_stored
+from lagbench.scoring.score_file import write_statistics
 
 MOST_BYTES, MOST_SECONDS = 2_000_000, 20.0
 SEEDS = 3

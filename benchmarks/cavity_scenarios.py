@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lagbench.format import ScenarioKey, read_scenario, scenario_path
-from lagbench.registry import Size, load
+from lagbench.data.registry import Size, load
+from lagbench.data.writer import ScenarioKey, read_scenario, scenario_path
 
 NAMES = ("wall", "direction", "speed", "reynolds_number", "start_substep")
 

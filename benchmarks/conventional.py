@@ -27,8 +27,8 @@ import time
 import numpy as np
 import taichi as ti
 
-from lagbench.generators.base import WALLS, ClosedBoxParameters, InitialState
-from lagbench.generators.experiment import Case, initial_state, plan, solver_parameters
+from lagbench.generators.acceptance.experiment import Case, initial_state, plan, solver_parameters
+from lagbench.generators.split import WALLS, ClosedBoxParameters, InitialState
 
 
 @ti.data_oriented

@@ -12,8 +12,8 @@ import argparse
 import resource
 from pathlib import Path
 
-from lagbench.generation import GenerationResult, generate
-from lagbench.registry import load
+from lagbench.data.registry import load
+from lagbench.make.generate import GenerationResult, generate
 
 HEADER = (
     "| split | size | scenarios | frames | wall [s] | CPU [s] | largest worker [MB] | on disk [MB] |\n"

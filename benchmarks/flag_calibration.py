@@ -24,14 +24,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.exam import Exam, load_exam
-from lagbench.flags import copy_suspect, evidence
-from lagbench.grid import Grid, fields
-from lagbench.layout import resolve_root
+from lagbench.data.grid import Grid, fields
+from lagbench.data.layout import resolve_root
+from lagbench.data.registry import load
 from lagbench.metrics import FramePair, Scenario, snapshots
-from lagbench.registry import load
+from lagbench.scoring.flags import Trace, Tracer, copy_suspect, evidence
+from lagbench.scoring.task import ScoredTask, load_scored_task
 from lagbench.submission import Predictions, open_predictions
-from lagbench.trace import Trace, Tracer
 
 Floats = NDArray[np.float64]
 
@@ -152,7 +151,7 @@ def trace_of(case: Case, predicted: Floats) -> Trace:
     return tracer.result()
 
 
-def cases(exam: Exam) -> dict[int, Case]:
+def cases(exam: ScoredTask) -> dict[int, Case]:
     """Return the test scenarios of a split by id."""
     held = []
     for number in exam.scenarios:
@@ -182,7 +181,7 @@ def main() -> int:
     print(f"{'prediction':32s} {'split':14s}{names}  copy_suspect")
     seen: dict[str, list[list[float]]] = {"honest": [], "made from the truth": [], "trained": []}
     for split in options.splits.split(","):
-        exam = load_exam(load().size(split, options.size), resolve_root(options.root))
+        exam = load_scored_task(load().size(split, options.size), resolve_root(options.root))
         by_id = cases(exam)
         held = list(by_id.values())
         for kind, table in (("honest", HONEST), ("made from the truth", DISHONEST)):

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import lagbench
 from lagbench.errors import DataError
-from lagbench.score_card import ScoreCard
+from lagbench.scoring.card import ScoreCard
 
 DATA = ("cavity/full", "cavity/mini", "curl-noise/mini", "fluid/mini", "multimaterial/mini")
 METRICS = ("vorticity_rmse", "vorticity_pearson", "position_rmse", "mse_avg", "energy_error")

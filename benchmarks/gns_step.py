@@ -23,10 +23,10 @@ from importlib.metadata import entry_points
 import torch
 from torch import Tensor, nn
 
-from lagbench.baselines import blocks, dense
-from lagbench.baselines.blocks import EdgeMLP
+from lagbench.baselines import layers
+from lagbench.baselines.graph import radius_graph
+from lagbench.baselines.layers import EdgeMLP
 from lagbench.baselines.network import EncodeProcessDecode
-from lagbench.baselines.radius_graph import radius_graph
 
 NODE_FEATURES, EDGE_FEATURES = 30, 3
 RADIUS = 1.72
@@ -46,9 +46,9 @@ def conventional(given: argparse.Namespace) -> None:
     if given.edge_layer == "plain":
         EdgeMLP.forward = plain
     if given.products == "torch":
-        dense._fast = lambda x, weight: False
+        layers._fast = lambda x, weight: False
     if given.hidden == "kept":
-        blocks.LARGEST_KEPT = math.inf
+        layers.LARGEST_KEPT = math.inf
 
 
 def particles(count: int, windows: int) -> Tensor:

@@ -25,12 +25,12 @@ from typing import Any
 
 from table_3_1 import THESIS, Row
 
-from lagbench.generation import generate
-from lagbench.generators.batch import Batch, Job, draw
+from lagbench.data.registry import Registry, load
+from lagbench.data.scenario import check_scenario
+from lagbench.data.statistics import file_moments
+from lagbench.generators.batch import Batch, SimulationJob, draw
 from lagbench.generators.simulate import scenario_writer
-from lagbench.registry import Registry, load
-from lagbench.scenario_file import check_scenario
-from lagbench.statistics import file_moments
+from lagbench.make.generate import generate
 
 FRAMES = (4, 10)
 """Frames of the two generations."""
@@ -116,7 +116,7 @@ def timed(function: Callable[[], object]) -> float:
 def measure_parts(row: Row, frames: int, root: Path) -> Parts:
     """Time the parts of a generation in this process."""
     size = registry_of(row, frames).size("fluid", "q")
-    job = Job(size=size, scenarios=(0,), root=root)
+    job = SimulationJob(size=size, scenarios=(0,), root=root)
     drawing = min(timed(lambda: draw(size, 0)) for _ in range(3))
     batch = Batch(job, lambda _: None)
     batch.solver.advance(1)

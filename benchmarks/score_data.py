@@ -14,8 +14,8 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from lagbench.format import ScenarioKey, ScenarioWriter, scenario_path
-from lagbench.registry import Registry, default_path, load
+from lagbench.data.registry import Registry, default_path, load
+from lagbench.data.writer import ScenarioKey, ScenarioWriter, scenario_path
 from lagbench.submission import PredictionsWriter
 
 __all__ = ["ScoreData", "make_score_data"]

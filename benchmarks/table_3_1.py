@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from lagbench.generators import solver
-from lagbench.generators.base import FreeSurfaceParameters, InitialState, Material
+from lagbench.generators.split import FreeSurfaceParameters, InitialState, Material
 
 _LIQUID_MODULUS = 30.0
 _COURANT = 0.4

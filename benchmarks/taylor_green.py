@@ -16,7 +16,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.grid import Grid, fields
+from lagbench.data.grid import Grid, fields
 
 Floats = NDArray[np.float64]
 

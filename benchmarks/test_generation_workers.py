@@ -10,7 +10,7 @@ from pytest_benchmark.fixture import BenchmarkFixture
 from timing import best_seconds
 
 import lagbench
-from lagbench.format import rehash
+from lagbench.data.writer import rehash
 
 TARGET = 1.8
 SCENARIOS = "0-23"

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pytest_benchmark.fixture import BenchmarkFixture
 from timing import best_seconds
 
-from lagbench import checksums
+from lagbench.data import checksums
 
 TARGET = 1e9
 FRAMES, PARTICLES = 600, 8192

@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 from timing import best_seconds
 from torch import Tensor
 
-from lagbench.baselines.radius_graph import radius_graph
+from lagbench.baselines.graph import radius_graph
 
 TARGET = 3e-3
 """Target on one core [s]."""

@@ -19,7 +19,7 @@ import pytest
 from naive_scorer import naive_scores
 from score_data import ScoreData, make_score_data
 
-from lagbench.exam import load_exam
+from lagbench.scoring.task import load_scored_task
 
 WALL_SECONDS = 2.0
 """Target after imports on two idle cores [s]."""
@@ -36,14 +36,14 @@ SCENARIOS = 6
 CHILD = """
 import json, resource, sys, time
 from pathlib import Path
-import lagbench.scoring, netCDF4
-from lagbench.registry import load
+import lagbench.scoring.score, netCDF4
+from lagbench.data.registry import load
 folder, workers = Path(sys.argv[1]), int(sys.argv[2])
 who = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
 peak = lambda: int(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0])
 cpu = lambda: sum(sum(resource.getrusage(one)[:2]) for one in who)
 wall, used = time.perf_counter(), cpu()
-card = lagbench.scoring.score(folder / "predictions.nc", root=folder / "root",
+card = lagbench.scoring.score.score(folder / "predictions.nc", root=folder / "root",
                               registry=load(folder / "datasets.yaml"), workers=workers)
 print(json.dumps({
     "wall": time.perf_counter() - wall,
@@ -73,7 +73,7 @@ def test_score_beside_a_naive_scorer(data: ScoreData) -> None:
     """All metrics of three rows take a fifth of the time of five naive ones of one row, or less."""
     folder = data.predictions.parent
     one, two = run_ours(folder, 1), run_ours(folder, 2)
-    exam = load_exam(data.registry.size("cavity", "full"), data.root)
+    exam = load_scored_task(data.registry.size("cavity", "full"), data.root)
     start, used = time.perf_counter(), time.process_time()
     for row, scenario in enumerate(exam.scenarios[:2]):
         naive_scores(exam.truth.path(scenario), data.predictions, row, 6, NAIVE_FRAMES)

@@ -18,7 +18,7 @@ from pytest_benchmark.fixture import BenchmarkFixture
 from statsmodels.tsa.api import VAR as StatsmodelsVAR
 from timing import best_seconds
 
-from lagbench.baselines.normal_equations import solve
+from lagbench.baselines.least_squares import solve
 from lagbench.baselines.var import LaggedRows
 
 TARGET_RATIO = 10.0

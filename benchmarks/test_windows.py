@@ -26,7 +26,7 @@ from torch.utils.data import DataLoader
 from window_data import FRAMES, write_gns_npz, write_lagrangebench_h5, write_ours
 
 from lagbench.baselines.windows import WindowDataset, WindowSampler, collate
-from lagbench.registry import load
+from lagbench.data.registry import load
 
 TARGET = 1000.0
 """Windows per second in one process."""
@@ -47,7 +47,7 @@ CHILD = """
 import json, sys
 from pathlib import Path
 from lagbench.baselines.windows import WindowDataset, WindowSampler
-from lagbench.registry import load
+from lagbench.data.registry import load
 root, windows = Path(sys.argv[1]), int(sys.argv[2])
 data = WindowDataset("cavity", root=root, history=6, registry=load(root / "datasets.yaml"))
 for drawn, index in enumerate(WindowSampler(data, seed=0)):

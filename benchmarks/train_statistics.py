@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import argparse
 
-from lagbench.registry import load
+from lagbench.data.registry import load
 
 THESIS = {
     "cavity": {

@@ -15,7 +15,7 @@ import time
 import numpy as np
 
 from lagbench.generators import solver
-from lagbench.generators.experiment import Case, initial_state, plan, solver_parameters
+from lagbench.generators.acceptance.experiment import Case, initial_state, plan, solver_parameters
 
 
 def main() -> int:

@@ -14,8 +14,8 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from lagbench.format import ScenarioKey, ScenarioWriter, scenario_path
-from lagbench.registry import Registry, default_path, load
+from lagbench.data.registry import Registry, default_path, load
+from lagbench.data.writer import ScenarioKey, ScenarioWriter, scenario_path
 
 __all__ = ["FRAMES", "PARTICLES", "trajectory", "write_gns_npz", "write_lagrangebench_h5", "write_ours"]
 

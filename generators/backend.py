@@ -12,18 +12,23 @@ import os
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from lagbench.errors import UsageError
-from lagbench.extras import require
-from lagbench.pool import available_cores
+from lagbench.errors import UsageError, require
+from lagbench.work.pool import available_cores
 
 from .solver import Device
+
+__all__ = [
+    "HARMLESS",
+    "place",
+    "start",
+]
+
 
 # Taichi greets on stdout as it is imported, which would spoil `--json`, and asks the network.
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
 ti = require("taichi", extra="generate")
 
-__all__ = ["HARMLESS", "place", "start"]
 
 HARMLESS = frozenset(
     {
@@ -45,15 +50,6 @@ def start(device: Device, *, scenarios: int = 1, threads: int | None = None) -> 
     """Start Taichi for a device unless it runs, and return the threads for parallel loops.
 
     The first call in a process fixes the size of the thread pool; idle threads sleep.
-
-    Args:
-        device: where the kernels will run.
-        scenarios: scenarios advanced together.
-        threads: threads that parallel loops use; None for all of the pool.
-
-    Raises:
-        UsageError: no Taichi, CPU and CUDA in one process, more threads than the pool has, or several
-            scenarios on the serial device.
     """
     if device is Device.CPU and scenarios != 1:
         raise UsageError(
@@ -110,11 +106,7 @@ def _initialise(on_gpu: bool, pool: int) -> None:
 
 
 def place(*groups: tuple[tuple[int, ...], Sequence[Any]]) -> Any:  # noqa: ANN401 (Taichi is untyped)
-    """Give fields their memory: each group (shape, fields) is one array of structs.
-
-    Returns:
-        Taichi's SNode tree, whose ``destroy()`` releases the memory.
-    """
+    """Give fields their memory: each group (shape, fields) is one array of structs."""
     builder = ti.FieldsBuilder()
     for shape, fields in groups:
         axes = (ti.i, ti.ij, ti.ijk, ti.ijkl)[len(shape) - 1]

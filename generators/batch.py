@@ -19,15 +19,24 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.data.registry import Size
 from lagbench.errors import UsageError, WorkFailedError
-from lagbench.registry import Size
 
-from .base import ClosedBoxParameters, FreeSurfaceParameters, InitialState, Split
+from .constants import blamed_on_parameters
 from .draws import generator
-from .preflight import blamed_on_parameters
 from .solver import Device, Solver, build
+from .split import ClosedBoxParameters, FreeSurfaceParameters, InitialState, Split
 
-__all__ = ["Batch", "Extremes", "Job", "Report", "draw", "solver_constants", "split_module", "substeps_of"]
+__all__ = [
+    "Batch",
+    "Extremes",
+    "SimulationJob",
+    "Report",
+    "draw",
+    "solver_constants",
+    "split_module",
+    "substeps_of",
+]
 
 STRIDE = 4_000_000
 """Particle-substeps between two reports: about a tenth of a second on a core."""
@@ -37,28 +46,17 @@ Report = Callable[[int], None]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Job:
-    """What a worker simulates in one go; picklable.
+class SimulationJob:
+    """What a worker simulates in one go; picklable."""
 
-    Attributes:
-        size: tier of a split with its parameters.
-        scenarios: ids that advance together; one on ``Device.CPU``.
-        root: folder that holds all data sets.
-        device: where the solver runs.
-    """
-
-    size: Size
-    scenarios: tuple[int, ...]
-    root: Path
-    device: Device = Device.CPU
+    size: Size  # tier of a split with its parameters
+    scenarios: tuple[int, ...]  # ids that advance together; one on Device.CPU
+    root: Path  # folder that holds all data sets
+    device: Device = Device.CPU  # where the solver runs
 
 
 def split_module(size: Size) -> Split:
-    """Return the module that draws the scenarios of a size.
-
-    Raises:
-        UsageError: it cannot be imported or lacks a function of ``base.Split``.
-    """
+    """Return the module that draws the scenarios of a size."""
     try:
         module = importlib.import_module(size.generator)
     except ImportError as error:
@@ -111,37 +109,22 @@ def substeps_of(size: Size, scenario: int) -> int:
 
 @dataclass
 class Extremes:
-    """The widest values that a scenario has shown at any substep.
+    """The widest values that a scenario has shown at any substep."""
 
-    Attributes:
-        max_speed: largest velocity component [length/s].
-        jacobian_min: smallest J of any particle [1].
-        jacobian_max: largest J of any particle [1].
-    """
-
-    max_speed: float = 0.0
-    jacobian_min: float = np.inf
-    jacobian_max: float = -np.inf
+    max_speed: float = 0.0  # largest velocity component [length/s]
+    jacobian_min: float = np.inf  # smallest J of any particle [1]
+    jacobian_max: float = -np.inf  # largest J of any particle [1]
 
 
 class Batch:
-    """Scenarios in a solver, and the frames at which they are due.
+    """Scenarios in a solver, and the frames at which they are due."""
 
-    Args:
-        job: what to simulate.
-        report: see :data:`Report`.
-        frames: frames wanted of each scenario; None for all that it records.
-
-    Attributes:
-        states: the scenarios before their first substep.
-        extremes: what each has gone through so far.
-        solver: holds the scenarios in the order of the job.
-    """
-
-    def __init__(self, job: Job, report: Report, frames: Sequence[int] | None = None) -> None:
-        self.job = job
+    def __init__(self, job: SimulationJob, report: Report, frames: Sequence[int] | None = None) -> None:
+        self.job = job  # what to simulate
+        # the scenarios before their first substep
         self.states = [draw(job.size, scenario) for scenario in job.scenarios]
-        self.extremes = [Extremes() for _ in job.scenarios]
+        self.extremes = [Extremes() for _ in job.scenarios]  # what each has gone through so far
+        # holds the scenarios in the order of the job
         self.solver = _solver(solver_constants(job.size), job.device, len(self.states))
         with self._naming():
             self.solver.load(self.states)
@@ -152,11 +135,7 @@ class Batch:
         self._displaced: list[tuple[int, NDArray[np.float32]]] = []
 
     def recordings(self) -> Iterator[tuple[int, int]]:
-        """Yield (index in the batch, frame) whenever the solver stands at that frame.
-
-        Raises:
-            WorkFailedError: a scenario blew up; says which, when, and the broken bound.
-        """
+        """Yield (index in the batch, frame) whenever the solver stands at that frame."""
         for substep, due in groupby(self._schedule(), key=lambda entry: entry[0]):
             self._advance_to(substep)
             self._position = self.solver.position()
@@ -200,9 +179,6 @@ class Batch:
         """Repeat everything up to here, then single substeps, to learn which one breaks first.
 
         Returns when none of them breaks: then the failure was not the simulation's.
-
-        Raises:
-            WorkFailedError: as the solver tells it, of the first broken substep.
         """
         self.solver.load(self.states)
         done = 0

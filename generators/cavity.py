@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from .base import WALLS, ClosedBoxParameters, InitialState, Material
+from .constants import closed_box_walls, constants
 from .draws import RandomSource, choice, log_uniform, quantise, uniform
 from .lattice import fill
-from .parameters import closed_box_walls, constants
+from .split import WALLS, ClosedBoxParameters, InitialState, Material
 
 if TYPE_CHECKING:
-    from lagbench.registry import Size
+    from lagbench.data.registry import Size
 
 __all__ = ["DRIVEN", "initial_state", "solver_parameters"]
 
@@ -39,11 +39,7 @@ def solver_parameters(size: Size) -> ClosedBoxParameters:
 def _wall_motion(
     rng: RandomSource, walls: tuple[str, ...], speed: float
 ) -> tuple[NDArray[np.float64], str, str]:
-    """Draw which way the walls move.
-
-    Returns:
-        Velocity of each wall [length/s], shape [4, 2]; the walls and directions in words.
-    """
+    """Draw which way the walls move."""
     signs = [2 * choice(rng, 2) - 1 for _ in walls]
     velocity = np.zeros((len(WALLS), 2))
     for wall, sign in zip(walls, signs, strict=True):

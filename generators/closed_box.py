@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from lagbench.errors import UsageError
 
-from .base import WALLS, ClosedBoxParameters, InitialState
 from .driver import Driver, stack
 from .nodal_stress import JACOBIAN_BOUND, NodalStress
 from .solver import Health
+from .split import WALLS, ClosedBoxParameters, InitialState
 
 __all__ = ["ClosedBox"]
 
@@ -53,15 +53,7 @@ class ClosedBox(Driver[ClosedBoxParameters]):
         self._kernels.walls.speed.from_numpy(velocity[:, (0, 1, 2, 3), (1, 1, 0, 0)])
 
     def advance(self, substeps: int, *, average: bool = False) -> None:
-        """Advance every scenario.
-
-        Args:
-            substeps: how many.
-            average: whether the nodal velocities count for :meth:`mean_grid_velocity`.
-
-        Raises:
-            WorkFailedError: a scenario broke the CFL bound or the bounds of J, or is not finite.
-        """
+        """Advance every scenario."""
         self._kernels.averaging = average
         self._averaged += substeps if average else 0
         super().advance(substeps)

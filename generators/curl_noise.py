@@ -21,15 +21,14 @@ from numpy.typing import NDArray
 
 from lagbench.errors import UsageError
 
-from .base import ClosedBoxParameters, InitialState, Material
+from .constants import closed_box_walls, constants
 from .draws import RandomSource, quantise
-from .jets import Jet, coordinates
 from .lattice import fill_grid
-from .parameters import closed_box_walls, constants
-from .perlin import gradients, noise, ramp
+from .noise import Jet, coordinates, gradients, noise, ramp
+from .split import ClosedBoxParameters, InitialState, Material
 
 if TYPE_CHECKING:
-    from lagbench.registry import Size
+    from lagbench.data.registry import Size
 
 __all__ = ["initial_state", "solver_parameters", "stream_function"]
 

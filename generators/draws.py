@@ -74,9 +74,6 @@ def quantise(values: ArrayLike) -> NDArray[np.float64]:
 
     Such a number below 16 in magnitude is exact in float32, so that nothing is rounded
     again on its way into the solver. Negative zero becomes zero.
-
-    Raises:
-        WorkFailedError: a value is not finite or reaches 16.
     """
     given = np.asarray(values, dtype=np.float64)
     if not np.all(np.abs(given) < _LARGEST):
@@ -103,9 +100,6 @@ def log_uniform(rng: RandomSource, low: float, high: float) -> float:
     """Draw x with ln x uniform on [ln low, ln high).
 
     x = low exp(u ln(high / low)), in 50 decimal digits, rounded once.
-
-    Raises:
-        WorkFailedError: ``low`` is not positive or above ``high``.
     """
     if not 0.0 < low <= high:
         raise WorkFailedError("a log-uniform range is empty", expected="0 < low <= high", got=(low, high))

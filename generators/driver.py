@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from lagbench.errors import UsageError, WorkFailedError
 
 from . import backend
-from .base import ClosedBoxParameters, FreeSurfaceParameters, InitialState
 from .solver import Device, Health
+from .split import ClosedBoxParameters, FreeSurfaceParameters, InitialState
 
 __all__ = ["Driver", "Kernels", "stack"]
 
@@ -31,19 +31,12 @@ class _Field(Protocol):
 
 
 class Kernels(Protocol):
-    """What a driver asks of the kernels of a formulation.
+    """What a driver asks of the kernels of a formulation."""
 
-    Attributes:
-        x: particle positions [length].
-        least: smallest coordinate of a particle.
-        most: largest coordinate of a particle.
-        speed_bound: the CFL bound dx/dt [length/s].
-    """
-
-    x: _Field
-    least: float
-    most: float
-    speed_bound: float
+    x: _Field  # particle positions [length]
+    least: float  # smallest coordinate of a particle
+    most: float  # largest coordinate of a particle
+    speed_bound: float  # the CFL bound dx/dt [length/s]
 
     def run_serially(self, substeps: int) -> None:
         """Advance scenario 0 by many substeps in one thread."""

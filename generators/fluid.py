@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from .base import FreeSurfaceParameters, InitialState, Material
+from .constants import constants, free_surface_walls, interval, ranges
 from .draws import RandomSource, choice, direction, normal, quantise, uniform
-from .parameters import constants, free_surface_walls, interval, ranges
 from .shapes import Blobs, Body, Disc, Rectangle, Region, Shape, place, seeds
+from .split import FreeSurfaceParameters, InitialState, Material
 
 if TYPE_CHECKING:
-    from lagbench.registry import Size
+    from lagbench.data.registry import Size
 
 __all__ = ["FAMILIES", "initial_state", "solver_parameters"]
 

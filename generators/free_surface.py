@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import constitutive
-from .base import FreeSurfaceParameters, InitialState, Material
 from .driver import Driver, stack
 from .particle_stress import ParticleStress
 from .solver import Health
+from .split import FreeSurfaceParameters, InitialState, Material
 
 __all__ = ["Energy", "FreeSurface", "courant"]
 
@@ -48,17 +48,12 @@ def courant(parameters: FreeSurfaceParameters) -> dict[Material, float]:
 
 @dataclass(frozen=True, kw_only=True)
 class Energy:
-    """Energy of each scenario [mass length^2/s^2], arrays of shape [scenario].
+    """Energy of each scenario [mass length^2/s^2], arrays of shape [scenario]."""
 
-    Attributes:
-        kinetic: sum m (abs(v)^2 + dx^2/4 abs(C)^2) / 2; the second part is what APIC carries.
-        gravitational: sum m g (y - y_floor).
-        elastic: sum V psi: K (J - 1 - ln J) in liquid, mu abs(F - R)^2 + lambda/2 (J - 1)^2,
-            times the hardening, in solids.
-    """
-
-    kinetic: Array
-    gravitational: Array
+    kinetic: Array  # sum m (abs(v)^2 + dx^2/4 abs(C)^2) / 2; the second part is what APIC carries
+    gravitational: Array  # sum m g (y - y_floor)
+    # sum V psi: K (J - 1 - ln J) in liquid, mu abs(F - R)^2 + lambda/2 (J - 1)^2, times the
+    # hardening, in solids
     elastic: Array
 
     @property

@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 
 from lagbench.errors import WorkFailedError
 
-from .base import FreeSurfaceParameters, InitialState, Material
+from .constants import constants, free_surface_walls, interval, ranges
 from .draws import RandomSource, choice, direction, quantise, uniform
-from .parameters import constants, free_surface_walls, interval, ranges
 from .shapes import Body, Disc, Rectangle, Shape, place, seeds
+from .split import FreeSurfaceParameters, InitialState, Material
 
 if TYPE_CHECKING:
-    from lagbench.registry import Size
+    from lagbench.data.registry import Size
 
 __all__ = ["PAIRS", "initial_state", "solver_parameters"]
 

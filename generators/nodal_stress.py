@@ -25,7 +25,7 @@ Valid while max abs(v) dt <= dx, which also bounds every fixed-point sum, and wh
 import taichi as ti
 
 from . import backend
-from .base import ClosedBoxParameters
+from .split import ClosedBoxParameters
 from .transfer import (
     Nothing,
     Template,
@@ -60,12 +60,6 @@ max abs(v) sum w abs(x_i - x_p) <= 4/dt, and a node lies within 1.5 dx per axis:
 class NodalStress:
     """Fields of a batch of scenarios and the kernels that advance them.
 
-    Args:
-        parameters: constants that the scenarios share.
-        scenarios: scenarios advanced together.
-        atomic: whether several threads run the phases.
-        threads: threads of the parallel loops on a CPU.
-
     Attributes:
         x: particle positions [length].
         carried: what P2G spreads: v_x, v_y, 1, J.
@@ -87,10 +81,10 @@ class NodalStress:
         self, parameters: ClosedBoxParameters, *, scenarios: int, atomic: bool, threads: int
     ) -> None:
         """Round the constants and take the memory."""
-        self.parameters = parameters
-        self.scenarios = scenarios
-        self.atomic = atomic
-        self.threads = threads
+        self.parameters = parameters  # constants that the scenarios share
+        self.scenarios = scenarios  # scenarios advanced together
+        self.atomic = atomic  # whether several threads run the phases
+        self.threads = threads  # threads of the parallel loops on a CPU
         self.averaging = False
         self.walls = Walls(grid=parameters.grid, wall=parameters.wall, no_slip=parameters.no_slip)
         self._set_constants()

@@ -23,7 +23,6 @@ it a settled liquid loses a fifth of its depth.
 import taichi as ti
 
 from . import backend
-from .base import FreeSurfaceParameters, Material
 from .constitutive import (
     corotated_stress,
     hardening,
@@ -33,6 +32,7 @@ from .constitutive import (
     plastic_return,
     viscous_stress,
 )
+from .split import FreeSurfaceParameters, Material
 from .transfer import Nothing, Value, accumulate, bounded, fixed_point_scale, from_fixed, stencil
 
 __all__ = ["ParticleStress"]
@@ -52,12 +52,6 @@ _LIQUID, _SNOW, _ROPE = int(Material.LIQUID), int(Material.SNOW), int(Material.R
 @ti.data_oriented
 class ParticleStress:
     """Fields of a batch of scenarios and the kernels that advance them.
-
-    Args:
-        parameters: constants that the scenarios share.
-        scenarios: scenarios advanced together.
-        atomic: whether several threads run the phases.
-        threads: threads of the parallel loops on a CPU.
 
     Attributes:
         x: particle positions [length].
@@ -80,10 +74,10 @@ class ParticleStress:
         self, parameters: FreeSurfaceParameters, *, scenarios: int, atomic: bool, threads: int
     ) -> None:
         """Round the constants and take the memory."""
-        self.parameters = parameters
-        self.scenarios = scenarios
-        self.atomic = atomic
-        self.threads = threads
+        self.parameters = parameters  # constants that the scenarios share
+        self.scenarios = scenarios  # scenarios advanced together
+        self.atomic = atomic  # whether several threads run the phases
+        self.threads = threads  # threads of the parallel loops on a CPU
         self._set_constants()
         self._make_fields()
 

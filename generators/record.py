@@ -19,12 +19,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from lagbench.atomic import write_atomically
-from lagbench.checksums import file_sha256
+from lagbench.data.checksums import file_sha256
+from lagbench.data.layout import dataset_folder, resolve_root
+from lagbench.data.manifest import Manifest, read_manifest
+from lagbench.data.registry import Measured, Size, default_path, load
+from lagbench.data.statistics import file_statistics
 from lagbench.errors import DataError, LagbenchError
-from lagbench.layout import dataset_folder, resolve_root
-from lagbench.manifest import Manifest, read_manifest
-from lagbench.registry import Measured, Size, default_path, load
-from lagbench.statistics import file_statistics
 
 __all__ = [
     "check_files",
@@ -46,11 +46,7 @@ _WIDTH = 110
 
 
 def check_files(folder: Path, manifest: Manifest) -> None:
-    """Compare every file of a data set with its manifest, byte by byte.
-
-    Raises:
-        DataError: a file is missing or not the one that the manifest describes.
-    """
+    """Compare every file of a data set with its manifest, byte by byte."""
     for entry in manifest.files:
         path = folder / entry.path
         if not path.is_file() or file_sha256(path) != entry.file_sha256:
@@ -62,11 +58,7 @@ def check_files(folder: Path, manifest: Manifest) -> None:
 
 
 def measured_values(manifest: Manifest) -> Measured:
-    """Return what datasets.yaml shall say about a complete data set.
-
-    Raises:
-        DataError: the data set is incomplete, or a test scenario has no twin floor.
-    """
+    """Return what datasets.yaml shall say about a complete data set."""
     twins = [entry.twin_floor for entry in manifest.files if entry.subset == "test"]
     if not manifest.complete or manifest.dataset_sha256 is None or not all(twins):
         raise DataError(
@@ -85,15 +77,7 @@ def measured_values(manifest: Manifest) -> Measured:
 
 
 def with_statistics(folder: Path, manifest: Manifest) -> Manifest:
-    """Return a manifest whose statistics follow from the files of train.
-
-    Args:
-        folder: folder of the data set.
-        manifest: what the folder holds.
-
-    Raises:
-        DataError: there is no file of train, or one is damaged.
-    """
+    """Return a manifest whose statistics follow from the files of train."""
     train = [folder / entry.path for entry in manifest.files if entry.subset == "train"]
     return manifest.model_copy(update={"statistics": file_statistics(train)})
 
@@ -150,18 +134,7 @@ def released_name(size: Size) -> str:
 
 
 def record(size: Size, manifest: Manifest, *, registry: Path, released: Path | None, allow: bool) -> Measured:
-    """Write what a manifest measures to datasets.yaml and to the list of released hashes.
-
-    Args:
-        size: tier of a split as ``registry`` describes it.
-        manifest: manifest of the generated data set.
-        registry: datasets.yaml to change.
-        released: JSON file that maps :func:`released_name` to data set hashes; None for none.
-        allow: whether a recorded hash of the same MAJOR version may change.
-
-    Raises:
-        DataError: the data set is incomplete or its hash changed without the version.
-    """
+    """Write what a manifest measures to datasets.yaml and to the list of released hashes."""
     values = measured_values(manifest)
     hashes = json.loads(released.read_text()) if released is not None and released.exists() else {}
     before = hashes.get(released_name(size)) or (size.measured.dataset_sha256 if size.measured else None)

@@ -47,17 +47,11 @@ class Shape(Protocol):
 
 @dataclass(frozen=True)
 class Rectangle:
-    """A rectangle whose length lies along a unit vector.
+    """A rectangle whose length lies along a unit vector."""
 
-    Attributes:
-        length: extent along ``axis`` [length].
-        width: extent across it [length].
-        axis: unit vector.
-    """
-
-    length: float
-    width: float
-    axis: tuple[float, float] = (1.0, 0.0)
+    length: float  # extent along 'axis' [length]
+    width: float  # extent across it [length]
+    axis: tuple[float, float] = (1.0, 0.0)  # unit vector
 
     @property
     def area(self) -> float:
@@ -112,17 +106,11 @@ class Disc:
 
 @dataclass(frozen=True)
 class Blobs:
-    """The union of discs of one radius; their bounding box is centred on the origin.
+    """The union of discs of one radius; their bounding box is centred on the origin."""
 
-    Attributes:
-        centres: centres of the discs [length].
-        radius: their radius [length].
-        area: area of the union [length^2].
-    """
-
-    centres: tuple[tuple[float, float], ...]
-    radius: float
-    area: float
+    centres: tuple[tuple[float, float], ...]  # centres of the discs [length]
+    radius: float  # their radius [length]
+    area: float  # area of the union [length^2]
 
     @classmethod
     def of_area(cls, area: float, offsets: Array, *, cells: int) -> Blobs:
@@ -167,15 +155,10 @@ def _union_area(centres: Array, extent: Array, cells: int) -> float:
 
 @dataclass(frozen=True)
 class Body:
-    """A shape put somewhere.
+    """A shape put somewhere."""
 
-    Attributes:
-        shape: outline about the origin.
-        centre: where the origin lies [length], shape [2].
-    """
-
-    shape: Shape
-    centre: Array
+    shape: Shape  # outline about the origin
+    centre: Array  # where the origin lies [length], shape [2]
 
     def distance(self, position: Array) -> Array:
         """Return the signed distance from the outline, negative inside [length]."""
@@ -188,11 +171,7 @@ def body_at(shape: Shape, x: float, y: float) -> Body:
 
 
 def place(rng: RandomSource, shape: Shape, region: Region) -> Body:
-    """Put a shape uniformly at random where its bounding box lies within a region.
-
-    Raises:
-        WorkFailedError: the shape is wider or higher than the region.
-    """
+    """Put a shape uniformly at random where its bounding box lies within a region."""
     centre = []
     for reach, (low, high) in zip(shape.reach, region, strict=True):
         if high - low < 2.0 * reach:

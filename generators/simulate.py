@@ -1,6 +1,17 @@
 """Simulate scenarios of a size and write each to its file.
 
 Neither xarray nor pandas is imported, which keeps a worker below 400 MB.
+
+The twin floor: how far a scenario drifts from a copy of itself that was nudged.
+
+At the last frame that a model is given, every coordinate of every particle moves by +2^-20 or
+-2^-20 (seeded signs), far below anything that a frame shows. The position RMSE between this
+twin and the truth at each predicted frame is what no model can be expected to undercut::
+
+    floor(f) = sqrt(mean over particles and axes of (x_twin(f) - x(f))^2)
+
+It starts at 2^-20 = 9.5e-7, stays near it while the flow is regular, and grows where
+trajectories diverge. A prediction that lies below it has seen the answer.
 """
 
 from __future__ import annotations
@@ -12,14 +23,25 @@ from dataclasses import asdict, dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.format import ScenarioKey, ScenarioWriter, scenario_path
-from lagbench.registry import Size
+from lagbench.data.registry import Size
+from lagbench.data.writer import ScenarioFile, ScenarioKey, ScenarioWriter, read_scenario, scenario_path
 
-from .base import ClosedBoxParameters, InitialState
-from .batch import Batch, Job, Report, split_module
-from .draws import seed_text
+from .batch import Batch, Report, SimulationJob, split_module, substeps_of
+from .draws import QUANTUM, entropy, seed_text
+from .split import ClosedBoxParameters, InitialState
 
-__all__ = ["Facts", "Outcome", "file_parameters", "scenario_key", "scenario_writer", "simulate"]
+__all__ = [
+    "Facts",
+    "Simulated",
+    "file_parameters",
+    "scenario_key",
+    "scenario_writer",
+    "simulate",
+    "nudge",
+    "twin_floors",
+    "twin_substeps",
+]
+
 
 _FILE_NAMES = {"reynolds": "reynolds_number"}
 """Drawn parameters that files call by their CF-like long name."""
@@ -27,46 +49,27 @@ _FILE_NAMES = {"reynolds": "reynolds_number"}
 
 @dataclass(frozen=True, kw_only=True)
 class Facts:
-    """What one simulated scenario went through; the manifest states it.
+    """What one simulated scenario went through; the manifest states it."""
 
-    Attributes:
-        start_substep: substeps before frame 0.
-        kinetic_energy_first: sum of m v^2 / 2 at frame 0.
-        kinetic_energy_last: the same at the last frame.
-        kinetic_energy_max: the largest of any frame.
-        kinetic_energy_mean: the mean over frames.
-        energy_last_over_max: last over largest; small where the motion has died down.
-        max_speed: largest velocity component at any substep [length/s].
-        cfl: cells that this speed crosses per substep [1].
-        jacobian_min: smallest J of any particle at any substep [1].
-        jacobian_max: largest J of any particle at any substep [1].
-    """
-
-    start_substep: int
-    kinetic_energy_first: float
-    kinetic_energy_last: float
-    kinetic_energy_max: float
-    kinetic_energy_mean: float
-    energy_last_over_max: float
-    max_speed: float
-    cfl: float
-    jacobian_min: float
-    jacobian_max: float
+    start_substep: int  # substeps before frame 0
+    kinetic_energy_first: float  # sum of m v^2 / 2 at frame 0
+    kinetic_energy_last: float  # the same at the last frame
+    kinetic_energy_max: float  # the largest of any frame
+    kinetic_energy_mean: float  # the mean over frames
+    energy_last_over_max: float  # last over largest; small where the motion has died down
+    max_speed: float  # largest velocity component at any substep [length/s]
+    cfl: float  # cells that this speed crosses per substep [1]
+    jacobian_min: float  # smallest J of any particle at any substep [1]
+    jacobian_max: float  # largest J of any particle at any substep [1]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Outcome:
-    """A scenario that was simulated and written.
+class Simulated:
+    """A scenario that was simulated and written."""
 
-    Attributes:
-        scenario: its id.
-        content_sha256: content hash of its file.
-        facts: see :class:`Facts`, as a plain mapping.
-    """
-
-    scenario: int
-    content_sha256: str
-    facts: dict[str, int | float]
+    scenario: int  # its id
+    content_sha256: str  # content hash of its file
+    facts: dict[str, int | float]  # see Facts, as a plain mapping
 
 
 def scenario_key(size: Size, scenario: int) -> ScenarioKey:
@@ -91,7 +94,7 @@ def file_parameters(size: Size, state: InitialState) -> dict[str, object]:
     return {**constants, **drawn, "start_substep": state.start_substep}
 
 
-def scenario_writer(job: Job, scenario: int, state: InitialState) -> ScenarioWriter:
+def scenario_writer(job: SimulationJob, scenario: int, state: InitialState) -> ScenarioWriter:
     """Return the writer of a scenario's file, with all that is known before it runs."""
     size = job.size
     key = scenario_key(size, scenario)
@@ -143,17 +146,8 @@ def _facts(batch: Batch, index: int, energies: list[float]) -> Facts:
     )
 
 
-def simulate(job: Job, report: Report) -> list[Outcome]:
-    """Simulate the scenarios of a job and write their files, all or none of them.
-
-    Args:
-        job: what to simulate and where to write it.
-        report: told the substeps done.
-
-    Raises:
-        WorkFailedError: a scenario blew up (which one, at which substep, which bound), or a
-            file cannot be written; then no file of the job appears.
-    """
+def simulate(job: SimulationJob, report: Report) -> list[Simulated]:
+    """Simulate the scenarios of a job and write their files, all or none of them."""
     batch = Batch(job, report)
     with ExitStack() as stack:
         recordings = [
@@ -165,10 +159,74 @@ def simulate(job: Job, report: Report) -> list[Outcome]:
         for index, _ in batch.recordings():
             recordings[index].append(*batch.frame(index))
     return [
-        Outcome(
+        Simulated(
             scenario=scenario,
             content_sha256=recording.writer.content_sha256,
             facts=asdict(_facts(batch, index, recording.energies)),
         )
         for index, (scenario, recording) in enumerate(zip(job.scenarios, recordings, strict=True))
     ]
+
+
+_STREAM = 1
+"""Appended to a scenario's seed: the nudge has a random stream of its own."""
+
+
+def nudge(size: Size, scenario: int) -> NDArray[np.float32]:
+    """Return the displacement of a scenario's twin [length], shape [particle, 2]."""
+    seed = (*entropy(size.split, size.name, size.major, scenario), _STREAM)
+    rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed)))
+    signs = np.where(rng.random((size.particles, 2)) < 0.5, -1.0, 1.0)
+    return (QUANTUM * signs).astype(np.float32)
+
+
+def twin_substeps(size: Size, scenario: int) -> int:
+    """Return how many substeps a scenario's twin takes."""
+    unused = size.frame_count(scenario) - _last_frame(size, scenario) - 1
+    return substeps_of(size, scenario) - unused * size.substeps_per_frame
+
+
+def _last_frame(size: Size, scenario: int) -> int:
+    last = size.task.input_frames + size.task.horizon - 1
+    return min(last, size.frame_count(scenario) - 1)
+
+
+def twin_floors(job: SimulationJob, report: Report) -> dict[int, tuple[float, ...]]:
+    """Simulate the twins of a job's scenarios beside their files.
+
+    Args:
+        job: scenarios whose files exist.
+        report: told the substeps done.
+
+    Returns:
+        For each scenario the RMSE per predicted frame [length].
+
+    Raises:
+        DataError: a scenario's file is missing or damaged.
+        WorkFailedError: a twin blew up.
+    """
+    size = job.size
+    counts = [_last_frame(size, scenario) + 1 for scenario in job.scenarios]
+    batch = Batch(job, report, frames=counts)
+    offsets = np.zeros((len(counts), size.particles, 2), dtype=np.float32)
+    floors: list[list[float]] = [[] for _ in counts]
+    with ExitStack() as stack:
+        truths = [stack.enter_context(_open_truth(job, scenario)) for scenario in job.scenarios]
+        for index, frame in batch.recordings():
+            if frame == size.task.input_frames - 1:
+                offsets[:] = 0.0
+                offsets[index] = nudge(size, job.scenarios[index])
+                batch.displace(offsets)
+            elif frame >= size.task.input_frames:
+                truth = truths[index].read("position", slice(frame, frame + 1))[0]
+                floors[index].append(_rmse(batch.frame(index)[0], truth))
+    return {scenario: tuple(floor) for scenario, floor in zip(job.scenarios, floors, strict=True)}
+
+
+def _open_truth(job: SimulationJob, scenario: int) -> ScenarioFile:
+    return read_scenario(scenario_path(job.root, scenario_key(job.size, scenario)))
+
+
+def _rmse(twin: NDArray[np.float32], truth: NDArray[np.float32]) -> float:
+    error = twin.astype(np.float64) - truth.astype(np.float64)
+    return math.sqrt(math.fsum((error * error).ravel().tolist()) / error.size)

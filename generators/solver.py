@@ -14,41 +14,32 @@ from typing import Protocol, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from .base import ClosedBoxParameters, FreeSurfaceParameters, InitialState
+from .split import ClosedBoxParameters, FreeSurfaceParameters, InitialState
 
-__all__ = ["Device", "Health", "Solver", "build"]
+__all__ = [
+    "Device",
+    "Health",
+    "Solver",
+    "build",
+]
 
 
 class Device(enum.StrEnum):
-    """Where and how the substeps run; the bits do not depend on it.
+    """Where and how the substeps run; the bits do not depend on it."""
 
-    Attributes:
-        CPU: one scenario, a whole frame of substeps in one serial kernel without atomics.
-        PARALLEL: the GPU's kernels (scenarios x particles, atomics) on Taichi's CPU threads.
-        CUDA: the same kernels on an NVIDIA GPU.
-    """
-
-    CPU = "cpu"
-    PARALLEL = "parallel"
-    CUDA = "cuda"
+    CPU = "cpu"  # one scenario, a whole frame of substeps in one serial kernel without atomics
+    PARALLEL = "parallel"  # the GPU's kernels (scenarios x particles, atomics) on Taichi's CPU threads
+    CUDA = "cuda"  # the same kernels on an NVIDIA GPU
 
 
 @dataclass(frozen=True, kw_only=True)
 class Health:
-    """What one scenario went through during the last advance.
+    """What one scenario went through during the last advance."""
 
-    Attributes:
-        finite: whether every position, velocity and J is a finite number.
-        max_speed: largest absolute velocity component of any particle or node at any
-            substep [length/s].
-        jacobian_min: smallest J of any particle at any substep [1].
-        jacobian_max: largest J of any particle at any substep [1].
-    """
-
-    finite: bool
-    max_speed: float
-    jacobian_min: float
-    jacobian_max: float
+    finite: bool  # whether every position, velocity and J is a finite number
+    max_speed: float  # largest absolute velocity component of any particle or node at any substep [length/s]
+    jacobian_min: float  # smallest J of any particle at any substep [1]
+    jacobian_max: float  # largest J of any particle at any substep [1]
 
 
 class Solver(Protocol):

@@ -15,28 +15,16 @@ __all__ = ["Walls"]
 
 @ti.data_oriented
 class Walls:
-    """The four walls of every scenario.
-
-    Args:
-        grid: cells across the unit box.
-        wall: index of the ghost nodes outside the low walls.
-        no_slip: whether the walls hold the fluid.
-
-    Attributes:
-        ghost: low and high index of the ghost nodes.
-        edge: low and high index of the interior nodes.
-        ring_size: number of ghost nodes around one scenario.
-        tangential: sign with which a wall mirrors a tangential component.
-        speed: tangential velocity of each wall [length/s], order of ``WALLS``; shape [scenario].
-    """
+    """The four walls of every scenario."""
 
     def __init__(self, *, grid: int, wall: int, no_slip: bool) -> None:
         """Set the indices; the field ``speed`` is the caller's to place."""
-        self.ghost = (wall, grid - wall)
-        self.edge = (wall + 1, grid - wall - 1)
+        self.ghost = (wall, grid - wall)  # low and high index of the ghost nodes
+        self.edge = (wall + 1, grid - wall - 1)  # low and high index of the interior nodes
         self.span = grid - 2 * wall
-        self.ring_size = 4 * self.span
-        self.tangential = -1 if no_slip else 1
+        self.ring_size = 4 * self.span  # number of ghost nodes around one scenario
+        self.tangential = -1 if no_slip else 1  # sign with which a wall mirrors a tangential component
+        # tangential velocity of each wall [length/s], order of WALLS; shape [scenario]
         self.speed = ti.Vector.field(4, ti.f32)
 
     @ti.func

@@ -13,13 +13,14 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from lagbench.make.generate import generate
+    from lagbench.make.verify import verify
+    from lagbench.scoring.compare import compare
+    from lagbench.scoring.score import score
+    from lagbench.store.dataset import list_splits, load_manifest, open_split
+
     from . import submission
-    from .comparison import compare
-    from .dataset import list_splits, load_manifest, open_split
-    from .generation import generate
-    from .scoring import score
     from .submission import template, validate
-    from .verification import verify
 
 __all__ = [
     "__version__",
@@ -36,15 +37,15 @@ __all__ = [
 ]
 
 _HOMES = {
-    "open_split": "dataset",
-    "list_splits": "dataset",
-    "load_manifest": "dataset",
-    "generate": "generation",
-    "verify": "verification",
+    "open_split": "store.dataset",
+    "list_splits": "store.dataset",
+    "load_manifest": "store.dataset",
+    "generate": "make.generate",
+    "verify": "make.verify",
     "template": "submission",
     "validate": "submission",
-    "score": "scoring",
-    "compare": "comparison",
+    "score": "scoring.score",
+    "compare": "scoring.compare",
 }
 
 __version__: str

@@ -27,13 +27,6 @@ def atomic_path(target: Path, *, option: str = ROOT_OPTION) -> Iterator[Path]:
     The parent folder is created. Before the rename the file is flushed to disk, after it
     the folder is, so that a crash at any time leaves the old file or the new one. When the
     body raises, the temporary file is removed and the target stays as it was.
-
-    Args:
-        target: path that shall appear.
-        option: what the user names another folder with, for the message.
-
-    Raises:
-        WorkFailedError: the operating system refused (no space, no permission).
     """
     temporary = temporary_name(target)
     try:
@@ -51,11 +44,7 @@ def atomic_path(target: Path, *, option: str = ROOT_OPTION) -> Iterator[Path]:
 
 
 def write_atomically(target: Path, data: bytes, *, option: str = ROOT_OPTION) -> None:
-    """Write bytes to a file that appears whole or not at all.
-
-    Raises:
-        WorkFailedError: the operating system refused.
-    """
+    """Write bytes to a file that appears whole or not at all."""
     with atomic_path(target, option=option) as temporary:
         temporary.write_bytes(data)
 

@@ -3,12 +3,17 @@
 Every error a user can cause is a :class:`LagbenchError`; its ``exit_code`` is what the
 command line returns. Codes: 1 checks failed, 2 usage, 3 a file the user gave is unreadable,
 4 data set missing, damaged or of another hash, 5 the work itself failed.
+
+Optional dependencies: import one, or say which extra installs it.
 """
 
 from __future__ import annotations
 
 import difflib
+import importlib
+import importlib.util
 from collections.abc import Iterable
+from types import ModuleType
 from typing import ClassVar
 
 __all__ = [
@@ -19,19 +24,13 @@ __all__ = [
     "UsageError",
     "WorkFailedError",
     "nearest",
+    "check_installed",
+    "require",
 ]
 
 
 class LagbenchError(Exception):
-    """Base of every error that lagbench raises on purpose.
-
-    Args:
-        what: what is wrong, one clause without a full stop.
-        where: file, key, variable or flag concerned.
-        expected: what would have been right.
-        got: what was found.
-        fix: what the user can do about it.
-    """
+    """Base of every error that lagbench raises on purpose."""
 
     exit_code: ClassVar[int] = 1
 
@@ -44,11 +43,11 @@ class LagbenchError(Exception):
         got: object = None,
         fix: str | None = None,
     ) -> None:
-        self.what = what
-        self.where = where
-        self.expected = expected
-        self.got = got
-        self.fix = fix
+        self.what = what  # what is wrong, one clause without a full stop
+        self.where = where  # file, key, variable or flag concerned
+        self.expected = expected  # what would have been right
+        self.got = got  # what was found
+        self.fix = fix  # what the user can do about it
         super().__init__(self._compose())
 
     def _compose(self) -> str:
@@ -113,3 +112,31 @@ def nearest(name: str, known: Iterable[str]) -> str:
     close = difflib.get_close_matches(name, words, n=1, cutoff=0.5)
     listing = f"known: {', '.join(words)}"
     return f"did you mean {close[0]!r}? {listing}" if close else listing
+
+
+def require(module: str, *, extra: str) -> ModuleType:
+    """Import an optional module."""
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if (error.name or "").split(".")[0] != module.split(".")[0]:
+            raise
+        raise _missing(module, extra) from None
+
+
+def check_installed(module: str, *, extra: str) -> None:
+    """Refuse before work starts, without importing: workers will import the module.
+
+    Raises:
+        UsageError: it is not installed; the message holds the command that installs it.
+    """
+    if importlib.util.find_spec(module) is None:
+        raise _missing(module, extra)
+
+
+def _missing(module: str, extra: str) -> UsageError:
+    return UsageError(
+        f"{module.split('.')[0]} is not installed",
+        where=f"this needs the extra {extra!r}",
+        fix=f"pip install 'lagbench[{extra}]'",
+    )

@@ -17,15 +17,15 @@ import pytest
 import yaml
 from report_bench import Method, ReportBench, damped, make_report_bench, noisy
 
-from lagbench import scoring
 from lagbench.board import draft
 from lagbench.board.entry_file import read_entry, spell_entry
 from lagbench.board.meta import Meta
 from lagbench.board.seal import sealed
 from lagbench.board.submit import SubmitResult, submit, submit_floor
-from lagbench.checksums import file_sha256
-from lagbench.floors import FLOORS
-from lagbench.registry import Registry
+from lagbench.data.checksums import file_sha256
+from lagbench.data.registry import Registry
+from lagbench.scoring import score
+from lagbench.scoring.floors import FLOORS
 from lagbench.submission import validate
 
 DAY = datetime.date(2026, 1, 31)
@@ -36,7 +36,7 @@ PLACE = "submissions/cavity/tiny"
 def in_process() -> Iterator[None]:
     """Validate predictions without a child process, which has tests of its own, to save its start."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in (scoring, draft):
+        for module in (score, draft):
             patch.setattr(module, "validate", functools.partial(validate, isolated=False))
         yield
 

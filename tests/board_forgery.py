@@ -14,9 +14,9 @@ from board_bench import BoardBench
 from lagbench.board.seeds import combine, summarise
 from lagbench.board.stored import read_stored
 from lagbench.metrics import Tally
-from lagbench.score_card import ScoreCard
-from lagbench.score_file import write_statistics
-from lagbench.sitting import SUBMISSION
+from lagbench.scoring.card import ScoreCard
+from lagbench.scoring.scenario import SUBMISSION
+from lagbench.scoring.score_file import write_statistics
 
 SCORES = "scores/cavity/tiny"
 

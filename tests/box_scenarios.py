@@ -9,9 +9,9 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.generators.base import ClosedBoxParameters, InitialState
 from lagbench.generators.closed_box import ClosedBox
 from lagbench.generators.solver import Device, build
+from lagbench.generators.split import ClosedBoxParameters, InitialState
 
 ALL_LIDS = (0.3, -0.2, 0.25, -0.35)
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from lagbench.generation import GenerationResult, generate
-from lagbench.registry import Registry, default_path, load
+from lagbench.data.registry import Registry, default_path, load
+from lagbench.make.generate import GenerationResult, generate
 
 SPLIT, SIZE = "curl-noise", "tiny"
 """The quickest data set to generate: five scenarios of 312 substeps."""

@@ -6,16 +6,7 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-from faulty import (
-    DIMS,
-    SHAPE,
-    attribute,
-    fault,
-    positions,
-    replace,
-    simple,
-    store,
-)
+from faulty import DIMS, SHAPE, attribute, fault, positions, replace, simple, store
 from submission_data import PARTICLES, Bench
 
 attribute("no_format_number", "lagbench_format", None, says="missing")

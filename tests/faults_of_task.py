@@ -7,18 +7,7 @@ from typing import Any
 
 import h5py
 import numpy as np
-from faulty import (
-    DIMS,
-    FAULTS,
-    Fault,
-    attribute,
-    fault,
-    positions,
-    replace,
-    rows,
-    simple,
-    store,
-)
+from faulty import DIMS, FAULTS, Fault, attribute, fault, positions, replace, rows, simple, store
 from numpy.typing import NDArray
 from submission_data import FRAMES, GIVEN, PARTICLES, Bench
 

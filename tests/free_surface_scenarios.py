@@ -10,11 +10,11 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.generators.base import FreeSurfaceParameters, InitialState, Material
 from lagbench.generators.draws import quantise
 from lagbench.generators.free_surface import FreeSurface
 from lagbench.generators.shapes import Shape, body_at, seeds
 from lagbench.generators.solver import Device, build
+from lagbench.generators.split import FreeSurfaceParameters, InitialState, Material
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lagbench.grid import Grid
+from lagbench.data.grid import Grid
 from lagbench.metrics import FramePair, Scenario, Setting, snapshots
 
 Floats = NDArray[np.float64]

@@ -7,8 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lagbench.baselines.operators.gat import GAT
-from lagbench.baselines.operators.gatv2 import GATv2
+from lagbench.baselines.operators.gat import GAT, GATv2
 from lagbench.baselines.operators.gns import GNS
 from lagbench.baselines.operators.operator import Operator
 from lagbench.baselines.operators.pointnet import PointNet

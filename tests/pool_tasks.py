@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 from lagbench.errors import DataError
-from lagbench.pool import Report
+from lagbench.work.pool import Report
 
 
 def square(number: int, report: Report) -> int:

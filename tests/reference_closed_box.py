@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.generators.base import ClosedBoxParameters, InitialState
+from lagbench.generators.split import ClosedBoxParameters, InitialState
 
 Single = NDArray[np.float32]
 f = np.float32

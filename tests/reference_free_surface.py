@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.generators.base import FreeSurfaceParameters, InitialState, Material
+from lagbench.generators.split import FreeSurfaceParameters, InitialState, Material
 
 Float = np.float32
 Floats = NDArray[np.float32]

@@ -11,13 +11,13 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from lagbench.checksums import dataset_hash, subset_hash
-from lagbench.exam import Exam, load_exam
-from lagbench.format import ScenarioKey, ScenarioWriter, scenario_path
-from lagbench.registry import Registry, Size, default_path, load
+from lagbench.data.checksums import dataset_hash, subset_hash
+from lagbench.data.registry import Registry, Size, default_path, load
+from lagbench.data.writer import ScenarioKey, ScenarioWriter, scenario_path
 from lagbench.report import write_report
-from lagbench.score_card import ScoreCard
-from lagbench.scoring import score
+from lagbench.scoring.card import ScoreCard
+from lagbench.scoring.score import score
+from lagbench.scoring.task import ScoredTask, load_scored_task
 from lagbench.submission import write
 
 Floats = NDArray[np.float64]
@@ -36,9 +36,9 @@ class ReportBench:
     size: Size
 
     @property
-    def exam(self) -> Exam:
+    def exam(self) -> ScoredTask:
         """Its test subset."""
-        return load_exam(self.size, self.root)
+        return load_scored_task(self.size, self.root)
 
     def submit(self, path: Path, method: Method, name: str, **labels: Any) -> Path:
         """Write the submission of a method."""

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from lagbench import registry
+from lagbench.data import registry
 from lagbench.generators import draws
-from lagbench.generators.base import InitialState
+from lagbench.generators.split import InitialState
 
 SPLITS = ("cavity", "curl-noise", "fluid", "multimaterial")
 SIZES = ("full", "mini", "tiny")

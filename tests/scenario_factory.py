@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.format import ScenarioKey, ScenarioWriter, scenario_path
+from lagbench.data.writer import ScenarioKey, ScenarioWriter, scenario_path
 
 PARAMETERS = {"dt": 0.002, "grid": 16, "start_substep": 40, "wall_moving": "top"}
 

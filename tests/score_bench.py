@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.exam import Exam, load_exam
-from lagbench.generation import GenerationResult
-from lagbench.registry import Registry, Size
-from lagbench.score_card import ScoreCard
-from lagbench.scoring import score
+from lagbench.data.registry import Registry, Size
+from lagbench.make.generate import GenerationResult
+from lagbench.scoring.card import ScoreCard
+from lagbench.scoring.score import score
+from lagbench.scoring.task import ScoredTask, load_scored_task
 from lagbench.submission import write
 
 Floats = NDArray[np.floating[Any]]
@@ -31,9 +31,9 @@ class ScoreBench:
     size: Size
 
     @property
-    def exam(self) -> Exam:
+    def exam(self) -> ScoredTask:
         """Its test subset."""
-        return load_exam(self.size, self.root)
+        return load_scored_task(self.size, self.root)
 
     def truth(self, scenario: int) -> Floats:
         """All positions of a test scenario, shape [frame, particle, 2]."""

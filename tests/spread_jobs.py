@@ -8,8 +8,8 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from lagbench.pool import Report
-from lagbench.sitting import Job, Outcome, sit_scenario
+from lagbench.scoring.scenario import ScenarioJob, ScenarioScores, score_scenario
+from lagbench.work.pool import Report
 
 
 @dataclass(frozen=True)
@@ -21,16 +21,16 @@ class Deadly:
         marker: file that says that it was tried; None for a harmless job.
     """
 
-    job: Job
+    job: ScenarioJob
     marker: Path | None
 
 
-def sit_after_dying_once(deadly: Deadly, report: Report) -> Outcome:
+def sit_after_dying_once(deadly: Deadly, report: Report) -> ScenarioScores:
     """Kill the worker on the first call with a marker, else score."""
     if deadly.marker is not None and not deadly.marker.exists():
         deadly.marker.touch()
         os.kill(os.getpid(), signal.SIGKILL)
-    return sit_scenario(deadly.job, report)
+    return score_scenario(deadly.job, report)
 
 
 def double(number: int, report: Report) -> int:

@@ -11,8 +11,8 @@ import yaml
 from numpy.typing import NDArray
 from scenario_factory import frames_of, make_key, write_scenario
 
-from lagbench.checksums import dataset_hash, subset_hash
-from lagbench.registry import Registry, default_path, load
+from lagbench.data.checksums import dataset_hash, subset_hash
+from lagbench.data.registry import Registry, default_path, load
 from lagbench.submission import ValidationResult, validate, write
 
 TESTS = (3, 4, 5)

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench import registry
-from lagbench.format import ScenarioKey, ScenarioWriter, scenario_path
+from lagbench.data import registry
+from lagbench.data.writer import ScenarioKey, ScenarioWriter, scenario_path
 
 OMEGA = 0.05
 """Angular velocity [1/frame]."""

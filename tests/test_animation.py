@@ -15,12 +15,13 @@ from numpy.typing import NDArray
 from PIL.GifImagePlugin import GifImageFile
 from swirls import OMEGA, write_swirl
 
-from lagbench import animation, palette, video
-from lagbench.animation import animate
+from lagbench.draw import animate as animation
+from lagbench.draw import animate as video
+from lagbench.draw import style
+from lagbench.draw.animate import Painter, animate, halve, pack, unpack
+from lagbench.draw.panels import Panel
+from lagbench.draw.recording import open_recording
 from lagbench.errors import DataError, UsageError, WorkFailedError
-from lagbench.painter import Painter, halve, pack, unpack
-from lagbench.panels import Panel
-from lagbench.recording import open_recording
 
 SIDE = animation.SIDE + 2 * animation.MARGIN
 
@@ -59,22 +60,22 @@ def paint(path: Path, panel: Panel, frame: int, side: int = 128) -> NDArray[np.u
 def test_dots_lie_where_the_particles_are(swirl: Path) -> None:
     """A disc of radius 0.4 is coloured inside, paper outside, and its box has walls."""
     image = paint(swirl, Panel.MATERIAL, 0)
-    blue = (image == palette.rgb(palette.MATERIAL_COLOURS[0])).all(axis=-1)
+    blue = (image == style.rgb(style.MATERIAL_COLOURS[0])).all(axis=-1)
     y, x = np.mgrid[0:128, 0:128] / 128.0 - 0.5
     radius = np.hypot(x, y)
     assert blue[radius < 0.35].mean() > 0.9
     assert not blue[radius > 0.44].any()
-    assert tuple(image[64, 1]) == tuple(palette.rgb(palette.WALL))
-    assert tuple(image[1, 20]) == tuple(palette.rgb(palette.MOVING))
+    assert tuple(image[64, 1]) == tuple(style.rgb(style.WALL))
+    assert tuple(image[1, 20]) == tuple(style.rgb(style.MOVING))
 
 
 def test_the_first_row_is_the_top_of_the_box(tmp_path: Path) -> None:
     """Materials by particle number: the sunflower's last points lie on the rim, the first in the middle."""
     path = write_swirl(tmp_path, "multimaterial", 0, walls=None, materials=2)
     image = paint(path, Panel.MATERIAL, 0)
-    assert tuple(image[64, 64]) == tuple(palette.rgb(palette.MATERIAL_COLOURS[0]))
+    assert tuple(image[64, 64]) == tuple(style.rgb(style.MATERIAL_COLOURS[0]))
     rim = image[64 - int(0.35 * 128), 60:68]  # 0.35 above the middle: the second material
-    assert (rim == palette.rgb(palette.MATERIAL_COLOURS[1])).all(axis=-1).any()
+    assert (rim == style.rgb(style.MATERIAL_COLOURS[1])).all(axis=-1).any()
 
 
 def test_vorticity_of_a_rotating_disc_is_red_inside(swirl: Path) -> None:
@@ -82,7 +83,7 @@ def test_vorticity_of_a_rotating_disc_is_red_inside(swirl: Path) -> None:
     image = paint(swirl, Panel.VORTICITY, 3).astype(int)
     middle = image[48:80, 48:80].reshape(-1, 3)
     assert (middle[:, 0] > middle[:, 2] + 60).all()
-    assert tuple(image[10, 120]) == tuple(palette.rgb(palette.PAPER))
+    assert tuple(image[10, 120]) == tuple(style.rgb(style.PAPER))
 
 
 def test_speeds_are_symmetric_about_the_middle(swirl: Path) -> None:

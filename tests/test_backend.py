@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 from conftest import SIZE, SPLIT
 
+from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
-from lagbench.generation import GenerationResult
-from lagbench.registry import Registry
-from lagbench.verification import verify
+from lagbench.make.generate import GenerationResult
+from lagbench.make.verify import verify
 
 START = """
 from lagbench.generators import backend

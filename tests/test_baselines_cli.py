@@ -21,7 +21,7 @@ from lagbench.baselines.catalogue import names
 from lagbench.baselines.checkpoint import load
 from lagbench.cli.app import app
 from lagbench.errors import DataError, WorkFailedError
-from lagbench.generation import GenerationResult
+from lagbench.make.generate import GenerationResult
 from lagbench.submission import validate
 
 Command = Callable[..., Result]
@@ -180,14 +180,14 @@ def test_two_processes_keep_one_model(lagbench: Command, tmp_path: Path) -> None
 
 def test_the_second_process_says_nothing(lagbench: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     """A helper of a training over several processes prints and writes nothing, no error either."""
-    from lagbench.baselines import training
+    from lagbench.baselines import train
     from lagbench.baselines.machine import is_helper
 
     def told(error: BaseException, **ranks: str) -> tuple[int, str]:
         for name in ("RANK", "LOCAL_RANK"):
             monkeypatch.setenv(name, ranks.get(name, "0"))
         assert is_helper() == bool(ranks)
-        monkeypatch.setattr(training, "train", Mock(side_effect=error))
+        monkeypatch.setattr(train, "train", Mock(side_effect=error))
         result = lagbench("train", "--baseline", "gns", *TINY)
         return result.exit_code, result.output
 

@@ -11,15 +11,16 @@ import pytest
 from conftest import SIZE, SPLIT
 from numpy.typing import NDArray
 
+from lagbench.data.manifest import read_manifest
+from lagbench.data.registry import Registry, Size, load
 from lagbench.errors import WorkFailedError
-from lagbench.generation import generate
-from lagbench.generators import batch, twin
-from lagbench.generators.base import InitialState
-from lagbench.generators.batch import Batch, Job, split_module
+from lagbench.generators import batch
+from lagbench.generators import simulate as twin
+from lagbench.generators.batch import Batch, SimulationJob, split_module
 from lagbench.generators.simulate import simulate
 from lagbench.generators.solver import Device, Solver, build
-from lagbench.manifest import read_manifest
-from lagbench.registry import Registry, Size, load
+from lagbench.generators.split import InitialState
+from lagbench.make.generate import generate
 
 
 @pytest.fixture
@@ -57,7 +58,7 @@ def failure(
 ) -> WorkFailedError:
     """Return the error that simulating some scenarios ends with."""
     with pytest.raises(WorkFailedError, match="the simulation blew up") as caught:
-        simulate(Job(size=size, scenarios=scenarios, root=root, device=device), lambda units: None)
+        simulate(SimulationJob(size=size, scenarios=scenarios, root=root, device=device), lambda units: None)
     return caught.value
 
 
@@ -120,7 +121,7 @@ def test_a_good_run_loads_its_states_once(
         load_states(solver, states)
 
     monkeypatch.setattr(kind, "load", counted)
-    simulate(Job(size=size, scenarios=(2,), root=tmp_path), lambda units: None)
+    simulate(SimulationJob(size=size, scenarios=(2,), root=tmp_path), lambda units: None)
     assert loads == [1]
 
 
@@ -134,7 +135,7 @@ def test_a_twin_is_replayed_with_its_nudge(
         return np.full((entry.particles, 2), np.nan, dtype=np.float32)
 
     monkeypatch.setattr(twin, "nudge", shove)
-    job = Job(size=size, scenarios=(3,), root=copied())
+    job = SimulationJob(size=size, scenarios=(3,), root=copied())
     with pytest.raises(WorkFailedError, match="blew up") as caught:
         twin.twin_floors(job, lambda units: None)
     start = (size.task.input_frames - 1) * size.substeps_per_frame
@@ -144,7 +145,7 @@ def test_a_twin_is_replayed_with_its_nudge(
 
 def test_a_failure_that_does_not_repeat_keeps_its_range(stiff: Size, tmp_path: Path) -> None:
     """Where the replay passes (a bit that flipped), the range of the first report is all there is."""
-    running = Batch(Job(size=stiff, scenarios=(2,), root=tmp_path), lambda units: None)
+    running = Batch(SimulationJob(size=stiff, scenarios=(2,), root=tmp_path), lambda units: None)
     solver = running.solver
 
     class Flaky:

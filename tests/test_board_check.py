@@ -19,8 +19,8 @@ from lagbench.board.check import CHECKS, check_board
 from lagbench.board.entry import Entry
 from lagbench.board.seeds import combine, summarise
 from lagbench.board.stored import read_stored
+from lagbench.data.registry import load
 from lagbench.errors import ChecksFailedError
-from lagbench.registry import load
 
 SCORES = "scores/cavity/tiny"
 

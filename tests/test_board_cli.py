@@ -15,12 +15,12 @@ import yaml
 from conftest import SIZE, SPLIT
 from typer.testing import CliRunner, Result
 
-from lagbench import scoring
 from lagbench.board.check import CHECKS
 from lagbench.board.entry import Entry
 from lagbench.board.meta import Meta
 from lagbench.cli.app import app
-from lagbench.generation import GenerationResult
+from lagbench.make.generate import GenerationResult
+from lagbench.scoring import score
 
 DOCS = Path(__file__).parent.parent / "docs"
 TOY = DOCS / "examples" / "toy_model"
@@ -97,7 +97,7 @@ def test_machines_are_answered_in_json(run: Run, monkeypatch: pytest.MonkeyPatch
     assert result.exit_code == 1
     assert "lagbench leaderboard build" in result.stderr
     assert run("leaderboard", "build", "--quiet").output == ""
-    monkeypatch.setattr(scoring, "validate", None)  # a usage error comes before any work
+    monkeypatch.setattr(score, "validate", None)  # a usage error comes before any work
     result = run("submit", "--floor", "persistence", "--split", SPLIT, "--author", "A")
     assert result.exit_code == 2
     assert "described by lagbench itself" in result.stderr

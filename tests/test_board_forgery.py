@@ -25,7 +25,6 @@ from board_forgery import (
 )
 from report_bench import damped, noisy
 
-from lagbench import scoring
 from lagbench.board import draft
 from lagbench.board.build import build
 from lagbench.board.check import CheckResult, check_board
@@ -34,8 +33,9 @@ from lagbench.board.entry_file import read_entry
 from lagbench.board.folder import Folder
 from lagbench.board.likeness import unlike, untrue
 from lagbench.board.stored import Stored, read_stored
+from lagbench.data.registry import Size, load
 from lagbench.errors import UnreadableFileError
-from lagbench.registry import Size, load
+from lagbench.scoring import score
 
 LEADERBOARD = Path(__file__).parent.parent / "leaderboard"
 LAST = slice(-5, None)
@@ -213,7 +213,7 @@ def test_broken_predictions_are_opened_in_the_child_only(
     cut = tmp_path / "cut.nc"
     cut.write_bytes(predictions.read_bytes()[:-9999])
     own.edit("damped", lambda held: held["score"].update(scored_by="me"))
-    for module in (scoring, draft):
+    for module in (score, draft):
         monkeypatch.setattr(module, "open_predictions", _never)
     paths = [cut, damaged(tmp_path / "nan.nc", predictions)]
     result = checked(own, predictions=paths, root=own.data.root)

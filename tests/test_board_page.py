@@ -22,7 +22,7 @@ from lagbench.board.model import Board, Cost
 from lagbench.board.packing import LEVELS, coarse, pack
 from lagbench.board.page import BUDGET, FEWEST, render
 from lagbench.board.payload import FINENESS, payload
-from lagbench.report.numbers import text
+from lagbench.report.html import text
 
 DIGITS = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789-_"
 

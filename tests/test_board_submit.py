@@ -16,7 +16,7 @@ from lagbench.board import submit as submitting
 from lagbench.board.check import check_board
 from lagbench.board.entry_file import read_entry
 from lagbench.board.publishing import batch
-from lagbench.checksums import file_sha256
+from lagbench.data.checksums import file_sha256
 from lagbench.errors import ChecksFailedError, UnreadableFileError, UsageError, WorkFailedError
 from lagbench.submission import open_predictions
 

@@ -12,14 +12,15 @@ import pytest
 from conftest import SIZE, SPLIT
 from forging import forge
 
-from lagbench import cards, checksums
+from lagbench.data import checksums
+from lagbench.data.manifest import Manifest, read_manifest, write_manifest
+from lagbench.data.registry import Measured, Registry
 from lagbench.errors import DataError
-from lagbench.generation import GenerationResult, generate
 from lagbench.generators.record import measured_values
-from lagbench.manifest import Manifest, read_manifest, write_manifest
-from lagbench.progress import Progress
-from lagbench.registry import Measured, Registry
-from lagbench.verification import verify
+from lagbench.make import cards
+from lagbench.make.generate import GenerationResult, generate
+from lagbench.make.verify import verify
+from lagbench.work.progress import Progress
 
 Copy = Callable[[], Path]
 

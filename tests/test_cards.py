@@ -16,12 +16,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from swirls import write_swirl
 
-from lagbench import cards, registry
-from lagbench.croissant import croissant_json
-from lagbench.layout import ScenarioKey, dataset_folder
-from lagbench.manifest import Manifest, describe_file, merge
-from lagbench.markdown import escape, table
-from lagbench.registry import Size
+from lagbench.data import registry
+from lagbench.data.layout import ScenarioKey, dataset_folder
+from lagbench.data.manifest import Manifest, describe_file, merge
+from lagbench.data.registry import Size
+from lagbench.draw.markdown import escape, table
+from lagbench.make import cards
+from lagbench.make.cards import croissant_json
 
 STATISTICS = {"position_mean": (0.5, 0.25), "velocity_std": (1.25e-3, 2.5e-3)}
 LOADER = """

@@ -14,17 +14,10 @@ import pytest
 import torch
 from simple_models import FACTS, Drift, install
 
-from lagbench.baselines.checkpoint import (
-    Checkpoint,
-    check_data,
-    load,
-    restore,
-    rounded_weights,
-    save,
-)
+from lagbench.baselines.checkpoint import Checkpoint, check_data, load, restore, rounded_weights, save
+from lagbench.data.registry import Registry
 from lagbench.errors import DataError, UnreadableFileError, UsageError
-from lagbench.generation import GenerationResult
-from lagbench.registry import Registry
+from lagbench.make.generate import GenerationResult
 
 
 def example(**changes: Any) -> Checkpoint:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
-from lagbench.checksums import (
+from lagbench.data.checksums import (
     ContentHasher,
     VariableHasher,
     canonical_json,

@@ -13,8 +13,8 @@ from conftest import SIZE, SPLIT
 from typer.testing import CliRunner, Result
 
 from lagbench.cli.app import app
-from lagbench.generation import GenerationResult
-from lagbench.registry import default_path
+from lagbench.data.registry import default_path
+from lagbench.make.generate import GenerationResult
 
 COMMANDS = ["list", "info", "generate", "verify", "plot", "animate", "cite", "doctor", "clean"]
 
@@ -161,7 +161,7 @@ def test_the_unexpected_asks_for_a_report(run: Run, monkeypatch: pytest.MonkeyPa
     def broken() -> None:
         raise RuntimeError("out of luck")
 
-    monkeypatch.setattr("lagbench.registry.load", broken)
+    monkeypatch.setattr("lagbench.data.registry.load", broken)
     result = run("list")
     assert result.exit_code == 5
     assert "unexpected RuntimeError: out of luck" in result.stderr
@@ -177,7 +177,7 @@ def test_an_interruption_exits_130(run: Run, monkeypatch: pytest.MonkeyPatch) ->
     def interrupted() -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("lagbench.registry.load", interrupted)
+    monkeypatch.setattr("lagbench.data.registry.load", interrupted)
     result = run("list")
     assert result.exit_code == 130
     assert "interrupted" in result.stderr

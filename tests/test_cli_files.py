@@ -13,8 +13,8 @@ from conftest import SIZE, SPLIT
 from typer.testing import CliRunner, Result
 
 from lagbench.cli.app import app
-from lagbench.doctor import NEEDED
-from lagbench.generation import GenerationResult
+from lagbench.cli.machine import NEEDED
+from lagbench.make.generate import GenerationResult
 
 Run = Callable[..., Result]
 
@@ -53,7 +53,7 @@ def test_a_dry_clean_writes_nothing(
     def refused(*_: object, **__: object) -> None:
         raise AssertionError
 
-    monkeypatch.setattr("lagbench.cleaning.dataset_lock", refused)
+    monkeypatch.setattr("lagbench.make.clean.dataset_lock", refused)
     result = run("clean", SPLIT, "--size", SIZE, "--root", root, "--dry-run")
     assert result.exit_code == 0, result.output
     assert "10 files" in result.stdout

@@ -14,9 +14,10 @@ import pytest
 from conftest import SIZE, SPLIT
 from typer.testing import CliRunner, Result
 
-from lagbench import scoring, submission
+from lagbench import submission
 from lagbench.cli.app import app
-from lagbench.generation import GenerationResult
+from lagbench.make.generate import GenerationResult
+from lagbench.scoring import score
 
 COMMANDS = ["template", "validate", "score", "compare"]
 Run = Callable[..., Result]
@@ -193,7 +194,7 @@ def test_an_unusable_folder_is_told_before_the_work(
     def measured(*_: object, **__: object) -> None:
         raise AssertionError("scenarios were measured")
 
-    monkeypatch.setattr(scoring, "spread", measured)
+    monkeypatch.setattr(score, "spread", measured)
     taken = predictions.parent / "taken"
     taken.write_text("")
     result = run("score", predictions, option, taken)

@@ -11,8 +11,8 @@ from box_scenarios import ALL_LIDS, after, box, loaded, parameters, quantise, sc
 from numpy.typing import NDArray
 
 from lagbench.errors import UsageError, WorkFailedError
-from lagbench.generators.base import ClosedBoxParameters, InitialState
 from lagbench.generators.solver import Device
+from lagbench.generators.split import ClosedBoxParameters, InitialState
 
 NO_SLIP = parameters()
 FREE_SLIP = parameters(no_slip=False)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from lagbench.generators.experiment import Case, plan
-from lagbench.generators.validation import CHECK_EVERY, Result, run
+from lagbench.generators.acceptance.cases import CHECK_EVERY, Result, run
+from lagbench.generators.acceptance.experiment import Case, plan
 
 pytestmark = pytest.mark.slow
 

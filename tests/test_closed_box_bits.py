@@ -7,7 +7,7 @@ import pytest
 from box_scenarios import ALL_LIDS, box, loaded, parameters, scenario, snapshot
 from reference_closed_box import ReferenceClosedBox
 
-from lagbench.generators.base import ClosedBoxParameters, InitialState
+from lagbench.generators.split import ClosedBoxParameters, InitialState
 
 NO_SLIP = parameters()
 FREE_SLIP = parameters(no_slip=False, wall=1, velocity_relaxation=0.002, density_coupling=0.002, shift=0.002)

@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 from conftest import SIZE, SPLIT
 
+from lagbench.data.manifest import merge, read_manifest, write_manifest
+from lagbench.data.registry import Registry
 from lagbench.errors import DataError, UsageError
-from lagbench.generation import GenerationResult, generate
-from lagbench.manifest import merge, read_manifest, write_manifest
-from lagbench.registry import Registry
+from lagbench.make.generate import GenerationResult, generate
 
 FOLDER = Path(SPLIT) / SIZE / "v1"
 

@@ -16,16 +16,16 @@ import pytest
 from cluster_bench import Sabotage, gone, local_cluster, scheduler_process, writers
 from conftest import SIZE, SPLIT
 
-from lagbench import campaign, cluster
+from lagbench.data.lock import Holder, read_holder
+from lagbench.data.manifest import read_manifest
+from lagbench.data.registry import Registry
 from lagbench.errors import UsageError, WorkFailedError
-from lagbench.generation import GenerationResult, generate
-from lagbench.locking import Holder, read_holder
-from lagbench.manifest import read_manifest
-from lagbench.outpost import Order, fulfil
-from lagbench.pool import Task
-from lagbench.progress import Progress
-from lagbench.registry import Registry
-from lagbench.shared_folder import Mark, marked
+from lagbench.make import generate as campaign
+from lagbench.make.generate import GenerationResult, generate
+from lagbench.work import cluster
+from lagbench.work.cluster import Mark, Order, fulfil, marked
+from lagbench.work.pool import Task
+from lagbench.work.progress import Progress
 
 pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
 

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from score_bench import ScoreBench, bench_of, half_right, still, straight
 
-from lagbench.comparison import ComparisonResult, compare
+from lagbench.data.registry import Registry
 from lagbench.errors import DataError, UnreadableFileError, UsageError
-from lagbench.generation import GenerationResult
-from lagbench.registry import Registry
-from lagbench.score_tables import card_tables, comparison_table, flag_lines
+from lagbench.make.generate import GenerationResult
+from lagbench.scoring.compare import ComparisonResult, compare
+from lagbench.scoring.tables import card_tables, comparison_table, flag_lines
 
 
 @pytest.fixture(scope="module")

@@ -13,11 +13,11 @@ import pytest
 from scenario_factory import frames_of, make_key, write_scenario
 
 import lagbench
-from lagbench import registry
-from lagbench.dataset import list_splits, load_manifest, open_split
+from lagbench.data import registry
+from lagbench.data.manifest import merge, write_manifest
+from lagbench.data.scenario import check_scenario, read_scenario
 from lagbench.errors import DataError, UsageError
-from lagbench.manifest import merge, write_manifest
-from lagbench.scenario_file import check_scenario, read_scenario
+from lagbench.store.dataset import list_splits, load_manifest, open_split
 
 TEST_IDS = registry.load().size("cavity", "tiny").subsets["test"]
 

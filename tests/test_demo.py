@@ -13,12 +13,12 @@ import yaml
 from conftest import SIZE, SPLIT
 from typer.testing import CliRunner, Result
 
-from lagbench import demo
-from lagbench.bench import SolverBench
+from lagbench.cli import demo_steps
 from lagbench.cli.app import app
+from lagbench.cli.machine import SolverBench
+from lagbench.data.registry import Registry
 from lagbench.errors import UsageError, WorkFailedError
-from lagbench.floors import FLOORS
-from lagbench.registry import Registry
+from lagbench.scoring.floors import FLOORS
 
 Run = Callable[..., Result]
 
@@ -40,11 +40,11 @@ def only_one(monkeypatch: pytest.MonkeyPatch, unmeasured: Registry) -> Registry:
     small = unmeasured.split(SPLIT)
     large = small.model_copy(update={"sizes": {"full": small.sizes["full"]}})
     registry = Registry({"large": large, SPLIT: small}, {})
-    monkeypatch.setattr("lagbench.registry.load", lambda: registry)
-    monkeypatch.setattr(demo, "MODEL_SPLIT", SPLIT)
-    monkeypatch.setattr(demo, "SETTINGS", ("training.steps=2", "model.latent=8"))
+    monkeypatch.setattr("lagbench.data.registry.load", lambda: registry)
+    monkeypatch.setattr(demo_steps, "MODEL_SPLIT", SPLIT)
+    monkeypatch.setattr(demo_steps, "SETTINGS", ("training.steps=2", "model.latent=8"))
     timed = SolverBench(split=SPLIT, size=SIZE, particles=1, substeps=1, frames=1, seconds_per_frame=0.5)
-    monkeypatch.setattr("lagbench.bench.bench_apart", lambda *_: timed)
+    monkeypatch.setattr("lagbench.cli.machine.bench_apart", lambda *_: timed)
     return registry
 
 
@@ -64,9 +64,9 @@ def test_the_demo_takes_the_splits_that_have_a_tiny_size(
     run: Run, only_one: Registry, copied: Callable[[], Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A split without one is left out, and the JSON object names what was made."""
-    monkeypatch.setattr(demo, "check_installed", no_torch)
+    monkeypatch.setattr(demo_steps, "check_installed", no_torch)
     root = copied()
-    assert demo.demo_splits(only_one) == [SPLIT]
+    assert demo_steps.demo_splits(only_one) == [SPLIT]
     made = made_by(run("demo", "--root", root, "--json"))["splits"]
     assert list(made) == [SPLIT]
     assert made[SPLIT]["generation"]["kept"] == [0, 1, 2, 3, 4]
@@ -77,7 +77,7 @@ def test_without_the_extra_the_data_are_made_and_one_line_says_how_to_get_the_re
     run: Run, only_one: Registry, copied: Callable[[], Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Exit code 0, the command that installs it, no leaderboard, and null in the JSON object."""
-    monkeypatch.setattr(demo, "check_installed", no_torch)
+    monkeypatch.setattr(demo_steps, "check_installed", no_torch)
     root = copied()
     result = run("demo", "--root", root)
     assert result.exit_code == 0, result.output
@@ -92,8 +92,8 @@ def test_without_the_extra_the_data_are_made_and_one_line_says_how_to_get_the_re
 
 def test_a_registry_without_the_models_split_is_no_error(only_one: Registry) -> None:
     """The reason names the split."""
-    assert demo.model_left_out(only_one) is None
-    reason = demo.model_left_out(Registry({"large": only_one.split("large")}, {}))
+    assert demo_steps.model_left_out(only_one) is None
+    reason = demo_steps.model_left_out(Registry({"large": only_one.split("large")}, {}))
     assert reason == f"the registry has no {SPLIT} {SIZE}"
 
 
@@ -137,9 +137,9 @@ def test_what_another_version_left_is_trained_anew(
     root = copied()
     made_by(run("demo", "--root", root, "--json"))
     (root / "runs" / f"{SPLIT}-gns" / "checkpoint.pt").write_bytes(b"damaged")
-    assert demo.demo_model(root=root).training.state == "finished"
-    monkeypatch.setattr(demo, "SETTINGS", ("training.steps=3", "model.latent=8"))
-    again = demo.demo_model(root=root).training
+    assert demo_steps.demo_model(root=root).training.state == "finished"
+    monkeypatch.setattr(demo_steps, "SETTINGS", ("training.steps=3", "model.latent=8"))
+    again = demo_steps.demo_model(root=root).training
     assert (again.state, again.step, again.steps) == ("finished", 3, 3)
     assert torch.load(again.weights, weights_only=True)
 
@@ -161,8 +161,8 @@ def test_a_solver_that_cannot_be_timed_is_no_error(monkeypatch: pytest.MonkeyPat
     def failed(*_: str) -> SolverBench:
         raise WorkFailedError("the solver could not be timed")
 
-    monkeypatch.setattr("lagbench.bench.bench_apart", failed)
-    assert demo._solver_time() is None
+    monkeypatch.setattr("lagbench.cli.machine.bench_apart", failed)
+    assert demo_steps._solver_time() is None
 
 
 @pytest.mark.slow

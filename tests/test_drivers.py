@@ -102,7 +102,7 @@ def test_taichi_is_imported_late_and_quietly() -> None:
     script = (
         "import sys, lagbench.generators.solver as solver\n"
         "assert 'taichi' not in sys.modules\n"
-        "from lagbench.generators.base import ClosedBoxParameters\n"
+        "from lagbench.generators.split import ClosedBoxParameters\n"
         f"solver.build({NO_SLIP!r})\n"
         "assert 'taichi' in sys.modules\n"
     )

@@ -11,10 +11,11 @@ import pytest
 from simple_models import install
 
 import lagbench
-from lagbench import plugins, registry
-from lagbench.baselines.prediction import predict
-from lagbench.baselines.training import train
-from lagbench.generation import GenerationResult, generate
+from lagbench.baselines.predict import predict
+from lagbench.baselines.train import train
+from lagbench.data import registry
+from lagbench.data import registry as plugins
+from lagbench.make.generate import GenerationResult, generate
 from lagbench.metrics import METRICS
 
 EXAMPLES = Path(__file__).parent.parent / "docs" / "examples"

@@ -14,16 +14,16 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 import lagbench
-from lagbench.checksums import dataset_hash, subset_hash
 from lagbench.cli.app import app
+from lagbench.data.checksums import dataset_hash, subset_hash
+from lagbench.data.layout import ScenarioKey, scenario_path
+from lagbench.data.local import locate
+from lagbench.data.scenario import check_scenario, read_scenario
 from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError, WorkFailedError
 from lagbench.exchange import adopt, local_split
 from lagbench.exchange.adoption import _by_subset
 from lagbench.exchange.local_split import LocalSplit
 from lagbench.exchange.measure import Measure, estimate_spacing
-from lagbench.layout import ScenarioKey, scenario_path
-from lagbench.locating import locate
-from lagbench.scenario_file import check_scenario, read_scenario
 
 BASIC: dict[str, Any] = {"radius": 0.1, "frame_interval": 0.25}
 

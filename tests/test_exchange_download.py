@@ -18,7 +18,7 @@ from lagbench.cli.app import app
 from lagbench.errors import LagbenchError, UsageError
 from lagbench.exchange import adopt, download
 from lagbench.exchange.local_split import LocalSplit
-from lagbench.generation import GenerationResult
+from lagbench.make.generate import GenerationResult
 from lagbench.store import mirror, mirror_errors
 
 FIRST = "train/0000.nc"

@@ -26,11 +26,11 @@ from typer.testing import CliRunner
 
 import lagbench
 from lagbench.cli.app import app
+from lagbench.data.registry import Registry
 from lagbench.errors import DataError, UsageError, WorkFailedError
 from lagbench.exchange import adopt, export, gns_npz
 from lagbench.exchange.local_split import LocalSplit
-from lagbench.generation import GenerationResult
-from lagbench.registry import Registry
+from lagbench.make.generate import GenerationResult
 
 GNS_KEYS = {
     *("bounds", "sequence_length", "default_connectivity_radius", "dim", "dt"),

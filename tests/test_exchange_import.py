@@ -14,11 +14,11 @@ from typer.testing import CliRunner
 
 import lagbench
 from lagbench.cli.app import app
+from lagbench.data.local import locate
+from lagbench.data.registry import Registry
 from lagbench.errors import DataError, UnreadableFileError, UsageError
 from lagbench.exchange import adopt, export, import_split
-from lagbench.generation import GenerationResult
-from lagbench.locating import locate
-from lagbench.registry import Registry
+from lagbench.make.generate import GenerationResult
 
 
 def positions(folder: Path, subset: str = "train") -> np.ndarray:

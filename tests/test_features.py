@@ -7,9 +7,8 @@ import pytest
 import torch
 from graph_cases import RADIUS, batch, facts, jittered, swirl
 
-from lagbench.baselines.features import NodeFeatures, Scale, edge_features, wall_distance
-from lagbench.baselines.noise import noisy, random_walk
-from lagbench.baselines.radius_graph import radius_graph
+from lagbench.baselines.graph import NodeFeatures, Scale, edge_features, radius_graph, wall_distance
+from lagbench.baselines.seeding import noisy, random_walk
 from lagbench.baselines.symmetry import Symmetry, draw, image
 from lagbench.errors import UsageError
 

@@ -12,11 +12,10 @@ import pytest
 from metric_flows import Floats, pairs_of, rollout, scenario_of
 from score_bench import Predict, ScoreBench, bench_of, half_right, late, right, still, straight
 
-from lagbench.flags import below_twin_floor, copy_suspect, evidence, physics
-from lagbench.generation import GenerationResult
+from lagbench.data.registry import Registry
+from lagbench.make.generate import GenerationResult
 from lagbench.metrics import FramePair, snapshots
-from lagbench.registry import Registry
-from lagbench.trace import SHIFTS, Trace, Tracer
+from lagbench.scoring.flags import SHIFTS, Trace, Tracer, below_twin_floor, copy_suspect, evidence, physics
 
 HORIZON = 6
 

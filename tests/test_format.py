@@ -17,9 +17,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scenario_factory import DIMS, PARAMETERS, frames_of, make_key, write_scenario
 
-from lagbench.checksums import content_hash, file_sha256
-from lagbench.errors import DataError, WorkFailedError
-from lagbench.format import (
+from lagbench.data.checksums import content_hash, file_sha256
+from lagbench.data.writer import (
     MATERIALS,
     ScenarioWriter,
     check_scenario,
@@ -27,6 +26,7 @@ from lagbench.format import (
     rehash,
     scenario_path,
 )
+from lagbench.errors import DataError, WorkFailedError
 
 KEY = make_key()
 TYPES = {
@@ -86,7 +86,7 @@ def test_free_surface_files_have_no_walls(tmp_path: Path) -> None:
 
 def test_materials_are_those_of_the_solver() -> None:
     """The flag meanings of the files name the solver's materials in order."""
-    from lagbench.generators.base import Material
+    from lagbench.generators.split import Material
 
     assert tuple(material.name.lower() for material in Material) == MATERIALS
 
@@ -348,7 +348,7 @@ def test_a_root_that_is_a_file_cannot_be_written(tmp_path: Path) -> None:
 def test_writing_needs_neither_xarray_nor_pandas() -> None:
     """Generation workers stay small: the writer loads numpy and netCDF4 only."""
     code = (
-        "import sys, netCDF4, lagbench.format\n"
+        "import sys, netCDF4, lagbench.data.writer\n"
         "print([m for m in ('xarray', 'pandas', 'h5py', 'pydantic', 'scipy', 'dask') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

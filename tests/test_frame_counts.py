@@ -5,16 +5,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lagbench.generators.batch import Batch, Job
+from lagbench.data.registry import Size, load
+from lagbench.generators.batch import Batch, SimulationJob
 from lagbench.generators.solver import Device
-from lagbench.registry import Size, load
 
 FIXED = (0, 26)
 
 
 def _share_left(size: Size, scenario: int) -> float:
     """Return the mean kinetic energy over frames 270-299 over the greatest of any frame."""
-    job = Job(size=size, scenarios=(scenario,), root=Path("unused"), device=Device.CPU)
+    job = SimulationJob(size=size, scenarios=(scenario,), root=Path("unused"), device=Device.CPU)
     batch = Batch(job, lambda _: None, frames=[300])
     energy = [float((batch.frame(i)[1].astype(np.float64) ** 2).sum()) for i, _ in batch.recordings()]
     return float(np.mean(energy[270:]) / max(energy))

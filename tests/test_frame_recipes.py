@@ -11,8 +11,8 @@ from frame_cases import facts_of, rotations
 from lagbench.baselines.baseline import Baseline
 from lagbench.baselines.catalogue import find
 from lagbench.baselines.recipe import Recipe, recipe_for, recipe_names
+from lagbench.data.registry import load
 from lagbench.errors import UsageError
-from lagbench.registry import load
 
 NETWORKS = ("mlp", "lstm", "lstm-mlp")
 VARS = ("var", "var-stable")

@@ -9,10 +9,10 @@ import pytest
 from free_surface_scenarios import Part, parameters, run, scenario, start
 
 from lagbench.errors import UsageError, WorkFailedError
-from lagbench.generators.base import InitialState, Material
 from lagbench.generators.free_surface import courant
 from lagbench.generators.shapes import Disc, Rectangle
 from lagbench.generators.solver import Device
+from lagbench.generators.split import InitialState, Material
 
 CONSTANTS = parameters()
 WEIGHTLESS = parameters(gravity=0.0)

@@ -20,10 +20,10 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import minimum_spanning_tree
 from scipy.spatial import Delaunay, cKDTree
 
-from lagbench import registry
-from lagbench.generators.base import FreeSurfaceParameters, InitialState, Material
+from lagbench.data import registry
 from lagbench.generators.free_surface import FreeSurface, courant
 from lagbench.generators.shapes import Disc, Rectangle
+from lagbench.generators.split import FreeSurfaceParameters, InitialState, Material
 
 Array = NDArray[np.float64]
 

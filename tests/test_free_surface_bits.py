@@ -10,11 +10,11 @@ import pytest
 from free_surface_scenarios import Part, parameters, run, scenario, snapshot, start
 from reference_free_surface import FreeSurfaceReference
 
-from lagbench.generators.base import InitialState, Material
 from lagbench.generators.free_surface import FreeSurface
 from lagbench.generators.shapes import Disc, Rectangle
 from lagbench.generators.solver import Device, build
-from lagbench.pool import available_cores
+from lagbench.generators.split import InitialState, Material
+from lagbench.work.pool import available_cores
 
 CONSTANTS = parameters()
 SQUARE = Rectangle(0.2, 0.2)

@@ -14,15 +14,15 @@ import pytest
 from conftest import SIZE, SPLIT
 from independent_hash import content_hash, dumps
 
-from lagbench.generation import GenerationResult, generate
+from lagbench.data.manifest import read_manifest
+from lagbench.data.registry import Registry, load
+from lagbench.data.scenario import read_scenario
 from lagbench.generators.batch import draw, substeps_of
 from lagbench.generators.draws import generator
-from lagbench.generators.twin import nudge
-from lagbench.manifest import read_manifest
-from lagbench.plan import estimate, select
-from lagbench.progress import Progress
-from lagbench.registry import Registry, load
-from lagbench.scenario_file import read_scenario
+from lagbench.generators.simulate import nudge
+from lagbench.make.generate import GenerationResult, generate
+from lagbench.make.plan import estimate, select
+from lagbench.work.progress import Progress
 
 
 def folder_of(root: Path) -> Path:
@@ -267,7 +267,7 @@ import re, sys
 from pathlib import Path
 from lagbench.generators.batch import Job
 from lagbench.generators.simulate import simulate
-from lagbench.registry import load
+from lagbench.data.registry import load
 size = load(Path(sys.argv[1])).size(sys.argv[2], "full")
 short = size.model_copy(update={"frames": 3, "parameters": {**size.parameters}})
 simulate(Job(size=short, scenarios=(int(sys.argv[3]),), root=Path(sys.argv[4])), lambda units: None)
@@ -291,7 +291,7 @@ def test_a_worker_stays_small(split: str, scenario: int, unmeasured_path: Path, 
 def test_this_process_never_loads_taichi(generated: GenerationResult) -> None:
     """The parent only plans: Taichi lives in the workers."""
     code = (
-        "import sys, lagbench.generation as g; "
+        "import sys, lagbench.make.generate as g; "
         f"g.generate({SPLIT!r}, {SIZE!r}, root={str(generated.root)!r}, dry_run=True); "
         "assert not {'taichi', 'torch'} & sys.modules.keys()"
     )

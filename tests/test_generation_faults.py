@@ -16,13 +16,13 @@ import pytest
 from conftest import SIZE, SPLIT
 
 from lagbench.atomic import temporary_name
+from lagbench.data.lock import dataset_lock
+from lagbench.data.manifest import read_manifest
+from lagbench.data.registry import Registry, load
 from lagbench.errors import DataError, UsageError, WorkFailedError
-from lagbench.generation import GenerationResult, generate
-from lagbench.generators.batch import Job
+from lagbench.generators.batch import SimulationJob
 from lagbench.generators.simulate import simulate
-from lagbench.locking import dataset_lock
-from lagbench.manifest import read_manifest
-from lagbench.registry import Registry, load
+from lagbench.make.generate import GenerationResult, generate
 
 
 def files(root: Path) -> list[str]:
@@ -104,7 +104,7 @@ def test_a_disk_that_fills_up_leaves_whole_files_only(
     small_disk: Path, unmeasured: Registry, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Somebody else takes the space in the midst: what was finished stays, the rest leaves no trace."""
-    monkeypatch.setattr("lagbench.campaign.check_disk", lambda root, needed: None)
+    monkeypatch.setattr("lagbench.make.generate.check_disk", lambda root, needed: None)
     with pytest.raises(WorkFailedError) as caught:
         generate(SPLIT, SIZE, root=small_disk, workers=1, registry=unmeasured)
     assert "free disk space" in str(caught.value)
@@ -122,7 +122,7 @@ def test_a_worker_on_a_full_disk_names_the_file(tmp_path: Path, unmeasured: Regi
     """/dev/full answers every write with ENOSPC; the error carries the path and the remedy."""
     if not Path("/dev/full").exists():
         pytest.skip("this system has no /dev/full")
-    job = Job(size=unmeasured.size(SPLIT, SIZE), scenarios=(2,), root=tmp_path)
+    job = SimulationJob(size=unmeasured.size(SPLIT, SIZE), scenarios=(2,), root=tmp_path)
     folder = tmp_path / SPLIT / SIZE / "v1" / "valid"
     folder.mkdir(parents=True)
     temporary_name(folder / "0002.nc").symlink_to("/dev/full")

@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 from conftest import SIZE, SPLIT
 
-from lagbench.cards import PICTURES
+from lagbench.data.registry import Registry
 from lagbench.errors import UsageError, WorkFailedError
-from lagbench.generation import generate
-from lagbench.registry import Registry
+from lagbench.make.cards import PICTURES
+from lagbench.make.generate import generate
 
 
 @pytest.mark.parametrize("dry_run", [True, False])

@@ -8,9 +8,8 @@ import torch
 from graph_cases import jittered
 from numpy.typing import NDArray
 
-from lagbench import grid as scoring
-from lagbench.baselines.loss import GRID_TERMS, TERMS, LossNorm, Scales, loss_terms, mean_norm
-from lagbench.baselines.motion import Motion
+from lagbench.baselines.loss import GRID_TERMS, TERMS, LossNorm, Motion, Scales, loss_terms, mean_norm
+from lagbench.data import grid as scoring
 
 GRID = scoring.Grid(10)
 SCALES = Scales(torch.tensor([0.25, 0.3]), torch.tensor([0.004, 0.003]), torch.tensor([2e-4, 1e-4]))
@@ -38,7 +37,7 @@ def terms(predicted: Motion, target: Motion, norm: str = "l2", **weights: float)
 
 
 def by_numpy(predicted: Motion, target: Motion, p: int) -> dict[str, float]:
-    """Return the six terms by NumPy and lagbench.grid, term after term as Eqs. 5.29-5.34 stand."""
+    """Return the six terms by NumPy and lagbench.data.grid, term after term as Eqs. 5.29-5.34 stand."""
     found = {}
     for name in ("acceleration", "velocity", "position"):
         error = (getattr(predicted, name) - getattr(target, name)).numpy() / getattr(SCALES, name).numpy()

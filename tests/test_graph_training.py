@@ -9,10 +9,9 @@ import pytest
 import torch
 from graph_cases import SMALL, batch, facts, jittered, network, oracle, rolled, swirl
 
-from lagbench.baselines.batch import Batch
+from lagbench.baselines.baseline import Batch
 from lagbench.baselines.catalogue import find
-from lagbench.baselines.loss import TERMS, Scales, loss_terms
-from lagbench.baselines.motion import Motion, State
+from lagbench.baselines.loss import TERMS, Motion, Scales, State, loss_terms
 from lagbench.baselines.operators.supergat import SuperGATLink
 from lagbench.baselines.simulator import GraphNetwork
 

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from lagbench import grid as gridding
+from lagbench.data import grid as gridding
+from lagbench.data.grid import Fields, Grid, Placement
 from lagbench.errors import UsageError
-from lagbench.grid import Fields, Grid, Placement
 
 Floats = NDArray[np.float64]
 BOTH = pytest.mark.parametrize("placement", list(Placement))

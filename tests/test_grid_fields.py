@@ -1,4 +1,4 @@
-"""The differentiable grid fields are those of lagbench.grid, and their gradients are right."""
+"""The differentiable grid fields are those of lagbench.data.grid, and their gradients are right."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lagbench import grid as reference
-from lagbench.baselines import grid_fields
+from lagbench.baselines import torch_grid
+from lagbench.data import grid as reference
+from lagbench.data.grid import Grid, Placement
 from lagbench.errors import UsageError
-from lagbench.grid import Grid, Placement
 
 GRIDS = [Grid(8), Grid(8, Placement.NODES), Grid(11)]
 
@@ -29,7 +29,7 @@ def torches(*arrays: NDArray[np.float64], dtype: torch.dtype = torch.float64) ->
     return [torch.from_numpy(array).to(dtype) for array in arrays]
 
 
-def compare(found: grid_fields.Fields, expected: reference.Fields, tolerance: float) -> None:
+def compare(found: torch_grid.Fields, expected: reference.Fields, tolerance: float) -> None:
     """Compare every field; vorticity and divergence are 0 where the scorer's are NaN."""
     np.testing.assert_array_equal(found.differentiable.numpy(), expected.differentiable)
     for name in ("weight", "velocity", "density", "vorticity", "divergence"):
@@ -48,7 +48,7 @@ def test_fields_are_those_of_the_scorer(grid: Grid, dtype: torch.dtype, toleranc
     expected = reference.fields(x, u, grid, full=full)
     assert expected.differentiable.any()
     assert not expected.differentiable.all()
-    found = grid_fields.fields(*torches(x, u, dtype=dtype), grid, full=full)
+    found = torch_grid.fields(*torches(x, u, dtype=dtype), grid, full=full)
     compare(found, expected, tolerance)
 
 
@@ -58,13 +58,13 @@ def test_windows_side_by_side_are_as_alone() -> None:
     x, u = particles(350)
     counts = [150, 0, 200]
     sample = torch.arange(3).repeat_interleave(torch.tensor(counts))
-    found = grid_fields.fields(*torches(x, u), grid, full=full, sample=sample, windows=3)
+    found = torch_grid.fields(*torches(x, u), grid, full=full, sample=sample, windows=3)
     for window, end in enumerate(np.cumsum(counts)):
         own = slice(end - counts[window], end)
         alone = reference.fields(x[own], u[own], grid, full=full)
         np.testing.assert_allclose(found.velocity[window].numpy(), alone.velocity, atol=1e-15)
         np.testing.assert_allclose(found.weight[window].numpy(), alone.weight, atol=1e-12)
-    counted = grid_fields.transfer(*torches(x, u), grid, sample=sample)
+    counted = torch_grid.transfer(*torches(x, u), grid, sample=sample)
     assert torch.equal(counted.weight, found.weight)
 
 
@@ -75,7 +75,7 @@ def test_counted_nodes_may_be_those_of_the_truth() -> None:
     x, u = particles(400)
     truth = reference.fields(x, u, grid, full=full)
     expected = reference.fields(x / 2, u, grid, full=full, counted=truth.counted)
-    found = grid_fields.fields(*torches(x / 2, u), grid, full=full, counted=torch.from_numpy(truth.counted))
+    found = torch_grid.fields(*torches(x / 2, u), grid, full=full, counted=torch.from_numpy(truth.counted))
     compare(found, expected, 1e-12)
 
 
@@ -85,7 +85,7 @@ def test_rotation_has_twice_its_rate() -> None:
     axis = (torch.arange(20, dtype=torch.float64) + 0.5) / 20  # two particles per cell and axis
     x = torch.cartesian_prod(axis, axis)
     u = 3.0 * torch.stack([0.5 - x[:, 1], x[:, 0] - 0.5], dim=1)
-    found = grid_fields.fields(x, u, grid, full=4.0)
+    found = torch_grid.fields(x, u, grid, full=4.0)
     inner = (slice(2, -2), slice(2, -2))  # the outermost nodes lack particles on one side
     torch.testing.assert_close(found.vorticity[inner], torch.full((6, 6), 6.0, dtype=torch.float64))
     torch.testing.assert_close(found.divergence[inner], torch.zeros(6, 6, dtype=torch.float64))
@@ -99,11 +99,11 @@ def test_gradients(name: str, cells: int) -> None:
     x, u = torches(*particles(40, seed=3, low=-0.05, high=0.9))
     u = 100 * u
     full = grid.full_weight(40, 0.9)
-    counted = grid_fields.fields(x, u, grid, full=full).counted
+    counted = torch_grid.fields(x, u, grid, full=full).counted
     assert counted.any()
 
     def field(position: Tensor, velocity: Tensor) -> Tensor:
-        found = grid_fields.fields(position, velocity, grid, full=full, counted=counted)
+        found = torch_grid.fields(position, velocity, grid, full=full, counted=counted)
         return torch.as_tensor(getattr(found, name))
 
     assert torch.autograd.gradcheck(field, (x.requires_grad_(), u.requires_grad_()))
@@ -112,7 +112,7 @@ def test_gradients(name: str, cells: int) -> None:
 def test_weight_and_momentum_are_conserved() -> None:
     """Away from the walls the weights of a particle sum to 1, wherever it is: the gradient is 0."""
     x, u = torches(*particles(30, low=0.3, high=0.7))
-    sums = grid_fields.transfer(x.requires_grad_(), u.requires_grad_(), Grid(8))
+    sums = torch_grid.transfer(x.requires_grad_(), u.requires_grad_(), Grid(8))
     torch.testing.assert_close(sums.weight.sum(), torch.tensor(30.0, dtype=torch.float64))
     total = sums.weight.sum() + sums.momentum.sum()
     at_x, at_u = torch.autograd.grad(total, (x, u))
@@ -126,8 +126,8 @@ def test_lost_particles_have_no_weight_and_no_gradient() -> None:
     x[:3] = torch.tensor([[1.5, 0.5], [float("nan"), 0.5], [0.5, -float("inf")]])
     u[1] = float("nan")
     grid = Grid(6)
-    kept = grid_fields.fields(x[3:], u[3:], grid, full=2.0)
-    found = grid_fields.fields(x.requires_grad_(), u.requires_grad_(), grid, full=2.0)
+    kept = torch_grid.fields(x[3:], u[3:], grid, full=2.0)
+    found = torch_grid.fields(x.requires_grad_(), u.requires_grad_(), grid, full=2.0)
     torch.testing.assert_close(found.velocity, kept.velocity)
     (found.vorticity.square().sum() + found.density.square().sum()).backward()
     for gradient in (x.grad, u.grad):
@@ -150,4 +150,4 @@ def test_lost_particles_have_no_weight_and_no_gradient() -> None:
 def test_shapes_that_do_not_fit_are_refused(x: Tensor, u: Tensor, sample: Tensor | None) -> None:
     """Positions, velocities and windows of unequal lengths are errors that give the shapes."""
     with pytest.raises(UsageError, match="do not fit"):
-        grid_fields.transfer(x, u, Grid(4), sample=sample)
+        torch_grid.transfer(x, u, Grid(4), sample=sample)

@@ -12,10 +12,10 @@ import pytest
 from independent_hash import content_hash
 from scenario_factory import make_key, write_scenario
 
-from lagbench import format as files
-from lagbench.crew import Crew
-from lagbench.pool import Report
-from lagbench.scenario_file import check_scenario, read_scenario
+from lagbench.data import writer as files
+from lagbench.data.scenario import check_scenario, read_scenario
+from lagbench.make.crew import Crew
+from lagbench.work.pool import Report
 
 PARTICLES = (1 << 17) + 1000
 """One chunk and a bit."""
@@ -55,8 +55,8 @@ import re, sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[1])
 from scenario_factory import make_key, write_scenario
-from lagbench.scenario_file import check_scenario
-from lagbench.statistics import file_moments
+from lagbench.data.scenario import check_scenario
+from lagbench.data.statistics import file_moments
 import scenario_factory, numpy
 particles, frames = 100_000, int(sys.argv[3])
 frame = numpy.random.default_rng(0).random((particles, 2), dtype=numpy.float32)
@@ -83,9 +83,9 @@ def test_memory_does_not_grow_with_frames(tmp_path: Path) -> None:
 
 def test_many_particles_are_drawn_by_some(tmp_path: Path) -> None:
     """150,000 particles make 50,000 dots of three times the area; a few make one each."""
-    from lagbench.canvas import figure
-    from lagbench.panels import Panel, draw
-    from lagbench.recording import open_recording
+    from lagbench.draw.panels import Panel, draw
+    from lagbench.draw.recording import open_recording
+    from lagbench.draw.style import figure
 
     drawn = {}
     for particles in (1500, 150_000):

@@ -139,10 +139,10 @@ def edges() -> dict[str, set[str]]:
 def test_the_graph_sees_the_package() -> None:
     """The reader finds modules, relative imports across packages and lazy imports in functions."""
     found = edges()
-    assert "lagbench.errors" in found["lagbench.registry"]
-    assert "lagbench.format" in found["lagbench.generators.simulate"]
+    assert "lagbench.errors" in found["lagbench.data.registry"]
+    assert "lagbench.data.writer" in found["lagbench.generators.simulate"]
     assert "lagbench.generators.batch" in found["lagbench.generators.simulate"]
-    assert "lagbench.generation" in found["lagbench.cli.data"]
+    assert "lagbench.make.generate" in found["lagbench.cli.data"]
 
 
 @pytest.mark.parametrize("name", sorted(GRAPH))

@@ -8,7 +8,7 @@ import platformdirs
 import pytest
 from scenario_factory import make_key
 
-from lagbench.layout import resolve_root, scenario_path
+from lagbench.data.layout import resolve_root, scenario_path
 
 
 def test_root_given_then_environment_then_platform(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

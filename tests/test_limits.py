@@ -12,12 +12,12 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lagbench.data.limits import NEEDED, Limit
+from lagbench.data.registry import default_path, load
 from lagbench.errors import UnreadableFileError
-from lagbench.generation import generate
-from lagbench.generators.preflight import LIMITS
-from lagbench.limits import NEEDED, Limit
-from lagbench.registry import default_path, load
-from lagbench.verification import verify
+from lagbench.generators.constants import LIMITS
+from lagbench.make.generate import generate
+from lagbench.make.verify import verify
 
 Change = Callable[[dict[str, Any]], object]
 

@@ -11,11 +11,11 @@ import pytest
 from exchange_readers import straight_runs
 
 import lagbench
+from lagbench.data.local import home, is_name, locate, rooted
+from lagbench.data.registry import load
 from lagbench.errors import UnreadableFileError, UsageError
 from lagbench.exchange import adopt
 from lagbench.exchange.local_split import LocalSplit
-from lagbench.locating import home, is_name, locate, rooted
-from lagbench.registry import load
 
 
 @pytest.fixture(scope="module")

@@ -13,14 +13,14 @@ from pathlib import Path
 
 import pytest
 
+from lagbench.data.layout import dataset_folder
+from lagbench.data.lock import dataset_lock, read_holder
 from lagbench.errors import WorkFailedError
-from lagbench.layout import dataset_folder
-from lagbench.locking import dataset_lock, read_holder
 
 HOLD = """
 import sys, time
 from pathlib import Path
-from lagbench.locking import dataset_lock
+from lagbench.data.lock import dataset_lock
 with dataset_lock(Path(sys.argv[1]), "cavity", "tiny", 1):
     print("held", flush=True)
     sys.stdin.readline()

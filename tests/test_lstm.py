@@ -12,11 +12,10 @@ from frame_cases import batch_of, counted, facts_of, rotations, share_of_persist
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from lagbench import grid as gridding
-from lagbench.baselines.frame_model import FrameWindow
-from lagbench.baselines.frame_state import FrameState
+from lagbench.baselines.frame_model import FrameState, FrameWindow
 from lagbench.baselines.lstm import LSTM, LSTMWithMLP
-from lagbench.grid import Grid, Placement
+from lagbench.data import grid as gridding
+from lagbench.data.grid import Grid, Placement
 
 SCENARIOS = rotations(4)
 FACTS = facts_of(SCENARIOS)

@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 from scenario_factory import make_key, write_scenario
 
-from lagbench.checksums import dataset_hash, subset_hash
+from lagbench.data.checksums import dataset_hash, subset_hash
+from lagbench.data.manifest import FileEntry, Manifest, describe_file, merge, read_manifest, write_manifest
 from lagbench.errors import DataError
-from lagbench.manifest import FileEntry, Manifest, describe_file, merge, read_manifest, write_manifest
 
 SUBSETS = {"train": (0, 1), "valid": (2,), "test": (3, 4), "extra": (5,)}
 STATISTICS = {"velocity_std": (0.00219, 0.00218)}

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from metric_flows import Floats, pairs_of, rollout, scenario_of
 
+from lagbench.data.grid import Grid
 from lagbench.errors import UsageError
-from lagbench.grid import Grid
 from lagbench.metrics import FAMILIES, METRICS, Direction, Metric, Score, aggregate, available, select, tally
 from lagbench.metrics import table as table_module
 

@@ -15,7 +15,7 @@ from pydantic import ValidationError
 
 from lagbench.baselines.catalogue import find
 from lagbench.baselines.facts import Facts
-from lagbench.baselines.frame_state import FrameState
+from lagbench.baselines.frame_model import FrameState
 from lagbench.baselines.mlp import MLP
 from lagbench.baselines.recipe import recipe_for
 from lagbench.errors import DataError

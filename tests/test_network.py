@@ -11,9 +11,8 @@ import torch
 from operator_graphs import OPERATORS, graph
 from torch import Tensor, nn
 
-from lagbench.baselines import blocks
-from lagbench.baselines.blocks import EdgeMLP, mlp
-from lagbench.baselines.dense import LayerNorm, Linear, linear
+from lagbench.baselines import layers
+from lagbench.baselines.layers import EdgeMLP, LayerNorm, Linear, linear, mlp
 from lagbench.baselines.network import EncodeProcessDecode, ProcessorLayer
 from lagbench.baselines.operators.gns import GNS
 from lagbench.baselines.operators.operator import Losses, Operator
@@ -52,7 +51,7 @@ def test_recomputed_hidden_layers(monkeypatch: pytest.MonkeyPatch, mixed: bool) 
     layer, inputs = EdgeMLP(16, 12), graph(300, 20_000, node=16, edge=16)
     results = []
     for limit in (1e12, 0.0):
-        monkeypatch.setattr(blocks, "LARGEST_KEPT", limit)
+        monkeypatch.setattr(layers, "LARGEST_KEPT", limit)
         node, edge = (part.clone().requires_grad_() for part in (inputs.node, inputs.edge))
         with torch.autocast("cpu", torch.bfloat16, enabled=mixed):
             update = layer(edge, node, inputs.edge_index)
@@ -65,7 +64,7 @@ def test_recomputed_hidden_layers(monkeypatch: pytest.MonkeyPatch, mixed: bool) 
 @pytest.mark.parametrize("limit", [1e12, 0.0])
 def test_gradients_of_the_edge_update(monkeypatch: pytest.MonkeyPatch, limit: float) -> None:
     """Gradients are finite differences' in float64, hidden layers kept or not."""
-    monkeypatch.setattr(blocks, "LARGEST_KEPT", limit)
+    monkeypatch.setattr(layers, "LARGEST_KEPT", limit)
     torch.manual_seed(0)
     layer, inputs = EdgeMLP(4, 3).double(), graph(5, 9, node=4, edge=4)
     node, edge = inputs.node.double().requires_grad_(), inputs.edge.double().requires_grad_()

@@ -17,17 +17,16 @@ from exchange_readers import straight_runs
 from object_stores import files, machine, objects, put, remove, s3_server, stored
 
 from lagbench.atomic import write_atomically
-from lagbench.checksums import file_sha256
+from lagbench.data.checksums import file_sha256
+from lagbench.data.layout import resolve_root, url_of
+from lagbench.data.manifest import read_manifest
+from lagbench.data.registry import Registry
 from lagbench.errors import DataError, WorkFailedError
 from lagbench.exchange import adopt, download
-from lagbench.generation import GenerationResult, generate
-from lagbench.layout import resolve_root
-from lagbench.manifest import read_manifest
-from lagbench.registry import Registry
+from lagbench.make.generate import GenerationResult, generate
 from lagbench.store import lease as leases
 from lagbench.store import publication
 from lagbench.store.remote import Remote
-from lagbench.working_copy import url_of
 
 FOLDER = f"{SPLIT}/{SIZE}/v1"
 MANIFEST = f"{FOLDER}/manifest.json"

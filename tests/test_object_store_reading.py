@@ -15,21 +15,20 @@ from typer.testing import CliRunner
 
 import lagbench
 from lagbench.baselines.facts import facts_of
-from lagbench.baselines.sources import sources_of
+from lagbench.baselines.frame_store import sources_of
 from lagbench.cli.app import app
+from lagbench.data.layout import as_url, resolve_root, url_of
+from lagbench.data.registry import Registry
 from lagbench.errors import DataError
 from lagbench.exchange import export
-from lagbench.generation import GenerationResult
-from lagbench.layout import resolve_root
-from lagbench.overview import overview
-from lagbench.registry import Registry
+from lagbench.make.generate import GenerationResult
+from lagbench.make.overview import overview
+from lagbench.make.verify import verify
 from lagbench.store import address, bringing
 from lagbench.store.fetching import quietly
 from lagbench.store.mirror import partial_name
 from lagbench.store.mirror_errors import WrongContentError, WrongLengthError
 from lagbench.submission import template
-from lagbench.verification import verify
-from lagbench.working_copy import as_url, url_of
 
 FOLDER = f"{SPLIT}/{SIZE}/v1"
 

@@ -14,9 +14,9 @@ from typer.testing import CliRunner
 import lagbench
 from lagbench.cli.app import app
 from lagbench.errors import DataError, UsageError, WorkFailedError
-from lagbench.generation import generate
+from lagbench.make.generate import generate
+from lagbench.make.verify import verify
 from lagbench.store import bringing
-from lagbench.verification import verify
 
 Use = Callable[[str], object]
 

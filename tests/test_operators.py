@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from operator_graphs import OPERATORS, Graph, graph
 from torch_geometric.nn import PointNetConv
 
-from lagbench.baselines.operators.gat import GAT
-from lagbench.baselines.operators.gatv2 import GATv2
+from lagbench.baselines.operators.gat import GAT, GATv2
 from lagbench.baselines.operators.gns import GNS
 from lagbench.baselines.operators.operator import Operator
 from lagbench.baselines.operators.pointnet import PointNet

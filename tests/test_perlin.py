@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 
-from lagbench.generators import curl_noise, draws, jets, perlin
+from lagbench.generators import curl_noise, draws, noise
 
 LOW, HIGH = 0.0375, 0.9625
 
@@ -51,7 +51,7 @@ def psi_by_hand(position: NDArray[np.float64], lattice: NDArray[np.float64], sca
 def lattice_of(frequency: int) -> NDArray[np.float64]:
     """Return the gradients of a test lattice."""
     rng = draws.generator("curl-noise", "test", 1, frequency)
-    return np.asarray(perlin.gradients(rng, frequency))
+    return np.asarray(noise.gradients(rng, frequency))
 
 
 @given(
@@ -61,7 +61,7 @@ def lattice_of(frequency: int) -> NDArray[np.float64]:
 )
 def test_jets_differentiate_polynomials(coefficients: list[float], x: float, y: float) -> None:
     """The Hessian of p(x y) follows from p' and p'' by hand (chain rule)."""
-    jet_x, jet_y = jets.coordinates(np.array([[x, y]]))
+    jet_x, jet_y = noise.coordinates(np.array([[x, y]]))
     p = (jet_x * jet_y).polynomial(*coefficients)
     exact = Polynomial(coefficients)
     first, second = exact.deriv(1)(x * y), exact.deriv(2)(x * y)
@@ -76,7 +76,7 @@ def test_noise_is_zero_with_the_drawn_slope_at_every_node() -> None:
     """Gradient noise: value 0 and gradient g at the nodes, the far corner included."""
     lattice = lattice_of(3)
     node = np.array([(i, j) for i in range(4) for j in range(4)], dtype=np.float64)
-    found = perlin.noise(*jets.coordinates(node), lattice)
+    found = noise.noise(*noise.coordinates(node), lattice)
     np.testing.assert_allclose(found.value, 0.0, atol=1e-15)
     np.testing.assert_allclose(np.stack([found.x, found.y], -1), lattice.reshape(-1, 2), atol=1e-14)
 
@@ -92,14 +92,14 @@ def test_gradients_are_unit_vectors() -> None:
 def test_noise_equals_the_thesis_formula(x: float, y: float) -> None:
     """The vectorised jet and a scalar transcription of Eqs. 5.40 and 5.41 agree."""
     lattice = lattice_of(5)
-    found = perlin.noise(*jets.coordinates(np.array([[x, y]])), lattice)
+    found = noise.noise(*noise.coordinates(np.array([[x, y]])), lattice)
     assert found.value[0] == pytest.approx(noise_by_hand(x, y, lattice), abs=1e-13)
 
 
 def test_ramp_joins_one_with_two_derivatives() -> None:
     """Bridson's ramp: 0 with slope 15/8 at 0; 1 with slope and curvature 0 from 1 on."""
     t = np.array([[0.0, 0.0], [1.0 - 1e-9, 0.0], [1.0, 0.0], [7.0, 0.0]])
-    found = perlin.ramp(jets.coordinates(t)[0])
+    found = noise.ramp(noise.coordinates(t)[0])
     np.testing.assert_allclose(found.value, [0.0, 1.0, 1.0, 1.0], atol=1e-15)
     np.testing.assert_allclose(found.x, [1.875, 0.0, 0.0, 0.0], atol=1e-15)
     np.testing.assert_allclose(found.xx, [0.0, 0.0, 0.0, 0.0], atol=1e-7)
@@ -126,7 +126,7 @@ def test_hessian_by_numerical_differentiation(frequency: int) -> None:
     lattice, step = lattice_of(frequency), 1e-6
     position = points(200, LOW + 0.001, HIGH - 0.001)
 
-    def flow(at: NDArray[np.float64]) -> jets.Jet:
+    def flow(at: NDArray[np.float64]) -> noise.Jet:
         return curl_noise.stream_function(at, lattice, low=LOW, high=HIGH, scale=0.01)
 
     here = flow(position)

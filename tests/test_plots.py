@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 from PIL import Image
 from swirls import OMEGA, TOP_TO_THE_RIGHT, write_swirl
 
-from lagbench import extras, palette
-from lagbench.canvas import figure, pixels_of
-from lagbench.dataset import open_split
+from lagbench import errors
+from lagbench.draw import style
+from lagbench.draw.panels import Panel, draw_walls, limit_of
+from lagbench.draw.plot import KINDS, contact_sheet, describe, plot_frame
+from lagbench.draw.recording import open_recording
+from lagbench.draw.style import figure, pixels_of
 from lagbench.errors import DataError, UsageError
-from lagbench.panels import Panel, draw_walls, limit_of
-from lagbench.plots import KINDS, contact_sheet, describe, plot_frame
-from lagbench.recording import open_recording
+from lagbench.store.dataset import open_split
 
 PNG_HEAD = b"\x89PNG\r\n\x1a\n"
 
@@ -86,7 +87,7 @@ def test_a_scenario_of_an_opened_split_draws_what_its_file_draws(tmp_path: Path)
 
 def test_importing_draws_in_nothing_heavy() -> None:
     """The modules can be imported without matplotlib, and importing them does not load it."""
-    code = "import sys, lagbench.plots, lagbench.animation, lagbench.cards; print(*sys.modules)"
+    code = "import sys, lagbench.draw.plot, lagbench.draw.animate, lagbench.make.cards; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert not {"matplotlib", "PIL", "xarray", "taichi", "torch"} & set(loaded.split())
 
@@ -136,9 +137,9 @@ def test_moving_walls_are_marked_and_point_where_they_slide(tmp_path: Path) -> N
             drawn[name] = pixels_of(page)
     side = drawn["right"].shape[0]
     band = int(0.025 * side)  # middle of the wall of tiny, which is 0.05 wide
-    assert tuple(drawn["right"][band, int(0.2 * side)]) == tuple(palette.rgb(palette.MOVING))
-    assert tuple(drawn["right"][-band, side // 2]) == tuple(palette.rgb(palette.WALL))
-    assert tuple(drawn["right"][side // 2, side // 2]) == tuple(palette.rgb(palette.PAPER))
+    assert tuple(drawn["right"][band, int(0.2 * side)]) == tuple(style.rgb(style.MOVING))
+    assert tuple(drawn["right"][-band, side // 2]) == tuple(style.rgb(style.WALL))
+    assert tuple(drawn["right"][side // 2, side // 2]) == tuple(style.rgb(style.PAPER))
     mirrored = np.abs(drawn["right"][:, ::-1].astype(int) - drawn["left"]).mean()
     assert mirrored < 0.2 * np.abs(drawn["right"].astype(int) - drawn["left"]).mean()
 
@@ -188,7 +189,7 @@ def test_a_broken_dependency_is_not_called_missing(tmp_path: Path, monkeypatch: 
     (tmp_path / "broken_extra.py").write_text("import no_such_module_at_all\n")
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(ModuleNotFoundError, match="no_such_module_at_all"):
-        extras.require("broken_extra", extra="plots")
+        errors.require("broken_extra", extra="plots")
 
 
 def test_sheet_of_driven_scenarios(tmp_path: Path) -> None:
@@ -203,7 +204,7 @@ def test_sheet_of_driven_scenarios(tmp_path: Path) -> None:
     again = contact_sheet("cavity", "tiny", tmp_path / "again.png", root=tmp_path, frame=2)
     assert again.read_bytes() == path.read_bytes()
     # each of the five panels shows the orange of its moving top wall
-    orange = (five == palette.rgb(palette.MOVING)).all(axis=-1).any(axis=0)
+    orange = (five == style.rgb(style.MOVING)).all(axis=-1).any(axis=0)
     assert np.count_nonzero(np.diff(orange.astype(int)) == 1) >= 5
 
 
@@ -220,8 +221,8 @@ def test_sheet_of_materials_shows_their_colours(tmp_path: Path) -> None:
     """Pairs of materials are coloured by material, each colour as the key has it."""
     write_swirl(tmp_path, "multimaterial", 0, walls=None, materials=3, parameters={"pair": "made-up"})
     image = pixels(contact_sheet("multimaterial", "tiny", tmp_path / "s.png", root=tmp_path))
-    for material, colour in enumerate(palette.MATERIAL_COLOURS):
-        assert (image == palette.rgb(colour)).all(axis=-1).any() == (material < 3)
+    for material, colour in enumerate(style.MATERIAL_COLOURS):
+        assert (image == style.rgb(colour)).all(axis=-1).any() == (material < 3)
 
 
 def test_sheet_of_nothing_names_the_command(tmp_path: Path) -> None:
@@ -235,18 +236,18 @@ def test_sheet_of_nothing_names_the_command(tmp_path: Path) -> None:
 
 def test_all_that_is_drawn_is_in_the_palette() -> None:
     """Every level of both maps and every flat colour keeps its exact value in a file."""
-    table = {tuple(colour) for colour in palette.colours().tolist()}
-    assert palette.colours().shape == (256, 3)
+    table = {tuple(colour) for colour in style.colours().tolist()}
+    assert style.colours().shape == (256, 3)
     flat = (
-        palette.PAPER,
-        palette.INK,
-        palette.MUTED,
-        palette.WALL,
-        palette.MOVING,
-        *palette.MATERIAL_COLOURS,
+        style.PAPER,
+        style.INK,
+        style.MUTED,
+        style.WALL,
+        style.MOVING,
+        *style.MATERIAL_COLOURS,
     )
-    assert {tuple(palette.rgb(colour).tolist()) for colour in flat} <= table
-    for levels in (palette.speed_map(), palette.vorticity_map()):
+    assert {tuple(style.rgb(colour).tolist()) for colour in flat} <= table
+    for levels in (style.speed_map(), style.vorticity_map()):
         drawn = (np.asarray(levels.colors)[:, :3] * 255.0).round().astype(int)
         assert {tuple(colour) for colour in drawn.tolist()} <= table
 
@@ -273,7 +274,7 @@ MACHADO = {  # Machado, Oliveira & Fernandes (2009), severity 1, linear RGB
 @pytest.mark.parametrize("vision", MACHADO)
 def test_materials_stay_apart_for_colour_blind_readers(vision: str) -> None:
     """Simulated deficiencies leave at least 0.2 of the RGB cube's side between any two materials."""
-    srgb = np.array([palette.rgb(colour) for colour in palette.MATERIAL_COLOURS]) / 255.0
+    srgb = np.array([style.rgb(colour) for colour in style.MATERIAL_COLOURS]) / 255.0
     linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
     seen = np.clip(linear @ np.array(MACHADO[vision]).T, 0.0, 1.0)
     back = np.where(seen <= 0.0031308, 12.92 * seen, 1.055 * seen ** (1 / 2.4) - 0.055)

@@ -11,8 +11,9 @@ from pathlib import Path
 import pytest
 import yaml
 
-from lagbench import plugins, registry
-from lagbench.registry import Registry, default_path, load
+from lagbench.data import registry
+from lagbench.data import registry as plugins
+from lagbench.data.registry import Registry, default_path, load
 
 Plug = Callable[..., Registry]
 

@@ -13,7 +13,7 @@ import pool_tasks
 import pytest
 
 from lagbench.errors import DataError, UsageError, WorkFailedError
-from lagbench.pool import ATTEMPTS, Pool, Task, available_cores, worker_count
+from lagbench.work.pool import ATTEMPTS, Pool, Task, available_cores, worker_count
 
 HERE = str(Path(__file__).parent)
 
@@ -157,7 +157,7 @@ import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[1])
 import pool_tasks
-from lagbench.pool import Pool, Task
+from lagbench.work.pool import Pool, Task
 with Pool(1) as pool:
     pool.submit(Task(name="a", function=getattr(pool_tasks, sys.argv[2]), arguments=(eval(sys.argv[3]),)))
     print([event.value for event in pool.events()])

@@ -14,17 +14,16 @@ import pytest
 import torch
 from simple_models import FACTS, Bursting, Drift, install
 
-from lagbench.baselines import prediction
-from lagbench.baselines.batch import Batch
+from lagbench.baselines import predict as prediction
+from lagbench.baselines.baseline import Batch
 from lagbench.baselines.checkpoint import Checkpoint, save
 from lagbench.baselines.facts import facts_of
-from lagbench.baselines.prediction import PredictionResult, predict
-from lagbench.baselines.rollout import roll_out, single
-from lagbench.baselines.validation import as_published, validate
+from lagbench.baselines.predict import PredictionResult, predict
+from lagbench.baselines.rollout import as_published, roll_out, single, validate
 from lagbench.baselines.windows import scenario_batch
+from lagbench.data.registry import Registry
 from lagbench.errors import DataError, UnreadableFileError, UsageError, WorkFailedError
-from lagbench.generation import GenerationResult
-from lagbench.registry import Registry
+from lagbench.make.generate import GenerationResult
 from lagbench.submission import validate as examine
 
 Predict = Callable[..., PredictionResult]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from lagbench.baselines.radius_graph import _graph_torch, radius_graph
+from lagbench.baselines.graph import _graph_torch, radius_graph
 from lagbench.errors import UsageError
 
 Floats = NDArray[np.float32]

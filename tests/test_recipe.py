@@ -10,10 +10,9 @@ import torch
 from simple_models import Drift, install
 
 from lagbench.baselines.catalogue import Entry, every_entry, find, names
-from lagbench.baselines.recipe import recipe_for, recipe_names
-from lagbench.baselines.training_options import Schedule, TrainingOptions
+from lagbench.baselines.recipe import Schedule, TrainingOptions, recipe_for, recipe_names
+from lagbench.data.registry import load
 from lagbench.errors import UnreadableFileError, UsageError
-from lagbench.registry import load
 
 TEXT = """
 format: 1

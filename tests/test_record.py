@@ -12,11 +12,11 @@ import pytest
 import yaml
 from conftest import SIZE, SPLIT
 
+from lagbench.data.manifest import Manifest, read_manifest, write_manifest
+from lagbench.data.registry import Measured, default_path, load
 from lagbench.errors import DataError
-from lagbench.generation import GenerationResult
 from lagbench.generators.record import main, measured_values, released_name, render, replace_measured
-from lagbench.manifest import Manifest, read_manifest, write_manifest
-from lagbench.registry import Measured, default_path, load
+from lagbench.make.generate import GenerationResult
 
 RELEASED = Path(__file__).parent / "data" / "released_hashes.json"
 

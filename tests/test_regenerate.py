@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from lagbench.generation import generate
-from lagbench.manifest import read_manifest
-from lagbench.registry import Size, load
-from lagbench.verification import verify
+from lagbench.data.manifest import read_manifest
+from lagbench.data.registry import Size, load
+from lagbench.make.generate import generate
+from lagbench.make.verify import verify
 
 ROOT = Path(__file__).parent.parent
 SPLITS = tuple(load().splits)

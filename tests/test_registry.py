@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 import yaml
 
+from lagbench.data.limits import SUBSETS
+from lagbench.data.registry import Size, default_path, load
 from lagbench.errors import UnreadableFileError, UsageError
-from lagbench.limits import SUBSETS
-from lagbench.registry import Size, default_path, load
 
 TIERS = [
     (split, size)

@@ -14,8 +14,7 @@ from report_bench import SPLITS, ReportBench, damped, make_report_bench, noisy, 
 
 from lagbench.errors import UsageError
 from lagbench.report import write_report
-from lagbench.report.markup import Markup, tag
-from lagbench.report.numbers import text
+from lagbench.report.html import Markup, tag, text
 
 HOSTILE = (
     "<script>alert(1)</script>",

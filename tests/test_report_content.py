@@ -20,13 +20,13 @@ from PIL import Image
 from report_bench import damped, make_report_bench, motion
 
 import lagbench.report
-from lagbench.exam import Exam
-from lagbench.grid import Grid, fields
+from lagbench.data.grid import Grid, fields
+from lagbench.data.registry import load
 from lagbench.metrics import METRICS, Setting, Tally, aggregate
-from lagbench.registry import load
 from lagbench.report.maps import inside, limit_of
-from lagbench.report.opening import _stable_of
 from lagbench.report.subject import Subject
+from lagbench.report.tables import _stable_of
+from lagbench.scoring.task import ScoredTask
 from lagbench.submission.truth import Truth
 
 
@@ -42,7 +42,7 @@ def subject_on(split: str, size_name: str) -> Subject:
         attribute_std=(1.0, 1.0, 1.0, 1.0),
         radius=task.radius,
     )
-    exam = Exam(truth=Truth(size, Path()), setting=setting, density=1.0)
+    exam = ScoredTask(truth=Truth(size, Path()), setting=setting, density=1.0)
     return Subject(exam=exam, title=split, entries=())
 
 

@@ -13,14 +13,25 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from lagbench.report.chart import BOTTOM, HEIGHT, LEFT, RIGHT, TOP, WIDTH, Bar, Plot, bar_chart
+from lagbench.report.chart import (
+    BOTTOM,
+    HEIGHT,
+    LEFT,
+    RIGHT,
+    TOP,
+    WIDTH,
+    Bar,
+    Plot,
+    bar_chart,
+    linear,
+    logarithmic,
+    spanning,
+)
 from lagbench.report.distributions import _edges, _shares
-from lagbench.report.markup import path_data
-from lagbench.report.numbers import interval, text
-from lagbench.report.particles import SIDE, paint
+from lagbench.report.flow import streamlines
+from lagbench.report.html import interval, path_data, text
+from lagbench.report.maps import SIDE, paint
 from lagbench.report.png import LEVELS, diverging, sequential
-from lagbench.report.scale import linear, logarithmic, spanning
-from lagbench.report.streamlines import streamlines
 
 ACROSS, UP = WIDTH - LEFT - RIGHT, HEIGHT - TOP - BOTTOM
 

@@ -20,10 +20,10 @@ from lagbench.baselines.reproduce.evidence import Evidence, Sources
 from lagbench.baselines.reproduce.plan import Plan
 from lagbench.baselines.reproduce.roster import EXPECTED, ROSTER
 from lagbench.baselines.reproduce.stage import staged
-from lagbench.generation import generate
-from lagbench.grid import fields
-from lagbench.registry import Registry, load
-from lagbench.score_file import read_statistics
+from lagbench.data.grid import fields
+from lagbench.data.registry import Registry, load
+from lagbench.make.generate import generate
+from lagbench.scoring.score_file import read_statistics
 
 
 @pytest.fixture(scope="session")

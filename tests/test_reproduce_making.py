@@ -15,9 +15,9 @@ from lagbench.baselines.reproduce import mlp_studies
 from lagbench.baselines.reproduce.evidence import Evidence
 from lagbench.baselines.reproduce.plan import Plan
 from lagbench.baselines.reproduce.thesis import STUDIES
+from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
-from lagbench.generation import GenerationResult
-from lagbench.registry import Registry
+from lagbench.make.generate import GenerationResult
 
 pytest.importorskip("torch", reason="the extra 'baselines' is not installed")
 

@@ -17,8 +17,8 @@ from lagbench.baselines.reproduce.learning_curves import loss_over_steps, smooth
 from lagbench.baselines.reproduce.method import Method, Seeded
 from lagbench.baselines.reproduce.scenes import stand_in
 from lagbench.baselines.reproduce.table_4_8 import rollout_table
+from lagbench.data.registry import load
 from lagbench.metrics import METRICS, Score
-from lagbench.registry import load
 
 
 def test_printed_parameters_follow_from_the_widths() -> None:

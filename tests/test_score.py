@@ -13,17 +13,17 @@ import numpy as np
 import pytest
 from score_bench import ScoreBench, bench_of, half_right, right, still, straight
 
-from lagbench.dataset import open_split
+from lagbench.data.registry import Registry
 from lagbench.errors import ChecksFailedError, DataError, UnreadableFileError, UsageError, WorkFailedError
-from lagbench.generation import GenerationResult
+from lagbench.make.generate import GenerationResult
 from lagbench.metrics import Direction
-from lagbench.progress import Progress
-from lagbench.registry import Registry
-from lagbench.score_card import ScoreCard, digits
-from lagbench.score_file import read_statistics
-from lagbench.scoring import score
-from lagbench.sitting import SUBMISSION
+from lagbench.scoring.card import ScoreCard, digits
+from lagbench.scoring.scenario import SUBMISSION
+from lagbench.scoring.score import score
+from lagbench.scoring.score_file import read_statistics
+from lagbench.store.dataset import open_split
 from lagbench.submission import template, validate
+from lagbench.work.progress import Progress
 
 
 @pytest.fixture(scope="module")

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from typer.main import get_command
 
-from lagbench import flags
 from lagbench.cli.app import app
 from lagbench.metrics import METRICS
+from lagbench.scoring import flags
 
 TEXT = (Path(__file__).parent.parent / "docs" / "scoring.md").read_text()
 

@@ -14,16 +14,14 @@ import pytest
 import xarray as xr
 from score_bench import ScoreBench, bench_of, straight
 
+from lagbench.data.registry import Registry
 from lagbench.errors import UnreadableFileError
-from lagbench.generation import GenerationResult
+from lagbench.make.generate import GenerationResult
 from lagbench.metrics import Tally, aggregate, select
 from lagbench.metrics.distributions import histograms
-from lagbench.preview import FRAMES, PARTICLES
-from lagbench.published import read_scores
-from lagbench.registry import Registry
-from lagbench.score_card import ScoreCard, digits
-from lagbench.score_file import read_statistics, write_statistics
-from lagbench.sitting import SUBMISSION, as_stored
+from lagbench.scoring.card import ScoreCard, digits, read_scores
+from lagbench.scoring.scenario import FRAMES, PARTICLES, SUBMISSION, as_stored
+from lagbench.scoring.score_file import read_statistics, write_statistics
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ import torch
 from graph_cases import batch, facts, jittered, network, oracle, rolled, swirl
 from pydantic import ValidationError
 
-from lagbench.baselines.motion import State, integrate
+from lagbench.baselines.loss import State, integrate
 from lagbench.baselines.operators.gat import GAT
 from lagbench.baselines.operators.gns import GNS
 from lagbench.baselines.simulator import GraphNetwork

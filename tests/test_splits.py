@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from scenario_draws import EVERY, SPLITS, all_of, digest, draw, state_of
 
-from lagbench import registry
+from lagbench.data import registry
 from lagbench.generators import draws
-from lagbench.generators.base import ClosedBoxParameters
+from lagbench.generators.split import ClosedBoxParameters
 
 GENERATORS = Path(draws.__file__).parent
 DRAWN = (

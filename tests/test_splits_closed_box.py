@@ -11,10 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scenario_draws import all_of, changed, draw, neighbours, state_of
 
-from lagbench import registry
+from lagbench.data import registry
 from lagbench.errors import UsageError
 from lagbench.generators import draws, lattice
-from lagbench.generators.base import WALLS
+from lagbench.generators.split import WALLS
 
 
 def test_cavity_scenarios_draw_what_the_design_says() -> None:

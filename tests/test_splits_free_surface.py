@@ -16,10 +16,10 @@ from scenario_draws import SIZES, all_of, changed, digest, draw, neighbours, sta
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from lagbench import registry
+from lagbench.data import registry
 from lagbench.errors import WorkFailedError
 from lagbench.generators import fluid, multimaterial
-from lagbench.generators.base import InitialState, Material
+from lagbench.generators.split import InitialState, Material
 
 DECLARED = [
     (split, name) for split in ("fluid", "multimaterial") for name in registry.load().split(split).parameters

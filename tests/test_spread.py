@@ -14,13 +14,14 @@ from cluster_bench import local_cluster, scheduler_process
 from score_bench import ScoreBench, bench_of, straight
 from spread_jobs import Deadly, double, sit_after_dying_once, take_worker_along, time_out
 
-from lagbench import cluster as clusters
-from lagbench import scoring, spread
+from lagbench.data.registry import Registry
 from lagbench.errors import UsageError, WorkFailedError
-from lagbench.generation import GenerationResult
-from lagbench.pool import Report
-from lagbench.registry import Registry
-from lagbench.sitting import Job, Outcome
+from lagbench.make.generate import GenerationResult
+from lagbench.scoring import score
+from lagbench.scoring.scenario import ScenarioJob, ScenarioScores
+from lagbench.work import cluster as clusters
+from lagbench.work import run
+from lagbench.work.pool import Report
 
 distributed = pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
 
@@ -41,7 +42,7 @@ def bench(generated: GenerationResult, unmeasured: Registry) -> ScoreBench:
 LOSER = """
 import sys
 from lagbench.errors import WorkFailedError
-from lagbench.spread import spread
+from lagbench.work.run import spread
 from spread_jobs import take_worker_along
 try:
     spread(take_worker_along, {"job 0": 0}, scheduler=sys.argv[1])
@@ -64,7 +65,7 @@ JOBS = {f"job {i}": i for i in range(6)}
 def test_results_come_in_order(workers: int) -> None:
     """Results stand in the order of the jobs although later ones end first; every unit is counted."""
     units: list[int] = []
-    assert spread.spread(double, JOBS, workers=workers, report=units.append) == [0, 2, 4, 6, 8, 10]
+    assert run.run_all(double, JOBS, workers=workers, report=units.append) == [0, 2, 4, 6, 8, 10]
     assert sum(units) == 6
 
 
@@ -72,9 +73,9 @@ def test_an_address_that_nobody_answers(monkeypatch: pytest.MonkeyPatch) -> None
     """An unreachable scheduler fails the work; an address of no known kind is a usage error."""
     monkeypatch.setattr(clusters, "CONNECT_SECONDS", 0.5)
     with pytest.raises(WorkFailedError, match="cannot reach the Dask scheduler"):
-        spread.spread(double, JOBS, scheduler="tcp://127.0.0.1:9")
+        run.run_all(double, JOBS, scheduler="tcp://127.0.0.1:9")
     with pytest.raises(UsageError, match="tcp://"):
-        spread.spread(double, JOBS, scheduler="carrier-pigeon://roof")
+        run.run_all(double, JOBS, scheduler="carrier-pigeon://roof")
 
 
 @pytest.mark.slow
@@ -88,12 +89,12 @@ def test_cluster_gives_the_same_bytes_though_a_worker_is_killed(
     there = bench.score(source, output_dir=tmp_path / "there", scheduler=address)
     marker = tmp_path / "killed"
 
-    def killing(function: Any, jobs: dict[str, Job], **options: Any) -> list[Outcome]:
+    def killing(function: Any, jobs: dict[str, ScenarioJob], **options: Any) -> list[ScenarioScores]:
         first = next(iter(jobs))
         held = {name: Deadly(job, marker if name == first else None) for name, job in jobs.items()}
-        return spread.spread(sit_after_dying_once, held, **options)
+        return run.run_all(sit_after_dying_once, held, **options)
 
-    monkeypatch.setattr(scoring, "spread", killing)
+    monkeypatch.setattr(score, "spread", killing)
     survived = bench.score(source, output_dir=tmp_path / "survived", scheduler=address)
     assert marker.exists()
     for card in (there, survived):
@@ -104,7 +105,7 @@ def test_cluster_gives_the_same_bytes_though_a_worker_is_killed(
 def test_a_lost_scheduler(losable: str, capfd: pytest.CaptureFixture[str]) -> None:
     """A scheduler that dies in the middle ends as failed work that says so, without Dask's traces."""
     with pytest.raises(WorkFailedError, match="the Dask cluster is lost"):
-        spread.spread(take_worker_along, {"job 0": 0}, scheduler=losable)
+        run.run_all(take_worker_along, {"job 0": 0}, scheduler=losable)
     captured = capfd.readouterr()
     assert captured.out + captured.err == ""
 
@@ -121,7 +122,7 @@ def test_a_lost_scheduler_stays_quiet_to_the_end(losable: str) -> None:
 def test_a_job_that_kills_every_worker(cluster: Any) -> None:
     """A job that no worker survives ends as failed work that names it, not as a hang."""
     with pytest.raises(WorkFailedError, match="job 0"):
-        spread.spread(take_worker_along, {"job 0": 0}, scheduler=cluster.scheduler_address)
+        run.run_all(take_worker_along, {"job 0": 0}, scheduler=cluster.scheduler_address)
 
 
 def test_a_killed_process_changes_nothing(
@@ -132,16 +133,18 @@ def test_a_killed_process_changes_nothing(
     here = bench.score(source, output_dir=tmp_path / "here", workers=1)
     marker, counted = tmp_path / "killed", []
 
-    def killing(function: Any, jobs: dict[str, Job], *, report: Report, **options: Any) -> list[Outcome]:
+    def killing(
+        function: Any, jobs: dict[str, ScenarioJob], *, report: Report, **options: Any
+    ) -> list[ScenarioScores]:
         held = {name: Deadly(job, marker) for name, job in jobs.items()}
 
         def count(units: int) -> None:
             counted.append(units)
             report(units)
 
-        return spread.spread(sit_after_dying_once, held, report=count, **options)
+        return run.run_all(sit_after_dying_once, held, report=count, **options)
 
-    monkeypatch.setattr(scoring, "spread", killing)
+    monkeypatch.setattr(score, "spread", killing)
     there = bench.score(source, output_dir=tmp_path / "there", workers=2)
     assert marker.exists()
     assert sum(counted) == 2 * bench.size.task.horizon
@@ -153,4 +156,4 @@ def test_a_killed_process_changes_nothing(
 def test_an_error_of_a_job_is_not_a_lost_cluster(cluster: Any) -> None:
     """A job's own time-out is told as what it is."""
     with pytest.raises(WorkFailedError, match=r"TimeoutError\('of the job'\)"):
-        spread.spread(time_out, {"job 0": 0}, scheduler=cluster.scheduler_address)
+        run.run_all(time_out, {"job 0": 0}, scheduler=cluster.scheduler_address)

@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenario_factory import frames_of, make_key, write_scenario
 
-from lagbench.errors import DataError
-from lagbench.statistics import (
+from lagbench.data.statistics import (
     MomentStream,
     combine,
     file_statistics,
@@ -19,6 +18,7 @@ from lagbench.statistics import (
     scenario_moments,
     statistics,
 )
+from lagbench.errors import DataError
 
 
 def test_by_hand() -> None:

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from scenario_factory import make_key, write_scenario
 from submission_data import FRAMES, GIVEN, PARTICLES, Bench, make_bench, truth
 
+from lagbench.data.registry import Registry
+from lagbench.data.writer import scenario_path
 from lagbench.errors import ChecksFailedError, DataError, UnreadableFileError
-from lagbench.format import scenario_path
-from lagbench.registry import Registry
 from lagbench.submission import Severity, ValidationResult, validate
 from lagbench.submission.guesses import guess_frames, guess_scenarios
 from lagbench.submission.truth import Truth

@@ -14,8 +14,8 @@ from hypothesis.extra import numpy as hnp
 from scenario_factory import frames_of
 from submission_data import FRAMES, GIVEN, HORIZON, PARTICLES, TESTS, Bench, make_bench, truth
 
+from lagbench.data.registry import Registry, load
 from lagbench.errors import DataError, UsageError, WorkFailedError
-from lagbench.registry import Registry, load
 from lagbench.submission import PredictionsWriter, open_predictions, template, write
 
 SHAPE = (HORIZON, PARTICLES, 2)

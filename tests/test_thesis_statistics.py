@@ -2,7 +2,7 @@
 
 import pytest
 
-from lagbench.registry import load
+from lagbench.data.registry import load
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from lagbench.generation import GenerationResult
+from lagbench.make.generate import GenerationResult
 
 torch = pytest.importorskip("torch", reason="the extra 'baselines' is not installed")
 

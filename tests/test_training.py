@@ -19,17 +19,16 @@ import torch
 from simple_models import FACTS, Drift, install
 from torch import Tensor
 
-from lagbench.baselines.batch import Batch
+from lagbench.baselines.baseline import Batch
 from lagbench.baselines.checkpoint import load
-from lagbench.baselines.descent import StepBatches
 from lagbench.baselines.module import TrainingModule
-from lagbench.baselines.training import TrainingResult, train
-from lagbench.baselines.training_options import TrainingOptions
+from lagbench.baselines.recipe import TrainingOptions
+from lagbench.baselines.train import StepBatches, TrainingResult, train
 from lagbench.baselines.windows import WindowDataset, WindowSampler
+from lagbench.data.registry import Registry
 from lagbench.errors import UsageError, WorkFailedError
-from lagbench.generation import GenerationResult
-from lagbench.progress import Progress
-from lagbench.registry import Registry
+from lagbench.make.generate import GenerationResult
+from lagbench.work.progress import Progress
 
 Run = Callable[..., TrainingResult]
 

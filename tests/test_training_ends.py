@@ -16,12 +16,12 @@ import torch
 from simple_models import Drift, install
 
 from lagbench.baselines.checkpoint import load, save
-from lagbench.baselines.run_folder import RunFolder
-from lagbench.baselines.training import TrainingResult, train
+from lagbench.baselines.job import RunFolder
+from lagbench.baselines.train import TrainingResult, train
+from lagbench.data.registry import Registry
 from lagbench.errors import DataError, UsageError, WorkFailedError
-from lagbench.generation import GenerationResult
-from lagbench.progress import Progress
-from lagbench.registry import Registry
+from lagbench.make.generate import GenerationResult
+from lagbench.work.progress import Progress
 
 Run = Callable[..., TrainingResult]
 

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from lagbench.errors import UsageError
-from lagbench.generators import diagnostics, experiment, ghia, profiles, validate
-from lagbench.generators.experiment import Case, plan
+from lagbench.generators.acceptance import __main__, diagnostics, experiment, ghia
+from lagbench.generators.acceptance import diagnostics as profiles
+from lagbench.generators.acceptance.experiment import Case, plan
 
 BOX = diagnostics.Box(low=0.0625, high=0.9375, cells=35)
 
@@ -203,7 +204,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Return the folders of the same run, done twice, picture included."""
     folders = [tmp_path_factory.mktemp("run") for _ in range(2)]
     for folder in folders:
-        assert validate.main(_arguments(folder, "--profiles", str(folder / "profiles.png"))) == 0
+        assert __main__.main(_arguments(folder, "--profiles", str(folder / "profiles.png"))) == 0
     return folders
 
 
@@ -236,7 +237,7 @@ def test_validate_reports_what_it_measured(written: list[Path]) -> None:
 def test_validate_stops_the_lid_where_nothing_is_tabulated(tmp_path: Path) -> None:
     """The energy falls once the lid stops; at Re 250 there is no table, so errors are null."""
     arguments = [*_arguments(tmp_path), "--re", "250", "--substeps", "600", "--lid-off-after", "300"]
-    assert validate.main(arguments) == 0
+    assert __main__.main(arguments) == 0
     found = json.loads((tmp_path / "result.json").read_text())
     energy = dict(zip(found["kinetic_energy"]["substep"], found["kinetic_energy"]["value"], strict=True))
     assert energy[600] < 0.95 * energy[300]
@@ -249,7 +250,7 @@ def test_validate_curl_noise(tmp_path: Path) -> None:
     """Most of the energy is left after ten frames, and divergence is small against vorticity."""
     target = tmp_path / "curl.json"
     options = ["--case", "curl-noise", "--grid", "20", "--frequency", "2", "--substeps", "500"]
-    assert validate.main([*options, "--json", str(target)]) == 0
+    assert __main__.main([*options, "--json", str(target)]) == 0
     found = json.loads(target.read_text())
     assert found["centre_lines"] is None
     assert 0.5 < found["energy_retention"] < 1.1
@@ -270,7 +271,7 @@ def test_validate_refuses_bad_options(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], words: str
 ) -> None:
     """Exit code 2, the reason on stderr without a traceback, no file written."""
-    assert validate.main([*_arguments(tmp_path), *options]) == 2
+    assert __main__.main([*_arguments(tmp_path), *options]) == 2
     told = capsys.readouterr()
     assert words in told.err
     assert "Traceback" not in told.err
@@ -281,6 +282,6 @@ def test_validate_refuses_bad_options(
 def test_validate_refuses_words_for_numbers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The parser itself exits with 2 and names the option."""
     with pytest.raises(SystemExit) as caught:
-        validate.main([*_arguments(tmp_path), "--re", "fast"])
+        __main__.main([*_arguments(tmp_path), "--re", "fast"])
     assert caught.value.code == 2
     assert "--re" in capsys.readouterr().err

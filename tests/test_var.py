@@ -12,12 +12,11 @@ from frame_cases import batch_of, facts_of, rollout, rotations, share_of_persist
 from numpy.typing import NDArray
 from statsmodels.tsa.api import VAR as StatsmodelsVAR
 
-from lagbench.baselines.normal_equations import solve
-from lagbench.baselines.principal import principal_directions
+from lagbench.baselines.least_squares import principal_directions, solve
 from lagbench.baselines.reproduce import var_protocol
 from lagbench.baselines.var import BLOCK, VAR, LaggedRows, StableVAR
 from lagbench.errors import WorkFailedError
-from lagbench.generation import GenerationResult
+from lagbench.make.generate import GenerationResult
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]

@@ -17,13 +17,13 @@ from forging import forge, mend_manifest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lagbench.data.manifest import Manifest, read_manifest
+from lagbench.data.registry import Registry, load
+from lagbench.data.scenario import check_scenario
 from lagbench.errors import DataError, UsageError
-from lagbench.generation import GenerationResult
 from lagbench.generators.record import measured_values, replace_measured
-from lagbench.manifest import Manifest, read_manifest
-from lagbench.registry import Registry, load
-from lagbench.scenario_file import check_scenario
-from lagbench.verification import evenly_spaced, verify
+from lagbench.make.generate import GenerationResult
+from lagbench.make.verify import evenly_spaced, verify
 
 Copy = Callable[[], Path]
 

@@ -16,9 +16,10 @@ import yaml
 from scenario_factory import frames_of, make_key, write_scenario
 from torch.utils.data import DataLoader
 
-from lagbench.baselines import frame_store, window_sampler
-from lagbench.baselines.batch import Batch
-from lagbench.baselines.sources import Source
+from lagbench.baselines import frame_store
+from lagbench.baselines import windows as window_sampler
+from lagbench.baselines.baseline import Batch
+from lagbench.baselines.frame_store import Source
 from lagbench.baselines.windows import (
     Window,
     WindowDataset,
@@ -27,8 +28,8 @@ from lagbench.baselines.windows import (
     scenario_batch,
     scenario_paths,
 )
+from lagbench.data.registry import Registry, load
 from lagbench.errors import DataError, LagbenchError, UsageError
-from lagbench.registry import Registry, load
 
 FRAMES = {0: 40, 1: 26, 2: 31}
 """Frames of the scenarios of train."""

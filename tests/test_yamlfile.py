@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from lagbench.data.yamlfile import MAX_BYTES, read_yaml
 from lagbench.errors import UnreadableFileError
-from lagbench.yamlfile import MAX_BYTES, read_yaml
 
 BOMB = "a: &a [x, x, x]\nb: &b [*a, *a, *a]\nc: [*b, *b, *b]\n"
 

@@ -1,14 +1,20 @@
-"""GAT: attention from a node, its neighbour and their edge, added up."""
+"""GAT: attention from a node, its neighbour and their edge, added up.
+
+GATv2: attention whose ranking of neighbours depends on the node.
+"""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch_geometric.nn import GATConv
+from torch_geometric.nn import GATConv, GATv2Conv
 
 from .operator import Losses, Operator
 
-__all__ = ["GAT"]
+__all__ = [
+    "GAT",
+    "GATv2",
+]
 
 
 class GAT(Operator):
@@ -28,6 +34,36 @@ class GAT(Operator):
     def __init__(self, latent: int, hidden: int) -> None:
         super().__init__(latent, hidden)
         self.conv = GATConv(2 * latent, latent, edge_dim=latent)
+
+    def forward(
+        self,
+        node: Tensor,
+        edge_index: Tensor,
+        edge: Tensor,
+        *,
+        generator: torch.Generator | None = None,
+    ) -> tuple[Tensor, Losses]:
+        """Return the update of each node."""
+        return self.conv(node, edge_index, edge), {}
+
+
+class GATv2(Operator):
+    r"""Dynamic graph attention of Brody et al. (2022): PyG's GATv2Conv.
+
+    .. math::
+
+        x_i' &= \sum_{j \in N(i) \cup \{i\}} \alpha_{ij} \Theta_s x_j \\
+        \alpha_{ij} &= \mathrm{softmax}_j\,a^T \mathrm{LeakyReLU}(
+            \Theta_r x_i + \Theta_s x_j + \Theta_e m_{ij})
+
+    The edge of a particle with itself is the mean of those that it receives.
+    """
+
+    method = "GNS + GATv2Conv"
+
+    def __init__(self, latent: int, hidden: int) -> None:
+        super().__init__(latent, hidden)
+        self.conv = GATv2Conv(2 * latent, latent, edge_dim=latent)
 
     def forward(
         self,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from lagbench.baselines.blocks import mlp
+from lagbench.baselines.layers import mlp
 
 from .operator import Losses, Operator
 

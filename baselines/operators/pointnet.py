@@ -5,8 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from lagbench.baselines.blocks import mlp
-from lagbench.baselines.dense import Linear
+from lagbench.baselines.layers import Linear, mlp
 
 from .operator import Losses, Operator
 

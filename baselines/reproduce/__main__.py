@@ -14,9 +14,9 @@ import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from lagbench.data.layout import resolve_root
+from lagbench.data.registry import Registry, load
 from lagbench.errors import LagbenchError, UsageError, nearest
-from lagbench.layout import resolve_root
-from lagbench.registry import Registry, load
 
 from .catalogue import ITEMS, Item
 from .making import make_run, outlook
@@ -30,12 +30,7 @@ __all__ = ["main", "reproduce"]
 
 
 def main(arguments: Sequence[str] | None = None, *, registry: Registry | None = None) -> int:
-    """Make what the arguments name; return the exit code.
-
-    Args:
-        arguments: command line; that of the process when None.
-        registry: where splits are described; ours when None.
-    """
+    """Make what the arguments name; return the exit code."""
     given = _parser().parse_args(arguments)
     try:
         items = _chosen(given.only, given.split)
@@ -66,14 +61,7 @@ def main(arguments: Sequence[str] | None = None, *, registry: Registry | None = 
 
 
 def reproduce(plan: Plan, items: Sequence[Item], *, training: bool = True, split: str | None = None) -> int:
-    """Make items; what fails is said, and the others are made. Return 0, or the last error's code.
-
-    Args:
-        plan: what was asked for.
-        items: tables and figures.
-        training: whether runs that are missing are made.
-        split: make all runs that the roster has for this split too.
-    """
+    """Make items; what fails is said, and the others are made. Return 0, or the last error's code."""
     code = 0
     if training:
         for error in _make_all(plan, items, split):
@@ -169,11 +157,7 @@ def _head(plan: Plan, item: Item) -> str:
 
 
 def _chosen(only: str | None, split: str | None) -> list[Item]:
-    """Return the items that were asked for.
-
-    Raises:
-        UsageError: no such item or split; the message names the nearest.
-    """
+    """Return the items that were asked for."""
     if split is not None and split not in EXPECTED:
         raise UsageError(f"no split {split!r}", where="--split", fix=nearest(split, EXPECTED))
     names = only.split(",") if only else list(ITEMS)

@@ -31,23 +31,14 @@ Needs = Mapping[str, tuple[str, ...]]
 
 @dataclass(frozen=True, kw_only=True)
 class Item:
-    """A table or figure.
+    """A table or figure."""
 
-    Attributes:
-        name: as in ``table_5_4``.
-        title: what the thesis shows there.
-        make: returns it.
-        needs: models whose scored runs it needs, by split.
-        studies: tables of MLPs whose trainings it needs.
-        splits: splits that it is about.
-    """
-
-    name: str
-    title: str
-    make: Callable[[Plan], Sheet]
-    needs: Needs
-    studies: tuple[str, ...]
-    splits: tuple[str, ...]
+    name: str  # as in table_5_4
+    title: str  # what the thesis shows there
+    make: Callable[[Plan], Sheet]  # returns it
+    needs: Needs  # models whose scored runs it needs, by split
+    studies: tuple[str, ...]  # tables of MLPs whose trainings it needs
+    splits: tuple[str, ...]  # splits that it is about
 
 
 def _item(

@@ -7,9 +7,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from lagbench.canvas import figure, pixels_of, png_bytes
-from lagbench.palette import INK, MUTED
-from lagbench.panels import Panel, colour_bar, draw, limit_of
+from lagbench.draw.panels import Panel, colour_bar, draw, limit_of
+from lagbench.draw.style import INK, MUTED, figure, pixels_of, png_bytes
 
 from .roster import label
 from .stage import Stage
@@ -119,14 +118,7 @@ def panel_rows(
     drawing: Drawing | None = None,
     across: bool = False,
 ) -> bytes:
-    """Draw rows of panels, one column per frame, in common colours per kind of panel.
-
-    Args:
-        rows: what each row shows.
-        frames: absolute frame numbers.
-        drawing: draws a panel in place of the usual.
-        across: one frame only: rows stand side by side, headings above.
-    """
+    """Draw rows of panels, one column per frame, in common colours per kind of panel."""
     cells = [(row, frame) for row in rows for frame in frames]
     shape = (1, len(rows)) if across else (len(rows), len(frames))
     limits = {panel: _limit(rows, frames, panel) for panel in {row[3] for row in rows}}

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lagbench.score_tables import Table
+from lagbench.scoring.tables import Table
 
 from .chart import TRUTH, Charts, charts, colour, tidy
 from .plan import Plan

@@ -15,11 +15,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from lagbench.data.registry import Registry, Size, load
+from lagbench.data.yamlfile import read_yaml
 from lagbench.errors import UnreadableFileError
-from lagbench.floors import FLOORS
-from lagbench.registry import Registry, Size, load
-from lagbench.score_file import NETCDF_NAME, read_statistics
-from lagbench.yamlfile import read_yaml
+from lagbench.scoring.floors import FLOORS
+from lagbench.scoring.score_file import NETCDF_NAME, read_statistics
 
 from .method import Cost, Method, Seeded
 
@@ -37,21 +37,13 @@ COST_NAME = "predictions.json"
 
 @dataclass(frozen=True, kw_only=True)
 class Sources:
-    """Where evidence lies.
+    """Where evidence lies."""
 
-    Attributes:
-        board: the leaderboard's folder; None to use runs alone.
-        weights: folder of committed weights and what their trainings recorded.
-        runs: folder of runs; None to use committed files alone.
-        recipe: variant of the recipes whose runs to read; None for the size's own.
-        registry: where splits are described; ours when None.
-    """
-
-    board: Path | None = BOARD
-    weights: Path = WEIGHTS
-    runs: Path | None = None
-    recipe: str | None = None
-    registry: Registry | None = None
+    board: Path | None = BOARD  # the leaderboard's folder; None to use runs alone
+    weights: Path = WEIGHTS  # folder of committed weights and what their trainings recorded
+    runs: Path | None = None  # folder of runs; None to use committed files alone
+    recipe: str | None = None  # variant of the recipes whose runs to read; None for the size's own
+    registry: Registry | None = None  # where splits are described; ours when None
 
     def size(self, split: str, size: str) -> Size:
         """Return what the registry says of a split and size."""
@@ -78,27 +70,12 @@ class Sources:
 
 
 class Evidence:
-    """What is known of the models on one split and size.
-
-    Attributes:
-        size: what the registry says.
-        methods: models by name, floors among them.
-        stale: files of scores that belong to another version of the data, which are left out.
-    """
+    """What is known of the models on one split and size."""
 
     def __init__(self, sources: Sources, split: str, size: str) -> None:
-        """Read entries, score files and records.
-
-        Args:
-            sources: where they lie.
-            split: name of the split.
-            size: name of the size.
-
-        Raises:
-            UsageError: unknown split or size.
-            UnreadableFileError: a file is not what its name promises.
-        """
-        self.size = sources.size(split, size)
+        """Read entries, score files and records."""
+        self.size = sources.size(split, size)  # what the registry says
+        # files of scores that belong to another version of the data, which are left out
         self.stale: list[Path] = []
         self._sources = sources
         board = sources.board
@@ -116,6 +93,7 @@ class Evidence:
                     found, name, seed, path, read_json(folder / RECORD_NAME) or self._record(name, seed)
                 )
                 costs = _run_cost(name, folder) | costs
+        # models by name, floors among them
         self.methods = {
             name: Method(
                 name=name,
@@ -196,11 +174,7 @@ def _parameters(seeds: Iterable[Seeded], entry: Mapping[str, Any] | None) -> int
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Return what a JSON file holds; nothing where it is not there.
-
-    Raises:
-        UnreadableFileError: it holds no JSON mapping.
-    """
+    """Return what a JSON file holds; nothing where it is not there."""
     if not path.is_file():
         return {}
     try:

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lagbench.panels import Panel, colour_scale, draw_walls
-from lagbench.score_tables import Table
+from lagbench.draw.panels import Panel, colour_scale, draw_walls
+from lagbench.scoring.tables import Table
 
 from .chart import Drawing, Line, named, panel_rows
 from .plan import Plan
@@ -31,15 +31,10 @@ AFTER = (1, 5, 10, 20, 30, 40)
 
 @dataclass(frozen=True, kw_only=True)
 class Figure:
-    """A figure of truth above prediction for some test cases.
+    """A figure of truth above prediction for some test cases."""
 
-    Attributes:
-        cases: numbers of the test cases, T0 first.
-        styles: quiver, streamlines: one picture each.
-    """
-
-    cases: tuple[int, ...]
-    styles: tuple[str, ...]
+    cases: tuple[int, ...]  # numbers of the test cases, T0 first
+    styles: tuple[str, ...]  # quiver, streamlines: one picture each
 
 
 FIGURES: Mapping[str, Figure] = {

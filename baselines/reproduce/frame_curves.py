@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lagbench.metrics import Score
 from lagbench.metrics.reductions import mean
-from lagbench.score_tables import Table
+from lagbench.scoring.tables import Table
 
 from .chart import TRUTH, charts, colour, tidy
 from .evidence import Evidence
@@ -35,25 +35,15 @@ BOUNDS = ((40, 0.0002), (80, 0.0004))
 
 @dataclass(frozen=True, kw_only=True)
 class Figure:
-    """A figure of curves over frames.
+    """A figure of curves over frames."""
 
-    Attributes:
-        split: name of the split.
-        metric: metric of a model per frame.
-        truth: metric that holds the truth's value; empty where 0 is perfect.
-        axis: what the vertical axis shows.
-        models: whose curves.
-        cases: whether each test scenario is a curve of its own.
-        said: what the thesis says of its figure.
-    """
-
-    split: str
-    metric: str
-    axis: str
-    said: str
-    truth: str = ""
-    models: tuple[str, ...] = OPERATORS
-    cases: bool = False
+    split: str  # name of the split
+    metric: str  # metric of a model per frame
+    axis: str  # what the vertical axis shows
+    said: str  # what the thesis says of its figure
+    truth: str = ""  # metric that holds the truth's value; empty where 0 is perfect
+    models: tuple[str, ...] = OPERATORS  # whose curves
+    cases: bool = False  # whether each test scenario is a curve of its own
 
 
 FIGURES: Mapping[str, Figure] = {

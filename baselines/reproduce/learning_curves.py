@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.extras import require
-from lagbench.score_tables import Table
+from lagbench.errors import require
+from lagbench.scoring.tables import Table
 
 from .chart import charts, colour, tidy
 from .evidence import read_json
@@ -35,31 +35,16 @@ SMOOTHED = 25
 
 @dataclass(frozen=True, kw_only=True)
 class Curve:
-    """The loss of one training.
+    """The loss of one training."""
 
-    Attributes:
-        name: what the legend calls it.
-        colour: of its line; None for the next in turn.
-        steps: optimiser steps, shape [entry].
-        loss: weighted sum of the raw terms, shape [entry].
-    """
-
-    name: str
-    colour: str | None
-    steps: Floats
-    loss: Floats
+    name: str  # what the legend calls it
+    colour: str | None  # of its line; None for the next in turn
+    steps: Floats  # optimiser steps, shape [entry]
+    loss: Floats  # weighted sum of the raw terms, shape [entry]
 
 
 def loss_over_steps(folder: Path, term: str = "total") -> tuple[Floats, Floats]:
-    """Return steps and loss of a training; empty where it left no log.
-
-    Args:
-        folder: folder of the run.
-        term: term of the loss.
-
-    Raises:
-        UsageError: TensorBoard is not installed.
-    """
+    """Return steps and loss of a training; empty where it left no log."""
     logs = folder / "tensorboard"
     if not logs.is_dir():
         return np.empty(0), np.empty(0)

@@ -6,19 +6,19 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from lagbench.baselines.job import OVER
 from lagbench.errors import DataError, UsageError
-from lagbench.progress import Progress
-from lagbench.score_card import JSON_NAME
-from lagbench.score_file import NETCDF_NAME, read_statistics
+from lagbench.scoring.card import JSON_NAME
+from lagbench.scoring.score_file import NETCDF_NAME, read_statistics
 from lagbench.submission import open_predictions
+from lagbench.work.progress import Progress
 
-from ..ledger import OVER
 from .evidence import RECORD_NAME, read_json
 from .plan import Plan
 from .roster import Model
 
 if TYPE_CHECKING:
-    from ..recipe import Recipe
+    from lagbench.baselines.recipe import Recipe
 
 __all__ = ["check_training", "make_run", "make_training", "outlook"]
 
@@ -40,19 +40,6 @@ def make_run(
 
     An interrupted training goes on where it stopped; predictions and scores of other data are
     made again.
-
-    Args:
-        plan: what was asked for.
-        split: name of the split.
-        model: what to train.
-        seed: seed of the training.
-        progress: called as the work advances.
-        say: called with what is made again, and why.
-
-    Raises:
-        UsageError: the folder holds a training with another recipe.
-        DataError: it holds a training on other data.
-        LagbenchError: as training, prediction and scoring do.
     """
     folder = plan.folder(split, model, seed)
     predictions, scores = folder / PREDICTIONS, folder / NETCDF_NAME
@@ -64,7 +51,7 @@ def make_run(
         return folder
     if not predictions.is_file():
         make_training(plan, split, model, seed, folder=folder, progress=progress)
-        from ..prediction import predict
+        from lagbench.baselines.predict import predict
 
         predict(
             folder / "weights.pt",
@@ -76,7 +63,7 @@ def make_run(
             progress=progress,
             registry=plan.registry,
         )
-    from lagbench.scoring import score
+    from lagbench.scoring.score import score
 
     score(predictions, root=plan.root, registry=plan.registry, progress=progress)
     return folder
@@ -91,22 +78,10 @@ def make_training(
     folder: Path,
     progress: Callable[[Progress], None] | None = None,
 ) -> None:
-    """Train a model unless its training is complete.
-
-    Args:
-        plan: what was asked for.
-        split: name of the split.
-        model: what to train.
-        seed: seed of the training.
-        folder: folder of the run.
-        progress: called as the work advances.
-
-    Raises:
-        LagbenchError: as :func:`lagbench.baselines.training.train` does.
-    """
+    """Train a model unless its training is complete."""
     if _complete(folder):
         return
-    from ..training import train
+    from lagbench.baselines.train import train
 
     train(
         model.baseline,
@@ -125,23 +100,11 @@ def make_training(
 
 
 def check_training(plan: Plan, split: str, model: Model, seed: int, *, folder: Path) -> None:
-    """Refuse a folder whose training is not the one that was asked for.
-
-    Args:
-        plan: what was asked for.
-        split: name of the split.
-        model: what to train.
-        seed: seed of the training.
-        folder: folder of the run; one without a record passes.
-
-    Raises:
-        UsageError: it was trained with another recipe.
-        DataError: it was trained on other data.
-    """
+    """Refuse a folder whose training is not the one that was asked for."""
     record = read_json(folder / RECORD_NAME)
     if not record:
         return
-    from ..run_folder import first_difference
+    from lagbench.baselines.job import first_difference
 
     asked = _recipe(plan, split, model, seed).as_json()
     if record.get("recipe") != asked:
@@ -156,11 +119,7 @@ def check_training(plan: Plan, split: str, model: Model, seed: int, *, folder: P
 
 
 def outlook(plan: Plan, split: str, model: Model, seed: int) -> str:
-    """Return what :func:`make_run` would do, in words; nothing is made.
-
-    Raises:
-        LagbenchError: as :func:`make_run` does before it makes anything.
-    """
+    """Return what :func:`make_run` would do, in words; nothing is made."""
     folder = plan.folder(split, model, seed)
     check_training(plan, split, model, seed, folder=folder)
     stale = _stale(plan.hash(split), folder)
@@ -179,8 +138,8 @@ def outlook(plan: Plan, split: str, model: Model, seed: int) -> str:
 
 def _recipe(plan: Plan, split: str, model: Model, seed: int) -> Recipe:
     """Return the recipe that was asked for."""
-    from ..catalogue import find
-    from ..recipe import recipe_for
+    from lagbench.baselines.catalogue import find
+    from lagbench.baselines.recipe import recipe_for
 
     settings, variant = (*model.settings, *plan.settings), model.recipe or plan.recipe
     return recipe_for(find(model.baseline), split, plan.size, variant=variant, settings=settings, seed=seed)

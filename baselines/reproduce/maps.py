@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from lagbench.panels import Panel
-from lagbench.score_tables import Table
+from lagbench.draw.panels import Panel
+from lagbench.scoring.tables import Table
 
 from .chart import Line, named, panel_rows
 from .evidence import Evidence
@@ -23,20 +23,13 @@ __all__ = ["FIGURES", "Figure", "draw_figure"]
 
 @dataclass(frozen=True, kw_only=True)
 class Figure:
-    """A figure of maps of test case T0.
+    """A figure of maps of test case T0."""
 
-    Attributes:
-        split: name of the split.
-        models: models beside the truth.
-        panels: kinds of map, one picture each.
-        after: frames after the last given one; empty for the frame at which models are compared.
-        said: what the thesis says of its figure.
-    """
-
-    split: str
-    models: tuple[str, ...]
-    panels: tuple[Panel, ...]
-    said: str
+    split: str  # name of the split
+    models: tuple[str, ...]  # models beside the truth
+    panels: tuple[Panel, ...]  # kinds of map, one picture each
+    said: str  # what the thesis says of its figure
+    # frames after the last given one; empty for the frame at which models are compared
     after: tuple[int, ...] = ()
 
 

@@ -22,16 +22,11 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class Cost:
-    """What a predicted frame costs.
+    """What a predicted frame costs."""
 
-    Attributes:
-        seconds_per_frame: of the model [s].
-        device: where it ran.
-        solver_seconds_per_frame: of the solver on the same machine [s]; None where not measured.
-    """
-
-    seconds_per_frame: float
-    device: str
+    seconds_per_frame: float  # of the model [s]
+    device: str  # where it ran
+    # of the solver on the same machine [s]; None where not measured
     solver_seconds_per_frame: float | None = None
 
     @property
@@ -43,19 +38,12 @@ class Cost:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Seeded:
-    """One training of a model.
+    """One training of a model."""
 
-    Attributes:
-        seed: its seed; None for what has none.
-        scores: scores by metric.
-        record: what training.json says; empty where it is not there.
-        path: file of the scores.
-    """
-
-    seed: int | None
-    scores: Mapping[str, Score]
-    record: Mapping[str, Any]
-    path: Path
+    seed: int | None  # its seed; None for what has none
+    scores: Mapping[str, Score]  # scores by metric
+    record: Mapping[str, Any]  # what training.json says; empty where it is not there
+    path: Path  # file of the scores
 
     @property
     def cpu_hours(self) -> float | None:
@@ -66,19 +54,12 @@ class Seeded:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Method:
-    """A model with all its seeds.
+    """A model with all its seeds."""
 
-    Attributes:
-        name: as in ``gns`` or ``gns-novorticity``.
-        seeds: one entry per training.
-        cost: of a predicted frame; None where it was not measured.
-        parameters: trained numbers; None where unknown.
-    """
-
-    name: str
-    seeds: tuple[Seeded, ...]
-    cost: Cost | None = None
-    parameters: int | None = None
+    name: str  # as in 'gns' or 'gns-novorticity'
+    seeds: tuple[Seeded, ...]  # one entry per training
+    cost: Cost | None = None  # of a predicted frame; None where it was not measured
+    parameters: int | None = None  # trained numbers; None where unknown
 
     @cached_property
     def scores(self) -> Mapping[str, Score]:

@@ -13,8 +13,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from lagbench.atomic import write_atomically
-from lagbench.progress import Progress
-from lagbench.score_tables import Table
+from lagbench.scoring.tables import Table
+from lagbench.work.progress import Progress
 
 from .evidence import read_json
 from .making import check_training, make_training
@@ -79,13 +79,7 @@ def study_folder(plan: Plan, name: str, study: Study) -> Path:
 
 
 def make_studies(plan: Plan, name: str, progress: Callable[[Progress], None] | None = None) -> None:
-    """Train the rows of a table and measure their errors, unless that was done.
-
-    Raises:
-        UsageError: a folder holds a training with another recipe.
-        DataError: a folder holds a training on other data.
-        LagbenchError: as training does.
-    """
+    """Train the rows of a table and measure their errors, unless that was done."""
     split = TABLES[name][1]
     for study in study_rows(name):
         folder, model = study_folder(plan, name, study), study_model(plan, study)
@@ -100,8 +94,8 @@ def one_step_error(plan: Plan, split: str, folder: Path, subset: str) -> float:
     """Return the mean of Eq. 4.16 over the windows of a subset [standardised^2]."""
     import torch
 
-    from ..checkpoint import load, restore
-    from ..windows import WindowDataset, collate
+    from lagbench.baselines.checkpoint import load, restore
+    from lagbench.baselines.windows import WindowDataset, collate
 
     model = restore(load(folder / "weights.pt")).eval()
     data = WindowDataset(

@@ -7,8 +7,8 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from lagbench.panels import Panel, draw
-from lagbench.score_tables import Table
+from lagbench.draw.panels import Panel, draw
+from lagbench.scoring.tables import Table
 
 from .chart import Line, named, panel_rows
 from .evidence import Evidence
@@ -29,19 +29,12 @@ TIMES = 6
 
 @dataclass(frozen=True, kw_only=True)
 class Figure:
-    """A figure of particles.
+    """A figure of particles."""
 
-    Attributes:
-        split: name of the split.
-        scenarios: ids in the thesis.
-        models: rows below the truth, for each scenario.
-        said: what the thesis says of its figure.
-    """
-
-    split: str
-    scenarios: tuple[int, ...]
-    models: tuple[str, ...]
-    said: str
+    split: str  # name of the split
+    scenarios: tuple[int, ...]  # ids in the thesis
+    models: tuple[str, ...]  # rows below the truth, for each scenario
+    said: str  # what the thesis says of its figure
 
 
 FIGURES: Mapping[str, Figure] = {

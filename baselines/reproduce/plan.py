@@ -6,11 +6,11 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
+from lagbench.data.local import rooted
+from lagbench.data.manifest import read_manifest
+from lagbench.data.registry import Registry, Size
 from lagbench.errors import UsageError
-from lagbench.exam import Exam, load_exam
-from lagbench.locating import rooted
-from lagbench.manifest import read_manifest
-from lagbench.registry import Registry, Size
+from lagbench.scoring.task import ScoredTask, load_scored_task
 
 from .evidence import Evidence, Sources
 from .roster import Model
@@ -20,33 +20,20 @@ __all__ = ["Plan"]
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """One size to reproduce.
+    """One size to reproduce."""
 
-    Attributes:
-        size: name of the size.
-        root: folder of all data sets.
-        runs: folder of runs; what is there is not made again.
-        output: folder of tables and pictures.
-        seeds: seeds of every training; pictures show the first.
-        recipe: variant of the recipes, as in ``short``; None for the size's own.
-        settings: changes to every recipe, as in ``training.steps=100``.
-        device: ``cpu``, ``cuda`` or ``auto``.
-        threads: threads on the CPU; one per core by default.
-        registry: where splits are described; ours when None.
-    """
-
-    size: str
-    root: Path
-    runs: Path
-    output: Path
-    seeds: tuple[int, ...] = (0,)
-    recipe: str | None = None
-    settings: tuple[str, ...] = ()
-    device: str = "auto"
-    threads: int | None = None
-    registry: Registry | None = None
+    size: str  # name of the size
+    root: Path  # folder of all data sets
+    runs: Path  # folder of runs; what is there is not made again
+    output: Path  # folder of tables and pictures
+    seeds: tuple[int, ...] = (0,)  # seeds of every training; pictures show the first
+    recipe: str | None = None  # variant of the recipes, as in 'short'; None for the size's own
+    settings: tuple[str, ...] = ()  # changes to every recipe, as in training.steps=100
+    device: str = "auto"  # 'cpu', 'cuda' or 'auto'
+    threads: int | None = None  # threads on the CPU; one per core by default
+    registry: Registry | None = None  # where splits are described; ours when None
     _evidence: dict[str, Evidence] = field(default_factory=dict, compare=False, repr=False)
-    _exams: dict[str, Exam] = field(default_factory=dict, compare=False, repr=False)
+    _exams: dict[str, ScoredTask] = field(default_factory=dict, compare=False, repr=False)
 
     @cached_property
     def described(self) -> Registry:
@@ -58,11 +45,7 @@ class Plan:
         return self.described.size(split, self.size)
 
     def hash(self, split: str) -> str | None:
-        """Return the hash of a split's data, those at hand before those recorded; None where unknown.
-
-        Raises:
-            DataError: the manifest is damaged.
-        """
+        """Return the hash of a split's data, those at hand before those recorded; None where unknown."""
         tier = self.tier(split)
         manifest = read_manifest(self.root, tier.split, tier.name, tier.major)
         recorded = tier.measured.dataset_sha256 if tier.measured else None
@@ -72,8 +55,8 @@ class Plan:
         """Return whether a model has the variant of the recipes that was asked for."""
         if self.recipe is None or self.recipe.endswith((".yaml", ".yml")):
             return True
-        from ..catalogue import find
-        from ..recipe import recipe_names
+        from lagbench.baselines.catalogue import find
+        from lagbench.baselines.recipe import recipe_names
 
         try:
             known = recipe_names(find(model.baseline))
@@ -108,12 +91,8 @@ class Plan:
         """Score files of other data among the evidence that was read; they are left out."""
         return [path for evidence in self._evidence.values() for path in evidence.stale]
 
-    def exam(self, split: str) -> Exam:
-        """Return the test subset of a split.
-
-        Raises:
-            DataError: it is missing or damaged.
-        """
+    def exam(self, split: str) -> ScoredTask:
+        """Return the test subset of a split."""
         if split not in self._exams:
-            self._exams[split] = load_exam(self.tier(split), self.root)
+            self._exams[split] = load_scored_task(self.tier(split), self.root)
         return self._exams[split]

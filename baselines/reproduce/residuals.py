@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lagbench.score_tables import Table
+from lagbench.scoring.tables import Table
 
 from .chart import charts, colour, tidy
 from .evidence import Evidence

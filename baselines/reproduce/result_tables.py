@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from lagbench.exam import ranking_metric
-from lagbench.floors import FLOORS
-from lagbench.markdown import table
+from lagbench.draw.markdown import table
 from lagbench.metrics import Direction, Metric
-from lagbench.score_tables import ARROWS
+from lagbench.scoring.floors import FLOORS
+from lagbench.scoring.tables import ARROWS
+from lagbench.scoring.task import ranking_metric
 
 from .evidence import Evidence
 from .method import Method

@@ -16,9 +16,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from lagbench.atomic import write_atomically
+from lagbench.draw.markdown import table
 from lagbench.errors import LagbenchError
-from lagbench.exam import ranking_metric
-from lagbench.markdown import table
+from lagbench.scoring.task import ranking_metric
 
 from .evidence import BOARD, WEIGHTS, Evidence, Sources, read_json
 from .result_tables import costs, horizon, rollout_errors, totals, vorticity_at
@@ -61,15 +61,7 @@ others), `mlp-change` is `--baseline mlp --recipe change`."""
 
 
 def render(sources: Sources, sizes: Sequence[str] = SIZES) -> str:
-    """Return the page.
-
-    Args:
-        sources: where scores and records lie.
-        sizes: sizes to report.
-
-    Raises:
-        UnreadableFileError: a file is not what its name promises.
-    """
+    """Return the page."""
     found = [Evidence(sources, split, size) for size in sizes for split in EXPECTED]
     known = [evidence for evidence in found if evidence.methods]
     parts = [HEAD, _findings(known), *(part for evidence in known for part in _chapter(evidence))]

@@ -16,21 +16,13 @@ SIZES = ("mini", "full")
 
 @dataclass(frozen=True, kw_only=True)
 class Model:
-    """A baseline, or a variant of one.
+    """A baseline, or a variant of one."""
 
-    Attributes:
-        name: as in ``gns-novorticity``; it names folders of runs and entries of the board.
-        baseline: what ``lagbench train --baseline`` is given.
-        label: what tables call it.
-        settings: changes to the recipe, as in ``model.loss.vorticity=0``.
-        recipe: variant of the recipe, as in ``change``; None for the size's own.
-    """
-
-    name: str
-    baseline: str
-    label: str
-    settings: tuple[str, ...] = ()
-    recipe: str | None = None
+    name: str  # as in gns-novorticity; it names folders of runs and entries of the board
+    baseline: str  # what lagbench train --baseline is given
+    label: str  # what tables call it
+    settings: tuple[str, ...] = ()  # changes to the recipe, as in model.loss.vorticity=0
+    recipe: str | None = None  # variant of the recipe, as in 'change'; None for the size's own
 
 
 def _changing(name: str) -> Model:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from lagbench.registry import Size
+from lagbench.data.registry import Size
 
 from .thesis import TABLE_4_8, Rollout
 
@@ -40,7 +40,7 @@ def case_id(size: Size, number: int) -> int | None:
 def after_given(size: Size, counts: Iterable[int]) -> tuple[int, ...]:
     """Return the absolute frames so many after the last given one, those that are predicted.
 
-    >>> from lagbench.registry import load
+    >>> from lagbench.data.registry import load
     >>> after_given(load().size("curl-noise", "full"), (1, 5, 35, 500))
     (6, 10, 40)
     """

@@ -8,7 +8,7 @@ from dataclasses import asdict
 from typing import Any
 
 from lagbench.atomic import write_atomically
-from lagbench.score_tables import Table
+from lagbench.scoring.tables import Table
 
 from .plan import Plan
 from .sheet import Sheet

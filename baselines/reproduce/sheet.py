@@ -9,39 +9,23 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from lagbench.atomic import write_atomically
-from lagbench.markdown import table
-from lagbench.score_tables import Table
+from lagbench.draw.markdown import table
+from lagbench.scoring.tables import Table
 
 __all__ = ["Sheet", "write_sheet"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sheet:
-    """One table or figure of the thesis, ours beside it.
+    """One table or figure of the thesis, ours beside it."""
 
-    Attributes:
-        notes: sentences; one paragraph each.
-        tables: numbers as text, one table each.
-        pictures: PNG files by what is added to their name.
-    """
-
-    notes: tuple[str, ...] = ()
-    tables: tuple[Table, ...] = ()
-    pictures: Mapping[str, bytes] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()  # sentences; one paragraph each
+    tables: tuple[Table, ...] = ()  # numbers as text, one table each
+    pictures: Mapping[str, bytes] = field(default_factory=dict)  # PNG files by what is added to their name
 
 
 def write_sheet(sheet: Sheet, folder: Path, name: str, head: str) -> str:
-    """Write ``<name>.md``, ``<name>[-n].csv`` and pictures; return the Markdown.
-
-    Args:
-        sheet: what to write.
-        folder: where to.
-        name: as in ``table_5_4``.
-        head: title, and what was run.
-
-    Raises:
-        WorkFailedError: the operating system refused.
-    """
+    """Write ``<name>.md``, ``<name>[-n].csv`` and pictures; return the Markdown."""
     parts = [head, *sheet.notes]
     for number, held in enumerate(sheet.tables):
         parts += [f"**{held.title}**", table(held.columns, held.rows)] if held.title else [_plain(held)]

@@ -8,9 +8,9 @@ from contextlib import ExitStack, contextmanager
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.data.scenario import ScenarioFile
+from lagbench.draw.recording import Recording, Scene, open_recording
 from lagbench.metrics import FramePair, Scenario, Snapshot
-from lagbench.recording import Recording, Scene, open_recording
-from lagbench.scenario_file import ScenarioFile
 from lagbench.submission import Predictions, open_predictions
 
 from .plan import Plan
@@ -21,14 +21,7 @@ Floats = NDArray[np.float64]
 
 
 class Stage:
-    """One test scenario.
-
-    Attributes:
-        id: its number.
-        scenario: what holds in all its frames, as metrics see it.
-        recording: the same as pictures see it.
-        names: models whose predictions are here, in the order in which they were asked for.
-    """
+    """One test scenario."""
 
     def __init__(
         self,
@@ -37,9 +30,10 @@ class Stage:
         recording: Recording,
         predictions: Mapping[str, Predictions],
     ) -> None:
-        self.id = recording.scenario
-        self.scenario = scenario
-        self.recording = recording
+        self.id = recording.scenario  # its number
+        self.scenario = scenario  # what holds in all its frames, as metrics see it
+        self.recording = recording  # the same as pictures see it
+        # models whose predictions are here, in the order in which they were asked for
         self.names = tuple(predictions)
         self._file = file
         self._predictions = predictions
@@ -87,18 +81,7 @@ class Stage:
 
 @contextmanager
 def staged(plan: Plan, split: str, scenario: int, names: Iterable[str]) -> Iterator[Stage]:
-    """Open a test scenario with the predictions of models; those without a run are left out.
-
-    Args:
-        plan: what was asked for.
-        split: name of the split.
-        scenario: id of a test scenario.
-        names: models.
-
-    Raises:
-        DataError: the scenario is missing or damaged.
-        UnreadableFileError: predictions are.
-    """
+    """Open a test scenario with the predictions of models; those without a run are left out."""
     paths = {name: plan.predictions(split, name) for name in names}
     with ExitStack() as stack:
         opened = stack.enter_context(plan.exam(split).opened(scenario))

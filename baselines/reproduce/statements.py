@@ -11,8 +11,8 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from lagbench.exam import ranking_metric
 from lagbench.metrics import Score, compare
+from lagbench.scoring.task import ranking_metric
 
 from .evidence import Evidence
 from .method import Method

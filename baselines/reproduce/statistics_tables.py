@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from lagbench.data.manifest import read_manifest
 from lagbench.errors import DataError
-from lagbench.manifest import read_manifest
-from lagbench.score_tables import Table
+from lagbench.scoring.tables import Table
 
 from .plan import Plan
 from .sheet import Sheet
@@ -18,11 +18,7 @@ SPLITS = {"table_5_1": "curl-noise", "table_5_3": "cavity"}
 
 
 def table(plan: Plan, name: str) -> Sheet:
-    """Return the statistics of one split.
-
-    Raises:
-        DataError: they are recorded nowhere.
-    """
+    """Return the statistics of one split."""
     split = SPLITS[name]
     tier = plan.tier(split)
     manifest = read_manifest(plan.root, split, plan.size, tier.major)

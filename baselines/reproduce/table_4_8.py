@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from lagbench.score_tables import Table
+from lagbench.scoring.tables import Table
 
 from .evidence import Evidence
 from .plan import Plan

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 
-from lagbench.score_tables import Table
+from lagbench.scoring.tables import Table
 
 from .chart import charts, colour, tidy
 from .interpolation import Floats, cubic_vorticity, errors

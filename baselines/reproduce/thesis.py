@@ -29,29 +29,17 @@ __all__ = [
 
 @dataclass(frozen=True, kw_only=True)
 class Study:
-    """One row of Tables 4.2 to 4.5: an MLP from frame to frame.
+    """One row of Tables 4.2 to 4.5: an MLP from frame to frame."""
 
-    Attributes:
-        table: number of the table, as in "4.2".
-        row: number of the row, from 1.
-        widths: units of the hidden layers.
-        activation: elu, relu, tanh or sigmoid.
-        parameters: as printed.
-        epochs: passes over the data.
-        batch: frames of an optimiser step.
-        train: mean squared error of training [standardised^2].
-        valid: of validation.
-    """
-
-    table: str
-    row: int
-    widths: tuple[int, ...]
-    activation: str
-    parameters: int
-    epochs: int
-    batch: int
-    train: float
-    valid: float
+    table: str  # number of the table, as in "4.2"
+    row: int  # number of the row, from 1
+    widths: tuple[int, ...]  # units of the hidden layers
+    activation: str  # elu, relu, tanh or sigmoid
+    parameters: int  # as printed
+    epochs: int  # passes over the data
+    batch: int  # frames of an optimiser step
+    train: float  # mean squared error of training [standardised^2]
+    valid: float  # of validation
 
 
 def _study(
@@ -129,19 +117,12 @@ STUDIES = (
 
 @dataclass(frozen=True, kw_only=True)
 class Rollout:
-    """One row of Table 4.8: errors of a rollout (Eqs. 4.17, 4.18) [standardised^2].
+    """One row of Table 4.8: errors of a rollout (Eqs. 4.17, 4.18) [standardised^2]."""
 
-    Attributes:
-        scenario: id in the thesis, and in our size ``full``.
-        scene: what moves.
-        average: average error by model.
-        end: error at the last frame by model.
-    """
-
-    scenario: int
-    scene: str
-    average: Mapping[str, float]
-    end: Mapping[str, float]
+    scenario: int  # id in the thesis, and in our size 'full'
+    scene: str  # what moves
+    average: Mapping[str, float]  # average error by model
+    end: Mapping[str, float]  # error at the last frame by model
 
 
 FRAME_MODELS = ("mlp", "lstm", "lstm-mlp")
@@ -179,21 +160,13 @@ SECTION_4_8_3: Mapping[str, float] = MappingProxyType({"minutes": 33.0, "gigabyt
 
 @dataclass(frozen=True, kw_only=True)
 class VorticityRow:
-    """One row of Tables 5.4 and 5.5 and Fig. 5.13: test scenario T0 of the cavity at frame 54.
+    """One row of Tables 5.4 and 5.5 and Fig. 5.13: test scenario T0 of the cavity at frame 54."""
 
-    Attributes:
-        mae: mean absolute error of the vorticity [1/frame].
-        mse: mean squared error.
-        rmse: its root.
-        kl: divergence of the magnitudes per node [nat].
-        pearson: correlation with the truth.
-    """
-
-    mae: float
-    mse: float
-    rmse: float
-    kl: float
-    pearson: float
+    mae: float  # mean absolute error of the vorticity [1/frame]
+    mse: float  # mean squared error
+    rmse: float  # its root
+    kl: float  # divergence of the magnitudes per node [nat]
+    pearson: float  # correlation with the truth
 
 
 def _vorticity(mae: float, mse: float, rmse: float, kl: float, pearson: float) -> VorticityRow:

@@ -25,11 +25,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.baselines.normal_equations import LeastSquares, solve
+from lagbench.baselines.least_squares import LeastSquares, solve
 from lagbench.baselines.var import LaggedRows
 from lagbench.baselines.windows import scenario_paths
-from lagbench.registry import load
-from lagbench.scenario_file import read_scenario
+from lagbench.data.registry import load
+from lagbench.data.scenario import read_scenario
 
 __all__ = ["ProtocolResult", "forecast_errors", "measure"]
 
@@ -44,54 +44,29 @@ States = NDArray[np.float32]
 
 @dataclass(frozen=True, kw_only=True)
 class ProtocolResult:
-    """What the thesis states, and what explains it.
+    """What the thesis states, and what explains it."""
 
-    Attributes:
-        split: name of the split.
-        size: name of the size.
-        features: dimensions of the VAR.
-        frames: frames fitted.
-        fit_seconds: wall time of the fit [s].
-        cpu_seconds: CPU time of the fit, all threads [s].
-        peak_gb: largest resident memory of the process [GB].
-        condition: condition number of the regressors.
-        floor: see :class:`~lagbench.baselines.normal_equations.LeastSquares`.
-        fit_mse: mean squared error of one step over the frames fitted [standardised^2].
-        forecast_frames: frames forecast.
-        forecast_mse: mean over them [standardised^2]; infinite once a forecast overflows.
-        mse_at: mean squared error of single frames of the forecast, by frame [standardised^2].
-        growth: factor per frame by which the last frames of the forecast grow; above 1 it diverges.
-        persistence_mse: of the last frame of training, kept [standardised^2].
-    """
-
-    split: str
-    size: str
-    features: int
-    frames: int
-    fit_seconds: float
-    cpu_seconds: float
-    peak_gb: float
-    condition: float
-    floor: float
-    fit_mse: float
+    split: str  # name of the split
+    size: str  # name of the size
+    features: int  # dimensions of the VAR
+    frames: int  # frames fitted
+    fit_seconds: float  # wall time of the fit [s]
+    cpu_seconds: float  # CPU time of the fit, all threads [s]
+    peak_gb: float  # largest resident memory of the process [GB]
+    condition: float  # condition number of the regressors
+    floor: float  # see LeastSquares
+    fit_mse: float  # mean squared error of one step over the frames fitted [standardised^2]
     forecast_frames: int
-    forecast_mse: float
-    mse_at: dict[int, float]
-    growth: float
-    persistence_mse: float
+    forecast_mse: float  # mean over them [standardised^2]; infinite once a forecast overflows
+    mse_at: dict[int, float]  # mean squared error of single frames of the forecast, by frame [standardised^2]
+    growth: float  # factor per frame by which the last frames of the forecast grow; above 1 it diverges
+    persistence_mse: float  # of the last frame of training, kept [standardised^2]
 
 
 def measure(
     split: str = "fluid", size: str = "full", *, root: str | Path | None = None, lags: int = 1
 ) -> ProtocolResult:
-    """Fit and forecast by the thesis's protocol.
-
-    Args:
-        split: name of the split.
-        size: name of the size.
-        root: folder of all data sets.
-        lags: order of the VAR.
-    """
+    """Fit and forecast by the thesis's protocol."""
     states = _all_states(split, size, root)
     train = int(TRAIN * len(states))
     valid = states[train : train + int(VALID * len(states))]

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lagbench.atomic import write_atomically
+from lagbench.data.registry import Registry
 from lagbench.errors import ChecksFailedError
-from lagbench.registry import Registry
 
 from .collect import collect
 from .folder import Folder
@@ -21,21 +21,13 @@ OPTION = "--board"
 
 @dataclass(frozen=True, kw_only=True)
 class BuildResult:
-    """A page that was drawn.
-
-    Attributes:
-        page: the page.
-        bytes: its length.
-        tabs: splits and sizes on it.
-        rows: entries on it.
-        written: files that were written, because they were missing or had other bytes.
-    """
+    """A page that was drawn."""
 
     page: Path
-    bytes: int
-    tabs: int
-    rows: int
-    written: tuple[Path, ...]
+    bytes: int  # its length
+    tabs: int  # splits and sizes on it
+    rows: int  # entries on it
+    written: tuple[Path, ...]  # files that were written, because they were missing or had other bytes
 
 
 def build(

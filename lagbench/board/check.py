@@ -11,12 +11,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
+from lagbench.data.layout import resolve_root
+from lagbench.data.registry import Registry, Size, load
 from lagbench.errors import LagbenchError
-from lagbench.floors import FLOORS
-from lagbench.layout import resolve_root
-from lagbench.progress import Progress
-from lagbench.registry import Registry, Size, load
+from lagbench.scoring.floors import FLOORS
 from lagbench.submission import Finding
+from lagbench.work.progress import Progress
 
 from .build import build
 from .entry import Entry, Status
@@ -58,23 +58,14 @@ Known = tuple[Entry, Size]
 
 @dataclass(frozen=True, kw_only=True)
 class CheckResult:
-    """What the checks say of a leaderboard's folder.
-
-    Attributes:
-        folder: the folder.
-        entries: entries that were looked at.
-        findings: all that is wrong.
-        page_checked: whether the page was compared; it is not while anything else is wrong.
-        floors_rescored: splits and sizes whose floors were predicted and scored anew.
-        floors_trusted: those whose floors' numbers were only aggregated again.
-    """
+    """What the checks say of a leaderboard's folder."""
 
     folder: Path
-    entries: int
-    findings: tuple[Finding, ...]
-    page_checked: bool
-    floors_rescored: tuple[str, ...] = ()
-    floors_trusted: tuple[str, ...] = ()
+    entries: int  # entries that were looked at
+    findings: tuple[Finding, ...]  # all that is wrong
+    page_checked: bool  # whether the page was compared; it is not while anything else is wrong
+    floors_rescored: tuple[str, ...] = ()  # splits and sizes whose floors were predicted and scored anew
+    floors_trusted: tuple[str, ...] = ()  # those whose floors' numbers were only aggregated again
 
     @property
     def exit_code(self) -> int:

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 from lagbench.metrics import Direction, Metric
-from lagbench.report.numbers import text
-from lagbench.report.wording import sentence, words
+from lagbench.report.html import sentence, text, words
 
 from .model import Row, Tab
 
@@ -47,27 +46,16 @@ PRESETS: Mapping[str, tuple[str, ...]] = MappingProxyType(
 
 @dataclass(frozen=True, kw_only=True)
 class Column:
-    """One column.
+    """One column."""
 
-    Attributes:
-        key: unique name, that of the metric where it shows one.
-        label: heading.
-        unit: unit, empty for pure numbers.
-        direction: what better means.
-        perfect: value of a perfect prediction, None where it depends.
-        form: how cells are written: "number", "count", "factor" or "text".
-        reported: whether the submitter says it and nothing can compute it again.
-        meaning: what it says, one or two sentences.
-    """
-
-    key: str
-    label: str
-    unit: str = ""
-    direction: Direction = Direction.NONE
-    perfect: float | None = None
-    form: str = "number"
-    reported: bool = False
-    meaning: str
+    key: str  # unique name, that of the metric where it shows one
+    label: str  # heading
+    unit: str = ""  # unit, empty for pure numbers
+    direction: Direction = Direction.NONE  # what better means
+    perfect: float | None = None  # value of a perfect prediction, None where it depends
+    form: str = "number"  # how cells are written: "number", "count", "factor" or "text"
+    reported: bool = False  # whether the submitter says it and nothing can compute it again
+    meaning: str  # what it says, one or two sentences
 
 
 REPORTED = "Self-reported: said by the submitter, computed again by nobody."

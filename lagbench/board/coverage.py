@@ -11,10 +11,10 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.format import MATERIALS
+from lagbench.data.registry import Size
+from lagbench.data.writer import MATERIALS
 from lagbench.metrics import METRICS, Metric, Tally, always, at_slow_frames
-from lagbench.registry import Size
-from lagbench.score_file import StoredScores
+from lagbench.scoring.score_file import StoredScores
 from lagbench.submission.task_checks import frames_to_predict
 
 __all__ = ["gaps", "reported_frames"]
@@ -30,12 +30,7 @@ def reported_frames(size: Size) -> tuple[int, ...]:
 
 
 def gaps(scores: StoredScores, size: Size) -> Iterator[tuple[str, str]]:
-    """Yield what the score file of a split and size should hold and does not: expected, got.
-
-    Args:
-        scores: the statistics, of the scenarios and frames of the size.
-        size: its split and size.
-    """
+    """Yield what the score file of a split and size should hold and does not: expected, got."""
     held = next(iter(scores.tallies.values())).names
     known = [metric for metric in METRICS.values() if metric.statistic is not None]
     lacking = [metric.name for metric in known if metric.extra is None and metric.name not in held]

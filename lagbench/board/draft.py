@@ -8,9 +8,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
-from lagbench.floors import FLOORS
-from lagbench.registry import Registry
+from lagbench.scoring.floors import FLOORS
 from lagbench.submission import Header, ValidationResult, open_predictions, validate
 
 from .entry import ID, LONGEST_ID, MOST_SEEDS, About, CostEntry
@@ -25,21 +25,13 @@ NEEDED = {"authors": "--author NAME", "command": "--command 'what makes the pred
 
 @dataclass(frozen=True, kw_only=True)
 class Draft:
-    """An entry before it is scored.
+    """An entry before it is scored."""
 
-    Attributes:
-        place: split, size and method.
-        about: what is said of the method; name and date are there.
-        seeds: seed of each file, None where it has none.
-        urls: address of each file, None where it has none.
-        scored_by: who runs the scorer.
-    """
-
-    place: tuple[str, str, str]
-    about: About
-    seeds: tuple[int | None, ...]
-    urls: tuple[str | None, ...]
-    scored_by: str
+    place: tuple[str, str, str]  # split, size and method
+    about: About  # what is said of the method; name and date are there
+    seeds: tuple[int | None, ...]  # seed of each file, None where it has none
+    urls: tuple[str | None, ...]  # address of each file, None where it has none
+    scored_by: str  # who runs the scorer
 
 
 def headers_of(
@@ -49,13 +41,7 @@ def headers_of(
     registry: Registry | None,
     examined: Callable[[ValidationResult], None] | None,
 ) -> list[Header]:
-    """Return what files say about themselves, each validated in a child process before it is opened.
-
-    Raises:
-        UnreadableFileError: a file cannot be read.
-        ChecksFailedError: one is not valid.
-        DataError: the test subset is missing, or one was made from another data set.
-    """
+    """Return what files say about themselves, each validated in a child process before it is opened."""
     headers = []
     for path in paths:
         result = validate(path, root=root, require_truth=True, registry=registry)
@@ -68,11 +54,7 @@ def headers_of(
 
 
 def check_needed(meta: Meta) -> None:
-    """Refuse a description that lacks what readers need.
-
-    Raises:
-        UsageError: keys are missing.
-    """
+    """Refuse a description that lacks what readers need."""
     missing = [option for key, option in NEEDED.items() if not getattr(meta, key)]
     if missing:
         raise UsageError(
@@ -83,12 +65,7 @@ def check_needed(meta: Meta) -> None:
 
 
 def draft_of(headers: Sequence[Header], meta: Meta, folder: Folder, *, replace: bool) -> Draft:
-    """Return the entry as far as it is known before the scoring.
-
-    Raises:
-        UsageError: the files do not belong together, the entry is there already, or the method
-            has the name of a floor.
-    """
+    """Return the entry as far as it is known before the scoring."""
     seeds, urls = _seeds(headers), _urls(headers, meta)
     place = (headers[0].split, headers[0].size, _method(headers[0], meta))
     path = folder.path / entry_path(place)

@@ -6,8 +6,8 @@ import stat
 from collections.abc import Iterator
 from pathlib import Path
 
+from lagbench.data.registry import Registry, Size
 from lagbench.errors import UnreadableFileError, UsageError
-from lagbench.registry import Registry, Size
 from lagbench.submission import Finding, Severity
 
 from .entry import Entry, PredictionEntry, Status

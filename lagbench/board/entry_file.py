@@ -10,9 +10,9 @@ import yaml
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
+from lagbench.data.yamlfile import read_yaml
 from lagbench.errors import ChecksFailedError, UnreadableFileError, nearest
 from lagbench.submission.findings import quoted
-from lagbench.yamlfile import read_yaml
 
 from .entry import PATTERNS, Entry
 
@@ -31,19 +31,12 @@ Model = TypeVar("Model", bound=BaseModel)
 
 @dataclass(frozen=True, kw_only=True)
 class Mistake:
-    """One thing in an entry that does not fit the schema.
+    """One thing in an entry that does not fit the schema."""
 
-    Attributes:
-        where: key, as in "predictions.0.url".
-        what: what is wrong.
-        got: what stands there, shortened and escaped.
-        fix: the nearest known key where one is unknown, else None.
-    """
-
-    where: str
-    what: str
-    got: str
-    fix: str | None = None
+    where: str  # key, as in "predictions.0.url"
+    what: str  # what is wrong
+    got: str  # what stands there, shortened and escaped
+    fix: str | None = None  # the nearest known key where one is unknown, else None
 
     def __str__(self) -> str:
         """Return the mistake as one line."""
@@ -51,11 +44,7 @@ class Mistake:
 
 
 def load_plain(path: Path) -> Any:  # noqa: ANN401
-    """Return what a YAML file of a submitter holds, after looking at its length.
-
-    Raises:
-        UnreadableFileError: no regular file, too long, or no plain YAML.
-    """
+    """Return what a YAML file of a submitter holds, after looking at its length."""
     try:
         regular, length = path.is_file(), path.stat().st_size
     except OSError as error:
@@ -84,12 +73,7 @@ def examine(kind: type[Model], value: object) -> tuple[Model | None, tuple[Mista
 
 
 def read_entry(path: Path) -> Entry:
-    """Read the entry of a YAML file.
-
-    Raises:
-        UnreadableFileError: no regular file, too long, or no plain YAML.
-        ChecksFailedError: it does not fit the schema.
-    """
+    """Read the entry of a YAML file."""
     entry, mistakes = examine(Entry, load_plain(path))
     if entry is None:
         raise ChecksFailedError(

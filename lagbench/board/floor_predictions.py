@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
+from lagbench.data.layout import resolve_root
+from lagbench.data.registry import Registry, load
 from lagbench.errors import UsageError, nearest
-from lagbench.exam import load_exam
-from lagbench.floors import FLOORS
-from lagbench.layout import resolve_root
-from lagbench.registry import Registry, load
+from lagbench.scoring.floors import FLOORS
+from lagbench.scoring.task import load_scored_task
 from lagbench.submission import PredictionsWriter
 
 __all__ = ["write_floor"]
@@ -25,25 +25,11 @@ def write_floor(
     root: str | Path | None = None,
     registry: Registry | None = None,
 ) -> Path:
-    """Write the predictions of a floor.
-
-    Args:
-        name: name of the floor.
-        path: file to write.
-        split: name of the split.
-        size: name of the size.
-        root: folder of all data sets.
-        registry: where splits are described; ours when None.
-
-    Raises:
-        UsageError: unknown floor, split or size.
-        DataError: the test subset is missing or damaged.
-        WorkFailedError: the disk is full or not writable.
-    """
+    """Write the predictions of a floor."""
     if name not in FLOORS:
         raise UsageError(f"no floor {name!r}", where="--floor", fix=nearest(name, FLOORS))
     described, folder = registry or load(), resolve_root(root)
-    exam = load_exam(described.size(split, size), folder)
+    exam = load_scored_task(described.size(split, size), folder)
     writer = PredictionsWriter(
         path, split=split, size=size, method=name, root=folder, registry=described, parameters=0
     )

@@ -53,11 +53,7 @@ def score_paths(place: tuple[str, str, str], seeds: Sequence[int | None]) -> tup
 
 
 class Folder:
-    """The files of a leaderboard.
-
-    Args:
-        path: the leaderboard's folder; itself it may be a link.
-    """
+    """The files of a leaderboard."""
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
@@ -68,11 +64,7 @@ class Folder:
         return self.path / PAGE_NAME
 
     def require(self) -> None:
-        """Refuse a folder that is no leaderboard.
-
-        Raises:
-            UsageError: it has no folder ``submissions``.
-        """
+        """Refuse a folder that is no leaderboard."""
         if not (self.path / SUBMISSIONS).is_dir():
             raise UsageError(
                 "no leaderboard here",

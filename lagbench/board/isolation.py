@@ -58,12 +58,7 @@ def _parts(paths: Sequence[Path]) -> int:
 
 
 def _asked(paths: Sequence[Path], room: float) -> tuple[list[str | None], str]:
-    """Return the child's answers, and how it ended.
-
-    Args:
-        paths: the files.
-        room: time that is left [s].
-    """
+    """Return the child's answers, and how it ended."""
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2"}
     try:
         done = subprocess.run(

@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.metrics import Tally
-from lagbench.preview import Preview
-from lagbench.score_file import FILM_RANGE, LEVELS, StoredScores
-from lagbench.sitting import LONG_BITS, LONG_ROLLOUT
+from lagbench.scoring.scenario import LONG_BITS, LONG_ROLLOUT, Preview
+from lagbench.scoring.score_file import FILM_RANGE, LEVELS, StoredScores
 
 from .pictures import PREDICTION, TRUTH
 from .stored import Stored

@@ -8,9 +8,7 @@ from itertools import groupby
 from types import MappingProxyType
 
 from lagbench.metrics import Direction, Metric
-from lagbench.report.markup import Markup, escaped, join, tag
-from lagbench.report.numbers import interval, text
-from lagbench.report.wording import words
+from lagbench.report.html import Markup, escaped, interval, join, tag, text, words
 
 from .columns import COSTS, Column, metric_column, presets_of, value_of, written
 from .embedding import clean

@@ -16,12 +16,7 @@ Place = tuple[str, str, str]
 
 
 def check_lives(folder: Folder, entries: Sequence[Entry]) -> Iterator[Finding]:
-    """Yield entries whose successor is not there, and those that follow each other in a circle.
-
-    Args:
-        folder: the leaderboard's folder.
-        entries: all entries that can be read.
-    """
+    """Yield entries whose successor is not there, and those that follow each other in a circle."""
     after = {
         entry.place: (entry.split, entry.size, entry.superseded_by)
         for entry in entries

@@ -30,14 +30,7 @@ Packed = list[str | float | int]
 
 
 def pack(values: ArrayLike, *, limits: tuple[float, float] | None = None, log: bool = False) -> Packed:
-    """Return values in 4094 equal steps between the least and the greatest.
-
-    Args:
-        values: numbers of any shape, taken in C order; what is not finite is missing.
-        limits: range to use instead; what lies outside is set to its ends.
-        log: take equal steps of the logarithm, where all values are at least 0; zeros become
-            the least value.
-    """
+    """Return values in 4094 equal steps between the least and the greatest."""
     x = np.asarray(values, np.float64).ravel()
     known = x[np.isfinite(x)]
     low, high = limits or ((float(known.min()), float(known.max())) if known.size else (0.0, 1.0))

@@ -14,7 +14,7 @@ import hashlib
 import re
 from importlib.resources import files
 
-from lagbench.report.markup import tag
+from lagbench.report.html import tag
 
 from .embedding import embedded
 from .listing import EXPLAINED, lede, navigation, sections
@@ -44,11 +44,7 @@ FOOT = (
 
 
 def render(board: Board) -> str:
-    """Return the page.
-
-    Args:
-        board: what it shows.
-    """
+    """Return the page."""
     style, theme, script = _style(), _part("theme.js"), _script()
     held = {
         "policy": _policy(style, theme, script),

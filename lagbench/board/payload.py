@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lagbench.report.wording import words
+from lagbench.report.html import words
 
 from .columns import COSTS, Column, columns_of, metric_column, presets_of
 from .embedding import clean
@@ -29,19 +29,12 @@ MEAN_DIGITS = 9
 
 
 class Fineness(NamedTuple):
-    """How much of the pictures the page holds.
-
-    Attributes:
-        film_frames: frames of a film.
-        particles: particles of a film.
-        maps: frames of vorticity maps and histograms.
-        nodes: nodes of a map a side.
-    """
+    """How much of the pictures the page holds."""
 
     film_frames: int
-    particles: int
-    maps: int
-    nodes: int
+    particles: int  # particles of a film
+    maps: int  # frames of vorticity maps and histograms
+    nodes: int  # nodes of a map a side
 
 
 FINENESS = (
@@ -106,15 +99,10 @@ def _numbers(values: Sequence[float]) -> list[float | str | None]:
 
 @dataclass
 class _Writer:
-    """Turns a board into plain values.
+    """Turns a board into plain values."""
 
-    Attributes:
-        fineness: how much of the pictures is kept.
-        pool: what is referred to by number.
-    """
-
-    fineness: Fineness
-    pool: list[Any] = field(default_factory=list)
+    fineness: Fineness  # how much of the pictures is kept
+    pool: list[Any] = field(default_factory=list)  # what is referred to by number
     _known: dict[str, int] = field(default_factory=dict)
 
     def tab(self, tab: Tab, board: Board) -> dict[str, Any]:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.metrics import Score
-from lagbench.preview import Preview
+from lagbench.scoring.scenario import Preview
 
 from .model import Curve, Histogram, Pictures
 

@@ -17,12 +17,7 @@ STAGE = ".submit-"
 
 
 class Batch:
-    """Files that wait for their publication.
-
-    Args:
-        folder: folder that all targets lie in.
-        stage: folder of the prepared files, on the same disk.
-    """
+    """Files that wait for their publication."""
 
     def __init__(self, folder: Path, stage: Path) -> None:
         self._folder, self._stage = folder, stage
@@ -34,11 +29,7 @@ class Batch:
         return self._staged(len(self._targets) - 1)
 
     def publish(self, *, remove: Collection[Path] = ()) -> None:
-        """Move all prepared files to their places and remove others, in this order; undo on failure.
-
-        Args:
-            remove: paths relative to the folder that shall be gone; missing ones do not matter.
-        """
+        """Move all prepared files to their places and remove others, in this order; undo on failure."""
         old = self._stage / "old"
         old.mkdir()
         undo: list[tuple[Path, Path | None]] = []
@@ -67,11 +58,7 @@ class Batch:
 
 @contextmanager
 def batch(folder: Path) -> Iterator[Batch]:
-    """Yield a batch of files for a folder; what is not published leaves no trace.
-
-    Raises:
-        WorkFailedError: the operating system refused.
-    """
+    """Yield a batch of files for a folder; what is not published leaves no trace."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         stage = Path(tempfile.mkdtemp(prefix=STAGE, dir=folder))

@@ -7,15 +7,15 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from lagbench.data.registry import Registry, Size
 from lagbench.errors import ChecksFailedError, UnreadableFileError, UsageError
 from lagbench.metrics import METRICS
-from lagbench.progress import Progress
-from lagbench.registry import Registry, Size
-from lagbench.score_card import ScoreCard
-from lagbench.score_file import write_statistics
-from lagbench.scoring import score
+from lagbench.scoring.card import ScoreCard
+from lagbench.scoring.score import score
+from lagbench.scoring.score_file import write_statistics
 from lagbench.submission import Finding
 from lagbench.submission.truth import Truth
+from lagbench.work.progress import Progress
 
 from .entry import Entry, ScoredFile
 from .entry_checks import finding
@@ -31,35 +31,20 @@ __all__ = ["Rescoring", "within_reach"]
 
 @dataclass(frozen=True, kw_only=True)
 class Rescoring:
-    """Scores predictions of entries again.
+    """Scores predictions of entries again."""
 
-    Attributes:
-        folder: the leaderboard's folder.
-        entries: entries whose files have been checked.
-        sound: score files that can be read.
-        registry: where splits are described.
-        root: folder of all data sets.
-        progress: told how far the scoring is.
-    """
-
-    folder: Folder
-    entries: Sequence[Entry]
-    sound: Collection[Path]
-    registry: Registry
-    root: str | Path | None = None
-    progress: Callable[[Progress], None] | None = None
+    folder: Folder  # the leaderboard's folder
+    entries: Sequence[Entry]  # entries whose files have been checked
+    sound: Collection[Path]  # score files that can be read
+    registry: Registry  # where splits are described
+    root: str | Path | None = None  # folder of all data sets
+    progress: Callable[[Progress], None] | None = None  # told how far the scoring is
 
     def of_files(self, predictions: Sequence[str | Path]) -> Iterator[Finding]:
         """Yield where predictions differ from what the leaderboard says of them.
 
         A file that cannot be read or is not valid is a finding: it is opened by the scorer
         alone, after its checks in a child process.
-
-        Args:
-            predictions: predictions.nc of entries, in any order.
-
-        Raises:
-            DataError: the test subset is missing, or they were made from another data set.
         """
         for path in predictions:
             where = str(path)
@@ -77,15 +62,7 @@ class Rescoring:
                 yield from self._compared(where, path, card, inner, said)
 
     def of_floor(self, entry: Entry) -> Iterator[Finding]:
-        """Yield where a floor, predicted and scored anew, differs from its entry.
-
-        Args:
-            entry: the entry of a floor.
-
-        Raises:
-            DataError: the test subset is missing or damaged.
-            WorkFailedError: the disk is full.
-        """
+        """Yield where a floor, predicted and scored anew, differs from its entry."""
         (inner,), (said,) = entry.score_paths[:1], entry.score.files[:1]
         with tempfile.TemporaryDirectory() as scratch:
             path = Path(scratch) / "predictions.nc"

@@ -6,8 +6,8 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from lagbench.data.registry import Size
 from lagbench.metrics.reductions import mean
-from lagbench.registry import Size
 
 from .entry import Entry, FlagEntry
 from .model import Cost, Detail, Prediction, RaisedFlag, Row, Value
@@ -29,29 +29,16 @@ ENERGY = "energy_predicted"
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Ingredients:
-    """What a row is made of.
+    """What a row is made of."""
 
-    Attributes:
-        entry: the YAML file.
-        current: whether its data set is that of today.
-        stored: score file of each seed.
-        scores: scores by metric, all seeds together.
-    """
-
-    entry: Entry
-    current: bool
-    stored: Sequence[Stored]
-    scores: Mapping[str, Combined]
+    entry: Entry  # the YAML file
+    current: bool  # whether its data set is that of today
+    stored: Sequence[Stored]  # score file of each seed
+    scores: Mapping[str, Combined]  # scores by metric, all seeds together
 
 
 def make_row(held: Ingredients, standing: Standing | None, size: Size) -> Row:
-    """Return a row.
-
-    Args:
-        held: what it is made of.
-        standing: its rank; None where it is not ranked.
-        size: its split and size.
-    """
+    """Return a row."""
     entry, files = held.entry, held.entry.score.files
     return Row(
         id=entry.method,

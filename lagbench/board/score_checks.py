@@ -6,9 +6,9 @@ import math
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from pathlib import Path
 
-from lagbench.checksums import file_sha256
+from lagbench.data.checksums import file_sha256
+from lagbench.data.registry import Size
 from lagbench.errors import UnreadableFileError
-from lagbench.registry import Size
 from lagbench.submission import Finding
 
 from .coverage import gaps
@@ -27,28 +27,15 @@ RESCORE = "submit the predictions again: lagbench submit; the score block is not
 
 
 class ScoreChecks:
-    """Checks on the scores of entries, one after the other.
-
-    Args:
-        folder: the leaderboard's folder.
-        broken: score files that cannot be read, and why, as a child process found.
-
-    Attributes:
-        sound: score files that were read.
-    """
+    """Checks on the scores of entries, one after the other."""
 
     def __init__(self, folder: Folder, broken: Mapping[Path, str]) -> None:
-        self.sound: set[Path] = set()
+        self.sound: set[Path] = set()  # score files that were read
         self._folder, self._broken = folder, broken
         self._witnesses: dict[tuple[str, str, str], tuple[Path, Stored]] = {}
 
     def of(self, entry: Entry, size: Size) -> Iterator[Finding]:
-        """Yield what is wrong with the scores of an entry.
-
-        Args:
-            entry: the entry.
-            size: its split and size.
-        """
+        """Yield what is wrong with the scores of an entry."""
         task = size if is_current(entry.dataset, size) else None
         stored: list[Stored] = []
         for path, said, made in zip(entry.score_paths, entry.score.files, entry.predictions, strict=True):

@@ -10,31 +10,17 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from lagbench import __version__
-from lagbench.checksums import file_sha256
-from lagbench.score_card import ScoreCard
+from lagbench.data.checksums import file_sha256
+from lagbench.scoring.card import ScoreCard
 
-from .entry import (
-    LONGEST_TEXT,
-    About,
-    DataSet,
-    FlagEntry,
-    PredictionEntry,
-    ScoreBlock,
-    ScoredFile,
-    Summary,
-)
+from .entry import LONGEST_TEXT, About, DataSet, FlagEntry, PredictionEntry, ScoreBlock, ScoredFile, Summary
 from .seal import UNSEALED, sealed
 
 __all__ = ["score_block", "scored_file"]
 
 
 def scored_file(card: ScoreCard, path: Path) -> ScoredFile:
-    """Return what an entry says of a score file.
-
-    Args:
-        card: the score card.
-        path: the score file written from it.
-    """
+    """Return what an entry says of a score file."""
     return ScoredFile(
         sha256=file_sha256(path),
         predictions_sha256=card.predictions_sha256,
@@ -59,18 +45,7 @@ def score_block(
     ranking: str,
     scored_by: str,
 ) -> ScoreBlock:
-    """Return a sealed score block.
-
-    Args:
-        place: split, size and method.
-        dataset: the data set that was predicted.
-        predictions: the predictions, in the order of ``files``.
-        files: what is said of each score file.
-        metrics: metrics of all seeds together.
-        about: what the submitter says, whose claims are sealed too.
-        ranking: name of the metric that ranks.
-        scored_by: who ran the scorer.
-    """
+    """Return a sealed score block."""
     block = ScoreBlock(
         scored_by=scored_by,
         lagbench=__version__,

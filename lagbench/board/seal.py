@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 
-from lagbench.checksums import canonical_json
+from lagbench.data.checksums import canonical_json
 
 from .entry import About, DataSet, PredictionEntry, ScoreBlock
 
@@ -30,15 +30,7 @@ def digest_of(
     about: About,
     block: ScoreBlock,
 ) -> str:
-    """Return the digest that a score block must have.
-
-    Args:
-        place: split, size and method.
-        dataset: the data set that was predicted.
-        predictions: the predictions that were scored.
-        about: what the submitter says; :data:`CLAIMS` of it enter.
-        block: the score block; its own digest does not enter.
-    """
+    """Return the digest that a score block must have."""
     value = {
         "place": list(place),
         "dataset": dataset.model_dump(),

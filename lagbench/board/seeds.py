@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.metrics import METRICS, Score, aggregate
-from lagbench.score_card import digits
-from lagbench.score_file import StoredScores
+from lagbench.scoring.card import digits
+from lagbench.scoring.score_file import StoredScores
 
 from .entry import Summary
 
@@ -28,26 +28,17 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Combined:
-    """A metric of all seeds of a method.
+    """A metric of all seeds of a method."""
 
-    Attributes:
-        score: mean over seeds, per frame and per scenario.
-        std: sample standard deviation over seeds of the mean over scenarios; NaN for one seed.
-        means: mean over scenarios of each seed.
-    """
-
-    score: Score
-    std: float
-    means: tuple[float, ...]
+    score: Score  # mean over seeds, per frame and per scenario
+    std: float  # sample standard deviation over seeds of the mean over scenarios; NaN for one seed
+    means: tuple[float, ...]  # mean over scenarios of each seed
 
 
 def combine(seeds: Sequence[StoredScores]) -> dict[str, Combined]:
     """Return the scores of a method by metric, in the table's order.
 
     Metrics are ours, whatever other packages are installed here, and those that all seeds have.
-
-    Args:
-        seeds: what the score file of each seed holds; all of the same scenarios and frames.
     """
     names = set.intersection(*(set(next(iter(held.tallies.values())).names) for held in seeds))
     metrics = [metric for metric in METRICS.values() if names.issuperset(metric.of)]

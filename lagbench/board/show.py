@@ -7,8 +7,8 @@ from collections.abc import Collection, Iterator
 from typing import Any
 
 from lagbench.errors import UsageError, nearest
-from lagbench.score_card import digits
-from lagbench.score_tables import Table
+from lagbench.scoring.card import digits
+from lagbench.scoring.tables import Table
 
 from .model import Board, Row, Tab, Value
 

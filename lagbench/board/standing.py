@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lagbench.layout import major_of
+from lagbench.data.layout import major_of
+from lagbench.data.registry import Size
 from lagbench.metrics import Score, compare, shared_ranks
-from lagbench.registry import Size
 
 from .entry import DataSet, Entry, Status
 
@@ -19,17 +19,12 @@ __all__ = ["Standing", "is_current", "is_ranked", "mean_loss", "standings"]
 
 @dataclass(frozen=True, kw_only=True)
 class Standing:
-    """The rank of a row.
+    """The rank of a row."""
 
-    Attributes:
-        rank: from 1; shared by all that cannot be told from the leader at 5 %.
-        shared: whether another row has it too.
-        p: of the sign-flip test against the leader; NaN for the leader itself and where fewer
-            than six scenarios allow no claim.
-    """
-
-    rank: int
-    shared: bool
+    rank: int  # from 1; shared by all that cannot be told from the leader at 5 %
+    shared: bool  # whether another row has it too
+    # of the sign-flip test against the leader; NaN for the leader itself and where fewer than six
+    # scenarios allow no claim
     p: float
 
 
@@ -51,11 +46,7 @@ def mean_loss(score: Score) -> float:
 
 
 def standings(scores: Mapping[str, Score]) -> dict[str, Standing]:
-    """Return the standing of each ranked method.
-
-    Args:
-        scores: score of the ranking metric, by method.
-    """
+    """Return the standing of each ranked method."""
     if not scores:
         return {}
     ranks = shared_ranks(scores)

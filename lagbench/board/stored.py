@@ -17,14 +17,14 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.data.grid import Grid, Placement
+from lagbench.data.registry import Size
 from lagbench.errors import UnreadableFileError
-from lagbench.exam import ranking_metric
-from lagbench.grid import Grid, Placement
 from lagbench.metrics.distributions import BINS
-from lagbench.preview import FRAMES, PARTICLES, Preview
-from lagbench.published import unreadable_scores
-from lagbench.registry import Size
-from lagbench.score_file import FILM_RANGE, StoredScores, read_statistics
+from lagbench.scoring.card import unreadable_scores
+from lagbench.scoring.scenario import FRAMES, PARTICLES, Preview
+from lagbench.scoring.score_file import FILM_RANGE, StoredScores, read_statistics
+from lagbench.scoring.task import ranking_metric
 from lagbench.submission.opening import opened
 from lagbench.submission.task_checks import frames_to_predict
 
@@ -49,30 +49,15 @@ LAYOUTS = (h5py.h5d.COMPACT, h5py.h5d.CONTIGUOUS, h5py.h5d.CHUNKED)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Stored:
-    """What a score file holds.
+    """What a score file holds."""
 
-    Attributes:
-        scores: identity and statistics.
-        preview: pictures of the first scenario.
-        precision: step of the packed vorticity maps [1/frame].
-    """
-
-    scores: StoredScores
-    preview: Preview
-    precision: float
+    scores: StoredScores  # identity and statistics
+    preview: Preview  # pictures of the first scenario
+    precision: float  # step of the packed vorticity maps [1/frame]
 
 
 def read_stored(path: Path, size: Size | None = None) -> Stored:
-    """Read a score file.
-
-    Args:
-        path: the file.
-        size: split and size whose scenarios, frames and grid it must have; any when None.
-
-    Raises:
-        UnreadableFileError: no regular file, too long, not self-contained, damaged, or not the
-            scores of this split and size.
-    """
+    """Read a score file."""
     _check_length(path)
     try:
         with opened(path) as file:

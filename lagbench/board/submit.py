@@ -12,13 +12,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from lagbench.data.registry import Registry
 from lagbench.errors import ChecksFailedError, WorkFailedError
-from lagbench.progress import Progress
-from lagbench.registry import Registry
-from lagbench.score_card import ScoreCard
-from lagbench.score_file import write_statistics
-from lagbench.scoring import score
+from lagbench.scoring.card import ScoreCard
+from lagbench.scoring.score import score
+from lagbench.scoring.score_file import write_statistics
 from lagbench.submission import ValidationResult
+from lagbench.work.progress import Progress
 
 from .draft import Draft, check_needed, draft_of, headers_of
 from .entry import About, DataSet, Entry, PredictionEntry
@@ -39,27 +39,16 @@ BOARD = Path("leaderboard")
 
 @dataclass(frozen=True, kw_only=True)
 class SubmitResult:
-    """An entry that was written.
+    """An entry that was written."""
 
-    Attributes:
-        split: name of the split.
-        size: name of the size.
-        method: id of the method.
-        ranking: name of the ranking metric.
-        mean: of the ranking metric over scenarios and seeds; None where undefined.
-        std: over seeds; None for one seed.
-        flags: names of flags that were raised.
-        files: what was written, the YAML file first.
-    """
-
-    split: str
-    size: str
-    method: str
-    ranking: str
-    mean: float | None
-    std: float | None
-    flags: tuple[str, ...]
-    files: tuple[Path, ...]
+    split: str  # name of the split
+    size: str  # name of the size
+    method: str  # id of the method
+    ranking: str  # name of the ranking metric
+    mean: float | None  # of the ranking metric over scenarios and seeds; None where undefined
+    std: float | None  # over seeds; None for one seed
+    flags: tuple[str, ...]  # names of flags that were raised
+    files: tuple[Path, ...]  # what was written, the YAML file first
 
 
 def submit(

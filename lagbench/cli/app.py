@@ -14,7 +14,9 @@ from typer.core import TyperGroup
 
 from lagbench.errors import LagbenchError
 
-from . import board, data, draw, exchange, scoring, show, training, upkeep
+from . import board, data, draw, exchange, scoring, training
+from . import data as show
+from . import data as upkeep
 from . import demo as tour
 
 __all__ = ["app"]

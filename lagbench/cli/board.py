@@ -13,8 +13,7 @@ from lagbench.errors import UsageError
 from . import entry_options as it
 from .entry_options import option
 from .options import JsonFlag, QuietFlag, RootOption, SplitArgument, SplitOption, WorkersOption, chosen
-from .output import print_json, print_table, say, spell_bytes
-from .progress import progress_bar
+from .output import print_json, print_table, progress_bar, say, spell_bytes
 
 if TYPE_CHECKING:
     from lagbench.board.check import CheckResult

@@ -1,4 +1,9 @@
-"""Commands that make and check data: generate, verify."""
+"""Commands that make and check data: generate, verify.
+
+Commands that say what there is: list, info, cite.
+
+Commands that look after the installation: doctor, clean.
+"""
 
 from __future__ import annotations
 
@@ -21,14 +26,23 @@ from .options import (
     WorkersOption,
     chosen,
 )
-from .output import print_json, print_table, say, spell_bytes, spell_seconds
-from .progress import progress_bar
+from .output import print_json, print_table, progress_bar, say, spell_bytes, spell_seconds
 
 if TYPE_CHECKING:
-    from lagbench.generation import GenerationResult
-    from lagbench.verification import VerificationResult
+    from lagbench.data.registry import Registry, Size
+    from lagbench.make.generate import GenerationResult
+    from lagbench.make.overview import Overview
+    from lagbench.make.verify import VerificationResult
 
-__all__ = ["generate", "verify"]
+__all__ = [
+    "generate",
+    "verify",
+    "cite",
+    "info",
+    "list_splits",
+    "clean",
+    "doctor",
+]
 
 
 def generate(
@@ -53,7 +67,7 @@ def generate(
     quiet: QuietFlag = False,
 ) -> None:
     """Simulate a split to files; goes on where an earlier call stopped."""
-    from lagbench.generation import generate as run
+    from lagbench.make.generate import generate as run
 
     with progress_bar(quiet=quiet or dry_run) as draw:
         result = run(
@@ -78,8 +92,8 @@ def generate(
 
 
 def _generated(result: GenerationResult) -> list[str]:
-    from lagbench.scenario_ids import spell_ids
-    from lagbench.working_copy import url_of
+    from lagbench.data.layout import url_of
+    from lagbench.data.registry import spell_ids
 
     to_do = len(result.simulated)
     if result.dry_run:
@@ -119,7 +133,7 @@ def verify(
     quiet: QuietFlag = False,
 ) -> None:
     """Hash the files of a split again and compare them with datasets.yaml."""
-    from lagbench.verification import verify as run
+    from lagbench.make.verify import verify as run
 
     with progress_bar(quiet=quiet) as draw:
         result = run(
@@ -152,3 +166,186 @@ def _verified(result: VerificationResult) -> None:
         listing = ", ".join(f"scenario {i} {word}" for i, word in result.regenerated.items())
         say(f"regenerated: {listing}")
     say(f"data set hash: {result.verdict}")
+
+
+def list_splits(root: RootOption = None, as_json: JsonFlag = False) -> None:
+    """List the splits and sizes, what they cost, and what is generated here."""
+    from lagbench.data.layout import resolve_root, url_of
+    from lagbench.data.local import rooted
+    from lagbench.data.registry import load
+    from lagbench.make.overview import overview
+
+    folder = resolve_root(root)
+    registry = rooted(folder, load())
+    found = [
+        overview(registry.size(name, size), folder)
+        for name in (*registry.splits, *registry.local_names())
+        for size in _sizes(registry, name)
+    ]
+    if as_json:
+        print_json({"root": folder, "sizes": found})
+        return
+    rows = [_row(entry) for entry in found]
+    print_table("", ("split", "size", *_COLUMNS), rows)
+    say(f"data sets live in {url_of(folder) or folder}")
+
+
+_COLUMNS = ("scenarios", "particles", "frames", "disk", "time", "here")
+
+
+def _sizes(registry: Registry, split: str) -> list[str]:
+    return list(registry.split(split).sizes)
+
+
+def _row(entry: Overview) -> tuple[object, ...]:
+    return (
+        entry.split,
+        entry.size,
+        "/".join(str(count) for count in entry.scenarios.values()),
+        entry.particles,
+        entry.frames,
+        spell_bytes(entry.bytes),
+        spell_seconds(entry.seconds) if entry.seconds else "-",
+        entry.state,
+    )
+
+
+def info(
+    name: SplitArgument = None,
+    split: SplitOption = None,
+    size: Annotated[
+        str | None, typer.Option("--size", metavar="NAME", help="One size in full; all in brief by default.")
+    ] = None,
+    root: RootOption = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Show a split: parameters with units, sizes in bytes, time to generate, local state."""
+    from lagbench.data.local import home
+    from lagbench.make.overview import overview
+
+    split_name, folder, registry = home(chosen(name, split), root=root)
+    entry = registry.split(split_name)
+    sizes = [registry.size(split_name, one) for one in ([size] if size else entry.sizes)]
+    found = [overview(one, folder) for one in sizes]
+    if as_json:
+        print_json(_facts(registry, split_name, sizes, found))
+        return
+    say(f"{entry.title} ({split_name} {entry.version}, {entry.licence})\n{entry.description}\n")
+    print_table("Sizes", ("split", "size", *_COLUMNS), [_row(one) for one in found])
+    print_table("Parameters", ("name", *entry.sizes, "unit", "meaning"), _parameters(registry, split_name))
+    for one, tier in zip(found, sizes, strict=True):
+        say("\n".join(_details(one, tier)))
+
+
+def _parameters(registry: Registry, split: str) -> list[tuple[object, ...]]:
+    entry = registry.split(split)
+    tiers = [registry.size(split, size) for size in entry.sizes]
+    return [
+        (name, *(tier.value(name) for tier in tiers), parameter.unit, parameter.description)
+        for name, parameter in entry.parameters.items()
+    ]
+
+
+def _details(entry: Overview, size: Size) -> list[str]:
+    from lagbench.data.registry import spell_ids
+
+    task = size.task
+    subsets = "; ".join(f"{name} {spell_ids(ids)}" for name, ids in size.subsets.items())
+    return [
+        f"{entry.split} {entry.size}",
+        f"  scenarios  {subsets}",
+        f"  task       {task.input_frames} frames given, {task.horizon} to predict, radius {task.radius}",
+        f"  frame      {size.frame_interval:.6g} s, {size.substeps_per_frame} substeps of {size.dt:.6g} s",
+        f"  hash       {entry.dataset_sha256 or 'not measured yet'}",
+        f"  folder     {entry.folder} (there: {entry.state})",
+        f"  picture    {entry.picture or 'none'}",
+    ]
+
+
+def _facts(registry: Registry, split: str, sizes: list[Size], found: list[Overview]) -> dict[str, object]:
+    entry = registry.split(split)
+    described = {
+        tier.name: {
+            "overview": one,
+            "parameters": {name: p.model_dump() for name, p in tier.parameters.items()},
+            "subsets": tier.subsets,
+            "task": tier.task.model_dump(),
+            "bounds": tier.bounds,
+            "dt": tier.dt,
+            "frame_interval": tier.frame_interval,
+        }
+        for tier, one in zip(sizes, found, strict=True)
+    }
+    head = {key: getattr(entry, key) for key in ("version", "title", "description", "citation", "licence")}
+    return {"split": split, **head, "sizes": described}
+
+
+def cite(
+    name: SplitArgument = None,
+    split: SplitOption = None,
+    root: RootOption = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Print how to cite a split: version, hashes of its sizes, and the works behind it."""
+    from lagbench.data.local import home
+
+    split_name, _, registry = home(chosen(name, split), root=root)
+    entry = registry.split(split_name)
+    measured = registry.measured.get(split_name, {})
+    hashes = {size: values.dataset_sha256 for size, values in measured.items()}
+    facts = {
+        "split": split_name,
+        "version": entry.version,
+        "title": entry.title,
+        "licence": entry.licence,
+        "citation": entry.citation,
+        "dataset_sha256": hashes,
+    }
+    if as_json:
+        print_json(facts)
+        return
+    say(f"lagbench, split {split_name!r} ({entry.title}), version {entry.version}, {entry.licence}.")
+    say(f"After: {entry.citation}.")
+    for size, value in hashes.items():
+        say(f"Data set hash of size {size}: {value}")
+
+
+def doctor(root: RootOption = None, as_json: JsonFlag = False) -> None:
+    """Check this machine: libraries, cores, disk, registry."""
+    from lagbench.errors import ChecksFailedError
+
+    from .machine import doctor as run
+
+    diagnosis = run(root)
+    if as_json:
+        print_json(diagnosis)
+    else:
+        print_table("", ("check", "state", "detail"), [(c.name, c.state, c.detail) for c in diagnosis.checks])
+    if not diagnosis.healthy:
+        broken = ", ".join(check.name for check in diagnosis.checks if check.state == "broken")
+        raise ChecksFailedError("this machine cannot run lagbench", got=f"broken: {broken}")
+
+
+def clean(
+    name: SplitArgument = None,
+    split: SplitOption = None,
+    size: SizeOption = "full",
+    root: RootOption = None,
+    leftovers: Annotated[
+        bool, typer.Option("--leftovers", help="Only temporary files of killed writers.")
+    ] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would go.")] = False,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
+) -> None:
+    """Remove a generated data set, or only what killed writers left of it."""
+    from lagbench.make.clean import clean as run
+
+    result = run(chosen(name, split), size, root=root, leftovers=leftovers, dry_run=dry_run)
+    if as_json:
+        print_json(result)
+        return
+    for path in result.removed:
+        say(str(path), quiet=quiet)
+    word = "would be removed" if dry_run else "removed"
+    say(f"{len(result.removed)} files, {spell_bytes(result.bytes)} {word}", quiet=quiet)

@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING
 import typer
 
 from .options import JsonFlag, QuietFlag, RootOption, WorkersOption
-from .output import print_json, print_table, say, spell_seconds
-from .progress import progress_bar
+from .output import print_json, print_table, progress_bar, say, spell_seconds
 
 if TYPE_CHECKING:
-    from lagbench.demo import DemoResult, ModelResult
+    from .demo_steps import DemoResult, ModelResult
 
 __all__ = ["demo"]
 
@@ -29,8 +28,9 @@ def demo(
     quiet: QuietFlag = False,
 ) -> None:
     """From nothing to data sets, a trained model, its scores and a leaderboard page."""
-    from lagbench.demo import demo_board, demo_splits, model_left_out
-    from lagbench.registry import load
+    from lagbench.data.registry import load
+
+    from .demo_steps import demo_board, demo_splits, model_left_out
 
     started = time.monotonic()
     registry = load()
@@ -52,7 +52,7 @@ def demo(
 
 
 def _data(names: list[str], root: Path | None, workers: int | None, *, quiet: bool) -> dict[str, DemoResult]:
-    from lagbench.demo import demo as run
+    from .demo_steps import demo as run
 
     results = {}
     for split in names:
@@ -64,7 +64,7 @@ def _data(names: list[str], root: Path | None, workers: int | None, *, quiet: bo
 
 
 def _model(root: Path | None, *, quiet: bool) -> ModelResult:
-    from lagbench.demo import MODEL, MODEL_SPLIT, demo_model
+    from .demo_steps import MODEL, MODEL_SPLIT, demo_model
 
     if not quiet:
         typer.echo(f"{MODEL_SPLIT}: training {MODEL}, predicting, scoring, submitting", err=True)

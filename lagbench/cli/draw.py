@@ -30,8 +30,8 @@ OutputOption = Annotated[
 
 def _source(name: str | None, split: str | None, size: str, scenario: int | None, root: Path | None) -> Path:
     """Return the scenario file that a user means by its path or by split, size and id."""
-    from lagbench.layout import ScenarioKey, scenario_path
-    from lagbench.locating import locate
+    from lagbench.data.layout import ScenarioKey, scenario_path
+    from lagbench.data.local import locate
     from lagbench.store.bringing import bring
 
     if name is not None and name.endswith(".nc"):
@@ -101,7 +101,7 @@ def plot(
     quiet: QuietFlag = False,
 ) -> None:
     """Draw one frame of a scenario: particles, vorticity, streamlines."""
-    from lagbench.plots import contact_sheet, plot_frame
+    from lagbench.draw.plot import contact_sheet, plot_frame
 
     if sheet:
         chosen_split = chosen(name, split)
@@ -135,7 +135,7 @@ def animate(
     quiet: QuietFlag = False,
 ) -> None:
     """Turn a scenario into an MP4 or GIF film; two scenarios stand side by side."""
-    from lagbench.animation import animate as run
+    from lagbench.draw.animate import animate as run
 
     source = _source(name, split, size, scenario, root)
     other = Path(second) if second else None

@@ -21,8 +21,7 @@ from .options import (
     WorkersOption,
     chosen,
 )
-from .output import print_json, say, spell_bytes
-from .progress import progress_bar
+from .output import print_json, progress_bar, say, spell_bytes
 
 if TYPE_CHECKING:
     from lagbench.exchange.local_split import LocalSplit
@@ -99,8 +98,8 @@ def download(
     quiet: QuietFlag = False,
 ) -> None:
     """Fetch a split from a mirror and check its content; simulate what no mirror has."""
+    from lagbench.data.registry import spell_ids
     from lagbench.exchange.downloading import download as run
-    from lagbench.scenario_ids import spell_ids
 
     with progress_bar(quiet=quiet) as draw:
         result = run(
@@ -262,8 +261,8 @@ def adopt(
 
 def _wishes(ctx: typer.Context) -> Any:  # noqa: ANN401 (the functions type them)
     """Return what a user says of the data: the options that import and adopt share."""
+    from lagbench.data.registry import parse_ids
     from lagbench.exchange.description import Wishes
-    from lagbench.scenario_ids import parse_ids
 
     said = {n: v for n, v in ctx.params.items() if n in Wishes.__annotations__ and v is not None}
     if "bounds" in said:

@@ -1,15 +1,32 @@
-"""What commands print: JSON for machines, tables and sentences for people."""
+"""What commands print: JSON for machines, tables and sentences for people.
+
+A progress bar on stderr, drawn only where a person watches.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Iterable, Mapping, Sequence
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import typer
 
-__all__ = ["print_json", "print_table", "say", "spell_bytes", "spell_seconds"]
+if TYPE_CHECKING:
+    from lagbench.work.progress import Progress as State
+
+__all__ = [
+    "print_json",
+    "print_table",
+    "say",
+    "spell_bytes",
+    "spell_seconds",
+    "progress_bar",
+]
+
 
 LAST_COLUMN = 24
 """Characters that the last column of a table, which wraps, keeps at least."""
@@ -89,3 +106,48 @@ def spell_seconds(seconds: float) -> str:
         return f"{max(seconds, 1):.0f} s"
     minutes = seconds / 60
     return f"{minutes:.0f} min" if minutes < 100 else f"{minutes / 60:.1f} h"
+
+
+@contextmanager
+def progress_bar(*, quiet: bool, counted: str = "scenarios") -> Iterator[Callable[[State], None] | None]:
+    """Yield what draws progress: overall bar, scenarios, scenarios per second, time left.
+
+    Args:
+        quiet: whether the user wants silence.
+        counted: what the work is counted in.
+
+    Yields:
+        A function to hand to ``generate``; None where stderr is no terminal or silence is wanted.
+    """
+    if quiet:
+        from lagbench.store.fetching import quietly
+
+        with quietly():
+            yield None
+        return
+    if not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TextColumn("{task.fields[count]}"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("starting", total=None, count="")
+
+        def draw(news: State) -> None:
+            bar.update(
+                task,
+                description=news.stage,
+                total=news.total,
+                completed=news.done,
+                count=f"{news.scenarios_done}/{news.scenarios} {counted}, {news.rate:.2f}/s",
+            )
+
+        yield draw

@@ -23,12 +23,11 @@ from .options import (
     WorkersOption,
     chosen,
 )
-from .output import print_json, print_table, say, spell_bytes
-from .progress import progress_bar
+from .output import print_json, print_table, progress_bar, say, spell_bytes
 
 if TYPE_CHECKING:
-    from lagbench.comparison import ComparisonResult
-    from lagbench.score_card import ScoreCard
+    from lagbench.scoring.card import ScoreCard
+    from lagbench.scoring.compare import ComparisonResult
     from lagbench.submission import ValidationResult
 
 __all__ = ["compare", "score", "template", "validate"]
@@ -125,7 +124,7 @@ def score(
     quiet: QuietFlag = False,
 ) -> None:
     """Score a predictions.nc beside two floors; write scores.json and scores.nc."""
-    from lagbench.scoring import score as run
+    from lagbench.scoring.score import score as run
 
     if len(predictions) > 1 and report is None:
         raise UsageError("several files are scored for one report", fix="add --report FOLDER")
@@ -225,7 +224,7 @@ def _wanted(split: str | None, root: Path | None) -> _Wanted:
     """Return what --split and --root say together: the path of a local split names its root."""
     if split is None:
         return _Wanted(None, root)
-    from lagbench.locating import home
+    from lagbench.data.local import home
 
     found = home(split, root=root)
     return _Wanted(found.name, found.root)
@@ -238,7 +237,7 @@ def _complain(result: ValidationResult) -> None:
 
 
 def _scored(card: ScoreCard, *, every: bool) -> None:
-    from lagbench.score_tables import card_tables, flag_lines
+    from lagbench.scoring.tables import card_tables, flag_lines
 
     for table in card_tables(card, every=every):
         print_table(table.title, table.columns, table.rows)
@@ -260,7 +259,7 @@ def compare(
     quiet: QuietFlag = False,
 ) -> None:
     """Compare two submissions over scenarios: exact sign-flip test and intervals."""
-    from lagbench.comparison import compare as run
+    from lagbench.scoring.compare import compare as run
 
     result = run(first, second, metrics=metric or (), root=root, workers=workers)
     if as_json:
@@ -270,7 +269,7 @@ def compare(
 
 
 def _compared(result: ComparisonResult, *, every: bool) -> None:
-    from lagbench.score_tables import comparison_table
+    from lagbench.scoring.tables import comparison_table
 
     table = comparison_table(result, every=every)
     print_table(table.title, table.columns, table.rows)

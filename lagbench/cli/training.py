@@ -14,13 +14,13 @@ import typer
 from lagbench.errors import LagbenchError, UsageError
 
 from .options import JsonFlag, QuietFlag, RootOption, SizeOption, SplitArgument, SplitOption, chosen
-from .output import print_json, say, spell_seconds
-from .progress import progress_bar
+from .output import print_json, progress_bar, say, spell_seconds
 
 if TYPE_CHECKING:
-    from lagbench.baselines.prediction import PredictionResult
-    from lagbench.baselines.training import TrainingResult
-    from lagbench.bench import SolverBench
+    from lagbench.baselines.predict import PredictionResult
+    from lagbench.baselines.train import TrainingResult
+
+    from .machine import SolverBench
 
 __all__ = ["bench", "predict", "train"]
 
@@ -74,14 +74,14 @@ def train(
     quiet: QuietFlag = False,
 ) -> None:
     """Train a reference model; goes on where an earlier call stopped."""
-    from lagbench.extras import check_installed
+    from lagbench.errors import check_installed
 
     if baseline is None:
         raise UsageError("no model is named", where="--baseline", fix="name one, as in --baseline gns")
     for module in ("torch", "torch_geometric", "pytorch_lightning"):
         check_installed(module, extra=EXTRA)
     from lagbench.baselines.machine import is_helper
-    from lagbench.baselines.training import train as run
+    from lagbench.baselines.train import train as run
 
     quiet = quiet or is_helper()
     with _told_once(), progress_bar(quiet=quiet, counted="steps") as draw:
@@ -130,8 +130,8 @@ def _told_once() -> Iterator[None]:
 
 def _where(split: str, root: Path | None) -> str:
     """Return the option that tells the next command where the data are."""
-    from lagbench.locating import home
-    from lagbench.registry import NO_GENERATOR
+    from lagbench.data.local import home
+    from lagbench.data.registry import NO_GENERATOR
 
     found = home(split, root=root)
     local = found.registry.split(found.name).generator == NO_GENERATOR
@@ -173,12 +173,12 @@ def predict(
     quiet: QuietFlag = False,
 ) -> None:
     """Roll a trained model out over the test scenarios into a predictions.nc."""
-    from lagbench.extras import check_installed
+    from lagbench.errors import check_installed
 
     for module in ("torch", "torch_geometric"):
         check_installed(module, extra=EXTRA)
-    from lagbench.baselines.prediction import predict as run
-    from lagbench.baselines.prediction import record_cost
+    from lagbench.baselines.predict import predict as run
+    from lagbench.baselines.predict import record_cost
 
     with progress_bar(quiet=quiet) as draw:
         result = run(
@@ -205,8 +205,9 @@ def _solver_time(result: PredictionResult, *, quiet: bool) -> SolverBench | None
 
     Local splits have no solver of ours.
     """
-    from lagbench.bench import bench_apart
-    from lagbench.registry import load
+    from lagbench.data.registry import load
+
+    from .machine import bench_apart
 
     if result.split not in load().splits:
         return None
@@ -249,7 +250,7 @@ def bench(
     quiet: QuietFlag = False,
 ) -> None:
     """Time our solver on this machine: processor seconds per frame of one scenario on one core."""
-    from lagbench.bench import bench_solver
+    from .machine import bench_solver
 
     if what != "solver":
         raise UsageError(

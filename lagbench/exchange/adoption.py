@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.checksums import HASHED_SUBSETS
+from lagbench.data.checksums import HASHED_SUBSETS
+from lagbench.data.scenario import MATERIALS
 from lagbench.errors import DataError, UnreadableFileError, UsageError
-from lagbench.progress import Progress
-from lagbench.variables import MATERIALS
+from lagbench.work.progress import Progress
 
 from .description import Description, Wishes
 from .inflation import check_inflation

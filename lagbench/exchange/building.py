@@ -10,16 +10,15 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from lagbench.checksums import HASHED_SUBSETS
+from lagbench.data.checksums import HASHED_SUBSETS
+from lagbench.data.layout import ScenarioKey, scenario_path
+from lagbench.data.local import DESCRIPTION
+from lagbench.data.manifest import FileEntry, Manifest, describe_file, merge, write_manifest
+from lagbench.data.registry import MAX_ID, NO_GENERATOR
+from lagbench.data.statistics import file_statistics
+from lagbench.data.writer import ScenarioWriter
 from lagbench.errors import DataError
-from lagbench.format import ScenarioWriter
-from lagbench.identity import environment_of
-from lagbench.layout import ScenarioKey, scenario_path
-from lagbench.locating import DESCRIPTION
-from lagbench.manifest import FileEntry, Manifest, describe_file, merge, write_manifest
-from lagbench.registry import NO_GENERATOR
-from lagbench.scenario_ids import MAX_ID
-from lagbench.statistics import file_statistics
+from lagbench.work.machine import environment_of
 
 from .description import SIZE, VERSION, Description, rate_of, split_yaml
 from .measure import Box, estimate_spacing
@@ -33,22 +32,16 @@ HEAD = '# A local split of lagbench, written by `lagbench {}`; its hashes stand 
 
 @dataclass
 class Building:
-    """A local split on the way.
+    """A local split on the way."""
 
-    Attributes:
-        about: what is known of the data.
-        root: root folder in which the split's folder is built.
-        spacing: distance of neighbouring particles at first [length]; 0 before the first scenario.
-        entries: manifest entries of the scenarios written so far, by id.
-        low: least coordinates of any particle [length].
-        high: greatest coordinates of any particle [length].
-    """
-
-    about: Description
-    root: Path
-    spacing: float = 0.0
+    about: Description  # what is known of the data
+    root: Path  # root folder in which the split's folder is built
+    spacing: float = 0.0  # distance of neighbouring particles at first [length]; 0 before the first scenario
+    # manifest entries of the scenarios written so far, by id
     entries: list[FileEntry] = field(default_factory=list)
+    # least coordinates of any particle [length]
     low: NDArray[np.float64] = field(default_factory=lambda: np.full(2, np.inf))
+    # greatest coordinates of any particle [length]
     high: NDArray[np.float64] = field(default_factory=lambda: np.full(2, -np.inf))
 
     def add(self, subset: str, trajectory: Trajectory) -> None:

@@ -7,10 +7,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypedDict
 
+from lagbench.data.local import is_name
+from lagbench.data.registry import NO_GENERATOR, spell_ids
 from lagbench.errors import UsageError
-from lagbench.locating import is_name
-from lagbench.registry import NO_GENERATOR
-from lagbench.scenario_ids import spell_ids
 
 from .measure import Box, Measure
 
@@ -65,53 +64,30 @@ class Wishes(TypedDict, total=False):
 
 @dataclass(frozen=True, kw_only=True)
 class Description:
-    """What is known of data from elsewhere; lengths are those of the source.
+    """What is known of data from elsewhere; lengths are those of the source."""
 
-    Attributes:
-        name: name of the split.
-        title: title of the split; its name when empty.
-        text: what the data are.
-        citation: whom to cite.
-        licence: licence of the data.
-        source: where they come from.
-        radius: connectivity radius.
-        frame_interval: time between frames [s].
-        bounds: box that holds the particles; None where the positions say.
-        rescale: whether to fit the bounds into the unit box.
-        density: rest density [mass/length^2].
-        spacing: distance of neighbouring particles at first; None to estimate it.
-        input_frames: frames given to a model.
-        horizon: frames to predict; None for all that every test scenario has.
-        frames_of_interest: absolute frames at which the scorer reports; None for the last one.
-        cells: cells across of the score grid; None for one that suits the spacing.
-        full_box: whether material fills the box, so that vorticity ranks; else positions rank.
-    """
-
-    name: str
-    title: str = ""
-    text: str = ""
-    citation: str = "none"
-    licence: str = "unknown"
-    source: str
-    radius: float
-    frame_interval: float
-    bounds: Box | None = None
-    rescale: bool = False
-    density: float = 1.0
-    spacing: float | None = None
-    input_frames: int = 6
-    horizon: int | None = None
+    name: str  # name of the split
+    title: str = ""  # title of the split; its name when empty
+    text: str = ""  # what the data are
+    citation: str = "none"  # whom to cite
+    licence: str = "unknown"  # licence of the data
+    source: str  # where they come from
+    radius: float  # connectivity radius
+    frame_interval: float  # time between frames [s]
+    bounds: Box | None = None  # box that holds the particles; None where the positions say
+    rescale: bool = False  # whether to fit the bounds into the unit box
+    density: float = 1.0  # rest density [mass/length^2]
+    spacing: float | None = None  # distance of neighbouring particles at first; None to estimate it
+    input_frames: int = 6  # frames given to a model
+    horizon: int | None = None  # frames to predict; None for all that every test scenario has
+    # absolute frames at which the scorer reports; None for the last one
     frames_of_interest: Sequence[int] | None = None
-    cells: int | None = None
-    full_box: bool = False
+    cells: int | None = None  # cells across of the score grid; None for one that suits the spacing
+    full_box: bool = False  # whether material fills the box, so that vorticity ranks; else positions rank
     measure: Measure = field(init=False, default=Measure())
 
     def __post_init__(self) -> None:
-        """Check what the user gave.
-
-        Raises:
-            UsageError: a name that cannot be one, a number out of range, a scale without bounds.
-        """
+        """Check what the user gave."""
         if not is_name(self.name):
             proposal = re.sub(r"[^a-z0-9_-]+", "-", self.name.lower()).strip("-_0123456789") or "own"
             raise UsageError(
@@ -151,21 +127,7 @@ def split_yaml(
     bounds: Box,
     measured: Mapping[str, object],
 ) -> dict[str, object]:
-    """Return the content of split.yaml as plain values.
-
-    Args:
-        about: what is known of the data.
-        subsets: scenario ids of each subset.
-        frames: frames of each scenario.
-        particles: particles in one scenario.
-        spacing: distance of neighbouring particles at first [length of the unit box].
-        bounds: box that holds the particles [length of the unit box].
-        measured: hashes and statistics.
-
-    Raises:
-        UsageError: test scenarios are too short for the task, or a frame of interest is not
-            predicted.
-    """
+    """Return the content of split.yaml as plain values."""
     task = _task(about, shortest=min(frames[i] for i in subsets["test"]), spacing=spacing)
     cells = task["score_grid"]["cells"]
     values: dict[str, object] = {

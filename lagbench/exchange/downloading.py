@@ -7,19 +7,18 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from lagbench.cards import write_cards
+from lagbench.data.layout import dataset_folder
+from lagbench.data.local import locate
+from lagbench.data.lock import dataset_lock
+from lagbench.data.manifest import read_manifest
+from lagbench.data.registry import Registry, spell_ids
 from lagbench.errors import UsageError
-from lagbench.generation import generate
-from lagbench.layout import dataset_folder
-from lagbench.locating import locate
-from lagbench.locking import dataset_lock
-from lagbench.manifest import read_manifest
-from lagbench.plan import Scenarios, Selection, select
-from lagbench.progress import Meter, Progress
-from lagbench.registry import Registry
-from lagbench.scenario_ids import spell_ids
+from lagbench.make.cards import write_cards
+from lagbench.make.generate import generate
+from lagbench.make.plan import Scenarios, Selection, select
+from lagbench.make.verify import compare, told
 from lagbench.store.publication import publication
-from lagbench.verdict import compare, told
+from lagbench.work.progress import Meter, Progress
 
 from .errand import Errand, Reason
 
@@ -31,35 +30,20 @@ CONNECTIONS = 4
 
 @dataclass(frozen=True, kw_only=True)
 class DownloadResult:
-    """What a download did.
+    """What a download did."""
 
-    Attributes:
-        split: name of the split.
-        size: name of the size.
-        folder: folder of the data set.
-        mirror: base URL that files came from; None where none was needed or reached.
-        downloaded: ids that were downloaded.
-        kept: ids whose files were there and right.
-        generated: ids that were simulated instead.
-        bytes: bytes that came from the mirror.
-        seconds: time that it took [s].
-        complete: whether train, valid and test are all there.
-        dataset_sha256: data set hash, once complete.
-        verdict: how the hashes compare with datasets.yaml, in words.
-    """
-
-    split: str
-    size: str
-    folder: Path
-    mirror: str | None
-    downloaded: tuple[int, ...]
-    kept: tuple[int, ...]
-    generated: tuple[int, ...]
-    bytes: int
-    seconds: float
-    complete: bool
-    dataset_sha256: str | None
-    verdict: str
+    split: str  # name of the split
+    size: str  # name of the size
+    folder: Path  # folder of the data set
+    mirror: str | None  # base URL that files came from; None where none was needed or reached
+    downloaded: tuple[int, ...]  # ids that were downloaded
+    kept: tuple[int, ...]  # ids whose files were there and right
+    generated: tuple[int, ...]  # ids that were simulated instead
+    bytes: int  # bytes that came from the mirror
+    seconds: float  # time that it took [s]
+    complete: bool  # whether train, valid and test are all there
+    dataset_sha256: str | None  # data set hash, once complete
+    verdict: str  # how the hashes compare with datasets.yaml, in words
 
 
 def download(
@@ -88,7 +72,7 @@ def download(
         mirror: base URL of a copy of a root folder; else those of datasets.yaml, in order.
         subset: some subsets only.
         scenarios: some ids only.
-        root: folder of all data sets, see :func:`lagbench.layout.resolve_root`.
+        root: folder of all data sets, see :func:`lagbench.data.layout.resolve_root`.
         connections: files that are fetched side by side.
         or_generate: whether to simulate what no mirror has, or when none answers.
         workers: worker processes of the simulation.

@@ -12,16 +12,14 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from lagbench.atomic import remove_leftovers
-from lagbench.checksums import file_sha256
+from lagbench.data.checksums import file_sha256
+from lagbench.data.layout import MANIFEST_NAME, ScenarioKey, dataset_folder, scenario_path
+from lagbench.data.manifest import FileEntry, Manifest, describe_file, merge, read_manifest, write_manifest
+from lagbench.data.registry import Size, spell_ids
+from lagbench.data.scenario import check_scenario
 from lagbench.errors import DataError, UsageError, WorkFailedError
-from lagbench.inventory import State, examine
-from lagbench.layout import MANIFEST_NAME, ScenarioKey, dataset_folder, scenario_path
-from lagbench.manifest import FileEntry, Manifest, describe_file, merge, read_manifest, write_manifest
-from lagbench.plan import check_disk, scenario_bytes
-from lagbench.progress import Meter
-from lagbench.registry import Size
-from lagbench.scenario_file import check_scenario
-from lagbench.scenario_ids import spell_ids
+from lagbench.make.plan import check_disk, scenario_bytes
+from lagbench.make.verify import State, examine
 from lagbench.store.mirror import Fetch, fetch, fetch_text
 from lagbench.store.mirror_errors import (
     ConnectionLostError,
@@ -30,6 +28,7 @@ from lagbench.store.mirror_errors import (
     NotOnMirrorError,
     WrongContentError,
 )
+from lagbench.work.progress import Meter
 
 __all__ = ["Errand", "Reason"]
 
@@ -44,37 +43,26 @@ SLACK = 1.25
 
 
 class Errand:
-    """One download: what is there, what is fetched, what is recorded.
-
-    Attributes:
-        mirror: base URL that files came from.
-        kept: ids whose files were there and right.
-        downloaded: ids that were fetched.
-        missing: ids that still are not there.
-        bytes: bytes that arrived.
-    """
+    """One download: what is there, what is fetched, what is recorded."""
 
     def __init__(self, size: Size, root: Path, wanted: Sequence[int], meter: Meter, connections: int) -> None:
         self.size, self.root, self._meter, self._connections = size, root, meter, connections
-        self.mirror: str | None = None
-        self.downloaded: list[int] = []
-        self.bytes = 0
+        self.mirror: str | None = None  # base URL that files came from
+        self.downloaded: list[int] = []  # ids that were fetched
+        self.bytes = 0  # bytes that arrived
         self._recorded = dict(size.measured.scenario_sha256) if size.measured else {}
         self._claims: dict[int, FileEntry] = {}
         self._old = self._read_old()
         meter.begin("checking", total=len(wanted), scenarios=len(wanted))
         findings = [examine(root, size, i, manifest=self._old, quick=True) for i in wanted]
         self._entries = [finding.entry for finding in findings if finding.entry]
+        # ids whose files were there and right
         self.kept = [f.scenario for f in findings if f.state is State.GOOD]
+        # ids that still are not there
         self.missing = [f.scenario for f in findings if f.state is not State.GOOD]
 
     def run(self, bases: Sequence[str]) -> Reason:
-        """Fetch what is missing from the mirrors in turn; return why something still is.
-
-        Raises:
-            DataError: a mirror lies.
-            WorkFailedError: the connection kept breaking, or the disk is full.
-        """
+        """Fetch what is missing from the mirrors in turn; return why something still is."""
         place = f"{self.size.split} {self.size.name}"
         reason: Reason = UsageError(
             "no mirror is known",

@@ -8,18 +8,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from lagbench.checksums import HASHED_SUBSETS
+from lagbench.data.checksums import HASHED_SUBSETS
+from lagbench.data.layout import ScenarioKey, scenario_path
+from lagbench.data.local import locate, remedy
+from lagbench.data.manifest import read_manifest
+from lagbench.data.registry import Registry, Size, spell_ids
+from lagbench.data.scenario import read_scenario
 from lagbench.errors import DataError, UsageError, nearest
 from lagbench.generators.batch import solver_constants
-from lagbench.layout import ScenarioKey, scenario_path
-from lagbench.locating import locate
-from lagbench.manifest import read_manifest
-from lagbench.progress import Meter, Progress
-from lagbench.registry import Registry, Size
-from lagbench.remedy import remedy
-from lagbench.scenario_file import read_scenario
-from lagbench.scenario_ids import spell_ids
 from lagbench.store.bringing import bring
+from lagbench.work.progress import Meter, Progress
 
 from . import gns_npz, lagrangebench_h5
 from .kinds import Format
@@ -30,37 +28,21 @@ __all__ = ["ExportResult", "export", "parse_format"]
 
 @dataclass(frozen=True, kw_only=True)
 class ExportResult:
-    """What was written.
+    """What was written."""
 
-    Attributes:
-        format: name of the format.
-        split: name of the split.
-        size: name of the size.
-        folder: folder of the files.
-        files: the files.
-        trajectories: number of trajectories by subset.
-        frames: frames by subset, over all trajectories.
-        left_out: frames that are not in the files, because that format needs equal lengths.
-        bytes: length of the files together [bytes].
-    """
-
-    format: str
-    split: str
-    size: str
-    folder: Path
+    format: str  # name of the format
+    split: str  # name of the split
+    size: str  # name of the size
+    folder: Path  # folder of the files
     files: tuple[Path, ...]
-    trajectories: dict[str, int]
-    frames: dict[str, int]
-    left_out: int
-    bytes: int
+    trajectories: dict[str, int]  # number of trajectories by subset
+    frames: dict[str, int]  # frames by subset, over all trajectories
+    left_out: int  # frames that are not in the files, because that format needs equal lengths
+    bytes: int  # length of the files together [bytes]
 
 
 def parse_format(name: str) -> Format:
-    """Return a format by name.
-
-    Raises:
-        UsageError: there is none; the message names the nearest.
-    """
+    """Return a format by name."""
     known = [form.value for form in Format]
     if name not in known:
         raise UsageError(f"no format {name!r}", where="--format", fix=nearest(name, known))
@@ -88,7 +70,7 @@ def export(
         size: name of the size.
         format: "gns-npz" or "lagrangebench-h5".
         output: folder for the files.
-        root: folder of all data sets, see :func:`lagbench.layout.resolve_root`.
+        root: folder of all data sets, see :func:`lagbench.data.layout.resolve_root`.
         from_walls: lagrangebench-h5 only: measure positions from the lower walls, so that the
             bounds that its models see are the walls; no bit is lost. Else positions are ours,
             and the bounds those of the unit box, which that program's neighbour search needs.
@@ -151,11 +133,7 @@ _ENDINGS = {Format.GNS_NPZ: gns_npz.ENDING, Format.LAGRANGEBENCH_H5: lagrangeben
 
 
 def _claim_target(folder: Path, names: Sequence[str], *, force: bool) -> None:
-    """Refuse a folder that must not be written to; begin to write over an earlier export.
-
-    Raises:
-        UsageError: files are there already, or a program that readers of the format run.
-    """
+    """Refuse a folder that must not be written to; begin to write over an earlier export."""
     if (folder / lagrangebench_h5.FORCE).exists():
         raise UsageError(
             "the folder holds a program that readers of this format run",

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.atomic import atomic_path
+from lagbench.data.scenario import ScenarioFile, read_scenario
 from lagbench.errors import UnreadableFileError, UsageError
-from lagbench.scenario_file import ScenarioFile, read_scenario
 
 from .inflation import check_inflation
 from .kinds import Format, materials_of, numbers_of
@@ -39,17 +39,6 @@ def write(path: Path, scenarios: Iterable[Path]) -> list[tuple[int, int]]:
 
     Members are stored uncompressed, as ``numpy.savez`` stores them: compressed bytes would
     change with the version of zlib.
-
-    Args:
-        path: file to write.
-        scenarios: scenario files in order.
-
-    Returns:
-        Frames and particles of every trajectory.
-
-    Raises:
-        DataError: a scenario file is damaged.
-        WorkFailedError: the operating system refused.
     """
     with atomic_path(path, option="--output") as temporary, zipfile.ZipFile(temporary, "w") as archive:
         return [_add(archive, f"simulation_{number}", file) for number, file in enumerate(scenarios)]
@@ -71,18 +60,7 @@ def _frames(file: ScenarioFile) -> Iterator[NDArray[np.float32]]:
 
 
 def trajectories(path: Path, *, allow_pickle: bool, kinds: Mapping[int, str]) -> Iterator[Trajectory]:
-    """Yield the trajectories of a file, one in memory at a time.
-
-    Args:
-        path: an npz file.
-        allow_pickle: whether the objects in it may be rebuilt.
-        kinds: what kinds of particles stand for, see :func:`lagbench.exchange.kinds.materials_of`.
-
-    Raises:
-        UsageError: the file holds pickled objects, and they may not be rebuilt.
-        UnreadableFileError: no such file.
-        DataError: positions that are not of two components.
-    """
+    """Yield the trajectories of a file, one in memory at a time."""
     if not allow_pickle:
         raise UsageError(
             "the trajectories in this format are pickled objects",

@@ -10,9 +10,9 @@ from typing import Any, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.checksums import HASHED_SUBSETS, file_sha256
+from lagbench.data.checksums import HASHED_SUBSETS, file_sha256
 from lagbench.errors import DataError, UnreadableFileError, UsageError
-from lagbench.progress import Progress
+from lagbench.work.progress import Progress
 
 from . import gns_npz, lagrangebench_h5
 from .description import Description, Wishes

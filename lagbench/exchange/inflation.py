@@ -18,16 +18,7 @@ MOST = 200
 
 
 def check_inflation(where: str, *, packed: int, unpacked: int) -> None:
-    """Refuse an array that is far larger than what a file holds of it.
-
-    Args:
-        where: file and key, for the message.
-        packed: what the file holds [bytes].
-        unpacked: what it would become [bytes].
-
-    Raises:
-        UnreadableFileError: it is.
-    """
+    """Refuse an array that is far larger than what a file holds of it."""
     if unpacked > max(HARMLESS, MOST * packed):
         raise UnreadableFileError(
             "the file would unpack to far more than it holds",

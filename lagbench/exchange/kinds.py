@@ -14,8 +14,8 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.data.scenario import MATERIALS
 from lagbench.errors import UnreadableFileError, UsageError, nearest
-from lagbench.variables import MATERIALS
 
 __all__ = ["DROP", "MEANINGS", "NUMBERS", "Format", "materials_of", "numbers_of", "parse_kinds"]
 

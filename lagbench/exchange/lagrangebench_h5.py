@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.atomic import atomic_path
+from lagbench.data.scenario import ScenarioFile, read_scenario
 from lagbench.errors import UnreadableFileError
-from lagbench.scenario_file import ScenarioFile, read_scenario
 
 from .inflation import check_inflation
 from .kinds import Format, materials_of, numbers_of
@@ -43,20 +43,6 @@ def write(
 
     Chunks of one frame, with gzip and shuffle, are read there 5 to 10 times faster than those
     that HDF5 chooses.
-
-    Args:
-        path: file to write.
-        scenarios: scenario files in order.
-        length: frames of every trajectory; longer scenarios become several, and what is left
-            over at their end is not written.
-        origin: what is taken off every position [length].
-
-    Returns:
-        Frames and particles of every trajectory.
-
-    Raises:
-        DataError: a scenario file is damaged.
-        WorkFailedError: the operating system refused.
     """
     import h5py
 
@@ -95,17 +81,7 @@ def _add(group: h5py.Group, file: ScenarioFile, frames: range, origin: NDArray[n
 def trajectories(
     path: Path, *, kinds: Mapping[int, str], origin: Sequence[float] = (0.0, 0.0)
 ) -> Iterator[Trajectory]:
-    """Yield the trajectories of a file; frames are read when asked for.
-
-    Args:
-        path: an HDF5 file.
-        kinds: what kinds of particles stand for, see :func:`lagbench.exchange.kinds.materials_of`.
-        origin: what is added to every position [length].
-
-    Raises:
-        UnreadableFileError: no such file, or a group that is no trajectory.
-        DataError: positions that are not of two components.
-    """
+    """Yield the trajectories of a file; frames are read when asked for."""
     import h5py
 
     try:

@@ -14,12 +14,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lagbench.atomic import temporary_name
-from lagbench.checksums import HASHED_SUBSETS
+from lagbench.data.checksums import HASHED_SUBSETS
+from lagbench.data.local import DESCRIPTION
+from lagbench.data.manifest import Manifest
+from lagbench.data.registry import load
 from lagbench.errors import DataError, UsageError, WorkFailedError
-from lagbench.locating import DESCRIPTION
-from lagbench.manifest import Manifest
-from lagbench.progress import Meter, Progress
-from lagbench.registry import load
+from lagbench.work.progress import Meter, Progress
 
 from .building import Building
 from .description import SIZE, Description
@@ -33,35 +33,20 @@ Subsets = Mapping[str, Iterable[Trajectory]]
 
 @dataclass(frozen=True, kw_only=True)
 class LocalSplit:
-    """A local split that was made.
+    """A local split that was made."""
 
-    Attributes:
-        folder: its folder, which ``--split`` takes.
-        name: its name.
-        size: its only size.
-        scenarios: number of scenarios by subset.
-        frames: frames of all scenarios.
-        particles: the fewest and the most particles of a scenario.
-        input_frames: frames given to a model.
-        horizon: frames to predict.
-        spacing: distance of neighbouring particles at first [length].
-        bytes: length of the scenario files [bytes].
-        dataset_sha256: hash of the data set.
-        notes: what a user should know.
-    """
-
-    folder: Path
+    folder: Path  # its folder, which --split takes
     name: str
-    size: str
-    scenarios: dict[str, int]
-    frames: int
-    particles: tuple[int, int]
-    input_frames: int
-    horizon: int
-    spacing: float
-    bytes: int
-    dataset_sha256: str
-    notes: tuple[str, ...] = ()
+    size: str  # its only size
+    scenarios: dict[str, int]  # number of scenarios by subset
+    frames: int  # frames of all scenarios
+    particles: tuple[int, int]  # the fewest and the most particles of a scenario
+    input_frames: int  # frames given to a model
+    horizon: int  # frames to predict
+    spacing: float  # distance of neighbouring particles at first [length]
+    bytes: int  # length of the scenario files [bytes]
+    dataset_sha256: str  # hash of the data set
+    notes: tuple[str, ...] = ()  # what a user should know
 
 
 def output_name(output: str | Path) -> str:
@@ -77,20 +62,7 @@ def make_local_split(
     command: str,
     progress: Callable[[Progress], None] | None = None,
 ) -> LocalSplit:
-    """Write a local split; it appears whole or not at all.
-
-    Args:
-        about: what is known of the data.
-        subsets: trajectories of train, valid and test; each must have some.
-        output: folder to make; its last part is the name of the split.
-        command: command that makes it, for the head of its description.
-        progress: called as the work advances.
-
-    Raises:
-        UsageError: the folder is there, its name is taken, or the task does not fit the data.
-        DataError: a subset is empty, or positions are not finite or outside the unit box.
-        WorkFailedError: the disk is full or not writable.
-    """
+    """Write a local split; it appears whole or not at all."""
     folder = Path(os.path.abspath(Path(output).expanduser()))
     if about.name in load().splits:
         raise UsageError(

@@ -15,9 +15,9 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter, ValidationError
 
 from lagbench.atomic import write_atomically
+from lagbench.data.registry import Size
+from lagbench.data.scenario import MATERIALS
 from lagbench.errors import UnreadableFileError
-from lagbench.registry import Size
-from lagbench.variables import MATERIALS
 
 from .kinds import NUMBERS, Format
 
@@ -35,53 +35,35 @@ _GRANULES = 2**20
 
 
 class Hints(BaseModel):
-    """What our own exports add: where the box lies and what the task is.
-
-    Attributes:
-        origin: what was taken off every position [length].
-        bounds: walls before that [length].
-        spacing: distance of neighbouring particles at first [length].
-        density: rest density [mass/length^2].
-        input_frames: frames given.
-        horizon: frames to predict.
-        frames_of_interest: absolute frames at which the scorer reports.
-        cells: cells across of the score grid.
-        placement: where its nodes lie.
-    """
+    """What our own exports add: where the box lies and what the task is."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
-    origin: Pair = (0.0, 0.0)
-    bounds: tuple[Pair, Pair] | None = None
+    origin: Pair = (0.0, 0.0)  # what was taken off every position [length]
+    bounds: tuple[Pair, Pair] | None = None  # walls before that [length]
+    # distance of neighbouring particles at first [length]
     spacing: Annotated[float, Field(gt=0)] | None = None
-    density: Annotated[float, Field(gt=0)] | None = None
-    input_frames: Annotated[int, Field(gt=1)] | None = None
-    horizon: Annotated[int, Field(gt=0)] | None = None
-    frames_of_interest: tuple[int, ...] | None = None
-    cells: Annotated[int, Field(gt=3)] | None = None
-    placement: Literal["cell_centres", "nodes"] | None = None
+    density: Annotated[float, Field(gt=0)] | None = None  # rest density [mass/length^2]
+    input_frames: Annotated[int, Field(gt=1)] | None = None  # frames given
+    horizon: Annotated[int, Field(gt=0)] | None = None  # frames to predict
+    frames_of_interest: tuple[int, ...] | None = None  # absolute frames at which the scorer reports
+    cells: Annotated[int, Field(gt=3)] | None = None  # cells across of the score grid
+    placement: Literal["cell_centres", "nodes"] | None = None  # where its nodes lie
 
 
 class Source(BaseModel):
-    """What a metadata.json says, as far as a local split needs it.
-
-    Attributes:
-        bounds: box of the source [its length].
-        radius: connectivity radius [its length].
-        frame_interval: time between frames [s]; None where none is stated.
-        spacing: distance of neighbouring particles at first [its length].
-        periodic: whether the box is periodic, along x and y.
-        hints: what our own exports add.
-    """
+    """What a metadata.json says, as far as a local split needs it."""
 
     model_config = ConfigDict(frozen=True)
 
-    bounds: tuple[Pair, Pair]
-    radius: Annotated[float, Field(gt=0, allow_inf_nan=False)]
+    bounds: tuple[Pair, Pair]  # box of the source [its length]
+    radius: Annotated[float, Field(gt=0, allow_inf_nan=False)]  # connectivity radius [its length]
+    # time between frames [s]; None where none is stated
     frame_interval: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None
+    # distance of neighbouring particles at first [its length]
     spacing: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None
-    periodic: tuple[bool, bool]
-    hints: Hints
+    periodic: tuple[bool, bool]  # whether the box is periodic, along x and y
+    hints: Hints  # what our own exports add
 
 
 def floor_of(value: float) -> float:
@@ -101,19 +83,7 @@ def describe(
     origin: tuple[float, float],
     free_slip: bool,
 ) -> dict[str, object]:
-    """Return the metadata of an export.
-
-    Args:
-        size: tier of a split.
-        form: format of the export.
-        shapes: what was written.
-        statistics: mean and std over train, per frame, see ``lagbench.statistics``.
-        title: title of the split.
-        dataset_sha256: hash of the data set.
-        spacing: distance of neighbouring particles at first [length].
-        origin: what was taken off every position [length].
-        free_slip: whether the fluid slides along the walls.
-    """
+    """Return the metadata of an export."""
     task, grid = size.task, size.task.score_grid
     common = {
         "bounds": [[low - o, high - o] for (low, high), o in zip(size.bounds, origin, strict=True)],
@@ -187,22 +157,14 @@ def _of_lagrangebench(size: Size, shapes: Shapes, *, spacing: float, free_slip: 
 
 
 def write_metadata(folder: Path, metadata: Mapping[str, object]) -> Path:
-    """Write metadata.json whole or not at all; return its path.
-
-    Raises:
-        WorkFailedError: the operating system refused.
-    """
+    """Write metadata.json whole or not at all; return its path."""
     path = folder / NAME
     write_atomically(path, (json.dumps(metadata, indent=1) + "\n").encode(), option="--output")
     return path
 
 
 def read_source(folder: Path, form: Format) -> Source:
-    """Return what a metadata.json says.
-
-    Raises:
-        UnreadableFileError: it is missing, no JSON, or lacks what a local split needs.
-    """
+    """Return what a metadata.json says."""
     path = folder / NAME
     values = _values(path)
     # Newer GNS programs keep one block for training and one for rollouts.

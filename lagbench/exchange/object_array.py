@@ -174,15 +174,7 @@ class _Arrays(pickle.Unpickler):
 
 
 def read_objects(stream: IO[bytes], where: str) -> NDArray[Any]:
-    """Return the array of a .npy stream, whose objects may be arrays and numbers only.
-
-    Args:
-        stream: a .npy file at its start.
-        where: file and key, for messages.
-
-    Raises:
-        UnreadableFileError: no .npy file, or a pickle that does more than rebuild arrays.
-    """
+    """Return the array of a .npy stream, whose objects may be arrays and numbers only."""
     try:
         version = np.lib.format.read_magic(stream)
         read_header = (

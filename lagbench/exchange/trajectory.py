@@ -22,22 +22,16 @@ PLANE = 2
 
 @dataclass(frozen=True, kw_only=True)
 class Trajectory:
-    """One trajectory whose frames are read when asked for.
+    """One trajectory whose frames are read when asked for."""
 
-    Attributes:
-        name: file and key, for messages.
-        frames: recorded frames.
-        material: value of ``lagbench.variables.MATERIALS`` of each particle, int8, shape [particle].
-        read: returns the frames in order, one at a time.
-        wall_velocity: [length/s], shape [wall, 2] or [frame, wall, 2]; None where there is none.
-        parameters: facts that the scenario's file states and hashes.
-    """
-
-    name: str
-    frames: int
+    name: str  # file and key, for messages
+    frames: int  # recorded frames
+    # value of lagbench.data.scenario.MATERIALS of each particle, int8, shape [particle]
     material: NDArray[np.int8]
-    read: Callable[[], Iterator[Frame]]
+    read: Callable[[], Iterator[Frame]]  # returns the frames in order, one at a time
+    # [length/s], shape [wall, 2] or [frame, wall, 2]; None where there is none
     wall_velocity: Array | None = None
+    # facts that the scenario's file states and hashes
     parameters: Mapping[str, object] = field(default_factory=dict)
 
     @property
@@ -51,12 +45,7 @@ class Trajectory:
 
 
 def check_array(name: str, shape: tuple[int, ...], dtype: np.dtype[np.generic]) -> None:
-    """Refuse positions that are no floats of two components over frames and particles.
-
-    Raises:
-        UnreadableFileError: another number of dimensions, no float.
-        DataError: other than two components, or too few frames or particles.
-    """
+    """Refuse positions that are no floats of two components over frames and particles."""
     if len(shape) != 3 or dtype.kind != "f":
         raise UnreadableFileError(
             "these are no positions",

@@ -25,24 +25,14 @@ __all__ = ["Score", "aggregate", "score"]
 
 @dataclass(frozen=True, eq=False)
 class Score:
-    """What a metric says of one prediction.
-
-    Attributes:
-        metric: the metric.
-        scenarios: scenario ids, ascending.
-        frames: absolute numbers of the predicted frames.
-        per_frame: value at each frame, NaN where not measured or undefined, shape
-            [scenario, frame].
-        values: value over the horizon, shape [scenario].
-        undefined: measured frames without a value, shape [scenario].
-    """
+    """What a metric says of one prediction."""
 
     metric: Metric
-    scenarios: tuple[int, ...]
-    frames: tuple[int, ...]
-    per_frame: Floats
-    values: Floats
-    undefined: tuple[int, ...]
+    scenarios: tuple[int, ...]  # scenario ids, ascending
+    frames: tuple[int, ...]  # absolute numbers of the predicted frames
+    per_frame: Floats  # value at each frame, NaN where not measured or undefined, shape [scenario, frame]
+    values: Floats  # value over the horizon, shape [scenario]
+    undefined: tuple[int, ...]  # measured frames without a value, shape [scenario]
 
     @property
     def mean(self) -> float:
@@ -55,21 +45,12 @@ class Score:
         return bootstrap_interval(self.values)
 
     def at(self, frame: int) -> Floats:
-        """Return the value at one absolute frame, shape [scenario].
-
-        Raises:
-            ValueError: the frame is not predicted.
-        """
+        """Return the value at one absolute frame, shape [scenario]."""
         return self.per_frame[:, self.frames.index(frame)]
 
 
 def score(metric: Metric, tallies: Mapping[int, Tally]) -> Score | None:
-    """Return the score of one metric, None where it was measured nowhere or the task is too short.
-
-    Args:
-        metric: the metric.
-        tallies: tally of each scenario, by scenario id; all of the same frames.
-    """
+    """Return the score of one metric, None where it was measured nowhere or the task is too short."""
     scenarios = tuple(sorted(tallies))
     frames = tallies[scenarios[0]].frames
     asked = np.stack([_measured(metric, tallies[i]) for i in scenarios])

@@ -64,15 +64,10 @@ def _held(pair: FramePair, snapshot: Snapshot, material: str) -> float:
 
 @dataclass(frozen=True)
 class OverBodies:
-    """Mean of a statistic over the elastic bodies of a scenario, or over those of one material.
+    """Mean of a statistic over the elastic bodies of a scenario, or over those of one material."""
 
-    Attributes:
-        statistic: value of one body, given its material.
-        materials: materials whose bodies are taken.
-    """
-
-    statistic: Callable[[FramePair, str], float]
-    materials: tuple[str, ...]
+    statistic: Callable[[FramePair, str], float]  # value of one body, given its material
+    materials: tuple[str, ...]  # materials whose bodies are taken
 
     def _present(self, pair: FramePair) -> list[str]:
         return [name for name in self.materials if name in pair.scenario.members]

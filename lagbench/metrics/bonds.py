@@ -18,15 +18,10 @@ STRETCH = 2.0
 
 @dataclass(frozen=True)
 class Bonds:
-    """Pairs of neighbouring particles of a body.
+    """Pairs of neighbouring particles of a body."""
 
-    Attributes:
-        pairs: numbers of the particles within the body, shape [pair, 2].
-        reach: greatest length at which each bond holds [length], shape [pair].
-    """
-
-    pairs: NDArray[np.intp]
-    reach: Floats
+    pairs: NDArray[np.intp]  # numbers of the particles within the body, shape [pair, 2]
+    reach: Floats  # greatest length at which each bond holds [length], shape [pair]
 
     @classmethod
     def within(cls, radius: float, position: Floats) -> Bonds:

@@ -78,22 +78,14 @@ def _signed_sums(d: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class Comparison:
-    """How far one submission is from another in one metric.
+    """How far one submission is from another in one metric."""
 
-    Attributes:
-        metric: name of the metric.
-        scenarios: ids of the scenarios for which both have a value.
-        difference: mean of first minus second, in the metric's loss: negative says that the
-            first is better.
-        interval: 95 % bootstrap interval of that mean.
-        p: two-sided p-value, NaN with fewer than six scenarios: none is claimed.
-    """
-
-    metric: str
-    scenarios: tuple[int, ...]
+    metric: str  # name of the metric
+    scenarios: tuple[int, ...]  # ids of the scenarios for which both have a value
+    # mean of first minus second, in the metric's loss: negative says that the first is better
     difference: float
-    interval: tuple[float, float]
-    p: float
+    interval: tuple[float, float]  # 95 % bootstrap interval of that mean
+    p: float  # two-sided p-value, NaN with fewer than six scenarios: none is claimed
 
     @property
     def significant(self) -> bool:
@@ -102,11 +94,7 @@ class Comparison:
 
 
 def compare(first: Score, second: Score) -> Comparison:
-    """Compare two scores of one metric over the scenarios that both have.
-
-    Raises:
-        UsageError: scores of different metrics, or of an observable.
-    """
+    """Compare two scores of one metric over the scenarios that both have."""
     if first.metric.name != second.metric.name:
         raise UsageError("scores of different metrics", got=f"{first.metric.name} and {second.metric.name}")
     one, two = _losses(first), _losses(second)
@@ -133,9 +121,6 @@ def shared_ranks(scores: Mapping[str, Score]) -> dict[str, int]:
     No other grouping: the rest are numbered by their mean. With fewer than six scenarios
     nothing can be told from the leader and all share its rank. Methods without any value
     come last.
-
-    Args:
-        scores: score of the ranking metric, by method.
     """
     losses = {name: _losses(score) for name, score in scores.items()}
     mean = {name: float(np.mean(list(loss.values()))) if loss else math.inf for name, loss in losses.items()}

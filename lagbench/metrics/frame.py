@@ -14,9 +14,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lagbench.data.grid import Fields, Grid, fields
+from lagbench.data.writer import MATERIALS
 from lagbench.errors import ChecksFailedError, UsageError
-from lagbench.format import MATERIALS
-from lagbench.grid import Fields, Grid, fields
 
 from .bonds import Bonds
 from .projections import sorted_projections
@@ -34,28 +34,19 @@ PERCENTILES = (5, 25, 50, 75, 95)
 
 @dataclass(frozen=True, kw_only=True)
 class Setting:
-    """What the metrics need to know of a split and size.
+    """What the metrics need to know of a split and size."""
 
-    Attributes:
-        grid: grid of the score fields.
-        input_frames: frames given to the model.
-        horizon: frames it predicts.
-        frames_of_interest: absolute frames at which slow metrics are measured.
-        attribute_std: standard deviations of (x, y, u, v) over train, u and v per frame
-            [length, length, length/frame, length/frame].
-        radius: first-frame neighbours lie within this distance [length].
-        materials: materials of the split; per-material metrics are formed for two or more.
-        centre: centre of the box [length].
-    """
-
-    grid: Grid
-    input_frames: int
-    horizon: int
-    frames_of_interest: tuple[int, ...]
+    grid: Grid  # grid of the score fields
+    input_frames: int  # frames given to the model
+    horizon: int  # frames it predicts
+    frames_of_interest: tuple[int, ...]  # absolute frames at which slow metrics are measured
+    # standard deviations of (x, y, u, v) over train, u and v per frame
+    # [length, length, length/frame, length/frame]
     attribute_std: tuple[float, float, float, float]
-    radius: float
+    radius: float  # first-frame neighbours lie within this distance [length]
+    # materials of the split; per-material metrics are formed for two or more
     materials: tuple[str, ...] = ("liquid",)
-    centre: tuple[float, float] = (0.5, 0.5)
+    centre: tuple[float, float] = (0.5, 0.5)  # centre of the box [length]
 
     @property
     def predicted_frames(self) -> range:
@@ -70,19 +61,12 @@ class Setting:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """Particles of one frame, of truth or of a prediction.
+    """Particles of one frame, of truth or of a prediction."""
 
-    Attributes:
-        position: x(f) [length], shape [particle, 2].
-        velocity: u(f) = x(f) - x(f-1) [length/frame], shape [particle, 2].
-        grid: grid of the fields.
-        full: weight of a full interior node [1].
-    """
-
-    position: Floats
-    velocity: Floats
-    grid: Grid
-    full: float
+    position: Floats  # x(f) [length], shape [particle, 2]
+    velocity: Floats  # u(f) = x(f) - x(f-1) [length/frame], shape [particle, 2]
+    grid: Grid  # grid of the fields
+    full: float  # weight of a full interior node [1]
 
     @cached_property
     def fields(self) -> Fields:
@@ -97,25 +81,15 @@ class Snapshot:
 
 @dataclass(frozen=True, kw_only=True)
 class Scenario:
-    """What holds in all frames of one scenario.
+    """What holds in all frames of one scenario."""
 
-    Attributes:
-        setting: the split and size.
-        given: true positions from frame 0 to the last given frame [length], shape
-            [frame, particle, 2]; at least two frames.
-        material: index into :data:`lagbench.format.MATERIALS`, shape [particle].
-        particle_mass: mass of every particle [mass].
-        area: area that the particles cover at first [length^2].
-
-    Raises:
-        UsageError: fewer than two frames, or material and positions do not fit.
-    """
-
-    setting: Setting
+    setting: Setting  # the split and size
+    # true positions from frame 0 to the last given frame [length], shape
+    # [frame, particle, 2]; at least two frames
     given: NDArray[np.floating]
-    material: NDArray[np.integer]
-    particle_mass: float
-    area: float
+    material: NDArray[np.integer]  # index into MATERIALS, shape [particle]
+    particle_mass: float  # mass of every particle [mass]
+    area: float  # area that the particles cover at first [length^2]
 
     def __post_init__(self) -> None:
         """Refuse shapes that would only fail later, with a worse message."""
@@ -150,12 +124,7 @@ class Scenario:
         return {name: Bonds.within(self.setting.radius, first[index]) for name, index in elastic.items()}
 
     def snapshot(self, position: ArrayLike, previous: ArrayLike) -> Snapshot:
-        """Return the snapshot of positions and those one frame before, both [particle, 2].
-
-        Raises:
-            UsageError: another number of particles.
-            ChecksFailedError: a position is NaN or infinite; no metric is defined then.
-        """
+        """Return the snapshot of positions and those one frame before, both [particle, 2]."""
         # columns contiguous: sums over particles and the grid transfer run along them
         x, before = (np.asarray(a, np.float64, order="F") for a in (position, previous))
         expected = (len(self.material), 2)
@@ -190,19 +159,12 @@ def snapshots(
 
 @dataclass(frozen=True)
 class FramePair:
-    """Truth and prediction of one frame of one scenario.
+    """Truth and prediction of one frame of one scenario."""
 
-    Attributes:
-        scenario: what holds in all its frames.
-        frame: absolute frame number.
-        truth: the simulated particles.
-        prediction: the predicted particles, in the same order.
-    """
-
-    scenario: Scenario
-    frame: int
-    truth: Snapshot
-    prediction: Snapshot
+    scenario: Scenario  # what holds in all its frames
+    frame: int  # absolute frame number
+    truth: Snapshot  # the simulated particles
+    prediction: Snapshot  # the predicted particles, in the same order
 
     @cached_property
     def position_error(self) -> Floats:

@@ -67,42 +67,26 @@ class Metric:
     NaN policy: where ``applies`` says no (no such material, not a slow frame) nothing is
     measured: an expected gap, not counted. Where ``defined`` says no, or a statistic is NaN,
     the frame is undefined: left out of the mean and counted.
-
-    Attributes:
-        name: unique name.
-        family: group of metrics that are shown together.
-        unit: unit of the value.
-        direction: what better means.
-        perfect: value of a perfect prediction; None where it depends on truth or task.
-        source: equation or section that defines it.
-        summary: what it says, one line.
-        statistic: value for one frame pair; None where the metric follows from others' series.
-        applies: whether the statistic is measured for a frame pair.
-        defined: whether it is defined there; otherwise it is NaN.
-        of: names of the statistics that ``series`` takes, its own by default.
-        series: value per frame from the series of those statistics, shape [frame].
-        over_frames: one number of a scenario from the value per frame.
-        per_frame: whether the value at a single frame means anything.
-        horizon: predicted frames needed; smaller tasks do not have the metric.
-        extra: extra of lagbench that it needs; such a metric is measured only when asked for.
     """
 
-    name: str
-    family: str
-    unit: str
-    direction: Direction
-    source: str
-    summary: str
-    perfect: float | None = None
+    name: str  # unique name
+    family: str  # group of metrics that are shown together
+    unit: str  # unit of the value
+    direction: Direction  # what better means
+    source: str  # equation or section that defines it
+    summary: str  # what it says, one line
+    perfect: float | None = None  # value of a perfect prediction; None where it depends on truth or task
+    # value for one frame pair; None where the metric follows from others' series
     statistic: Callable[[FramePair], float] | None = None
-    applies: Callable[[FramePair], bool] = always
-    defined: Callable[[FramePair], bool] = always
-    of: tuple[str, ...] = ()
+    applies: Callable[[FramePair], bool] = always  # whether the statistic is measured for a frame pair
+    defined: Callable[[FramePair], bool] = always  # whether it is defined there; otherwise it is NaN
+    of: tuple[str, ...] = ()  # names of the statistics that 'series' takes, its own by default
+    # value per frame from the series of those statistics, shape [frame]
     series: Callable[..., Floats] = identity
-    over_frames: Callable[[Floats], float] = mean
-    per_frame: bool = True
-    horizon: int = 1
-    extra: str | None = None
+    over_frames: Callable[[Floats], float] = mean  # one number of a scenario from the value per frame
+    per_frame: bool = True  # whether the value at a single frame means anything
+    horizon: int = 1  # predicted frames needed; smaller tasks do not have the metric
+    extra: str | None = None  # extra of lagbench that it needs; such a metric is measured only when asked for
 
     def __post_init__(self) -> None:
         """Fill in ``of``; refuse a metric that nothing could be computed for or judged by.

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lagbench.format import MATERIALS
+from lagbench.data.writer import MATERIALS
 
 from .frame import Floats, FramePair
 from .metric import Direction, Metric
@@ -59,17 +59,11 @@ def velocity_error(pair: FramePair) -> Floats:
 
 @dataclass(frozen=True)
 class ErrorMean:
-    """Mean of a particle error over all particles, or over those of one material.
+    """Mean of a particle error over all particles, or over those of one material."""
 
-    Attributes:
-        error: the error of all particles, shape [particle, 2].
-        law: :func:`mean_squared_error` or :func:`mean_absolute_error`.
-        material: name of a material, None for all.
-    """
-
-    error: Callable[[FramePair], Floats]
-    law: Callable[[Floats], float]
-    material: str | None = None
+    error: Callable[[FramePair], Floats]  # the error of all particles, shape [particle, 2]
+    law: Callable[[Floats], float]  # mean_squared_error or mean_absolute_error
+    material: str | None = None  # name of a material, None for all
 
     def __call__(self, pair: FramePair) -> float:
         """Return the mean for one frame pair."""

@@ -67,15 +67,10 @@ def last(values: Floats) -> float:
 
 @dataclass(frozen=True)
 class FirstFrames:
-    """A reduction of the first predicted frames only; NaN when there are fewer.
+    """A reduction of the first predicted frames only; NaN when there are fewer."""
 
-    Attributes:
-        count: predicted frames that are taken.
-        end: whether to return the last of them instead of their mean.
-    """
-
-    count: int
-    end: bool = False
+    count: int  # predicted frames that are taken
+    end: bool = False  # whether to return the last of them instead of their mean
 
     def __call__(self, values: Floats) -> float:
         """Return the mean over those frames, or the last one."""

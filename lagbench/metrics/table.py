@@ -42,11 +42,7 @@ METRICS: Mapping[str, Metric] = MappingProxyType(
 
 
 def available() -> dict[str, Metric]:
-    """Return all metrics by name, those of other installed packages last.
-
-    Raises:
-        UsageError: an entry point is no metric, or takes a name that another has.
-    """
+    """Return all metrics by name, those of other installed packages last."""
     known = dict(METRICS)
     for point in sorted(entry_points(group=GROUP), key=lambda point: point.name):
         for metric in _load(point):
@@ -79,16 +75,7 @@ def select(
     extras: Collection[str] = (),
     known: Mapping[str, Metric] | None = None,
 ) -> tuple[Metric, ...]:
-    """Return metrics and those whose statistics they follow from, in the table's order.
-
-    Args:
-        names: metrics wanted; by default all that need no extra.
-        extras: extras whose metrics are wanted too.
-        known: table to choose from, :func:`available` by default.
-
-    Raises:
-        UsageError: an unknown name; the message names the nearest known one.
-    """
+    """Return metrics and those whose statistics they follow from, in the table's order."""
     table = available() if known is None else known
     if names is None:
         names = [m.name for m in table.values() if m.extra is None or m.extra in extras]

@@ -23,31 +23,19 @@ __all__ = ["Tally", "measure", "tally"]
 
 @dataclass(frozen=True, eq=False)
 class Tally:
-    """Sums over measurements of the statistics of one scenario.
+    """Sums over measurements of the statistics of one scenario."""
 
-    Attributes:
-        names: names of the statistics.
-        frames: absolute frame numbers.
-        total: sum of the defined values, shape [statistic, frame].
-        weight: how many defined values that is, shape [statistic, frame].
-        undefined: how many values were NaN, shape [statistic, frame].
-    """
-
-    names: tuple[str, ...]
-    frames: tuple[int, ...]
-    total: Floats
-    weight: NDArray[np.int64]
-    undefined: NDArray[np.int64]
+    names: tuple[str, ...]  # names of the statistics
+    frames: tuple[int, ...]  # absolute frame numbers
+    total: Floats  # sum of the defined values, shape [statistic, frame]
+    weight: NDArray[np.int64]  # how many defined values that is, shape [statistic, frame]
+    undefined: NDArray[np.int64]  # how many values were NaN, shape [statistic, frame]
 
     @classmethod
     def of(
         cls, names: Sequence[str], frames: Sequence[int], measured: Mapping[int, Mapping[str, float]]
     ) -> Self:
-        """Return the tally of values by frame and name; what is missing weighs nothing.
-
-        Raises:
-            UsageError: a frame or a name that the tally does not have.
-        """
+        """Return the tally of values by frame and name; what is missing weighs nothing."""
         row = {name: i for i, name in enumerate(names)}
         column = {frame: i for i, frame in enumerate(frames)}
         values = np.zeros((len(row), len(column)))
@@ -62,11 +50,7 @@ class Tally:
         return cls(tuple(names), tuple(frames), np.where(nan, 0.0, values), seen * ~nan, seen * nan)
 
     def __add__(self, other: Tally) -> Tally:
-        """Combine two pieces of the same scenario.
-
-        Raises:
-            UsageError: the two hold different statistics or frames.
-        """
+        """Combine two pieces of the same scenario."""
         if (self.names, self.frames) != (other.names, other.frames):
             raise UsageError("tallies of different statistics or frames do not add")
         return Tally(
@@ -96,12 +80,6 @@ def measure(pair: FramePair, metrics: Iterable[Metric]) -> dict[str, float]:
 
 
 def tally(pairs: Iterable[FramePair], metrics: Sequence[Metric], frames: Sequence[int]) -> Tally:
-    """Measure consecutive frame pairs, holding one at a time.
-
-    Args:
-        pairs: frame pairs of one scenario, any part of its frames.
-        metrics: metrics to measure.
-        frames: all predicted frames of the scenario.
-    """
+    """Measure consecutive frame pairs, holding one at a time."""
     names = [m.name for m in metrics if m.statistic is not None]
     return Tally.of(names, frames, {pair.frame: measure(pair, metrics) for pair in pairs})

@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.extras import require
+from lagbench.errors import require
 
 from .frame import Floats, FramePair
 from .metric import Direction, Metric, at_slow_frames

@@ -1,6 +1,6 @@
 """Errors of the vorticity field at the nodes that the truth's material fills.
 
-``omega = dv/dx - du/dy`` (Eq. 5.19) by :mod:`lagbench.grid`, per frame. Undefined where
+``omega = dv/dx - du/dy`` (Eq. 5.19) by :mod:`lagbench.data.grid`, per frame. Undefined where
 fewer than 16 nodes can be compared. Pearson and slope are also undefined where a field is
 constant: a prediction at rest has no correlation, neither good nor bad.
 """

@@ -6,6 +6,6 @@ small PNG files inside the page.
 
 from __future__ import annotations
 
-from .writing import FILE_NAME, render, write_report
+from .report import FILE_NAME, render, write_report
 
 __all__ = ["FILE_NAME", "render", "write_report"]

@@ -2,20 +2,129 @@
 
 Classes of marks: ``s0`` .. ``s5`` series, ``d1`` .. ``d3`` dashes, ``truth``, ``floor0`` ..
 for the floors. Each chart has a title and a description for those who do not see it.
+
+Axes: from values to pixels, with round ticks.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .markup import Markup, join, path_data, tag
-from .scale import Scale
+from .html import Markup, decimals, join, path_data, power, tag
 
-__all__ = ["Bar", "Plot", "bar_chart"]
+__all__ = [
+    "Scale",
+    "Tick",
+    "linear",
+    "logarithmic",
+    "spanning",
+    "Bar",
+    "Plot",
+    "bar_chart",
+]
+
+
+Floats = NDArray[np.float64]
+
+WIDE = 60.0
+"""From this ratio of greatest to least value an axis of errors is logarithmic."""
+
+DEEPEST = 1e-6
+"""A logarithmic axis reaches no lower than this share of its top."""
+
+_STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)
+
+
+@dataclass(frozen=True)
+class Tick:
+    """A mark of an axis."""
+
+    value: float  # where it stands
+    label: str  # its text
+
+
+@dataclass(frozen=True)
+class Scale:
+    """One axis."""
+
+    low: float  # value at its start
+    high: float  # value at its end
+    log: bool  # whether it is logarithmic
+    exponent: int  # the labels are in units of this power of ten
+    ticks: tuple[Tick, ...]  # its marks
+
+    def share(self, values: ArrayLike) -> Floats:
+        """Return where values lie between low (0) and high (1); NaN where they have no place."""
+        x = np.asarray(values, np.float64)
+        if not self.log:
+            return (x - self.low) / (self.high - self.low)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            logs = np.where(x > 0.0, np.log10(np.where(x > 0.0, x, 1.0)), np.nan)
+        low, high = math.log10(self.low), math.log10(self.high)
+        return np.asarray((logs - low) / (high - low), np.float64)
+
+    @property
+    def factor(self) -> str:
+        """What the labels are to be multiplied by, empty for 1."""
+        return f"×{power(self.exponent)}" if self.exponent else ""
+
+
+def linear(low: float, high: float, *, count: int = 5, tight: bool = False) -> Scale:
+    """Return a linear axis that covers a range."""
+    if not high > low:
+        middle = abs(low) or 1.0
+        low, high = low - 0.5 * middle, low + 0.5 * middle
+    step = _round_step((high - low) / count)
+    first, last = math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9)
+    numbers = [k * step for k in range(first, last + 1)]
+    if tight:
+        numbers = [value for value in numbers if low - 1e-9 * step <= value <= high + 1e-9 * step]
+    else:
+        low, high = numbers[0], numbers[-1]
+    largest = max(abs(low), abs(high))
+    order = math.floor(math.log10(largest))
+    exponent = order if order < -2 or order > 4 else 0
+    unit = 10.0**exponent
+    labels = decimals([value / unit for value in numbers], step / unit)
+    return Scale(low, high, False, exponent, tuple(map(Tick, numbers, labels)))
+
+
+def _round_step(rough: float) -> float:
+    """Return the round number next above."""
+    unit = 10.0 ** math.floor(math.log10(rough))
+    return next(factor * unit for factor in _STEPS if factor * unit >= rough * (1 - 1e-9))
+
+
+def logarithmic(low: float, high: float) -> Scale:
+    """Return a logarithmic axis over whole decades; few decades have ticks between, many skip some."""
+    first, last = math.floor(math.log10(low) + 1e-9), math.ceil(math.log10(high) - 1e-9)
+    last = max(last, first + 1)
+    every = 1 + (last - first) // 7
+    ticks = [Tick(10.0**k, power(k)) for k in range(first, last + 1, every)]
+    if last - first == 1:
+        ticks += [Tick(factor * 10.0**first, f"{factor}×{power(first)}") for factor in (2, 5)]
+    return Scale(10.0**first, 10.0**last, True, 0, tuple(ticks))
+
+
+def spanning(series: Sequence[ArrayLike], *, zero: bool = True, log: bool | None = None) -> Scale:
+    """Return an axis for series of values; what is not finite is left out."""
+    values = np.concatenate([np.asarray(s, np.float64).ravel() for s in series] or [np.zeros(0)])
+    values = values[np.isfinite(values) & (np.abs(values) < 1e300)]
+    if not values.size:
+        return linear(0.0, 1.0)
+    low, high = float(values.min()), float(values.max())
+    positive = values[values > DEEPEST * high] if high > 0.0 else values[:0]
+    if log is None:
+        log = low >= 0.0 and positive.size > 0 and float(np.percentile(positive, 5)) * WIDE < high
+    if log and positive.size and high > 1e-300:
+        return logarithmic(float(positive.min()), high)
+    return linear(min(low, 0.0) if zero else low, max(high, 0.0) if zero else high)
+
 
 WIDTH, HEIGHT = 460, 270
 LEFT, RIGHT, TOP, BOTTOM = 44, 10, 30, 40
@@ -30,20 +139,12 @@ ROW, BAR = 40, 11
 
 
 class Plot:
-    """One chart, built mark by mark.
-
-    Args:
-        x: horizontal axis.
-        y: vertical axis.
-        x_label: quantity and unit of the horizontal axis.
-        y_label: quantity and unit of the vertical axis; it stands above the plot.
-        height: height [pixel]; the width is 460.
-    """
+    """One chart, built mark by mark."""
 
     def __init__(self, x: Scale, y: Scale, *, x_label: str, y_label: str, height: int = HEIGHT) -> None:
         self._x, self._y = x, y
         self._labels = (x_label, y_label)
-        self._height = height
+        self._height = height  # height [pixel]; the width is 460
         self._across, self._up = WIDTH - LEFT - RIGHT, height - TOP - BOTTOM
         self._marks: list[Markup] = []
 
@@ -87,12 +188,7 @@ class Plot:
         self._marks.append(tag("text", label, x=self._across, y=f"{place:.1f}", class_="note end"))
 
     def svg(self, title: str, description: str) -> Markup:
-        """Return the chart.
-
-        Args:
-            title: what it shows.
-            description: what is to be seen, for those who do not see it.
-        """
+        """Return the chart."""
         area = tag(
             "svg",
             tag("g", *self._marks, transform=f"translate({MARGIN} {MARGIN})"),
@@ -133,35 +229,18 @@ class Plot:
 
 @dataclass(frozen=True, kw_only=True)
 class Bar:
-    """One bar of a chart.
+    """One bar of a chart."""
 
-    Attributes:
-        label: what it stands for.
-        value: its length; NaN leaves it out.
-        written: the value as text.
-        dots: values of the scenarios, drawn on the bar.
-        kind: classes of the mark.
-        bold: whether it is the best.
-    """
-
-    label: str
-    value: float
-    written: str
-    dots: Sequence[float]
-    kind: str
-    bold: bool = False
+    label: str  # what it stands for
+    value: float  # its length; NaN leaves it out
+    written: str  # the value as text
+    dots: Sequence[float]  # values of the scenarios, drawn on the bar
+    kind: str  # classes of the mark
+    bold: bool = False  # whether it is the best
 
 
 def bar_chart(bars: Sequence[Bar], scale: Scale, label: str, title: str, description: str) -> Markup:
-    """Return horizontal bars with their names above them.
-
-    Args:
-        bars: the bars from top to bottom.
-        scale: axis of the values.
-        label: quantity and unit of the axis.
-        title: what the chart shows.
-        description: for those who do not see it.
-    """
+    """Return horizontal bars with their names above them."""
     left, right = 8, 14
     across, bottom = WIDTH - left - right, ROW * len(bars) + 6
 

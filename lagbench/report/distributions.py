@@ -9,15 +9,16 @@ from numpy.typing import NDArray
 
 from lagbench.metrics import FramePair
 
-from .chart import Plot
-from .gallery import Gallery, Moment
-from .markup import Markup, join, tag
-from .numbers import text
+from .chart import Plot, Scale, linear
+from .html import Markup, join, tag, text
 from .page import Figure, key
-from .scale import Scale, linear
-from .subject import Subject
+from .subject import Gallery, Moment, Subject
 
-__all__ = ["histogram_figures", "residual_figures"]
+__all__ = [
+    "histogram_figures",
+    "residual_figures",
+]
+
 
 Floats = NDArray[np.float64]
 

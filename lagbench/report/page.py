@@ -2,6 +2,8 @@
 
 Nothing in it is fetched from anywhere: styles, drawings and pictures stand in the file, there
 is no script, and a content security policy forbids the browser to ask for more.
+
+Panels side by side: rows of truth, predictions and differences, columns of frames.
 """
 
 from __future__ import annotations
@@ -10,62 +12,52 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 
-from .markup import Markup, join, tag
+from .html import Markup, join, tag, text
+from .png import data_uri
+from .subject import Walls
 
-__all__ = ["Figure", "Section", "document", "key", "paragraph", "table"]
+__all__ = [
+    "Figure",
+    "Section",
+    "document",
+    "key",
+    "paragraph",
+    "table",
+    "grid",
+    "image",
+    "ramp",
+    "vector",
+]
+
 
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Figure:
-    """One figure.
+    """One figure."""
 
-    Attributes:
-        name: identifier, unique on the page.
-        title: what it shows, a few words.
-        thesis: the figure of the thesis that it corresponds to, as in "Fig. 5.10".
-        body: the drawing, with its key.
-        caption: what it shows, units, how to read it.
-        wide: whether it takes the whole width.
-        data: its numbers as a table, where that is cheap.
-    """
-
-    name: str
-    title: str
-    thesis: str
-    body: Markup
-    caption: Markup
-    wide: bool = False
-    data: Markup | None = None
+    name: str  # identifier, unique on the page
+    title: str  # what it shows, a few words
+    thesis: str  # the figure of the thesis that it corresponds to, as in "Fig. 5.10"
+    body: Markup  # the drawing, with its key
+    caption: Markup  # what it shows, units, how to read it
+    wide: bool = False  # whether it takes the whole width
+    data: Markup | None = None  # its numbers as a table, where that is cheap
 
 
 @dataclass(frozen=True, kw_only=True)
 class Section:
-    """A stretch of the page.
+    """A stretch of the page."""
 
-    Attributes:
-        name: identifier, unique on the page.
-        title: its heading.
-        lead: what stands before the figures.
-        figures: its figures.
-    """
-
-    name: str
-    title: str
-    lead: Markup
+    name: str  # identifier, unique on the page
+    title: str  # its heading
+    lead: Markup  # what stands before the figures
     figures: Sequence[Figure] = ()
 
 
 def document(title: str, head: Markup, sections: Sequence[Section], foot: Markup) -> str:
-    """Return the page.
-
-    Args:
-        title: title of the window.
-        head: top of the page.
-        sections: its sections; figures are numbered through all of them.
-        foot: last lines.
-    """
+    """Return the page."""
     links = [tag("li", tag("a", section.title, href=f"#part-{section.name}")) for section in sections]
     contents = tag("nav", tag("ol", *links), class_="contents", aria_label="Contents")
     first = 1
@@ -115,12 +107,7 @@ def _figure(figure: Figure, number: int) -> Markup:
 
 
 def key(items: Sequence[tuple[str, str]], *, kind: str = "line") -> Markup:
-    """Return what the marks of a figure mean.
-
-    Args:
-        items: classes of the mark and its name.
-        kind: class of the marks themselves, "line" or "square".
-    """
+    """Return what the marks of a figure mean."""
     return tag(
         "ul", *(tag("li", _swatch(mark, kind), tag("span", name)) for mark, name in items), class_="key"
     )
@@ -137,14 +124,7 @@ def _swatch(mark: str, kind: str) -> Markup:
 def table(
     head: Sequence[object], rows: Sequence[Sequence[object]], *, kind: str = "", label: str = ""
 ) -> Markup:
-    """Return a table in a box of its own that scrolls when it is wider than the page.
-
-    Args:
-        head: headings of the columns.
-        rows: cells of each row, the first one its heading.
-        kind: further classes.
-        label: what it holds, for those who do not see it.
-    """
+    """Return a table in a box of its own that scrolls when it is wider than the page."""
     headings = tag("tr", *(tag("th", cell, scope="col") for cell in head))
     body = [tag("tr", tag("th", row[0], scope="row"), *(tag("td", cell) for cell in row[1:])) for row in rows]
     drawn = tag("table", tag("thead", headings), tag("tbody", *body), class_=kind or None)
@@ -154,3 +134,41 @@ def table(
 def paragraph(*parts: object) -> Markup:
     """Return a paragraph."""
     return tag("p", join(parts))
+
+
+SIDE = 200
+"""Side of the coordinates of a vector panel."""
+
+
+def grid(
+    columns: Sequence[object], rows: Sequence[tuple[str, Sequence[Markup]]], *, width: float = 6.6
+) -> Markup:
+    """Return panels in a grid that scrolls sideways on narrow screens."""
+    cells = [tag("span"), *(tag("span", column, class_="time") for column in columns)]
+    for name, panels in rows:
+        cells += [tag("span", name, class_="side"), *panels]
+    tracks = f"grid-template-columns:minmax(5.2rem,6.5rem) repeat({len(columns)},minmax({width}rem,1fr))"
+    return tag("div", tag("div", *cells, class_="panels", style=tracks), class_="scroll", tabindex=0)
+
+
+def image(png: bytes, walls: Walls, alt: str, *, smooth: bool = False) -> Markup:
+    """Return a panel that shows a picture of the inside of the box."""
+    kind = "smooth" if smooth else None
+    return tag("span", tag("img", src=data_uri(png), alt=alt, class_=kind), class_=_classes(walls))
+
+
+def vector(drawn: Markup, walls: Walls, alt: str) -> Markup:
+    """Return a panel of lines in coordinates from 0 to 200."""
+    svg = tag("svg", tag("title", alt), drawn, viewBox=f"0 0 {SIDE} {SIDE}", class_="flow", role="img")
+    return tag("span", svg, class_=_classes(walls))
+
+
+def _classes(walls: Walls) -> str:
+    return f"panel {walls.classes}".strip()
+
+
+def ramp(kind: str, limit: float, unit: str, *, signed: bool = False) -> Markup:
+    """Return the key of a colour scale."""
+    low = f"−{text(limit)}" if signed else "0"
+    bar = tag("span", class_=f"ramp {kind}")
+    return tag("p", join([low, bar, text(limit)], " "), tag("span", unit, class_="muted"), class_="scale")

@@ -12,9 +12,18 @@ import zlib
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.palette import rgb
+from lagbench.draw.style import rgb
 
-__all__ = ["CLOCKWISE", "COUNTER", "FAST", "data_uri", "diverging", "encode", "sequential"]
+__all__ = [
+    "CLOCKWISE",
+    "COUNTER",
+    "FAST",
+    "data_uri",
+    "diverging",
+    "encode",
+    "sequential",
+]
+
 
 Bytes = NDArray[np.uint8]
 

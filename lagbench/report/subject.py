@@ -1,8 +1,12 @@
-"""What a report is about: the entries, the task, and the frames that its pictures show."""
+"""What a report is about: the entries, the task, and the frames that its pictures show.
+
+The frames that pictures show, read from truth and predictions a few at a time.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -10,17 +14,30 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.data.layout import resolve_root
+from lagbench.data.local import rooted
+from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
-from lagbench.exam import Exam, load_exam
-from lagbench.layout import resolve_root
-from lagbench.locating import rooted
-from lagbench.method_names import told_apart
-from lagbench.metrics import Metric, Score
-from lagbench.registry import Registry
-from lagbench.score_card import ScoreCard
-from lagbench.sitting import SUBMISSION
+from lagbench.metrics import FramePair, Metric, Scenario, Score, Snapshot
+from lagbench.scoring.card import ScoreCard
+from lagbench.scoring.compare import told_apart
+from lagbench.scoring.scenario import SUBMISSION
+from lagbench.scoring.task import OpenScenario, ScoredTask, load_scored_task
+from lagbench.submission import Predictions, open_predictions
 
-__all__ = ["COLOURS", "Entry", "Row", "Subject", "kind_of", "subject_of"]
+__all__ = [
+    "COLOURS",
+    "Entry",
+    "Row",
+    "Subject",
+    "kind_of",
+    "subject_of",
+    "Gallery",
+    "Moment",
+    "Walls",
+    "open_gallery",
+]
+
 
 COLOURS = 6
 """Series that differ in colour; further ones are dashed."""
@@ -38,19 +55,12 @@ SAME = ("split", "size", "dataset_version", "dataset_sha256")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Entry:
-    """One submission of the report.
+    """One submission of the report."""
 
-    Attributes:
-        number: its place in the order in which the files were given, from 0.
-        name: its method, told apart from others of that name.
-        card: what the scorer says of it.
-        predictions: its file.
-    """
-
-    number: int
-    name: str
-    card: ScoreCard
-    predictions: Path
+    number: int  # its place in the order in which the files were given, from 0
+    name: str  # its method, told apart from others of that name
+    card: ScoreCard  # what the scorer says of it
+    predictions: Path  # its file
 
     @property
     def kind(self) -> str:
@@ -60,34 +70,21 @@ class Entry:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Row:
-    """What stands beside each other in tables and charts: an entry or a floor.
-
-    Attributes:
-        name: its name.
-        kind: classes of its marks.
-        scores: its scores by metric.
-        entry: the entry, None for a floor.
-    """
+    """What stands beside each other in tables and charts: an entry or a floor."""
 
     name: str
-    kind: str
-    scores: Mapping[str, Score]
-    entry: Entry | None = None
+    kind: str  # classes of its marks
+    scores: Mapping[str, Score]  # its scores by metric
+    entry: Entry | None = None  # the entry, None for a floor
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Subject:
-    """Everything that the figures are drawn from.
+    """Everything that the figures are drawn from."""
 
-    Attributes:
-        exam: the test subset.
-        title: title of the split.
-        entries: the submissions in the order in which they were given.
-    """
-
-    exam: Exam
-    title: str
-    entries: tuple[Entry, ...]
+    exam: ScoredTask  # the test subset
+    title: str  # title of the split
+    entries: tuple[Entry, ...]  # the submissions in the order in which they were given
 
     @cached_property
     def rows(self) -> tuple[Row, ...]:
@@ -187,18 +184,7 @@ def subject_of(
     root: str | Path | None = None,
     registry: Registry | None = None,
 ) -> Subject:
-    """Return the subject of a report.
-
-    Args:
-        cards: score cards.
-        predictions: their files, in the same order.
-        root: folder of all data sets.
-        registry: where splits are described; ours when None.
-
-    Raises:
-        UsageError: nothing to report, or cards of different splits, sizes or data sets.
-        DataError: the test subset is missing or damaged.
-    """
+    """Return the subject of a report."""
     if not cards or len(cards) != len(predictions):
         raise UsageError(
             "a report needs score cards and their predictions",
@@ -209,7 +195,7 @@ def subject_of(
         _check_same(cards[0], card, path)
     folder, header = resolve_root(root), cards[0].header
     described = rooted(folder, registry)
-    exam = load_exam(described.size(header.split, header.size), folder)
+    exam = load_scored_task(described.size(header.split, header.size), folder)
     names = told_apart([card.header.method for card in cards], taken=cards[0].scores)
     entries = [
         Entry(number=i, name=name, card=card, predictions=Path(path))
@@ -229,3 +215,113 @@ def _check_same(first: ScoreCard, card: ScoreCard, path: Path) -> None:
                 got=got,
                 fix="report submissions to one data set together, others on their own",
             )
+
+
+WALLS = ("left", "right", "bottom", "top")
+_ALONG = ((0.0, 1.0), (0.0, 1.0), (1.0, 0.0), (1.0, 0.0))
+
+
+@dataclass(frozen=True)
+class Walls:
+    """Which walls of a scenario move, and its Reynolds number."""
+
+    moving: tuple[str, ...]  # names of the walls that slide
+    reynolds: float | None  # Reynolds number, None where there is none
+    mark: str  # what sets the scenario apart, as in "falling circle"; empty where nothing does
+
+    @property
+    def classes(self) -> str:
+        """Classes of a panel whose walls move."""
+        return " ".join(f"{wall}-moves" for wall in self.moving)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Moment:
+    """One frame of one scenario: the truth and every entry's prediction."""
+
+    scenario: int  # id of the scenario
+    frame: int  # absolute frame number
+    pairs: tuple[FramePair, ...]  # truth and prediction of each entry, in their order
+
+    @property
+    def truth(self) -> Snapshot:
+        """The true particles."""
+        return self.pairs[0].truth
+
+    @property
+    def setting_of(self) -> Scenario:
+        """What holds in all frames of the scenario."""
+        return self.pairs[0].scenario
+
+    @cached_property
+    def true_vorticity(self) -> NDArray[np.float64]:
+        """Vorticity of the truth, NaN where it is not compared [1/frame], shape [x node, y node]."""
+        return self.truth.fields.vorticity
+
+
+@dataclass(frozen=True, eq=False)
+class Gallery:
+    """All frames that the pictures of a report show."""
+
+    moments: Mapping[tuple[int, int], Moment]  # moments by scenario id and frame
+    walls: Mapping[int, Walls]  # walls by scenario id
+
+    def at(self, scenario: int, frames: Collection[int]) -> list[Moment]:
+        """Return the moments of a scenario at some frames."""
+        return [self.moments[scenario, frame] for frame in frames]
+
+
+def open_gallery(subject: Subject) -> Gallery:
+    """Read the frames that the pictures of a report show."""
+    moments: dict[tuple[int, int], Moment] = {}
+    walls: dict[int, Walls] = {}
+    with ExitStack() as stack:
+        files = [stack.enter_context(open_predictions(entry.predictions)) for entry in subject.entries]
+        for scenario in subject.scenarios:
+            with subject.exam.opened(scenario) as truth:
+                walls[scenario] = _walls(truth)
+                for moment in _moments(truth, files, scenario, _frames(subject, scenario)):
+                    moments[scenario, moment.frame] = moment
+    return Gallery(moments, walls)
+
+
+def _frames(subject: Subject, scenario: int) -> list[int]:
+    """Return the frames of a scenario that are shown: all in the first, and of free surfaces."""
+    if scenario != subject.scenarios[0] and subject.full_box:
+        return [subject.key_frame]
+    return sorted({subject.key_frame, *subject.times, *subject.histogram_frames})
+
+
+def _moments(
+    truth: OpenScenario, files: list[Predictions], number: int, frames: list[int]
+) -> Iterator[Moment]:
+    scenario = truth.scenario
+    for frame in frames:
+        position = truth.file.read("position", slice(frame - 1, frame + 1))
+        true = scenario.snapshot(position[1], position[0])
+        pairs = [FramePair(scenario, frame, true, _predicted(f, scenario, number, frame)) for f in files]
+        yield Moment(scenario=number, frame=frame, pairs=tuple(pairs))
+
+
+def _predicted(file: Predictions, scenario: Scenario, number: int, frame: int) -> Snapshot:
+    if frame == scenario.setting.input_frames:
+        return scenario.snapshot(file.frames(number, frame, 1)[0], scenario.given[-1])
+    before, now = file.frames(number, frame - 1, 2)
+    return scenario.snapshot(now, before)
+
+
+def _walls(truth: OpenScenario) -> Walls:
+    file = truth.file
+    speed = np.zeros((4, 2))
+    if "wall_velocity" in file.variables:
+        speed = np.asarray(file.read("wall_velocity", 0), np.float64) * _ALONG
+    parameters = file.header.parameters
+    reynolds = parameters.get("reynolds_number")
+    marks = [str(parameters[name]) for name in ("family", "pair") if name in parameters]
+    if "frequency" in parameters:
+        marks.append(f"frequency {parameters['frequency']}")
+    return Walls(
+        moving=tuple(wall for wall, v in zip(WALLS, speed, strict=True) if v.any()),
+        reynolds=float(reynolds) if isinstance(reynolds, (int, float)) else None,
+        mark=", ".join(marks),
+    )

@@ -50,26 +50,15 @@ class Readable(Protocol):
 
 @dataclass(frozen=True)
 class Answer:
-    """What a mirror answers.
+    """What a mirror answers."""
 
-    Attributes:
-        stream: the bytes from ``start`` on.
-        start: the offset asked for, or 0 where the mirror starts over.
-        total: length of the whole file as announced; None where none is.
-        page: whether it says itself that it is a page to look at.
-    """
-
-    stream: Readable
-    start: int
-    total: int | None
-    page: bool = False
+    stream: Readable  # the bytes from 'start' on
+    start: int  # the offset asked for, or 0 where the mirror starts over
+    total: int | None  # length of the whole file as announced; None where none is
+    page: bool = False  # whether it says itself that it is a page to look at
 
     def blocks(self, url: str) -> Iterator[bytes]:
-        """Yield what arrives.
-
-        Raises:
-            BrokenError: the connection broke.
-        """
+        """Yield what arrives."""
         while True:
             try:
                 block = self.stream.read(BLOCK)

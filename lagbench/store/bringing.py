@@ -15,15 +15,13 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from lagbench.checksums import file_sha256
+from lagbench.data.checksums import file_sha256
+from lagbench.data.layout import MANIFEST_NAME, dataset_folder, url_of
+from lagbench.data.lock import dataset_lock
+from lagbench.data.manifest import FileEntry, Manifest, merge, read_manifest, write_manifest
+from lagbench.data.registry import Size, spell_ids
 from lagbench.errors import DataError
-from lagbench.identity import may_differ
-from lagbench.layout import MANIFEST_NAME, dataset_folder
-from lagbench.locking import dataset_lock
-from lagbench.manifest import FileEntry, Manifest, merge, read_manifest, write_manifest
-from lagbench.registry import Size
-from lagbench.scenario_ids import spell_ids
-from lagbench.working_copy import url_of
+from lagbench.work.machine import may_differ
 
 from .fetching import address_of, called_store, fetch_scenarios
 from .mirror import fetch_text
@@ -86,17 +84,7 @@ def bring(size: Size, root: Path, scenarios: Iterable[int] = (), *, thoroughly: 
 
 
 def remote_manifest(size: Size, url: str, *, fresh: float | None = None) -> Manifest | None:
-    """Return the manifest of a data set in a store; None where there is none.
-
-    Args:
-        size: tier of a split.
-        url: root in the store.
-        fresh: how old an earlier answer may be [s].
-
-    Raises:
-        DataError: what the store sent is no manifest, or the bucket does not exist.
-        WorkFailedError: the store refuses or does not answer.
-    """
+    """Return the manifest of a data set in a store; None where there is none."""
     place = address_of(size, url, MANIFEST_NAME)
     when, known = _asked.get((url, place), (-1e9, None))
     if time.monotonic() - when < (FRESH if fresh is None else fresh):
@@ -114,16 +102,7 @@ def remote_manifest(size: Size, url: str, *, fresh: float | None = None) -> Mani
 
 
 def unstored(size: Size, root: Path, scenarios: Iterable[int]) -> tuple[int, ...]:
-    """Return scenarios that the manifest of a working copy's store lacks.
-
-    Args:
-        size: one size of a split.
-        root: folder of all data sets; a plain folder has no store, and lacks nothing.
-        scenarios: ids.
-
-    Raises:
-        DataError, WorkFailedError: see :func:`remote_manifest`.
-    """
+    """Return scenarios that the manifest of a working copy's store lacks."""
     url = url_of(root)
     if url is None:
         return ()
@@ -144,14 +123,7 @@ def is_right(entry: FileEntry, size: Size, manifest: Manifest) -> bool:
 
 
 def merged(size: Size, root: Path, found: Manifest, local: Manifest | None) -> Manifest:
-    """Return the store's manifest with what only the working copy holds.
-
-    Args:
-        size: tier of a split.
-        root: the working copy.
-        found: manifest of the store, without what is not right there.
-        local: manifest of the working copy.
-    """
+    """Return the store's manifest with what only the working copy holds."""
     folder = dataset_folder(root, size.split, size.name, size.major)
     if local is None:
         return found

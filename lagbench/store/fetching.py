@@ -12,12 +12,12 @@ from contextvars import ContextVar
 from pathlib import Path
 
 from lagbench.atomic import remove_leftovers
-from lagbench.checksums import file_sha256
+from lagbench.data.checksums import file_sha256
+from lagbench.data.layout import dataset_folder
+from lagbench.data.manifest import FileEntry
+from lagbench.data.registry import Size
+from lagbench.data.scenario import check_scenario
 from lagbench.errors import DataError, WorkFailedError
-from lagbench.layout import dataset_folder
-from lagbench.manifest import FileEntry
-from lagbench.registry import Size
-from lagbench.scenario_file import check_scenario
 
 from .mirror import Fetch, fetch
 from .mirror_errors import NotDataError, NotOnMirrorError, WrongContentError
@@ -61,12 +61,7 @@ def quietly() -> Iterator[None]:
 
 
 def fetch_scenarios(size: Size, root: Path, url: str, entries: Collection[FileEntry]) -> None:
-    """Fetch objects into the working copy, whose lock is held; each appears whole and right.
-
-    Raises:
-        DataError: an object is not there, no data, or of another length or content.
-        WorkFailedError: the store refuses or does not answer, or the disk is full.
-    """
+    """Fetch objects into the working copy, whose lock is held; each appears whole and right."""
     if not entries:
         return
     told = _Ticker(url, len(entries), sum(entry.bytes for entry in entries))

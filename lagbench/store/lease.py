@@ -20,8 +20,8 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 
+from lagbench.data.lock import Holder
 from lagbench.errors import LagbenchError, WorkFailedError
-from lagbench.locking import Holder
 
 from .remote import Remote
 
@@ -44,23 +44,15 @@ POLL = 2.0
 
 @dataclass(frozen=True, kw_only=True)
 class _Lock:
-    """What a lock object says.
+    """What a lock object says."""
 
-    Attributes:
-        pid: process id of the holder.
-        host: its machine.
-        since: when it took the lock, ISO 8601 in UTC.
-        expires: until when it holds unless renewed, likewise.
-        released: whether the holder gave it back.
-        token: random word of the holder.
-    """
-
-    pid: int = field(default_factory=os.getpid)
-    host: str = field(default_factory=socket.gethostname)
+    pid: int = field(default_factory=os.getpid)  # process id of the holder
+    host: str = field(default_factory=socket.gethostname)  # its machine
+    # when it took the lock, ISO 8601 in UTC
     since: str = field(default_factory=lambda: _now().isoformat(timespec="seconds"))
-    expires: str = ""
-    released: bool = False
-    token: str = field(default_factory=lambda: secrets.token_hex(8))
+    expires: str = ""  # until when it holds unless renewed, likewise
+    released: bool = False  # whether the holder gave it back
+    token: str = field(default_factory=lambda: secrets.token_hex(8))  # random word of the holder
 
     @property
     def free(self) -> bool:
@@ -84,13 +76,7 @@ class _Lock:
 
 
 class Lease:
-    """The lock of a data set, held by this process.
-
-    Args:
-        remote: the data set's objects.
-        number: number of the lock object.
-        lock: what it says.
-    """
+    """The lock of a data set, held by this process."""
 
     def __init__(self, remote: Remote, number: int, lock: _Lock) -> None:
         self._remote, self._number, self._lock = remote, number, lock
@@ -100,11 +86,7 @@ class Lease:
         self._thread.start()
 
     def check(self) -> None:
-        """Refuse to write on once the lock is not ours any more.
-
-        Raises:
-            WorkFailedError: another writer took over, or the lock could not be renewed in time.
-        """
+        """Refuse to write on once the lock is not ours any more."""
         if self._lost is None and _now() > datetime.fromisoformat(self._lock.expires):
             self._lost = "it expired: the store did not answer"
         if self._lost is not None:
@@ -143,18 +125,7 @@ class Lease:
 def lease(
     remote: Remote, *, timeout: float | None = None, on_wait: Callable[[str], None] | None = None
 ) -> Iterator[Lease]:
-    """Hold the lock of a data set in a store.
-
-    Args:
-        remote: the data set's objects.
-        timeout: how long to wait for another writer [s]; None waits for ever, 0 not at all.
-        on_wait: called once with the holder in words before waiting.
-
-    Raises:
-        WorkFailedError: another writer still holds it after the timeout, or the store refuses,
-            does not answer, or knows no conditional put.
-        DataError: the bucket does not exist.
-    """
+    """Hold the lock of a data set in a store."""
     held = _acquire(remote, timeout, on_wait)
     try:
         yield held

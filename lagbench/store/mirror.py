@@ -36,21 +36,13 @@ SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
 @dataclass(frozen=True, kw_only=True)
 class Fetch:
-    """A file to fetch.
+    """A file to fetch."""
 
-    Attributes:
-        url: where it is.
-        target: where it shall be; its temporary name is beside that.
-        limit: bytes beyond which no file of this kind goes.
-        length: bytes that it has, where that is known.
-        sha256: SHA-256 of its bytes as the mirror states it.
-    """
-
-    url: str
-    target: Path
-    limit: int
-    length: int | None = None
-    sha256: str | None = None
+    url: str  # where it is
+    target: Path  # where it shall be; its temporary name is beside that
+    limit: int  # bytes beyond which no file of this kind goes
+    length: int | None = None  # bytes that it has, where that is known
+    sha256: str | None = None  # SHA-256 of its bytes as the mirror states it
 
 
 def partial_name(target: Path) -> Path:
@@ -59,25 +51,7 @@ def partial_name(target: Path) -> Path:
 
 
 def fetch(wanted: Fetch, *, report: Callable[[int], None] | None = None) -> Path:
-    """Bring a file to its temporary name, going on where an earlier attempt stopped.
-
-    Args:
-        wanted: what to fetch.
-        report: told the bytes that arrived; may raise to stop.
-
-    Returns:
-        The temporary name. After a broken connection the bytes stay there, to go on from;
-        after a lie of the mirror nothing does.
-
-    Raises:
-        NotOnMirrorError: no such file there.
-        MirrorUnreachableError: no answer.
-        ConnectionLostError: the connection broke too often.
-        NotDataError: a page instead of data.
-        TruncatedError: the file ends too early.
-        WrongLengthError: another length than announced or known, or beyond the limit.
-        WorkFailedError: the disk is full or not writable.
-    """
+    """Bring a file to its temporary name, going on where an earlier attempt stopped."""
     partial = partial_name(wanted.target)
     try:
         partial.parent.mkdir(parents=True, exist_ok=True)
@@ -126,12 +100,7 @@ def _insist(wanted: Fetch, partial: Path, report: Callable[[int], None]) -> None
 
 
 def fetch_text(url: str, *, limit: int) -> bytes:
-    """Return a small file.
-
-    Raises:
-        NotOnMirrorError, MirrorUnreachableError, ConnectionLostError, NotDataError,
-        TruncatedError, WrongLengthError: see :func:`fetch`.
-    """
+    """Return a small file."""
     failures = 0
     while True:
         try:

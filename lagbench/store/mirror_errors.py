@@ -48,14 +48,9 @@ class WrongContentError(DataError):
 
 
 class BrokenError(Exception):
-    """An attempt that ended early; another may go on from there.
-
-    Attributes:
-        error: what to raise when no other attempt is made.
-        stale: whether what is there already has to go first.
-    """
+    """An attempt that ended early; another may go on from there."""
 
     def __init__(self, error: WorkFailedError | DataError, *, stale: bool = False) -> None:
         super().__init__(str(error))
-        self.error = error
-        self.stale = stale
+        self.error = error  # what to raise when no other attempt is made
+        self.stale = stale  # whether what is there already has to go first

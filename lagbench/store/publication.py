@@ -13,12 +13,11 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from lagbench.checksums import file_sha256
+from lagbench.data.checksums import file_sha256
+from lagbench.data.layout import MANIFEST_NAME, dataset_folder, url_of
+from lagbench.data.manifest import FileEntry, Manifest, merge, write_manifest
+from lagbench.data.registry import Size
 from lagbench.errors import DataError, LagbenchError
-from lagbench.layout import MANIFEST_NAME, dataset_folder
-from lagbench.manifest import FileEntry, Manifest, merge, write_manifest
-from lagbench.registry import Size
-from lagbench.working_copy import url_of
 
 from .bringing import is_right, local_manifest, merged, remote_manifest, writing
 from .fetching import fetch_scenarios
@@ -33,23 +32,14 @@ EVERY = 10.0
 
 
 class Publication:
-    """A data set in a store, and the working copy that it is written from.
-
-    Args:
-        size: tier of a split.
-        root: the working copy.
-        remote: the data set's objects.
-        lock: the lock that allows to write; None to look only.
-
-    Attributes:
-        held: entries of the scenarios that the store holds and that are right, by id.
-    """
+    """A data set in a store, and the working copy that it is written from."""
 
     def __init__(self, size: Size, root: Path, remote: Remote, lock: Lease | None) -> None:
         self._size, self._root, self._remote, self._lock = size, root, remote, lock
         self._folder = dataset_folder(root, size.split, size.name, size.major)
         self._names = remote.sizes()
         found = self._read_manifest()
+        # entries of the scenarios that the store holds and that are right, by id
         self.held = {
             e.scenario: e
             for e in found.files
@@ -67,12 +57,7 @@ class Publication:
             write_manifest(self._root, known)
 
     def bring(self, scenarios: Iterable[int]) -> None:
-        """Fetch what the store holds of some scenarios and the working copy does not.
-
-        Raises:
-            DataError: an object has other content than the manifest says.
-            WorkFailedError: the store refuses or does not answer, or the disk is full.
-        """
+        """Fetch what the store holds of some scenarios and the working copy does not."""
         entries = [self.held[i] for i in scenarios if i in self.held]
         lacking = [e for e in entries if not self._is_local(e)]
         fetch_scenarios(self._size, self._root, self._remote.root, lacking)
@@ -84,12 +69,7 @@ class Publication:
         return all(self._remote.read(name) == text for name, text in cards.items())
 
     def follow(self, manifest: Manifest, *, at_once: bool = False) -> None:
-        """Put what the manifest names and the store lacks; then, if it is time, the manifest.
-
-        Raises:
-            WorkFailedError: the store refuses or does not answer, or the lock was lost.
-            DataError: a file of the working copy is another than the manifest says.
-        """
+        """Put what the manifest names and the store lacks; then, if it is time, the manifest."""
         self._latest = manifest
         for entry in self._lacking(manifest):
             self._put(entry)
@@ -97,11 +77,7 @@ class Publication:
             self._put_manifest(manifest)
 
     def finish(self, manifest: Manifest, cards: Iterable[Path]) -> None:
-        """Put the cards, and the manifest last.
-
-        Raises:
-            WorkFailedError: the store refuses or does not answer, or the lock was lost.
-        """
+        """Put the cards, and the manifest last."""
         self.follow(manifest)
         # The text comes after the pictures that it shows: where it is right, so are they.
         for path in reversed([*cards]):
@@ -179,13 +155,7 @@ class Publication:
 
 
 def look_at(size: Size, root: Path) -> Publication | None:
-    """Return what a store holds of a data set, to look only; None for a root that is a plain folder.
-
-    Raises:
-        DataError: the bucket does not exist.
-        WorkFailedError: the store refuses or does not answer.
-        UsageError: what reads this kind of address is not installed.
-    """
+    """Return what a store holds of a data set, to look only; None for a root that is a plain folder."""
     url = url_of(root)
     return None if url is None else Publication(size, root, _remote(size, url), None)
 
@@ -194,18 +164,7 @@ def look_at(size: Size, root: Path) -> Publication | None:
 def publication(
     size: Size, root: Path, *, on_wait: Callable[[str], None] | None = None
 ) -> Iterator[Publication | None]:
-    """Hold a data set of a store for writing; yield None for a root that is a plain folder.
-
-    Args:
-        size: tier of a split.
-        root: folder of all data sets, whose own lock is held.
-        on_wait: called with the holder in words when another process holds the store's lock.
-
-    Raises:
-        DataError: the bucket does not exist.
-        WorkFailedError: the store refuses, does not answer, or knows no conditional put.
-        UsageError: what reads this kind of address is not installed.
-    """
+    """Hold a data set of a store for writing; yield None for a root that is a plain folder."""
     url = url_of(root)
     if url is None:
         yield None

@@ -9,8 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from lagbench.errors import DataError, LagbenchError, UsageError, WorkFailedError
-from lagbench.extras import require
+from lagbench.errors import DataError, LagbenchError, UsageError, WorkFailedError, require
 
 __all__ = ["Remote", "check_bucket", "refusals_told", "translated"]
 
@@ -28,15 +27,7 @@ _CREDENTIALS = {"NoCredentialsError", "PartialCredentialsError", "ProfileNotFoun
 
 
 class Remote:
-    """The folder of one data set version in a store; names are relative to it.
-
-    Args:
-        url: root in the store.
-        folder: folder of the data set below it, ``<split>/<size>/v<MAJOR>``.
-
-    Raises:
-        UsageError: fsspec knows no such kind of address, or what reads it is not installed.
-    """
+    """The folder of one data set version in a store; names are relative to it."""
 
     def __init__(self, url: str, folder: str) -> None:
         self.root, self.url = url, f"{url}/{folder}"
@@ -45,12 +36,7 @@ class Remote:
         self._local = bool({"file", "local"} & {*_protocols(self._system)})
 
     def sizes(self) -> dict[str, int]:
-        """Return the length of every object by name [bytes].
-
-        Raises:
-            DataError: the bucket does not exist.
-            WorkFailedError: the store refuses or does not answer.
-        """
+        """Return the length of every object by name [bytes]."""
         with refusals_told(self.url):
             try:
                 found = self._system.find(self._path, detail=True)
@@ -86,12 +72,7 @@ class Remote:
                 self._system.pipe_file(self._at(name), data)
 
     def put(self, name: str, source: Path) -> None:
-        """Put a file as an object, whole or not at all.
-
-        Raises:
-            WorkFailedError: the store refuses or does not answer; no such object is there then, or
-                still the old one.
-        """
+        """Put a file as an object, whole or not at all."""
         with refusals_told(self.url):
             if self._local:
                 self._settle(name, lambda path: self._system.put_file(str(source), path))
@@ -99,11 +80,7 @@ class Remote:
                 self._system.put_file(str(source), self._at(name))
 
     def create(self, name: str, data: bytes) -> bool:
-        """Put an object only where none of that name is; return whether it was put.
-
-        Raises:
-            WorkFailedError: the store refuses, or knows no conditional put.
-        """
+        """Put an object only where none of that name is; return whether it was put."""
         path = self._at(name)
         with refusals_told(self.url):
             try:
@@ -155,10 +132,6 @@ def file_system(url: str) -> tuple[Any, str]:
     """Return the file system of fsspec that an address belongs to, and the address within it.
 
     Nothing is remembered of what it holds: what other machines do must be seen at once.
-
-    Raises:
-        UsageError: the extra ``s3`` is not installed.
-        ImportError, ValueError: as fsspec raises them for other kinds of addresses.
     """
     if url.startswith(S3):
         require("s3fs", extra="s3")
@@ -174,12 +147,7 @@ def file_system(url: str) -> tuple[Any, str]:
 
 
 def check_bucket(url: str) -> None:
-    """Tell a missing bucket from one that holds nothing here.
-
-    Raises:
-        DataError: it does not exist.
-        WorkFailedError: the store refuses or does not answer.
-    """
+    """Tell a missing bucket from one that holds nothing here."""
     if not url.startswith(S3):
         return
     bucket = url.split("//", 1)[1].split("/")[0]
@@ -191,13 +159,7 @@ def check_bucket(url: str) -> None:
 
 @contextmanager
 def refusals_told(url: str) -> Iterator[None]:
-    """Turn what a file system of fsspec raises into errors that say what to do.
-
-    Raises:
-        DataError: the bucket does not exist.
-        UsageError: no such kind of address, or its package is not installed.
-        WorkFailedError: the store refuses, does not answer, or fails.
-    """
+    """Turn what a file system of fsspec raises into errors that say what to do."""
     try:
         yield
     except LagbenchError:

@@ -63,29 +63,17 @@ class Odd:
 
 @dataclass(frozen=True, kw_only=True)
 class Array:
-    """A data set as its header describes it.
-
-    Attributes:
-        name: its name.
-        shape: lengths of its dimensions; None where asking could touch another file.
-        dims: names of its dimensions, an empty name where one has none.
-        kind: its type in words, such as "float32" or "compound".
-        layout: "contiguous", "chunked", "compact", "virtual" or "external files".
-        chunks: shape of a chunk; None where not chunked.
-        largest_chunk: length of the longest chunk as it is packed in the file [bytes].
-        foreign_filters: filters beyond zlib, shuffle and checksum, by name.
-        packing: scale_factor and add_offset, where it has them.
-    """
+    """A data set as its header describes it."""
 
     name: str
-    shape: tuple[int, ...] | None
-    dims: tuple[str, ...]
-    kind: str
-    layout: str
-    chunks: tuple[int, ...] | None
-    largest_chunk: int
-    foreign_filters: tuple[str, ...]
-    packing: Mapping[str, object]
+    shape: tuple[int, ...] | None  # lengths of its dimensions; None where asking could touch another file
+    dims: tuple[str, ...]  # names of its dimensions, an empty name where one has none
+    kind: str  # its type in words, such as "float32" or "compound"
+    layout: str  # "contiguous", "chunked", "compact", "virtual" or "external files"
+    chunks: tuple[int, ...] | None  # shape of a chunk; None where not chunked
+    largest_chunk: int  # length of the longest chunk as it is packed in the file [bytes]
+    foreign_filters: tuple[str, ...]  # filters beyond zlib, shuffle and checksum, by name
+    packing: Mapping[str, object]  # scale_factor and add_offset, where it has them
 
     @property
     def self_contained(self) -> bool:
@@ -102,29 +90,17 @@ class Array:
 
 @dataclass(frozen=True, kw_only=True)
 class Anatomy:
-    """A file as its headers describe it.
+    """A file as its headers describe it."""
 
-    Attributes:
-        links: entry of the root group to what it is: "variable", "group", "soft link", ...
-        link_count: how many entries there are; ``links`` holds the first of them.
-        attributes: attribute of the format to its value, None where it is missing.
-        arrays: variable of the format to its description, where a hard link leads to one.
-        integers: coordinate to its values, where they could be read.
-    """
-
-    links: Mapping[str, str]
-    link_count: int
-    attributes: Mapping[str, object]
-    arrays: Mapping[str, Array]
-    integers: Mapping[str, tuple[int, ...]]
+    links: Mapping[str, str]  # entry of the root group to what it is: "variable", "group", "soft link", ...
+    link_count: int  # how many entries there are; 'links' holds the first of them
+    attributes: Mapping[str, object]  # attribute of the format to its value, None where it is missing
+    arrays: Mapping[str, Array]  # variable of the format to its description, where a hard link leads to one
+    integers: Mapping[str, tuple[int, ...]]  # coordinate to its values, where they could be read
 
 
 def dissect(file: h5py.File, path: Path) -> Anatomy:
-    """Return what a file holds; values are read of coordinates only.
-
-    Raises:
-        UnreadableFileError: HDF5 cannot read it.
-    """
+    """Return what a file holds; values are read of coordinates only."""
     with reading(path):
         root = h5py.h5g.open(file.id, b"/")
         count = root.get_num_objs()

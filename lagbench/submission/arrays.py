@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lagbench.data.registry import Registry, spell_ids
 from lagbench.errors import UsageError
-from lagbench.registry import Registry
-from lagbench.scenario_ids import spell_ids
 
 from .header import DIMS
 from .writer import Label, PredictionsWriter

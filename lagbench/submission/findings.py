@@ -54,25 +54,15 @@ class Severity(enum.StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """One thing that is wrong with a file.
+    """One thing that is wrong with a file."""
 
-    Attributes:
-        check: name of the check, one of :data:`CHECKS`.
-        severity: errors reject the file, warnings flag it.
-        what: what is wrong, one clause.
-        where: variable, attribute, scenario or frame concerned.
-        expected: what would have been right.
-        got: what was found.
-        fix: what to do about it.
-    """
-
-    check: str
-    severity: Severity
-    what: str
-    where: str
-    expected: str
-    got: str
-    fix: str
+    check: str  # name of the check, one of CHECKS
+    severity: Severity  # errors reject the file, warnings flag it
+    what: str  # what is wrong, one clause
+    where: str  # variable, attribute, scenario or frame concerned
+    expected: str  # what would have been right
+    got: str  # what was found
+    fix: str  # what to do about it
 
     def __str__(self) -> str:
         """Return the finding as lines for people."""
@@ -83,25 +73,15 @@ class Finding:
 
 @dataclass(frozen=True, kw_only=True)
 class ValidationResult:
-    """What the checks say about one file.
+    """What the checks say about one file."""
 
-    Attributes:
-        path: the file.
-        split: split that it names; None where it could not be read.
-        size: size that it names.
-        method: method that it names.
-        findings: all that is wrong, in the order of :data:`CHECKS`.
-        passed: checks that found nothing.
-        skipped: check to the reason why it could not be made.
-    """
-
-    path: Path
-    split: str | None
-    size: str | None
-    method: str | None
-    findings: tuple[Finding, ...]
-    passed: tuple[str, ...]
-    skipped: Mapping[str, str]
+    path: Path  # the file
+    split: str | None  # split that it names; None where it could not be read
+    size: str | None  # size that it names
+    method: str | None  # method that it names
+    findings: tuple[Finding, ...]  # all that is wrong, in the order of CHECKS
+    passed: tuple[str, ...]  # checks that found nothing
+    skipped: Mapping[str, str]  # check to the reason why it could not be made
 
     @property
     def errors(self) -> tuple[Finding, ...]:

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.scenario_ids import spell_ids
+from lagbench.data.registry import spell_ids
 
 __all__ = ["guess_frames", "guess_scenarios", "guess_start", "spell_numbers"]
 
@@ -28,12 +28,7 @@ def spell_numbers(numbers: Sequence[int]) -> str:
 
 
 def guess_frames(got: Sequence[int], expected: range) -> str:
-    """Return what seems to have happened to the frame numbers.
-
-    Args:
-        got: frame numbers of the file.
-        expected: absolute numbers of the frames to predict.
-    """
+    """Return what seems to have happened to the frame numbers."""
     given, count = expected.start, len(expected)
     if not got:
         return "there are no frames"
@@ -76,12 +71,7 @@ def _ordinal(number: int) -> str:
 
 
 def guess_scenarios(got: Sequence[int], subsets: Mapping[str, Sequence[int]]) -> str:
-    """Return where unknown scenario ids may come from.
-
-    Args:
-        got: ids of the file.
-        subsets: subset to its ids.
-    """
+    """Return where unknown scenario ids may come from."""
     for subset, ids in subsets.items():
         if subset != "test" and set(got) <= set(ids):
             return f"these are scenarios of {subset}"

@@ -59,36 +59,19 @@ def fits(name: str, value: object) -> bool:
 
 @dataclass(frozen=True, kw_only=True)
 class Header:
-    """What a predictions.nc says about itself.
+    """What a predictions.nc says about itself."""
 
-    Attributes:
-        split: name of the split.
-        size: name of the size.
-        dataset_version: semantic version of the split, as in "1.0.0".
-        dataset_sha256: hash of the data set that the model was given, 64 hex digits.
-        method: what made the predictions.
-        scenarios: scenario ids in the order in which they are stored.
-        frames: absolute numbers of the predicted frames.
-        particles: particles in every frame.
-        seconds_per_frame: cost of one predicted frame [s].
-        device: machine that predicted.
-        seed: seed of the training.
-        parameters: trainable parameters of the model.
-        training: what the model was trained on, in words.
-        diverged_at: scenario id to the absolute frame from which its rollout is frozen.
-    """
-
-    split: str
-    size: str
-    dataset_version: str
-    dataset_sha256: str
-    method: str
-    scenarios: tuple[int, ...]
-    frames: tuple[int, ...]
-    particles: int
-    seconds_per_frame: float | None
-    device: str | None
-    seed: int | None
-    parameters: int | None
-    training: str | None
-    diverged_at: Mapping[int, int]
+    split: str  # name of the split
+    size: str  # name of the size
+    dataset_version: str  # semantic version of the split, as in "1.0.0"
+    dataset_sha256: str  # hash of the data set that the model was given, 64 hex digits
+    method: str  # what made the predictions
+    scenarios: tuple[int, ...]  # scenario ids in the order in which they are stored
+    frames: tuple[int, ...]  # absolute numbers of the predicted frames
+    particles: int  # particles in every frame
+    seconds_per_frame: float | None  # cost of one predicted frame [s]
+    device: str | None  # machine that predicted
+    seed: int | None  # seed of the training
+    parameters: int | None  # trainable parameters of the model
+    training: str | None  # what the model was trained on, in words
+    diverged_at: Mapping[int, int]  # scenario id to the absolute frame from which its rollout is frozen

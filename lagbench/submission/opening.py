@@ -43,11 +43,7 @@ def reading(path: Path, variable: str | None = None) -> Iterator[None]:
 
 @contextmanager
 def opened(path: Path) -> Iterator[h5py.File]:
-    """Open an HDF5 file for reading; no lock, nothing but a regular file.
-
-    Raises:
-        UnreadableFileError: missing, no regular file, not HDF5, or damaged.
-    """
+    """Open an HDF5 file for reading; no lock, nothing but a regular file."""
     check_file(path)
     with reading(path):
         file = h5py.File(path, "r", locking=False)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lagbench.locating import locate
-from lagbench.registry import Registry
+from lagbench.data.local import locate
+from lagbench.data.registry import Registry
 from lagbench.store.bringing import bring
 
 from .truth import Truth
@@ -19,25 +19,15 @@ __all__ = ["TemplateResult", "template"]
 
 @dataclass(frozen=True, kw_only=True)
 class TemplateResult:
-    """A template that was written.
+    """A template that was written."""
 
-    Attributes:
-        path: the file.
-        split: name of the split.
-        size: name of the size.
-        scenarios: ids of the test scenarios.
-        frames: absolute numbers of the first and the last frame to predict.
-        particles: particles in every frame.
-        bytes: length of the file.
-    """
-
-    path: Path
-    split: str
-    size: str
-    scenarios: tuple[int, ...]
-    frames: tuple[int, int]
-    particles: int
-    bytes: int
+    path: Path  # the file
+    split: str  # name of the split
+    size: str  # name of the size
+    scenarios: tuple[int, ...]  # ids of the test scenarios
+    frames: tuple[int, int]  # absolute numbers of the first and the last frame to predict
+    particles: int  # particles in every frame
+    bytes: int  # length of the file
 
 
 def template(
@@ -54,7 +44,7 @@ def template(
         split: name of the split.
         size: name of the size.
         output: file to write.
-        root: folder of all data sets, see :func:`lagbench.layout.resolve_root`.
+        root: folder of all data sets, see :func:`lagbench.data.layout.resolve_root`.
         registry: where splits are described; ours when None.
 
     Raises:

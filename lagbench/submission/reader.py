@@ -11,9 +11,9 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.checksums import ContentHasher
+from lagbench.data.checksums import ContentHasher
+from lagbench.data.registry import spell_ids
 from lagbench.errors import UsageError
-from lagbench.scenario_ids import spell_ids
 
 from .anatomy import Anatomy, dissect
 from .findings import Findings
@@ -141,14 +141,7 @@ def open_predictions(path: str | Path) -> Predictions:
 
 
 def attach(file: h5py.File, path: Path, anatomy: Anatomy, stack: ExitStack) -> Predictions:
-    """Return the predictions of an open file whose layout has been checked.
-
-    Args:
-        file: the open file.
-        path: its path.
-        anatomy: what it holds.
-        stack: closes the file; the predictions take over what it holds.
-    """
+    """Return the predictions of an open file whose layout has been checked."""
     header = header_of(anatomy)
     with reading(path, "position"):
         position = h5py.Dataset(_open_position(file, anatomy))

@@ -17,8 +17,8 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+from lagbench.data.registry import Registry
 from lagbench.errors import WorkFailedError
-from lagbench.registry import Registry
 
 from .findings import CHECKS, Finding, Findings, Severity, ValidationResult
 
@@ -49,27 +49,16 @@ OUT_OF_MEMORY = 77
 
 @dataclass(frozen=True, kw_only=True)
 class Request:
-    """What to validate.
+    """What to validate."""
 
-    Attributes:
-        path: the file.
-        root: folder of all data sets.
-        require_truth: whether a missing test subset is an error.
-        registry: where splits are described.
-    """
-
-    path: Path
-    root: Path
-    require_truth: bool
-    registry: Registry
+    path: Path  # the file
+    root: Path  # folder of all data sets
+    require_truth: bool  # whether a missing test subset is an error
+    registry: Registry  # where splits are described
 
 
 def run_isolated(request: Request) -> ValidationResult:
-    """Examine a file in a child process; whatever stops the child fails the check ``readable``.
-
-    Raises:
-        WorkFailedError: the child failed for a reason that is not the file's.
-    """
+    """Examine a file in a child process; whatever stops the child fails the check ``readable``."""
     status = request.path.stat()
     # A sparse file claims any length; what it occupies is what has to be read.
     extra = min(status.st_size, 512 * status.st_blocks) / BYTES_PER_SECOND

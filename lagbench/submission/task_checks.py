@@ -7,11 +7,11 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
+from lagbench.data.layout import major_of
+from lagbench.data.local import remedy
+from lagbench.data.manifest import read_manifest
+from lagbench.data.registry import Registry, Size
 from lagbench.errors import DataError, UnreadableFileError, UsageError
-from lagbench.layout import major_of
-from lagbench.manifest import read_manifest
-from lagbench.registry import Registry, Size
-from lagbench.remedy import remedy
 
 from .anatomy import Anatomy
 from .findings import Findings, quoted

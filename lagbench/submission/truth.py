@@ -7,12 +7,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.data.layout import ScenarioKey, scenario_path
+from lagbench.data.local import remedy
+from lagbench.data.registry import Size, spell_ids
+from lagbench.data.scenario import ScenarioFile, read_scenario
 from lagbench.errors import DataError
-from lagbench.layout import ScenarioKey, scenario_path
-from lagbench.registry import Size
-from lagbench.remedy import remedy
-from lagbench.scenario_file import ScenarioFile, read_scenario
-from lagbench.scenario_ids import spell_ids
 
 __all__ = ["Truth"]
 
@@ -21,23 +20,14 @@ BLOCK = 16
 
 
 class Truth:
-    """The test subset of a data set.
-
-    Args:
-        size: what the registry says of the data set.
-        root: folder of all data sets.
-    """
+    """The test subset of a data set."""
 
     def __init__(self, size: Size, root: Path) -> None:
-        self.size = size
-        self.root = root
+        self.size = size  # what the registry says of the data set
+        self.root = root  # folder of all data sets
 
     def require(self) -> None:
-        """Check that every test scenario is there.
-
-        Raises:
-            DataError: some are missing; the message has the command that makes them.
-        """
+        """Check that every test scenario is there."""
         ids = self.size.subsets["test"]
         missing = [i for i in ids if not self.path(i).is_file()]
         if missing:
@@ -54,11 +44,7 @@ class Truth:
         return scenario_path(self.root, self._key(scenario))
 
     def open(self, scenario: int) -> ScenarioFile:
-        """Open a test scenario; check that it is the one that the registry means.
-
-        Raises:
-            DataError: missing, damaged, of another version or of another hash.
-        """
+        """Open a test scenario; check that it is the one that the registry means."""
         path, key = self.path(scenario), self._key(scenario)
         file = read_scenario(path)
         header = file.header
@@ -77,11 +63,7 @@ class Truth:
         )
 
     def given(self, scenario: int) -> NDArray[np.float32]:
-        """Return the frames given to a model [length], shape [frame, particle, space].
-
-        Raises:
-            DataError: see :meth:`open`; or frames or particles are missing.
-        """
+        """Return the frames given to a model [length], shape [frame, particle, space]."""
         task = self.size.task
         with self.open(scenario) as file:
             frames: NDArray[np.float32] = file.read("position", slice(0, task.input_frames))
@@ -98,13 +80,6 @@ class Truth:
         """Return the largest distance that a particle moves from one frame to the next [length].
 
         Reading stops as soon as one of at least ``enough`` is found, which is then returned.
-
-        Args:
-            scenario: id of a test scenario.
-            enough: distance beyond which no more need be known [length].
-
-        Raises:
-            DataError: see :meth:`open`.
         """
         task, largest = self.size.task, 0.0
         with self.open(scenario) as file:

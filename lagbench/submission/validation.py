@@ -12,10 +12,10 @@ from pathlib import Path
 
 import h5py
 
+from lagbench.data.layout import resolve_root
+from lagbench.data.local import rooted
+from lagbench.data.registry import Registry
 from lagbench.errors import DataError, UnreadableFileError, UsageError
-from lagbench.layout import resolve_root
-from lagbench.locating import rooted
-from lagbench.registry import Registry
 
 from .anatomy import Anatomy, dissect
 from .findings import CHECKS, Findings, ValidationResult
@@ -25,15 +25,7 @@ from .reader import Predictions, attach
 from .sandbox import Request, run_isolated
 from .task_checks import check_dataset, check_frames, check_particles, check_scenarios, check_split
 from .truth import Truth
-from .value_checks import (
-    Survey,
-    check_domain,
-    check_finite,
-    check_frozen,
-    check_jumps,
-    check_start,
-    survey,
-)
+from .value_checks import Survey, check_domain, check_finite, check_frozen, check_jumps, check_start, survey
 
 __all__ = ["examine", "validate"]
 
@@ -54,7 +46,7 @@ def validate(
 
     Args:
         path: the file.
-        root: folder of all data sets, see :func:`lagbench.layout.resolve_root`; the checks
+        root: folder of all data sets, see :func:`lagbench.data.layout.resolve_root`; the checks
             ``start`` and ``max_displacement`` need the test subset there.
         require_truth: whether a missing test subset is an error of the check ``dataset``, as it
             is for scoring; else those checks are skipped and say so.

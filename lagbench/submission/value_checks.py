@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.registry import Size
+from lagbench.data.registry import Size
 
 from .findings import Findings
 from .guesses import guess_start
@@ -34,37 +34,21 @@ FILL = np.float32(9.969209968386869e36)
 
 @dataclass
 class Survey:
-    """What one pass over a scenario's predictions saw.
+    """What one pass over a scenario's predictions saw."""
 
-    Attributes:
-        scenario: id of the scenario.
-        values: how many values there are.
-        bad: values that are not finite, or were never written.
-        unwritten: those of them that were never written.
-        first_bad: frame, particle and component of the first of them.
-        positions: how many positions there are.
-        outside: positions outside the domain.
-        off_grid: positions outside the unit box.
-        farthest: largest distance outside the domain along an axis [length].
-        first_outside: frame and particle of the first one outside.
-        jump: largest distance of a particle between consecutive frames [length].
-        jump_at: frame and particle of it.
-        settled: frame that is repeated from there to the end.
-    """
-
-    scenario: int
-    values: int = 0
-    bad: int = 0
-    unwritten: int = 0
-    first_bad: tuple[int, int, int] | None = None
-    positions: int = 0
-    outside: int = 0
-    off_grid: int = 0
-    farthest: float = 0.0
-    first_outside: tuple[int, int] | None = None
-    jump: float = 0.0
-    jump_at: tuple[int, int] | None = None
-    settled: int = 0
+    scenario: int  # id of the scenario
+    values: int = 0  # how many values there are
+    bad: int = 0  # values that are not finite, or were never written
+    unwritten: int = 0  # those of them that were never written
+    first_bad: tuple[int, int, int] | None = None  # frame, particle and component of the first of them
+    positions: int = 0  # how many positions there are
+    outside: int = 0  # positions outside the domain
+    off_grid: int = 0  # positions outside the unit box
+    farthest: float = 0.0  # largest distance outside the domain along an axis [length]
+    first_outside: tuple[int, int] | None = None  # frame and particle of the first one outside
+    jump: float = 0.0  # largest distance of a particle between consecutive frames [length]
+    jump_at: tuple[int, int] | None = None  # frame and particle of it
+    settled: int = 0  # frame that is repeated from there to the end
     _first: tuple[int, NDArray[np.float32]] | None = field(default=None, repr=False)
     _last: NDArray[np.float32] | None = field(default=None, repr=False)
 

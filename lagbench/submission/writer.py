@@ -12,11 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lagbench.atomic import atomic_path
+from lagbench.data.local import locate, remedy
+from lagbench.data.registry import Registry, Size, spell_ids
 from lagbench.errors import DataError, UsageError, WorkFailedError, nearest
-from lagbench.locating import locate
-from lagbench.registry import Registry, Size
-from lagbench.remedy import remedy
-from lagbench.scenario_ids import spell_ids
 from lagbench.store.bringing import bring
 
 from .header import DIMS, FORMAT, NEVER, OPTIONAL, SPACE, fits, kind_of

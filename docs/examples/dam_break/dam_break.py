@@ -4,11 +4,11 @@ from pathlib import Path
 
 import numpy as np
 
-from lagbench.generators.base import FreeSurfaceParameters, InitialState
+from lagbench.data.registry import Size
+from lagbench.generators.constants import constants, free_surface_walls
 from lagbench.generators.draws import RandomSource, uniform
-from lagbench.generators.parameters import constants, free_surface_walls
 from lagbench.generators.shapes import Rectangle, body_at, seeds
-from lagbench.registry import Size
+from lagbench.generators.split import FreeSurfaceParameters, InitialState
 
 REGISTRY = Path(__file__).with_name("dam_break.yaml")
 

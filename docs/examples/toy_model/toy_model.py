@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 import lagbench
 from lagbench import submission
-from lagbench.registry import load
+from lagbench.data.registry import load
 
 Floats = NDArray[np.float64]
 

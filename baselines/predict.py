@@ -1,0 +1,250 @@
+"""Predict: roll a trained model out over the test scenarios into a predictions.nc.
+
+Of the test subset only the given frames are read. Time is taken of rollouts alone, after one
+step to warm up; that of the neighbour search is measured on frames of the same rollouts.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from lagbench.atomic import write_atomically
+from lagbench.data.layout import resolve_root
+from lagbench.data.local import rooted
+from lagbench.data.registry import Registry
+from lagbench.submission import PredictionsWriter
+from lagbench.work.progress import Meter, Progress
+
+from .baseline import Baseline, Batch
+from .checkpoint import Checkpoint, check_data, load, restore
+from .facts import Facts
+from .graph import radius_graph
+from .job import parameter_count
+from .machine import bound_memory, chosen_device, hardware, memory_errors_told, threads_used
+from .rollout import Rollout, roll_out
+from .windows import scenario_batch, scenario_paths
+
+__all__ = [
+    "PredictionResult",
+    "predict",
+    "record_cost",
+]
+
+
+SEARCHES = 5
+"""Frames of a rollout on which the neighbour search is timed alone."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PredictionResult:
+    """What a prediction made and cost."""
+
+    path: Path  # the predictions.nc
+    split: str  # name of the split
+    size: str  # name of the size
+    method: str  # what made it
+    scenarios: int  # scenarios predicted
+    frames: int  # frames of each
+    batch: int  # scenarios that were rolled out side by side
+    seconds_per_frame: float  # time of one frame of one scenario [s]
+    seconds_without_search: float  # the same without the neighbour search [s]
+    # 'processor' on one CPU thread, where other work on the machine then does not count; 'wall' on
+    # a GPU and on several threads
+    clock: str
+    device: str  # processor and threads, or GPU
+    parameters: int  # trained numbers of the model
+    diverged: Mapping[int, int]  # scenario id to the absolute frame from which its rollout is frozen
+
+
+def predict(
+    checkpoint: str | Path,
+    output: str | Path = "predictions.nc",
+    *,
+    root: str | Path | None = None,
+    device: str = "auto",
+    threads: int | None = None,
+    batch: int | None = None,
+    method: str | None = None,
+    progress: Callable[[Progress], None] | None = None,
+    registry: Registry | None = None,
+) -> PredictionResult:
+    """Predict every test scenario of the data set that a model was trained on.
+
+    Args:
+        checkpoint: weights.pt or checkpoint.pt of a training.
+        output: file to write; ``<name>.json`` beside it says what it cost.
+        root: folder of all data sets; else ``LAGBENCH_ROOT``, else the user data folder.
+        device: ``cpu``, ``cuda`` or ``auto``.
+        threads: threads on the CPU; one per core by default.
+        batch: scenarios side by side; 1 on a CPU and all on a GPU by default.
+        method: what to call it; the model's own name by default.
+        progress: called as the work advances.
+        registry: where splits are described; ours when None.
+
+    Raises:
+        UnreadableFileError: the checkpoint is damaged or unsafe.
+        DataError: the data set is missing, damaged, or not the one of the training.
+        UsageError: the model's baseline is not installed, or no such device.
+        WorkFailedError: out of memory, or the disk is full.
+    """
+    found = load(checkpoint)
+    home = resolve_root(root)
+    known = rooted(home, registry)
+    facts = check_data(found, root=home, registry=known, where=str(checkpoint))
+    machine = chosen_device(device)
+    bound_memory()
+    paths = _test_files(facts, home, known)
+    side = min(batch or (1 if machine == "cpu" else len(paths)), len(paths))
+    with threads_used(threads), memory_errors_told("lower --batch"):
+        model = restore(found, where=str(checkpoint)).to(machine)
+        work = _Rollouts(model, facts, paths, side, machine)
+        label, hardware_label, count = method or model.method, _device_label(machine), parameter_count(model)
+        writer = PredictionsWriter(
+            output,
+            split=facts.split,
+            size=facts.size,
+            method=label,
+            dataset_sha256=facts.dataset_sha256,
+            registry=known,
+            device=hardware_label,
+            parameters=count,
+            **_provenance(found),
+        )
+        _write(writer, work, Meter(progress))
+    result = PredictionResult(
+        path=Path(output),
+        split=facts.split,
+        size=facts.size,
+        method=label,
+        scenarios=len(paths),
+        frames=facts.horizon,
+        batch=side,
+        seconds_per_frame=work.seconds_per_frame,
+        seconds_without_search=work.seconds_per_frame - work.search_per_frame,
+        clock=work.clock,
+        device=hardware_label,
+        parameters=count,
+        diverged=work.diverged,
+    )
+    record_cost(result)
+    return result
+
+
+def record_cost(result: PredictionResult, *, solver: float | None = None) -> Path:
+    """Write what a prediction cost to ``<name>.json`` beside it; return that path.
+
+    Args:
+        result: the prediction.
+        solver: time of our solver for a frame on one core of the same machine [s].
+
+    Raises:
+        WorkFailedError: the disk is full or not writable.
+    """
+    plain = {**asdict(result), "path": result.path.name, "solver_seconds_per_frame": solver}
+    path = result.path.with_suffix(".json")
+    write_atomically(path, json.dumps(plain, indent=2, sort_keys=True).encode() + b"\n", option="--output")
+    return path
+
+
+def _test_files(facts: Facts, root: Path, registry: Registry) -> list[Path]:
+    paths = scenario_paths(facts.split, subset="test", size=facts.size, root=root, registry=registry)
+    return list(paths.values())
+
+
+def _write(writer: PredictionsWriter, work: _Rollouts, meter: Meter) -> None:
+    meter.begin("predicting", total=len(work), scenarios=len(work))
+    with writer:
+        for rollout in work:
+            writer.add(rollout.scenario, rollout.position.numpy(), diverged_at=rollout.diverged_at)
+            meter.count(1, scenarios=1)
+        writer.label(seconds_per_frame=work.seconds_per_frame)
+
+
+class _Rollouts:
+    """Rolls scenarios out, some side by side, and takes the time."""
+
+    def __init__(self, model: Baseline, facts: Facts, paths: list[Path], side: int, machine: str) -> None:
+        self.seconds = 0.0  # time of the rollouts [s]
+        # the time that is taken, 'processor' or 'wall'
+        self.clock = "processor" if machine == "cpu" and torch.get_num_threads() == 1 else "wall"
+        self.frames = 0  # frames that the model was asked for, of all scenarios; frozen ones cost nothing
+        # scenario id to the absolute frame from which its rollout is frozen
+        self.diverged: dict[int, int] = {}
+        self._model, self._facts, self._machine = model, facts, machine
+        self._groups = [paths[first : first + side] for first in range(0, len(paths), side)]
+        self._searches: list[float] = []
+
+    def __len__(self) -> int:
+        """Return the number of scenarios."""
+        return sum(map(len, self._groups))
+
+    def __iter__(self) -> Iterator[Rollout]:
+        """Yield the rollout of every scenario."""
+        for number, group in enumerate(self._groups):
+            given = scenario_batch(group, slice(0, self._facts.input_frames)).to(self._machine)
+            if number == 0:
+                roll_out(self._model, given, 1)
+            started = self._now()
+            found = roll_out(self._model, given, self._facts.horizon)
+            self.seconds += self._now() - started
+            self.frames += sum(self._made(one) for one in found)
+            self._time_searches(given, found)
+            marks = {one.scenario: one.diverged_at for one in found if one.diverged_at is not None}
+            self.diverged.update(marks)
+            yield from found
+
+    @property
+    def seconds_per_frame(self) -> float:
+        """Time of one frame of one scenario [s]."""
+        return self.seconds / self.frames
+
+    @property
+    def search_per_frame(self) -> float:
+        """Time of the neighbour search in it [s]; 0 for a model without one."""
+        return sum(self._searches) / len(self._searches) if self._searches else 0.0
+
+    def _made(self, rollout: Rollout) -> int:
+        """Return the frames that a rollout took, the first one that is not finite included."""
+        if rollout.diverged_at is None:
+            return self._facts.horizon
+        return rollout.diverged_at - self._facts.input_frames + 1
+
+    def _time_searches(self, given: Batch, found: list[Rollout]) -> None:
+        """Search neighbours once more in some frames of the rollouts, and take the time."""
+        radius = getattr(self._model, "radius", None)
+        if radius is None:
+            return
+        positions = torch.cat([one.position for one in found], dim=1).to(self._machine)
+        for frame in range(0, len(positions), max(1, len(positions) // SEARCHES)):
+            started = self._now()
+            radius_graph(positions[frame], float(radius), given.sample)
+            self._searches.append((self._now() - started) / len(found))
+
+    def _now(self) -> float:
+        if self._machine == "cuda":
+            torch.cuda.synchronize()
+        return time.process_time() if self.clock == "processor" else time.perf_counter()
+
+
+def _device_label(machine: str) -> str:
+    found = hardware(machine)
+    threads = found["threads"]
+    on_cpu = f"{found['processor']}, {threads} thread{'s' if threads > 1 else ''}"
+    return str(found["device"]) if machine == "cuda" else on_cpu
+
+
+def _provenance(checkpoint: Checkpoint) -> dict[str, Any]:
+    """Return seed and training in words, for the file's attributes."""
+    facts, done = checkpoint.facts, checkpoint.training
+    recipe = done.get("recipe", {})
+    options = recipe.get("training", {})
+    subsets = "+".join(options.get("windows", ("train",)))
+    words = f"{facts.split} {facts.size} {subsets}, recipe {recipe.get('name')}, step {done.get('step', 0)}"
+    return {"training": words, "seed": int(options.get("seed", 0))}

@@ -1,0 +1,405 @@
+"""Train a baseline: seeded, resumable, on one processor or several.
+
+A step draws its windows and its noise from (seed, step, process) alone, so that a training
+that was interrupted and resumed ends, on one thread, with the same bits as one that was not.
+
+Gradient descent over windows, by pytorch-lightning, on one device or several.
+
+Models that are fitted in closed form, through the same door as those that are trained.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import chain, count, islice
+from pathlib import Path
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from pytorch_lightning import Trainer
+from pytorch_lightning.loggers import TensorBoardLogger
+from torch.utils.data import DataLoader, Sampler
+
+from lagbench.atomic import check_writable
+from lagbench.data.local import locate
+from lagbench.data.registry import Registry
+from lagbench.errors import DataError, UsageError
+from lagbench.work.progress import Meter, Progress
+
+from .baseline import Baseline
+from .callback import TrainingCallback
+from .catalogue import find
+from .checkpoint import Checkpoint, load_weights, rounded_weights, save
+from .facts import Facts, facts_of
+from .job import STOPPED_EARLY, RunFolder, TrainingJob, TrainingRecord, default_folder, parameter_count
+from .machine import (
+    bound_memory,
+    chosen_device,
+    is_helper,
+    memory_errors_told,
+    multiplies_bfloat16,
+    threads_used,
+)
+from .module import TrainingModule
+from .recipe import recipe_for
+from .rollout import validate, validation_windows
+from .seeding import generators_kept, reseed, seed_of
+from .symmetry import check_symmetry
+from .windows import Window, WindowDataset, WindowSampler, collate, scenario_batch
+
+__all__ = [
+    "TrainingResult",
+    "train",
+    "StepBatches",
+    "descend",
+    "quiet",
+    "ClosedForm",
+    "fit",
+]
+
+
+SMALLER = "lower --set training.batch=1, then the model: model.latent, .layers, .widths or .lags"
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingResult:
+    """What a training made."""
+
+    baseline: str  # name of the baseline
+    split: str  # name of the split
+    size: str  # name of the size
+    recipe: str  # name of the recipe
+    folder: Path  # folder of the run
+    weights: Path  # weights to predict from
+    checkpoint: Path  # last state, to go on from
+    state: str  # finished, stopped early or interrupted
+    step: int  # optimiser steps made
+    steps: int  # steps of the whole training
+    parameters: int  # trainable parameters
+    loss: dict[str, float]  # raw loss terms of the last step, and their weighted sum 'total'
+    best_rmse: float | None  # position RMSE of the best validation [length]; None without one
+    best_step: int | None
+    cpu_seconds: float  # processor time in all runs [s]
+    wall_seconds: float  # time of all runs [s]
+
+
+def train(
+    baseline: str,
+    split: str,
+    size: str = "full",
+    *,
+    recipe: str | None = None,
+    settings: tuple[str, ...] = (),
+    seed: int | None = None,
+    root: str | Path | None = None,
+    output: str | Path | None = None,
+    resume: bool = True,
+    fresh: bool = False,
+    device: str = "auto",
+    processes: int = 1,
+    threads: int | None = None,
+    workers: int = 0,
+    progress: Callable[[Progress], None] | None = None,
+    registry: Registry | None = None,
+) -> TrainingResult:
+    """Train a baseline on the windows of a split.
+
+    Args:
+        baseline: name of the baseline.
+        split: name of the split, or the path of a local one.
+        size: name of the size.
+        recipe: variant of the recipe, or a YAML file of recipes.
+        settings: changes to the recipe, as in ``training.steps=100``.
+        seed: seed in place of the recipe's.
+        root: folder of all data sets; else ``LAGBENCH_ROOT``, else the user data folder.
+        output: folder of the run; ``runs/<split>/<size>/<baseline>-<seed>`` by default.
+        resume: go on with what an earlier run left there.
+        fresh: train anew whatever is there.
+        device: ``cpu``, ``cuda`` or ``auto``.
+        processes: processes, one device each (torchrun's own number where that started us).
+        threads: threads of a process on the CPU; by default its share of the cores.
+        workers: processes that read windows ahead; 0 reads them in between.
+        progress: called as the work advances.
+        registry: where splits are described; ours when None.
+
+    Raises:
+        UsageError: unknown baseline, split, size, recipe or key; images that gravity forbids; or
+            the folder holds another training, or weights without their checkpoint.
+        DataError: the data set is missing or damaged.
+        UnreadableFileError: the checkpoint in the folder is damaged.
+        WorkFailedError: the loss is not finite, memory or disk is full.
+        KeyboardInterrupt: interrupted; the state after the last step is stored.
+    """
+    entry = find(baseline)
+    tier, home, known = locate(split, size, root=root, registry=registry)
+    plan = recipe_for(entry, tier.split, size, variant=recipe, settings=settings, seed=seed)
+    check_symmetry(plan.model.get("symmetry"), tier)
+    facts = facts_of(tier.split, size, root=home, registry=known)
+    folder = RunFolder(Path(output) if output else default_folder(plan))
+    check_writable(folder.path, option="--output")
+    shared = int(os.environ.get("WORLD_SIZE", processes))
+    earlier = folder.earlier(plan, resume=resume, fresh=fresh)
+    _check_same(earlier, facts, shared, folder)
+    if earlier is None and not is_helper():
+        folder.clear()
+    job = TrainingJob(
+        recipe=plan,
+        facts=facts,
+        folder=folder,
+        earlier=earlier,
+        root=home,
+        registry=known,
+        device=chosen_device(device),
+        processes=shared,
+        workers=workers,
+        meter=Meter(progress),
+    )
+    bound_memory()
+    here = int(os.environ.get("LOCAL_WORLD_SIZE", processes))
+    with generators_kept(), threads_used(threads, processes=here), memory_errors_told(SMALLER):
+        reseed(seed_of(plan.training.seed))
+        model = entry.model.build(plan.model, facts)
+        ledger, steps = _run(job, model)
+    return _result(job, ledger, model, steps)
+
+
+def _run(job: TrainingJob, model: Baseline) -> tuple[TrainingRecord, int]:
+    """Fit or train; Lightning is imported only here."""
+    if getattr(model, "closed_form", False):
+        return fit(job, model)
+
+    return descend(job, model)
+
+
+def _check_same(earlier: Checkpoint | None, facts: Facts, processes: int, folder: RunFolder) -> None:
+    """Refuse to go on with other data, or with another number of processes."""
+    if earlier is None:
+        return
+    if earlier.facts.dataset_sha256 != facts.dataset_sha256:
+        raise DataError(
+            "the training began on another version of the data set",
+            where=str(folder.path),
+            expected=earlier.facts.dataset_sha256,
+            got=facts.dataset_sha256,
+            fix="train anew with --fresh",
+        )
+    if earlier.training.get("processes") != processes:
+        raise UsageError(
+            "the training began with another number of processes",
+            where="--processes",
+            expected=earlier.training.get("processes"),
+            got=processes,
+            fix="the learning rate and the order of windows follow from it; or train anew with --fresh",
+        )
+
+
+def _result(job: TrainingJob, ledger: TrainingRecord, model: Baseline, steps: int) -> TrainingResult:
+    return TrainingResult(
+        baseline=job.recipe.baseline,
+        split=job.facts.split,
+        size=job.facts.size,
+        recipe=job.recipe.name,
+        folder=job.folder.path,
+        weights=job.folder.weights,
+        checkpoint=job.folder.checkpoint,
+        state=ledger.state,
+        step=ledger.step,
+        steps=steps,
+        parameters=parameter_count(model),
+        loss=ledger.loss,
+        best_rmse=ledger.best_rmse,
+        best_step=ledger.best_step,
+        cpu_seconds=ledger.cpu_seconds,
+        wall_seconds=ledger.wall_seconds,
+    )
+
+
+LOGGERS = ("lightning.pytorch", "lightning.fabric", "pytorch_lightning", "lightning_fabric")
+
+
+class StepBatches(Sampler[list[int]]):
+    """Windows of each step of a training, from any step on."""
+
+    def __init__(self, sampler: WindowSampler, batch: int, *, first: int, last: int) -> None:
+        self.sampler = sampler  # draws the windows of one process, epoch after epoch
+        self.batch = batch  # windows of a step
+        self.steps = range(first, last)
+
+    def __len__(self) -> int:
+        """Return the number of steps."""
+        return len(self.steps)
+
+    def __iter__(self) -> Iterator[list[int]]:
+        """Yield the windows of each step."""
+        epoch, used = divmod(self.steps.start * self.batch, len(self.sampler))
+        self.sampler.seek(epoch, used * self.sampler.ranks)
+        drawn = chain.from_iterable(self.sampler for _ in count())
+        for _ in self.steps:
+            yield list(islice(drawn, self.batch))
+
+
+def descend(job: TrainingJob, model: Baseline) -> tuple[TrainingRecord, int]:
+    """Train a model; return the ledger and the steps of the whole training."""
+    facts, options = job.facts, job.recipe.training
+    data = WindowDataset(
+        facts.split,
+        subset=options.windows,
+        size=facts.size,
+        root=job.root,
+        registry=job.registry,
+        history=model.history,
+        future=model.future,
+    )
+    steps = options.total_steps(len(data), processes=job.processes)
+    ledger = job.ledger()
+    module = _module(job, model, data, ledger, steps)
+    if ledger.state != STOPPED_EARLY:
+        ledger.state = "finished" if ledger.step >= steps else "running"
+    if ledger.state != "running":
+        return ledger, steps
+    keeper = TrainingCallback(
+        job.folder,
+        ledger,
+        about=job.checkpoint(),
+        record=job.record(model, steps=steps, windows=len(data)),
+        validation=validation_windows(job),
+        meter=job.meter,
+    )
+    with quiet():
+        _fit(_trainer(job, keeper), module)
+    if ledger.state == "interrupted":
+        raise KeyboardInterrupt
+    return ledger, steps
+
+
+def _module(
+    job: TrainingJob, model: Baseline, data: WindowDataset, ledger: TrainingRecord, steps: int
+) -> TrainingModule:
+    """Return the module at the step where an earlier run ended."""
+    options, earlier = job.recipe.training, job.earlier
+    if earlier is not None:
+        load_weights(model, earlier.weights, where=str(job.folder.checkpoint))
+
+    def loader(rank: int, ranks: int) -> DataLoader[Window]:
+        sampler = WindowSampler(data, seed=options.seed, rank=rank, ranks=ranks)
+        batches = StepBatches(sampler, options.batch, first=ledger.step, last=steps)
+        return DataLoader(
+            data,
+            batch_sampler=batches,
+            collate_fn=collate,
+            num_workers=job.workers,
+            persistent_workers=job.workers > 0,
+            multiprocessing_context="spawn" if job.workers else None,
+        )
+
+    return TrainingModule(
+        model,
+        options,
+        loader=loader,
+        steps=steps,
+        processes=job.processes,
+        step=ledger.step,
+        optimizer=earlier.optimizer if earlier else None,
+    )
+
+
+def _trainer(job: TrainingJob, keeper: TrainingCallback) -> Trainer:
+    options = job.recipe.training
+    return Trainer(
+        accelerator="gpu" if job.device == "cuda" else "cpu",
+        devices=_devices(job),
+        num_nodes=int(os.environ.get("GROUP_WORLD_SIZE", "1")),
+        strategy="ddp" if job.processes > 1 else "auto",
+        precision=_precision(options.precision, job.device),
+        max_epochs=1,
+        logger=TensorBoardLogger(job.folder.path, name="", version=job.folder.logs.name),
+        callbacks=[keeper],
+        default_root_dir=job.folder.path,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        limit_val_batches=0,
+        num_sanity_val_steps=0,
+        use_distributed_sampler=False,
+    )
+
+
+def _devices(job: TrainingJob) -> int:
+    """Return the processes on this machine: torchrun's number where it started us."""
+    return int(os.environ.get("LOCAL_WORLD_SIZE", job.processes))
+
+
+def _precision(name: str, device: str) -> Literal["32-true", "bf16-mixed"]:
+    half = name == "bf16" or (name == "auto" and multiplies_bfloat16(device))
+    return "bf16-mixed" if half else "32-true"
+
+
+def _fit(trainer: Trainer, module: TrainingModule) -> None:
+    try:
+        trainer.fit(module)
+    except SystemExit:  # what Lightning makes of a second Ctrl-C
+        raise KeyboardInterrupt from None
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Keep Lightning's advice from our users: none of it is about what they asked for."""
+    loggers = [logging.getLogger(name) for name in LOGGERS]
+    levels = [logger.level for logger in loggers]
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", module=r"(pytorch_lightning|lightning_fabric|tensorboard)(\..*)?")
+        for logger in loggers:
+            logger.setLevel(logging.ERROR)
+        try:
+            yield
+        finally:
+            for logger, level in zip(loggers, levels, strict=True):
+                logger.setLevel(level)
+
+
+STEPS = 1
+"""A closed form counts as one step."""
+
+
+class ClosedForm(Protocol):
+    """What a baseline with ``closed_form = True`` has beside the contract."""
+
+    def fit(self, scenarios: Iterator[NDArray[np.float32]]) -> Mapping[str, float]:
+        """Set the coefficients from positions, shape [frame, particle, 2]; return figures to log."""
+        ...
+
+
+def fit(job: TrainingJob, model: Baseline) -> tuple[TrainingRecord, int]:
+    """Fit a model to every scenario, validate and store it; return the ledger and its one step."""
+    ledger = job.ledger()
+    if job.earlier is not None:
+        load_weights(model, job.earlier.weights, where=str(job.folder.checkpoint))
+        ledger.state = "finished"
+        return ledger, STEPS
+    figures = model.fit(_scenarios(job))  # type: ignore[operator]
+    ledger.step, ledger.loss = STEPS, {name: float(value) for name, value in figures.items()}
+    truth = validation_windows(job)
+    if truth is not None:
+        ledger.validated(validate(model, truth))
+    ledger.state = "finished"
+    ledger.read_clocks()
+    state = {name: value.detach() for name, value in model.state_dict().items()}
+    save(job.folder.weights, job.checkpoint(weights=rounded_weights(model), training=ledger.as_json()))
+    save(job.folder.checkpoint, job.checkpoint(weights=state, training=ledger.as_json()))
+    job.folder.write_record({**job.record(model, steps=STEPS), **ledger.as_json()})
+    return ledger, STEPS
+
+
+def _scenarios(job: TrainingJob) -> Iterator[NDArray[np.float32]]:
+    """Yield the positions of every scenario to fit, shape [frame, particle, 2]."""
+    paths = [path for subset in job.recipe.training.windows for path in job.files(subset).values()]
+    job.meter.begin("fitting", total=len(paths) + 1, scenarios=len(paths))
+    for path in paths:
+        yield scenario_batch(path).position.transpose(0, 1).numpy()
+        job.meter.count(1, scenarios=1)

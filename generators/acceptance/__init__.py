@@ -1,0 +1,1 @@
+"""Is the physics right: Ghia, energy, settling."""

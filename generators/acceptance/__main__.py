@@ -1,0 +1,267 @@
+"""Validate the closed-box solver: Ghia's cavity, or the decay of curl noise.
+
+    python -m lagbench.generators.acceptance --case cavity --re 400 --substeps 100000 --json re400.json
+    python -m lagbench.generators.acceptance --case curl-noise --frequency 4 --json curl.json
+
+Writes u and v at the points of Ghia, Ghia & Shin (1982), their error against the tables at Reynolds
+numbers 100, 400, 1000, 3200 and 5000, the range of J, empty cells (every 10,000 substeps and at the
+end), kinetic energy per frame, divergence against vorticity, and the time taken. All but the
+entries under "timing" is the same in every run. Exit code 0: done; 2: bad options; 5: the solver
+failed; 130: interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import Progress
+
+from lagbench.errors import LagbenchError, UsageError, WorkFailedError
+from lagbench.generators.solver import Device
+
+from . import ghia
+from .cases import Result, run
+from .diagnostics import box_of, draw
+from .experiment import Case, Experiment, plan, solver_parameters
+
+__all__ = [
+    "document",
+    "main",
+    "parser",
+    "settings",
+]
+
+
+DIGITS = 9
+"""Significant digits of the numbers in the JSON file: fewer than libraries differ in."""
+
+JSON = dict[str, Any]
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the options."""
+    made = argparse.ArgumentParser(
+        prog="python -m lagbench.generators.acceptance",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = made.add_argument
+    add("--case", type=Case, choices=list(Case), required=True, help="which closed box")
+    add("--json", type=Path, metavar="FILE", help="results")
+    add(
+        "--re",
+        type=float,
+        metavar="R",
+        help="Reynolds number; curl-noise is inviscid without it",
+    )
+    add("--grid", type=int, default=40, metavar="N", help="cells across the unit box (default 40)")
+    add("--particles", type=int, metavar="P", help="particles (default 8192 (N/40)^2, curl-noise 8096)")
+    add("--substeps", type=int, metavar="K", help="solver steps (default 100000, curl-noise 600 frames)")
+    add("--dt", type=float, help="substep in seconds (default 2e-3 * 40/N)")
+    add("--lid-speed", type=float, metavar="U", help="speed of the lid (default 0.15)")
+    add("--lid-off-after", type=int, metavar="K", help="substep after which the lid stands still")
+    add("--frequency", type=int, metavar="F", help="Perlin frequency of curl noise (default 4)")
+    add("--seed", type=int, default=0, help="seed of the particle lattice and the stirring")
+    add("--device", type=Device, choices=list(Device), default=Device.CPU, help="where to run")
+    add("--profiles", type=Path, metavar="PNG", help="draw the centre lines (cavity)")
+    return made
+
+
+def settings(given: argparse.Namespace) -> Experiment:
+    """Return the experiment that the options ask for."""
+    default = 100_000 if given.case is Case.CAVITY else 30_000 * given.grid // 40
+    return plan(
+        given.case,
+        substeps=default if given.substeps is None else given.substeps,
+        reynolds=given.re,
+        grid=given.grid,
+        particles=given.particles,
+        dt=given.dt,
+        lid_speed=given.lid_speed,
+        lid_off_after=given.lid_off_after,
+        frequency=given.frequency,
+        seed=given.seed,
+    )
+
+
+def check_outputs(given: argparse.Namespace) -> None:
+    """Make sure that the files can be written, before the long run."""
+    if given.profiles is not None and given.case is not Case.CAVITY:
+        raise UsageError("curl noise has no centre-line profiles", where="--profiles", fix="leave it out")
+    if given.profiles is not None and given.profiles.suffix.lower() not in {".png", ".pdf", ".svg"}:
+        raise UsageError(
+            "not a picture format", where="--profiles", expected=".png, .pdf or .svg", got=given.profiles
+        )
+    for flag, path in (("--json", given.json), ("--profiles", given.profiles)):
+        if path is not None:
+            _probe(flag, path)
+
+
+def _probe(flag: str, path: Path) -> None:
+    """Open a file for writing without changing it; create its folder."""
+    fresh = not path.exists()
+    try:
+        path.absolute().parent.mkdir(parents=True, exist_ok=True)
+        path.open("ab").close()
+    except OSError as error:
+        raise UsageError(
+            "the file cannot be written",
+            where=f"{flag} {path}",
+            expected="a file in a folder that you may write to",
+            got=error.strerror,
+        ) from error
+    if fresh:
+        path.unlink()
+
+
+def rounded(value: object) -> object:
+    """Return a JSON value with its floats cut to significant digits, NaN as null."""
+    if isinstance(value, float):
+        return float(f"{value:.{DIGITS}g}") if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {key: rounded(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [rounded(item) for item in value]
+    return value
+
+
+def document(result: Result) -> JSON:
+    """Return everything a run has shown, as the JSON file states it."""
+    e, checks = result.experiment, result.checks
+    parameters = solver_parameters(e)
+    box = box_of(parameters)
+    work = e.particles * e.substeps
+    found: JSON = {
+        "format": 1,
+        "case": e.case.value,
+        "settings": asdict(e),
+        "parameters": asdict(parameters),
+        "box": [box.low, box.high],
+        "time": e.substeps * e.dt,
+        "centre_lines": _centre_lines(result),
+        "ghia": _ghia(result),
+        "jacobian": {
+            "min": min(c.jacobian_min for c in checks),
+            "max": max(c.jacobian_max for c in checks),
+            "min_outside_lid_corners": min(c.jacobian_min_outside_lid_corners for c in checks),
+            "max_outside_lid_corners": max(c.jacobian_max_outside_lid_corners for c in checks),
+        },
+        "empty_cells": max(c.empty_cells for c in checks),
+        "divergence_over_vorticity": checks[-1].divergence_over_vorticity,
+        "checks": [asdict(c) for c in checks],
+        "kinetic_energy": {"substep": result.frame_substeps, "value": result.kinetic_energy},
+        "energy_retention": result.retention,
+        "largest_rise_after_lid_off": result.largest_rise_after_lid_off,
+        "timing": {
+            "solver_seconds": result.seconds,
+            "nanoseconds_per_particle_substep": 1e9 * result.seconds / work,
+            "particle_substeps_per_second": work / result.seconds,
+        },
+    }
+    return {key: rounded(value) for key, value in found.items()}
+
+
+def _centre_lines(result: Result) -> JSON | None:
+    if result.profiles is None:
+        return None
+    found = result.profiles.at_reference_points()
+    reference = ghia.centre_lines(result.experiment.reynolds or 0.0)
+    return {
+        "averaged_substeps": [result.averaged_from, result.experiment.substeps],
+        "u": _points("y", ghia.Y, "u", found.u, None if reference is None else reference.u),
+        "v": _points("x", ghia.X, "v", found.v, None if reference is None else reference.v),
+    }
+
+
+def _points(
+    along: str,
+    abscissae: Sequence[float],
+    name: str,
+    values: NDArray[np.float64],
+    reference: NDArray[np.float64] | None,
+) -> list[JSON]:
+    tabulated = np.full(len(abscissae), np.nan) if reference is None else reference
+    return [
+        {along: x, name: float(value), "ghia": float(known)}
+        for x, value, known in zip(abscissae, values, tabulated, strict=True)
+    ]
+
+
+def _ghia(result: Result) -> JSON | None:
+    found = result.deviations()
+    if found is None:
+        return None
+    u, v = found
+    return {"u_rmse": u.rmse, "v_rmse": v.rmse, "u_max": u.maximum, "v_max": v.maximum}
+
+
+def summary(found: JSON) -> str:
+    """Return the results in a few lines."""
+    j, ghia_error = found["jacobian"], found["ghia"]
+    lines = [
+        f"J {j['min']:.4f} to {j['max']:.4f}, outside the lid corners {j['min_outside_lid_corners']:.4f} "
+        f"to {j['max_outside_lid_corners']:.4f}; empty cells {found['empty_cells']}",
+        f"{found['timing']['nanoseconds_per_particle_substep']:.1f} ns per particle and substep",
+    ]
+    if ghia_error is not None:
+        lines.insert(0, "against Ghia: " + ", ".join(f"{k} {v:.4f}" for k, v in ghia_error.items()))
+    if found["case"] == Case.CURL_NOISE and found["energy_retention"] is not None:
+        lines.insert(
+            0,
+            f"energy left {found['energy_retention']:.3f}, divergence over vorticity "
+            f"{found['divergence_over_vorticity']:.4f}",
+        )
+    if found["largest_rise_after_lid_off"] is not None:
+        lines.insert(0, f"largest rise of energy with the lid off {found['largest_rise_after_lid_off']:.2e}")
+    return "\n".join(lines)
+
+
+def perform(given: argparse.Namespace) -> JSON:
+    """Run what the options ask for, write the files and return the results."""
+    experiment = settings(given)
+    check_outputs(given)
+    console = Console(stderr=True)
+    with Progress(console=console, disable=not console.is_terminal) as progress:
+        task = progress.add_task(experiment.case.value, total=experiment.substeps)
+        result = run(
+            experiment, device=given.device, report=lambda done: progress.update(task, completed=done)
+        )
+    found = document(result)
+    if given.json is not None:
+        given.json.write_text(json.dumps(found, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    if given.profiles is not None and result.profiles is not None:
+        e = experiment
+        title = f"Re {e.reynolds:g}, {e.grid} x {e.grid}, {e.substeps} substeps"
+        draw(result.profiles, ghia.centre_lines(experiment.reynolds or 0.0), title, given.profiles)
+    return found
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command and return its exit code."""
+    given = parser().parse_args(arguments)
+    try:
+        sys.stdout.write(summary(perform(given)) + "\n")
+    except LagbenchError as error:
+        sys.stderr.write(f"error: {error}\n")
+        return error.exit_code
+    except OSError as error:
+        sys.stderr.write(f"error: {error}\n")
+        return WorkFailedError.exit_code
+    except KeyboardInterrupt:
+        sys.stderr.write("interrupted\n")
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,170 @@
+"""From a size in datasets.yaml to constants, walls and the ranges of what is drawn.
+
+What the constants of a solver may be: wrong names and values are told before work starts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import MISSING, fields
+from difflib import get_close_matches
+from typing import TYPE_CHECKING, TypeVar
+
+from lagbench.data.limits import Limit
+from lagbench.errors import UnreadableFileError, UsageError
+
+from .shapes import Region
+from .split import ClosedBoxParameters, FreeSurfaceParameters
+
+if TYPE_CHECKING:
+    from lagbench.data.registry import Size
+
+__all__ = [
+    "blamed_on_parameters",
+    "check_constants",
+    "closed_box_walls",
+    "constants",
+    "free_surface_walls",
+    "interval",
+    "ranges",
+]
+
+
+ParametersType = type[ClosedBoxParameters] | type[FreeSurfaceParameters]
+
+_POSITIVE = Limit(low=0.0, open_low=True)
+_NOT_NEGATIVE = Limit(low=0.0)
+_SHARE = Limit(low=0.0, high=1.0)
+_POISSON = Limit(low=0.0, high=0.5, open_high=True)
+
+LIMITS = {
+    "particles": Limit(low=1, whole=True),
+    "grid": Limit(low=4, whole=True),
+    "wall": Limit(low=0, whole=True),
+    "dt": _POSITIVE,
+    "density": _POSITIVE,
+    "modulus": _POSITIVE,
+    "liquid_modulus": _POSITIVE,
+    "jelly_modulus": _POSITIVE,
+    "rope_modulus": _POSITIVE,
+    "snow_modulus": _POSITIVE,
+    "jelly_poisson": _POISSON,
+    "rope_poisson": _POISSON,
+    "snow_poisson": _POISSON,
+    "velocity_relaxation": _SHARE,
+    "jacobian_relaxation": _SHARE,
+    "density_coupling": _SHARE,
+    "shift": _NOT_NEGATIVE,
+    "liquid_viscosity": _NOT_NEGATIVE,
+    "elastic_damping": _NOT_NEGATIVE,
+    "jacobian_min": Limit(low=0.0, high=1.0, open_low=True),
+    "jacobian_max": Limit(low=1.0),
+    "snow_compression": Limit(low=0.0, high=1.0, open_high=True),
+    "snow_stretch": _NOT_NEGATIVE,
+    "snow_hardening": _NOT_NEGATIVE,
+    "snow_hardening_min": _POSITIVE,
+    "snow_hardening_max": _POSITIVE,
+    "snow_jp_min": _POSITIVE,
+    "snow_jp_max": _POSITIVE,
+}
+"""Limits of constants that both the solvers and their stability rest on; others are finite numbers."""
+
+
+def check_constants(kind: ParametersType, given: Mapping[str, object], size: Size) -> None:
+    """Refuse constants that a solver cannot use."""
+    for field in fields(kind):
+        if field.name not in given:
+            if field.default is MISSING:
+                raise _missing(field.name, kind, size)
+            continue
+        limit, value = LIMITS.get(field.name, Limit()), given[field.name]
+        if field.type == "bool":
+            good, expected = isinstance(value, bool), "true or false"
+        else:
+            good, expected = limit.holds(value), str(limit)
+        if field.name == "wall" and good:
+            # The box between the walls is four cells wide at least.
+            high = (int(str(given["grid"])) - 4) // 2
+            limit = Limit(low=0, high=high, whole=True)
+            good, expected = limit.holds(value), str(limit)
+        if not good:
+            raise UnreadableFileError(
+                "a parameter has no possible value",
+                where=f"{size.file}, {_key(size, field.name)}",
+                expected=expected,
+                got=repr(value),
+            )
+
+
+def _key(size: Size, name: str) -> str:
+    return f"splits.{size.split}, size {size.name}, parameter {name}"
+
+
+def _missing(name: str, kind: ParametersType, size: Size) -> UnreadableFileError:
+    """Return an error that names the parameter that may have been meant."""
+    known = {field.name for field in fields(kind)}
+    strange = [other for other in size.parameters if other not in known]
+    close = get_close_matches(name, strange, n=3)
+    return UnreadableFileError(
+        "a parameter is missing",
+        where=f"{size.file}, {_key(size, name)}",
+        expected=name,
+        got=", ".join(close) or "no name like it",
+        fix=f"did you mean {close[0]!r}?" if close else f"declare {name} under parameters of the split",
+    )
+
+
+@contextmanager
+def blamed_on_parameters(size: Size, work: str) -> Iterator[None]:
+    """Turn what a split's module raises over its parameters into an error that names their file."""
+    where = f"{size.file}, splits.{size.split}, size {size.name}"
+    try:
+        yield
+    except UsageError as error:
+        raise UnreadableFileError(
+            error.what, where=where, expected=error.expected, got=error.got, fix=error.fix
+        ) from error
+    except (TypeError, ValueError, ArithmeticError, LookupError) as error:
+        texts = [f"{n} = {p.value!r}" for n, p in size.parameters.items() if isinstance(p.value, bool | str)]
+        listing = f"; parameters that are no numbers: {', '.join(texts)}" if texts else ""
+        raise UnreadableFileError(
+            f"{work} failed with these parameters",
+            where=where,
+            expected=f"parameters that {size.generator} can use",
+            got=f"{type(error).__name__}: {error}{listing}",
+            fix="compare the parameters with those in the datasets.yaml of lagbench",
+        ) from error
+
+
+Kind = TypeVar("Kind", ClosedBoxParameters, FreeSurfaceParameters)
+
+
+def constants(kind: type[Kind], size: Size, **fixed: object) -> Kind:
+    """Return the solver constants that a size names; others keep their defaults."""
+    given = {f.name: size.value(f.name) for f in fields(kind) if f.name in size.parameters}
+    settled = {"dt": size.dt, **given, **fixed}
+    check_constants(kind, settled, size)
+    return kind(**settled)
+
+
+def closed_box_walls(size: Size) -> tuple[float, float]:
+    """Return the low and high wall, half-way between two nodes [length]."""
+    low = (float(size.value("wall")) + 0.5) / size.grid
+    return low, 1.0 - low
+
+
+def free_surface_walls(size: Size) -> tuple[float, float]:
+    """Return the low and high wall, each on a node [length]."""
+    low = float(size.value("wall")) / size.grid
+    return low, 1.0 - low
+
+
+def interval(size: Size, name: str) -> tuple[float, float]:
+    """Return the parameters ``<name>_min`` and ``<name>_max``."""
+    return float(size.value(f"{name}_min")), float(size.value(f"{name}_max"))
+
+
+def ranges(size: Size, name: str) -> Region:
+    """Return the intervals of ``<name>_x`` and ``<name>_y``."""
+    return interval(size, f"{name}_x"), interval(size, f"{name}_y")

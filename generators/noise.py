@@ -1,0 +1,146 @@
+"""Perlin noise and the window that ends it at walls (thesis §5.9; Bridson 2007).
+
+Both are polynomials within a lattice cell, so that a stream function made of them has
+continuous second derivatives, and every operation is + - * or floor.
+
+Functions of the plane carried together with their first and second derivatives.
+
+A :class:`Jet` obeys the product rule to second order, so a field written once in + - * has
+exact derivatives (to rounding) and no step width to choose:
+
+    (f g)_x = f_x g + f g_x,    (f g)_xy = f_xy g + f_x g_y + f_y g_x + f g_xy.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .draws import RandomSource, direction
+
+__all__ = [
+    "Jet",
+    "coordinates",
+    "gradients",
+    "noise",
+    "ramp",
+]
+
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Jet:
+    """A function at many points: value, gradient and Hessian, each of shape [point]."""
+
+    value: Array
+    x: Array
+    y: Array
+    xx: Array
+    xy: Array
+    yy: Array
+
+    def __add__(self, other: Jet) -> Jet:
+        """Add term by term."""
+        return Jet(*(a + b for a, b in zip(self._terms(), other._terms(), strict=True)))
+
+    def __sub__(self, other: Jet) -> Jet:
+        """Subtract term by term."""
+        return self + other.scale(-1.0)
+
+    def __mul__(self, other: Jet) -> Jet:
+        """Multiply by the product rule."""
+        f, g = self, other
+        return Jet(
+            f.value * g.value,
+            f.x * g.value + f.value * g.x,
+            f.y * g.value + f.value * g.y,
+            f.xx * g.value + 2.0 * (f.x * g.x) + f.value * g.xx,
+            f.xy * g.value + f.x * g.y + f.y * g.x + f.value * g.xy,
+            f.yy * g.value + 2.0 * (f.y * g.y) + f.value * g.yy,
+        )
+
+    def scale(self, factor: Array | float) -> Jet:
+        """Multiply by numbers that do not depend on the point's coordinates."""
+        return Jet(*(factor * term for term in self._terms()))
+
+    def shift(self, amount: Array | float) -> Jet:
+        """Add numbers that do not depend on the point's coordinates."""
+        return Jet(self.value + amount, self.x, self.y, self.xx, self.xy, self.yy)
+
+    def polynomial(self, *coefficients: float) -> Jet:
+        """Return c0 + c1 f + c2 f^2 + ... by Horner's rule."""
+        result = self.scale(0.0)
+        for coefficient in reversed(coefficients):
+            result = (result * self).shift(coefficient)
+        return result
+
+    def where(self, condition: NDArray[np.bool_], otherwise: float) -> Jet:
+        """Keep the function where the condition holds; a constant takes its place elsewhere."""
+        value, *derivatives = self._terms()
+        kept = (np.where(condition, term, 0.0) for term in derivatives)
+        return Jet(np.where(condition, value, otherwise), *kept)
+
+    def _terms(self) -> tuple[Array, Array, Array, Array, Array, Array]:
+        return self.value, self.x, self.y, self.xx, self.xy, self.yy
+
+
+def coordinates(position: Array) -> tuple[Jet, Jet]:
+    """Return x and y as jets at the given points, shape [point, 2]."""
+    zero = np.zeros(len(position))
+    one = np.ones(len(position))
+    x = Jet(position[:, 0], one, zero, zero, zero, zero)
+    y = Jet(position[:, 1], zero, one, zero, zero, zero)
+    return x, y
+
+
+def gradients(rng: RandomSource, frequency: int) -> NDArray[np.float64]:
+    """Draw the unit gradients of a lattice, shape [frequency + 1, frequency + 1, 2]."""
+    nodes = frequency + 1
+    drawn = [direction(rng) for _ in range(nodes * nodes)]
+    return np.array(drawn, dtype=np.float64).reshape(nodes, nodes, 2)
+
+
+def fade(t: Jet) -> Jet:
+    """Return Perlin's 6 t^5 - 15 t^4 + 10 t^3; slope and curvature vanish at 0 and 1."""
+    return t.polynomial(0.0, 0.0, 0.0, 10.0, -15.0, 6.0)
+
+
+def _lerp(share: Jet, start: Jet, end: Jet) -> Jet:
+    return start + share * (end - start)
+
+
+def noise(x: Jet, y: Jet, lattice: NDArray[np.float64]) -> Jet:
+    """Return gradient noise with lattice nodes at whole numbers (Eqs. 5.40, 5.41).
+
+    It is 0 at every node and its slope there is the node's gradient.
+
+    Args:
+        x: first coordinate in lattice cells, between 0 and the lattice's cells.
+        y: second coordinate, alike.
+        lattice: gradients, shape [node, node, 2].
+    """
+    last = len(lattice) - 2
+    # A point on the far wall belongs to the last cell, not to one beyond the lattice.
+    i = np.minimum(np.floor(x.value).astype(np.int64), last)
+    j = np.minimum(np.floor(y.value).astype(np.int64), last)
+    p, q = x.shift(-i.astype(np.float64)), y.shift(-j.astype(np.float64))
+
+    def corner(k: int, m: int) -> Jet:
+        slope = lattice[i + k, j + m]
+        return p.shift(-float(k)).scale(slope[:, 0]) + q.shift(-float(m)).scale(slope[:, 1])
+
+    u, w = fade(p), fade(q)
+    return _lerp(w, _lerp(u, corner(0, 0), corner(1, 0)), _lerp(u, corner(0, 1), corner(1, 1)))
+
+
+def ramp(t: Jet) -> Jet:
+    """Return Bridson's ramp: (15 t - 10 t^3 + 3 t^5) / 8 up to t = 1, then 1.
+
+    It starts from 0 with a slope of 15/8 and arrives with slope and curvature 0.
+    """
+    rising = t.polynomial(0.0, 1.875, 0.0, -1.25, 0.0, 0.375)
+    return rising.where(t.value < 1.0, 1.0)

@@ -1,0 +1,259 @@
+"""From nothing to a leaderboard: data at size ``tiny``, a trained model, its scores, a page.
+
+Everything lies under one root folder, which the demo may fill as it likes: the data sets,
+``pictures/``, ``runs/`` and a leaderboard of its own, never the one of the repository.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lagbench.data.layout import ScenarioKey, resolve_root, scenario_path
+from lagbench.data.registry import Registry, Size, load
+from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError, check_installed
+from lagbench.make.generate import GenerationResult, Progress, generate
+from lagbench.make.verify import VerificationResult, verify
+
+if TYPE_CHECKING:
+    from lagbench.baselines.predict import PredictionResult
+    from lagbench.baselines.train import TrainingResult
+    from lagbench.board.build import BuildResult
+    from lagbench.board.meta import Meta
+    from lagbench.board.submit import SubmitResult
+    from lagbench.scoring.card import ScoreCard
+
+    from .machine import SolverBench
+
+__all__ = [
+    "DEMO_SIZE",
+    "MODEL",
+    "MODEL_SPLIT",
+    "DemoResult",
+    "ModelResult",
+    "demo",
+    "demo_board",
+    "demo_model",
+    "demo_splits",
+    "model_left_out",
+]
+
+
+DEMO_SIZE = "tiny"
+
+MODEL, MODEL_SPLIT = "gns", "cavity"
+"""The baseline that the demo trains, and the split that it learns."""
+
+SETTINGS = (
+    *("training.steps=150", "training.batch=4", "training.learning_rate=2.0e-3"),
+    *("model.noise_std=3.0e-4", "model.symmetry=square", "model.wall_velocity=true"),
+)
+"""Changes to the recipe of size tiny, which is shorter: those of cavity mini."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemoResult:
+    """One split of the demo: what was generated, how it verified, and its picture."""
+
+    generation: GenerationResult  # result of generate
+    verification: VerificationResult  # result of verify
+    picture: Path  # PNG of the first test scenario at its last frame of interest
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelResult:
+    """The model of the demo: how it was trained, what it predicted, how it scored, the page."""
+
+    training: TrainingResult  # result of train
+    prediction: PredictionResult  # result of predict
+    card: ScoreCard  # its scores beside those of the floors
+    solver: SolverBench | None  # what our solver takes here; None where it cannot be timed
+    entries: tuple[SubmitResult, ...]  # entries of the leaderboard: the floors, then the model
+    page: BuildResult  # the leaderboard's page
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the fields by name, the card as what scores.json holds."""
+        return {**vars(self), "card": self.card.as_json()}
+
+
+def demo_splits(registry: Registry) -> list[str]:
+    """Return the splits that have a size ``tiny``; those of other packages need not."""
+    return [name for name, split in registry.splits.items() if DEMO_SIZE in split.sizes]
+
+
+def demo(
+    split: str,
+    *,
+    root: str | Path | None = None,
+    workers: int | None = None,
+    progress: Callable[[Progress], None] | None = None,
+) -> DemoResult:
+    """Generate, verify and draw one split at size ``tiny``.
+
+    Args:
+        split: name of the split.
+        root: folder of the data and of ``pictures/``; see ``resolve_root``.
+        workers: worker processes; one per core when None.
+        progress: called as the generation advances.
+
+    Raises:
+        LagbenchError: what :func:`~lagbench.make.generate.generate`,
+            :func:`~lagbench.make.verify.verify` and :func:`~lagbench.draw.plot.plot_frame` raise.
+    """
+    from lagbench.draw.plot import plot_frame
+
+    folder = resolve_root(root)
+    size = load().size(split, DEMO_SIZE)
+    generation = generate(split, DEMO_SIZE, root=folder, workers=workers, progress=progress)
+    verification = verify(split, DEMO_SIZE, root=folder, complete=True)
+    verification.check()
+    pictures = folder / "pictures"
+    pictures.mkdir(exist_ok=True)
+    picture = plot_frame(
+        _first_test(size, folder), size.task.frames_of_interest[-1], pictures / f"{split}.png"
+    )
+    return DemoResult(generation=generation, verification=verification, picture=picture)
+
+
+def _first_test(size: Size, root: Path) -> Path:
+    scenario = size.subsets["test"][0]
+    key = ScenarioKey(
+        split=size.split, size=size.name, version=size.version, scenario=scenario, subset="test"
+    )
+    return scenario_path(root, key)
+
+
+def model_left_out(registry: Registry) -> str | None:
+    """Return why there can be no model, and what helps; None where there can be one."""
+    if MODEL_SPLIT not in demo_splits(registry):
+        return f"the registry has no {MODEL_SPLIT} {DEMO_SIZE}"
+    try:
+        for module in ("torch", "torch_geometric", "pytorch_lightning"):
+            check_installed(module, extra="baselines")
+    except UsageError as error:
+        return f"{error.what}; {error.fix}"
+    return None
+
+
+def demo_board(root: str | Path | None = None) -> Path:
+    """Return the folder of the demo's leaderboard; refuse that of anyone else.
+
+    Raises:
+        UsageError: the folder holds entries of other sizes, so it is no demo's.
+    """
+    from lagbench.board.folder import Folder
+
+    board = Folder(resolve_root(root) / "leaderboard")
+    others = [path for path in board.entries() if path.parts[2] != DEMO_SIZE]
+    if others:
+        raise UsageError(
+            "the demo would write into another leaderboard",
+            where=str(board.path),
+            expected=f"entries of size {DEMO_SIZE} only, or none",
+            got=others[0].as_posix(),
+            fix="give the demo a folder of its own: --root demo",
+        )
+    return board.path
+
+
+def demo_model(
+    *, root: str | Path | None = None, progress: Callable[[Progress], None] | None = None
+) -> ModelResult:
+    """Train a small model, predict, score and submit it with the floors, draw the page.
+
+    The data set must be there, see :func:`demo`. One thread: a model as small as this gains
+    nothing by a second, and the same machine trains the same weights.
+
+    Args:
+        root: folder of the data, of ``runs/`` and of ``leaderboard/``.
+        progress: called as the work advances.
+
+    Raises:
+        UsageError: the extra ``baselines`` is not installed, or the leaderboard is no demo's.
+        DataError: the data set is missing or damaged.
+        WorkFailedError: the work failed, or the disk is full.
+        KeyboardInterrupt: interrupted; the next call goes on with the training.
+    """
+    from lagbench.baselines.predict import predict
+    from lagbench.board.build import build
+    from lagbench.board.submit import submit, submit_floor
+    from lagbench.scoring.floors import FLOORS
+    from lagbench.scoring.score import score
+
+    folder, board = resolve_root(root), demo_board(root)
+    run = folder / "runs" / f"{MODEL_SPLIT}-{MODEL}"
+    training = _trained(run, folder, progress)
+    prediction = predict(
+        training.weights,
+        run / "predictions.nc",
+        root=folder,
+        device="cpu",
+        threads=1,
+        method=MODEL,
+        progress=progress,
+    )
+    solver = _solver_time()
+    floors = [
+        submit_floor(name, split=MODEL_SPLIT, size=DEMO_SIZE, board=board, root=folder) for name in FLOORS
+    ]
+    entry = submit(
+        [prediction.path], _said(training, prediction, solver), board=board, root=folder, replace=True
+    )
+    return ModelResult(
+        training=training,
+        prediction=prediction,
+        card=score(prediction.path, root=folder),
+        solver=solver,
+        entries=(*floors, entry),
+        page=build(board),
+    )
+
+
+def _trained(run: Path, root: Path, progress: Callable[[Progress], None] | None) -> TrainingResult:
+    from lagbench.baselines.train import train
+
+    begin = partial(
+        train,
+        MODEL,
+        MODEL_SPLIT,
+        DEMO_SIZE,
+        settings=SETTINGS,
+        root=root,
+        output=run,
+        device="cpu",
+        threads=1,
+        progress=progress,
+    )
+    try:
+        return begin()
+    except (UsageError, DataError, UnreadableFileError):
+        # What is left of another version or was damaged is the demo's own: not worth an error.
+        return begin(fresh=True)
+
+
+def _solver_time() -> SolverBench | None:
+    from .machine import bench_apart
+
+    try:
+        return bench_apart(MODEL_SPLIT, DEMO_SIZE)
+    except LagbenchError:
+        return None
+
+
+def _said(training: TrainingResult, prediction: PredictionResult, solver: SolverBench | None) -> Meta:
+    """Return what the entry says of the model."""
+    from lagbench.board.meta import Meta
+
+    return Meta(
+        method=MODEL,
+        name=f"{MODEL.upper()}, {training.steps} steps",
+        authors=("lagbench demo",),
+        licence="MIT",
+        notes="Trained for seconds to show the way; it says little of what such a model can do.",
+        hardware=prediction.device,
+        command="lagbench demo",
+        solver_seconds_per_frame=None if solver is None else float(f"{solver.seconds_per_frame:.6g}"),
+    )

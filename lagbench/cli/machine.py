@@ -1,0 +1,219 @@
+"""Look at this machine: libraries, cores, disk, registry; what a bug report needs.
+
+Time our solver: what a surrogate has to beat on the same machine.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from lagbench.data.layout import resolve_root
+from lagbench.data.registry import load
+from lagbench.errors import LagbenchError, WorkFailedError, check_installed
+from lagbench.make.plan import free_bytes
+from lagbench.work.pool import available_cores
+
+__all__ = [
+    "Check",
+    "Diagnosis",
+    "doctor",
+    "SolverBench",
+    "bench_apart",
+    "bench_solver",
+]
+
+
+NEEDED = (
+    "numpy",
+    "scipy",
+    "xarray",
+    "netCDF4",
+    "h5py",
+    "dask",
+    "pandas",
+    "pydantic",
+    "PyYAML",
+    "typer",
+    "rich",
+    "platformdirs",
+    "filelock",
+    "fsspec",
+)
+OPTIONAL = {
+    "taichi": "generate",
+    "matplotlib": "plots",
+    "imageio": "plots",
+    "torch": "baselines",
+    "distributed": "cluster",
+    "s3fs": "s3",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check:
+    """One thing looked at."""
+
+    name: str  # what it is
+    state: str  # "ok", "missing" (something optional) or "broken"
+    detail: str  # what was found, and how to mend it
+
+
+@dataclass(frozen=True, kw_only=True)
+class Diagnosis:
+    """All that was looked at."""
+
+    checks: tuple[Check, ...]  # in the order of looking
+
+    @property
+    def healthy(self) -> bool:
+        """Whether nothing is broken."""
+        return all(check.state != "broken" for check in self.checks)
+
+
+def doctor(root: str | Path | None = None) -> Diagnosis:
+    """Look at what lagbench needs on this machine; changes nothing.
+
+    Args:
+        root: folder of all data sets; else ``LAGBENCH_ROOT``, else the user data folder.
+    """
+    folder = resolve_root(root)
+    return Diagnosis(
+        checks=(
+            Check(name="lagbench", state="ok", detail=version("lagbench")),
+            Check(name="python", state="ok", detail=f"{platform.python_version()} on {platform.platform()}"),
+            _processor(),
+            *(_library(name) for name in NEEDED),
+            *(_extra(name, extra) for name, extra in OPTIONAL.items()),
+            _attempt("registry", _registry),
+            _attempt("data folder", lambda: _folder(folder)),
+        )
+    )
+
+
+def _processor() -> Check:
+    native = platform.machine() in {"x86_64", "AMD64"} and platform.system() == "Linux"
+    promise = "bits as in datasets.yaml" if native else "bits may differ: see docs/determinism.md"
+    detail = f"{platform.machine()}, {available_cores()} of {os.cpu_count()} cores; {promise}"
+    return Check(name="processor", state="ok", detail=detail)
+
+
+def _library(name: str) -> Check:
+    try:
+        return Check(name=name, state="ok", detail=version(name))
+    except PackageNotFoundError:
+        return Check(name=name, state="broken", detail="not installed: pip install lagbench")
+
+
+def _extra(name: str, extra: str) -> Check:
+    try:
+        return Check(name=name, state="ok", detail=version(name))
+    except PackageNotFoundError:
+        return Check(name=name, state="missing", detail=f"pip install 'lagbench[{extra}]'")
+
+
+def _attempt(name: str, look: Callable[[], str]) -> Check:
+    try:
+        return Check(name=name, state="ok", detail=look())
+    except (LagbenchError, OSError) as error:
+        return Check(name=name, state="broken", detail=str(error))
+
+
+def _registry() -> str:
+    registry = load()
+    measured = sum(len(sizes) for sizes in registry.measured.values())
+    return f"{len(registry.splits)} splits, hashes of {measured} sizes"
+
+
+def _folder(folder: Path) -> str:
+    """Return where data sets live; an OSError when nothing can be written there."""
+    existing = next(place for place in (folder, *folder.parents) if place.exists())
+    with tempfile.TemporaryFile(dir=existing):
+        return f"{folder}, {free_bytes(folder)} bytes free"
+
+
+WARM_UP = 2
+"""Frames before the clock starts: kernels compile when they first run."""
+
+FRAMES = 20
+
+LEAST = 0.5
+"""Shortest time over which the mean is taken [s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SolverBench:
+    """What a frame costs the solver, one scenario on one core."""
+
+    split: str  # name of the split
+    size: str  # name of the size
+    particles: int  # particles of the scenario
+    substeps: int  # solver steps of a frame
+    frames: int  # frames that were timed
+    # mean processor time of a frame [s], so that other work on the machine does not count; writing
+    # it to disk is not part of it
+    seconds_per_frame: float
+
+
+def bench_solver(split: str, size: str = "full", *, frames: int = FRAMES) -> SolverBench:
+    """Simulate the first test scenario for some frames and time them.
+
+    Taichi starts once per process: call this from one of its own, as :func:`bench_apart` does.
+
+    Args:
+        split: name of the split.
+        size: name of the size.
+        frames: frames to time at least; as many as half a second takes if that is more.
+
+    Raises:
+        UsageError: unknown split or size, or Taichi is not installed.
+    """
+    tier = load().size(split, size)
+    check_installed("taichi", extra="generate")
+    from lagbench.generators.batch import draw, solver_constants
+    from lagbench.generators.solver import build
+
+    with_state = draw(tier, tier.subsets["test"][0])
+    solver = build(solver_constants(tier))
+    solver.load([with_state])
+    solver.advance(WARM_UP * tier.substeps_per_frame)
+    started, timed = time.process_time(), 0
+    while timed < frames or time.process_time() - started < LEAST:
+        solver.advance(tier.substeps_per_frame)
+        solver.position()
+        timed += 1
+    seconds = (time.process_time() - started) / timed
+    return SolverBench(
+        split=split,
+        size=size,
+        particles=tier.particles,
+        substeps=tier.substeps_per_frame,
+        frames=timed,
+        seconds_per_frame=seconds,
+    )
+
+
+def bench_apart(split: str, size: str = "full", *, frames: int = FRAMES) -> SolverBench:
+    """Time the solver in a process of its own, which this one's memory and threads do not disturb.
+
+    Raises:
+        UsageError: unknown split or size, or Taichi is not installed.
+        WorkFailedError: the process failed.
+    """
+    load().size(split, size)
+    check_installed("taichi", extra="generate")
+    options = ["--split", split, "--size", size, "--frames", str(frames), "--json"]
+    command = [sys.executable, "-m", "lagbench", "bench", "solver", *options]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise WorkFailedError("the solver could not be timed", got=done.stderr.strip()[-300:])
+    return SolverBench(**json.loads(done.stdout))

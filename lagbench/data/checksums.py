@@ -1,0 +1,239 @@
+"""Content hashes: what a data set says, not how a library packed it.
+
+A file hash would change with the compression, the chunks or the version of HDF5. The
+content hash of a scenario is built from its values alone, in two levels::
+
+    variable = SHA-256(canonical JSON of {name, dtype, dims, shape}, newline, values)
+    content  = SHA-256(canonical JSON of {split, size, major, scenario, subset, seed,
+                                          parameters, variables: {name: variable}})
+
+so that variables can be hashed side by side while frames arrive, and a damaged one can be
+named. Values are little-endian, in C order, with one zero and one NaN; docs/format.md has it all.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lagbench.errors import DataError
+
+__all__ = [
+    "HASHED_SUBSETS",
+    "ContentHasher",
+    "Variable",
+    "VariableHasher",
+    "canonical_json",
+    "content_hash",
+    "dataset_hash",
+    "dtype_name",
+    "file_sha256",
+    "plain",
+    "subset_hash",
+]
+
+
+HASHED_SUBSETS = ("train", "valid", "test")
+"""Subsets that the data set hash covers."""
+
+BLOCK_BYTES = 1 << 18
+"""Values are made canonical in blocks that stay in the second-level cache [bytes]."""
+
+
+class Variable(Protocol):
+    """What :func:`content_hash` needs of a variable; those of xarray fit."""
+
+    @property
+    def dims(self) -> Sequence[object]:
+        """Names of the dimensions."""
+
+    @property
+    def values(self) -> ArrayLike:
+        """All values."""
+
+
+def plain(value: object) -> object:
+    """Return a JSON value equal to an attribute, whatever library read it.
+
+    Booleans become 0 and 1, because netCDF has none; NumPy scalars and arrays of one element
+    become Python numbers; -0.0 becomes 0.0.
+    """
+    if isinstance(value, np.ndarray):
+        value = value.item() if value.size == 1 else value.tolist()
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, bytes):
+        value = value.decode("utf-8")
+    if isinstance(value, int):
+        return int(value)
+    if isinstance(value, float) and math.isfinite(value):
+        return value + 0.0
+    if isinstance(value, str) and "\0" not in value:
+        return str(value)
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    raise DataError(
+        "a value cannot be hashed",
+        expected="a finite number or a string without NUL, or lists and mappings of them",
+        got=repr(value),
+    )
+
+
+def canonical_json(value: object) -> bytes:
+    """Return the one JSON text of a value, as UTF-8.
+
+    Keys sorted by code point, no white space, no escapes beyond what JSON demands, floats in
+    the shortest form that reads back equal (``repr``), integers without a point.
+
+    >>> canonical_json({"b": 1, "a": [-0.0, 1e-7]})
+    b'{"a":[0.0,1e-07],"b":1}'
+    """
+    text = json.dumps(
+        plain(value), sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False
+    )
+    return text.encode("utf-8")
+
+
+def dtype_name(dtype: object) -> str:
+    """Return the name by which a type enters the hash, byte order left out.
+
+    >>> dtype_name(np.dtype(">f4")), dtype_name(str)
+    ('float32', 'string')
+    """
+    resolved = np.dtype(dtype)  # type: ignore[call-overload]
+    if resolved.kind in "OSTU":
+        return "string"
+    if resolved.kind in "iuf":
+        return str(resolved.name)
+    raise DataError("a type cannot be hashed", expected="integers, floats or strings", got=str(resolved))
+
+
+class VariableHasher:
+    """SHA-256 of one variable whose values arrive in C order, piece by piece."""
+
+    def __init__(self, name: str, dtype: object, dims: Sequence[object], shape: Sequence[int]) -> None:
+        self.name = name  # name of the variable
+        self.dtype = dtype_name(dtype)
+        self._missing = math.prod(shape)
+        self._sha = hashlib.sha256()
+        self._joint = b""
+        header = {"name": name, "dtype": self.dtype, "dims": list(dims), "shape": list(shape)}
+        self._sha.update(canonical_json(header) + b"\n")
+
+    def update(self, values: ArrayLike) -> None:
+        """Add the next values."""
+        array = np.asarray(values)
+        if dtype_name(array.dtype) != self.dtype:
+            raise self._wrong("values have another type", self.dtype, array.dtype)
+        if array.size > self._missing:
+            raise self._wrong("too many values", f"at most {self._missing} more", array.size)
+        self._missing -= array.size
+        if self.dtype == "string":
+            self._update_strings(array)
+        else:
+            self._update_numbers(array)
+
+    def hexdigest(self) -> str:
+        """Return the hash, 64 hex digits."""
+        if self._missing:
+            raise self._wrong("values are missing", "as many as the shape holds", f"{self._missing} fewer")
+        return self._sha.hexdigest()
+
+    def _update_numbers(self, array: NDArray[np.generic]) -> None:
+        little = array.astype(array.dtype.newbyteorder("<"), order="C", copy=False).reshape(-1)
+        step = BLOCK_BYTES // little.itemsize
+        for start in range(0, little.size, step):
+            self._sha.update(_canonical(little[start : start + step]).data)
+
+    def _update_strings(self, array: NDArray[np.generic]) -> None:
+        for item in array.reshape(-1).tolist():
+            text = plain(item)
+            if not isinstance(text, str):
+                raise self._wrong("a value is not a string", "a string", repr(item))
+            self._sha.update(self._joint + text.encode("utf-8"))
+            self._joint = b"\0"
+
+    def _wrong(self, what: str, expected: object, got: object) -> DataError:
+        return DataError(what, where=f"variable {self.name!r}", expected=expected, got=got)
+
+
+def _canonical(block: NDArray[np.generic]) -> NDArray[np.generic]:
+    """Return a block with one zero and one NaN; the block itself where nothing changes."""
+    if block.dtype.kind != "f":
+        return block
+    bits = block.view(f"<i{block.itemsize}")
+    # The bits of -0.0 are the smallest integer of their width, and a minimum passes NaN on: two
+    # fast reductions find both, and integers keep subnormals where a library flushes them to zero.
+    negative_zero = np.iinfo(bits.dtype).min
+    if bits.min() > negative_zero and not np.isnan(block.min()):
+        return block
+    clean = bits.copy()
+    clean[bits == negative_zero] = 0
+    clean[np.isnan(block)] = np.full(1, np.nan, block.dtype).view(bits.dtype)[0]
+    return clean
+
+
+class ContentHasher:
+    """Content hash of a scenario whose variables arrive side by side."""
+
+    def __init__(self, identity: Mapping[str, object]) -> None:
+        self._identity = dict(identity)
+        self._variables: dict[str, VariableHasher] = {}
+
+    def declare(self, name: str, dtype: object, dims: Sequence[object], shape: Sequence[int]) -> None:
+        """Announce a variable before its values come."""
+        self._variables[name] = VariableHasher(name, dtype, dims, shape)
+
+    def update(self, name: str, values: ArrayLike) -> None:
+        """Add the next values of a variable, in C order."""
+        self._variables[name].update(values)
+
+    def digests(self) -> dict[str, str]:
+        """Return the hash of every variable, sorted by name."""
+        return {name: self._variables[name].hexdigest() for name in sorted(self._variables)}
+
+    def hexdigest(self) -> str:
+        """Return the content hash, 64 hex digits."""
+        whole = {**self._identity, "variables": self.digests()}
+        return hashlib.sha256(canonical_json(whole)).hexdigest()
+
+
+def content_hash(variables: Mapping[Any, Variable], identity: Mapping[str, object]) -> str:
+    """Return the content hash of variables held in memory."""
+    hasher = ContentHasher(identity)
+    for name, variable in variables.items():
+        values = np.asarray(variable.values)
+        hasher.declare(str(name), values.dtype, variable.dims, values.shape)
+        hasher.update(str(name), values)
+    return hasher.hexdigest()
+
+
+def file_sha256(path: Path) -> str:
+    """Return the SHA-256 of a file's bytes."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def subset_hash(hashes: Mapping[int, str]) -> str:
+    """Return the SHA-256 of the lines ``{id:04d} {content hash}``, by id."""
+    lines = "".join(f"{scenario:04d} {hashes[scenario]}\n" for scenario in sorted(hashes))
+    return hashlib.sha256(lines.encode("ascii")).hexdigest()
+
+
+def dataset_hash(split: str, size: str, major: int, subsets: Mapping[str, str]) -> str:
+    """Return the data set hash over train, valid and test; other subsets are left out."""
+    missing = [subset for subset in HASHED_SUBSETS if subset not in subsets]
+    if missing:
+        raise DataError("the data set hash needs every subset", where=f"{split} {size}", got=f"no {missing}")
+    hashed = {subset: subsets[subset] for subset in HASHED_SUBSETS}
+    whole = {"split": split, "size": size, "major": major, "subsets": hashed}
+    return hashlib.sha256(canonical_json(whole)).hexdigest()

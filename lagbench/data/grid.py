@@ -1,0 +1,283 @@
+"""Grid fields of particles: quadratic B-spline transfer, vorticity, divergence.
+
+Node velocity is ``sum_p(w u) / sum_p(w)`` with ``w(d) = b(d_x / h) b(d_y / h)`` and
+
+    b(s) = 3/4 - s^2             for |s| <= 1/2,
+    b(s) = (3/2 - |s|)^2 / 2     for 1/2 <= |s| <= 3/2, else 0.
+
+The scorer, the plots and the differentiable twin in the training loss share this one
+definition. Arrays of particles have shape [..., particle, 2], fields [..., x node, y node];
+leading axes are frames or scenarios, and a batch gives the same bits as its frames alone.
+"""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lagbench.errors import UsageError
+
+__all__ = [
+    "COUNTED_SHARE",
+    "EMPTY_SHARE",
+    "Fields",
+    "Grid",
+    "Placement",
+    "Transfer",
+    "central_differences",
+    "counted_nodes",
+    "differentiable_nodes",
+    "divergence",
+    "fields",
+    "node_velocity",
+    "transfer",
+    "vorticity",
+]
+
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+COUNTED_SHARE = 0.35
+"""A node counts from this share of a full interior node's weight: walls (1/2) do, corners (1/4) not."""
+
+EMPTY_SHARE = 1e-3
+"""Below this share of a full node's weight a node is empty and its velocity is 0."""
+
+_LOW, _HIGH = 1, 2  # rows that the stencil of a particle in the unit box can reach past the grid
+
+
+class Placement(enum.StrEnum):
+    """Where the nodes of a grid lie."""
+
+    CELL_CENTRES = "cell_centres"
+    NODES = "nodes"
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Square grid of nodes over the unit box.
+
+    >>> Grid(4, Placement.CELL_CENTRES).axis
+    array([0.125, 0.375, 0.625, 0.875])
+    """
+
+    cells: int  # cells across the box
+    # nodes at (i + 1/2) / cells (cell centres) or at i / cells (nodes)
+    placement: Placement = Placement.CELL_CENTRES
+
+    def __post_init__(self) -> None:
+        """Accept the placement's name as it stands in datasets.yaml."""
+        if self.cells < 2:
+            raise UsageError("a grid needs cells", where="cells", expected="at least 2", got=self.cells)
+        object.__setattr__(self, "placement", Placement(self.placement))
+
+    @property
+    def spacing(self) -> float:
+        """Distance h between neighbouring nodes [length]."""
+        return 1.0 / self.cells
+
+    @property
+    def nodes(self) -> int:
+        """Nodes along one side."""
+        return self.cells + (self.placement is Placement.NODES)
+
+    @property
+    def origin(self) -> float:
+        """Position of node 0 in units of h: 1/2 or 0."""
+        return 0.5 if self.placement is Placement.CELL_CENTRES else 0.0
+
+    @property
+    def axis(self) -> Floats:
+        """Positions of the nodes along one side [length], shape [nodes]."""
+        return (np.arange(self.nodes) + self.origin) / self.cells
+
+    def full_weight(self, particles: int, area: float) -> float:
+        """Return the weight ``N h^2 / A`` of a node deep inside the material [1].
+
+        Args:
+            particles: particles N of the scenario.
+            area: area A that they cover at first [length^2].
+        """
+        return particles * self.spacing**2 / area
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """Sums over the particles around each node."""
+
+    weight: Floats  # sum(w) [1], shape [..., x node, y node]
+    momentum: Floats  # sum(w u) [unit of u], shape [..., x node, y node, 2]
+
+
+@dataclass(frozen=True)
+class Fields:
+    """Grid fields of one frame or a batch of frames."""
+
+    grid: Grid  # where the nodes lie
+    weight: Floats  # sum(w) [1], shape [..., x node, y node]
+    velocity: Floats  # node velocity, 0 at empty nodes [unit of u], shape [..., x node, y node, 2]
+    counted: Mask  # nodes that count, shape [..., x node, y node]
+    full: float  # weight of a full interior node [1]
+
+    @property
+    def density(self) -> Floats:
+        """Density relative to the initial one [1], shape [..., x node, y node]."""
+        return self.weight / self.full
+
+    @cached_property
+    def differentiable(self) -> Mask:
+        """Nodes at which vorticity and divergence stand, shape [..., x node, y node]."""
+        return differentiable_nodes(self.counted)
+
+    @cached_property
+    def vorticity(self) -> Floats:
+        """``dv/dx - du/dy`` [unit of u / length], NaN where not differentiable."""
+        return np.where(self.differentiable, vorticity(self.velocity, self.grid.spacing), np.nan)
+
+    @cached_property
+    def divergence(self) -> Floats:
+        """``du/dx + dv/dy`` [unit of u / length], NaN where not differentiable."""
+        return np.where(self.differentiable, divergence(self.velocity, self.grid.spacing), np.nan)
+
+
+def fields(
+    position: ArrayLike,
+    velocity: ArrayLike,
+    grid: Grid,
+    *,
+    full: float,
+    counted: Mask | None = None,
+) -> Fields:
+    """Return the grid fields of particles.
+
+    Args:
+        position: particle positions [length], shape [..., particle, 2].
+        velocity: particle velocities u, shape [..., particle, 2]; per frame gives 1/frame.
+        grid: grid of the fields.
+        full: weight of a full interior node, :meth:`Grid.full_weight` [1].
+        counted: nodes that count, those of the truth when a prediction is scored; by default
+            those of these particles.
+    """
+    sums = transfer(position, velocity, grid)
+    if counted is None:
+        counted = counted_nodes(sums.weight, full)
+    return Fields(grid, sums.weight, node_velocity(sums, full), counted, full)
+
+
+def transfer(position: ArrayLike, velocity: ArrayLike, grid: Grid) -> Transfer:
+    """Sum weights and momenta of the particles at the nodes.
+
+    Particles outside the unit box, or with a position that is no number, carry no weight.
+
+    Args:
+        position: particle positions [length], shape [..., particle, 2].
+        velocity: particle velocities u, shape [..., particle, 2].
+        grid: grid of the fields.
+
+    Raises:
+        UsageError: the shapes differ or do not end in [particle, 2].
+    """
+    x = np.asarray(position, np.float64)
+    u = np.asarray(velocity, np.float64)
+    if x.shape != u.shape or x.ndim < 2 or x.shape[-1] != 2:
+        raise UsageError(
+            "positions and velocities do not fit",
+            expected="two arrays of one shape [..., particle, 2]",
+            got=f"{x.shape} and {u.shape}",
+        )
+    leading = x.shape[:-2]
+    weight = np.empty((*leading, grid.nodes, grid.nodes))
+    momentum = np.empty((*weight.shape, 2))
+    for frame in np.ndindex(leading):  # a frame fits the cache, a batch does not
+        weight[frame], momentum[frame] = _scatter(x[frame], u[frame], grid)
+    return Transfer(weight, momentum)
+
+
+def _scatter(x: Floats, u: Floats, grid: Grid) -> tuple[Floats, Floats]:
+    """Return ``sum(w)`` and ``sum(w u)`` of one frame."""
+    inside = ((x >= 0.0) & (x <= 1.0)).all(axis=-1)
+    s = x[inside].T * grid.cells - grid.origin
+    base = np.floor(s - 0.5)
+    weight_x, weight_y = _spline(s - base)
+    side = grid.nodes + _LOW + _HIGH
+    column, row = base.astype(np.intp) + _LOW
+    corner = column * side + row
+    u_x, u_y = u[inside].T.copy()
+
+    sums = np.zeros((3, side * side))
+    for i, k in np.ndindex(3, 3):
+        node = corner + (i * side + k)
+        w = weight_x[i] * weight_y[k]
+        for total, weights in zip(sums, (w, w * u_x, w * u_y), strict=True):
+            total += np.bincount(node, weights, side * side)
+    inner = sums.reshape(3, side, side)[:, _LOW:-_HIGH, _LOW:-_HIGH]
+    return inner[0], np.moveaxis(inner[1:], 0, -1)
+
+
+def _spline(s: Floats) -> Floats:
+    """Return the weights of the three nodes of each axis, shape [2, node, particle]."""
+    return np.stack([0.5 * (1.5 - s) ** 2, 0.75 - (s - 1.0) ** 2, 0.5 * (s - 0.5) ** 2], axis=1)
+
+
+def counted_nodes(weight: Floats, full: float) -> Mask:
+    """Return the nodes with at least :data:`COUNTED_SHARE` of a full interior node's weight."""
+    return weight >= COUNTED_SHARE * full
+
+
+def node_velocity(sums: Transfer, full: float) -> Floats:
+    """Return ``sum(w u) / sum(w)``, 0 where the weight is below :data:`EMPTY_SHARE` of full."""
+    filled = (sums.weight >= EMPTY_SHARE * full) & (sums.weight > 0.0)
+    velocity = np.zeros_like(sums.momentum)
+    np.divide(sums.momentum, sums.weight[..., None], out=velocity, where=filled[..., None])
+    return velocity
+
+
+def differentiable_nodes(counted: Mask) -> Mask:
+    """Return the nodes whose four neighbours exist and count."""
+    inner = np.zeros_like(counted)
+    inner[..., 1:-1, 1:-1] = (
+        counted[..., 2:, 1:-1] & counted[..., :-2, 1:-1] & counted[..., 1:-1, 2:] & counted[..., 1:-1, :-2]
+    )
+    return inner
+
+
+def central_differences(field: Floats, spacing: float) -> tuple[Floats, Floats]:
+    """Return ``df/dx`` and ``df/dy``, 0 on the rim of the grid where no central difference exists.
+
+    Args:
+        field: values at the nodes, shape [..., x node, y node].
+        spacing: distance h between nodes [length].
+    """
+    along_x, along_y = np.zeros_like(field), np.zeros_like(field)
+    along_x[..., 1:-1, :] = (field[..., 2:, :] - field[..., :-2, :]) / (2.0 * spacing)
+    along_y[..., :, 1:-1] = (field[..., :, 2:] - field[..., :, :-2]) / (2.0 * spacing)
+    return along_x, along_y
+
+
+def vorticity(velocity: Floats, spacing: float) -> Floats:
+    """Return ``omega = dv/dx - du/dy`` (Eq. 5.19); solid-body rotation Omega gives 2 Omega.
+
+    Args:
+        velocity: node velocity, shape [..., x node, y node, 2].
+        spacing: distance h between nodes [length].
+    """
+    return (
+        central_differences(velocity[..., 1], spacing)[0] - central_differences(velocity[..., 0], spacing)[1]
+    )
+
+
+def divergence(velocity: Floats, spacing: float) -> Floats:
+    """Return ``du/dx + dv/dy``; an incompressible flow gives 0.
+
+    Args:
+        velocity: node velocity, shape [..., x node, y node, 2].
+        spacing: distance h between nodes [length].
+    """
+    return (
+        central_differences(velocity[..., 0], spacing)[0] + central_differences(velocity[..., 1], spacing)[1]
+    )

@@ -1,0 +1,186 @@
+"""Where data sets live: the root folder and the path of every scenario.
+
+``<root>/<split>/<size>/v<MAJOR>/<subset>/<id:04d>.nc``, with ``manifest.json`` beside the
+subsets. Nothing here touches the disk, but that a root in an object store gets its working copy.
+
+The local folder that stands for a root folder in an object store.
+
+netCDF4 and HDF5 read and write files, so a root given as a URL (``s3://bucket/prefix``) becomes a
+folder of the user's cache, named from the URL, that says in ``store.json`` what it is a copy of.
+Everything works on that folder; ``lagbench.store`` brings objects there and puts them back.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from lagbench.atomic import write_atomically
+
+__all__ = [
+    "CACHE_VARIABLE",
+    "as_url",
+    "open_copy",
+    "url_of",
+    "MANIFEST_NAME",
+    "ROOT_VARIABLE",
+    "ScenarioKey",
+    "dataset_folder",
+    "major_of",
+    "resolve_root",
+    "scenario_path",
+]
+
+
+CACHE_VARIABLE = "LAGBENCH_CACHE"
+"""Environment variable that names the folder of working copies."""
+
+MARK = "store.json"
+"""Name of the file that says what a folder is a working copy of."""
+
+_URL = re.compile(r"([a-z][a-z0-9+.-]+):/(.*)", re.DOTALL)
+
+
+def as_url(root: str | Path) -> str | None:
+    """Return a root as a URL without a slash at its end; None where it is a path.
+
+    A ``Path`` takes the second slash away; it is put back.
+
+    >>> as_url("s3://bucket/data/"), as_url(Path("s3://bucket/data")), as_url("data/cavity")
+    ('s3://bucket/data', 's3://bucket/data', None)
+    """
+    match = _URL.fullmatch(str(root))
+    if match is None:
+        return None
+    scheme, rest = match.groups()
+    # What a local file system names by URL is absolute.
+    lead = "/" if scheme in {"file", "local"} else ""
+    return f"{scheme}://{lead}{rest.strip('/')}"
+
+
+def open_copy(url: str) -> Path:
+    """Return the working copy of a root in a store; make and mark it where it is not there."""
+    folder = _place(url)
+    if url_of(folder) != url:
+        text = json.dumps({"url": url}, indent=1) + "\n"
+        write_atomically(folder / MARK, text.encode(), option=CACHE_VARIABLE)
+    return folder
+
+
+def url_of(root: Path) -> str | None:
+    """Return the URL that a root folder is the working copy of; None for any other folder.
+
+    A mark in any other place than the cache means nothing: a stranger may have put it there.
+    """
+    try:
+        url = json.loads((root / MARK).read_text(encoding="utf-8"))["url"]
+    except (OSError, ValueError, TypeError, KeyError):
+        return None
+    return url if isinstance(url, str) and as_url(url) == url and root == _place(url) else None
+
+
+def _place(url: str) -> Path:
+    return _cache() / _name(url)
+
+
+def _name(url: str) -> str:
+    """Return a file name that says the URL readably, and tells it from all others.
+
+    >>> _name("s3://bucket/data")
+    's3-bucket-data-397b84d8'
+    """
+    words = re.sub(r"[^A-Za-z0-9._]+", "-", url).strip("-.")[:60]
+    return f"{words}-{hashlib.sha256(url.encode()).hexdigest()[:8]}"
+
+
+def _cache() -> Path:
+    given = os.environ.get(CACHE_VARIABLE)
+    if given:
+        return Path(given).expanduser().absolute()
+    import platformdirs
+
+    return platformdirs.user_cache_path("lagbench", appauthor=False) / "stores"
+
+
+ROOT_VARIABLE = "LAGBENCH_ROOT"
+"""Environment variable that names the root folder."""
+
+MANIFEST_NAME = "manifest.json"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScenarioKey:
+    """What names one scenario."""
+
+    split: str  # name of the split
+    size: str  # name of the size
+    version: str  # semantic version of the split, as in "1.0.0"
+    scenario: int  # id within the size
+    subset: str  # subset that holds the scenario
+
+    @property
+    def major(self) -> int:
+        """MAJOR of the version: it changes when existing bits change."""
+        return major_of(self.version)
+
+    def identity(self, seed: str, parameters: Mapping[str, object]) -> dict[str, object]:
+        """Return what enters the content hash beside the variables."""
+        return {
+            "split": self.split,
+            "size": self.size,
+            "major": self.major,
+            "scenario": self.scenario,
+            "subset": self.subset,
+            "seed": seed,
+            "parameters": dict(parameters),
+        }
+
+
+def major_of(version: str) -> int:
+    """Return MAJOR of a semantic version.
+
+    >>> major_of("2.1.0")
+    2
+    """
+    return int(version.split(".")[0])
+
+
+def resolve_root(root: str | Path | None = None) -> Path:
+    """Return the folder that holds all data sets.
+
+    Args:
+        root: what the user gave; else ``LAGBENCH_ROOT``; else the platform's user data folder.
+            A URL (``s3://bucket/prefix``) stands for its working copy, see
+            :mod:`lagbench.data.layout`.
+
+    Raises:
+        WorkFailedError: the working copy of a URL cannot be made.
+    """
+    given = root or os.environ.get(ROOT_VARIABLE)
+    if given:
+        url = as_url(given)
+        if url is not None:
+            return open_copy(url)
+        return Path(given).expanduser().absolute()
+    import platformdirs
+
+    return platformdirs.user_data_path("lagbench", appauthor=False)
+
+
+def dataset_folder(root: Path, split: str, size: str, major: int) -> Path:
+    """Return the folder of one data set version.
+
+    >>> dataset_folder(Path("data"), "cavity", "tiny", 1).as_posix()
+    'data/cavity/tiny/v1'
+    """
+    return root / split / size / f"v{major}"
+
+
+def scenario_path(root: Path, key: ScenarioKey) -> Path:
+    """Return the path of a scenario file."""
+    return dataset_folder(root, key.split, key.size, key.major) / key.subset / f"{key.scenario:04d}.nc"

@@ -1,0 +1,147 @@
+"""Which parameters a size needs, and which values its numbers may have.
+
+Checked when a datasets.yaml is loaded, for every split alike; what the constants of a solver
+may be is told where it gets them (``lagbench.generators.constants``). Every mistake is a
+``ValueError`` whose message names key, expected, got and, for names, the nearest known one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from lagbench.errors import nearest
+
+__all__ = [
+    "SUBSETS",
+    "Limit",
+    "check_frames",
+    "check_parameters",
+    "check_subsets",
+]
+
+
+Value = int | float | bool | str
+
+SUBSETS = ("train", "valid", "test", "extra")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limit:
+    """The numbers that a parameter may be."""
+
+    low: float = -math.inf  # least value
+    high: float = math.inf  # greatest value
+    whole: bool = False  # whether it must be an integer
+    open_low: bool = False  # whether 'low' itself is too small
+    open_high: bool = False  # whether 'high' itself is too large
+
+    def holds(self, value: object) -> bool:
+        """Tell whether a value is a finite number within the limit."""
+        kinds = int if self.whole else (int, float)
+        if isinstance(value, bool) or not isinstance(value, kinds) or not math.isfinite(value):
+            return False
+        above = self.low < value if self.open_low else self.low <= value
+        below = value < self.high if self.open_high else value <= self.high
+        return above and below
+
+    def __str__(self) -> str:
+        """Return the limit in words.
+
+        >>> print(Limit(low=1, high=4096, whole=True))
+        an integer, >= 1 and <= 4096
+        """
+        low = f"{'>' if self.open_low else '>='} {self.low:.10g}" if self.low > -math.inf else ""
+        high = f"{'<' if self.open_high else '<='} {self.high:.10g}" if self.high < math.inf else ""
+        sides = " and ".join(side for side in (low, high) if side)
+        kind = "an integer" if self.whole else "a finite number"
+        return f"{kind}, {sides}" if sides else kind
+
+
+NEEDED = {
+    "particles": Limit(low=1, high=10_000_000, whole=True),
+    "grid": Limit(low=4, high=4096, whole=True),
+    "substeps_per_frame": Limit(low=1, high=1_000_000, whole=True),
+    "frame_rate": Limit(low=0, high=1e9, open_low=True),
+    "density": Limit(low=0, open_low=True),
+}
+"""What every split must give: reading, estimating and writing rest on it."""
+
+FRAMES = Limit(low=1, high=1_000_000, whole=True)
+"""Frames of one scenario."""
+
+_NUMBER = Limit()
+
+
+def check_parameters(size: str, given: Mapping[str, Value], declared: Mapping[str, Value | None]) -> None:
+    """Refuse unknown, missing and impossible parameters of a size."""
+    for name in given:
+        if name not in declared:
+            message = f"size {size}: undeclared parameter {name!r}: {nearest(name, declared)}"
+            raise ValueError(message)
+    missing = [n for n, value in declared.items() if value is None and n not in given]
+    if missing:
+        message = f"size {size}: no value for {', '.join(missing)}"
+        raise ValueError(message)
+    for name in NEEDED:
+        if name not in declared:
+            message = f"parameters: no {name!r}, which every split needs; {nearest(name, declared)}"
+            raise ValueError(message)
+    for name, default in declared.items():
+        key = f"sizes.{size}.parameters.{name}" if name in given else f"parameters.{name}.value"
+        _check_value(key, given.get(name, default), NEEDED.get(name))
+
+
+def _check_value(key: str, value: Value | None, limit: Limit | None) -> None:
+    # Texts and switches are a split's own affair, unless the name is one that every split needs.
+    if limit is None and isinstance(value, bool | str):
+        return
+    limit = limit or _NUMBER
+    if not limit.holds(value):
+        message = f"{key}: expected {limit}; got {value!r}"
+        raise ValueError(message)
+
+
+def check_subsets(size: str, subsets: Mapping[str, Sequence[int]]) -> None:
+    """Refuse unknown subsets and ids that stand in two of them."""
+    unknown = set(subsets) - set(SUBSETS)
+    if unknown:
+        message = f"size {size}: no subset {min(unknown)!r}: {nearest(min(unknown), SUBSETS)}"
+        raise ValueError(message)
+    ids = [i for subset in subsets.values() for i in subset]
+    if len(ids) != len(set(ids)):
+        message = f"size {size}: a scenario stands in two subsets"
+        raise ValueError(message)
+
+
+def check_frames(
+    size: str,
+    frames: int | Mapping[int, Sequence[int]],
+    subsets: Mapping[str, Sequence[int]],
+    *,
+    task_frames: int,
+) -> None:
+    """Refuse impossible frame counts, and test scenarios shorter than their task."""
+    key = f"sizes.{size}.frames"
+    ids = sorted(i for subset in subsets.values() for i in subset)
+    counts = dict.fromkeys(ids, frames) if isinstance(frames, int) else _counts(size, frames, ids)
+    for scenario, count in counts.items():
+        if not FRAMES.holds(count):
+            message = f"{key}: expected {FRAMES}; got {count!r}"
+            raise ValueError(message)
+        if scenario in subsets.get("test", ()) and count < task_frames:
+            message = (
+                f"{key}: expected at least input_frames + horizon = {task_frames} "
+                f"for test scenario {scenario}; got {count}"
+            )
+            raise ValueError(message)
+
+
+def _counts(size: str, frames: Mapping[int, Sequence[int]], ids: Sequence[int]) -> dict[int, int]:
+    """Return the frame count of each scenario."""
+    pairs = sorted((i, count) for count, group in frames.items() for i in group)
+    if [i for i, _ in pairs] != list(ids):
+        message = f"size {size}: frames must name every scenario once"
+        raise ValueError(message)
+    return dict(pairs)

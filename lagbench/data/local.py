@@ -1,0 +1,221 @@
+"""Where a split is described and where its data live: by its name, or by the path of its folder.
+
+A *local split* is a folder ``<root>/<name>/`` with its own description, ``split.yaml`` (laid out
+as datasets.yaml), and its data in the same places as those of any other split. So
+``--split path/to/own`` means the split ``own`` with the root folder ``path/to``; once the root
+is named (``--root path/to``), its name is enough. Files from strangers carry names only: a path
+is understood where the user gives one, in :func:`locate` and :func:`home`, and nowhere else.
+
+What makes a data set whole again, in words for the user.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+from lagbench.errors import UnreadableFileError, UsageError, nearest
+
+from .layout import resolve_root, url_of
+from .registry import NO_GENERATOR, Measured, Registry, Size, Split, load
+
+__all__ = [
+    "DESCRIPTION",
+    "Home",
+    "Located",
+    "RootedRegistry",
+    "home",
+    "is_name",
+    "locate",
+    "rooted",
+    "remedy",
+]
+
+
+DESCRIPTION = "split.yaml"
+"""Name of the file that describes a local split; it stands in the split's folder."""
+
+_NAME = re.compile(r"[a-z][a-z0-9_-]{0,63}")
+
+
+class Home(NamedTuple):
+    """A split by name, the root folder of its data, and the registry that describes it."""
+
+    name: str
+    root: Path
+    registry: Registry
+
+
+class Located(NamedTuple):
+    """One size of a split, the root folder of its data, and the registry that describes it."""
+
+    size: Size
+    root: Path
+    registry: Registry
+
+
+class RootedRegistry(Registry):
+    """A registry that also knows the local splits of one root folder.
+
+    A local split never replaces one of the same name, and its description is read when it is
+    first asked for.
+    """
+
+    def __init__(self, base: Registry, root: Path) -> None:
+        super().__init__(base.splits, base.measured, base.files)
+        self.base, self.root = base, root
+
+    def split(self, name: str) -> Split:
+        """Return a split by name."""
+        if name not in self.splits and name in self.local_names():
+            self._add(name)
+        if name not in self.splits:
+            known = (*self.splits, *self.local_names())
+            raise UsageError(f"no split {name!r}", where="--split", fix=nearest(name, known))
+        return self.splits[name]
+
+    def local_names(self) -> tuple[str, ...]:
+        """Return the names of the root's local splits, sorted; those that others have left out."""
+        try:
+            found = [path.parent.name for path in self.root.glob(f"*/{DESCRIPTION}")]
+        except OSError:
+            return ()
+        return tuple(sorted(name for name in found if is_name(name) and name not in self.base.splits))
+
+    def _add(self, name: str) -> None:
+        path = self.root / name / DESCRIPTION
+        split, measured = _described(path, name)
+        self.splits[name], self.files[name] = split, path
+        self.measured = {**self.measured, name: measured}
+
+
+def is_name(text: str) -> bool:
+    """Tell whether a text can name a split: a path cannot.
+
+    >>> is_name("dam-break"), is_name("../dam-break")
+    (True, False)
+    """
+    return _NAME.fullmatch(text) is not None
+
+
+def rooted(root: Path, registry: Registry | None = None) -> RootedRegistry:
+    """Return a registry that also knows the local splits of a root folder, by name.
+
+    Args:
+        root: folder of all data sets.
+        registry: the other splits; ours when None.
+    """
+    base = registry or load()
+    return RootedRegistry(base.base if isinstance(base, RootedRegistry) else base, root)
+
+
+def home(split: str, *, root: str | Path | None = None, registry: Registry | None = None) -> Home:
+    """Return what a user means by ``--split``: a name, or the path of a local split's folder.
+
+    What has a separator (``path/to/own``, ``./own``, ``own/``) is a path; so is a name that no
+    split has while the current folder holds a local split of that name.
+
+    Args:
+        split: name or path.
+        root: folder of all data sets; not needed with a path, whose parent it is.
+        registry: the other splits; ours when None.
+
+    Raises:
+        UsageError: unknown split, no local split at the path, or a path and another root.
+        UnreadableFileError: the description of the local split is not right.
+    """
+    path = Path(os.path.abspath(Path(split).expanduser()))
+    if "/" in split or os.sep in split or split in {".", "..", "~"}:
+        return _at(path, root, registry)
+    folder = resolve_root(root)
+    known = rooted(folder, registry)
+    try:
+        known.split(split)
+    except UsageError:
+        if root is None and (path / DESCRIPTION).is_file():
+            return _at(path, root, registry)
+        raise
+    return Home(split, folder, known)
+
+
+def locate(
+    split: str, size: str = "full", *, root: str | Path | None = None, registry: Registry | None = None
+) -> Located:
+    """Return one size of the split that a user means, and where its data live; see :func:`home`.
+
+    Raises:
+        UsageError: see :func:`home`; or the split has no such size.
+        UnreadableFileError: the description of the local split is not right.
+    """
+    name, folder, known = home(split, root=root, registry=registry)
+    return Located(known.size(name, size), folder, known)
+
+
+def _at(folder: Path, root: str | Path | None, registry: Registry | None) -> Home:
+    """Return the local split of a folder."""
+    name, parent = folder.name, folder.parent
+    if root is not None and resolve_root(root).resolve() != parent.resolve():
+        raise UsageError(
+            "a path and another root name the split",
+            where="--split and --root",
+            expected=f"the root {parent}",
+            got=root,
+            fix="give the path alone, or the root and the split's name",
+        )
+    if not (folder / DESCRIPTION).is_file() or not is_name(name):
+        raise UsageError(
+            "no local split there",
+            where="--split",
+            expected=f"the name of a split, or a folder that holds {DESCRIPTION}, named like its split",
+            got=folder,
+            fix="lagbench list names the splits; lagbench import and lagbench adopt make local ones",
+        )
+    known = rooted(parent, registry)
+    if name not in known.local_names():
+        raise UsageError(
+            f"the name {name!r} is taken by another split",
+            where=str(folder),
+            fix="import or adopt the data again under another name",
+        )
+    known.split(name)
+    return Home(name, parent, known)
+
+
+def _described(path: Path, name: str) -> tuple[Split, Mapping[str, Measured]]:
+    """Return what a local split's description says of it."""
+    file = load(path)
+    if list(file.splits) != [name]:
+        raise UnreadableFileError(
+            "the folder is not named like its split",
+            where=str(path),
+            expected=f"one split, {name!r}",
+            got=", ".join(file.splits) or "none",
+            fix="rename the folder back: the name is part of every hash",
+        )
+    split = file.splits[name]
+    # A dotted path would be imported: a description must not choose code to run.
+    if split.generator != NO_GENERATOR:
+        raise UnreadableFileError(
+            "a local split cannot name a generator",
+            where=f"{path}, key splits.{name}.generator",
+            expected=NO_GENERATOR,
+            got=split.generator,
+            fix="an installed package adds splits that are simulated: see examples/",
+        )
+    return split, file.measured.get(name, {})
+
+
+def remedy(size: Size, *options: str, root: Path | None = None) -> str:
+    """Return what makes a data set whole again.
+
+    >>> from lagbench.data.registry import load
+    >>> remedy(load().size("cavity", "tiny"), "--subset test")
+    'lagbench generate --split cavity --size tiny --subset test'
+    """
+    if size.simulated:
+        place = [] if root is None else [f"--root {url_of(root) or root}"]
+        return " ".join((f"lagbench generate --split {size.split} --size {size.name}", *options, *place))
+    return "remove the folder and make the local split again: lagbench adopt, or lagbench import"

@@ -1,0 +1,213 @@
+"""manifest.json: what a data set folder holds, and where it came from.
+
+It stands beside the subsets, is written last, and is itself not hashed. A generation of some
+scenarios leaves ``complete: false``; a later one merges its files into what is there.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
+
+from lagbench.atomic import write_atomically
+from lagbench.errors import DataError
+from lagbench.work.machine import may_differ
+
+from .checksums import HASHED_SUBSETS, dataset_hash, file_sha256, subset_hash
+from .layout import MANIFEST_NAME, ScenarioKey, dataset_folder, major_of, scenario_path
+from .scenario import read_scenario
+from .statistics import round_digits
+
+__all__ = [
+    "FileEntry",
+    "Manifest",
+    "describe_file",
+    "merge",
+    "read_manifest",
+    "write_manifest",
+]
+
+
+Hash = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]*$")]
+Row = Annotated[tuple[float, ...], Field(strict=False)]
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+
+class FileEntry(_Strict):
+    """One scenario file."""
+
+    scenario: int  # id of the scenario
+    subset: Name  # subset that holds it
+    path: str  # file relative to the manifest's folder: <subset>/<id:04d>.nc and nothing else
+    frames: int  # recorded frames
+    particles: int  # particles in every frame
+    content_sha256: Hash  # content hash
+    bytes: int  # length of the file
+    file_sha256: Hash  # SHA-256 of its bytes; differs between library versions
+    device: str  # device that simulated it
+    # further numbers by name, such as the energy of the last frame over the largest
+    facts: dict[str, float] = Field(default_factory=dict)
+    twin_floor: Row = ()  # position RMSE of the nudged twin at each predicted frame [length]; test only
+
+    @field_validator("path")
+    @classmethod
+    def _follows(cls, path: str, info: ValidationInfo) -> str:
+        """Refuse a path that leads elsewhere: files are opened and published by it."""
+        if {"subset", "scenario"} <= info.data.keys():
+            wanted = f"{info.data['subset']}/{info.data['scenario']:04d}.nc"
+            if path != wanted:
+                message = f"expected {wanted!r}"
+                raise ValueError(message)
+        return path
+
+    def has_hash(self, recorded: str | None) -> bool:
+        """Return whether the content hash begins with the digits that datasets.yaml has."""
+        return recorded is not None and self.content_sha256.startswith(recorded)
+
+
+class Manifest(_Strict):
+    """All that is recorded about a data set folder."""
+
+    format: Literal[1] = 1  # number of this layout
+    split: str  # name of the split
+    size: str  # name of the size
+    version: str  # semantic version of the split
+    complete: bool = False  # whether every scenario of train, valid and test is there
+    # "bitwise" where every file comes from a machine that promises equal bits or has the hash of
+    # datasets.yaml, else "tolerance"; see lagbench.work.machine
+    identity: Literal["bitwise", "tolerance"] = "bitwise"
+    dataset_sha256: Hash | None = None  # data set hash; None until complete
+    subset_sha256: dict[str, Hash] = Field(default_factory=dict)  # hash of every complete subset
+    # mean and std per component over train, see lagbench.data.statistics; empty until train is complete
+    statistics: dict[str, Row] = Field(default_factory=dict)
+    # the distinct machines and library versions that wrote files, oldest first
+    environments: Annotated[tuple[dict[str, str], ...], Field(strict=False)] = ()
+    files: Annotated[tuple[FileEntry, ...], Field(strict=False)] = ()  # scenario files by ascending id
+
+    def entry(self, scenario: int) -> FileEntry | None:
+        """Return the entry of a scenario; None where it is not generated."""
+        return next((entry for entry in self.files if entry.scenario == scenario), None)
+
+    def only(self, scenario: int) -> Manifest:
+        """Return a manifest that names one file at the most."""
+        return self.model_copy(update={"files": tuple(e for e in self.files if e.scenario == scenario)})
+
+    def mean_twin_floor(self) -> tuple[float, ...]:
+        """Return the mean twin floor over test at each frame that all have [length].
+
+        Nine digits; empty where a test scenario has no twin.
+        """
+        twins = [entry.twin_floor for entry in self.files if entry.subset == "test"]
+        if not all(twins):
+            return ()
+        return tuple(round_digits(math.fsum(column) / len(column)) for column in zip(*twins, strict=False))
+
+
+def describe_file(
+    root: Path, key: ScenarioKey, facts: Mapping[str, float] | None = None, *, digest: str | None = None
+) -> FileEntry:
+    """Return the manifest entry of a scenario file on disk; its content is not re-hashed."""
+    path = scenario_path(root, key)
+    with read_scenario(path) as file:
+        header = file.header
+    return FileEntry(
+        scenario=key.scenario,
+        subset=key.subset,
+        path=f"{key.subset}/{path.name}",
+        frames=header.frames,
+        particles=header.particles,
+        content_sha256=header.content_sha256,
+        bytes=path.stat().st_size,
+        file_sha256=digest or file_sha256(path),
+        device=header.device,
+        facts=dict(facts or {}),
+    )
+
+
+def merge(
+    old: Manifest | None,
+    files: Iterable[FileEntry],
+    *,
+    split: str,
+    size: str,
+    version: str,
+    subsets: Mapping[str, Sequence[int]],
+    environment: Mapping[str, str] | None = None,
+    recorded: Mapping[int, str] | None = None,
+    statistics: Mapping[str, Sequence[float]] | None = None,
+) -> Manifest:
+    """Return a manifest with new files put in; new entries replace old ones of the same id."""
+    kept = [entry for entry in old.files if entry.scenario in subsets.get(entry.subset, ())] if old else []
+    entries = {entry.scenario: entry for entry in (*kept, *files)}
+    hashes = _subset_hashes(entries, subsets)
+    complete = all(name in hashes for name in HASHED_SUBSETS)
+    environments = list(old.environments) if old else []
+    if environment is not None and dict(environment) not in environments:
+        environments.append(dict(environment))
+    if statistics is None and old and old.subset_sha256.get("train") == hashes.get("train"):
+        statistics = old.statistics
+    return Manifest(
+        split=split,
+        size=size,
+        version=version,
+        complete=complete,
+        identity=_identity(entries.values(), environments, recorded or {}),
+        dataset_sha256=dataset_hash(split, size, major_of(version), hashes) if complete else None,
+        subset_sha256=hashes,
+        statistics={n: tuple(row) for n, row in (statistics or {}).items()} if "train" in hashes else {},
+        environments=tuple(environments),
+        files=tuple(entries[scenario] for scenario in sorted(entries)),
+    )
+
+
+def read_manifest(root: Path, split: str, size: str, major: int) -> Manifest | None:
+    """Return the manifest of a data set folder; None where there is none."""
+    path = dataset_folder(root, split, size, major) / MANIFEST_NAME
+    try:
+        text = path.read_bytes()
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise DataError("cannot read the manifest", where=str(path), got=error.strerror) from error
+    try:
+        return Manifest.model_validate_json(text)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise DataError(
+            "the manifest is damaged",
+            where=f"{path}, key {'.'.join(map(str, first['loc'])) or '(whole file)'}",
+            got=first["msg"],
+            fix="remove it; lagbench generate checks the files and writes it anew",
+        ) from None
+
+
+def write_manifest(root: Path, manifest: Manifest) -> Path:
+    """Write a manifest beside its subsets, whole or not at all; return its path."""
+    folder = dataset_folder(root, manifest.split, manifest.size, major_of(manifest.version))
+    path = folder / MANIFEST_NAME
+    write_atomically(path, (manifest.model_dump_json(indent=1) + "\n").encode())
+    return path
+
+
+def _identity(
+    entries: Iterable[FileEntry], environments: Sequence[Mapping[str, str]], recorded: Mapping[int, str]
+) -> Literal["bitwise", "tolerance"]:
+    unproven = [entry for entry in entries if not entry.has_hash(recorded.get(entry.scenario))]
+    return "tolerance" if any(may_differ(entry.device, environments) for entry in unproven) else "bitwise"
+
+
+def _subset_hashes(entries: Mapping[int, FileEntry], subsets: Mapping[str, Sequence[int]]) -> dict[str, str]:
+    """Return the hash of every subset whose scenarios are all there."""
+    return {
+        name: subset_hash({i: entries[i].content_sha256 for i in ids})
+        for name, ids in subsets.items()
+        if all(i in entries for i in ids)
+    }

@@ -1,0 +1,319 @@
+"""Open scenario files: header, arrays read when asked for, and their content hash.
+
+Whatever is wrong with a file becomes a DataError that names it and, where one can be told,
+the variable.
+
+The variables of a scenario file, and what their attributes must say.
+
+Attributes do not enter the content hash, yet readers compute with them: ``scale_factor`` or
+other ``units`` change what xarray returns although no stored value changed. So a variable has
+exactly the attributes given here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagbench.errors import DataError, LagbenchError
+
+from .checksums import ContentHasher, plain
+from .layout import ScenarioKey
+
+if TYPE_CHECKING:
+    import netCDF4
+
+__all__ = [
+    "ATTRIBUTES",
+    "AXES",
+    "MATERIALS",
+    "WALLS",
+    "attributes_of",
+    "differing_attributes",
+    "ScenarioFile",
+    "ScenarioHeader",
+    "check_scenario",
+    "read_scenario",
+    "rehash",
+]
+
+
+MATERIALS = ("liquid", "jelly", "snow", "rope")
+"""Meaning of the values 0, 1, 2, 3 of ``material``."""
+
+WALLS = ("left", "right", "bottom", "top")
+AXES = ("x", "y")
+
+ATTRIBUTES: Mapping[str, Mapping[str, object]] = {
+    "frame": {"long_name": "frame number; 0 is the state when recording starts", "units": "1"},
+    "time": {"long_name": "time since frame 0", "units": "s"},
+    "particle": {"long_name": "particle number", "units": "1"},
+    "space": {"long_name": "axis of the unit box"},
+    "wall": {"long_name": "wall of the box"},
+    "position": {"long_name": "particle position in lengths of the unit box", "units": "1"},
+    "velocity": {"long_name": "particle velocity of the solver in box lengths per second", "units": "s-1"},
+    "material": {
+        "long_name": "constitutive model",
+        "flag_values": np.arange(len(MATERIALS), dtype=np.int8),
+        "flag_meanings": " ".join(MATERIALS),
+    },
+    "particle_mass": {"long_name": "mass of one particle, density times area over particles", "units": "1"},
+    "wall_velocity": {"long_name": "velocity of each wall in box lengths per second", "units": "s-1"},
+}
+"""Attributes of each variable beside ``coordinates`` and ``content_sha256``."""
+
+_FREE = {"content_sha256", "long_name"}
+"""Attributes that are checked elsewhere, and prose, which a patch release may word anew."""
+
+
+def attributes_of(name: str, dims: Sequence[str]) -> dict[str, object]:
+    """Return the attributes that a variable is written with."""
+    # xarray makes a coordinate only of what the CF attribute `coordinates` names.
+    extra = {"coordinates": "time"} if "frame" in dims and len(dims) > 1 else {}
+    return {**ATTRIBUTES[name], **extra}
+
+
+def differing_attributes(name: str, dims: Sequence[str], found: Mapping[str, object]) -> list[str]:
+    """Return the names of attributes that are missing, unknown or say something else."""
+    wanted = attributes_of(name, dims) if name in ATTRIBUTES else {}
+    names = (wanted.keys() | found.keys()) - _FREE
+    return sorted(n for n in names if not _equal(wanted.get(n), found.get(n)))
+
+
+def _equal(wanted: object, found: object) -> bool:
+    if isinstance(wanted, np.ndarray):
+        return isinstance(found, np.ndarray) and wanted.dtype == found.dtype and np.array_equal(wanted, found)
+    return isinstance(found, str) and wanted == found
+
+
+BLOCK_BYTES = 1 << 20
+"""Files are streamed in pieces of about this size [bytes]."""
+
+CHUNK_CACHE = 1 << 20
+"""Chunk cache of a variable [bytes]; the default of 64 MB would keep whole scenarios."""
+
+DEFLATE_RATIO = 1032
+"""No zlib stream unpacks to more than this many times its length."""
+
+_REPAIR = "lagbench generate writes it anew; a local split is made again by lagbench adopt or import"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScenarioHeader:
+    """What a scenario file says about itself."""
+
+    key: ScenarioKey  # what names the scenario
+    seed: str  # how the random numbers were seeded
+    parameters: Mapping[str, object]  # physical parameters by name, those that enter the content hash
+    content_sha256: str  # content hash as stored; see rehash for the true one
+    variable_sha256: Mapping[str, str]  # stored hash of each variable
+    frames: int  # recorded frames
+    particles: int  # particles in every frame
+    device: str  # device that simulated
+    generator: str  # dotted path of the split's module
+    lagbench_version: str  # version that wrote the file
+
+
+class ScenarioFile:
+    """An open scenario file: its header, and arrays that are read when asked for.
+
+    Use it as a context manager. Every method raises DataError naming file and variable where
+    the file is damaged.
+
+    Attributes:
+        path: path of the file.
+        header: what the file says about itself.
+    """
+
+    def __init__(self, path: Path, file: netCDF4.Dataset) -> None:
+        self.path = path
+        self._file = file
+        with _damage(path):
+            _check_lengths(path, file)
+            self.header = _header(file)
+
+    def __enter__(self) -> Self:
+        """Return the file itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the file."""
+        self.close()
+
+    def close(self) -> None:
+        """Close the file; a second call does nothing."""
+        if self._file.isopen():
+            self._file.close()
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        """Names of all variables, sorted."""
+        with _damage(self.path):
+            return tuple(sorted(self._file.variables))
+
+    def read(self, name: str, frames: slice | int = slice(None)) -> NDArray[Any]:
+        """Return a variable, or some of its frames (entries along the first dimension)."""
+        with _damage(self.path, name):
+            variable = self._file.variables[name]
+            part = frames if variable.ndim else ...
+            return _texts(self.path, name, part) if variable.dtype is str else np.asarray(variable[part])
+
+    def blocks(self, name: str) -> Iterator[NDArray[Any]]:
+        """Yield a variable in order, in pieces of at most about 1 MiB."""
+        with _damage(self.path, name):
+            shape = self._file.variables[name].shape
+            item = np.dtype(np.float64).itemsize * int(np.prod(shape[1:], dtype=np.int64))
+        step = max(1, BLOCK_BYTES // max(1, item))
+        starts = range(0, shape[0], step) if shape else range(1)
+        for start in starts:
+            yield self.read(name, slice(start, start + step))
+
+    def check_attributes(self) -> None:
+        """Refuse attributes that make other readers read other values."""
+        for name in self.variables:
+            with _damage(self.path, name):
+                variable = self._file.variables[name]
+                found = {key: variable.getncattr(key) for key in variable.ncattrs()}
+                unlike = differing_attributes(name, variable.dimensions, found)
+            if unlike:
+                raise DataError(
+                    "attributes of a variable are not those of the format",
+                    where=f"{self.path}, variable {name!r}",
+                    expected="those of docs/format.md",
+                    got=", ".join(f"{key} = {found.get(key, 'missing')}" for key in unlike),
+                    fix=_REPAIR,
+                )
+
+    def computed_hasher(self) -> ContentHasher:
+        """Return a hasher that has read the whole file."""
+        header = self.header
+        hasher = ContentHasher(header.key.identity(header.seed, header.parameters))
+        for name in self.variables:
+            with _damage(self.path, name):
+                variable = self._file.variables[name]
+                hasher.declare(name, variable.dtype, variable.dimensions, variable.shape)
+                for block in self.blocks(name):
+                    hasher.update(name, block)
+        return hasher
+
+
+def _texts(path: Path, name: str, part: object) -> NDArray[Any]:
+    """Return a variable of texts, read by h5py.
+
+    Texts read by netCDF4 1.7.5 from a file that is open elsewhere in this process leave the
+    HDF5 library in a state in which, once another file is written, that file opens no more.
+    h5py has a library of its own.
+    """
+    import h5py
+
+    with h5py.File(path, "r") as file:
+        return np.asarray(file[name].asstr()[part])
+
+
+def read_scenario(path: Path) -> ScenarioFile:
+    """Open a scenario file."""
+    import netCDF4
+
+    if not path.is_file():
+        raise DataError("a scenario file is missing", where=str(path), fix=_REPAIR)
+    with _damage(path), ExitStack() as stack:
+        file = netCDF4.Dataset(path, "r")
+        stack.callback(file.close)
+        file.set_auto_maskandscale(False)
+        file.set_auto_chartostring(False)
+        for variable in file.variables.values():
+            if variable.chunking() != "contiguous":
+                variable.set_var_chunk_cache(CHUNK_CACHE)
+        opened = ScenarioFile(path, file)
+        stack.pop_all()
+    return opened
+
+
+def rehash(path: Path) -> str:
+    """Return the content hash computed from a file's values."""
+    with read_scenario(path) as file:
+        return file.computed_hasher().hexdigest()
+
+
+def check_scenario(path: Path, expected: str | None = None) -> str:
+    """Recompute a file's content hash, compare it, and check what is not hashed."""
+    with read_scenario(path) as file:
+        stored = file.header
+        hasher = file.computed_hasher()
+        file.check_attributes()
+    for name, digest in hasher.digests().items():
+        if stored.variable_sha256.get(name) != digest:
+            where = f"{path}, variable {name!r}"
+            raise _mismatch("values differ from their hash", where, stored.variable_sha256.get(name), digest)
+    content = hasher.hexdigest()
+    if content != stored.content_sha256:
+        where = f"{path}, attributes"
+        raise _mismatch("attributes differ from their hash", where, stored.content_sha256, content)
+    if expected is not None and not content.startswith(expected):
+        raise _mismatch("the file has another content hash", str(path), expected, content)
+    return content
+
+
+def _mismatch(what: str, where: str, expected: str | None, got: str) -> DataError:
+    return DataError(what, where=where, expected=expected or "a stored hash", got=got, fix=_REPAIR)
+
+
+def _check_lengths(path: Path, file: netCDF4.Dataset) -> None:
+    """Refuse lengths that no file of this size can hold, before memory is asked for them."""
+    largest = DEFLATE_RATIO * path.stat().st_size
+    for name, variable in file.variables.items():
+        held = variable.size * (1 if variable.dtype is str else variable.dtype.itemsize)
+        if held > largest:
+            raise DataError(
+                "a variable is larger than its file can hold",
+                where=f"{path}, variable {name!r}",
+                expected=f"at most {largest} bytes",
+                got=f"shape {variable.shape}",
+                fix=_REPAIR,
+            )
+
+
+def _header(file: netCDF4.Dataset) -> ScenarioHeader:
+    names = str(file.hashed_parameters).split()
+    return ScenarioHeader(
+        key=ScenarioKey(
+            split=str(file.split),
+            size=str(file.size),
+            version=str(file.version),
+            scenario=int(file.scenario),
+            subset=str(file.subset),
+        ),
+        seed=str(file.seed),
+        parameters={name: plain(file.getncattr(name)) for name in names},
+        content_sha256=str(file.content_sha256),
+        variable_sha256={n: str(getattr(v, "content_sha256", "")) for n, v in file.variables.items()},
+        frames=file.dimensions["frame"].size,
+        particles=file.dimensions["particle"].size,
+        device=str(file.device),
+        generator=str(file.generator),
+        lagbench_version=str(file.lagbench_version),
+    )
+
+
+@contextmanager
+def _damage(path: Path, variable: str | None = None) -> Iterator[None]:
+    """Turn whatever HDF5 raises on damaged bytes into a DataError naming the place."""
+    try:
+        yield
+    except LagbenchError as error:
+        if str(path) in (error.where or ""):
+            raise
+        raise _damaged(path, variable, error.what) from error
+    except Exception as error:  # no list of types holds: damage surfaces as nearly any of them
+        raise _damaged(path, variable, f"{type(error).__name__}: {error}") from error
+
+
+def _damaged(path: Path, variable: str | None, got: str) -> DataError:
+    where = str(path) if variable is None else f"{path}, variable {variable!r}"
+    return DataError("a scenario file is damaged or not one of lagbench", where=where, got=got, fix=_REPAIR)

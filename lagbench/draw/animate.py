@@ -1,0 +1,454 @@
+"""A scenario as a moving picture: MP4 or GIF, two scenarios side by side where two are given.
+
+Needs ``pip install 'lagbench[plots]'``. Frames are read, painted and encoded one at a time,
+so memory does not grow with the length.
+
+Frames of an animation, drawn straight into pixels: milliseconds where a figure takes longer.
+
+A panel is painted at twice its size and averaged down, which smooths the rims of the dots.
+Pixels are packed into one integer, ``red + green 2^8 + blue 2^16``.
+
+Video files that grow frame by frame: MP4 through ffmpeg, GIF with one palette.
+
+Files appear whole or not at all, without dates, and memory does not grow with their length.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagbench.atomic import atomic_path
+from lagbench.errors import UsageError, WorkFailedError, nearest, require
+
+from .panels import DOT, Panel, box_of, colour_bar, draw_walls, limit_of, material_key
+from .plot import describe
+from .recording import Recording, Scene, open_recording
+from .style import (
+    DPI,
+    INK,
+    MATERIAL_COLOURS,
+    MUTED,
+    figure,
+    pixels_of,
+    reduced,
+    rgb,
+    speed_map,
+    vorticity_map,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.colors import ListedColormap
+
+    from lagbench.data.registry import Registry
+
+__all__ = [
+    "Packed",
+    "Painter",
+    "halve",
+    "pack",
+    "unpack",
+    "SUFFIXES",
+    "Write",
+    "open_video",
+    "KINDS",
+    "animate",
+]
+
+
+Packed = NDArray[np.uint32]
+
+OVERSAMPLING = 2
+_EVEN = np.uint32(0xFEFEFE)
+
+
+def pack(pixels: NDArray[np.uint8]) -> Packed:
+    """Return RGB bytes, shape [..., 3], as packed pixels.
+
+    >>> hex(pack(np.array([[0x11, 0x22, 0x33]], np.uint8))[0])
+    '0x332211'
+    """
+    red, green, blue = np.moveaxis(pixels.astype(np.uint32), -1, 0)
+    packed: Packed = red | green << np.uint32(8) | blue << np.uint32(16)
+    return packed
+
+
+def unpack(packed: Packed) -> NDArray[np.uint8]:
+    """Return packed pixels as RGB bytes, shape [..., 3]."""
+    return np.ascontiguousarray(packed.astype("<u4")).view(np.uint8).reshape(*packed.shape, 4)[..., :3]
+
+
+def halve(packed: Packed) -> Packed:
+    """Return an image of half the size: each pixel the mean of four, rounded down twice."""
+    rows = _mean(packed[0::2], packed[1::2])
+    return _mean(rows[:, 0::2], rows[:, 1::2])
+
+
+def _mean(a: Packed, b: Packed) -> Packed:
+    """Return the mean of packed pixels: the shared bits and half of the others, colour by colour."""
+    return (a & b) + (((a ^ b) & _EVEN) >> np.uint32(1))
+
+
+@dataclass(frozen=True)
+class _Disc:
+    """Offsets of the pixels of a dot from its middle, as rows and columns."""
+
+    rows: NDArray[np.intp]
+    columns: NDArray[np.intp]
+
+    @staticmethod
+    def of(diameter: float) -> _Disc:
+        """Return a disc of a diameter in pixels, one pixel at least."""
+        reach = int(np.ceil(diameter / 2))
+        grid = np.mgrid[-reach : reach + 1, -reach : reach + 1]
+        inside = (grid**2).sum(axis=0) <= max(diameter / 2, 0.5) ** 2
+        return _Disc(grid[0][inside], grid[1][inside])
+
+
+class Painter:
+    """Paints one recording, frame by frame."""
+
+    def __init__(self, recording: Recording, panel: Panel, *, side: int, limit: float) -> None:
+        """Paint what does not move."""
+        self.panel = panel  # speed, material or vorticity
+        self.limit = limit  # top of the colour scale
+        self._side = side * OVERSAMPLING
+        self._disc = _Disc.of(DOT * recording.spacing * self._side)
+        self._margin = int(self._disc.rows.max(initial=0)) + 1
+        with figure(self._side / DPI, self._side / DPI) as drawn:
+            draw_walls(drawn.add_axes((0, 0, 1, 1)), recording)
+            self._walls = pack(pixels_of(drawn))
+        self._materials = pack(np.array([rgb(colour) for colour in MATERIAL_COLOURS]))[recording.material]
+        self._colours = _table(vorticity_map() if panel is Panel.VORTICITY else speed_map())
+        self._inside = _inside(recording, self._side)
+
+    def paint(self, scene: Scene) -> Packed:
+        """Return the panel of one frame, shape [row, column], first row at the top."""
+        if self.panel is Panel.VORTICITY:
+            return halve(self._field(scene))
+        return halve(self._dots(scene))
+
+    def _dots(self, scene: Scene) -> Packed:
+        """Draw a dot for every particle, cut off at the walls; later particles lie on earlier ones."""
+        margin = self._margin
+        image = np.pad(self._walls, margin)
+        shown = ((scene.position >= 0.0) & (scene.position <= 1.0)).all(axis=-1)
+        x, y = scene.position[shown].T
+        column = np.minimum((x * self._side).astype(np.intp), self._side - 1) + margin
+        row = np.minimum(((1.0 - y) * self._side).astype(np.intp), self._side - 1) + margin
+        width = image.shape[1]
+        stamp = self._disc.rows * width + self._disc.columns
+        colours = self._materials if self.panel is Panel.MATERIAL else self._by_speed(scene)
+        places = (row * width + column)[:, None] + stamp
+        image.reshape(-1)[places] = colours[shown][:, None]
+        return np.where(self._inside, image[margin:-margin, margin:-margin], self._walls)
+
+    def _by_speed(self, scene: Scene) -> Packed:
+        return self._colours[_level(scene.speed / self.limit, len(self._colours))]
+
+    def _field(self, scene: Scene) -> Packed:
+        """Draw a square around every node that has a vorticity; paper elsewhere."""
+        fields = scene.fields
+        middle = (np.arange(self._side) + 0.5) / self._side
+        index = np.floor(middle * fields.grid.cells - fields.grid.origin + 0.5).astype(np.intp)
+        index = np.clip(index, 0, fields.grid.nodes - 1)
+        omega = fields.vorticity.T[::-1][np.ix_(fields.grid.nodes - 1 - index[::-1], index)]
+        defined = np.isfinite(omega) & self._inside
+        level = _level(0.5 + 0.5 * np.where(defined, omega, 0.0) / self.limit, len(self._colours))
+        return np.where(defined, self._colours[level], self._walls)
+
+
+def _level(share: NDArray[np.float64], levels: int) -> NDArray[np.intp]:
+    """Return the entry of a table of so many colours for shares of its scale."""
+    return np.clip(share * levels, 0, levels - 1).astype(np.intp)
+
+
+def _table(colours: ListedColormap) -> Packed:
+    return pack((np.asarray(colours.colors)[:, :3] * 255.0).round().astype(np.uint8))
+
+
+def _inside(recording: Recording, side: int) -> NDArray[np.bool_]:
+    """Return the pixels within the walls, shape [row, column]."""
+    left, right, bottom, top = box_of(recording)
+    middle = (np.arange(side) + 0.5) / side
+    columns = (middle >= left) & (middle <= right)
+    rows = (1.0 - middle >= bottom) & (1.0 - middle <= top)
+    inside: NDArray[np.bool_] = rows[:, None] & columns
+    return inside
+
+
+SUFFIXES = (".mp4", ".gif")
+"""Endings of the files that can be written."""
+
+Write = Callable[[NDArray[np.uint8]], None]
+"""Appends one frame: RGB bytes, shape [row, column, 3]."""
+
+_CODING = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "20", "-preset", "veryfast"]
+_CONTAINER = ["-f", "mp4", "-movflags", "+faststart", "-map_metadata", "-1"]
+_NO_DATES = ["-fflags", "+bitexact", "-flags:v", "+bitexact"]
+
+
+@contextmanager
+def open_video(path: Path, size: tuple[int, int], frames_per_second: float) -> Iterator[Write]:
+    """Yield a function that appends a frame; the file appears when the body ends well."""
+    with atomic_path(path) as temporary:
+        gif = path.suffix.lower() == ".gif"
+        coder = _gif(temporary, frames_per_second) if gif else _mp4(temporary, size, frames_per_second)
+        with coder as write:
+            yield write
+
+
+@contextmanager
+def _mp4(path: Path, size: tuple[int, int], rate: float) -> Iterator[Write]:
+    """Feed frames to ffmpeg through a pipe."""
+    width, height = size
+    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{rate:g}", "-i", "-"]
+    command = [_ffmpeg(), "-y", "-loglevel", "error", *source, *_CODING, *_CONTAINER, *_NO_DATES, str(path)]
+    with tempfile.TemporaryFile() as log:
+        # A session of its own: Ctrl-C shall reach us, not the encoder.
+        process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=log, start_new_session=True)
+        pipe = cast("IO[bytes]", process.stdin)
+        finished = False
+        try:
+            yield lambda frame: _send(pipe, frame)
+            pipe.close()
+            finished = process.wait() == 0
+        except BrokenPipeError:
+            process.wait()
+        finally:
+            process.kill()
+            process.wait()
+            with suppress(BrokenPipeError):
+                pipe.close()
+        if not finished:
+            log.seek(0)
+            said = log.read().decode(errors="replace").strip()
+            raise WorkFailedError(
+                "ffmpeg cannot encode the video", where=str(path.parent), got=said or "nothing said"
+            )
+
+
+def _send(pipe: IO[bytes], frame: NDArray[np.uint8]) -> None:
+    pipe.write(frame.tobytes())
+
+
+def _ffmpeg() -> str:
+    """Return the path of the encoder that imageio brings, or of the system's."""
+    ffmpeg = require("imageio_ffmpeg", extra="plots")
+    try:
+        return str(ffmpeg.get_ffmpeg_exe())
+    except RuntimeError as error:
+        raise UsageError(
+            "no ffmpeg", got=error, fix="pip install 'lagbench[plots]', or write a .gif"
+        ) from None
+
+
+@contextmanager
+def _gif(path: Path, rate: float) -> Iterator[Write]:
+    """Write a GIF that repeats for ever, all frames in lagbench's 256 colours."""
+    images = require("PIL.Image", extra="plots")
+    coder = require("PIL.GifImagePlugin", extra="plots")
+    delay = max(20, 10 * round(100.0 / rate))  # hundredths of a second; viewers slow down below two
+    with path.open("wb") as file:
+
+        def write(frame: NDArray[np.uint8]) -> None:
+            image = reduced(images.fromarray(frame))
+            if not file.tell():
+                file.writelines(coder.getheader(image, info={"loop": 0})[0])
+            file.writelines(coder.getdata(image, duration=delay))
+
+        yield write
+        file.write(b";")
+
+
+KINDS = (Panel.SPEED, Panel.MATERIAL, Panel.VORTICITY)
+"""What an animation can show."""
+
+SLOWEST, FASTEST = 0.01, 1000.0
+"""Frames per second that every player and both formats can hold [1/s]."""
+
+SAMPLES = 12
+"""Frames that set the colour scale, spread over the scenario."""
+
+SIDE, GAP, MARGIN, TOP, BOTTOM = 512, 24, 24, 84, 76  # [pixel]; all even, as video coding wants it
+BAR = 300  # length of the colour bar [pixel]
+DIGIT, LINE = 10, 20  # cell of a digit of the counter [pixel]
+
+
+def animate(
+    source: str | Path,
+    output: str | Path,
+    *,
+    beside: str | Path | None = None,
+    kind: Panel | str | None = None,
+    frames_per_second: float = 30.0,
+    every: int = 1,
+    quiet: bool = False,
+    registry: Registry | None = None,
+) -> Path:
+    """Turn a scenario into an MP4 or GIF file; return its path.
+
+    The file appears whole or not at all.
+
+    Args:
+        source: scenario file.
+        output: file to write, ending in .mp4 or .gif.
+        beside: second scenario file, drawn to the right with the same colour scale; frames
+            are matched by number and end with the shorter of the two.
+        kind: one of :data:`KINDS`; material where there are several, else speed, when None.
+        frames_per_second: frames shown per second, 0.01 to 1000; a GIF rounds to hundredths of
+            a second.
+        every: show every n-th frame.
+        quiet: show no progress; without a terminal on stderr none is shown anyway.
+        registry: where splits are described; ours when None.
+
+    Raises:
+        UsageError: unknown kind or ending, a rate out of bounds, a step that is not positive,
+            no matplotlib.
+        DataError: a scenario file is missing or damaged.
+        WorkFailedError: the video cannot be encoded or written.
+    """
+    path = Path(output)
+    _check(path, kind, frames_per_second, every)
+    with ExitStack() as stack:
+        sources = [source] if beside is None else [source, beside]
+        recordings = [stack.enter_context(open_recording(item, registry=registry)) for item in sources]
+        film = _Film(recordings, _kind(kind, recordings))
+        numbers = range(0, min(recording.frames for recording in recordings), every)
+        write = stack.enter_context(open_video(path, film.size, frames_per_second))
+        for frame in _counted(numbers, path, quiet=quiet):
+            write(film.frame(frame))
+    return path
+
+
+def _check(path: Path, kind: Panel | str | None, rate: float, every: int) -> None:
+    if path.suffix.lower() not in SUFFIXES:
+        raise UsageError(
+            "no such kind of video",
+            where="output",
+            expected=f"a name ending in {' or '.join(SUFFIXES)}",
+            got=path,
+        )
+    if kind is not None and kind not in KINDS:
+        raise UsageError(
+            f"an animation cannot show {kind!r}", where="--kind", fix=nearest(str(kind), map(str, KINDS))
+        )
+    if not SLOWEST <= rate <= FASTEST or every < 1:  # nan lies in no interval
+        raise UsageError(
+            "an animation needs a positive rate and step",
+            where="--fps, --every",
+            expected=f"{SLOWEST:g} to {FASTEST:g} frames/s, every 1 or more",
+            got=f"{rate} frames/s, every {every}",
+        )
+
+
+def _kind(kind: Panel | str | None, recordings: Sequence[Recording]) -> Panel:
+    if kind is not None:
+        return Panel(kind)
+    mixed = any(np.unique(recording.material).size > 1 for recording in recordings)
+    return Panel.MATERIAL if mixed else Panel.SPEED
+
+
+def _counted(numbers: range, path: Path, *, quiet: bool) -> Iterator[int]:
+    """Yield frame numbers; show how far the work is where somebody can see it."""
+    if quiet or not sys.stderr.isatty():
+        yield from numbers
+        return
+    from rich.console import Console
+    from rich.progress import track
+
+    yield from track(numbers, description=path.name, console=Console(stderr=True), transient=True)
+
+
+class _Film:
+    """Composes the frames: a still background, one painted panel per recording, a counter."""
+
+    def __init__(self, recordings: Sequence[Recording], panel: Panel) -> None:
+        limit = max(_limit(recording, panel) for recording in recordings)
+        self._recordings = recordings
+        self._painters = [Painter(recording, panel, side=SIDE, limit=limit) for recording in recordings]
+        self._lefts = [MARGIN + column * (SIDE + GAP) for column in range(len(recordings))]
+        width = self._lefts[-1] + SIDE + MARGIN
+        self.size = (width, TOP + SIDE + BOTTOM)
+        self._still = _background(recordings, panel, limit, self.size)
+        self._counter = _Counter.of(recordings[0], right=width - MARGIN)
+
+    def frame(self, number: int) -> NDArray[np.uint8]:
+        """Return one frame as RGB bytes, shape [row, column, 3]."""
+        image = self._still.copy()
+        for recording, painter, left in zip(self._recordings, self._painters, self._lefts, strict=True):
+            image[TOP : TOP + SIDE, left : left + SIDE] = unpack(painter.paint(recording.scene(number)))
+        self._counter.draw(image, number)
+        return image
+
+
+def _limit(recording: Recording, panel: Panel) -> float:
+    """Return a top of the colour scale that suits the whole recording."""
+    if panel is Panel.MATERIAL:
+        return 1.0
+    numbers = np.linspace(0, recording.frames - 1, SAMPLES).astype(int)
+    return max(limit_of(panel, recording.scene(int(number))) for number in np.unique(numbers))
+
+
+def _background(
+    recordings: Sequence[Recording], panel: Panel, limit: float, size: tuple[int, int]
+) -> NDArray[np.uint8]:
+    """Return all that does not move: titles, names of the scenarios, colour bar or key."""
+    width, height = size
+    with figure(width / DPI, height / DPI) as drawn:
+        titles = dict.fromkeys(recording.title for recording in recordings)
+        drawn.text(
+            MARGIN / width, 1 - 14 / height, " | ".join(titles), fontsize=12, fontweight="bold", va="top"
+        )
+        for column, recording in enumerate(recordings):
+            left = (MARGIN + column * (SIDE + GAP)) / width
+            drawn.text(left, 1 - (TOP - 12) / height, describe(recording), fontsize=9, color=MUTED)
+        below = drawn.add_axes((MARGIN / width, (BOTTOM - 24) / height, BAR / width, 10 / height))
+        if panel is Panel.MATERIAL:
+            material_key(below, np.concatenate([recording.material for recording in recordings]))
+        else:
+            colour_bar(below, panel, limit)
+        return pixels_of(drawn)
+
+
+@dataclass(frozen=True)
+class _Counter:
+    """Frame number and time at the bottom right, put together from digits drawn once."""
+
+    digits: dict[str, NDArray[np.uint8]]  # picture of each character, all of one size
+    right: int  # right end [pixel]
+    interval: float  # time between frames [s]
+    places: tuple[int, int]  # characters of the longest frame number and of the longest time
+
+    @staticmethod
+    def of(recording: Recording, *, right: int) -> _Counter:
+        """Return the counter of a recording."""
+        last = recording.frames - 1
+        interval = recording.size.frame_interval
+        letters = {letter: _letter(letter) for letter in "0123456789.frames t="}
+        return _Counter(letters, right, interval, (len(str(last)), len(f"{last * interval:.2f}")))
+
+    def draw(self, image: NDArray[np.uint8], number: int) -> None:
+        """Write the frame number and its time into an image."""
+        text = f"frame {number:>{self.places[0]}}  {number * self.interval:>{self.places[1]}.2f} s"
+        left = self.right - DIGIT * len(text)
+        top = TOP + SIDE + 12
+        for letter in text:
+            image[top : top + LINE, left : left + DIGIT] = self.digits[letter]
+            left += DIGIT
+
+
+def _letter(letter: str) -> NDArray[np.uint8]:
+    """Return the picture of one character in a cell of its own, shape [LINE, DIGIT, 3]."""
+    with figure(DIGIT / DPI, LINE / DPI) as drawn:
+        drawn.text(0.5, 0.25, letter, fontsize=8.5, family="DejaVu Sans Mono", ha="center", color=INK)
+        return pixels_of(drawn)

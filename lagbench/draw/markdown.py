@@ -1,0 +1,50 @@
+"""Markdown from values: escaped text and aligned tables."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+__all__ = [
+    "escape",
+    "table",
+]
+
+
+_SPECIAL = re.compile(r"([\\`*_\[\]<>|#&~$])")
+
+
+def escape(text: object) -> str:
+    r"""Return text that Markdown shows as it stands, on one line.
+
+    >>> print(escape("a_b | <c>"))
+    a\_b \| \<c\>
+    """
+    return _SPECIAL.sub(r"\\\1", " ".join(str(text).split()))
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    """Return a table; numbers are set flush right, everything is escaped.
+
+    Cells that start and end with a backtick are code and stay as they are.
+    """
+    numeric = [all(isinstance(row[i], int | float) for row in rows) and bool(rows) for i in range(len(head))]
+    lines = [_line([escape(cell) for cell in head]), _line(["---:" if right else "---" for right in numeric])]
+    lines += [_line([_cell(cell) for cell in row]) for row in rows]
+    return "\n".join(lines)
+
+
+def _cell(value: object) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, int):
+        return f"{value:,}"
+    if isinstance(value, float):
+        return f"{value:.9g}"
+    text = str(value)
+    is_code = len(text) > 2 and text.startswith("`") and text.endswith("`") and "`" not in text[1:-1]
+    return text.replace("|", "\\|") if is_code else escape(text)
+
+
+def _line(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"

@@ -1,0 +1,315 @@
+"""Pictures of one frame: particles, vorticity, streamlines, with the walls around them.
+
+Needs matplotlib: ``pip install 'lagbench[plots]'``. The same frame gives the same bytes.
+
+Contact sheets: many scenarios of a split on one page, to be looked at.
+
+Splits whose scenarios draw a ``family`` or ``pair`` get one row per kind over time; the
+others get a table of scenarios at one frame. Needs matplotlib.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lagbench.data.local import locate, remedy
+from lagbench.data.registry import Registry, Size
+from lagbench.data.writer import ScenarioKey, scenario_path
+from lagbench.errors import DataError, UsageError, nearest
+from lagbench.store.bringing import bring
+
+from .panels import TITLES, Panel, colour_bar, draw, limit_of, material_key, moving_walls
+from .recording import Recording, Scene, open_recording
+from .style import MUTED, figure, header, save_png
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from matplotlib.figure import Figure
+
+__all__ = [
+    "contact_sheet",
+    "scenario_files",
+    "KINDS",
+    "Panel",
+    "describe",
+    "plot_frame",
+]
+
+
+COLUMNS = 6
+TIMES = (0.0, 0.05, 0.1, 0.2, 0.5, 1.0)
+"""Moments of a row over time, as shares of the last frame."""
+
+DRIVEN, DECAYING = 30, 36
+"""Scenarios on a sheet of flows that walls drive, and of those that only decay (Figs. 5.7, 5.20)."""
+
+SIDE, GAP, LABEL, MARGIN, TOP, BAR = 1.3, 0.08, 0.18, 0.22, 0.7, 0.58  # [inch]
+KIND_PARAMETERS = ("family", "pair")
+WALL_SHARE = 0.6  # the fluid itself seldom moves faster than this share of the wall's speed
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Cell:
+    """One small panel: a scene, its label, and the top of its colour scale."""
+
+    scene: Scene
+    label: str
+    limit: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Sheet:
+    """What is on a page."""
+
+    rows: Sequence[Sequence[_Cell]]  # the small panels
+    panel: Panel  # what they show
+    subtitle: str  # second line of the title
+    limit: float  # top of the colour bar
+    unit: str | None = None  # label of the colour bar where it is not the panel's own
+
+
+def contact_sheet(
+    split: str,
+    size: str,
+    output: str | Path,
+    *,
+    root: str | Path | None = None,
+    kind: Panel | str | None = None,
+    frame: int | None = None,
+    registry: Registry | None = None,
+) -> Path:
+    """Draw many scenarios of a split on one page as a PNG file; return its path.
+
+    Args:
+        split: name of the split.
+        size: name of the size.
+        output: file to write, ending in .png.
+        root: folder that holds all data sets; see ``resolve_root``.
+        kind: what each panel shows; the default suits the split.
+        frame: frame to show where the sheet is a table of scenarios; when None, the first, or
+            the last frame of interest of what starts at rest or is driven.
+        registry: where splits are described; ours when None.
+
+    Raises:
+        UsageError: unknown split, size or kind, no matplotlib.
+        DataError: no scenario is there, or a file is damaged.
+    """
+    tier, folder, splits = locate(split, size, root=root, registry=registry)
+    bring(tier, folder, tier.scenarios)
+    files = scenario_files(tier, folder)
+    if not files:
+        raise DataError(
+            "nothing to draw",
+            where=f"{tier.split} {size} under {folder}",
+            fix=remedy(tier, root=folder),
+        )
+    panel = None if kind is None else Panel(kind)
+    kinds = _first_of_each_kind(files, splits)
+    sheet = _over_time(kinds, panel, splits) if kinds else _table(files, panel, frame, splits)
+    columns = max(len(row) for row in sheet.rows)
+    width = 2 * MARGIN + columns * (SIDE + GAP) - GAP
+    height = TOP + len(sheet.rows) * (SIDE + LABEL + GAP) + BAR
+    with figure(max(width, 5.0), height) as drawn:
+        header(drawn, f"{splits.split(tier.split).title} · {tier.split} {size}", sheet.subtitle, left=MARGIN)
+        _draw_sheet(drawn, sheet)
+        return save_png(drawn, output)
+
+
+def scenario_files(size: Size, root: Path) -> list[Path]:
+    """Return the scenario files that are there: train, valid, test, extra, each by id."""
+    keys = (
+        ScenarioKey(split=size.split, size=size.name, version=size.version, scenario=i, subset=subset)
+        for subset, ids in size.subsets.items()
+        for i in sorted(ids)
+    )
+    return [path for path in (scenario_path(root, key) for key in keys) if path.is_file()]
+
+
+def _kind_of(recording: Recording) -> str:
+    names = [str(recording.parameters[name]) for name in KIND_PARAMETERS if name in recording.parameters]
+    return names[0] if names else ""
+
+
+def _first_of_each_kind(files: Sequence[Path], splits: Registry) -> dict[str, Path]:
+    """Return the first scenario of every family or pair, in order of appearance."""
+    found: dict[str, Path] = {}
+    for path in files:
+        with open_recording(path, registry=splits) as recording:
+            if kind := _kind_of(recording):
+                found.setdefault(kind, path)
+    return dict(sorted(found.items(), key=lambda item: item[1].name))
+
+
+def _over_time(kinds: dict[str, Path], panel: Panel | None, splits: Registry) -> _Sheet:
+    """Return one row per kind: the same moments of each, one colour scale."""
+    rows = [list(_moments(path, splits)) for path in kinds.values()]
+    if panel is None:
+        mixed = any(np.unique(row[0].recording.material).size > 1 for row in rows)
+        panel = Panel.MATERIAL if mixed else Panel.SPEED
+    limit = max(limit_of(panel, scene) for row in rows for scene in row)
+    cells = [
+        [_Cell(scene=s, label=_moment_label(kind, s, first=s is row[0]), limit=limit) for s in row]
+        for kind, row in zip(kinds, rows, strict=True)
+    ]
+    return _Sheet(rows=cells, panel=panel, subtitle="the first scenario of each kind over time", limit=limit)
+
+
+def _moments(path: Path, splits: Registry) -> Iterator[Scene]:
+    with open_recording(path, registry=splits) as recording:
+        for share in TIMES:
+            yield recording.scene(round(share * (recording.frames - 1)))
+
+
+def _moment_label(kind: str, scene: Scene, *, first: bool) -> str:
+    return f"{scene.recording.scenario}  {kind}" if first else f"frame {scene.frame}"
+
+
+def _table(files: Sequence[Path], panel: Panel | None, frame: int | None, splits: Registry) -> _Sheet:
+    """Return a table of scenarios at one frame."""
+    with open_recording(files[0], registry=splits) as recording:
+        driven = bool(recording.wall_velocity.any())
+        panel = panel or (Panel.STREAMLINES if driven else Panel.VORTICITY)
+        if frame is None:
+            starts_at_rest = driven or not recording.scene(0).speed.any()
+            latest = recording.size.task.frames_of_interest[-1] if starts_at_rest else 0
+            frame = min(latest, recording.frames - 1)
+    scenes = []
+    for path in files[: DRIVEN if driven else DECAYING]:
+        with open_recording(path, registry=splits) as recording:
+            scenes.append(recording.scene(frame))
+    scaled = driven and panel in (Panel.STREAMLINES, Panel.SPEED)
+    common = float(np.median([limit_of(panel, scene) for scene in scenes]))
+    limits = [WALL_SHARE * np.abs(s.recording.wall_velocity).max() if scaled else common for s in scenes]
+    cells = [_Cell(scene=s, label=_name(s), limit=m) for s, m in zip(scenes, limits, strict=True)]
+    return _Sheet(
+        rows=[cells[i : i + COLUMNS] for i in range(0, len(cells), COLUMNS)],
+        panel=panel,
+        subtitle=f"{len(cells)} scenarios at frame {scenes[0].frame}",
+        limit=WALL_SHARE if scaled else common,
+        unit="speed / wall speed" if scaled else None,
+    )
+
+
+def _name(scene: Scene) -> str:
+    recording = scene.recording
+    if recording.reynolds is not None:
+        return f"{recording.scenario}   Re {recording.reynolds:.0f}"
+    if "frequency" in recording.parameters:
+        return f"{recording.scenario}   frequency {recording.parameters['frequency']}"
+    return str(recording.scenario)
+
+
+def _draw_sheet(drawn: Figure, sheet: _Sheet) -> None:
+    width, height = drawn.get_size_inches()
+    for row, cells in enumerate(sheet.rows):
+        for column, cell in enumerate(cells):
+            left = MARGIN + column * (SIDE + GAP)
+            bottom = height - TOP - (row + 1) * (SIDE + LABEL + GAP) + GAP
+            axes = drawn.add_axes((left / width, bottom / height, SIDE / width, SIDE / height))
+            axes.set_title(cell.label, fontsize=7.5, color=MUTED, pad=2.5)
+            draw(axes, sheet.panel, cell.scene, limit=cell.limit, detail=0.0)
+    below = drawn.add_axes((MARGIN / width, 0.42 / height, 2.6 / width, 0.09 / height))
+    if sheet.panel is Panel.MATERIAL:
+        material_key(below, np.concatenate([c.scene.recording.material for row in sheet.rows for c in row]))
+    else:
+        colour_bar(below, sheet.panel, sheet.limit, label=sheet.unit)
+
+
+ALL = "all"
+KINDS = (ALL, *(str(panel) for panel in Panel))
+"""What :func:`plot_frame` can draw."""
+
+SIDE, GAP, MARGIN, TOP, BAR = 3.25, 0.25, 0.25, 0.96, 0.66  # [inch]
+WALLS = ("left", "right", "bottom", "top")
+MARKS = ("family", "pair", "frequency")
+SEPARATOR = "  ·  "
+DIRECTIONS = {(1, 0): "right", (-1, 0): "left", (0, 1): "up", (0, -1): "down"}
+
+
+def plot_frame(
+    source: str | Path | xr.Dataset,
+    frame: int,
+    output: str | Path,
+    *,
+    kind: str = ALL,
+    registry: Registry | None = None,
+) -> Path:
+    """Draw one frame of a scenario as a PNG file; return its path.
+
+    Args:
+        source: scenario file, or a data set of one scenario.
+        frame: absolute frame number; negative ones count from the end.
+        output: file to write, ending in .png.
+        kind: one of :data:`KINDS`; ``all`` draws three panels side by side.
+        registry: where splits are described; ours when None.
+
+    Raises:
+        UsageError: unknown kind, no such frame, a name that is no .png, no matplotlib.
+        DataError: the scenario file is missing or damaged.
+    """
+    if kind not in KINDS:
+        raise UsageError(f"no kind of picture {kind!r}", where="--kind", fix=nearest(kind, KINDS))
+    with open_recording(source, registry=registry) as recording:
+        scene = recording.scene(frame)
+    panels = _panels(recording) if kind == ALL else [Panel(kind)]
+    width = 2 * MARGIN + len(panels) * SIDE + (len(panels) - 1) * GAP
+    with figure(width, TOP + SIDE + BAR) as drawn:
+        single = len(panels) == 1
+        subtitle = describe(recording) if single else SEPARATOR.join([describe(recording), *_moment(scene)])
+        header(drawn, recording.title, subtitle, left=MARGIN)
+        _draw_panels(drawn, panels, scene)
+        return save_png(drawn, output)
+
+
+def describe(recording: Recording) -> str:
+    """Return split, size, scenario and what sets it apart, as in "cavity full · scenario 3 · Re 120"."""
+    parts = [f"{recording.size.split} {recording.size.name}", f"scenario {recording.scenario}"]
+    if recording.reynolds is not None:
+        parts.append(f"Re {recording.reynolds:.0f}")
+    parts += [f"{name} {recording.parameters[name]}" for name in MARKS if name in recording.parameters]
+    return SEPARATOR.join(parts)
+
+
+def _moment(scene: Scene) -> list[str]:
+    """Return frame and time, and which walls move, which way, how fast."""
+    return [f"frame {scene.frame}", f"t = {scene.time:.2f} s", *_motions(scene.recording)]
+
+
+def _motions(recording: Recording) -> list[str]:
+    """Say which walls move, which way, how fast."""
+    return [
+        f"{WALLS[wall]} wall moves {DIRECTIONS[_sign(v[0]), _sign(v[1])]} at {np.abs(v).max():.3g} length/s"
+        for wall, v in moving_walls(recording)
+    ]
+
+
+def _sign(value: float) -> int:
+    return int(np.sign(value))
+
+
+def _panels(recording: Recording) -> list[Panel]:
+    """Return the three panels that suit a scenario."""
+    if np.unique(recording.material).size > 1:
+        return [Panel.MATERIAL, Panel.SPEED, Panel.VORTICITY]
+    return [Panel.SPEED, Panel.VORTICITY, Panel.STREAMLINES]
+
+
+def _draw_panels(drawn: Figure, panels: Sequence[Panel], scene: Scene) -> None:
+    width, height = drawn.get_size_inches()
+    for column, panel in enumerate(panels):
+        left = (MARGIN + column * (SIDE + GAP)) / width
+        axes = drawn.add_axes((left, BAR / height, SIDE / width, SIDE / height))
+        moment = f" at frame {scene.frame}, t = {scene.time:.2f} s" if len(panels) == 1 else ""
+        axes.set_title(TITLES[panel] + moment)
+        limit = limit_of(panel, scene)
+        draw(axes, panel, scene, limit=limit)
+        below = drawn.add_axes((left, (BAR - 0.2) / height, SIDE / width, 0.09 / height))
+        if panel is Panel.MATERIAL:
+            material_key(below, scene.recording.material)
+        else:
+            colour_bar(below, panel, limit)

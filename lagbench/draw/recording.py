@@ -1,0 +1,190 @@
+"""A scenario as a picture needs it: frames, walls, names and grid fields.
+
+A recording is a scenario file, or an ``xarray.Dataset`` of one scenario as
+``xarray.open_dataset`` and ``lagbench.open_split(...).sel(scenario=3)`` give it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagbench.data import grid as gridding
+from lagbench.data.local import rooted
+from lagbench.data.registry import Registry, Size, load
+from lagbench.data.writer import read_scenario
+from lagbench.errors import UsageError
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+__all__ = [
+    "Recording",
+    "Scene",
+    "open_recording",
+]
+
+
+Read = Callable[[str, slice | int], NDArray[Any]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene:
+    """One frame of a scenario."""
+
+    recording: Recording  # scenario that the frame belongs to
+    frame: int  # absolute frame number
+    position: NDArray[np.float64]  # [length], shape [particle, 2]
+    velocity: NDArray[np.float64]  # velocity of the solver [length/s], shape [particle, 2]
+    # x(f) - x(f-1), at frame 0 velocity times frame interval [length/frame]
+    displacement: NDArray[np.float64]
+
+    @property
+    def time(self) -> float:
+        """Time since frame 0 [s]."""
+        return self.frame * self.recording.size.frame_interval
+
+    @property
+    def speed(self) -> NDArray[np.float64]:
+        """Speed of each particle [length/s], shape [particle]."""
+        speed: NDArray[np.float64] = np.sqrt((self.velocity**2).sum(axis=-1))
+        return speed
+
+    @cached_property
+    def fields(self) -> gridding.Fields:
+        """Fields on the size's score grid; vorticity and divergence in 1/frame."""
+        score_grid = self.recording.size.task.score_grid
+        grid = gridding.Grid(score_grid.cells, gridding.Placement(score_grid.placement))
+        full = grid.full_weight(self.recording.particles, self.recording.area)
+        return gridding.fields(self.position, self.displacement, grid, full=full)
+
+
+class Recording:
+    """A scenario whose frames are read one at a time."""
+
+    def __init__(
+        self,
+        identity: Mapping[str, Any],
+        parameters: Mapping[str, Any],
+        frames: int,
+        variables: set[str],
+        read: Read,
+        registry: Registry,
+    ) -> None:
+        """Read what holds for all frames."""
+        # tier of the split, from the registry
+        self.size: Size = registry.size(str(identity["split"]), str(identity["size"]))
+        self.title = registry.split(self.size.split).title  # title of the split
+        self.scenario = int(identity["scenario"])  # id
+        self.subset = str(identity["subset"])  # subset that holds the scenario
+        self.parameters = parameters  # physical parameters by name
+        self.frames = frames  # recorded frames
+        self._read = read
+        self._present = np.isfinite(read("position", 0)).all(axis=-1)
+        # material of each particle, shape [particle]
+        self.material = read("material", slice(None))[self._present].astype(np.int8)
+        moving = "wall_velocity" in variables
+        # [length/s], shape [wall, 2]; zeros where the file has none
+        self.wall_velocity = read("wall_velocity", 0).astype(np.float64) if moving else np.zeros((4, 2))
+        self._mass = float(read("particle_mass", slice(None)))
+
+    @property
+    def particles(self) -> int:
+        """Particles in every frame."""
+        return len(self.material)
+
+    @property
+    def area(self) -> float:
+        """Area that the material covers at first [length^2]."""
+        return self._mass * self.particles / float(self.size.value("density"))
+
+    @property
+    def spacing(self) -> float:
+        """Mean distance of neighbouring particles at first [length]."""
+        return float(np.sqrt(self.area / self.particles))
+
+    @property
+    def reynolds(self) -> float | None:
+        """Reynolds number, None where there is none."""
+        value = self.parameters.get("reynolds_number")
+        return None if value is None else float(value)
+
+    def frame_number(self, frame: int) -> int:
+        """Return an absolute frame number; negative ones count from the end."""
+        if not -self.frames <= frame < self.frames:
+            raise UsageError(
+                f"no frame {frame}",
+                where=f"scenario {self.scenario}",
+                expected=f"0 to {self.frames - 1}",
+                got=frame,
+            )
+        return frame % self.frames
+
+    def scene(self, frame: int) -> Scene:
+        """Return one frame; negative numbers count from the end."""
+        number = self.frame_number(frame)
+        position, velocity = self._particles("position", number), self._particles("velocity", number)
+        if number:
+            displacement = position - self._particles("position", number - 1)
+        else:
+            displacement = velocity * self.size.frame_interval
+        return Scene(
+            recording=self, frame=number, position=position, velocity=velocity, displacement=displacement
+        )
+
+    def _particles(self, name: str, frame: int) -> NDArray[np.float64]:
+        return self._read(name, frame)[self._present].astype(np.float64)
+
+
+@contextmanager
+def open_recording(
+    source: str | Path | xr.Dataset, *, registry: Registry | None = None
+) -> Iterator[Recording]:
+    """Open a scenario file, or a data set of one scenario, for drawing."""
+    if not isinstance(source, str | Path):
+        yield _of_dataset(source, registry or load())
+        return
+    with read_scenario(Path(source)) as file:
+        head = file.header
+        key = head.key
+        identity = {"split": key.split, "size": key.size, "scenario": key.scenario, "subset": key.subset}
+        variables = set(file.variables)
+        splits = rooted(_root_of(Path(source)), registry)
+        yield Recording(identity, head.parameters, head.frames, variables, file.read, splits)
+
+
+def _root_of(path: Path) -> Path:
+    """Return the root folder of a scenario file that stands where ``scenario_path`` puts it."""
+    parents = path.absolute().parents
+    return parents[min(4, len(parents) - 1)]
+
+
+def _of_dataset(data: xr.Dataset, registry: Registry) -> Recording:
+    """Return the recording that a data set of one scenario holds."""
+    if "scenario" in data.dims:
+        raise UsageError(
+            "a picture shows one scenario",
+            got=f"a data set of {data.sizes['scenario']}",
+            fix="choose one: data.sel(scenario=3)",
+        )
+    attributes: dict[str, Any] = {str(k): v for k, v in data.attrs.items()}
+    identity = {
+        name: data.coords[name].item() if name in data.coords else attributes[name] for name in _IDENTITY
+    }
+    frames = int(data["frame_count"]) if "frame_count" in data else data.sizes["frame"]
+
+    def read(name: str, frames: slice | int) -> NDArray[Any]:
+        variable = data[name]
+        return np.asarray(variable.isel(frame=frames) if "frame" in variable.dims else variable)
+
+    return Recording(identity, attributes, frames, {str(name) for name in data.variables}, read, registry)
+
+
+_IDENTITY = ("split", "size", "scenario", "subset")

@@ -1,0 +1,1 @@
+"""Make data sets: generate, verify, describe, clean."""

@@ -1,0 +1,391 @@
+"""Data set cards: README.md with pictures, and croissant.json, beside the manifest.
+
+Both follow from the registry and the manifest alone and hold no date, so the same data set
+gets the same bytes. Pictures are drawn where matplotlib is installed.
+
+Croissant 1.1 metadata: a data set described for search engines and loaders.
+
+The document passes ``mlcroissant validate``. It names every file with its SHA-256 and lists
+the scenarios as records. There is no date in it: the same manifest gives the same bytes.
+Specification: https://docs.mlcommons.org/croissant/docs/croissant-spec-1.1.html
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+from lagbench.atomic import write_atomically
+from lagbench.data.layout import dataset_folder
+from lagbench.data.manifest import FileEntry, Manifest
+from lagbench.data.registry import Registry, Size, Split, spell_ids
+from lagbench.draw.markdown import escape, table
+
+__all__ = [
+    "CONFORMS_TO",
+    "croissant_json",
+    "describe_dataset",
+    "CARD_NAME",
+    "CROISSANT_NAME",
+    "NOTES",
+    "PICTURES",
+    "card_texts",
+    "dataset_card",
+    "write_cards",
+]
+
+
+CONFORMS_TO = "http://mlcommons.org/croissant/1.1"
+LICENCES = {"CC-BY-4.0": "https://creativecommons.org/licenses/by/4.0/"}
+NETCDF = "application/x-netcdf"
+KEYWORDS = ("particle simulation", "material point method", "surrogate model", "computational fluid dynamics")
+
+_TERMS = (
+    *("arrayShape", "citeAs", "column", "containedIn", "equivalentProperty", "extract", "field"),
+    *("fileObject", "fileProperty", "fileSet", "format", "includes", "isArray", "isLiveDataset"),
+    *("jsonPath", "key", "md5", "parentField", "path", "recordSet", "references", "regex", "repeated"),
+    *("replace", "samplingRate", "separator", "source", "subField", "transform"),
+)
+
+_CONTEXT: Mapping[str, object] = {
+    "@language": "en",
+    "@vocab": "https://schema.org/",
+    "conformsTo": "dct:conformsTo",
+    "cr": "http://mlcommons.org/croissant/",
+    "data": {"@id": "cr:data", "@type": "@json"},
+    "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
+    "dct": "http://purl.org/dc/terms/",
+    "description": {"@container": "@language"},
+    "examples": {"@id": "cr:examples", "@type": "@json"},
+    "name": {"@container": "@language"},
+    "rai": "http://mlcommons.org/croissant/RAI/",
+    "sc": "https://schema.org/",
+    **{term: f"cr:{term}" for term in _TERMS},
+}
+
+_FIELDS: Mapping[str, tuple[str, str]] = {
+    "scenario": ("sc:Integer", "id of the scenario"),
+    "subset": ("sc:Text", "subset that holds the scenario"),
+    "path": ("sc:Text", "file, relative to this document"),
+    "frames": ("sc:Integer", "recorded frames"),
+    "particles": ("sc:Integer", "particles in every frame"),
+    "content_sha256": ("sc:Text", "content hash, the same on every machine"),
+}
+
+
+def croissant_json(size: Size, split: Split, manifest: Manifest) -> str:
+    """Return the Croissant document of a data set folder."""
+    return json.dumps(describe_dataset(size, split, manifest), indent=1, ensure_ascii=False) + "\n"
+
+
+def describe_dataset(size: Size, split: Split, manifest: Manifest) -> dict[str, object]:
+    """Return the Croissant document as plain values."""
+    return {
+        "@context": dict(_CONTEXT),
+        "@type": "sc:Dataset",
+        "name": f"lagbench-{size.split}-{size.name}",
+        "description": f"{split.title}, size {size.name}. {split.description}",
+        "conformsTo": CONFORMS_TO,
+        "citeAs": split.citation,
+        "creator": {"@type": "sc:Organization", "name": "The lagbench authors"},
+        "isLiveDataset": False,
+        "keywords": list(KEYWORDS),
+        "license": LICENCES.get(split.licence, split.licence),
+        "version": manifest.version,
+        "distribution": [_file_object(entry) for entry in manifest.files],
+        "recordSet": [_record_set(manifest.files)],
+    }
+
+
+def _file_object(entry: FileEntry) -> dict[str, object]:
+    return {
+        "@type": "cr:FileObject",
+        "@id": entry.path,
+        "name": entry.path,
+        "description": f"scenario {entry.scenario} of {entry.subset}: {entry.frames} frames, netCDF4",
+        "contentUrl": entry.path,
+        "contentSize": f"{entry.bytes} B",
+        "encodingFormat": NETCDF,
+        "sha256": entry.file_sha256,
+    }
+
+
+def _record_set(files: Sequence[FileEntry]) -> dict[str, object]:
+    """Return the table of scenarios as a record set that holds its own data."""
+    return {
+        "@type": "cr:RecordSet",
+        "@id": "scenarios",
+        "name": "scenarios",
+        "description": "One record per scenario file.",
+        "key": {"@id": "scenarios/scenario"},
+        "field": [
+            {
+                "@type": "cr:Field",
+                "@id": f"scenarios/{name}",
+                "name": name,
+                "description": description,
+                "dataType": kind,
+            }
+            for name, (kind, description) in _FIELDS.items()
+        ],
+        "data": [{f"scenarios/{name}": getattr(entry, name) for name in _FIELDS} for entry in files],
+    }
+
+
+CARD_NAME, CROISSANT_NAME = "README.md", "croissant.json"
+
+PICTURES: Mapping[str, str] = {
+    "pictures/scenarios.png": "scenarios of this data set",
+    "pictures/frame.png": "one frame of a test scenario",
+}
+"""Pictures of a card, relative to it, and what they show."""
+
+NOTES: Mapping[str, str] = {
+    "multimaterial": (
+        "In the pair snow-snow everything comes to rest after about 65 frames: the rest of these scenarios "
+        "holds almost no motion, and a model that stands still looks good there."
+    ),
+    "fluid": "Scenarios differ in length: the longer ones are those that still move.",
+    "curl-noise": "Energy only decays: the higher the frequency, the faster.",
+}
+"""What a reader of one split's card must know beside its description."""
+
+VARIABLES = (
+    ("`position`", "frame, particle, space", "float32", "length", "particle positions in the unit box"),
+    ("`velocity`", "frame, particle, space", "float32", "length/s", "particle velocities of the solver"),
+    ("`material`", "particle", "int8", "1", "0 liquid, 1 jelly, 2 snow, 3 rope"),
+    ("`particle_mass`", "", "float64", "density x area", "mass of one particle"),
+    (
+        "`wall_velocity`",
+        "frame, wall, space",
+        "float32",
+        "length/s",
+        "closed box: walls left, right, bottom, top",
+    ),
+    ("`time`", "frame", "float64", "s", "time since frame 0"),
+)
+
+
+def write_cards(root: Path, size: Size, split: Split, manifest: Manifest) -> list[Path]:
+    """Write README.md, croissant.json and, with matplotlib, the pictures; return their paths.
+
+    Each file appears whole or not at all. Where the text is already there and the pictures
+    too, nothing is written: the card names every content hash, so the data are the same.
+    """
+    folder = dataset_folder(root, size.split, size.name, size.major)
+    texts = {folder / name: text for name, text in card_texts(size, split, manifest).items()}
+    drawn = [folder / name for name in _pictures(manifest)]
+    if not _are_there(texts, drawn):
+        if drawn:
+            _draw(root, size, split, manifest)
+        for path, text in texts.items():
+            write_atomically(path, text)
+    return [*texts, *drawn]
+
+
+def card_texts(size: Size, split: Split, manifest: Manifest) -> dict[str, bytes]:
+    """Return the texts of a data set's card by name, README.md first."""
+    return {
+        CARD_NAME: dataset_card(size, split, manifest, pictures=_pictures(manifest)).encode(),
+        CROISSANT_NAME: croissant_json(size, split, manifest).encode(),
+    }
+
+
+def _pictures(manifest: Manifest) -> list[str]:
+    return list(PICTURES) if manifest.files and importlib.util.find_spec("matplotlib") else []
+
+
+def _are_there(texts: Mapping[Path, bytes], pictures: Sequence[Path]) -> bool:
+    """Return whether all files of a card are on disk, with these texts."""
+    found = all(path.is_file() for path in (*texts, *pictures))
+    return found and all(path.read_bytes() == text for path, text in texts.items())
+
+
+def _draw(root: Path, size: Size, split: Split, manifest: Manifest) -> None:
+    """Draw the pictures of the card."""
+    from lagbench.draw.plot import contact_sheet, plot_frame
+
+    splits = Registry({size.split: split}, {})
+    folder = dataset_folder(root, size.split, size.name, size.major)
+    sheet, single = PICTURES
+    contact_sheet(size.split, size.name, folder / sheet, root=root, registry=splits)
+    shown = next((e for e in manifest.files if e.subset == "test"), manifest.files[0])
+    frame = min(size.task.frames_of_interest[-1], shown.frames - 1)
+    plot_frame(folder / shown.path, frame, folder / single, registry=splits)
+
+
+def dataset_card(size: Size, split: Split, manifest: Manifest, *, pictures: list[str]) -> str:
+    """Return the card of a data set as Markdown with a YAML head."""
+    parts = [
+        _head(size, split, manifest),
+        f"# {escape(split.title)} · {size.split} {size.name}",
+        escape(split.description),
+        *([escape(NOTES[size.split])] if size.split in NOTES else []),
+        *(f"![{PICTURES[name]}]({name})" for name in pictures),
+        "## In short",
+        _facts(size, manifest),
+        "## Subsets",
+        _subsets(size, manifest),
+        "## Reading",
+        _reading(size),
+        "## Task",
+        _task(size, manifest),
+        *_statistics(manifest),
+        "## Parameters",
+        _parameters(size),
+        "## Regenerate and verify",
+        _commands(size, manifest),
+        "## Scenarios",
+        _scenarios(manifest),
+        "## Licence and citation",
+        f"{escape(split.licence)}. {escape(split.citation)}.",
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _head(size: Size, split: Split, manifest: Manifest) -> str:
+    """Return the YAML head; JSON strings and lists are YAML."""
+    count = len(manifest.files)
+    lines = {
+        "pretty_name": f"{split.title} ({size.split} {size.name})",
+        "license": split.licence.lower(),
+        "tags": list(KEYWORDS),
+        "size_categories": ["n<1K" if count < 1000 else "1K<n<10K"],
+        "version": manifest.version,
+    }
+    body = [f"{key}: {json.dumps(value, ensure_ascii=False)}" for key, value in lines.items()]
+    return "\n".join(["---", *body, "---"])
+
+
+def _facts(size: Size, manifest: Manifest) -> str:
+    frames = sorted({entry.frames for entry in manifest.files})
+    rows = [
+        ("version", manifest.version),
+        ("complete", manifest.complete),
+        (
+            "data set hash",
+            f"`{manifest.dataset_sha256}`" if manifest.dataset_sha256 else "none before it is complete",
+        ),
+        ("identity", manifest.identity),
+        ("scenarios", len(manifest.files)),
+        (
+            "frames per scenario",
+            " to ".join(str(f) for f in dict.fromkeys((frames[0], frames[-1]))) if frames else "0",
+        ),
+        ("frames together", sum(entry.frames for entry in manifest.files)),
+        ("particles", size.particles),
+        ("frame interval", f"{size.frame_interval:.6g} s"),
+        ("substep", f"{size.dt:.6g} s, {size.substeps_per_frame} per frame"),
+        ("box", " x ".join(f"[{low:.9g}, {high:.9g}]" for low, high in size.bounds)),
+        ("bytes", sum(entry.bytes for entry in manifest.files)),
+    ]
+    return table(("", ""), rows)
+
+
+def _subsets(size: Size, manifest: Manifest) -> str:
+    rows = []
+    for subset, ids in size.subsets.items():
+        there = [entry for entry in manifest.files if entry.subset == subset]
+        digest = manifest.subset_sha256.get(subset)
+        rows.append(
+            (
+                subset,
+                spell_ids(ids),
+                f"{len(there)} of {len(ids)}",
+                sum(entry.frames for entry in there),
+                sum(entry.bytes for entry in there),
+                f"`{digest}`" if digest else "incomplete",
+            )
+        )
+    return table(("subset", "ids", "scenarios", "frames", "bytes", "hash"), rows)
+
+
+def _reading(size: Size) -> str:
+    code = (
+        "```python\n"
+        "import lagbench\n\n"
+        f'data = lagbench.open_split("{size.split}", subset="train", size="{size.name}")\n'
+        'position = data["position"]  # (scenario, frame, particle, space), read when computed\n'
+        "```"
+    )
+    plain = (
+        "One netCDF4 file per scenario, which `xarray.open_dataset` reads without lagbench. "
+        "Lengths are in units of the unit box, time in seconds. Frame 0 is the state when recording starts."
+    )
+    return f"{plain}\n\n{code}\n\n{table(('variable', 'dimensions', 'type', 'unit', 'meaning'), VARIABLES)}"
+
+
+def _task(size: Size, manifest: Manifest) -> str:
+    task = size.task
+    grid = f"{task.score_grid.cells} cells a side, {task.score_grid.placement.replace('_', ' ')}"
+    rows = [
+        ("input frames", str(task.input_frames)),
+        ("frames to predict", str(task.horizon)),
+        ("frames of interest", ", ".join(map(str, task.frames_of_interest))),
+        ("score grid", grid),
+        ("radius for graph models", f"{task.radius:g}"),
+        *_twin_floor(manifest),
+    ]
+    return table(("", ""), rows)
+
+
+def _twin_floor(manifest: Manifest) -> Iterator[tuple[str, str]]:
+    """Yield how far a twin that starts 2^-20 away drifts, where that was measured."""
+    floors = [entry.twin_floor for entry in manifest.files if entry.twin_floor]
+    if floors:
+        first, last = (sum(floor[i] for floor in floors) / len(floors) for i in (0, -1))
+        text = f"position RMSE {first:.3g} at the first predicted frame, {last:.3g} at the last"
+        yield ("twin that starts 2^-20 away", text)
+
+
+def _statistics(manifest: Manifest) -> Iterator[str]:
+    """Yield the statistics of train where there are any."""
+    if manifest.statistics:
+        yield "## Statistics of train"
+        yield "With the frame as unit of time: velocity is x(f) - x(f-1), acceleration its difference."
+        yield table(
+            ("", "x", "y"), [(name.replace("_", " "), *row) for name, row in manifest.statistics.items()]
+        )
+
+
+def _parameters(size: Size) -> str:
+    rows = [(f"`{name}`", _plain(p.value), p.unit, p.description) for name, p in size.parameters.items()]
+    return table(("parameter", "value", "unit", "meaning"), rows)
+
+
+def _plain(value: object) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _commands(size: Size, manifest: Manifest) -> str:
+    options = f"--split {size.split} --size {size.name}"
+    promise = (
+        "The files hold the same bits on every x86-64 Linux machine, with any number of workers."
+        if manifest.identity == "bitwise"
+        else "Some files come from a device that does not promise equal bits: they agree to a tolerance."
+    )
+    return (
+        f"{promise}\n\n"
+        "```sh\n"
+        "pip install 'lagbench[generate]'\n"
+        f"lagbench generate {options}\n"
+        f"lagbench verify {options}                 # re-hash every file\n"
+        f"lagbench verify {options} --regenerate 2  # simulate two scenarios again and compare\n"
+        "```"
+    )
+
+
+def _scenarios(manifest: Manifest) -> str:
+    names = sorted({name for entry in manifest.files for name in entry.facts})
+    rows = [_scenario_row(entry, names) for entry in manifest.files]
+    listing = table(
+        ("id", "file", "frames", *(name.replace("_", " ") for name in names), "content hash"), rows
+    )
+    return f"<details><summary>{len(rows)} files</summary>\n\n{listing}\n\n</details>"
+
+
+def _scenario_row(entry: FileEntry, names: list[str]) -> tuple[object, ...]:
+    facts = [f"{entry.facts[name]:.6g}" if name in entry.facts else "" for name in names]
+    return (entry.scenario, f"`{entry.path}`", entry.frames, *facts, f"`{entry.content_sha256}`")

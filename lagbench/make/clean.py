@@ -1,0 +1,103 @@
+"""Remove what killed writers left, or a generated data set."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+
+from lagbench.atomic import SUFFIX
+from lagbench.data.layout import MANIFEST_NAME, dataset_folder
+from lagbench.data.local import DESCRIPTION, locate
+from lagbench.data.lock import LOCK_NAME, dataset_lock
+from lagbench.data.registry import Registry, Size
+from lagbench.errors import WorkFailedError
+
+from .cards import CARD_NAME, CROISSANT_NAME, PICTURES
+
+__all__ = [
+    "CleanResult",
+    "clean",
+]
+
+
+CARDS = (MANIFEST_NAME, CARD_NAME, CROISSANT_NAME, *PICTURES)
+"""What lagbench writes beside the subsets."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CleanResult:
+    """What was, or with ``dry_run`` would be, removed."""
+
+    removed: tuple[Path, ...]  # the files
+    bytes: int  # their length together [bytes]
+    dry_run: bool  # whether they are still there
+
+
+def clean(
+    split: str,
+    size: str,
+    *,
+    root: str | Path | None = None,
+    leftovers: bool = False,
+    dry_run: bool = False,
+    registry: Registry | None = None,
+) -> CleanResult:
+    """Remove a generated data set; files that lagbench did not write stay.
+
+    Args:
+        split: name of the split.
+        size: name of the size.
+        root: folder of all data sets; else ``LAGBENCH_ROOT``, else the user data folder.
+        leftovers: remove only temporary files of killed writers.
+        dry_run: only say what would go; writes nothing, a lock neither.
+        registry: where splits are described; ours when None.
+
+    Raises:
+        UsageError: unknown split or size.
+        WorkFailedError: another process writes the data set, or a file cannot be removed.
+    """
+    tier, home, _ = locate(split, size, root=root, registry=registry)
+    folder = dataset_folder(home, tier.split, size, tier.major)
+    if not folder.is_dir():
+        return CleanResult(removed=(), bytes=0, dry_run=dry_run)
+    with nullcontext() if dry_run else dataset_lock(home, tier.split, size, tier.major, timeout=0):
+        found = tuple(_leftovers(folder) if leftovers else _generated(folder, tier))
+        length = sum(path.stat().st_size for path in found)
+        if not dry_run:
+            _remove(found)
+    if not dry_run and not leftovers:
+        _remove_empty(folder, stop=home)
+    return CleanResult(removed=found, bytes=length, dry_run=dry_run)
+
+
+def _leftovers(folder: Path) -> list[Path]:
+    return sorted(folder.rglob(f".*{SUFFIX}"))
+
+
+def _generated(folder: Path, size: Size) -> list[Path]:
+    """Return the files that lagbench wrote; nobody else's."""
+    scenarios = [folder / subset / f"{i:04d}.nc" for subset, ids in size.subsets.items() for i in ids]
+    cards = [folder / name for name in CARDS]
+    if not size.simulated:  # the description of a local split says nothing without its data
+        cards.append(folder.parents[1] / DESCRIPTION)
+    return sorted({path for path in (*scenarios, *cards, *_leftovers(folder)) if path.is_file()})
+
+
+def _remove(paths: Iterable[Path]) -> None:
+    for path in paths:
+        try:
+            path.unlink(missing_ok=True)
+        except OSError as error:
+            raise WorkFailedError("cannot remove a file", where=str(path), got=error.strerror) from error
+
+
+def _remove_empty(folder: Path, *, stop: Path) -> None:
+    """Remove folders that hold nothing any more, up to the root folder."""
+    (folder / LOCK_NAME).unlink(missing_ok=True)
+    for place in (*(child for child in folder.iterdir() if child.is_dir()), folder, *folder.parents):
+        if place == stop or any(place.iterdir()):
+            continue
+        if stop in place.parents:
+            place.rmdir()

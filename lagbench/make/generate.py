@@ -1,0 +1,419 @@
+"""Generate a data set: simulate what is missing, crash-safe, resumable, on all cores.
+
+A scenario's file appears whole or not at all, and the manifest is brought up to date after
+each, so that an interrupted generation goes on where it stopped and ends with the same bytes
+as an uninterrupted one.
+
+One generation: what is there, what is simulated, what is recorded.
+
+The parent process plans, hands scenarios to workers and keeps the manifest; it never
+simulates, so that Ctrl-C reaches it at once and a crash of the solver cannot take it along.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from lagbench.atomic import remove_leftovers
+from lagbench.data.layout import MANIFEST_NAME, dataset_folder, scenario_path
+from lagbench.data.local import locate
+from lagbench.data.lock import dataset_lock
+from lagbench.data.manifest import FileEntry, Manifest, describe_file, merge, read_manifest, write_manifest
+from lagbench.data.registry import Registry, Size, Split, spell_ids
+from lagbench.data.statistics import file_moments, round_digits, statistics
+from lagbench.errors import DataError, UsageError, check_installed, nearest
+from lagbench.generators.batch import SimulationJob
+from lagbench.generators.simulate import Simulated, scenario_key, simulate, twin_floors, twin_substeps
+from lagbench.generators.solver import Device
+from lagbench.store.publication import Publication, look_at, publication
+from lagbench.work.cluster import Cluster, await_file
+from lagbench.work.machine import environment_of, promises_bits
+from lagbench.work.pool import Event, Pool, Task, worker_count
+from lagbench.work.progress import Meter, Progress
+
+from .cards import card_texts, write_cards
+from .crew import Crew
+from .gather import gather
+from .plan import Estimate, Scenarios, Selection, check_disk, estimate, free_bytes, select
+from .verify import Finding, Look, compare, look
+
+__all__ = [
+    "Generation",
+    "GenerationResult",
+    "Progress",
+    "generate",
+    "parse_device",
+]
+
+
+BATCH_PARTICLES = 1 << 19
+"""Particles that a parallel device advances together at the most."""
+
+
+class Generation:
+    """Brings a data set folder to the state that its size describes."""
+
+    def __init__(
+        self,
+        size: Size,
+        root: Path,
+        device: Device,
+        crew: Crew,
+        meter: Meter,
+        *,
+        split: Split,
+        sources: Sequence[Path] = (),
+    ) -> None:
+        self.size, self.root, self.device, self.crew = size, root, device, crew
+        self.sources = sources  # other root folders to take finished scenarios from
+        # the store that the root folder is a working copy of; None for a plain folder
+        self.store: Publication | None = None
+        self.manifest = self._merged(None, [])  # what the folder holds, as far as is known
+        self.kept: list[int] = []  # ids whose files were there and right
+        self.to_do: Estimate = estimate(size, ())  # ids to simulate and what that takes
+        self.verdict = ""  # how the hashes compare with datasets.yaml, in words
+        self._meter = meter  # counts the work
+        self._split = split  # the split that the size belongs to
+        self._promised: list[int] = []
+
+    def survey(self, wanted: Sequence[int], *, force: bool = False) -> None:
+        """Find out what is there and what is to do; writes nothing."""
+        old = self._old_manifest()
+        held = self.store.held if self.store else {}
+        local = [i for i in self.size.scenarios if i not in held]
+        suspects = [i for i in local if i in wanted or self._has_changed(i, old)]
+        self._meter.begin("checking", total=len(suspects), scenarios=len(suspects))
+        good = [finding.entry for finding in self._examined(suspects, old) if finding.entry]
+        bad = set(suspects) - {entry.scenario for entry in good}
+        good += held.values()
+        kept = tuple(e for e in old.files if e.scenario not in bad)
+        self.manifest = self._merged(old.model_copy(update={"files": kept}), good)
+        self.kept = [i for i in wanted if i not in bad and not force]
+        self.to_do = estimate(self.size, [i for i in wanted if i not in self.kept])
+
+    def run(self, wanted: Sequence[int], *, force: bool = False) -> None:
+        """Simulate what is missing or wrong; write the manifest, compare, write cards."""
+        folder = dataset_folder(self.root, self.size.split, self.size.name, self.size.major)
+        remove_leftovers(folder)
+        for source in self.sources:
+            self._keep(gather(self.size, self.root, source, self._old_manifest()))
+        self.survey(wanted, force=force)
+        check_disk(self.root, self.to_do.bytes)
+        self._keep(self.manifest)
+        try:
+            self._simulate()
+        finally:
+            # The workers are gone by now; what they had not finished goes too.
+            remove_leftovers(folder)
+        self._record_statistics()
+        self.verdict = compare(self.size, self.manifest, promised=self._promised)
+        self._write_cards()
+
+    def missing(self) -> tuple[int, ...]:
+        """Return the ids of the size that the manifest does not hold."""
+        return tuple(i for i in self.size.scenarios if self.manifest.entry(i) is None)
+
+    def _old_manifest(self) -> Manifest:
+        """Return the manifest on disk, an empty one where there is none that can be read."""
+        try:
+            old = read_manifest(self.root, self.size.split, self.size.name, self.size.major)
+        except DataError:  # it is written anew from the files
+            old = None
+        return self._merged(old, [])
+
+    def _examined(self, suspects: Sequence[int], old: Manifest) -> list[Finding]:
+        orders = {
+            f"scenario {i}": Look(root=self.root, size=self.size, scenario=i, manifest=old.only(i))
+            for i in suspects
+        }
+        return self.crew.read(look, orders, map(self._path, suspects), self._count_files)
+
+    def _count_files(self, files: int) -> None:
+        self._meter.count(files, scenarios=files)
+
+    def _path(self, scenario: int) -> Path:
+        return scenario_path(self.root, scenario_key(self.size, scenario))
+
+    def _has_changed(self, scenario: int, old: Manifest) -> bool:
+        """Return whether a file came, went, or has another length than the manifest says."""
+        entry, path = old.entry(scenario), self._path(scenario)
+        return (path.stat().st_size if path.exists() else None) != (entry.bytes if entry else None)
+
+    def _merged(
+        self,
+        base: Manifest | None,
+        files: Sequence[FileEntry],
+        environment: Mapping[str, str] | None = None,
+    ) -> Manifest:
+        return merge(
+            base,
+            files,
+            split=self.size.split,
+            size=self.size.name,
+            version=self.size.version,
+            subsets=self.size.subsets,
+            environment=environment,
+            recorded=self.size.measured.scenario_sha256 if self.size.measured else None,
+        )
+
+    def _simulate(self) -> None:
+        """Run everything that is to do in workers, and the twins of test scenarios."""
+        twins = [i for i in self.kept if self._lacks_twin(i)]
+        self._bring(twins)
+        tasks = [*self._tasks(), *(self._twin(i) for i in twins)]
+        if not tasks:
+            return
+        total = round(sum(task.cost for task in tasks))
+        total += sum(twin_substeps(self.size, i) for i in self.to_do.scenarios if self._is_test(i))
+        self._meter.begin("simulating", total=total, scenarios=len(self.to_do.scenarios))
+        folder = dataset_folder(self.root, self.size.split, self.size.name, self.size.major)
+        with self.crew.simulating(len(tasks), self.device, folder) as crew:
+            for task in tasks:
+                crew.submit(task)
+            for event in crew.events():
+                self._take(event, crew)
+
+    def _tasks(self) -> list[Task]:
+        """Return one task per batch of scenarios of similar length."""
+        costs = dict(zip(self.to_do.scenarios, self.to_do.substeps, strict=True))
+        longest_first = sorted(costs, key=lambda i: (-costs[i], i))
+        width = 1 if self.device is Device.CPU else max(1, BATCH_PARTICLES // self.size.particles)
+        batches = [tuple(longest_first[k : k + width]) for k in range(0, len(longest_first), width)]
+        return [
+            Task(
+                name=f"{self.size.split} {self.size.name}, scenario {spell_ids(batch)}",
+                function=simulate,
+                arguments=(self._job(batch),),
+                cost=sum(costs[i] for i in batch),
+            )
+            for batch in batches
+        ]
+
+    def _twin(self, scenario: int) -> Task:
+        return Task(
+            name=f"{self.size.split} {self.size.name}, twin of scenario {scenario}",
+            function=twin_floors,
+            arguments=(self._job((scenario,)),),
+            cost=twin_substeps(self.size, scenario),
+        )
+
+    def _job(self, scenarios: tuple[int, ...]) -> SimulationJob:
+        return SimulationJob(size=self.size, scenarios=scenarios, root=self.root, device=self.device)
+
+    def _is_test(self, scenario: int) -> bool:
+        return self.size.subset_of(scenario) == "test"
+
+    def _lacks_twin(self, scenario: int) -> bool:
+        entry = self.manifest.entry(scenario)
+        return self._is_test(scenario) and (entry is None or not entry.twin_floor)
+
+    def _take(self, event: Event, crew: Pool | Cluster) -> None:
+        """Act on news from a worker."""
+        if event.kind == "progress":
+            self._meter.count(event.value)
+        elif event.kind == "lost":
+            self._meter.count(-event.value)
+        elif event.task.function is simulate:
+            self._take_outcomes(event.value, crew, event.machine or environment_of(self.device))
+        else:
+            self._take_floors(event.value)
+
+    def _take_outcomes(
+        self, outcomes: Sequence[Simulated], crew: Pool | Cluster, machine: Mapping[str, str]
+    ) -> None:
+        environment = {**machine, "device": self.device.value}
+        if promises_bits(environment):
+            self._promised += [outcome.scenario for outcome in outcomes]
+        for outcome in outcomes:
+            await_file(self._path(outcome.scenario))
+        entries = [
+            describe_file(self.root, scenario_key(self.size, outcome.scenario), outcome.facts)
+            for outcome in outcomes
+        ]
+        self._keep(self._merged(self.manifest, entries, environment))
+        self._meter.count(scenarios=len(entries))
+        for outcome in outcomes:
+            if self._is_test(outcome.scenario):
+                crew.submit(self._twin(outcome.scenario))
+
+    def _take_floors(self, floors: dict[int, tuple[float, ...]]) -> None:
+        entries = [
+            entry.model_copy(update={"twin_floor": tuple(map(round_digits, floors[entry.scenario]))})
+            for entry in self.manifest.files
+            if entry.scenario in floors
+        ]
+        self._keep(self._merged(self.manifest, entries))
+
+    def _keep(self, manifest: Manifest) -> None:
+        self.manifest = manifest
+        folder = dataset_folder(self.root, self.size.split, self.size.name, self.size.major)
+        if manifest.files or (folder / MANIFEST_NAME).exists():
+            write_manifest(self.root, manifest)
+            if self.store:
+                self.store.follow(manifest)
+
+    def _bring(self, scenarios: Iterable[int]) -> None:
+        """Have files of scenarios here that only the store holds."""
+        if self.store:
+            self.store.bring(scenarios)
+
+    def _record_statistics(self) -> None:
+        """Bring the statistics of train up to date and write the manifest."""
+        manifest, train, measured = self.manifest, self.size.subsets["train"], self.size.measured
+        # Those of other bits differ from datasets.yaml by right.
+        doubted = measured and manifest.identity == "bitwise" and manifest.statistics != measured.statistics
+        if "train" in manifest.subset_sha256 and (doubted or not manifest.statistics):
+            self._bring(train)
+            self._meter.begin("statistics", total=len(train), scenarios=len(train))
+            paths = {f"scenario {i}": self._path(i) for i in train}
+            moments = self.crew.read(file_moments, paths, paths.values(), self._count_files)
+            manifest = manifest.model_copy(update={"statistics": statistics(moments)})
+        self._keep(manifest)
+
+    def _write_cards(self) -> None:
+        self._meter.begin("cards", total=1, scenarios=len(self.manifest.files))
+        if self.store and self.store.is_settled(
+            self.manifest, card_texts(self.size, self._split, self.manifest)
+        ):
+            return
+        self._bring(self.size.scenarios)
+        cards = write_cards(self.root, self.size, self._split, self.manifest)
+        if self.store:
+            self.store.finish(self.manifest, cards)
+
+
+@dataclass(frozen=True, kw_only=True)
+class GenerationResult:
+    """What a generation did, or would do."""
+
+    split: str  # name of the split
+    size: str  # name of the size
+    version: str  # semantic version
+    root: Path  # folder of all data sets
+    folder: Path  # folder of this one
+    device: str  # where the solver ran
+    workers: int  # worker processes
+    simulated: tuple[int, ...]  # ids that were (dry run: would be) simulated
+    kept: tuple[int, ...]  # ids whose files were there and right
+    missing: tuple[int, ...]  # ids of the size that are still not there
+    bytes_needed: int  # disk space of 'simulated' before compression [bytes]
+    bytes_free: int  # free disk space before the start [bytes]
+    seconds_expected: float  # expected time [s], for orientation
+    seconds: float = 0.0  # time that it took [s]
+    complete: bool = False  # whether train, valid and test are all there
+    dataset_sha256: str | None = None  # data set hash, once complete
+    verdict: str = ""  # how the hashes compare with datasets.yaml, in words
+    dry_run: bool = False  # whether nothing was done
+
+
+def generate(
+    split: str,
+    size: str = "full",
+    *,
+    subset: Selection = None,
+    scenarios: Scenarios = None,
+    root: str | Path | None = None,
+    workers: int | None = None,
+    device: str = "cpu",
+    scheduler: str | None = None,
+    gather: Sequence[str | Path] = (),
+    force: bool = False,
+    dry_run: bool = False,
+    progress: Callable[[Progress], None] | None = None,
+    on_wait: Callable[[str], None] | None = None,
+    registry: Registry | None = None,
+) -> GenerationResult:
+    """Simulate the scenarios of a split that are not on disk yet, and check their hashes.
+
+    Args:
+        split: name of the split.
+        size: name of the size.
+        subset: some subsets only.
+        scenarios: some ids only, as numbers or as text such as "0,3-5".
+        root: folder of all data sets; else ``LAGBENCH_ROOT``, else the user data folder. With a
+            URL (``s3://bucket/prefix``) files are written to its working copy and put into the
+            store, see docs/scaling.md.
+        workers: worker processes; one per core, or one for the parallel devices.
+        device: "cpu", "parallel" or "cuda"; the bits do not depend on it.
+        scheduler: address of a Dask scheduler whose workers simulate instead; they must see
+            the root folder under the same path.
+        gather: other root folders, from which finished scenarios are taken first.
+        force: simulate anew what is there and right.
+        dry_run: only say what it would take.
+        progress: called as the work advances.
+        on_wait: called with the holder in words when another process holds the lock.
+        registry: where splits are described; ours when None.
+
+    Raises:
+        UsageError: unknown split, size, subset, scenario or device, fewer than one worker, or
+            Taichi is not installed; or nothing can be gathered from a folder.
+        WorkFailedError: disk full or not writable, a scenario blew up, workers keep dying, the
+            cluster is lost or does not see the root folder; or the store refuses, does not answer,
+            or knows no conditional put.
+        DataError: the result has other hashes than datasets.yaml, or there is no such bucket.
+    """
+    started = time.monotonic()
+    tier, folder, splits = locate(split, size, root=root, registry=registry)
+    wanted = select(tier, subset=subset, scenarios=scenarios)
+    target = parse_device(device)
+    cores = worker_count(workers, default=None if target.value == "cpu" else 1)
+    free = free_bytes(dataset_folder(folder, tier.split, size, tier.major))
+    campaign = Generation(
+        tier,
+        folder,
+        target,
+        Crew(workers=cores, scheduler=scheduler),
+        Meter(progress),
+        split=splits.split(tier.split),
+        sources=[Path(source).expanduser().absolute() for source in gather],
+    )
+    if dry_run:
+        campaign.store = look_at(tier, folder)
+        campaign.survey(wanted, force=force)
+    else:
+        if scheduler is None:
+            check_installed("taichi", extra="generate")
+        with (
+            dataset_lock(folder, tier.split, size, tier.major, on_wait=on_wait),
+            publication(tier, folder, on_wait=on_wait) as campaign.store,
+        ):
+            campaign.run(wanted, force=force)
+    seconds = time.monotonic() - started
+    return _result(campaign, bytes_free=free, seconds=seconds, dry_run=dry_run)
+
+
+def _result(campaign: Generation, *, bytes_free: int, seconds: float, dry_run: bool) -> GenerationResult:
+    size = campaign.size
+    return GenerationResult(
+        split=size.split,
+        size=size.name,
+        version=size.version,
+        root=campaign.root,
+        folder=dataset_folder(campaign.root, size.split, size.name, size.major),
+        device=campaign.device.value,
+        workers=campaign.crew.workers,
+        simulated=campaign.to_do.scenarios,
+        kept=tuple(campaign.kept),
+        missing=campaign.missing(),
+        bytes_needed=campaign.to_do.bytes,
+        bytes_free=bytes_free,
+        seconds_expected=campaign.to_do.seconds(campaign.crew.workers),
+        seconds=seconds,
+        complete=campaign.manifest.complete,
+        dataset_sha256=campaign.manifest.dataset_sha256,
+        verdict=campaign.verdict,
+        dry_run=dry_run,
+    )
+
+
+def parse_device(name: str) -> Device:
+    """Return a device by name."""
+    from lagbench.generators.solver import Device
+
+    names = [device.value for device in Device]
+    if name not in names:
+        raise UsageError(f"no device {name!r}", where="--device", fix=nearest(name, names))
+    return Device(name)

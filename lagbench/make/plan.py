@@ -1,0 +1,149 @@
+"""What a generation will simulate, and the bytes and time that it takes.
+
+Nothing here writes; drawing the initial states tells how many substeps lie ahead.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from lagbench.data.registry import Size, parse_ids, spell_ids
+from lagbench.errors import UsageError, WorkFailedError, nearest
+
+__all__ = [
+    "Estimate",
+    "check_disk",
+    "estimate",
+    "free_bytes",
+    "scenario_bytes",
+    "select",
+]
+
+
+SECONDS_PER_PARTICLE_SUBSTEP = 45e-9
+"""Orientation for one core [s]; benchmarks/ measures it."""
+
+SECONDS_PER_FRAME = 1.5e-3
+"""Orientation for reading, checking and writing one frame of a scenario [s]."""
+
+BYTES_PER_PARTICLE = 2 * 2 * 4
+"""Position and velocity in one frame, two float32 each, before compression [bytes]."""
+
+BYTES_BESIDE_FRAMES = 64 * 1024
+"""Header, constants and chunk index of a file, generously [bytes]."""
+
+Selection = str | Sequence[str] | None
+Scenarios = str | Iterable[int] | None
+
+
+def _names(subset: Selection) -> tuple[str, ...]:
+    if subset is None:
+        return ()
+    return tuple(subset.replace(" ", "").split(",")) if isinstance(subset, str) else tuple(subset)
+
+
+def select(size: Size, *, subset: Selection = None, scenarios: Scenarios = None) -> tuple[int, ...]:
+    """Return the scenario ids that a user means, ascending."""
+    names = _names(subset) or tuple(size.subsets)
+    for name in names:
+        if name not in size.subsets:
+            raise UsageError(
+                f"{size.split} {size.name} has no subset {name!r}",
+                where="--subset",
+                fix=nearest(name, size.subsets),
+            )
+    held = {i for name in names for i in size.subsets[name]}
+    if scenarios is None:
+        return tuple(sorted(held))
+    wanted = parse_ids(scenarios) if isinstance(scenarios, str) else tuple(scenarios)
+    strangers = [i for i in wanted if i not in held]
+    if strangers or not wanted:
+        raise UsageError(
+            f"no scenario {spell_ids(strangers) or 'at all'} in {', '.join(names)}",
+            where=f"--scenarios, {size.split} {size.name}",
+            expected="; ".join(f"{name} {spell_ids(size.subsets[name])}" for name in names),
+            got=spell_ids(wanted),
+        )
+    return tuple(sorted(set(wanted)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """What simulating some scenarios takes."""
+
+    scenarios: tuple[int, ...]  # their ids, ascending
+    substeps: tuple[int, ...]  # substeps of each, in the same order
+    frames: int  # frames that they record together
+    bytes: int  # disk space, before compression [bytes]; files come out a little smaller
+    core_seconds: float  # time on one core [s], for orientation
+
+    def seconds(self, workers: int) -> float:
+        """Return the time with some workers [s]: shared evenly, but never below the longest."""
+        if not self.substeps:
+            return 0.0
+        longest = self.core_seconds * max(self.substeps) / sum(self.substeps)
+        return max(self.core_seconds / workers, longest)
+
+
+def scenario_bytes(size: Size, scenario: int) -> int:
+    """Return the most bytes that a scenario's file takes, in sum over a data set."""
+    return size.frame_count(scenario) * size.particles * BYTES_PER_PARTICLE + BYTES_BESIDE_FRAMES
+
+
+def estimate(size: Size, scenarios: Sequence[int]) -> Estimate:
+    """Return what simulating these scenarios takes."""
+    if not size.simulated:
+        raise UsageError(
+            "a local split cannot be simulated",
+            where=f"{size.split} {size.name}",
+            fix="lagbench import or lagbench adopt makes it again from the data that it came from",
+        )
+    from lagbench.generators.batch import solver_constants, substeps_of
+
+    solver_constants(size)
+    substeps = tuple(substeps_of(size, i) for i in scenarios)
+    frames = sum(size.frame_count(i) for i in scenarios)
+    simulating = sum(substeps) * size.particles * SECONDS_PER_PARTICLE_SUBSTEP
+    return Estimate(
+        scenarios=tuple(scenarios),
+        substeps=substeps,
+        frames=frames,
+        bytes=sum(scenario_bytes(size, i) for i in scenarios),
+        core_seconds=simulating + frames * SECONDS_PER_FRAME,
+    )
+
+
+def free_bytes(folder: Path) -> int:
+    """Return the free space of the file system that holds, or would hold, a folder [bytes].
+
+    Raises:
+        WorkFailedError: nothing can be written there: the nearest existing parent is a file, or
+            is not ours to write.
+    """
+    existing = next(place for place in (folder, *folder.parents) if place.exists())
+    if not existing.is_dir() or not os.access(existing, os.W_OK | os.X_OK):
+        raise WorkFailedError(
+            "no data set can be written here",
+            where=str(folder),
+            expected="a folder that you may write to",
+            got=f"{existing} is {'write-protected' if existing.is_dir() else 'a file'}",
+            fix="name another folder: --root or LAGBENCH_ROOT",
+        )
+    return shutil.disk_usage(existing).free
+
+
+def check_disk(root: Path, needed: int) -> None:
+    """Refuse to start what cannot fit."""
+    free = free_bytes(root)
+    if free < needed:
+        raise WorkFailedError(
+            "not enough disk space",
+            where=str(root),
+            expected=f"{needed} bytes free",
+            got=f"{free} bytes free",
+            fix="free disk space, name another folder with --root, or fewer scenarios with --scenarios",
+        )

@@ -1,0 +1,227 @@
+"""HTML and SVG as text that cannot be broken out of: plain strings are always escaped.
+
+>>> tag("p", "a < b", tag("b", "!"), class_="note")
+'<p class="note">a &lt; b<b>!</b></p>'
+
+Numbers as readers like them: few digits, real minus signs, powers of ten raised.
+
+Names of metrics and frames as readers read them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from unicodedata import east_asian_width
+
+from lagbench.metrics import Metric
+
+__all__ = [
+    "Markup",
+    "escaped",
+    "join",
+    "path_data",
+    "tag",
+    "MISSING",
+    "decimals",
+    "html",
+    "interval",
+    "power",
+    "text",
+    "clipped",
+    "quantity",
+    "sentence",
+    "unit",
+    "words",
+]
+
+
+VOID = frozenset({"br", "col", "hr", "img", "link", "meta"})
+"""Elements of HTML without an end tag."""
+
+SHAPES = frozenset({"circle", "line", "path", "rect", "stop", "use"})
+"""Elements of SVG that close themselves."""
+
+_ESCAPES = {ord("&"): "&amp;", ord("<"): "&lt;", ord(">"): "&gt;", ord('"'): "&quot;", ord("'"): "&#39;"}
+_UNPRINTABLE = dict.fromkeys((*range(9), 11, 12, *range(14, 32), *range(127, 160)), "�")
+# marks that turn the direction of the text around them
+_TURNING = dict.fromkeys((1564, 8206, 8207, *range(8234, 8239), *range(8294, 8298)), "�")
+_TABLE = _ESCAPES | _UNPRINTABLE | _TURNING
+
+
+class Markup(str):
+    """Text that is HTML already; only this module and :func:`tag` make it from strangers' text."""
+
+    __slots__ = ()
+
+
+def escaped(text: object) -> Markup:
+    """Return any text as HTML that shows it.
+
+    Control characters, lone surrogates and marks that turn the text direction become U+FFFD.
+
+    >>> escaped('<script>"&"')
+    '&lt;script&gt;&quot;&amp;&quot;'
+    """
+    if isinstance(text, Markup):
+        return text
+    whole = str(text).encode("utf-8", "replace").decode("utf-8")
+    return Markup(whole.translate(_TABLE))
+
+
+def join(parts: Iterable[object], separator: object = "") -> Markup:
+    """Return parts one after the other, those that are no markup escaped."""
+    return Markup(escaped(separator).join(escaped(part) for part in parts))
+
+
+def tag(name: str, /, *children: object, **attributes: object) -> Markup:
+    """Return an element; children and values that are no markup are escaped."""
+    spelled = "".join(_attribute(key, value) for key, value in attributes.items())
+    if name in VOID:
+        return Markup(f"<{name}{spelled}>")
+    if name in SHAPES and not children:
+        return Markup(f"<{name}{spelled}/>")
+    return Markup(f"<{name}{spelled}>{join(children)}</{name}>")
+
+
+def _attribute(key: str, value: object) -> str:
+    if value is None or value is False:
+        return ""
+    name = key.rstrip("_").replace("_", "-")
+    return f" {name}" if value is True else f' {name}="{escaped(value)}"'
+
+
+def path_data(points: Iterable[tuple[float, float]]) -> str:
+    """Return SVG path data through points; a point that is no number leaves a gap.
+
+    >>> nan = float("nan")
+    >>> path_data([(0, 0), (1, 2.25), (nan, 0), (3, 3)])
+    'M0 0L1 2.2M3 3h0'
+    """
+    pieces: list[list[str]] = [[]]
+    for x, y in points:
+        if x - x == 0.0 and y - y == 0.0:
+            pieces[-1].append(f"{_short(x)} {_short(y)}")
+        elif pieces[-1]:
+            pieces.append([])
+    return "".join(
+        f"M{piece[0]}h0" if len(piece) == 1 else "M" + "L".join(piece) for piece in pieces if piece
+    )
+
+
+def _short(value: float) -> str:
+    text = f"{value:.1f}".removesuffix(".0")
+    return "0" if text == "-0" else text
+
+
+MISSING = "–"
+"""What stands where there is no number."""
+
+DIGITS = 3
+"""Significant digits."""
+
+PLAIN = (-3, 5)
+"""Powers of ten between which numbers are written out."""
+
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def power(exponent: int) -> str:
+    """Return a power of ten.
+
+    >>> power(-4)
+    '10⁻⁴'
+    """
+    return f"10{str(exponent).translate(_RAISED)}"
+
+
+def text(value: float, digits: int = DIGITS) -> str:
+    """Return a number with so many significant digits.
+
+    >>> text(0.012345), text(-2.5e-7), text(1200000.0), text(20.0), text(math.nan)
+    ('0.0123', '−2.50×10⁻⁷', '1.20×10⁶', '20', '–')
+    """
+    if not math.isfinite(value):
+        return MISSING if math.isnan(value) else ("∞" if value > 0 else "−∞")
+    if value == 0.0:
+        return "0"
+    if value == int(value) and abs(value) < 10.0 ** PLAIN[1]:
+        return _minus(str(int(value)))
+    mantissa, _, exponent = f"{value:.{digits - 1}e}".partition("e")
+    order = int(exponent)
+    if PLAIN[0] <= order < PLAIN[1]:
+        return _minus(f"{float(f'{mantissa}e{order}'):.{max(0, digits - 1 - order)}f}")
+    return f"{_minus(mantissa)}×{power(order)}"
+
+
+def html(value: float) -> Markup:
+    """Return a number as markup that keeps together."""
+    return tag("span", text(value), class_="n")
+
+
+def interval(bounds: tuple[float, float]) -> Markup:
+    """Return an interval as markup; nothing where there is none."""
+    low, high = bounds
+    if math.isnan(low) or math.isnan(high):
+        return Markup("")
+    return tag("span", join([text(low), text(high)], " … "), class_="ci")
+
+
+def decimals(values: Sequence[float], step: float) -> list[str]:
+    """Return multiples of a step with just the decimals that the step needs.
+
+    >>> decimals([-0.5, 0.0, 0.5], 0.5)
+    ['−0.5', '0', '0.5']
+    """
+    places = max(0, -math.floor(math.log10(step) + 1e-9))
+    while places < 9 and abs(round(step, places) - step) > 1e-9 * step:
+        places += 1
+    return [_minus(f"{value:.{places}f}") if abs(value) > step / 1e6 else "0" for value in values]
+
+
+def _minus(written: str) -> str:
+    return written.replace("-", "−")
+
+
+_CAPITALS = {"mse": "MSE", "mae": "MAE", "rmse": "RMSE", "kl": "KL", "w1": "W1", "w2": "W2"}
+_OTHERS = {"pearson": "correlation", "avg": "average", "hist": "histogram", "abs": "magnitudes"}
+
+
+def words(name: str, *, capital: bool = False) -> str:
+    """Return the name of a metric as words.
+
+    >>> words("vorticity_rmse"), words("mse_avg", capital=True), words("energy_error", capital=True)
+    ('vorticity RMSE', 'MSE average', 'Energy error')
+    """
+    written = " ".join(_CAPITALS.get(part) or _OTHERS.get(part, part) for part in name.split("_"))
+    return written[0].upper() + written[1:] if capital else written
+
+
+def clipped(name: str, room: int = 34) -> str:
+    """Return a name that takes no more room than so many narrow letters.
+
+    >>> clipped("SuperGAT with a loss of six terms", room=12)
+    'SuperGAT wi…'
+    """
+    widths = [2 if east_asian_width(letter) in "WF" else 1 for letter in name]
+    if sum(widths) <= room:
+        return name
+    kept = 0
+    while sum(widths[: kept + 1]) < room:
+        kept += 1
+    return f"{name[:kept]}…"
+
+
+def unit(metric: Metric) -> str:
+    """Return the unit in brackets with a space before it, nothing for pure numbers."""
+    return "" if metric.unit == "1" else f" [{metric.unit.replace('^2', '²')}]"
+
+
+def quantity(metric: Metric) -> str:
+    """Return what an axis shows: name and unit."""
+    return words(metric.name) + unit(metric)
+
+
+def sentence(metric: Metric) -> str:
+    """Return what a metric says, its unit and where it is defined, as one sentence."""
+    return f"{metric.summary[0].upper()}{metric.summary[1:]}{unit(metric)} ({metric.source})."

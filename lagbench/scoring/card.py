@@ -1,0 +1,269 @@
+"""The score card: what the scorer says of one submission, and its form as scores.json.
+
+It holds no time, host or path, and reductions run in id order: the same predictions give the
+same bytes. Numbers have nine significant digits; what is undefined is null.
+
+Scores as a scores.json tells them, which may come from anybody: checked before they are used.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lagbench.atomic import write_atomically
+from lagbench.data.statistics import round_digits
+from lagbench.errors import UnreadableFileError
+from lagbench.metrics import Comparison, Metric, Score, Setting, Tally, available, bootstrap_interval, compare
+from lagbench.metrics.reductions import mean
+from lagbench.submission import Finding, Header
+from lagbench.submission.format_checks import MAX_NAME
+
+from .flags import Flag
+from .scenario import SUBMISSION, Preview
+
+__all__ = [
+    "FORMAT",
+    "IDENTITY",
+    "JSON_NAME",
+    "ScoreCard",
+    "digits",
+    "write_json",
+    "PublishedScores",
+    "parse_scores",
+    "read_scores",
+    "unreadable_scores",
+]
+
+
+FORMAT = 1
+"""Number of the layout of scores.json and scores.nc; stored as ``lagbench_scores``."""
+
+JSON_NAME = "scores.json"
+
+IDENTITY = ("split", "size", "dataset_version", "dataset_sha256", "method")
+"""What says which data set was predicted, and by what."""
+
+LABELS = ("seconds_per_frame", "device", "seed", "parameters", "training")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ScoreCard:
+    """What the scorer says of one submission."""
+
+    header: Header  # what the predictions say about themselves
+    predictions_sha256: str  # content hash of the predicted positions
+    setting: Setting  # the task, as metrics see it
+    ranking: str  # name of the metric that ranks
+    # statistics by row (submission, persistence, constant-velocity) and scenario
+    tallies: Mapping[str, Mapping[int, Tally]]
+    scores: Mapping[str, Mapping[str, Score]]  # scores by row and metric
+    flags: tuple[Flag, ...]  # what a reader should know
+    warnings: tuple[Finding, ...]  # findings of the validation that do not reject
+    preview: Preview  # pictures of the first scenario
+    files: tuple[Path, ...] = ()  # scores.json and scores.nc, where they were written
+
+    @property
+    def scenarios(self) -> tuple[int, ...]:
+        """Ids of the scenarios, ascending."""
+        return tuple(sorted(self.tallies[SUBMISSION]))
+
+    @property
+    def reported_frames(self) -> tuple[int, ...]:
+        """Frames of interest, and the last one."""
+        return tuple(sorted(self.setting.slow_frames.intersection(self.setting.predicted_frames)))
+
+    @property
+    def submission(self) -> Mapping[str, Score]:
+        """Scores of the submission, by metric."""
+        return self.scores[SUBMISSION]
+
+    def against(self, row: str) -> Comparison:
+        """Compare the submission with a floor in the ranking metric."""
+        return compare(self.submission[self.ranking], self.scores[row][self.ranking])
+
+    def at(self, path: Path, *more: Path) -> ScoreCard:
+        """Return this card with the files that it was written to."""
+        return replace(self, files=(path, *more))
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the card as what scores.json holds."""
+        header, setting = self.header, self.setting
+        used = [score.metric for score in self.submission.values()]
+        floors = [row for row in self.scores if row != SUBMISSION]
+        return {
+            "lagbench_scores": FORMAT,
+            **{name: getattr(header, name) for name in IDENTITY},
+            "predictions_sha256": self.predictions_sha256,
+            **{name: getattr(header, name) for name in LABELS if getattr(header, name) is not None},
+            "diverged_at": {str(i): frame for i, frame in sorted(header.diverged_at.items())},
+            "task": {
+                "input_frames": setting.input_frames,
+                "horizon": setting.horizon,
+                "frames": list(self.reported_frames),
+                "scenarios": list(self.scenarios),
+            },
+            "ranking_metric": self.ranking,
+            "metrics": {metric.name: _described(metric) for metric in used},
+            "rows": {
+                row: {name: self._score(score, row) for name, score in scores.items()}
+                for row, scores in self.scores.items()
+            },
+            "against": {row: _comparison(self.against(row)) for row in floors},
+            "flags": {flag.name: _flag(flag) for flag in self.flags},
+            "warnings": [{"check": f.check, "what": f.what, "got": f.got} for f in self.warnings],
+        }
+
+    def _score(self, score: Score, row: str) -> dict[str, Any]:
+        said: dict[str, Any] = {
+            "mean": digits(score.mean),
+            "interval": [digits(bound) for bound in score.interval],
+            "values": [digits(value) for value in score.values.tolist()],
+            "undefined": list(score.undefined),
+        }
+        if score.metric.per_frame:
+            said["at"] = {str(frame): _at(score, frame, row) for frame in self.reported_frames}
+        return said
+
+
+def digits(value: float) -> float | None:
+    """Return a number with nine significant digits, None where it is none.
+
+    >>> digits(2 / 3)
+    0.666666667
+    """
+    return round_digits(value) if math.isfinite(value) else None
+
+
+def _at(score: Score, frame: int, row: str) -> dict[str, Any]:
+    values = score.at(frame)
+    said: dict[str, Any] = {"mean": digits(mean(values))}
+    if row == SUBMISSION:
+        said["interval"] = [digits(bound) for bound in bootstrap_interval(values)]
+    return said
+
+
+def _described(metric: Metric) -> dict[str, Any]:
+    return {
+        "family": metric.family,
+        "unit": metric.unit,
+        "direction": str(metric.direction),
+        "perfect": metric.perfect,
+        "source": metric.source,
+        "summary": metric.summary,
+    }
+
+
+def _comparison(found: Comparison) -> dict[str, Any]:
+    return {
+        "metric": found.metric,
+        "difference": digits(found.difference),
+        "interval": [digits(bound) for bound in found.interval],
+        "p": digits(found.p),
+    }
+
+
+def _flag(flag: Flag) -> dict[str, Any]:
+    numbers = {name: digits(value) for name, value in flag.evidence.items()}
+    return {"raised": flag.raised, "reasons": list(flag.reasons), "evidence": numbers}
+
+
+def write_json(card: ScoreCard, path: Path) -> None:
+    """Write scores.json, whole or not at all."""
+    text = json.dumps(card.as_json(), indent=1, allow_nan=False, ensure_ascii=False)
+    write_atomically(path, f"{text}\n".encode(), option="--output")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PublishedScores:
+    """What a scores.json says, as far as another submission can be compared with it."""
+
+    identity: Mapping[str, str]  # split, size, version and hash of the data set, and the method
+    predictions_sha256: str  # content hash of the predicted positions
+    ranking: str  # name of the metric that ranks
+    # scores by row and metric, over the horizon; values per frame are not in the file
+    scores: Mapping[str, Mapping[str, Score]]
+
+
+def read_scores(path: Path) -> PublishedScores:
+    """Read a scores.json; metrics that are not installed here are left out."""
+    try:
+        return parse_scores(json.loads(path.read_bytes()))
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError) as error:
+        raise unreadable_scores(path, error) from error
+    except RecursionError as error:
+        # its own trace is a thousand frames long and says no more
+        raise unreadable_scores(path, error) from None
+
+
+def unreadable_scores(path: Path, error: Exception) -> UnreadableFileError:
+    """Return the error for a file that is not the scores.json or scores.nc that its name promises."""
+    return UnreadableFileError(
+        f"not a scores{path.suffix} of lagbench",
+        where=str(path),
+        expected="what `lagbench score` writes beside the predictions",
+        got=f"{type(error).__name__}: {str(error)[:MAX_NAME]}",
+        fix="score the predictions again: lagbench score predictions.nc",
+    )
+
+
+def parse_scores(held: Mapping[str, Any]) -> PublishedScores:
+    """Return what a score card as JSON says: :meth:`ScoreCard.as_json`, or a scores.json."""
+    if held["lagbench_scores"] != FORMAT:
+        raise ValueError(f"layout {str(held['lagbench_scores'])[:MAX_NAME]!r}, not {FORMAT}")
+    ids = tuple(_integer(i, "an id") for i in held["task"]["scenarios"])
+    if len(set(ids)) < len(ids):
+        raise ValueError("scenario ids that occur twice")
+    known = available()
+    return PublishedScores(
+        identity={name: _text(held, name) for name in IDENTITY},
+        predictions_sha256=_text(held, "predictions_sha256"),
+        ranking=_text(held, "ranking_metric"),
+        scores={
+            row: {n: _read_score(known[n], ids, said) for n, said in scores.items() if n in known}
+            for row, scores in held["rows"].items()
+        },
+    )
+
+
+def _text(held: Mapping[str, Any], name: str) -> str:
+    """Return text under the rule for attributes of predictions: it goes to terminals as it is."""
+    text = held[name]
+    if not isinstance(text, str) or not text.strip() or len(text) > MAX_NAME or not text.isprintable():
+        raise ValueError(f"{name} is not printable text of 1 to {MAX_NAME} characters")
+    return text
+
+
+def _read_score(metric: Metric, ids: tuple[int, ...], said: Mapping[str, Any]) -> Score:
+    values = _floats(said["values"])
+    undefined = tuple(_integer(count, "a number of frames") for count in said["undefined"])
+    for numbers in (values, undefined):
+        if len(numbers) != len(ids):
+            raise ValueError(f"{metric.name}: {len(numbers)} values of {len(ids)} scenarios")
+    return Score(
+        metric=metric,
+        scenarios=ids,
+        frames=(),
+        per_frame=np.empty((len(ids), 0)),
+        values=np.array(values),
+        undefined=undefined,
+    )
+
+
+def _integer(number: object, what: str) -> int:
+    if not isinstance(number, int) or not 0 <= number < 2**31:
+        raise ValueError(f"{what} is no integer from 0 to 2^31 - 1")
+    return int(number)
+
+
+def _floats(values: Iterable[float | None]) -> list[float]:
+    found = [math.nan if value is None else float(value) for value in values]
+    if any(math.isinf(value) for value in found):
+        raise ValueError("an infinite value")
+    return found

@@ -1,0 +1,215 @@
+"""One scenario of a submission against the truth: the unit of work that is spread.
+
+The truth's snapshots and fields are formed once for the submission and both floors; memory
+is that of a few frames, whatever the horizon.
+
+The few pictures of a submission that a board page draws, taken while it is scored.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagbench.metrics import FramePair, Metric, Scenario, Snapshot, Tally, measure, select, snapshots
+from lagbench.metrics.distributions import BINS, histograms
+from lagbench.submission import Predictions, open_predictions
+from lagbench.work.pool import Report
+
+from .flags import Trace, Tracer
+from .floors import FLOORS
+from .task import ScoredTask
+
+__all__ = [
+    "FRAMES",
+    "PARTICLES",
+    "PreviewRecorder",
+    "Preview",
+    "SUBMISSION",
+    "ScenarioJob",
+    "ScenarioScores",
+    "as_stored",
+    "measure_rows",
+    "score_scenario",
+]
+
+
+FRAMES = 45
+"""Frames of the particle film, evenly spaced over the horizon."""
+
+PARTICLES = 200
+"""Particles of the film, evenly spaced over the particle numbers."""
+
+
+@dataclass(frozen=True, eq=False)
+class Preview:
+    """Pictures of one scenario; index 0 of ``side`` is the truth, 1 the prediction."""
+
+    scenario: int  # id of the scenario
+    map_frames: tuple[int, ...]  # frames of interest and the last one
+    # at the compared nodes, NaN elsewhere [1/frame], shape [side, map frame, x node, y node]
+    vorticity: NDArray[np.float32]
+    # shares of 64 bins over the truth's range of omega, NaN where there is none [1], shape
+    # [side, map frame, bin]
+    histogram: NDArray[np.float32]
+    histogram_range: NDArray[np.float32]  # that range [1/frame], shape [map frame, 2]
+    film_frames: tuple[int, ...]
+    particles: tuple[int, ...]  # numbers of the particles in the film
+    material: NDArray[np.int8]  # their materials, shape [film particle]
+    film: NDArray[np.float32]  # their positions [length], shape [side, film frame, film particle, 2]
+
+
+class PreviewRecorder:
+    """Takes the pictures of one scenario, frame pair by frame pair."""
+
+    def __init__(self, number: int, scenario: Scenario) -> None:
+        setting = scenario.setting
+        frames = setting.predicted_frames
+        self._number, self._scenario = number, scenario
+        self._maps = tuple(sorted(setting.slow_frames.intersection(frames)))
+        self._film_frames = _spaced(frames, FRAMES)
+        self._particles = _spaced(range(len(scenario.material)), PARTICLES)
+        shape = (2, len(self._maps), setting.grid.nodes, setting.grid.nodes)
+        self._vorticity = np.full(shape, np.nan, np.float32)
+        self._histogram = np.full((*shape[:2], BINS), np.nan, np.float32)
+        self._range = np.full((shape[1], 2), np.nan, np.float32)
+        self._film = np.zeros((2, len(self._film_frames), len(self._particles), 2), np.float32)
+
+    def add(self, pair: FramePair) -> None:
+        """Look at a frame; most are not pictured."""
+        if pair.frame in self._film_frames:
+            shown = list(self._particles)
+            i = self._film_frames.index(pair.frame)
+            self._film[0, i] = pair.truth.position[shown]
+            self._film[1, i] = np.clip(pair.prediction.position[shown], -1e6, 1e6)
+        if pair.frame in self._maps and pair.node_count:
+            self._map(self._maps.index(pair.frame), pair)
+
+    def _map(self, i: int, pair: FramePair) -> None:
+        truth, prediction = pair.true_vorticity, pair.predicted_vorticity
+        self._vorticity[0, i][pair.nodes] = truth
+        self._vorticity[1, i][pair.nodes] = np.clip(prediction, -1e30, 1e30)
+        shares = histograms(truth, prediction)
+        if shares is not None:
+            self._histogram[:, i] = shares
+            self._range[i] = np.min(truth), np.max(truth)
+
+    def result(self) -> Preview:
+        """Return the pictures."""
+        return Preview(
+            scenario=self._number,
+            map_frames=self._maps,
+            vorticity=self._vorticity,
+            histogram=self._histogram,
+            histogram_range=self._range,
+            film_frames=self._film_frames,
+            particles=self._particles,
+            material=self._scenario.material[list(self._particles)].astype(np.int8),
+            film=self._film,
+        )
+
+
+def _spaced(numbers: range, count: int) -> tuple[int, ...]:
+    """Return evenly spaced members of a range, first and last included; all if there are few.
+
+    >>> _spaced(range(6, 16), 4)
+    (6, 9, 12, 15)
+    """
+    if len(numbers) <= count:
+        return tuple(numbers)
+    return tuple(numbers[i * (len(numbers) - 1) // (count - 1)] for i in range(count))
+
+
+SUBMISSION = "submission"
+"""Row of the submission; the floors have rows of their names."""
+
+LARGEST = float(np.finfo(np.float32).max)
+
+LONG_ROLLOUT = 100
+"""Predicted frames beyond which statistics are rounded more coarsely than float32."""
+
+LONG_BITS = 11
+"""Significant bits of statistics of a long rollout: a relative error of 4.9e-4 at most."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScenarioJob:
+    """What a worker needs to score one scenario."""
+
+    exam: ScoredTask  # the test subset
+    scenario: int  # id of the scenario
+    predictions: Path  # a predictions.nc that has been validated
+    metrics: tuple[str, ...]  # names of the metrics
+    pictured: bool = False  # whether to take the preview
+
+
+@dataclass(frozen=True, eq=False)
+class ScenarioScores:
+    """What was measured of one scenario."""
+
+    scenario: int  # id of the scenario
+    tallies: Mapping[str, Tally]  # statistics by row
+    trace: Trace  # how the submission's error moves
+    preview: Preview | None  # pictures, if they were asked for
+
+
+def score_scenario(job: ScenarioJob, report: Report) -> ScenarioScores:
+    """Score one scenario of a submission and of the floors."""
+    metrics = select(job.metrics)
+    with job.exam.opened(job.scenario) as truth, open_predictions(job.predictions) as predictions:
+        scenario = truth.scenario
+        rows = {SUBMISSION: _predicted(predictions, job.scenario, scenario)}
+        rows |= {name: floor(scenario) for name, floor in FLOORS.items()}
+        photographer = PreviewRecorder(job.scenario, scenario) if job.pictured else None
+        tallies, trace = measure_rows(scenario, truth.snapshots(), rows, metrics, photographer, report)
+    return ScenarioScores(job.scenario, tallies, trace, photographer.result() if photographer else None)
+
+
+def measure_rows(
+    scenario: Scenario,
+    truth: Iterator[Snapshot],
+    rows: Mapping[str, Iterator[Snapshot]],
+    metrics: tuple[Metric, ...],
+    photographer: PreviewRecorder | None = None,
+    report: Report = lambda _: None,
+) -> tuple[dict[str, Tally], Trace]:
+    """Measure rows of predictions of one scenario side by side, frame by frame."""
+    frames = scenario.setting.predicted_frames
+    tracer, first = Tracer(scenario), next(iter(rows))
+    measured: dict[str, dict[int, dict[str, float]]] = {name: {} for name in rows}
+    for frame, true, *predicted in zip(frames, truth, *rows.values(), strict=True):
+        for name, snapshot in zip(rows, predicted, strict=True):
+            pair = FramePair(scenario, frame, true, snapshot)
+            measured[name][frame] = measure(pair, metrics)
+            if name == first:
+                tracer.add(pair)
+                if photographer:
+                    photographer.add(pair)
+        report(1)
+    names = [m.name for m in metrics if m.statistic is not None]
+    tallies = {name: as_stored(Tally.of(names, frames, values)) for name, values in measured.items()}
+    return tallies, tracer.result()
+
+
+def as_stored(tally: Tally) -> Tally:
+    """Return a tally rounded as scores.nc holds it: to float32, of long rollouts to 11 bits.
+
+    Scores are formed from rounded statistics, so that whoever aggregates scores.nc again gets
+    the same digits. Long rollouts have so many frames that their float32 would not fit into a
+    small file, and that rounding averages out. Beyond float32 a statistic saturates.
+    """
+    total = tally.total
+    if len(tally.frames) > LONG_ROLLOUT:
+        mantissa, exponent = np.frexp(total)
+        total = np.ldexp(np.rint(np.ldexp(mantissa, LONG_BITS)), exponent - LONG_BITS)
+    stored = np.clip(total, -LARGEST, LARGEST).astype(np.float32)
+    return replace(tally, total=stored.astype(np.float64))
+
+
+def _predicted(predictions: Predictions, number: int, scenario: Scenario) -> Iterator[Snapshot]:
+    frames = (frame for _, block in predictions.blocks(number) for frame in block)
+    return snapshots(scenario, frames)

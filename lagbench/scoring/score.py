@@ -1,0 +1,155 @@
+"""Score a predictions.nc: validate, measure beside the floors, aggregate, flag, write."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from lagbench.atomic import check_writable
+from lagbench.data.layout import resolve_root
+from lagbench.data.local import rooted
+from lagbench.data.registry import Registry
+from lagbench.errors import UsageError, nearest
+from lagbench.make.overview import available_cores
+from lagbench.metrics import Metric, Score, aggregate, available, select
+from lagbench.submission import ValidationResult, open_predictions, validate
+from lagbench.work.progress import Meter, Progress
+from lagbench.work.run import run_all
+
+from .card import JSON_NAME, ScoreCard, write_json
+from .flags import Flag, below_twin_floor, copy_suspect, physics
+from .floors import PERSISTENCE
+from .scenario import SUBMISSION, ScenarioJob, ScenarioScores, score_scenario
+from .score_file import NETCDF_NAME, write_statistics
+from .task import ScoredTask, load_scored_task, ranking_metric
+
+__all__ = [
+    "score",
+]
+
+
+WORTH_WORKERS = 1_000_000
+"""Particles times predicted frames below which starting worker processes costs more than it gains."""
+
+
+def score(
+    predictions: str | Path,
+    *,
+    root: str | Path | None = None,
+    output_dir: str | Path | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    extras: Collection[str] = (),
+    progress: Callable[[Progress], None] | None = None,
+    examined: Callable[[ValidationResult], None] | None = None,
+    registry: Registry | None = None,
+    write: bool = True,
+) -> ScoreCard:
+    """Score a submission and write scores.json and scores.nc.
+
+    Args:
+        predictions: a predictions.nc.
+        root: folder of all data sets, see :func:`lagbench.data.layout.resolve_root`.
+        output_dir: folder for the two files; that of the predictions by default.
+        workers: worker processes; by default one per core where the work is worth it.
+        scheduler: address of a Dask scheduler that takes the scenarios instead.
+        extras: extras whose metrics are wanted too, as in ("transport",).
+        progress: told how far the work is.
+        examined: told what the validation found, before anything is raised for it.
+        registry: where splits are described; ours when None.
+        write: whether to write the two files.
+
+    Returns:
+        The score card; ``files`` names what was written.
+
+    Raises:
+        UsageError: an extra that brings no metrics, or that is not installed.
+        UnreadableFileError: the predictions cannot be read.
+        ChecksFailedError: they are not valid.
+        DataError: they were made from another data set, or the test subset is missing or damaged.
+        WorkFailedError: a worker or the cluster was lost, the disk is full, or the folder
+            cannot be written to, which is seen before the work.
+    """
+    metrics = _chosen(extras)
+    path, holder = Path(predictions).absolute(), resolve_root(root)
+    described = rooted(holder, registry)
+    folder = Path(predictions).parent if output_dir is None else Path(output_dir)
+    result = validate(path, root=holder, require_truth=True, registry=described)
+    if examined is not None:
+        examined(result)
+    result.check()
+    if write:
+        check_writable(folder, option="--output")
+    with open_predictions(path) as opened:
+        header, content = opened.header, opened.content_sha256()
+    exam = load_scored_task(described.size(header.split, header.size), holder)
+    outcomes = _outcomes(exam, path, tuple(m.name for m in metrics), workers, scheduler, Meter(progress))
+    tallies = {
+        row: {outcome.scenario: outcome.tallies[row] for outcome in outcomes} for row in outcomes[0].tallies
+    }
+    scores = {row: aggregate(metrics, held) for row, held in tallies.items()}
+    preview = next(outcome.preview for outcome in outcomes if outcome.preview is not None)
+    card = ScoreCard(
+        header=header,
+        predictions_sha256=content,
+        setting=exam.setting,
+        ranking=ranking_metric(exam.size),
+        tallies=tallies,
+        scores=scores,
+        flags=_flags(exam, outcomes, scores),
+        warnings=result.warnings,
+        preview=preview,
+    )
+    return _written(card, folder) if write else card
+
+
+def _written(card: ScoreCard, folder: Path) -> ScoreCard:
+    json_path, netcdf_path = folder / JSON_NAME, folder / NETCDF_NAME
+    write_statistics(card, netcdf_path)
+    write_json(card, json_path)
+    return card.at(json_path, netcdf_path)
+
+
+def _chosen(extras: Collection[str]) -> tuple[Metric, ...]:
+    """Return the metrics to measure; refuse an extra that brings none."""
+    known = {metric.extra for metric in available().values() if metric.extra}
+    for extra in extras:
+        if extra not in known:
+            raise UsageError(f"no extra {extra!r} with metrics", where="--extras", fix=nearest(extra, known))
+    return select(extras=extras)
+
+
+def _outcomes(
+    exam: ScoredTask,
+    path: Path,
+    metrics: tuple[str, ...],
+    workers: int | None,
+    scheduler: str | None,
+    meter: Meter,
+) -> list[ScenarioScores]:
+    """Return what was measured of every scenario, by ascending id."""
+    ids, horizon = exam.scenarios, exam.setting.horizon
+    jobs = {
+        f"scenario {i}": ScenarioJob(
+            exam=exam, scenario=i, predictions=path, metrics=metrics, pictured=i == ids[0]
+        )
+        for i in ids
+    }
+    if workers is None:
+        worth = len(ids) * horizon * exam.size.particles >= WORTH_WORKERS
+        workers = available_cores() if worth else 1
+    meter.begin("scoring", total=len(ids) * horizon, scenarios=len(ids))
+    return run_all(score_scenario, jobs, workers=workers, scheduler=scheduler, report=meter.count)
+
+
+def _flags(
+    exam: ScoredTask, outcomes: Sequence[ScenarioScores], scores: Mapping[str, Mapping[str, Score]]
+) -> tuple[Flag, ...]:
+    traces = [outcome.trace for outcome in outcomes]
+    error, still = (
+        np.asarray(np.mean(scores[row]["position_rmse"].per_frame, axis=0))
+        for row in (SUBMISSION, PERSISTENCE)
+    )
+    return copy_suspect(traces), below_twin_floor(error, still, exam.twin_floor), physics(traces)

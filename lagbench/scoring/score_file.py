@@ -1,0 +1,202 @@
+"""scores.nc: the statistics of a submission per scenario and frame, and its preview.
+
+Every score of the submission follows from it: ``read_statistics(path).scores()`` gives the
+digits of scores.json. Statistics are float32 and NaN where undefined, those of long rollouts
+rounded to 11 significant bits (see :func:`lagbench.scoring.scenario.as_stored`), so that no full size takes
+more than 0.3 MB; ``measured`` tells which were measured at all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagbench.atomic import atomic_path
+from lagbench.errors import WorkFailedError
+from lagbench.metrics import Score, Tally, aggregate, available
+
+from .card import FORMAT, IDENTITY, ScoreCard, unreadable_scores
+from .scenario import SUBMISSION, Preview
+
+__all__ = [
+    "NETCDF_NAME",
+    "StoredScores",
+    "read_statistics",
+    "write_statistics",
+]
+
+
+NETCDF_NAME = "scores.nc"
+
+INDEX = 4096
+"""About what HDF5 takes for the index of chunks; smaller variables are not compressed [bytes]."""
+
+LEVELS = 65534
+"""Greatest packed value of a preview; 65535 stands for what is missing."""
+
+FILM_RANGE = (-0.5, 1.5)
+"""Positions in the preview are clipped to this range [length]."""
+
+_PREVIEW: Mapping[str, tuple[tuple[str, ...], str]] = {
+    "vorticity": (("side", "map_frame", "x_node", "y_node"), "vorticity per frame; side: truth, prediction"),
+    "histogram": (("side", "map_frame", "bin"), "shares of 64 vorticity bins over the truth's range"),
+    "film": (("side", "film_frame", "film_particle", "space"), "particle positions [length]"),
+}
+
+
+def write_statistics(card: ScoreCard, path: Path) -> None:
+    """Write scores.nc, whole or not at all; equal cards give equal bytes."""
+    import netCDF4
+
+    with atomic_path(path, option="--output") as temporary, ExitStack() as stack:
+        try:
+            file = netCDF4.Dataset(temporary, "w", format="NETCDF4")
+            stack.callback(file.close)
+            _define(file, card)
+        except (OSError, RuntimeError) as error:
+            fix = "free disk space, or name a folder that you may write to: --output"
+            raise WorkFailedError("cannot write scores", where=str(path), got=error, fix=fix) from error
+
+
+def _define(file: Any, card: ScoreCard) -> None:  # noqa: ANN401
+    tallies = [card.tallies[SUBMISSION][i] for i in card.scenarios]
+    names, frames = tallies[0].names, tallies[0].frames
+    file.setncatts(
+        {
+            "lagbench_scores": FORMAT,
+            **{name: getattr(card.header, name) for name in IDENTITY},
+            "predictions_sha256": card.predictions_sha256,
+            "ranking_metric": card.ranking,
+            "statistics": " ".join(names),
+        }
+    )
+    _store(file, "scenario", ("scenario",), np.array(card.scenarios, np.int32))
+    _store(file, "frame", ("frame",), np.array(frames, np.int32))
+    dims = ("statistic", "scenario", "frame")
+    values = np.stack([np.stack([tally.series(name) for tally in tallies]) for name in names])
+    measured = np.stack([np.stack([tally.measured(name) for tally in tallies]) for name in names])
+    _store(file, "value", dims, values.astype(np.float32))
+    _store(file, "measured", dims, measured.astype(np.int8))
+    _define_preview(file.createGroup("preview"), card.preview)
+
+
+def _define_preview(group: Any, preview: Preview) -> None:  # noqa: ANN401
+    group.scenario = preview.scenario
+    numbers = {
+        "map_frame": preview.map_frames,
+        "film_frame": preview.film_frames,
+        "film_particle": preview.particles,
+    }
+    for name, held in numbers.items():
+        _store(group, name, (name,), np.array(held, np.int32))
+    _store(group, "material", ("film_particle",), preview.material)
+    _store(group, "histogram_range", ("map_frame", "end"), preview.histogram_range)
+    film = np.clip(preview.film, *FILM_RANGE)
+    for name, values in {
+        "vorticity": preview.vorticity,
+        "histogram": preview.histogram,
+        "film": film,
+    }.items():
+        dims, text = _PREVIEW[name]
+        packed, attributes = _packed(values, FILM_RANGE if name == "film" else None)
+        _store(group, name, dims, packed, {"long_name": text, **attributes})
+
+
+def _packed(
+    values: NDArray[np.float32], limits: tuple[float, float] | None
+) -> tuple[NDArray[np.uint16], dict[str, Any]]:
+    """Return values as uint16 and the CF attributes that unpack them."""
+    wide = values.astype(np.float64)
+    known = wide[np.isfinite(wide)]
+    low, high = limits or ((float(known.min()), float(known.max())) if known.size else (0.0, 1.0))
+    scale = (high - low) / LEVELS or 1.0
+    steps = np.where(np.isfinite(wide), np.rint((wide - low) / scale), LEVELS + 1)
+    attributes = {"scale_factor": scale, "add_offset": low, "_FillValue": np.uint16(LEVELS + 1)}
+    return steps.astype(np.uint16), attributes
+
+
+def _store(
+    group: Any,  # noqa: ANN401
+    name: str,
+    dims: tuple[str, ...],
+    values: NDArray[Any],
+    attributes: Mapping[str, Any] | None = None,
+) -> None:
+    given = dict(attributes or {})
+    for dim, length in zip(dims, values.shape, strict=True):
+        if dim not in group.dimensions:
+            group.createDimension(dim, length)
+    fill = given.pop("_FillValue", False)
+    packed = values.nbytes > INDEX
+    variable = group.createVariable(
+        name,
+        values.dtype,
+        dims,
+        compression="zlib" if packed else None,
+        complevel=9,
+        shuffle=True,
+        fill_value=fill,
+        chunksizes=values.shape if packed else None,
+        contiguous=not packed,
+    )
+    variable.setncatts(given)
+    variable.set_auto_maskandscale(False)
+    variable[...] = values
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StoredScores:
+    """What a scores.nc holds beside its preview."""
+
+    identity: Mapping[str, str]  # split, size, version and hash of the data set, and the method
+    predictions_sha256: str  # content hash of the predicted positions
+    ranking: str  # name of the metric that ranks
+    tallies: Mapping[int, Tally]  # statistics of the submission by scenario
+
+    def scores(self) -> dict[str, Score]:
+        """Return the scores of all installed metrics whose statistics are here, by name."""
+        names = set(next(iter(self.tallies.values())).names)
+        metrics = [metric for metric in available().values() if names.issuperset(metric.of)]
+        return aggregate(metrics, self.tallies)
+
+
+def read_statistics(path: Path) -> StoredScores:
+    """Read the statistics of a scores.nc."""
+    import netCDF4
+
+    try:
+        with netCDF4.Dataset(path, "r") as file:
+            file.set_auto_maskandscale(False)
+            if file.lagbench_scores != FORMAT:
+                raise ValueError(f"layout {file.lagbench_scores!r}, not {FORMAT}")
+            names = tuple(str(file.statistics).split())
+            frames = tuple(file["frame"][:].tolist())
+            values, measured = file["value"][:].astype(np.float64), file["measured"][:]
+            return StoredScores(
+                identity={name: str(file.getncattr(name)) for name in IDENTITY},
+                predictions_sha256=str(file.predictions_sha256),
+                ranking=str(file.ranking_metric),
+                tallies={
+                    scenario: _tally(names, frames, values[:, i], measured[:, i])
+                    for i, scenario in enumerate(file["scenario"][:].tolist())
+                },
+            )
+    except Exception as error:  # HDF5 on damaged bytes raises nearly any type
+        raise unreadable_scores(path, error) from error
+
+
+def _tally(
+    names: tuple[str, ...], frames: tuple[int, ...], values: NDArray[np.float64], measured: NDArray[np.int8]
+) -> Tally:
+    if values.shape != (len(names), len(frames)):
+        raise ValueError(f"{values.shape} values of {len(names)} statistics at {len(frames)} frames")
+    undefined = np.isnan(values) & (measured != 0)
+    weight = ~np.isnan(values) & (measured != 0)
+    total = np.where(weight, values, 0.0)
+    return Tally(names, frames, total, weight.astype(np.int64), undefined.astype(np.int64))

@@ -1,0 +1,151 @@
+"""The test subset as metrics see it: the exam that submissions sit.
+
+Scoring needs the files of ``test`` only; what follows from ``train`` stands in datasets.yaml
+or, for a data set that is not recorded there, in its manifest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from lagbench.data.grid import Grid, Placement
+from lagbench.data.local import remedy
+from lagbench.data.manifest import Manifest, read_manifest
+from lagbench.data.registry import Size
+from lagbench.data.scenario import ScenarioFile
+from lagbench.data.writer import MATERIALS
+from lagbench.errors import DataError
+from lagbench.metrics import Scenario, Setting, Snapshot, snapshots
+from lagbench.store.bringing import bring
+from lagbench.submission.truth import Truth
+
+__all__ = [
+    "ScoredTask",
+    "OpenScenario",
+    "load_scored_task",
+    "ranking_metric",
+]
+
+
+@dataclass(frozen=True)
+class OpenScenario:
+    """A test scenario whose file is open."""
+
+    scenario: Scenario  # what holds in all its frames
+    file: ScenarioFile
+
+    def snapshots(self) -> Iterator[Snapshot]:
+        """Yield the true snapshots of the predicted frames, two in memory at a time."""
+        numbers = self.scenario.setting.predicted_frames
+        return snapshots(self.scenario, (self.file.read("position", frame) for frame in numbers))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScoredTask:
+    """The test subset of one split and size."""
+
+    truth: Truth  # its files
+    setting: Setting  # the split and size, as metrics see it
+    density: float  # rest density [mass/length^2]
+    # position RMSE of the nudged twin per predicted frame [length]; empty where it is recorded nowhere
+    twin_floor: tuple[float, ...] = ()
+
+    @property
+    def size(self) -> Size:
+        """What the registry says of the split and size."""
+        return self.truth.size
+
+    @property
+    def scenarios(self) -> tuple[int, ...]:
+        """Ids of the test scenarios, ascending."""
+        return tuple(sorted(self.size.subsets["test"]))
+
+    @contextmanager
+    def opened(self, scenario: int) -> Iterator[OpenScenario]:
+        """Yield a scenario while its file is open."""
+        with self.truth.open(scenario) as file:
+            material = file.read("material")
+            mass = float(file.read("particle_mass"))
+            held = Scenario(
+                setting=self.setting,
+                given=file.read("position", slice(0, self.setting.input_frames)),
+                material=material,
+                particle_mass=mass,
+                area=mass * len(material) / self.density,
+            )
+            yield OpenScenario(held, file)
+
+
+def ranking_metric(size: Size) -> str:
+    """Return the metric that ranks: of vorticity in a full box, of particles elsewhere."""
+    full_box = Placement(size.task.score_grid.placement) is Placement.CELL_CENTRES
+    return "vorticity_rmse" if full_box else "mse_avg"
+
+
+def load_scored_task(size: Size, root: Path) -> ScoredTask:
+    """Check that the test subset is there and gather what the metrics need to know."""
+    bring(size, root, size.subsets["test"])
+    truth = Truth(size, root)
+    truth.require()
+    test = sorted(size.subsets["test"])
+    present = set().union(*(_materials(truth, scenario) for scenario in test))
+    manifest = None if size.measured else read_manifest(root, size.split, size.name, size.major)
+    task, (x, y) = size.task, size.bounds
+    return ScoredTask(
+        truth=truth,
+        density=float(size.value("density")),
+        twin_floor=size.measured.twin_floor if size.measured else _floor(manifest, test),
+        setting=Setting(
+            grid=Grid(task.score_grid.cells, Placement(task.score_grid.placement)),
+            input_frames=task.input_frames,
+            horizon=task.horizon,
+            frames_of_interest=task.frames_of_interest,
+            attribute_std=_attribute_std(size, root, manifest),
+            radius=task.radius,
+            materials=tuple(name for name in MATERIALS if name in present),
+            centre=((x[0] + x[1]) / 2.0, (y[0] + y[1]) / 2.0),
+        ),
+    )
+
+
+def _materials(truth: Truth, scenario: int) -> set[str]:
+    """Return the materials of a scenario after checking that its file is long enough."""
+    needed = truth.size.task.input_frames + truth.size.task.horizon
+    with truth.open(scenario) as file:
+        frames, material = file.header.frames, file.read("material")
+    if frames < needed:
+        where = str(truth.path(scenario))
+        raise DataError("a test scenario is too short", where=where, expected=f"{needed} frames", got=frames)
+    return {MATERIALS[value] for value in np.unique(material).tolist()}
+
+
+def _attribute_std(size: Size, root: Path, manifest: Manifest | None) -> tuple[float, float, float, float]:
+    """Return the standard deviations of x, y, u, v over train."""
+    known: Mapping[str, tuple[float, ...]] = manifest.statistics if manifest else {}
+    if size.measured:
+        known = size.measured.statistics
+    try:
+        (x, y), (u, v) = known["position_std"], known["velocity_std"]
+    except (KeyError, ValueError):
+        raise DataError(
+            "the statistics of train are recorded nowhere",
+            where=f"datasets.yaml, and the manifest of {size.split} {size.name} in {root}",
+            expected="position_std and velocity_std, two numbers each",
+            got=", ".join(known) or "nothing",
+            fix=remedy(size, root=root),
+        ) from None
+    return x, y, u, v
+
+
+def _floor(manifest: Manifest | None, test: Sequence[int]) -> tuple[float, ...]:
+    """Return the mean twin floor over the test scenarios, empty unless all have one."""
+    entries = [manifest.entry(scenario) if manifest else None for scenario in test]
+    rows = [entry.twin_floor for entry in entries if entry and entry.twin_floor]
+    if len(rows) < len(test) or len({len(row) for row in rows}) != 1:
+        return ()
+    return tuple(np.mean(rows, axis=0).tolist())

@@ -1,0 +1,177 @@
+"""Open a generated data set as one lazy xarray.Dataset."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from lagbench.data import registry
+from lagbench.data.layout import ScenarioKey, dataset_folder, scenario_path
+from lagbench.data.local import locate, remedy
+from lagbench.data.registry import spell_ids
+from lagbench.errors import DataError, UsageError, nearest
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from lagbench.data.manifest import Manifest
+    from lagbench.data.registry import Size
+
+__all__ = [
+    "list_splits",
+    "load_manifest",
+    "open_split",
+]
+
+
+CHUNK_BYTES = 4 << 20
+"""Dask reads position and velocity in chunks of about this size [bytes]."""
+
+PADDING = -1
+"""Material of particles that a scenario does not have."""
+
+
+def list_splits() -> tuple[str, ...]:
+    """Return the names of all splits in the registry, sorted."""
+    return tuple(sorted(registry.load().splits))
+
+
+def load_manifest(split: str, *, size: str = "full", root: str | Path | None = None) -> Manifest:
+    """Return the manifest of a generated data set.
+
+    Args:
+        split: name of the split, or path of a local split's folder.
+        size: name of the size.
+        root: folder of all data sets, see :func:`lagbench.data.layout.resolve_root`.
+
+    Raises:
+        UsageError: unknown split or size.
+        DataError: nothing is generated, or the manifest is damaged.
+    """
+    from lagbench.data.manifest import read_manifest
+
+    from .bringing import bring
+
+    entry, folder, _ = locate(split, size, root=root)
+    bring(entry, folder)
+    manifest = read_manifest(folder, entry.split, size, entry.major)
+    if manifest is None:
+        raise DataError(
+            "the data set has no manifest",
+            where=str(dataset_folder(folder, entry.split, size, entry.major)),
+            fix=remedy(entry, root=folder),
+        )
+    return manifest
+
+
+def open_split(
+    split: str,
+    *,
+    subset: str = "test",
+    size: str = "full",
+    root: str | Path | None = None,
+) -> xr.Dataset:
+    """Open one subset of a generated data set; arrays are read when computed.
+
+    Args:
+        split: name of the split, or path of a local split's folder.
+        subset: train, valid, test or, for multimaterial, extra.
+        size: name of the size.
+        root: folder of all data sets, see :func:`lagbench.data.layout.resolve_root`.
+
+    Returns:
+        ``position`` and ``velocity`` with dims (scenario, frame, particle, space) as dask
+        arrays, ``material`` (scenario, particle), ``particle_mass`` (scenario), in a closed box
+        ``wall_velocity`` (scenario, frame, wall, space), and ``frame_count`` and
+        ``particle_count`` (scenario). Coordinate ``scenario`` holds the ids. Scenarios with
+        fewer frames or particles than the largest are padded with NaN, material with -1.
+
+    Raises:
+        UsageError: unknown split, size or subset.
+        DataError: scenarios are missing, damaged, or of another version.
+    """
+    import xarray as xr
+
+    from .bringing import bring
+
+    entry, folder, _ = locate(split, size, root=root)
+    if subset not in entry.subsets:
+        where = f"{split} {size}"
+        raise UsageError(f"no subset {subset!r}", where=where, fix=nearest(subset, entry.subsets))
+    ids = entry.subsets[subset]
+    bring(entry, folder, ids)
+    keys = [
+        ScenarioKey(split=entry.split, size=size, version=entry.version, scenario=i, subset=subset)
+        for i in ids
+    ]
+    _require(entry, folder, keys)
+    scenarios = [_open_scenario(scenario_path(folder, key), key, remedy(entry, root=folder)) for key in keys]
+    return _join(scenarios, xr.Variable("scenario", list(ids), {"long_name": "scenario id", "units": "1"}))
+
+
+def _require(size: Size, root: Path, keys: list[ScenarioKey]) -> None:
+    """Say which scenarios are missing and what makes them."""
+    missing = [key.scenario for key in keys if not scenario_path(root, key).is_file()]
+    if missing:
+        raise DataError(
+            f"{len(missing)} of {len(keys)} scenarios are not there",
+            where=str(scenario_path(root, keys[0]).parent),
+            got=f"missing: {spell_ids(missing)}",
+            fix=remedy(size, f"--subset {keys[0].subset}", root=root),
+        )
+
+
+def _open_scenario(path: Path, key: ScenarioKey, fix: str) -> xr.Dataset:
+    """Open one file lazily and check that it is the scenario that its path says."""
+    import xarray as xr
+
+    try:
+        stored = xr.open_dataset(path, engine="netcdf4", cache=False)
+        frame_bytes = stored["position"].dtype.itemsize * stored.sizes["particle"] * stored.sizes["space"]
+        scenario = stored.chunk(frame=max(1, CHUNK_BYTES // frame_bytes), particle=-1, space=-1)
+        scenario.set_close(stored.close)
+        found = {name: scenario.attrs[name] for name in ("split", "size", "scenario", "version")}
+    except Exception as error:  # HDF5 on damaged bytes raises nearly any type
+        raise DataError(
+            "a scenario file is damaged or not one of lagbench",
+            where=str(path),
+            got=f"{type(error).__name__}: {error}",
+            fix=fix,
+        ) from error
+    same_major = str(found["version"]).split(".")[0] == str(key.major)
+    if not same_major or (found["split"], found["size"], int(found["scenario"])) != (
+        key.split,
+        key.size,
+        key.scenario,
+    ):
+        raise DataError("a scenario file is another scenario", where=str(path), expected=key, got=found)
+    return scenario
+
+
+def _join(scenarios: list[xr.Dataset], ids: xr.Variable) -> xr.Dataset:
+    """Stack scenarios of unequal lengths along a new first dimension."""
+    import xarray as xr
+
+    frames = [scenario.sizes["frame"] for scenario in scenarios]
+    particles = [scenario.sizes["particle"] for scenario in scenarios]
+    longest = scenarios[frames.index(max(frames))]
+    fullest = scenarios[particles.index(max(particles))]
+    labels = {"frame": longest["frame"], "particle": fullest["particle"]}
+    padded = [
+        scenario.drop_vars("time").reindex(labels, fill_value={"material": PADDING}) for scenario in scenarios
+    ]
+    joined = xr.concat(
+        padded, dim=ids, data_vars="all", coords="minimal", join="exact", combine_attrs="drop_conflicts"
+    )
+    joined = joined.assign_coords(scenario=ids, time=longest["time"].compute())
+    joined["frame_count"] = ("scenario", frames, {"long_name": "recorded frames", "units": "1"})
+    joined["particle_count"] = ("scenario", particles, {"long_name": "particles", "units": "1"})
+    for variable in joined.variables.values():
+        variable.attrs.pop("content_sha256", None)
+
+    def close() -> None:
+        for scenario in scenarios:
+            scenario.close()
+
+    joined.set_close(close)
+    return joined
