@@ -20,7 +20,7 @@ from lagbench.generators.split import ClosedBoxParameters
 
 GENERATORS = Path(draws.__file__).parent
 DRAWN = (
-    "draws", "lattice", "jets", "perlin", "shapes", "parameters", "cavity", "curl_noise", "fluid",
+    "draws", "lattice", "noise", "shapes", "constants", "cavity", "curl_noise", "fluid",
     "multimaterial",
 )  # fmt: skip
 
