@@ -21,7 +21,7 @@ from lagbench.data.local import locate, remedy
 from lagbench.data.registry import Registry, Size
 from lagbench.data.writer import ScenarioKey, scenario_path
 from lagbench.errors import DataError, UsageError, nearest
-from lagbench.store.bringing import bring
+from lagbench.store.copy import bring
 
 from .panels import TITLES, Panel, colour_bar, draw, limit_of, material_key, moving_walls
 from .recording import Recording, Scene, open_recording

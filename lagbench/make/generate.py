@@ -351,8 +351,7 @@ def generate(
         UsageError: unknown split, size, subset, scenario or device, fewer than one worker, or
             Taichi is not installed; or nothing can be gathered from a folder.
         WorkFailedError: disk full or not writable, a scenario blew up, workers keep dying, the
-            cluster is lost or does not see the root folder; or the store refuses, does not answer,
-            or knows no conditional put.
+            cluster is lost or does not see the root folder; or the store refuses or does not answer.
         DataError: the result has other hashes than datasets.yaml, or there is no such bucket.
     """
     started = time.monotonic()
@@ -378,7 +377,7 @@ def generate(
             check_installed("taichi", extra="generate")
         with (
             dataset_lock(folder, tier.split, size, tier.major, on_wait=on_wait),
-            publication(tier, folder, on_wait=on_wait) as campaign.store,
+            publication(tier, folder) as campaign.store,
         ):
             campaign.run(wanted, force=force)
     seconds = time.monotonic() - started

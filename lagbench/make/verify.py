@@ -32,7 +32,7 @@ from lagbench.errors import DataError, check_installed
 from lagbench.generators.batch import SimulationJob
 from lagbench.generators.simulate import simulate
 from lagbench.generators.solver import Device
-from lagbench.store.bringing import bring, unstored
+from lagbench.store.copy import bring, unstored
 from lagbench.work.machine import may_differ
 from lagbench.work.pool import Pool, Task, worker_count
 from lagbench.work.progress import Meter, Progress

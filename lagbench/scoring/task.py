@@ -21,7 +21,7 @@ from lagbench.data.scenario import ScenarioFile
 from lagbench.data.writer import MATERIALS
 from lagbench.errors import DataError
 from lagbench.metrics import Scenario, Setting, Snapshot, snapshots
-from lagbench.store.bringing import bring
+from lagbench.store.copy import bring
 from lagbench.submission.truth import Truth
 
 __all__ = [

@@ -9,7 +9,7 @@ import numpy as np
 
 from lagbench.data.local import locate
 from lagbench.data.registry import Registry
-from lagbench.store.bringing import bring
+from lagbench.store.copy import bring
 
 from .truth import Truth
 from .writer import PredictionsWriter

@@ -83,7 +83,7 @@ def _brought(result: ValidationResult, request: Request) -> bool:
         size = request.registry.size(result.split, result.size)
     except UsageError:
         return False
-    from lagbench.store.bringing import bring
+    from lagbench.store.copy import bring
 
     return bring(size, request.root, size.subsets["test"])
 

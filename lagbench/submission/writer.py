@@ -15,7 +15,7 @@ from lagbench.atomic import atomic_path
 from lagbench.data.local import locate, remedy
 from lagbench.data.registry import Registry, Size, spell_ids
 from lagbench.errors import DataError, UsageError, WorkFailedError, nearest
-from lagbench.store.bringing import bring
+from lagbench.store.copy import bring
 
 from .header import DIMS, FORMAT, NEVER, OPTIONAL, SPACE, fits, kind_of
 from .task_checks import dataset_hash_of, frames_to_predict

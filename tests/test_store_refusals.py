@@ -16,7 +16,7 @@ from lagbench.cli.app import app
 from lagbench.errors import DataError, UsageError, WorkFailedError
 from lagbench.make.generate import generate
 from lagbench.make.verify import verify
-from lagbench.store import bringing
+from lagbench.store import copy
 
 Use = Callable[[str], object]
 
@@ -31,7 +31,7 @@ def s3() -> Iterator[str]:
 @pytest.fixture(autouse=True)
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """Be a machine of its own, on which nothing arrives."""
-    monkeypatch.setattr(bringing, "FRESH", 0.0)
+    monkeypatch.setattr(copy, "FRESH", 0.0)
     folder = machine(monkeypatch, tmp_path / "cache")
     yield folder
     assert files(folder) == {}

@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import shutil
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import xarray as xr
 from conftest import SIZE, SPLIT
-from object_stores import files, machine, objects, put, remove, stored
+from object_stores import Store, files, holding, machine, s3_server
 from typer.testing import CliRunner
 
 import lagbench
@@ -24,41 +25,48 @@ from lagbench.exchange import export
 from lagbench.make.generate import GenerationResult
 from lagbench.make.overview import overview
 from lagbench.make.verify import verify
-from lagbench.store import address, bringing
-from lagbench.store.fetching import quietly
-from lagbench.store.mirror import partial_name
-from lagbench.store.mirror_errors import WrongContentError, WrongLengthError
+from lagbench.store import copy
+from lagbench.store.fetch import partial_name
+from lagbench.store.objects import WrongContentError, WrongLengthError
 from lagbench.submission import template
 
 FOLDER = f"{SPLIT}/{SIZE}/v1"
+MANIFEST = f"{FOLDER}/manifest.json"
 
 
 @pytest.fixture(autouse=True)
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Be a machine of its own, that asks for the manifest each time."""
-    monkeypatch.setattr(bringing, "FRESH", 0.0)
+    monkeypatch.setattr(copy, "FRESH", 0.0)
     return machine(monkeypatch, tmp_path / "cache")
 
 
-@pytest.fixture
-def url(generated: GenerationResult) -> str:
-    """A store that holds the tiny data set."""
-    return stored(generated.root)
+@pytest.fixture(scope="module")
+def s3() -> Iterator[str]:
+    """An S3 server."""
+    with s3_server() as url:
+        yield url
+
+
+@pytest.fixture(params=("http", "file", "s3"))
+def store(request: pytest.FixtureRequest, generated: GenerationResult, tmp_path: Path) -> Iterator[Store]:
+    """A store of each kind that holds the tiny data set."""
+    place = request.getfixturevalue("s3") if request.param == "s3" else request.param
+    with holding(place, tmp_path, generated.root) as held:
+        yield held
 
 
 @pytest.fixture
-def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:
-    """Name and offset of every scenario that is asked for."""
-    seen: list[tuple[str, int]] = []
-    ask = address._ask_fsspec
+def folder(generated: GenerationResult, tmp_path: Path) -> Iterator[Store]:
+    """A folder by its URL that holds it, for what the kind of a store does not matter to."""
+    with holding("file", tmp_path, generated.root) as held:
+        yield held
 
-    def asking(url: str, offset: int) -> address.Answer:
-        if url.endswith(".nc"):
-            seen.append((url.split("/v1/")[1], offset))
-        return ask(url, offset)
 
-    monkeypatch.setattr(address, "_ask_fsspec", asking)
-    return seen
+@pytest.fixture
+def url(folder: Store) -> str:
+    """The URL of that folder."""
+    return folder.url
 
 
 @pytest.fixture
@@ -73,18 +81,17 @@ def here(url: str) -> list[str]:
     return sorted(name.removeprefix(f"{FOLDER}/") for name in files(resolve_root(url)))
 
 
-def test_a_subset_comes_and_nothing_else(
-    url: str, generated: GenerationResult, tiny: Registry, asked: list[tuple[str, int]]
-) -> None:
+def test_a_subset_comes_and_nothing_else(store: Store, generated: GenerationResult, tiny: Registry) -> None:
     """The arrays are those of the folder; a second look fetches nothing."""
     with (
-        lagbench.open_split(SPLIT, size=SIZE, root=url) as far,
+        lagbench.open_split(SPLIT, size=SIZE, root=store.url) as far,
         lagbench.open_split(SPLIT, size=SIZE, root=generated.root) as near,
     ):
         xr.testing.assert_identical(far.compute(), near.compute())
-    assert here(url) == ["manifest.json", "test/0003.nc", "test/0004.nc"]
-    lagbench.open_split(SPLIT, size=SIZE, root=url).close()
-    assert sorted(asked) == [("test/0003.nc", 0), ("test/0004.nc", 0)]
+    assert here(store.url) == ["manifest.json", "test/0003.nc", "test/0004.nc"]
+    store.remove(f"{FOLDER}/test/0003.nc")
+    lagbench.open_split(SPLIT, size=SIZE, root=store.url).close()
+    assert not store.server or store.server.count("0004.nc") == 1
 
 
 def test_scores_are_those_of_the_folder(
@@ -128,81 +135,79 @@ def test_a_listing_counts_what_the_store_has(url: str, tiny: Registry) -> None:
     found = overview(tiny.size(SPLIT, SIZE), resolve_root(url))
     assert (found.state, found.present) == ("yes", {"train": 2, "valid": 1, "test": 2})
     assert here(url) == []
-    empty = stored(resolve_root("memory://nothing"))
-    assert overview(tiny.size(SPLIT, SIZE), resolve_root(empty)).state == "no"
+    assert overview(tiny.size(SPLIT, SIZE), resolve_root(f"{url}/nothing")).state == "no"
 
 
-def test_what_the_store_lacks_is_missed(url: str, tiny: Registry) -> None:
-    """As in a folder: the error names the scenarios and the command."""
-    with pytest.raises(DataError, match=r"missing: 0-1\n  fix: lagbench generate"):
-        lagbench.open_split(SPLIT, size=SIZE, subset="train", root="memory://nothing/here")
+def test_what_the_store_lacks_is_missed(store: Store, tiny: Registry) -> None:
+    """As in a folder: a DataError that names the scenarios."""
+    with pytest.raises(DataError) as caught:
+        lagbench.open_split(SPLIT, size=SIZE, subset="train", root=f"{store.url}/nothing")
+    assert "0-1" in str(caught.value)
 
 
-def test_verify_mends_the_copy_and_tells_of_the_store(url: str, tiny: Registry) -> None:
-    """A damaged file comes again; an object that is gone is named."""
-    verify(SPLIT, SIZE, root=url, complete=True, registry=tiny).check()
-    path = resolve_root(url) / FOLDER / "valid/0002.nc"
+def test_verify_mends_the_copy_and_tells_of_the_store(store: Store, tiny: Registry) -> None:
+    """A damaged file comes again; an object that is gone is named, but over HTTP, which lists nothing."""
+    verify(SPLIT, SIZE, root=store.url, complete=True, registry=tiny).check()
+    path = resolve_root(store.url) / FOLDER / "valid/0002.nc"
     path.write_bytes(path.read_bytes()[:-9] + bytes(9))
-    verify(SPLIT, SIZE, root=url, complete=True, registry=tiny).check()
-    remove(url, f"{FOLDER}/valid/0002.nc")
-    with pytest.raises(DataError, match=r"not there(.*\n)*.*scenarios 2\n"):
-        verify(SPLIT, SIZE, root=url, registry=tiny)
+    verify(SPLIT, SIZE, root=store.url, complete=True, registry=tiny).check()
+    store.remove(f"{FOLDER}/valid/0002.nc")
+    if not store.server:
+        with pytest.raises(DataError) as caught:
+            verify(SPLIT, SIZE, root=store.url, registry=tiny)
+        assert str(caught.value.where).endswith("scenarios 2")
 
 
-def test_an_emptied_store_is_not_whole(url: str, tiny: Registry) -> None:
+def test_an_emptied_store_is_not_whole(store: Store, tiny: Registry) -> None:
     """Files that are in the working copy alone make no data set of the store whole, be it one or all."""
-    whole = verify(SPLIT, SIZE, root=url, complete=True, registry=tiny)
+    whole = verify(SPLIT, SIZE, root=store.url, complete=True, registry=tiny)
     assert not whole.problems
-    manifest = json.loads(objects(url)[f"{FOLDER}/manifest.json"])
+    manifest = json.loads(store.read(MANIFEST))
     manifest["files"] = [entry for entry in manifest["files"] if entry["scenario"] != 3]
-    put(url, f"{FOLDER}/manifest.json", json.dumps(manifest).encode())
-    lost = verify(SPLIT, SIZE, root=url, registry=tiny)
+    store.put(MANIFEST, json.dumps(manifest).encode())
+    lost = verify(SPLIT, SIZE, root=store.url, registry=tiny)
     assert "scenario 3 is in the working copy alone, not in the store" in lost.problems
-    remove(url, f"{FOLDER}/manifest.json")
-    emptied = verify(SPLIT, SIZE, root=url, registry=tiny)
-    assert sum("in the working copy alone" in words for words in emptied.problems) == 5
+    store.remove(MANIFEST)
+    assert len(verify(SPLIT, SIZE, root=store.url, registry=tiny).problems) == 5
 
 
 @pytest.mark.parametrize("change", ["flipped", "shorter", "other scenario"])
-def test_other_content_is_refused(url: str, tiny: Registry, change: str) -> None:
+def test_other_content_is_refused(folder: Store, tiny: Registry, change: str) -> None:
     """The error names the object, and no file of it is left."""
-    good = objects(url)[f"{FOLDER}/test/0003.nc"]
-    other = objects(url)[f"{FOLDER}/test/0004.nc"]
+    good, other = (folder.read(f"{FOLDER}/test/{name}.nc") for name in ("0003", "0004"))
     bad = {
         "flipped": good[:-9] + bytes([good[-9] ^ 1]) + good[-8:],
         "shorter": good[:-1],
         "other scenario": other,
     }
-    put(url, f"{FOLDER}/test/0003.nc", bad[change])
+    folder.put(f"{FOLDER}/test/0003.nc", bad[change])
     with pytest.raises((WrongContentError, WrongLengthError)) as caught:
-        lagbench.open_split(SPLIT, size=SIZE, root=url)
-    assert caught.value.where == f"{url}/{FOLDER}/test/0003.nc"
-    assert "mirror" not in str(caught.value)
-    assert {*here(url)} <= {"test/0004.nc"}
+        lagbench.open_split(SPLIT, size=SIZE, root=folder.url)
+    assert caught.value.where == f"{folder.url}/{FOLDER}/test/0003.nc"
+    assert {*here(folder.url)} <= {"test/0004.nc"}
 
 
-def test_another_data_set_is_refused(url: str, unmeasured: Registry, generated: GenerationResult) -> None:
+def test_another_data_set_is_refused(folder: Store) -> None:
     """A manifest whose hashes are not those of datasets.yaml brings nothing."""
-    text = json.loads(objects(url)[f"{FOLDER}/manifest.json"])
+    text = json.loads(folder.read(MANIFEST))
     for entry in text["files"]:
         entry["content_sha256"] = "0" * 64
-    put(url, f"{FOLDER}/manifest.json", json.dumps(text).encode())
-    with pytest.raises(WrongContentError, match="holds another data set"):
-        lagbench.open_split(SPLIT, size=SIZE, root=url)
-    assert here(url) == []
+    folder.put(MANIFEST, json.dumps(text).encode())
+    with pytest.raises(WrongContentError):
+        lagbench.open_split(SPLIT, size=SIZE, root=folder.url)
+    assert here(folder.url) == []
 
 
-def test_fetching_goes_on_where_it_stopped(
-    url: str, tiny: Registry, generated: GenerationResult, asked: list[tuple[str, int]]
-) -> None:
+def test_fetching_goes_on_where_it_stopped(store: Store, tiny: Registry, generated: GenerationResult) -> None:
     """Half a file under its temporary name is completed from there."""
     whole = (generated.folder / "test/0003.nc").read_bytes()
-    half = partial_name(resolve_root(url) / FOLDER / "test/0003.nc")
+    half = partial_name(resolve_root(store.url) / FOLDER / "test/0003.nc")
     half.parent.mkdir(parents=True)
     half.write_bytes(whole[: len(whole) // 2])
-    lagbench.open_split(SPLIT, size=SIZE, root=url).close()
-    assert ("test/0003.nc", len(whole) // 2) in asked
-    assert here(url) == ["manifest.json", "test/0003.nc", "test/0004.nc"]
+    lagbench.open_split(SPLIT, size=SIZE, root=store.url).close()
+    assert here(store.url) == ["manifest.json", "test/0003.nc", "test/0004.nc"]
+    if store.server:
+        assert (f"/{FOLDER}/test/0003.nc", f"bytes={len(whole) // 2}-") in store.server.asked
 
 
 def test_who_watches_is_told_how_far_it_is(
@@ -212,21 +217,23 @@ def test_who_watches_is_told_how_far_it_is(
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     lagbench.open_split(SPLIT, size=SIZE, root=url).close()
     assert f"fetching from {url}: 2 of 2 files" in capsys.readouterr().err
-    with quietly():
+    with copy.quietly():
         lagbench.open_split(SPLIT, size=SIZE, subset="valid", root=url).close()
     assert capsys.readouterr() == ("", "")
 
 
-def test_what_only_the_copy_has_stays_known(url: str, tiny: Registry, generated: GenerationResult) -> None:
+def test_what_only_the_copy_has_stays_known(
+    folder: Store, tiny: Registry, generated: GenerationResult
+) -> None:
     """Reading loses nothing of a generation that could not put its files yet."""
-    shutil.copytree(generated.root, resolve_root(url), dirs_exist_ok=True)
-    (resolve_root(url) / FOLDER / "test/0003.nc").unlink()
-    full = objects(url)[f"{FOLDER}/manifest.json"]
+    shutil.copytree(generated.root, resolve_root(folder.url), dirs_exist_ok=True)
+    (resolve_root(folder.url) / FOLDER / "test/0003.nc").unlink()
+    full = folder.read(MANIFEST)
     less = json.loads(full)
     less["files"] = [entry for entry in less["files"] if entry["subset"] != "train"]
-    put(url, f"{FOLDER}/manifest.json", json.dumps(less).encode())
-    lagbench.open_split(SPLIT, size=SIZE, root=url).close()
-    assert (resolve_root(url) / FOLDER / "manifest.json").read_bytes() == full
+    folder.put(MANIFEST, json.dumps(less).encode())
+    lagbench.open_split(SPLIT, size=SIZE, root=folder.url).close()
+    assert (resolve_root(folder.url) / MANIFEST).read_bytes() == full
 
 
 def test_urls_and_paths_are_told_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
