@@ -17,6 +17,8 @@ import pytest
 from lying_server import Mirror, serving
 from moto.server import ThreadedMotoServer
 
+from lagbench.data.layout import NOTES_NAME
+
 CREDENTIALS = {
     "AWS_ACCESS_KEY_ID": "testing",
     "AWS_SECRET_ACCESS_KEY": "testing",
@@ -65,12 +67,12 @@ def objects(url: str) -> dict[str, bytes]:
 
 
 def files(root: Path) -> dict[str, bytes]:
-    """Return name and content of all files below a folder but locks and the mark."""
+    """Return name and content of all files below a folder but locks, notes and the mark."""
     found = {path.relative_to(root).as_posix(): path for path in root.rglob("*") if path.is_file()}
     return {
         name: path.read_bytes()
         for name, path in found.items()
-        if ".lock" not in name and path.name != "store.json"
+        if ".lock" not in name and path.name not in ("store.json", NOTES_NAME)
     }
 
 

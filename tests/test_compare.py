@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from pathlib import Path
 from typing import Any
@@ -263,3 +264,25 @@ def test_how_much_better_lies_in_its_interval(
     assert found, line
     by, low, high = map(float, found.groups())
     assert 0.0 < low <= by <= high
+
+
+def test_pipes_and_devices_are_refused_at_once(tmp_path: Path) -> None:
+    """A FIFO that nobody writes to, a device that never ends, a file too long, by any name."""
+    os.mkfifo(tmp_path / "fifo.json")
+    (tmp_path / "zero.json").symlink_to("/dev/zero")
+    with (tmp_path / "long.json").open("wb") as stream:
+        stream.truncate(1 << 40)
+    for name in ("fifo.json", "zero.json", "long.json", "x" * 300, "y" * 300 + ".json"):
+        with pytest.raises(UnreadableFileError) as caught:
+            compare(tmp_path / name, tmp_path / name)
+        assert caught.value.where == str(tmp_path / name)
+
+
+def test_booleans_are_no_ids_and_no_values(tmp_path: Path) -> None:
+    """True is no scenario 1, nor an error of 1."""
+    whole = published(tmp_path, [1.0, 2.0], method="a")
+    for number, task in enumerate(({"scenarios": [False, True]}, {"scenarios": [0, 1]})):
+        values = [True, 2.0] if number else [1.0, 2.0]
+        odd = published(tmp_path, values, method=f"b{number}", task=task)
+        with pytest.raises(UnreadableFileError):
+            compare(whole, odd)

@@ -12,7 +12,8 @@ import netCDF4
 import numpy as np
 import pytest
 import torch
-from simple_models import FACTS, Bursting, Drift, install
+from simple_models import FACTS, Bursting, Drift, State, install
+from torch import Tensor
 
 from lagbench.baselines import predict as prediction
 from lagbench.baselines.baseline import Batch
@@ -177,6 +178,23 @@ def test_a_diverging_scenario_leaves_others_alone() -> None:
     alone = roll_out(model, single(batch, 0), 8)[0]
     assert torch.equal(good.position, alone.position)
     assert good.position.shape == bad.position.shape == (8, 3, 2)
+
+
+class Fleeing(Drift):
+    """A Drift whose particles go a box farther to the right in every frame."""
+
+    def advance(self, state: State) -> tuple[State, Tensor]:
+        """Advance by one frame."""
+        state, position = super().advance(state)
+        return state, position + torch.tensor([float(state[2] - 1), 0.0])
+
+
+def test_a_rollout_is_frozen_before_it_is_too_far(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the scorer would refuse is frozen within ten boxes, as what ceases to be finite is."""
+    found = roll_out(Fleeing.build({"start": 0.0}, FACTS), windows([0.9]), 30)[0]
+    assert found.diverged_at is not None
+    assert 8.0 < float(found.position.max()) < 10.6
+    assert torch.isfinite(found.position).all()
 
 
 def test_rollouts_keep_the_mode() -> None:

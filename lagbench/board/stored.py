@@ -25,7 +25,7 @@ from lagbench.scoring.card import unreadable_scores
 from lagbench.scoring.scenario import FRAMES, PARTICLES, Preview
 from lagbench.scoring.score_file import FILM_RANGE, StoredScores, read_statistics
 from lagbench.scoring.task import ranking_metric
-from lagbench.submission.opening import opened
+from lagbench.submission.hdf5 import opened
 from lagbench.submission.task_checks import frames_to_predict
 
 from .coverage import reported_frames

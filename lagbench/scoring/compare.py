@@ -8,6 +8,7 @@ Names of methods that stand beside each other.
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,7 +20,7 @@ from lagbench.errors import DataError, UnreadableFileError, UsageError, nearest
 from lagbench.metrics import Comparison, Direction, Score
 from lagbench.metrics import compare as compare_scores
 from lagbench.metrics.comparison import FEWEST_SCENARIOS
-from lagbench.submission.format_checks import MAX_NAME
+from lagbench.submission.format import MAX_NAME
 
 from .card import JSON_NAME, PublishedScores, digits, parse_scores, read_scores
 from .scenario import SUBMISSION
@@ -176,7 +177,7 @@ def _contestant(
 ) -> tuple[Contestant, Mapping[str, Mapping[str, Score]]]:
     """Return a submission and the floors scored beside it."""
     path = Path(source)
-    if path.is_dir():
+    if os.path.isdir(path):  # unlike Path.is_dir, it takes any name
         path = path / JSON_NAME
     held = read_scores(path) if path.suffix == ".json" else _scored(path, root, workers, registry)
     if SUBMISSION not in held.scores:

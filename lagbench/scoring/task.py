@@ -92,6 +92,7 @@ def load_scored_task(size: Size, root: Path) -> ScoredTask:
     bring(size, root, size.subsets["test"])
     truth = Truth(size, root)
     truth.require()
+    truth.check()
     test = sorted(size.subsets["test"])
     present = set().union(*(_materials(truth, scenario) for scenario in test))
     manifest = None if size.measured else read_manifest(root, size.split, size.name, size.major)

@@ -15,26 +15,30 @@ from lagbench.data.checksums import ContentHasher
 from lagbench.data.registry import spell_ids
 from lagbench.errors import UsageError
 
-from .anatomy import Anatomy, dissect
 from .findings import Findings
-from .format_checks import check_dims, check_dtype, check_format, check_marks
-from .header import DIMS, OPTIONAL, REQUIRED, SPACE, Header
-from .opening import opened, reading
-from .storage import cache_of
+from .format import (
+    DIMS,
+    REQUIRED,
+    SPACE,
+    Anatomy,
+    Header,
+    check_dims,
+    check_dtype,
+    check_format,
+    check_marks,
+    dissect,
+    header_of,
+)
+from .hdf5 import cache_of, opened, reading
 
-__all__ = ["Predictions", "open_predictions"]
+__all__ = ["Predictions", "attach", "open_predictions"]
 
 BLOCK_BYTES = 4 << 20
 """Blocks have about this size [bytes]."""
 
 
 class Predictions:
-    """An open predictions.nc; use it as a context manager.
-
-    Attributes:
-        path: path of the file.
-        header: what it says about itself.
-    """
+    """An open predictions.nc; use it as a context manager."""
 
     def __init__(self, path: Path, header: Header, position: h5py.Dataset, stack: ExitStack) -> None:
         self.path = path
@@ -102,16 +106,21 @@ class Predictions:
         Raises:
             UnreadableFileError: the file is damaged.
         """
+        hasher = self.hasher()
+        for scenario in sorted(self.header.scenarios):
+            for _, block in self.blocks(scenario):
+                hasher.update("position", block)
+        return hasher.hexdigest()
+
+    def hasher(self) -> ContentHasher:
+        """Return the content hash as far as the header goes; blocks follow by ascending scenario id."""
         header = self.header
         ids = sorted(header.scenarios)
         identity = {name: getattr(header, name) for name in REQUIRED}
         hasher = ContentHasher({**identity, "scenarios": ids, "frames": list(header.frames)})
         shape = (len(ids), len(header.frames), header.particles, SPACE)
         hasher.declare("position", np.dtype(np.float32), DIMS, shape)
-        for scenario in ids:
-            for _, block in self.blocks(scenario):
-                hasher.update("position", block)
-        return hasher.hexdigest()
+        return hasher
 
     def _rows(self, row: int, first: int, count: int) -> NDArray[np.float32]:
         with reading(self.path, "position"):
@@ -141,37 +150,12 @@ def open_predictions(path: str | Path) -> Predictions:
 
 
 def attach(file: h5py.File, path: Path, anatomy: Anatomy, stack: ExitStack) -> Predictions:
-    """Return the predictions of an open file whose layout has been checked."""
+    """Return the predictions of an open file whose layout has been checked; they take over the stack."""
     header = header_of(anatomy)
     with reading(path, "position"):
-        position = h5py.Dataset(_open_position(file, anatomy))
+        # just the chunk cache that reading in order needs
+        size, kept = cache_of(anatomy.arrays["position"])
+        plist = h5py.h5p.create(h5py.h5p.DATASET_ACCESS)
+        plist.set_chunk_cache(10 * kept + 521, size, 1.0)
+        position = h5py.Dataset(h5py.h5d.open(file.id, b"position", plist))
     return Predictions(path, header, position, stack.pop_all())
-
-
-def header_of(anatomy: Anatomy) -> Header:
-    """Return the header of a file whose layout has been checked."""
-    scenarios = anatomy.integers["scenario"]
-    marks = anatomy.integers.get("diverged_at", ())
-    labels: dict[str, Any] = {name: str(anatomy.attributes[name]) for name in REQUIRED}
-    labels |= {name: _optional(anatomy.attributes[name], kind) for name, kind in OPTIONAL.items()}
-    return Header(
-        **labels,
-        scenarios=scenarios,
-        frames=anatomy.integers["frame"],
-        particles=(anatomy.arrays["position"].shape or ())[2],
-        diverged_at={i: mark for i, mark in zip(scenarios, marks, strict=False) if mark >= 0},
-    )
-
-
-def _optional(value: object, kind: type[Any]) -> Any:  # noqa: ANN401
-    if kind is float and isinstance(value, int):
-        return float(value)
-    return value if isinstance(value, kind) else None
-
-
-def _open_position(file: h5py.File, anatomy: Anatomy) -> h5py.h5d.DatasetID:
-    """Open ``position`` with just the chunk cache that reading in order needs."""
-    size, kept = cache_of(anatomy.arrays["position"])
-    plist = h5py.h5p.create(h5py.h5p.DATASET_ACCESS)
-    plist.set_chunk_cache(10 * kept + 521, size, 1.0)
-    return h5py.h5d.open(file.id, b"position", plist)

@@ -1,4 +1,4 @@
-"""Checks on the predicted positions: finite, where they start, where they lie, how far they jump."""
+"""Checks on the predicted positions: finite, frozen, where they lie, how far they jump."""
 
 from __future__ import annotations
 
@@ -10,23 +10,22 @@ from numpy.typing import NDArray
 from lagbench.data.registry import Size
 
 from .findings import Findings
-from .guesses import guess_start
-from .reader import Predictions
+from .predictions import Predictions
+from .start import JUMP
 from .truth import Truth
 
 __all__ = [
-    "JUMP",
+    "MAX_DISTANCE",
     "Survey",
     "check_domain",
     "check_finite",
     "check_frozen",
     "check_jumps",
-    "check_start",
     "survey",
 ]
 
-JUMP = 10.0
-"""A step is suspect beyond this many of the truth's largest per-frame displacement."""
+MAX_DISTANCE = 10.0
+"""Farthest outside the walls that a position may be [length]; the box has length 1."""
 
 FILL = np.float32(9.969209968386869e36)
 """What netCDF puts where a float32 was never written."""
@@ -36,30 +35,25 @@ FILL = np.float32(9.969209968386869e36)
 class Survey:
     """What one pass over a scenario's predictions saw."""
 
-    scenario: int  # id of the scenario
-    values: int = 0  # how many values there are
+    scenario: int
+    values: int = 0
     bad: int = 0  # values that are not finite, or were never written
     unwritten: int = 0  # those of them that were never written
-    first_bad: tuple[int, int, int] | None = None  # frame, particle and component of the first of them
-    positions: int = 0  # how many positions there are
-    outside: int = 0  # positions outside the domain
+    first_bad: tuple[int, int, int] | None = None  # frame, particle and component
+    positions: int = 0
+    outside: int = 0  # positions more than a solver cell outside the box
     off_grid: int = 0  # positions outside the unit box
-    farthest: float = 0.0  # largest distance outside the domain along an axis [length]
-    first_outside: tuple[int, int] | None = None  # frame and particle of the first one outside
+    farthest: float = 0.0  # largest distance outside the box along an axis [length]
+    first_outside: tuple[int, int] | None = None  # frame and particle
+    lost: tuple[int, int] | None = None  # frame and particle of the first beyond MAX_DISTANCE
     jump: float = 0.0  # largest distance of a particle between consecutive frames [length]
-    jump_at: tuple[int, int] | None = None  # frame and particle of it
+    jump_at: tuple[int, int] | None = None  # frame and particle
     settled: int = 0  # frame that is repeated from there to the end
     _first: tuple[int, NDArray[np.float32]] | None = field(default=None, repr=False)
     _last: NDArray[np.float32] | None = field(default=None, repr=False)
 
     def add(self, first: int, block: NDArray[np.float32], size: Size) -> None:
-        """Take in consecutive frames.
-
-        Args:
-            first: absolute number of the first of them.
-            block: positions [length], shape [frame, particle, space].
-            size: what the registry says of the data set.
-        """
+        """Take in consecutive frames [length], shape [frame, particle, space], the first one by number."""
         wrong = ~np.isfinite(block) | (block == FILL)
         if wrong.any():
             self._add_wrong(first, block, wrong)
@@ -74,11 +68,7 @@ class Survey:
         self._last = block[-1:].copy()
 
     def follow(self, given: NDArray[np.float32]) -> None:
-        """Take in the step from the last given frame to the first predicted one.
-
-        Args:
-            given: positions at the last given frame [length], shape [particle, space].
-        """
+        """Take in the step from the last given frame to the first predicted one."""
         if self._first:
             frame, first = self._first
             self._add_jumps(frame, np.concatenate([given[None], first]))
@@ -103,6 +93,9 @@ class Survey:
             self.outside += int(np.count_nonzero(far))
             self.farthest = max(self.farthest, float(beyond[far].max()))
             self.off_grid += int(np.count_nonzero(((block < 0) | (block > 1)).any(axis=-1)))
+            if self.lost is None and self.farthest > MAX_DISTANCE:
+                frame, particle = (int(i[0]) for i in np.nonzero(beyond > MAX_DISTANCE))
+                self.lost = (first + frame, particle)
 
     def _add_steps(self, first: int, joined: NDArray[np.float32]) -> None:
         moved = np.flatnonzero((joined[1:] != joined[:-1]).any(axis=(1, 2)))
@@ -120,14 +113,20 @@ class Survey:
             self.jump_at = (first + int(frame), int(particle))
 
 
-def survey(predictions: Predictions, size: Size) -> list[Survey]:
-    """Read all predictions of known scenarios once, in blocks, by ascending id."""
+def survey(predictions: Predictions, size: Size) -> tuple[list[Survey], str | None]:
+    """Read all predictions of known scenarios once, in blocks, by ascending id.
+
+    Returns what was seen, and the content hash where all scenarios are known.
+    """
     known = sorted(set(predictions.header.scenarios) & set(size.subsets["test"]))
     surveys = [Survey(scenario) for scenario in known]
+    hasher = predictions.hasher()
     for one in surveys:
         for first, block in predictions.blocks(one.scenario):
+            hasher.update("position", block)
             one.add(first, block, size)
-    return surveys
+    whole = known == sorted(predictions.header.scenarios)
+    return surveys, hasher.hexdigest() if whole else None
 
 
 def check_finite(surveys: list[Survey], out: Findings) -> None:
@@ -166,10 +165,22 @@ def check_frozen(predictions: Predictions, surveys: list[Survey], out: Findings)
 
 
 def check_domain(surveys: list[Survey], size: Size, out: Findings) -> None:
-    """Flag positions more than a solver cell outside the box."""
+    """Flag positions more than a solver cell outside the box; refuse those beyond ten boxes."""
     out.made("in_domain")
     bad = [one for one in surveys if one.first_outside]
     if not bad:
+        return
+    lost = next((one for one in bad if one.lost), None)
+    if lost is not None:
+        frame, particle = lost.lost or (0, 0)
+        out.error(
+            "in_domain",
+            "positions lie far beyond the box: one of them would ruin every mean",
+            where=f"first in scenario {lost.scenario}, frame {frame}, particle {particle}",
+            expected=f"at most {MAX_DISTANCE:g} lengths of the unit box outside the walls",
+            got=f"up to {max(one.farthest for one in bad):.3g} outside",
+            fix="freeze a diverging rollout before that and name the frame in diverged_at",
+        )
         return
     frame, particle = bad[0].first_outside or (0, 0)
     share = sum(one.outside for one in bad) / max(1, sum(one.positions for one in surveys))
@@ -200,26 +211,3 @@ def check_jumps(surveys: list[Survey], truth: Truth, out: Findings) -> None:
                 fix="check the rollout for instability, and that particles keep their order",
             )
     out.made("max_displacement")
-
-
-def check_start(predictions: Predictions, truth: Truth, out: Findings) -> None:
-    """Check that the first predicted frame follows the last given one, particle by particle."""
-    header = predictions.header
-    for scenario in sorted(set(header.scenarios) & set(truth.size.subsets["test"])):
-        given = truth.given(scenario)[-1]
-        first = predictions.frames(scenario, header.frames[0], 1)[0]
-        with np.errstate(all="ignore"):
-            square = np.sum((first.astype(np.float64) - given) ** 2, axis=-1)
-            distance = float(np.sqrt(square.mean()))
-        limit = JUMP * truth.largest_displacement(scenario, enough=distance / JUMP)
-        if np.isfinite(distance) and distance > limit:
-            out.error(
-                "start",
-                "the first predicted frame is far from the last given one",
-                where=f"scenario {scenario}, frame {header.frames[0]}",
-                expected=f"root mean square distance at most {limit:.3g},"
-                f" {JUMP:g} times the truth's largest displacement in a frame",
-                got=f"{distance:.3g}",
-                fix=guess_start(first, given, limit),
-            )
-    out.made("start")
