@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,12 +13,12 @@ import pytest
 from lagbench.baselines import catalogue
 from lagbench.baselines.reproduce import __main__ as command
 from lagbench.baselines.reproduce import mlp_studies
-from lagbench.baselines.reproduce.evidence import Evidence
-from lagbench.baselines.reproduce.plan import Plan
+from lagbench.baselines.reproduce.runs import Plan
 from lagbench.baselines.reproduce.thesis import STUDIES
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
 from lagbench.make.generate import GenerationResult
+from lagbench.scoring.score_file import read_statistics
 
 pytest.importorskip("torch", reason="the extra 'baselines' is not installed")
 
@@ -65,14 +66,11 @@ def test_what_is_there_is_what_was_asked_for(
     capsys.readouterr()
 
     assert reproduce(*ONLY, "--set", "training.steps=2") == 2
-    told = capsys.readouterr().err
-    assert str(folder) in told
-    assert "training.steps = 2, as asked for; the folder has 1" in told
-    assert "--runs" in told
+    assert str(folder) in capsys.readouterr().err
 
     label(folder / "scores.nc", dataset_sha256="f" * 64)
     assert reproduce(*ONLY, *steps) == 0
-    assert f"{folder / 'scores.nc'}: of another version of the data; made again" in capsys.readouterr().err
+    assert str(folder / "scores.nc") in capsys.readouterr().err
     again = stamps(folder)
     assert {name for name in FILES if again[name] != first[name]} == {"scores.nc"}
 
@@ -85,9 +83,7 @@ def test_what_is_there_is_what_was_asked_for(
 
     record = folder / "training.json"
     record.write_text(json.dumps({**json.loads(record.read_text()), "dataset_sha256": "e" * 64}))
-    capsys.readouterr()
     assert reproduce(*ONLY, *steps) == 4
-    assert "trained on other data" in capsys.readouterr().err
 
 
 def test_studies_are_what_was_asked_for(
@@ -111,7 +107,7 @@ def test_studies_are_what_was_asked_for(
             mlp_studies.make_studies(plan, "table_4_2")
             assert list((tmp_path / "runs").rglob("errors.json"))
         else:
-            with pytest.raises(UsageError, match=r"training\.steps = 2"):
+            with pytest.raises(UsageError):
                 mlp_studies.make_studies(plan, "table_4_2")
 
 
@@ -179,20 +175,41 @@ def test_the_way_to_full_is_told_without_data(tmp_path: Path, capsys: pytest.Cap
     assert not list(tmp_path.iterdir())
 
 
-def test_scores_that_are_left_out_are_named(
-    reproduce: Reproduce,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+def test_committed_weights_are_shown_without_training(
+    reproduce: Reproduce, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Where nothing is made, score files of other data are named on stderr."""
-    found = tmp_path / "runs" / SPLIT / "tiny" / "supergat-0" / "scores.nc"
-    init = Evidence.__init__
+    """Their predictions are made on the spot, once, and are those of the run that the weights come from."""
+    made, weights = tmp_path / "runs" / SPLIT / "tiny" / "supergat-0", tmp_path / "weights" / SPLIT / "tiny"
+    assert reproduce(*ONLY, "--set", "training.steps=1") == 0
+    weights.mkdir(parents=True)
+    for source, target in (("weights.pt", "supergat-3.pt"), ("training.json", "supergat-3.json")):
+        (made / source).rename(weights / target)
+    expected = read_statistics(made / "scores.nc").predictions_sha256
+    shutil.rmtree(tmp_path / "runs")
+    capsys.readouterr()
 
-    def stale(self: Evidence, *words: str) -> None:
-        init(self, *words)
-        self.stale.append(found)
+    words = (*ONLY, "--no-training", "--weights", str(tmp_path / "weights"))
+    assert reproduce(*words) == 0
+    assert "seeds 3; 1 x 2 steps" in capsys.readouterr().out
+    folder = made.with_name("supergat-3")
+    assert read_statistics(folder / "scores.nc").predictions_sha256 == expected
+    first = stamps(folder)
+    assert reproduce(*words) == 0
+    assert stamps(folder) == first
+    assert not (folder / "tensorboard").exists()
+    assert list((tmp_path / "runs" / "reproduce" / "tiny").glob("fig_5_22*.png"))
 
-    monkeypatch.setattr(Evidence, "__init__", stale)
-    reproduce(*ONLY, "--no-training")
-    assert f"{found}: scores of another version of the data; left out" in capsys.readouterr().err
+
+def test_nothing_is_made_without_training_and_weights(reproduce: Reproduce, tmp_path: Path) -> None:
+    """Without runs and committed weights a figure says so, and no run appears."""
+    assert reproduce(*ONLY, "--no-training", "--weights", str(tmp_path / "none")) == 0
+    assert [path.name for path in (tmp_path / "runs").iterdir()] == ["reproduce"]
+
+
+def test_unusable_committed_weights_leave_nothing(reproduce: Reproduce, tmp_path: Path) -> None:
+    """Damaged weights end with exit code 3, and no run that a later training would take for its own."""
+    weights = tmp_path / "weights" / SPLIT / "tiny" / "supergat-0.pt"
+    weights.parent.mkdir(parents=True)
+    weights.write_bytes(b"no weights")
+    assert reproduce(*ONLY, "--no-training", "--weights", str(tmp_path / "weights")) == 3
+    assert not list((tmp_path / "runs" / SPLIT).rglob("*.*"))
