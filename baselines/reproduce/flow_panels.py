@@ -85,7 +85,7 @@ def _quiver() -> Drawing:
 
     def drawing(axes: Axes, stage: Stage, name: str | None, frame: int, limit: float) -> None:
         scene = stage.scene(name, frame)
-        draw_walls(axes, scene.recording)
+        draw_walls(axes, scene.recording, scene.frame)
         fields = scene.fields
         x, y = np.meshgrid(fields.grid.axis, fields.grid.axis, indexing="ij")
         shown = fields.counted
