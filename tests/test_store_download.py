@@ -337,7 +337,7 @@ def test_simulated_splits_come_from_a_store_or_are_simulated(
     assert result.verdict == "equal to datasets.yaml"
     assert result.dataset_sha256 == generated.dataset_sha256
     assert len(told) == 1
-    assert f"{running.url}/curl-noise/tiny/v1/test/0003.nc" in told[0]
+    assert f"{running.url}/curl-noise/tiny/v2/test/0003.nc" in told[0]
     assert lagbench.verify("curl-noise", "tiny", root=tmp_path).warnings == ()
 
 

@@ -30,7 +30,7 @@ from lagbench.store.fetch import partial_name
 from lagbench.store.objects import WrongContentError, WrongLengthError
 from lagbench.submission import template
 
-FOLDER = f"{SPLIT}/{SIZE}/v1"
+FOLDER = f"{SPLIT}/{SIZE}/v2"
 MANIFEST = f"{FOLDER}/manifest.json"
 
 

@@ -168,7 +168,7 @@ def panel_rows(rows: Sequence[tuple[str, Rollouts, str | None]], frames: Sequenc
 
 def _draw_arrows(axes: Axes, scene: Scene, limit: float) -> None:
     """Draw the velocity at the nodes; the fastest arrow spans two and a half of them."""
-    draw_walls(axes, scene.recording)
+    draw_walls(axes, scene.recording, scene.frame)
     fields, scale = scene.fields, colour_scale(Panel.STREAMLINES, limit)
     x, y = np.meshgrid(fields.grid.axis, fields.grid.axis, indexing="ij")
     shown = fields.counted
