@@ -76,7 +76,7 @@ def _root_mean_square(values: Array) -> float:
     return math.sqrt(math.fsum(v * v for v in flat) / len(flat))
 
 
-def _grid_rates(lattice: Array, size: Size) -> tuple[float, float]:
+def _grid_rates(lattice: Array, size: Size, scale: float) -> tuple[float, float]:
     """Return RMS divergence (Eq. 5.54) and vorticity [1/s] as the solver's grid sees them.
 
     Central differences between nodes inside the walls: what is not zero of the divergence is
@@ -86,12 +86,20 @@ def _grid_rates(lattice: Array, size: Size) -> tuple[float, float]:
     first, last = size.value("wall") + 1, size.grid - size.value("wall")
     node = np.arange(first, last) / size.grid
     points = np.stack([side.ravel() for side in np.meshgrid(node, node, indexing="ij")], axis=-1)
-    psi = stream_function(points, lattice, low=low, high=high, scale=size.value("velocity_scale"))
+    psi = stream_function(points, lattice, low=low, high=high, scale=scale)
     u, v = (part.reshape(len(node), len(node)) for part in (psi.y, -psi.x))
     slope = 0.5 * size.grid
     divergence = (u[2:, 1:-1] - u[:-2, 1:-1] + v[1:-1, 2:] - v[1:-1, :-2]) * slope
     vorticity = (v[2:, 1:-1] - v[:-2, 1:-1] - u[1:-1, 2:] + u[1:-1, :-2]) * slope
     return _root_mean_square(divergence), _root_mean_square(vorticity)
+
+
+def _scale(size: Size, frequency: int) -> float:
+    """Return s of Eq. (1) at a frequency [length/s]: that of the least one times (F_least / F)^k."""
+    scale = float(size.value("velocity_scale"))
+    for _ in range(size.value("scale_falloff")):
+        scale = scale * size.value("frequency_min") / frequency
+    return scale
 
 
 def _positions(rng: RandomSource, size: Size, low: float, high: float) -> Array:
@@ -113,9 +121,10 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     frequency = scenario % size.value("frequency_count") + size.value("frequency_min")
     position = _positions(rng, size, low, high)
     lattice = gradients(rng, frequency)
-    psi = stream_function(position, lattice, low=low, high=high, scale=size.value("velocity_scale"))
+    scale = _scale(size, frequency)
+    psi = stream_function(position, lattice, low=low, high=high, scale=scale)
     velocity, affine = _flow(psi)
-    divergence, vorticity = _grid_rates(lattice, size)
+    divergence, vorticity = _grid_rates(lattice, size, scale)
     energy = 0.5 * math.fsum(v * v for v in velocity.ravel().tolist()) / size.particles
     return InitialState(
         position=position,
@@ -125,6 +134,7 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
         area=(high - low) * (high - low),
         parameters={
             "frequency": frequency,
+            "scale": scale,
             "initial_kinetic_energy": energy,
             "initial_divergence_rms": divergence,
             "initial_vorticity_rms": vorticity,

@@ -257,7 +257,7 @@ def test_withdrawn_entries_may_be_old(own: BoardBench) -> None:
     """What is not active need not belong to the data set of today."""
     text = own.data.size.file.read_text() if own.data.size.file.exists() else ""
     newer = own.folder.parent / "newer.yaml"
-    newer.write_text(text.replace("version: 1.0.0", "version: 2.0.0"))
+    newer.write_text(text.replace("version: 2.0.0", "version: 3.0.0"))
     bench = own
     result = check_board(bench.folder, registry=load(newer), page=False, isolated=False)
     assert {finding.check for finding in result.findings} == {"version"}

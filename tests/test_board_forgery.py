@@ -241,7 +241,7 @@ def test_a_broken_score_file_is_not_opened_for_its_predictions(
 def newer(own: BoardBench) -> Path:
     """Write a registry in which the data set has a new MAJOR version."""
     path = own.folder.parent / "newer.yaml"
-    path.write_text(own.data.size.file.read_text().replace("version: 1.0.0", "version: 2.0.0"))
+    path.write_text(own.data.size.file.read_text().replace("version: 2.0.0", "version: 3.0.0"))
     return path
 
 

@@ -69,7 +69,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     size, manifest = make(root)
     assert manifest.complete
     written = write(root, size, manifest)
-    folder = dataset_folder(root, "cavity", "tiny", 1)
+    folder = dataset_folder(root, "cavity", "tiny", 2)
     assert {p.relative_to(folder).as_posix() for p in written} == {
         "README.md",
         "croissant.json",

@@ -17,7 +17,7 @@ from lagbench.data.registry import Registry
 from lagbench.errors import DataError, UsageError
 from lagbench.make.generate import GenerationResult, generate
 
-FOLDER = Path(SPLIT) / SIZE / "v1"
+FOLDER = Path(SPLIT) / SIZE / "v2"
 
 
 def everything(root: Path) -> dict[str, bytes]:
@@ -29,7 +29,7 @@ def everything(root: Path) -> dict[str, bytes]:
 
 def part(generated: GenerationResult, root: Path, registry: Registry, ids: tuple[int, ...]) -> Path:
     """Return a root that holds some scenarios only, as a job of an array leaves it."""
-    size, whole = registry.size(SPLIT, SIZE), read_manifest(generated.root, SPLIT, SIZE, 1)
+    size, whole = registry.size(SPLIT, SIZE), read_manifest(generated.root, SPLIT, SIZE, 2)
     assert whole is not None
     entries = [entry for entry in whole.files if entry.scenario in ids]
     for entry in entries:

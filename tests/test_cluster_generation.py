@@ -55,7 +55,7 @@ def test_a_worker_killed_and_one_slowed(
     The client says that it is another machine: the manifest names those that simulated.
     """
     monkeypatch.setattr(campaign, "environment_of", lambda device: {"machine": "aarch64", "device": device})
-    folder, holders = tmp_path / SPLIT / SIZE / "v1", list[Holder | None]()
+    folder, holders = tmp_path / SPLIT / SIZE / "v2", list[Holder | None]()
     news: list[Progress] = []
     with Sabotage(tmp_path, lambda: holders.append(read_holder(folder))) as sabotage:
         result = generate(
@@ -94,7 +94,7 @@ def test_a_lost_scheduler_is_an_error_and_resumed(
             )
     assert caught.value.exit_code == 5
     assert "run the same command again" in str(caught.value)
-    manifest = read_manifest(tmp_path, SPLIT, SIZE, 1)
+    manifest = read_manifest(tmp_path, SPLIT, SIZE, 2)
     assert manifest is not None
     assert len(manifest.files) >= 1
     assert writers(tmp_path) == {}

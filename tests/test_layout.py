@@ -29,4 +29,4 @@ def test_a_relative_root_is_made_absolute(monkeypatch: pytest.MonkeyPatch, tmp_p
 
 def test_scenario_path_of_the_design() -> None:
     """<root>/<split>/<size>/v<MAJOR>/<subset>/<id:04d>.nc."""
-    assert scenario_path(Path("r"), make_key(7)).as_posix() == "r/cavity/tiny/v1/test/0007.nc"
+    assert scenario_path(Path("r"), make_key(7)).as_posix() == "r/cavity/tiny/v2/test/0007.nc"

@@ -28,7 +28,7 @@ from lagbench.store import lease as leases
 from lagbench.store import publication
 from lagbench.store.remote import Remote
 
-FOLDER = f"{SPLIT}/{SIZE}/v1"
+FOLDER = f"{SPLIT}/{SIZE}/v2"
 MANIFEST = f"{FOLDER}/manifest.json"
 Fill = Callable[[str], str]
 Run = Callable[..., GenerationResult]
@@ -295,7 +295,7 @@ def test_what_was_made_anew_is_not_fetched_back(
     path.write_bytes(path.read_bytes() + b"\0")
     with publication.publication(size, root) as store:
         assert store is not None
-        manifest = read_manifest(root, SPLIT, SIZE, 1)
+        manifest = read_manifest(root, SPLIT, SIZE, 2)
         assert manifest is not None
         first = manifest.files[0]
         new = first.model_copy(update={"bytes": first.bytes + 1, "file_sha256": file_sha256(path)})

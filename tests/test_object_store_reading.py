@@ -30,7 +30,7 @@ from lagbench.store.mirror import partial_name
 from lagbench.store.mirror_errors import WrongContentError, WrongLengthError
 from lagbench.submission import template
 
-FOLDER = f"{SPLIT}/{SIZE}/v1"
+FOLDER = f"{SPLIT}/{SIZE}/v2"
 
 
 @pytest.fixture(autouse=True)

@@ -61,7 +61,7 @@ def run(
 def truth(root: Path) -> dict[int, np.ndarray]:
     """Return the positions of the test scenarios by id, read without our code."""
     found = {}
-    for file in sorted((root / "curl-noise/tiny/v1/test").glob("*.nc")):
+    for file in sorted((root / "curl-noise/tiny/v2/test").glob("*.nc")):
         with netCDF4.Dataset(file) as data:
             found[int(file.stem)] = np.asarray(data["position"][:], np.float64)
     return found
@@ -188,7 +188,7 @@ def test_rollouts_keep_the_mode() -> None:
 
 def test_validation_error(run: Predict, generated: GenerationResult) -> None:
     """The RMSE is the mean over scenarios of the root of the mean squared error, with bf16 weights."""
-    folder = generated.root / "curl-noise/tiny/v1/train"
+    folder = generated.root / "curl-noise/tiny/v2/train"
     model = Drift.build({"start": 1 / 3}, FACTS)
     found = validate(model, scenario_batch(sorted(folder.glob("*.nc")), slice(0, 10)))
     a = float(torch.tensor(1 / 3).bfloat16())
@@ -216,7 +216,7 @@ def test_only_the_given_frames_are_read(run: Predict, copied: Callable[[], Path]
     """With all later frames of test overwritten the predictions are the same."""
     root = copied()
     whole = run(name="a.nc", root=root)
-    for file in (root / "curl-noise/tiny/v1/test").glob("*.nc"):
+    for file in (root / "curl-noise/tiny/v2/test").glob("*.nc"):
         file.chmod(0o644)
         with netCDF4.Dataset(file, "r+") as data:
             data["position"][6:] = 0.5

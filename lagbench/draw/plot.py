@@ -277,14 +277,14 @@ def describe(recording: Recording) -> str:
 
 def _moment(scene: Scene) -> list[str]:
     """Return frame and time, and which walls move, which way, how fast."""
-    return [f"frame {scene.frame}", f"t = {scene.time:.2f} s", *_motions(scene.recording)]
+    return [f"frame {scene.frame}", f"t = {scene.time:.2f} s", *_motions(scene)]
 
 
-def _motions(recording: Recording) -> list[str]:
+def _motions(scene: Scene) -> list[str]:
     """Say which walls move, which way, how fast."""
     return [
         f"{WALLS[wall]} wall moves {DIRECTIONS[_sign(v[0]), _sign(v[1])]} at {np.abs(v).max():.3g} length/s"
-        for wall, v in moving_walls(recording)
+        for wall, v in moving_walls(scene.recording, scene.frame)
     ]
 
 
