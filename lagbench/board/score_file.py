@@ -2,13 +2,20 @@
 
 HDF5 lets a file show the bytes of other files as its own (external links, external storage,
 virtual data sets) and unpack a few bytes to gigabytes. Both are refused by looking at the
-headers, before a value is read.
+headers, before a value is read. HDF5 is also C code that believes what it reads, so strangers'
+files are first read in a child process under limits: this module is the child's program too.
 """
 
 from __future__ import annotations
 
+import json
+import os
+import resource
 import stat
-from collections.abc import Iterator
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,9 +35,7 @@ from lagbench.scoring.task import ranking_metric
 from lagbench.submission.hdf5 import opened
 from lagbench.submission.task_checks import frames_to_predict
 
-from .coverage import reported_frames
-
-__all__ = ["MAX_SCORE_BYTES", "Stored", "read_stored"]
+__all__ = ["MAX_SCORE_BYTES", "Stored", "main", "read_stored", "reported_frames", "unreadable_in_child"]
 
 MAX_SCORE_BYTES = 300_000
 """Longest score file [bytes]."""
@@ -46,6 +51,25 @@ FILTERS = (h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE)
 NUMBERS = (h5py.h5t.INTEGER, h5py.h5t.FLOAT)
 LAYOUTS = (h5py.h5d.COMPACT, h5py.h5d.CONTIGUOUS, h5py.h5d.CHUNKED)
 
+MEMORY = 768 << 20
+"""Address space of the child [bytes]."""
+
+CPU_SECONDS = 10
+"""Computing time of the child to start, and for every 50 files [s]."""
+
+FILES_PER_PART = 50
+
+MOST_STOPS = 5
+"""Files that may stop a child before the rest is left unread: each costs a child's whole time."""
+
+WALL_SECONDS = 600.0
+"""Time for every 50 files together [s]; a busy machine may need minutes."""
+
+UNREAD = "not read, because too many others had to be stopped or took all the time allowed"
+
+CHILD = "lagbench.board.score_file"
+"""The child's program; -P keeps the current folder, where strangers' files may lie, off its path."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Stored:
@@ -56,6 +80,12 @@ class Stored:
     precision: float  # step of the packed vorticity maps [1/frame]
 
 
+def reported_frames(size: Size) -> tuple[int, ...]:
+    """Return the frames of interest and the last one, absolute."""
+    frames = tuple(frames_to_predict(size))
+    return tuple(sorted({*size.task.frames_of_interest, frames[-1]}.intersection(frames)))
+
+
 def read_stored(path: Path, size: Size | None = None) -> Stored:
     """Read a score file."""
     _check_length(path)
@@ -63,7 +93,11 @@ def read_stored(path: Path, size: Size | None = None) -> Stored:
         with opened(path) as file:
             _check_members(file)
         scores = read_statistics(path)
-        _check_statistics(scores)
+        tallies = list(scores.tallies.values())
+        if not tallies or len(tallies[0].names) > MAX_STATISTICS:
+            raise ValueError("no scenarios, or too many statistics")
+        if not all(np.isfinite(tally.total).all() for tally in tallies):
+            raise ValueError("infinite statistics")
         preview, precision = _read_preview(path)
         if size is not None:
             _check_task(scores, preview, size)
@@ -101,9 +135,11 @@ def _check_members(file: h5py.File) -> None:
     total = 0
     for dataset in _datasets(file):
         plist = dataset.id.get_create_plist()
-        filters = {plist.get_filter(i)[0] for i in range(plist.get_nfilters())}
-        if plist.get_layout() not in LAYOUTS or plist.get_external_count() or not filters.issubset(FILTERS):
-            raise ValueError("a variable that does not lie in this file, or is packed in another way")
+        filters = [plist.get_filter(i)[0] for i in range(plist.get_nfilters())]
+        if plist.get_layout() not in LAYOUTS or plist.get_external_count():
+            raise ValueError("a variable that does not lie in this file")
+        if not set(filters).issubset(FILTERS) or len(set(filters)) < len(filters):
+            raise ValueError("a variable that is packed in another way, or twice")
         if dataset.id.get_type().get_class() not in NUMBERS:  # strings may share one long piece of heap
             raise ValueError("a variable that holds no plain numbers")
         total += dataset.id.get_space().get_simple_extent_npoints() * dataset.id.get_type().get_size()
@@ -130,14 +166,6 @@ def _datasets(file: h5py.File) -> Iterator[h5py.Dataset]:
                 groups.append(group[name])
             else:
                 raise ValueError("a group that score files do not have")
-
-
-def _check_statistics(scores: StoredScores) -> None:
-    tallies = list(scores.tallies.values())
-    if not tallies or len(tallies[0].names) > MAX_STATISTICS:
-        raise ValueError("no scenarios, or too many statistics")
-    if not all(np.isfinite(tally.total).all() for tally in tallies):
-        raise ValueError("infinite statistics")
 
 
 def _read_preview(path: Path) -> tuple[Preview, float]:
@@ -190,11 +218,10 @@ def _check_shapes(preview: Preview) -> None:
     for name, (got, expected) in shapes.items():
         if got != expected:
             raise ValueError(f"{name} has shape {got}, not {expected}")
-    low, high = FILM_RANGE
-    ends = preview.film[np.isfinite(preview.film)]
-    if frames > FRAMES or particles > PARTICLES or ends.size < preview.film.size:
+    if frames > FRAMES or particles > PARTICLES or not np.isfinite(preview.film).all():
         raise ValueError("the film is longer than films are, or has holes")
-    if ends.size and (ends.min() < low - 1e-3 or ends.max() > high + 1e-3):
+    low, high = FILM_RANGE
+    if preview.film.size and (preview.film.min() < low - 1e-3 or preview.film.max() > high + 1e-3):
         raise ValueError("the film leaves its range")
 
 
@@ -209,7 +236,70 @@ def _check_task(scores: StoredScores, preview: Preview, size: Size) -> None:
     grid = Grid(task.score_grid.cells, Placement(task.score_grid.placement))
     if preview.vorticity.shape[-1] != grid.nodes or preview.map_frames != reported_frames(size):
         raise ValueError("maps of another grid or of other frames")
-    if not set(preview.film_frames).issubset(frames) or preview.film_frames != tuple(
-        sorted(preview.film_frames)
-    ):
+    shown = preview.film_frames
+    if not set(shown).issubset(frames) or shown != tuple(sorted(shown)):
         raise ValueError("a film of other frames")
+
+
+def unreadable_in_child(paths: Sequence[Path]) -> dict[Path, str]:
+    """Return the files that cannot be read, and why.
+
+    A child that a file stops is started anew for the rest, :data:`MOST_STOPS` times at most and
+    within :data:`WALL_SECONDS` for every :data:`FILES_PER_PART` files, whatever the files do.
+    """
+    found: dict[Path, str] = {}
+    left, stops = list(paths), 0
+    end = time.monotonic() + WALL_SECONDS * _parts(paths)
+    while left:
+        if stops == MOST_STOPS or time.monotonic() >= end:
+            return found | dict.fromkeys(left, UNREAD)
+        answers, how = _asked(left, end - time.monotonic())
+        found |= {path: str(said) for path, said in zip(left, answers, strict=False) if said is not None}
+        if len(answers) < len(left):
+            found[left[len(answers)]] = f"reading it had to be stopped: {how}"
+            stops += 1
+        left = left[len(answers) + 1 :]
+    return found
+
+
+def _parts(paths: Sequence[Path]) -> int:
+    return 1 + len(paths) // FILES_PER_PART
+
+
+def _asked(paths: Sequence[Path], room: float) -> tuple[list[str | None], str]:
+    """Return the child's answers, one line of JSON per file, and how it ended within so many seconds."""
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2"}
+    try:
+        done = subprocess.run(
+            [sys.executable, "-P", "-m", CHILD, str(MEMORY), str(CPU_SECONDS * _parts(paths))],
+            input=json.dumps([str(path) for path in paths]).encode(),
+            capture_output=True,
+            timeout=room,
+            env=environment,
+            check=False,
+        )
+        output, how = done.stdout, f"exit code {done.returncode}"
+    except subprocess.TimeoutExpired as error:
+        output, how = error.stdout or b"", "no end in time"
+    return [json.loads(line) for line in output.splitlines(keepends=True) if line.endswith(b"\n")], how
+
+
+def main() -> int:
+    """Read the files named on stdin under limits: memory [bytes] and computing time [s], the arguments."""
+    memory, seconds = int(sys.argv[1]), int(sys.argv[2])
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
+    resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds + 1))
+    for path in json.load(sys.stdin):
+        try:
+            read_stored(Path(path))
+            answer = None
+        except UnreadableFileError as error:
+            answer = f"{error.what}: {error.got}"
+        sys.stdout.write(json.dumps(answer) + "\n")
+        sys.stdout.flush()
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
