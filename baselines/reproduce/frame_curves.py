@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.metrics import Score
-from lagbench.metrics.reductions import mean
+from lagbench.metrics import Score, mean
 from lagbench.scoring.tables import Table
 
 from .chart import TRUTH, charts, colour, tidy

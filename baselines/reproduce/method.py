@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.metrics import Score
-from lagbench.metrics.reductions import mean
+from lagbench.metrics import Score, mean
 
 __all__ = ["Cost", "Method", "Seeded"]
 

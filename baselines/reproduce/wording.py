@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 
 from lagbench.metrics import Score, compare
-from lagbench.metrics.comparison import FEWEST_SCENARIOS
+from lagbench.metrics.significance import FEWEST_SCENARIOS
 
 __all__ = ["agreement", "interval", "listed", "number", "ordinal", "pair", "told", "wins"]
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from lagbench.data.registry import Size
-from lagbench.metrics.reductions import mean
+from lagbench.metrics import mean
 
 from .entry import Entry, FlagEntry
 from .model import Cost, Detail, Prediction, RaisedFlag, Row, Value
