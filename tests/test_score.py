@@ -108,7 +108,7 @@ def test_json_says_what_the_card_says(standing: ScoreCard) -> None:
         "direction": "lower",
         "perfect": 0.0,
         "source": "Eq. 3.3, Table 5.4",
-        "summary": "root mean squared vorticity error over the counted nodes",
+        "summary": "Root mean squared vorticity error over the counted nodes",
     }
 
 
@@ -275,4 +275,4 @@ def test_optional_metrics_name_their_extra(bench: ScoreBench, standing: ScoreCar
         with pytest.raises(UsageError, match=r"lagbench\[transport\]"):
             bench.evaluate(source, extras=("transport",))
     else:
-        assert bench.evaluate(source, extras=("transport",)).submission["sinkhorn"].mean > 0.0
+        assert bench.evaluate(source, extras=("transport",)).submission["sinkhorn_pot"].mean > 0.0

@@ -249,7 +249,10 @@ def _scored(card: ScoreCard, *, every: bool) -> None:
 
 
 def compare(
-    first: Annotated[str, typer.Argument(metavar="A", help="scores.json, its folder, or predictions.nc.")],
+    first: Annotated[
+        str,
+        typer.Argument(metavar="A", help="scores.json, its folder, a folder of seeds, predictions.nc."),
+    ],
     second: Annotated[str, typer.Argument(metavar="B", help="Another, or persistence or constant-velocity.")],
     metric: Annotated[
         list[str] | None, typer.Option("--metric", metavar="NAME", help="Metric to compare by; repeatable.")
@@ -260,7 +263,7 @@ def compare(
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
-    """Compare two submissions over scenarios: exact sign-flip test and intervals."""
+    """Compare two methods over scenarios, and over seeds where there are several: tests and intervals."""
     from lagbench.scoring.compare import compare as run
 
     result = run(first, second, metrics=metric or (), root=root, workers=workers)

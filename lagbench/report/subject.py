@@ -121,7 +121,7 @@ class Subject:
     @property
     def full_box(self) -> bool:
         """Whether the material fills the box: no surface, one material."""
-        return self.ranking.name == "vorticity_rmse"
+        return self.exam.setting.full_box
 
     @property
     def scenarios(self) -> tuple[int, ...]:

@@ -20,8 +20,17 @@ import numpy as np
 from lagbench.atomic import write_atomically
 from lagbench.data.statistics import round_digits
 from lagbench.errors import UnreadableFileError
-from lagbench.metrics import Comparison, Metric, Score, Setting, Tally, available, bootstrap_interval, compare
-from lagbench.metrics.reductions import mean
+from lagbench.metrics import (
+    Comparison,
+    Metric,
+    Score,
+    Setting,
+    Tally,
+    available,
+    bootstrap_interval,
+    compare,
+    mean,
+)
 from lagbench.submission import Finding, Header
 from lagbench.submission.format import MAX_NAME
 from lagbench.submission.hdf5 import check_regular
