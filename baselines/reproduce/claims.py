@@ -13,9 +13,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from lagbench.metrics import Comparison, Direction, compare
-from lagbench.metrics.comparison import SIGNIFICANCE
-from lagbench.scoring.tables import SHOWN, Table
+from lagbench.metrics import CHOSEN, Comparison, Direction, compare, holm
+from lagbench.metrics.significance import SIGNIFICANCE
+from lagbench.scoring.tables import Table
 
 from .evidence import Evidence, ordered
 from .sheet import number
@@ -31,7 +31,6 @@ __all__ = [
     "compared",
     "comparison_table",
     "floors_ahead",
-    "holm",
 ]
 
 
@@ -149,9 +148,11 @@ def _pair(evidence: Evidence, first: str, second: str, metric: str, frame: int |
     if metric not in one.scores or metric not in two.scores:
         return None
     scores = [held.scores[metric] for held in (one, two)]
+    sides = [[seed.scores[metric] for seed in held.seeds] for held in (one, two)]
     if frame is not None:
         scores = [replace(score, values=score.at(frame)) for score in scores]
-    test = compare(*scores)
+        sides = [[replace(score, values=score.at(frame)) for score in side] for side in sides]
+    test = compare(*sides)
     losses = [[score.metric.loss(value) for value in score.values.tolist()] for score in scores]
     return Compared(
         where=evidence.where,
@@ -165,20 +166,6 @@ def _pair(evidence: Evidence, first: str, second: str, metric: str, frame: int |
         seeds=(len(one.seeds), len(two.seeds)),
         p=test.p,
     )
-
-
-def holm(p: Sequence[float]) -> list[float]:
-    """Return p-values corrected for their number, in the order given; undefined ones do not count.
-
-    With m of them in ascending order, ``p'_k = max over j <= k of min(1, (m - j + 1) p_j)``, k from 1.
-    """
-    corrected = list(p)
-    order = sorted((i for i in range(len(p)) if not math.isnan(p[i])), key=lambda i: p[i])
-    greatest = 0.0
-    for place, i in enumerate(order):
-        greatest = max(greatest, min(1.0, (len(order) - place) * p[i]))
-        corrected[i] = greatest
-    return corrected
 
 
 def claim_rows(claim: Claim, evidence: Evidence) -> list[Compared]:
@@ -237,7 +224,7 @@ def floors_ahead(everything: Sequence[Evidence]) -> Table:
     """Return the metrics in which a floor is better than every model, in the mean."""
     rows = []
     for evidence in everything:
-        for metric in dict.fromkeys((evidence.ranking, *SHOWN)):
+        for metric in dict.fromkeys((evidence.ranking, *CHOSEN)):
             scores = {n: m.scores[metric] for n, m in evidence.methods.items() if metric in m.scores}
             if any(score.metric.direction is Direction.NONE for score in scores.values()):
                 continue

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lagbench.errors import require
 from lagbench.metrics import METRICS, Score
-from lagbench.metrics.reductions import mean
+from lagbench.metrics.metric import mean
 from lagbench.scoring.tables import Table
 
 from .drawing import TRUTH, charts, png, tidy

@@ -24,7 +24,7 @@ from lagbench.data.registry import Registry, Size, load
 from lagbench.data.yamlfile import read_yaml
 from lagbench.errors import UnreadableFileError
 from lagbench.metrics import Score
-from lagbench.metrics.reductions import mean
+from lagbench.metrics.metric import mean
 from lagbench.scoring.floors import FLOORS
 from lagbench.scoring.score_file import NETCDF_NAME, read_statistics
 from lagbench.scoring.task import ranking_metric

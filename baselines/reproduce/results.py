@@ -20,9 +20,9 @@ from typing import Any
 from lagbench.atomic import write_atomically
 from lagbench.draw.markdown import table
 from lagbench.errors import LagbenchError
-from lagbench.metrics import Direction, Metric
+from lagbench.metrics import CHOSEN, Direction, Metric
 from lagbench.scoring.floors import FLOORS
-from lagbench.scoring.tables import ARROWS, SHOWN, Table
+from lagbench.scoring.tables import ARROWS, Table
 
 from .claims import CLAIMS, answer, claim_rows, comparison_table, floors_ahead
 from .evidence import BOARD, WEIGHTS, Evidence, Method, Sources, read_json
@@ -183,7 +183,7 @@ def _horizon(evidence: Evidence) -> str:
     held: dict[str, Metric] = {}
     for method in evidence.methods.values():
         held |= {name: score.metric for name, score in method.scores.items()}
-    chosen = [held[name] for name in dict.fromkeys((evidence.ranking, *SHOWN)) if name in held]
+    chosen = [held[name] for name in dict.fromkeys((evidence.ranking, *CHOSEN)) if name in held]
     # vorticity says little where the material does not fill the box
     hidden = ("vorticity", "distributions") if free else ()
     shown = [m for m in chosen if m.direction is not Direction.NONE and m.family not in hidden]

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from lagbench.data.registry import Registry, Size, load
 from lagbench.errors import ChecksFailedError, UnreadableFileError
 from lagbench.metrics import METRICS, Score
-from lagbench.metrics.comparison import FEWEST_SCENARIOS
-from lagbench.metrics.reductions import mean
+from lagbench.metrics.metric import mean
+from lagbench.metrics.significance import FEWEST_SCENARIOS, Standing, mean_loss, standings
 from lagbench.scoring.scenario import Preview
 from lagbench.submission.task_checks import frames_to_predict
 
@@ -28,7 +28,7 @@ from .floors import FloorScores, read_floors
 from .folder import Folder
 from .model import Board, Curve, Floor, Histogram, Pictures, Row, Tab, Value
 from .payload import spaced
-from .ranking import Combined, Standing, combine, is_current, mean_loss, standings
+from .ranking import Combined, combine, is_current
 from .score_file import Stored, read_stored, reported_frames
 from .verified import Verification, read_verified, verification_of
 
@@ -149,14 +149,14 @@ def _tab(
     witness = min(found, key=lambda held: (held.stored[0].precision, held.entry.method))
     ranking = witness.stored[0].scores.ranking
     ranked = {
-        held.entry.method: held.scores[ranking].score
+        held.entry.method: held.scores[ranking].seeds
         for held in found
         if held.current and held.entry.status is Status.ACTIVE and ranking in held.scores
     }
     places = standings(ranked)
 
     def order(held: _Held) -> tuple[bool, float, str]:
-        loss = mean_loss(held.scores[ranking].score) if ranking in held.scores else math.inf
+        loss = mean_loss(held.scores[ranking].seeds) if ranking in held.scores else math.inf
         return held.entry.method not in ranked, loss, held.entry.method
 
     rows = [
@@ -198,7 +198,9 @@ def _row(held: _Held, size: Size, standing: Standing | None, verified: Verificat
         p=standing.p if standing else math.nan,
         verified=verified,
         skill=_skill(held.stored),
-        values={name: _value(found.score, found.std, size) for name, found in held.scores.items()},
+        values={
+            name: _value(found.score, found.interval, found.std, size) for name, found in held.scores.items()
+        },
         seed_means=held.scores[ranking].means,
         curves=_curves(scores, ranking),
         energy=curve(scores[ENERGIES[1]]),
@@ -218,15 +220,15 @@ def _floor(held: FloorScores, size: Size, ranking: str) -> Floor:
     return Floor(
         name=held.name,
         definition=held.definition,
-        values={name: _value(score, math.nan, size) for name, score in held.scores.items()},
+        values={name: _value(score, score.interval, math.nan, size) for name, score in held.scores.items()},
         curves=_curves(held.scores, ranking),
         energy=curve(energy) if energy is not None and np.isfinite(energy.per_frame).mean() > 0.5 else None,
         counts=held.counts,
     )
 
 
-def _value(score: Score, std: float, size: Size) -> Value:
-    low, high = score.interval
+def _value(score: Score, interval: tuple[float, float], std: float, size: Size) -> Value:
+    low, high = interval
     frames = [frame for frame in reported_frames(size) if frame in score.frames]
     return Value(
         mean=score.mean,

@@ -1,8 +1,7 @@
-"""From score files to one score per method, and from scores to ranks.
+"""From score files to one score per method.
 
 The mean over seeds is taken per scenario (and per frame) first, over the seeds that have a
-value there; what follows, the mean over scenarios, its interval and the tests, then takes
-the scenarios as its sample, as with a single seed.
+value there; intervals and tests resample scenarios and seeds together.
 """
 
 from __future__ import annotations
@@ -17,14 +16,13 @@ from numpy.typing import NDArray
 
 from lagbench.data.layout import major_of
 from lagbench.data.registry import Size
-from lagbench.metrics import METRICS, Score, aggregate, compare
-from lagbench.metrics.comparison import SIGNIFICANCE
+from lagbench.metrics import METRICS, Score, aggregate, bootstrap_interval
 from lagbench.scoring.card import digits
 from lagbench.scoring.score_file import StoredScores
 
 from .entry import DataSet, Summary
 
-__all__ = ["Combined", "Standing", "combine", "holm", "is_current", "mean_loss", "standings", "summarise"]
+__all__ = ["Combined", "combine", "is_current", "summarise"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -34,6 +32,12 @@ class Combined:
     score: Score  # mean over seeds, per frame and per scenario
     std: float  # sample standard deviation over seeds of the mean over scenarios; NaN for one seed
     means: tuple[float, ...]  # mean over scenarios of each seed
+    seeds: tuple[Score, ...]  # of each seed, in the order of the files
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """95 % interval of the mean: over scenarios and seeds together, one seed: over scenarios."""
+        return bootstrap_interval(np.stack([seed.values for seed in self.seeds]))
 
 
 def combine(seeds: Sequence[StoredScores]) -> dict[str, Combined]:
@@ -51,7 +55,7 @@ def combine(seeds: Sequence[StoredScores]) -> dict[str, Combined]:
 def _combined(scores: Sequence[Score]) -> Combined:
     first, means = scores[0], tuple(held.mean for held in scores)
     if len(scores) == 1:
-        return Combined(score=first, std=math.nan, means=means)
+        return Combined(score=first, std=math.nan, means=means, seeds=tuple(scores))
     score = Score(
         metric=first.metric,
         scenarios=first.scenarios,
@@ -62,7 +66,7 @@ def _combined(scores: Sequence[Score]) -> Combined:
     )
     defined = [value for value in means if not math.isnan(value)]
     std = float(np.std(defined, ddof=1)) if len(defined) > 1 else math.nan
-    return Combined(score=score, std=std, means=means)
+    return Combined(score=score, std=std, means=means, seeds=tuple(scores))
 
 
 def _mean_defined(arrays: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
@@ -76,7 +80,7 @@ def summarise(scores: Mapping[str, Combined]) -> dict[str, Summary]:
     """Return what the score block of an entry says of the metrics: nine digits, null where undefined."""
     found = {}
     for name, held in scores.items():
-        low, high = held.score.interval
+        low, high = held.interval
         found[name] = Summary(
             mean=digits(held.score.mean), std=digits(held.std), low=digits(low), high=digits(high)
         )
@@ -87,44 +91,3 @@ def is_current(dataset: DataSet, size: Size) -> bool:
     """Tell whether a data set is that of today: same MAJOR version, same hash where one is recorded."""
     recorded = size.measured.dataset_sha256 if size.measured else dataset.sha256
     return major_of(dataset.version) == size.major and dataset.sha256 == recorded
-
-
-@dataclass(frozen=True, kw_only=True)
-class Standing:
-    """Where a method stands among those that are ranked."""
-
-    rank: int  # from 1, in the order of the mean
-    p: float  # against the leader, corrected for all who are compared with it; NaN without a claim
-
-    @property
-    def tied(self) -> bool:
-        """Whether it cannot be told from the leader at 5 %."""
-        return self.p >= SIGNIFICANCE
-
-
-def mean_loss(score: Score) -> float:
-    """Return the mean over scenarios of the loss; infinite where nothing is defined."""
-    losses = [score.metric.loss(value) for value in score.values.tolist() if not math.isnan(value)]
-    return float(np.mean(losses)) if losses else math.inf
-
-
-def standings(scores: Mapping[str, Score]) -> dict[str, Standing]:
-    """Return where each method stands, from its score of the ranking metric."""
-    order = sorted(scores, key=lambda name: (mean_loss(scores[name]), name))
-    against = [compare(scores[name], scores[order[0]]).p for name in order[1:]]
-    corrected = [math.nan, *holm(against)]
-    return {name: Standing(rank=i, p=p) for i, (name, p) in enumerate(zip(order, corrected, strict=False), 1)}
-
-
-def holm(p: Sequence[float]) -> list[float]:
-    """Return p-values corrected for their number by Holm's steps; NaN, where none is claimed, stays.
-
-    >>> holm([0.01, 0.04, 0.03])
-    [0.03, 0.06, 0.06]
-    """
-    known = sorted(range(len(p)), key=lambda i: (math.isnan(p[i]), p[i]))
-    found, least, count = [math.nan] * len(p), 0.0, sum(not math.isnan(value) for value in p)
-    for step, i in enumerate(known[:count]):
-        least = max(least, min(1.0, (count - step) * p[i]))
-        found[i] = least
-    return found
