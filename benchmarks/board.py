@@ -36,7 +36,7 @@ from lagbench.board.seeds import combine, summarise
 from lagbench.board.stored import read_stored
 from lagbench.cli.output import spell_bytes
 from lagbench.data.checksums import file_sha256
-from lagbench.scoring.floors import CONSTANT_VELOCITY, PERSISTENCE
+from lagbench.floors import constant_velocity, persistence
 from lagbench.scoring.scenario import SUBMISSION, as_stored
 from lagbench.scoring.score_file import write_statistics
 
@@ -92,7 +92,7 @@ def make_board(source: Path, target: Path, count: int) -> None:
         for path in (entry.yaml_path, *entry.score_paths):
             (target / path).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(source / path, target / path)
-    bases = {entry.split: entry for entry in floors if entry.method == CONSTANT_VELOCITY}
+    bases = {entry.split: entry for entry in floors if entry.method == constant_velocity.FLOOR.name}
     splits = sorted(bases)
     for number in range(count - len(floors)):
         _make(bases[splits[number % len(splits)]], target, number)
@@ -164,7 +164,7 @@ def _described(
                 solver_seconds_per_frame=0.05 if number % 3 else None,
             ),
             "status": Status.SUPERSEDED if superseded else status,
-            "superseded_by": PERSISTENCE if superseded else None,
+            "superseded_by": persistence.FLOOR.name if superseded else None,
             "reason": "made up" if superseded or status is Status.WITHDRAWN else "",
             "predictions": made,
         }

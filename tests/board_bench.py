@@ -24,8 +24,8 @@ from lagbench.board.seal import sealed
 from lagbench.board.submit import SubmitResult, submit, submit_floor
 from lagbench.data.checksums import file_sha256
 from lagbench.data.registry import Registry
+from lagbench.floors import FLOORS
 from lagbench.scoring import score
-from lagbench.scoring.floors import FLOORS
 from lagbench.submission import validate
 
 DAY = datetime.date(2026, 1, 31)

@@ -22,9 +22,9 @@ from lagbench.board.show import as_plain, chosen_tabs, tables
 from lagbench.board.standing import standings
 from lagbench.board.stored import read_stored
 from lagbench.errors import ChecksFailedError, UsageError
+from lagbench.floors import FLOORS
 from lagbench.metrics import METRICS, Score, bootstrap_interval
 from lagbench.scoring.card import ScoreCard, digits
-from lagbench.scoring.floors import FLOORS
 from lagbench.scoring.score_file import read_statistics
 
 

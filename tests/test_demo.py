@@ -18,7 +18,7 @@ from lagbench.cli.app import app
 from lagbench.cli.machine import SolverBench
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError, WorkFailedError
-from lagbench.scoring.floors import FLOORS
+from lagbench.floors import FLOORS
 
 Run = Callable[..., Result]
 

@@ -22,6 +22,7 @@ LAYERS = (
     ("generators", "metrics", "draw"),
     ("submission",),
     ("make",),
+    ("floors",),
     ("exchange", "scoring"),
     ("report", "baselines"),
     ("board",),

@@ -18,7 +18,7 @@ from typing import Any
 from lagbench.data.registry import Registry, Size, load
 from lagbench.data.yamlfile import read_yaml
 from lagbench.errors import UnreadableFileError
-from lagbench.scoring.floors import FLOORS
+from lagbench.floors import FLOORS
 from lagbench.scoring.score_file import NETCDF_NAME, read_statistics
 
 from .method import Cost, Method, Seeded

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from lagbench.draw.markdown import table
+from lagbench.floors import FLOORS
 from lagbench.metrics import Direction, Metric
-from lagbench.scoring.floors import FLOORS
 from lagbench.scoring.tables import ARROWS
 from lagbench.scoring.task import ranking_metric
 

@@ -14,7 +14,7 @@ from types import MappingProxyType
 from lagbench.data.layout import resolve_root
 from lagbench.data.registry import Registry, Size, load
 from lagbench.errors import LagbenchError
-from lagbench.scoring.floors import FLOORS
+from lagbench.floors import FLOORS
 from lagbench.submission import Finding
 from lagbench.work.progress import Progress
 

@@ -11,9 +11,9 @@ from pathlib import Path
 
 from lagbench.data.registry import Registry, Size, load
 from lagbench.errors import ChecksFailedError, UnreadableFileError
+from lagbench.floors import FLOORS
 from lagbench.metrics import METRICS
 from lagbench.metrics.comparison import FEWEST_SCENARIOS
-from lagbench.scoring.floors import FLOORS
 from lagbench.submission.task_checks import frames_to_predict
 
 from .entry import Entry

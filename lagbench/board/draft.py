@@ -10,7 +10,7 @@ from pathlib import Path
 
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
-from lagbench.scoring.floors import FLOORS
+from lagbench.floors import FLOORS
 from lagbench.submission import Header, ValidationResult, open_predictions, validate
 
 from .entry import ID, LONGEST_ID, MOST_SEEDS, About, CostEntry

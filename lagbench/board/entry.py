@@ -24,7 +24,7 @@ from pydantic import (
     model_validator,
 )
 
-from lagbench.scoring.floors import FLOORS
+from lagbench.floors import FLOORS
 
 from .folder import entry_path, score_paths
 

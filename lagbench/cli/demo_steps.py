@@ -180,7 +180,7 @@ def demo_model(
     from lagbench.baselines.predict import predict
     from lagbench.board.build import build
     from lagbench.board.submit import submit, submit_floor
-    from lagbench.scoring.floors import FLOORS
+    from lagbench.floors import FLOORS
     from lagbench.scoring.score import score
 
     folder, board = resolve_root(root), demo_board(root)

@@ -123,7 +123,7 @@ def score(
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
-    """Score a predictions.nc beside two floors; write scores.json and scores.nc."""
+    """Score a predictions.nc beside the floors; write scores.json and scores.nc."""
     from lagbench.scoring.score import score as run
 
     if len(predictions) > 1 and report is None:
@@ -237,8 +237,9 @@ def _complain(result: ValidationResult) -> None:
 
 
 def _scored(card: ScoreCard, *, every: bool) -> None:
-    from lagbench.scoring.tables import card_tables, flag_lines
+    from lagbench.scoring.tables import card_tables, flag_lines, skill_line
 
+    say(skill_line(card))
     for table in card_tables(card, every=every):
         print_table(table.title, table.columns, table.rows)
     for line in flag_lines(card):
@@ -248,7 +249,7 @@ def _scored(card: ScoreCard, *, every: bool) -> None:
 
 def compare(
     first: Annotated[str, typer.Argument(metavar="A", help="scores.json, its folder, or predictions.nc.")],
-    second: Annotated[str, typer.Argument(metavar="B", help="Another, or persistence or constant-velocity.")],
+    second: Annotated[str, typer.Argument(metavar="B", help="Another, or the name of a floor.")],
     metric: Annotated[
         list[str] | None, typer.Option("--metric", metavar="NAME", help="Metric to compare by; repeatable.")
     ] = None,

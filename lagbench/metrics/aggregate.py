@@ -30,7 +30,9 @@ class Score:
     metric: Metric
     scenarios: tuple[int, ...]  # scenario ids, ascending
     frames: tuple[int, ...]  # absolute numbers of the predicted frames
-    per_frame: Floats  # value at each frame, NaN where not measured or undefined, shape [scenario, frame]
+    # value at each frame, NaN where not measured or undefined, shape [scenario, frame]; [1, frame]
+    # where only the mean over scenarios is kept, as of shipped floors
+    per_frame: Floats
     values: Floats  # value over the horizon, shape [scenario]
     undefined: tuple[int, ...]  # measured frames without a value, shape [scenario]
 
