@@ -157,7 +157,7 @@ def energy_curves(subject: Subject) -> Iterator[Figure]:
         f"Kinetic energy, scenario {scenario}",
         "Fig. 5.28",
         [("truth", "truth", first["energy_true"].per_frame[0])]
-        + [(row.name, row.kind, row.scores["energy_predicted"].per_frame[0]) for row in subject.rows],
+        + [(e.name, e.kind, e.card.submission["energy_predicted"].per_frame[0]) for e in subject.entries],
         "kinetic energy [mass length²/frame²]",
         f"E = Σ m |u|² / 2 with u the displacement per frame, in scenario {scenario}.",
     )
@@ -290,14 +290,14 @@ def _figure(subject: Subject, rows: list[Row], name: str, title: str, thesis: st
         caption=join(
             [
                 f"{sentence(metric)} Mean over {len(subject.scenarios)} test scenarios at frame {frame},"
-                f" dots are the scenarios. {better};"
+                f" dots are the scenarios of entries. {better};"
                 f" perfect is {metric.perfect:g}. A dash means undefined, as for a prediction at rest."
             ]
         ),
         data=table(
             ["method", "mean", *(f"scenario {i}" for i in subject.scenarios)],
             [
-                [row.name, html(bar.value), *(html(v) for v in bar.dots)]
+                [row.name, html(bar.value), *([html(v) for v in bar.dots] or [""] * len(subject.scenarios))]
                 for row, bar in zip(ordered, bars, strict=True)
             ],
             label=title,
@@ -316,7 +316,7 @@ def _bar(row: Row, name: str, frame: int, *, best: bool) -> Bar:
         label=clipped(row.name),
         value=middle,
         written=text(middle),
-        dots=tuple(values.tolist()),
+        dots=tuple(values.tolist()) if row.entry is not None else (),
         kind=row.kind,
         bold=best,
     )

@@ -27,7 +27,7 @@ from lagbench.work.run import run_all
 from .scenario import measure_rows
 from .task import ScoredTask, load_scored_task
 
-__all__ = ["FloorJob", "differences", "measurable", "measure", "measure_scenario"]
+__all__ = ["FloorJob", "differences", "kept_in", "measurable", "measure", "measure_scenario"]
 
 TOLERANCE = 1e-4
 """Relative difference up to which shipped and measured values are equal: libraries round differently."""
@@ -122,6 +122,12 @@ def _kept(job: FloorJob, path: Path) -> FloorTally:
         return FloorTally(job.floor, job.scenario, tally, float(held["seconds_per_frame"]))
 
 
+def kept_in(size: Size, root: Path) -> Path:
+    """Return the folder in which an interrupted measurement of a data set is kept."""
+    sha256 = size.measured.dataset_sha256 if size.measured else "unrecorded"
+    return root / ".floors" / f"{size.split}-{size.name}-{sha256[:16]}"
+
+
 def measure(
     size: Size,
     root: Path,
@@ -151,15 +157,13 @@ def measure(
     exam = load_scored_task(size, root)
     names = [floor.name for floor in floors_of(size) if floors is None or floor.name in floors]
     metrics = select()
-    version = size.measured.dataset_sha256[:16] if size.measured else ""
-    folder = root / ".floors" / f"{size.split}-{size.name}-{version}"
     jobs = {
         f"{name} on scenario {i}": FloorJob(
             exam=exam,
             scenario=i,
             floor=name,
             metrics=tuple(metric.name for metric in metrics),
-            keep=folder / f"{name}-{i:04d}.npz" if resume and version else None,
+            keep=kept_in(size, root) / f"{name}-{i:04d}.npz" if resume else None,
         )
         for name in names
         for i in exam.scenarios

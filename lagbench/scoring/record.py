@@ -11,6 +11,7 @@ nothing is written; exit code 4 says that what is shipped is not what was measur
 from __future__ import annotations
 
 import argparse
+import shutil
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -22,7 +23,7 @@ from lagbench.floors import shipped
 from lagbench.floors.shipped import FOLDER, shipped_path, write_shipped
 from lagbench.submission.truth import Truth
 
-from .floors import differences, measure
+from .floors import differences, kept_in, measure
 from .task import load_scored_task
 
 __all__ = ["main", "record"]
@@ -38,13 +39,15 @@ def record(size: Size, root: Path, *, workers: int = 1, folder: Path = FOLDER) -
         raise DataError("the data set has no recorded hash", where=f"{size.split} {size.name}")
     setting = load_scored_task(size, root).setting
     reported = sorted(setting.slow_frames.intersection(setting.predicted_frames))
-    return write_shipped(
+    path = write_shipped(
         size,
         measure(size, root, workers=workers, resume=True),
         dataset_sha256=size.measured.dataset_sha256,
         reported=reported,
         folder=folder,
     )
+    shutil.rmtree(kept_in(size, root))
+    return path
 
 
 def _check(size: Size, root: Path, workers: int) -> None:
