@@ -180,7 +180,7 @@ def opened(root: Path, size: Size, scenario: int) -> tuple[Given, NDArray[np.flo
         return given_in(file, size, root), future
 
 
-def test_the_analog_of_a_scenario_of_train_is_exact(generated: GenerationResult, unmeasured: Registry) -> None:
+def test_the_analog_of_a_copy_is_exact(generated: GenerationResult, unmeasured: Registry) -> None:
     """A full box that stands in train is its own analog, and its motion carries it where it goes."""
     size = unmeasured.size(generated.split, generated.size)
     own = size.subsets["train"][1]
@@ -189,7 +189,7 @@ def test_the_analog_of_a_scenario_of_train_is_exact(generated: GenerationResult,
     np.testing.assert_allclose(predicted("analog", held), future, atol=1e-5)
 
 
-def test_the_analog_of_another_scenario_is_of_train(generated: GenerationResult, unmeasured: Registry) -> None:
+def test_the_analog_of_another_is_of_train(generated: GenerationResult, unmeasured: Registry) -> None:
     """A test scenario gets another one's motion: particles start where they are and stay in the box."""
     size = unmeasured.size(generated.split, generated.size)
     held, future = opened(generated.root, size, size.subsets["test"][0])
@@ -229,7 +229,7 @@ def test_assignment_of_unequal_counts() -> None:
 
 
 def test_the_subset_that_carries_mass_is_spread_evenly() -> None:
-    """A quarter of a jittered lattice has four particles in 4 x 4 spacings, far more evenly than by chance."""
+    """A quarter of a jittered lattice has four in 4 x 4 spacings, far more evenly than by chance."""
     side = np.stack(np.meshgrid(np.arange(48), np.arange(48)), axis=-1).reshape(-1, 2)
     points = (side + 0.5 + 0.2 * scattered(48 * 48, -0.5, 0.5)) / 48
     material = (points[:, 0] > 0.5).astype(np.int8)
