@@ -16,12 +16,11 @@ from lagbench.floors import FLOORS, floors_of, shipped
 from lagbench.floors.shipped import shipped_path, write_shipped
 from lagbench.make.generate import GenerationResult
 from lagbench.metrics import METRICS, Score
-from lagbench.metrics.intervals import ratio_interval
 from lagbench.scoring import score as scoring
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.floors import differences, kept_in, measurable, measure
 from lagbench.scoring.scenario import SUBMISSION
-from lagbench.scoring.skill import best_floor, skill
+from lagbench.scoring.skill import best_floor, ratio_interval, skill
 from lagbench.scoring.tables import card_tables, skill_line
 
 

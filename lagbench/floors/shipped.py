@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from lagbench.atomic import write_atomically
 from lagbench.data.registry import Size
 from lagbench.metrics import Score, available
-from lagbench.metrics.reductions import mean
 
 __all__ = ["CURVES", "FOLDER", "FloorScores", "shipped", "shipped_path", "write_shipped"]
 
@@ -154,13 +153,19 @@ def _said(floor: FloorScores, reported: Sequence[int]) -> dict[str, Any]:
         "seconds_per_frame": _number(floor.seconds_per_frame, 3),
         "values": {name: [_number(v, DIGITS) for v in s.values.tolist()] for name, s in scores.items()},
         "undefined": {name: list(s.undefined) for name, s in scores.items() if any(s.undefined)},
-        "at": {name: [_number(mean(s.at(f)), FRAME_DIGITS) for f in reported] for name, s in told.items()},
+        "at": {name: [_number(_mean(s.at(f)), FRAME_DIGITS) for f in reported] for name, s in told.items()},
         "curves": {
-            name: [_number(mean(told[name].at(f)), FRAME_DIGITS) for f in _knots(told[name].frames).tolist()]
+            name: [_number(_mean(told[name].at(f)), FRAME_DIGITS) for f in _knots(told[name].frames).tolist()]
             for name in CURVES
             if name in told
         },
     }
+
+
+def _mean(values: NDArray[np.float64]) -> float:
+    """Return the mean over the scenarios that have a value."""
+    defined = values[np.isfinite(values)]
+    return float(np.mean(defined)) if defined.size else math.nan
 
 
 def _number(value: float, digits: int) -> float | None:

@@ -30,9 +30,7 @@ class Score:
     metric: Metric
     scenarios: tuple[int, ...]  # scenario ids, ascending
     frames: tuple[int, ...]  # absolute numbers of the predicted frames
-    # value at each frame, NaN where not measured or undefined, shape [scenario, frame]; [1, frame]
-    # where only the mean over scenarios is kept, as of shipped floors
-    per_frame: Floats
+    per_frame: Floats  # value at each frame, NaN where not measured or undefined, shape [scenario, frame]
     values: Floats  # value over the horizon, shape [scenario]
     undefined: tuple[int, ...]  # measured frames without a value, shape [scenario]
 

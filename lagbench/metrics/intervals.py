@@ -8,7 +8,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["LEVEL", "RESAMPLES", "bootstrap_interval", "ratio_interval"]
+__all__ = ["LEVEL", "RESAMPLES", "bootstrap_interval"]
 
 LEVEL = 0.95
 """Share of the resampled means that an interval holds."""
@@ -45,25 +45,4 @@ def bootstrap_interval(values: ArrayLike) -> tuple[float, float]:
         return math.nan, math.nan
     means = np.mean(defined[_draws(defined.size)], axis=1)
     low, high = np.quantile(means, [(1.0 - LEVEL) / 2.0, (1.0 + LEVEL) / 2.0])
-    return float(low), float(high)
-
-
-def ratio_interval(numerator: ArrayLike, denominator: ArrayLike) -> tuple[float, float]:
-    """Return the 95 % percentile interval of a ratio of means, both over the same resampled scenarios.
-
-    Args:
-        numerator: one value per scenario, shape [scenario].
-        denominator: likewise, not negative.
-
-    Returns:
-        Lower and upper bound; NaN with fewer than two scenarios.
-    """
-    above, below = np.asarray(numerator, np.float64), np.asarray(denominator, np.float64)
-    if above.size < 2:
-        return math.nan, math.nan
-    draws = _draws(above.size)
-    ratios = np.full(RESAMPLES, np.inf)
-    totals = np.sum(below[draws], axis=1)
-    np.divide(np.sum(above[draws], axis=1), totals, out=ratios, where=totals > 0.0)
-    low, high = np.quantile(ratios, [(1.0 - LEVEL) / 2.0, (1.0 + LEVEL) / 2.0])
     return float(low), float(high)
