@@ -75,7 +75,7 @@ def test_the_interval_of_a_ratio() -> None:
     low, high = ratio_interval([1.0, 1.0, 4.0, 1.0], base)
     assert low < 7.0 / 11.0 < high
     # scenarios are drawn together: no resample is beyond the extreme ratios of single scenarios
-    assert 1.0 / 3.0 <= low
+    assert low >= 1.0 / 3.0
     assert high <= 1.0
 
 
