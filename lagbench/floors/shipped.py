@@ -30,6 +30,7 @@ FORMAT = 1
 """Number of the layout of these files; stored as ``lagbench_floors``."""
 
 CURVES = (
+    *("vorticity_nrmse", "cloud_distance"),
     *("vorticity_mse", "vorticity_rmse", "vorticity_pearson", "attribute_mse"),
     *("position_rmse", "velocity_rmse", "energy_ratio", "energy_retention", "density_rmse"),
     *("divergence_rms", "shape_error", "connectivity"),
@@ -39,7 +40,7 @@ CURVES = (
 KNOTS = 100
 """Frames of a curve that are kept."""
 
-DIGITS, FRAME_DIGITS = 6, 4
+DIGITS, FRAME_DIGITS, CURVE_DIGITS = 5, 4, 3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -155,7 +156,7 @@ def _said(floor: FloorScores, reported: Sequence[int]) -> dict[str, Any]:
         "undefined": {name: list(s.undefined) for name, s in scores.items() if any(s.undefined)},
         "at": {name: [_number(_mean(s.at(f)), FRAME_DIGITS) for f in reported] for name, s in told.items()},
         "curves": {
-            name: [_number(_mean(told[name].at(f)), FRAME_DIGITS) for f in _knots(told[name].frames).tolist()]
+            name: [_number(_mean(told[name].at(f)), CURVE_DIGITS) for f in _knots(told[name].frames).tolist()]
             for name in CURVES
             if name in told
         },
