@@ -20,6 +20,7 @@ from lagbench.scoring import score as scoring
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.floors import differences, kept_in, measurable, measure
 from lagbench.scoring.scenario import SUBMISSION
+from lagbench.scoring.score_file import read_statistics
 from lagbench.scoring.skill import best_floor, ratio_interval, skill
 from lagbench.scoring.tables import card_tables, skill_line
 
@@ -110,6 +111,8 @@ def test_shipped_scores_are_the_measured_ones(bench: ScoreBench, tmp_path: Path)
             if score.metric.per_frame:
                 at = [np.nanmean(s.at(25)) if np.isfinite(s.at(25)).any() else 0.0 for s in (told, score)]
                 assert at[0] == pytest.approx(at[1], rel=1e-3)
+    last = found["frozen-field"].scores["vorticity_pearson"].per_frame[:, -1]
+    np.testing.assert_allclose(held["frozen-field"].correlation, last, rtol=1e-3)
     curve = found["frozen-field"].scores["position_rmse"].per_frame.mean(axis=0)
     told = held["frozen-field"].scores["position_rmse"].per_frame[0]
     np.testing.assert_allclose(told, curve, rtol=6e-3)
@@ -167,7 +170,7 @@ def test_scoring_takes_what_is_shipped(
 def test_skill_stands_in_the_card(bench: ScoreBench, tmp_path: Path) -> None:
     """The truth has skill 1; persistence has none above 0; line, first row and JSON say the same."""
     perfect = bench.evaluate(bench.submit(tmp_path / "right.nc", right))
-    standing: ScoreCard = bench.evaluate(bench.submit(tmp_path / "still.nc", still))
+    standing: ScoreCard = bench.score(bench.submit(tmp_path / "still.nc", still))
     assert perfect.skill is not None
     assert standing.skill is not None
     assert perfect.skill.value == 1.0
@@ -176,5 +179,7 @@ def test_skill_stands_in_the_card(bench: ScoreBench, tmp_path: Path) -> None:
     assert said["floor"] == standing.skill.floor
     assert FLOORS[said["floor"]].counts
     assert said["value"] == pytest.approx(standing.skill.value)
+    again = read_statistics(standing.files[1]).skill()
+    assert again == standing.skill
     assert next(iter(card_tables(standing))).rows[0][0] == "skill"
     assert standing.skill.floor in skill_line(standing)

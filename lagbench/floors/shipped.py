@@ -3,7 +3,7 @@
 ``measured/<split>-<size>.json`` is bound to the hash of the data set. It has the value of every
 metric per scenario, and of what is told frame by frame the mean over scenarios: at the reported
 frames, and for the metrics in :data:`CURVES` at all frames (of long rollouts at a hundred, linear
-between). Numbers have six significant digits, those of frames four.
+between). Numbers have five significant digits, means at frames four, curves three.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from lagbench.atomic import write_atomically
 from lagbench.data.registry import Size
 from lagbench.metrics import Score, available
 
-__all__ = ["CURVES", "FOLDER", "FloorScores", "shipped", "shipped_path", "write_shipped"]
+__all__ = ["CURVES", "FOLDER", "FloorScores", "correlation_of", "shipped", "shipped_path", "write_shipped"]
 
 FOLDER = Path(__file__).parent / "measured"
 
@@ -40,6 +40,9 @@ CURVES = (
 KNOTS = 100
 """Frames of a curve that are kept."""
 
+CORRELATED = 54
+"""Frame at which the correlation of vorticity is kept of every scenario; the last one of shorter tasks."""
+
 DIGITS, FRAME_DIGITS, CURVE_DIGITS = 5, 4, 3
 
 
@@ -50,8 +53,15 @@ class FloorScores:
     name: str  # name of the floor
     # scores by metric; per_frame has one row, the mean over scenarios, NaN where it is not kept
     scores: Mapping[str, Score]
-    # CPU time to predict a frame on the machine that measured [s]; as small as it may be, it is no score
+    # CPU time to predict a frame on the machine that measured [s], which is no score
     seconds_per_frame: float
+    correlation: NDArray[np.float64]  # of vorticity at frame 54 [1], NaN where undefined, shape [scenario]
+
+
+def correlation_of(scores: Mapping[str, Score]) -> NDArray[np.float64]:
+    """Return the correlation of vorticity at frame 54, or the last one, shape [scenario]."""
+    pearson = scores["vorticity_pearson"]
+    return pearson.at(min(CORRELATED, pearson.frames[-1]))
 
 
 def shipped_path(size: Size, folder: Path = FOLDER) -> Path:
@@ -81,6 +91,7 @@ def shipped(size: Size, folder: Path = FOLDER) -> Mapping[str, FloorScores] | No
             name=name,
             scores=dict(_scores(said, tuple(held["scenarios"]), frames, held["reported_frames"])),
             seconds_per_frame=said["seconds_per_frame"],
+            correlation=_floats(said["correlation"]),
         )
         for name, said in held["floors"].items()
     }
@@ -152,6 +163,7 @@ def _said(floor: FloorScores, reported: Sequence[int]) -> dict[str, Any]:
     told = {name: score for name, score in scores.items() if score.metric.per_frame}
     return {
         "seconds_per_frame": _number(floor.seconds_per_frame, 3),
+        "correlation": [_number(value, FRAME_DIGITS) for value in floor.correlation.tolist()],
         "values": {name: [_number(v, DIGITS) for v in s.values.tolist()] for name, s in scores.items()},
         "undefined": {name: list(s.undefined) for name, s in scores.items() if any(s.undefined)},
         "at": {name: [_number(_mean(s.at(f)), FRAME_DIGITS) for f in reported] for name, s in told.items()},

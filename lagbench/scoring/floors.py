@@ -19,6 +19,7 @@ from lagbench.atomic import atomic_path
 from lagbench.data.layout import ScenarioKey, scenario_path
 from lagbench.data.registry import Size
 from lagbench.floors import FLOORS, FloorScores, floors_of, given_in
+from lagbench.floors.shipped import correlation_of
 from lagbench.metrics import Tally, aggregate, select, snapshots
 from lagbench.work.pool import Report
 from lagbench.work.progress import Meter, Progress
@@ -175,10 +176,12 @@ def measure(
 
 
 def _together(name: str, found: list[FloorTally]) -> FloorScores:
+    scores = aggregate(select(), {held.scenario: held.tally for held in found})
     return FloorScores(
         name=name,
-        scores=aggregate(select(), {held.scenario: held.tally for held in found}),
+        scores=scores,
         seconds_per_frame=float(np.median([held.seconds_per_frame for held in found])),
+        correlation=correlation_of(scores),
     )
 
 
