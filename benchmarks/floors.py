@@ -40,7 +40,8 @@ def main() -> int:
     for size, floors in held:
         _print_floors(size, floors)
     print("\n| data set | frozen field below 0.8 | median correlation |\n|---|---:|---:|")
-    return 0 if all([_asks_enough(size, floors, each=given.each) for size, floors in held]) else 1
+    enough = [_asks_enough(size, floors, each=given.each) for size, floors in held]
+    return 0 if all(enough) else 1
 
 
 def _print_floors(size: Size, floors: Mapping[str, FloorScores]) -> None:
