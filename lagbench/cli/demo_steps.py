@@ -180,7 +180,8 @@ def demo_model(
     from lagbench.baselines.predict import predict
     from lagbench.board.build import build
     from lagbench.board.submit import submit, submit_floor
-    from lagbench.floors import FLOORS
+    from lagbench.data.registry import load
+    from lagbench.floors import floors_of
     from lagbench.scoring.score import score
 
     folder, board = resolve_root(root), demo_board(root)
@@ -197,7 +198,8 @@ def demo_model(
     )
     solver = _solver_time()
     floors = [
-        submit_floor(name, split=MODEL_SPLIT, size=DEMO_SIZE, board=board, root=folder) for name in FLOORS
+        submit_floor(floor.name, split=MODEL_SPLIT, size=DEMO_SIZE, board=board, root=folder)
+        for floor in floors_of(load().size(MODEL_SPLIT, DEMO_SIZE))
     ]
     entry = submit(
         [prediction.path], _said(training, prediction, solver), board=board, root=folder, replace=True

@@ -61,8 +61,6 @@ SolverOption = Annotated[
 ]
 UrlsOption = Annotated[list[str] | None, option("--url", "URL", "Where FILE can be had; one per FILE.")]
 ScoredByOption = Annotated[str | None, option("--scored-by", "NAME", "Who runs this; else the author.")]
-FloorOption = Annotated[
-    str | None, option("--floor", "NAME", "Instead of FILE: persistence or constant-velocity.")
-]
+FloorOption = Annotated[str | None, option("--floor", "NAME", "Instead of FILE: the name of a floor.")]
 FloorSizeOption = Annotated[str | None, option("--size", "NAME", "With --floor: tiny, mini or full.")]
 ReplaceFlag = Annotated[bool, typer.Option("--replace", help="Replace the entry of that name.")]
