@@ -274,6 +274,7 @@ def _figure(subject: Subject, rows: list[Row], name: str, title: str, thesis: st
     ordered = sorted(rows, key=lambda row: _loss(metric, mean(row.scores[name].at(frame))))
     best = next((row for row in ordered if row.entry is not None), None)
     bars = [_bar(row, name, frame, best=row is best and len(subject.entries) > 1) for row in ordered]
+    unknown = [np.nan] * len(subject.scenarios)  # of shipped floors the mean is kept
     drawn = bar_chart(
         bars,
         _scale(metric, bars),
@@ -297,7 +298,7 @@ def _figure(subject: Subject, rows: list[Row], name: str, title: str, thesis: st
         data=table(
             ["method", "mean", *(f"scenario {i}" for i in subject.scenarios)],
             [
-                [row.name, html(bar.value), *([html(v) for v in bar.dots] or [""] * len(subject.scenarios))]
+                [row.name, html(bar.value), *(html(v) for v in bar.dots or unknown)]
                 for row, bar in zip(ordered, bars, strict=True)
             ],
             label=title,
