@@ -8,7 +8,7 @@ an interrupted measurement goes on where it stopped.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -49,37 +49,39 @@ def measurable(size: Size, root: Path) -> tuple[str, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class FloorJob:
-    """What a worker needs to measure a floor on one scenario."""
+    """What a worker needs to measure the floors on one scenario."""
 
     exam: ScoredTask  # the test subset
     scenario: int  # id of the scenario
-    floor: str  # name of the floor
+    floors: tuple[str, ...]  # names of the floors
     metrics: tuple[str, ...]  # names of the metrics
     keep: Path | None = None  # file that holds the result once it is there
 
 
 @dataclass(frozen=True, eq=False)
-class FloorTally:
-    """What was measured of a floor on one scenario."""
+class FloorTallies:
+    """What was measured of the floors on one scenario."""
 
-    floor: str  # name of the floor
     scenario: int  # id of the scenario
-    tally: Tally
-    seconds_per_frame: float  # CPU time of the prediction, median over frames [s]
+    tallies: Mapping[str, Tally]  # statistics by name of the floor
+    seconds_per_frame: Mapping[str, float]  # CPU time of the prediction, median over frames [s]
 
 
-def measure_scenario(job: FloorJob, report: Report) -> FloorTally:
-    """Measure one floor on one scenario, or read what was measured before."""
+def measure_scenario(job: FloorJob, report: Report) -> FloorTallies:
+    """Measure the floors on one scenario, or read what was measured before."""
     if job.keep is not None and job.keep.is_file():
         report(job.exam.setting.horizon)
         return _kept(job, job.keep)
-    seconds: list[float] = []
+    seconds: dict[str, list[float]] = {name: [] for name in job.floors}
     with job.exam.opened(job.scenario) as truth:
         given = given_in(truth.file, job.exam.size, job.exam.truth.root)
-        timed = _timed(FLOORS[job.floor].predict(given), seconds)
-        rows = {job.floor: snapshots(truth.scenario, timed)}
+        rows = {
+            name: snapshots(truth.scenario, _timed(FLOORS[name].predict(given), taken))
+            for name, taken in seconds.items()
+        }
         tallies, _ = measure_rows(truth.scenario, truth.snapshots(), rows, select(job.metrics), report=report)
-    found = FloorTally(job.floor, job.scenario, tallies[job.floor], float(np.median(seconds)))
+    medians = {name: float(np.median(taken)) for name, taken in seconds.items()}
+    found = FloorTallies(job.scenario, tallies, medians)
     if job.keep is not None:
         _keep(found, job.keep)
     return found
@@ -96,31 +98,32 @@ def _timed(frames: Iterator[NDArray[np.float32]], seconds: list[float]) -> Itera
         yield frame
 
 
-def _keep(found: FloorTally, path: Path) -> None:
+def _keep(found: FloorTallies, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    tally = found.tally
+    tallies = list(found.tallies.values())
     with atomic_path(path, option="--root") as temporary, open(temporary, "wb") as file:
         np.savez(
             file,
-            names=np.array(tally.names),
-            frames=np.array(tally.frames),
-            total=tally.total,
-            weight=tally.weight,
-            undefined=tally.undefined,
-            seconds_per_frame=found.seconds_per_frame,
+            floors=np.array(list(found.tallies)),
+            names=np.array(tallies[0].names),
+            frames=np.array(tallies[0].frames),
+            total=np.stack([tally.total for tally in tallies]),
+            weight=np.stack([tally.weight for tally in tallies]),
+            undefined=np.stack([tally.undefined for tally in tallies]),
+            seconds_per_frame=np.array(list(found.seconds_per_frame.values())),
         )
 
 
-def _kept(job: FloorJob, path: Path) -> FloorTally:
+def _kept(job: FloorJob, path: Path) -> FloorTallies:
     with np.load(path, allow_pickle=False) as held:
-        tally = Tally(
-            tuple(held["names"].tolist()),
-            tuple(held["frames"].tolist()),
-            held["total"],
-            held["weight"],
-            held["undefined"],
+        names, frames = tuple(held["names"].tolist()), tuple(held["frames"].tolist())
+        sums = zip(held["total"], held["weight"], held["undefined"], strict=True)
+        floors = held["floors"].tolist()
+        return FloorTallies(
+            job.scenario,
+            {name: Tally(names, frames, *parts) for name, parts in zip(floors, sums, strict=True)},
+            dict(zip(floors, held["seconds_per_frame"].tolist(), strict=True)),
         )
-        return FloorTally(job.floor, job.scenario, tally, float(held["seconds_per_frame"]))
 
 
 def kept_in(size: Size, root: Path) -> Path:
@@ -156,31 +159,29 @@ def measure(
         UsageError: a floor needs an extra that is not installed.
     """
     exam = load_scored_task(size, root)
-    names = [floor.name for floor in floors_of(size) if floors is None or floor.name in floors]
-    metrics = select()
+    names = tuple(floor.name for floor in floors_of(size) if floors is None or floor.name in floors)
     jobs = {
-        f"{name} on scenario {i}": FloorJob(
+        f"floors on scenario {i}": FloorJob(
             exam=exam,
             scenario=i,
-            floor=name,
-            metrics=tuple(metric.name for metric in metrics),
-            keep=kept_in(size, root) / f"{name}-{i:04d}.npz" if resume else None,
+            floors=names,
+            metrics=tuple(metric.name for metric in select()),
+            keep=kept_in(size, root) / f"{i:04d}.npz" if resume else None,
         )
-        for name in names
         for i in exam.scenarios
     }
     meter = Meter(progress)
     meter.begin("measuring floors", total=len(jobs) * exam.setting.horizon, scenarios=len(jobs))
     found = run_all(measure_scenario, jobs, workers=workers, report=meter.count)
-    return {name: _together(name, [held for held in found if held.floor == name]) for name in names}
+    return {name: _together(name, found) for name in names}
 
 
-def _together(name: str, found: list[FloorTally]) -> FloorScores:
-    scores = aggregate(select(), {held.scenario: held.tally for held in found})
+def _together(name: str, found: Sequence[FloorTallies]) -> FloorScores:
+    scores = aggregate(select(), {held.scenario: held.tallies[name] for held in found})
     return FloorScores(
         name=name,
         scores=scores,
-        seconds_per_frame=float(np.median([held.seconds_per_frame for held in found])),
+        seconds_per_frame=float(np.median([held.seconds_per_frame[name] for held in found])),
         correlation=correlation_of(scores),
     )
 
