@@ -1,61 +1,74 @@
-"""Score the two floors, persistence and constant velocity, and print them as Markdown.
+"""Print what the floors score, and whether the tasks can be won without learning, as Markdown.
 
-    python benchmarks/floors.py --root FOLDER [--data cavity/mini ...]
+    python benchmarks/floors.py [--data cavity/full ...] [--each]
 
-The submission is the template that `lagbench template` writes (persistence); the scorer computes
-both floors beside every submission. Intervals are 95 % bootstrap intervals over test scenarios.
+From the scores that the package ships (``python -m lagbench.scoring.record`` measures them): for
+each data set and floor the ranking metric with its 95 % interval over test scenarios, the
+correlation of vorticity at frame 54 (tiny: the last), and the CPU time of a frame; the best floor
+is marked. Then, for the full boxes, the share of test scenarios in which the frozen field
+correlates below 0.8 at that frame. Exits with 1 where that is less than 75 % at full or mini.
 """
 
 from __future__ import annotations
 
 import argparse
-import sys
-import tempfile
-from pathlib import Path
+from collections.abc import Mapping
 
-import lagbench
-from lagbench.errors import DataError
-from lagbench.scoring.card import ScoreCard
+import numpy as np
 
-DATA = ("cavity/full", "cavity/mini", "curl-noise/mini", "fluid/mini", "multimaterial/mini")
-METRICS = ("vorticity_rmse", "vorticity_pearson", "position_rmse", "mse_avg", "energy_error")
-ROWS = ("persistence", "constant-velocity")
+from lagbench.data.registry import Size, load
+from lagbench.floors import FloorScores, shipped
+from lagbench.scoring.skill import best_floor
+from lagbench.scoring.task import ranking_metric
+
+FALLEN, SHARE = 0.8, 0.75
+ACCEPTED = ("full", "mini")
 
 
 def main() -> int:
-    """Print one row per data set and floor; the ranking metric carries its interval."""
+    """Print both tables; tell whether every task asks enough."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--root", type=Path, required=True)
-    parser.add_argument("--data", nargs="+", default=DATA, metavar="SPLIT/SIZE")
+    parser.add_argument("--data", nargs="+", metavar="SPLIT/SIZE")
+    parser.add_argument("--each", action="store_true", help="correlation of the frozen field by scenario")
     given = parser.parse_args()
-    print(f"| data set | floor | {' | '.join(f'`{name}`' for name in METRICS)} |")
-    print(f"|---|---|{'---:|' * len(METRICS)}")
-    for name in given.data:
-        split, size = name.split("/")
-        try:
-            card = _score(split, size, given.root)
-        except DataError as error:
-            print(f"{name} is left out: {error}", file=sys.stderr)
-            continue
-        for row in ROWS:
-            cells = [_cell(card.scores[row][metric], ranks=metric == card.ranking) for metric in METRICS]
-            print(f"| {split} {size} | {row} | {' | '.join(cells)} |", flush=True)
-    return 0
+    registry = load()
+    names = given.data or [f"{name}/{tier}" for name, s in registry.splits.items() for tier in s.sizes]
+    sizes = [registry.size(*name.split("/")) for name in names]
+    held = [(size, floors) for size in sizes if (floors := shipped(size))]
+    print("| data set | floor | ranking metric | 95 % interval | correlation | seconds per frame |")
+    print("|---|---|---:|---:|---:|---:|")
+    for size, floors in held:
+        _print_floors(size, floors)
+    print("\n| data set | frozen field below 0.8 | median correlation |\n|---|---:|---:|")
+    enough = [_asks_enough(size, floors, each=given.each) for size, floors in held]
+    return 0 if all(enough) else 1
 
 
-def _score(split: str, size: str, root: Path) -> ScoreCard:
-    """Score the template of a data set, in a folder that is gone afterwards."""
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "predictions.nc"
-        lagbench.template(split, size, output=file, root=root)
-        return lagbench.score(file, root=root)
+def _print_floors(size: Size, floors: Mapping[str, FloorScores]) -> None:
+    ranking = ranking_metric(size)
+    best = best_floor({name: floor.scores[ranking] for name, floor in floors.items()})
+    for name, floor in floors.items():
+        score = floor.scores[ranking]
+        low, high = score.interval
+        known = floor.correlation[np.isfinite(floor.correlation)]
+        correlation = f"{np.mean(known):.3f}" if known.size else "undefined"
+        print(
+            f"| {size.split} {size.name} | {name}{' (best)' if name == best else ''} | {score.mean:.4g} |"
+            f" {low:.3g} to {high:.3g} | {correlation} | {floor.seconds_per_frame:.2g} |"
+        )
 
 
-def _cell(score: lagbench.metrics.Score, *, ranks: bool) -> str:
-    if score.mean != score.mean:  # NaN: undefined in every frame
-        return "undefined"
-    interval = f" ({score.interval[0]:.3g} to {score.interval[1]:.3g})" if ranks else ""
-    return f"{score.mean:.3g}{interval}"
+def _asks_enough(size: Size, floors: Mapping[str, FloorScores], *, each: bool) -> bool:
+    """Print how often the frozen field fails; a correlation that is undefined has failed."""
+    if "frozen-field" not in floors:
+        return True
+    correlation = floors["frozen-field"].correlation
+    below = float(np.mean(~(correlation >= FALLEN)))
+    middle = float(np.nanmedian(correlation))
+    print(f"| {size.split} {size.name} | {below:.0%} of {correlation.size} | {middle:.3f} |")
+    if each:
+        print(f"| | {' '.join(f'{value:.2f}' for value in correlation)} | |")
+    return size.name not in ACCEPTED or below >= SHARE
 
 
 if __name__ == "__main__":

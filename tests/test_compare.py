@@ -259,14 +259,14 @@ def test_tables_show_floors_undefined_and_units(bench: ScoreBench, tmp_path: Pat
     horizon, at_frames, per_scenario = card_tables(card)
     assert horizon.columns[3:5] == ("persistence", "constant-\nvelocity")
     rows = {row[0]: row for row in horizon.rows}
-    assert next(iter(rows)) == card.ranking
-    assert rows["vorticity_pearson"][6] == "20 of 40"
+    assert list(rows)[:2] == ["skill", card.ranking]
+    assert rows["vorticity_pearson"][horizon.columns.index("undefined")] == "20 of 40"
     assert rows["vorticity_rmse"][-1] == "1/frame"
     assert " to " in rows["vorticity_rmse"][2]
     assert at_frames.columns == ("metric", "15", "25")
     assert per_scenario.columns == ("row", "3", "4")
     every, *_ = card_tables(card, every=True)
-    assert [row[0] for row in every.rows] == list(card.submission)
+    assert [row[0] for row in every.rows] == ["skill", *card.submission]
     assert len({len(row) for row in horizon.rows} | {len(horizon.columns)}) == 1
     lines = list(flag_lines(card))
     assert any(line.startswith("flag copy_suspect: raised") for line in lines)

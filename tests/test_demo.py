@@ -16,11 +16,13 @@ from typer.testing import CliRunner, Result
 from lagbench.cli import demo_steps
 from lagbench.cli.app import app
 from lagbench.cli.machine import SolverBench
-from lagbench.data.registry import Registry
+from lagbench.data.registry import Registry, load
 from lagbench.errors import UsageError, WorkFailedError
-from lagbench.scoring.floors import FLOORS
+from lagbench.floors import floors_of
 
 Run = Callable[..., Result]
+
+FLOORS = [floor.name for floor in floors_of(load().size(SPLIT, SIZE))]
 
 
 @pytest.fixture

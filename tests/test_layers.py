@@ -23,6 +23,7 @@ LAYERS = (
     ("generators", "metrics", "draw"),
     ("submission",),
     ("make",),
+    ("floors",),
     ("exchange", "scoring"),
     ("report", "baselines"),
     ("board",),

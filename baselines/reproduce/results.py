@@ -20,8 +20,8 @@ from typing import Any
 from lagbench.atomic import write_atomically
 from lagbench.draw.markdown import table
 from lagbench.errors import LagbenchError
+from lagbench.floors import FLOORS
 from lagbench.metrics import CHOSEN, Direction, Metric
-from lagbench.scoring.floors import FLOORS
 from lagbench.scoring.tables import ARROWS, Table
 
 from .claims import CLAIMS, answer, claim_rows, comparison_table, floors_ahead

@@ -20,6 +20,7 @@ from lagbench.metrics import METRICS, Score
 from lagbench.metrics.metric import mean
 from lagbench.metrics.significance import FEWEST_SCENARIOS, Standing, mean_loss, standings
 from lagbench.scoring.scenario import Preview
+from lagbench.scoring.skill import skill
 from lagbench.submission.task_checks import frames_to_predict
 
 from .entry import Entry, Status
@@ -160,7 +161,7 @@ def _tab(
         return held.entry.method not in ranked, loss, held.entry.method
 
     rows = [
-        _row(held, size, places.get(held.entry.method), verification_of(held.entry, verified))
+        _row(held, size, places.get(held.entry.method), verification_of(held.entry, verified), floors)
         for held in sorted(found, key=order)
     ]
     shown = {name for row in rows for name in row.values}
@@ -187,7 +188,13 @@ def _known(names: Iterable[str], known: set[str]) -> tuple[str, ...]:
     return tuple(name for name in dict.fromkeys(names) if name in known)
 
 
-def _row(held: _Held, size: Size, standing: Standing | None, verified: Verification | None) -> Row:
+def _row(
+    held: _Held,
+    size: Size,
+    standing: Standing | None,
+    verified: Verification | None,
+    floors: Sequence[FloorScores],
+) -> Row:
     preview, ranking = held.stored[0].preview, held.stored[0].scores.ranking
     scores = {name: found.score for name, found in held.scores.items()}
     return Row(
@@ -197,7 +204,7 @@ def _row(held: _Held, size: Size, standing: Standing | None, verified: Verificat
         tied=standing.tied if standing else False,
         p=standing.p if standing else math.nan,
         verified=verified,
-        skill=_skill(held.stored),
+        skill=_skill(held.scores[ranking].score, floors) if held.current else None,
         values={
             name: _value(found.score, found.interval, found.std, size) for name, found in held.scores.items()
         },
@@ -209,10 +216,14 @@ def _row(held: _Held, size: Size, standing: Standing | None, verified: Verificat
     )
 
 
-def _skill(stored: Sequence[Stored]) -> Value | None:
-    """Return the skill that score files say. None does yet: here it enters, and the page shows it."""
-    del stored
-    return None
+def _skill(score: Score, floors: Sequence[FloorScores]) -> Value | None:
+    """Return how much better a row is than the best floor, from the mean over its seeds."""
+    name = score.metric.name
+    found = skill(score, {floor.name: floor.scores[name] for floor in floors if name in floor.scores})
+    if found is None:
+        return None
+    low, high = found.interval
+    return Value(mean=found.value, std=math.nan, low=low, high=high, per_scenario=(), at={}, undefined=0)
 
 
 def _floor(held: FloorScores, size: Size, ranking: str) -> Floor:

@@ -1,8 +1,9 @@
 """The floors of a board: the one place that knows where their scores come from.
 
-Which floors there are, :mod:`lagbench.scoring.floors` says. The scorer measures them beside a
-submission, and ``lagbench submit`` keeps that under ``floors/``: statistics that are equal
-whoever submits, in the layout of a score file whose pictures show the truth alone.
+Which floors there are, :mod:`lagbench.floors` says, and of our data sets also what they score. Those
+of a split of somebody's own the scorer measures beside a submission, and ``lagbench submit`` keeps
+that under ``floors/``: statistics that are equal whoever submits, in the layout of a score file whose
+pictures show the truth alone.
 """
 
 from __future__ import annotations
@@ -15,9 +16,10 @@ import numpy as np
 
 from lagbench.data.registry import Size
 from lagbench.errors import UnreadableFileError
+from lagbench.floors import FLOORS as KNOWN
+from lagbench.floors import shipped
 from lagbench.metrics import Score
 from lagbench.scoring.card import ScoreCard
-from lagbench.scoring.floors import FLOORS as KNOWN
 from lagbench.scoring.scenario import SUBMISSION
 from lagbench.scoring.score_file import write_statistics
 
@@ -46,6 +48,8 @@ def floor_names() -> tuple[str, ...]:
 
 def read_floors(folder: Folder, size: Size) -> tuple[FloorScores, ...]:
     """Return the floors of a split and size, those of another data set left out."""
+    if known := shipped(size):
+        return tuple(_described(name, held.scores) for name, held in known.items())
     found = []
     for path in folder.floor_files(size.split, size.name):
         scores = read_stored(folder.path / path).scores
@@ -53,8 +57,13 @@ def read_floors(folder: Folder, size: Size) -> tuple[FloorScores, ...]:
             continue
         read_stored(folder.path / path, size)
         held = {name: made.score for name, made in combine([scores]).items()}
-        found.append(FloorScores(name=path.stem, scores=held))
+        found.append(_described(path.stem, held))
     return tuple(found)
+
+
+def _described(name: str, scores: Mapping[str, Score]) -> FloorScores:
+    floor = KNOWN[name]
+    return FloorScores(name=name, scores=scores, definition=floor.definition, counts=floor.counts)
 
 
 def dataset_of(identity: Mapping[str, str]) -> DataSet:

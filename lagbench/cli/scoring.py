@@ -253,7 +253,7 @@ def compare(
         str,
         typer.Argument(metavar="A", help="scores.json, its folder, a folder of seeds, predictions.nc."),
     ],
-    second: Annotated[str, typer.Argument(metavar="B", help="Another, or persistence or constant-velocity.")],
+    second: Annotated[str, typer.Argument(metavar="B", help="Another, or the name of a floor.")],
     metric: Annotated[
         list[str] | None, typer.Option("--metric", metavar="NAME", help="Metric to compare by; repeatable.")
     ] = None,

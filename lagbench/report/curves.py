@@ -156,7 +156,7 @@ def energy_curves(subject: Subject) -> Iterator[Figure]:
         f"Kinetic energy, scenario {scenario}",
         "Fig. 5.28",
         [("truth", "truth", first["energy_true"].per_frame[0])]
-        + [(row.name, row.kind, row.scores["energy_predicted"].per_frame[0]) for row in subject.rows],
+        + [(e.name, e.kind, e.card.submission["energy_predicted"].per_frame[0]) for e in subject.entries],
         "kinetic energy [mass length²/frame²]",
         f"E = Σ m |u|² / 2 with u the displacement per frame, in scenario {scenario}.",
     )
@@ -273,6 +273,7 @@ def _figure(subject: Subject, rows: list[Row], name: str, title: str, thesis: st
     ordered = sorted(rows, key=lambda row: _loss(metric, mean(row.scores[name].at(frame))))
     best = next((row for row in ordered if row.entry is not None), None)
     bars = [_bar(row, name, frame, best=row is best and len(subject.entries) > 1) for row in ordered]
+    unknown = [np.nan] * len(subject.scenarios)  # of shipped floors the mean is kept
     drawn = bar_chart(
         bars,
         _scale(metric, bars),
@@ -289,14 +290,14 @@ def _figure(subject: Subject, rows: list[Row], name: str, title: str, thesis: st
         caption=join(
             [
                 f"{sentence(metric)} Mean over {len(subject.scenarios)} test scenarios at frame {frame},"
-                f" dots are the scenarios. {better};"
+                f" dots are the scenarios of entries. {better};"
                 f" perfect is {metric.perfect:g}. A dash means undefined, as for a prediction at rest."
             ]
         ),
         data=table(
             ["method", "mean", *(f"scenario {i}" for i in subject.scenarios)],
             [
-                [row.name, html(bar.value), *(html(v) for v in bar.dots)]
+                [row.name, html(bar.value), *(html(v) for v in bar.dots or unknown)]
                 for row, bar in zip(ordered, bars, strict=True)
             ],
             label=title,
@@ -315,7 +316,7 @@ def _bar(row: Row, name: str, frame: int, *, best: bool) -> Bar:
         label=clipped(row.name),
         value=middle,
         written=text(middle),
-        dots=tuple(values.tolist()),
+        dots=tuple(values.tolist()) if row.entry is not None else (),
         kind=row.kind,
         bold=best,
     )

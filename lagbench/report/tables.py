@@ -76,19 +76,21 @@ def every_metric(subject: Subject) -> Markup:
 
 
 def _anywhere(subject: Subject, name: str) -> bool:
-    return all(name in row.scores for row in subject.rows)
+    """Tell whether all entries have a metric; shipped floors lack those of extras."""
+    return all(name in entry.card.submission for entry in subject.entries)
 
 
 def _score_rows(subject: Subject, names: Sequence[str]) -> Markup:
     rows = subject.rows
     cells = []
     for name in names:
-        scores = [row.scores[name] for row in rows]
-        best = _best(scores[0].metric, [score.mean for score in scores])
+        scores = [row.scores.get(name) for row in rows]
+        metric = rows[0].scores[name].metric
+        best = _best(metric, [math.nan if score is None else score.mean for score in scores])
         cells.append(
             [
-                _named(scores[0].metric, ranks=name == subject.ranking.name),
-                *(_cell(score, best=i == best) for i, score in enumerate(scores)),
+                _named(metric, ranks=name == subject.ranking.name),
+                *("" if score is None else _cell(score, best=i == best) for i, score in enumerate(scores)),
             ]
         )
     return table(["metric", *(_heading(row) for row in rows)], cells, kind="scores", label="Scores")
@@ -212,6 +214,9 @@ def _tiles(subject: Subject) -> Iterator[Markup]:
     best = subject.best_entry
     whose = f"{best.name}: " if len(subject.entries) > 1 else ""
     ranking = subject.ranking.name
+    found = best.entry.card.skill if best.entry is not None else None
+    if found is not None:
+        yield _card(f"{whose}skill", found.value, found.interval, f"1 - score / score of {found.floor}")
     yield _tile(f"{whose}{words(ranking)}", best.scores[ranking], _beside(subject, best))
     for name in TILES:
         score = best.scores.get(name)
@@ -250,7 +255,7 @@ def _at_frame(subject: Subject, score: Score) -> Markup:
 
 
 def _beside(subject: Subject, row: Row) -> str:
-    """Return how the ranking metric stands beside the better floor."""
+    """Return how the ranking metric stands beside the least floor."""
     metric = subject.ranking
     floors = [r for r in subject.rows if r.entry is None]
     if not floors or metric.direction is not Direction.LOWER:

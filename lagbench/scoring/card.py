@@ -12,6 +12,7 @@ import json
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +38,7 @@ from lagbench.submission.hdf5 import check_regular
 
 from .flags import Flag
 from .scenario import SUBMISSION, Preview
+from .skill import Skill, skill
 
 __all__ = [
     "FORMAT",
@@ -71,9 +73,9 @@ class ScoreCard:
     predictions_sha256: str  # content hash of the predicted positions
     setting: Setting  # the task, as metrics see it
     ranking: str  # name of the metric that ranks
-    # statistics by row (submission, persistence, constant-velocity) and scenario
+    # statistics by row and scenario: of the submission, and of floors that were measured beside it
     tallies: Mapping[str, Mapping[int, Tally]]
-    scores: Mapping[str, Mapping[str, Score]]  # scores by row and metric
+    scores: Mapping[str, Mapping[str, Score]]  # scores by row (submission, then floors) and metric
     flags: tuple[Flag, ...]  # what a reader should know
     warnings: tuple[Finding, ...]  # findings of the validation that do not reject
     preview: Preview  # pictures of the first scenario
@@ -93,6 +95,13 @@ class ScoreCard:
     def submission(self) -> Mapping[str, Score]:
         """Scores of the submission, by metric."""
         return self.scores[SUBMISSION]
+
+    @cached_property
+    def skill(self) -> Skill | None:
+        """How much better than the best floor; None where no floor that counts has a score."""
+        floors = {row: scores for row, scores in self.scores.items() if row != SUBMISSION}
+        ranked = {row: scores[self.ranking] for row, scores in floors.items() if self.ranking in scores}
+        return skill(self.submission[self.ranking], ranked)
 
     def against(self, row: str) -> Comparison:
         """Compare the submission with a floor in the ranking metric."""
@@ -120,6 +129,7 @@ class ScoreCard:
                 "scenarios": list(self.scenarios),
             },
             "ranking_metric": self.ranking,
+            "skill": _skill(self.skill),
             "metrics": {metric.name: _described(metric) for metric in used},
             "rows": {
                 row: {name: self._score(score, row) for name, score in scores.items()}
@@ -167,6 +177,16 @@ def _described(metric: Metric) -> dict[str, Any]:
         "perfect": metric.perfect,
         "source": metric.source,
         "summary": metric.summary,
+    }
+
+
+def _skill(found: Skill | None) -> dict[str, Any] | None:
+    if found is None:
+        return None
+    return {
+        "floor": found.floor,
+        "value": digits(found.value),
+        "interval": [digits(bound) for bound in found.interval],
     }
 
 

@@ -1,59 +1,205 @@
-"""Two predictions that cost nothing, which every submission stands beside.
+"""The scores of floors: shipped with the package, or measured where they are not.
 
-With n given frames 0..n-1 and k = 1, 2, ... the number of the predicted frame::
-
-    persistence         x(n-1+k) = x(n-1)
-    constant velocity   x(n-1+k) = x(n-1) + k (x(n-1) - x(n-2))
-
-Positions are rounded to float32 as those of a predictions.nc. Nothing keeps the second in
-the box: particles that leave it carry no weight on the grid.
+:func:`measure` is what the shipped ones come from (``python -m lagbench.scoring.record``) and
+what they are checked against. A scenario that is measured is kept under the root folder, so that
+an interrupted measurement goes on where it stopped.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from types import MappingProxyType
+import time
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.metrics import Scenario, Snapshot, snapshots
+from lagbench.atomic import atomic_path
+from lagbench.data.layout import ScenarioKey, scenario_path
+from lagbench.data.registry import Size
+from lagbench.floors import FLOORS, FloorScores, floors_of, given_in
+from lagbench.floors.shipped import correlation_of
+from lagbench.metrics import Tally, aggregate, select, snapshots
+from lagbench.work.pool import Report
+from lagbench.work.progress import Meter, Progress
+from lagbench.work.run import run_all
 
-__all__ = [
-    "CONSTANT_VELOCITY",
-    "FLOORS",
-    "PERSISTENCE",
-    "constant_velocity",
-    "persistence",
-]
+from .scenario import measure_rows
+from .task import ScoredTask, load_scored_task
+
+__all__ = ["FloorJob", "differences", "kept_in", "measurable", "measure", "measure_scenario"]
+
+TOLERANCE = 1e-4
+"""Relative difference up to which shipped and measured values are equal: libraries round differently."""
 
 
-PERSISTENCE = "persistence"
-CONSTANT_VELOCITY = "constant-velocity"
+def measurable(size: Size, root: Path) -> tuple[str, ...]:
+    """Return the names of the floors that scoring measures itself where none are shipped.
 
-
-def persistence(scenario: Scenario) -> Iterator[Snapshot]:
-    """Yield the last given state, at rest, for every predicted frame.
-
-    It is one object throughout, so that its grid fields are formed once.
+    Those that count for the best floor; what looks at train only where all of train is there.
     """
-    last = scenario.snapshot(scenario.given[-1], scenario.given[-1])
-    return (last for _ in scenario.setting.predicted_frames)
+    train = [
+        ScenarioKey(split=size.split, size=size.name, version=size.version, scenario=i, subset="train")
+        for i in size.subsets.get("train", ())
+    ]
+    trained = bool(train) and all(scenario_path(root, key).is_file() for key in train)
+    return tuple(f.name for f in floors_of(size) if f.counts and (trained or not f.reads_train))
 
 
-def constant_velocity(scenario: Scenario) -> Iterator[Snapshot]:
-    """Yield the snapshots of particles that keep their last given velocity."""
-    return snapshots(scenario, _straight_on(scenario))
+@dataclass(frozen=True, kw_only=True)
+class FloorJob:
+    """What a worker needs to measure the floors on one scenario."""
+
+    exam: ScoredTask  # the test subset
+    scenario: int  # id of the scenario
+    floors: tuple[str, ...]  # names of the floors
+    metrics: tuple[str, ...]  # names of the metrics
+    keep: Path | None = None  # file that holds the result once it is there
 
 
-def _straight_on(scenario: Scenario) -> Iterator[NDArray[np.float32]]:
-    last = np.asarray(scenario.given[-1], np.float64)
-    step = last - scenario.given[-2]
-    for number in range(1, scenario.setting.horizon + 1):
-        yield (last + number * step).astype(np.float32)
+@dataclass(frozen=True, eq=False)
+class FloorTallies:
+    """What was measured of the floors on one scenario."""
+
+    scenario: int  # id of the scenario
+    tallies: Mapping[str, Tally]  # statistics by name of the floor
+    seconds_per_frame: Mapping[str, float]  # CPU time of the prediction, median over frames [s]
 
 
-FLOORS: Mapping[str, Callable[[Scenario], Iterator[Snapshot]]] = MappingProxyType(
-    {PERSISTENCE: persistence, CONSTANT_VELOCITY: constant_velocity}
-)
-"""The floors by name, in the order in which they are shown."""
+def measure_scenario(job: FloorJob, report: Report) -> FloorTallies:
+    """Measure the floors on one scenario, or read what was measured before."""
+    if job.keep is not None and job.keep.is_file():
+        report(job.exam.setting.horizon)
+        return _kept(job, job.keep)
+    seconds: dict[str, list[float]] = {name: [] for name in job.floors}
+    with job.exam.opened(job.scenario) as truth:
+        given = given_in(truth.file, job.exam.size, job.exam.truth.root)
+        rows = {
+            name: snapshots(truth.scenario, _timed(FLOORS[name].predict(given), taken))
+            for name, taken in seconds.items()
+        }
+        tallies, _ = measure_rows(truth.scenario, truth.snapshots(), rows, select(job.metrics), report=report)
+    medians = {name: float(np.median(taken)) for name, taken in seconds.items()}
+    found = FloorTallies(job.scenario, tallies, medians)
+    if job.keep is not None:
+        _keep(found, job.keep)
+    return found
+
+
+def _timed(frames: Iterator[NDArray[np.float32]], seconds: list[float]) -> Iterator[NDArray[np.float32]]:
+    """Yield frames; add the CPU time that each took."""
+    while True:
+        start = time.process_time()
+        frame = next(frames, None)
+        if frame is None:
+            return
+        seconds.append(time.process_time() - start)
+        yield frame
+
+
+def _keep(found: FloorTallies, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    tallies = list(found.tallies.values())
+    with atomic_path(path, option="--root") as temporary, open(temporary, "wb") as file:
+        np.savez(
+            file,
+            floors=np.array(list(found.tallies)),
+            names=np.array(tallies[0].names),
+            frames=np.array(tallies[0].frames),
+            total=np.stack([tally.total for tally in tallies]),
+            weight=np.stack([tally.weight for tally in tallies]),
+            undefined=np.stack([tally.undefined for tally in tallies]),
+            seconds_per_frame=np.array(list(found.seconds_per_frame.values())),
+        )
+
+
+def _kept(job: FloorJob, path: Path) -> FloorTallies:
+    with np.load(path, allow_pickle=False) as held:
+        names, frames = tuple(held["names"].tolist()), tuple(held["frames"].tolist())
+        sums = zip(held["total"], held["weight"], held["undefined"], strict=True)
+        floors = held["floors"].tolist()
+        return FloorTallies(
+            job.scenario,
+            {name: Tally(names, frames, *parts) for name, parts in zip(floors, sums, strict=True)},
+            dict(zip(floors, held["seconds_per_frame"].tolist(), strict=True)),
+        )
+
+
+def kept_in(size: Size, root: Path) -> Path:
+    """Return the folder in which an interrupted measurement of a data set is kept."""
+    sha256 = size.measured.dataset_sha256 if size.measured else "unrecorded"
+    return root / ".floors" / f"{size.split}-{size.name}-{sha256[:16]}"
+
+
+def measure(
+    size: Size,
+    root: Path,
+    *,
+    floors: Collection[str] | None = None,
+    workers: int = 1,
+    resume: bool = False,
+    progress: Callable[[Progress], None] | None = None,
+) -> dict[str, FloorScores]:
+    """Measure the floors of a data set.
+
+    Args:
+        size: the split and size; its test subset must be there, and train for ``analog``.
+        root: folder of all data sets.
+        floors: names of the floors; all that the size has when None.
+        workers: worker processes.
+        resume: whether to keep what is measured under the root, and take what is kept there.
+        progress: told how far the work is.
+
+    Returns:
+        Scores by name of the floor, those of the single frames with one row per scenario.
+
+    Raises:
+        DataError: the data are missing or damaged.
+        UsageError: a floor needs an extra that is not installed.
+    """
+    exam = load_scored_task(size, root)
+    names = tuple(floor.name for floor in floors_of(size) if floors is None or floor.name in floors)
+    jobs = {
+        f"floors on scenario {i}": FloorJob(
+            exam=exam,
+            scenario=i,
+            floors=names,
+            metrics=tuple(metric.name for metric in select()),
+            keep=kept_in(size, root) / f"{i:04d}.npz" if resume else None,
+        )
+        for i in exam.scenarios
+    }
+    meter = Meter(progress)
+    meter.begin("measuring floors", total=len(jobs) * exam.setting.horizon, scenarios=len(jobs))
+    found = run_all(measure_scenario, jobs, workers=workers, report=meter.count)
+    return {name: _together(name, found) for name in names}
+
+
+def _together(name: str, found: Sequence[FloorTallies]) -> FloorScores:
+    scores = aggregate(select(), {held.scenario: held.tallies[name] for held in found})
+    return FloorScores(
+        name=name,
+        scores=scores,
+        seconds_per_frame=float(np.median([held.seconds_per_frame[name] for held in found])),
+        correlation=correlation_of(scores),
+    )
+
+
+def differences(
+    expected: Mapping[str, FloorScores], found: Mapping[str, FloorScores]
+) -> dict[str, tuple[str, ...]]:
+    """Return by floor the metrics whose values per scenario differ, those that one lacks included."""
+    unlike = {}
+    for name in {**expected, **found}:
+        one, two = (held[name].scores if name in held else {} for held in (expected, found))
+        unlike[name] = tuple(
+            metric
+            for metric in {**one, **two}
+            if metric not in one
+            or metric not in two
+            or not np.allclose(
+                one[metric].values, two[metric].values, rtol=TOLERANCE, atol=1e-12, equal_nan=True
+            )
+        )
+    return {name: metrics for name, metrics in unlike.items() if metrics}

@@ -1,7 +1,7 @@
 """One scenario of a submission against the truth: the unit of work that is spread.
 
-The truth's snapshots and fields are formed once for the submission and both floors; memory
-is that of a few frames, whatever the horizon.
+The truth's snapshots and fields are formed once for the submission and the floors beside it;
+memory is that of a few frames, whatever the horizon.
 
 The few pictures of a submission that a board page draws, taken while it is scored.
 """
@@ -15,14 +15,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.floors import FLOORS, given_in
 from lagbench.metrics import FramePair, Metric, Scenario, Snapshot, Tally, measure, select, snapshots
 from lagbench.metrics.distributions import BINS, histograms
 from lagbench.submission import Predictions, open_predictions
 from lagbench.work.pool import Report
 
 from .flags import Trace, Tracer
-from .floors import FLOORS
-from .task import ScoredTask
+from .task import OpenScenario, ScoredTask
 
 __all__ = [
     "FRAMES",
@@ -33,6 +33,7 @@ __all__ = [
     "ScenarioJob",
     "ScenarioScores",
     "as_stored",
+    "floor_snapshots",
     "measure_rows",
     "score_scenario",
 ]
@@ -144,6 +145,7 @@ class ScenarioJob:
     scenario: int  # id of the scenario
     predictions: Path  # a predictions.nc that has been validated
     metrics: tuple[str, ...]  # names of the metrics
+    floors: tuple[str, ...] = ()  # names of the floors to measure beside it
     pictured: bool = False  # whether to take the preview
 
 
@@ -158,15 +160,21 @@ class ScenarioScores:
 
 
 def score_scenario(job: ScenarioJob, report: Report) -> ScenarioScores:
-    """Score one scenario of a submission and of the floors."""
+    """Score one scenario of a submission and of the floors that are to be measured."""
     metrics = select(job.metrics)
     with job.exam.opened(job.scenario) as truth, open_predictions(job.predictions) as predictions:
         scenario = truth.scenario
         rows = {SUBMISSION: _predicted(predictions, job.scenario, scenario)}
-        rows |= {name: floor(scenario) for name, floor in FLOORS.items()}
+        rows |= {name: floor_snapshots(name, truth, job.exam) for name in job.floors}
         photographer = PreviewRecorder(job.scenario, scenario) if job.pictured else None
         tallies, trace = measure_rows(scenario, truth.snapshots(), rows, metrics, photographer, report)
     return ScenarioScores(job.scenario, tallies, trace, photographer.result() if photographer else None)
+
+
+def floor_snapshots(name: str, truth: OpenScenario, exam: ScoredTask) -> Iterator[Snapshot]:
+    """Yield the snapshots that a floor predicts."""
+    given = given_in(truth.file, exam.size, exam.truth.root)
+    return snapshots(truth.scenario, FLOORS[name].predict(given))
 
 
 def measure_rows(

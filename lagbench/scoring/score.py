@@ -1,4 +1,4 @@
-"""Score a predictions.nc: validate, measure beside the floors, aggregate, flag, write."""
+"""Score a predictions.nc: validate, measure, aggregate, put beside the floors, flag, write."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from lagbench.data.layout import resolve_root
 from lagbench.data.local import rooted
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError, nearest
+from lagbench.floors import persistence, shipped
 from lagbench.make.overview import available_cores
 from lagbench.metrics import Metric, Score, aggregate, available, select
 from lagbench.submission import ValidationResult, open_predictions, validate
@@ -20,7 +21,7 @@ from lagbench.work.run import run_all
 
 from .card import JSON_NAME, ScoreCard, write_json
 from .flags import Flag, below_twin_floor, copy_suspect, physics
-from .floors import PERSISTENCE
+from .floors import measurable
 from .scenario import SUBMISSION, ScenarioJob, ScenarioScores, score_scenario
 from .score_file import NETCDF_NAME, write_statistics
 from .task import ScoredTask, load_scored_task, ranking_metric
@@ -90,11 +91,16 @@ def score(
     with open_predictions(path) as opened:
         header, content = opened.header, result.sha256 or opened.content_sha256()
     exam = load_scored_task(described.size(header.split, header.size), holder)
-    outcomes = _outcomes(exam, path, tuple(m.name for m in metrics), workers, scheduler, Meter(progress))
+    known = shipped(exam.size) or {}
+    floors = () if known else measurable(exam.size, holder)
+    outcomes = _outcomes(
+        exam, path, tuple(m.name for m in metrics), floors, workers, scheduler, Meter(progress)
+    )
     tallies = {
         row: {outcome.scenario: outcome.tallies[row] for outcome in outcomes} for row in outcomes[0].tallies
     }
-    scores = {row: aggregate(metrics, held) for row, held in tallies.items()}
+    scores: dict[str, Mapping[str, Score]] = {row: aggregate(metrics, held) for row, held in tallies.items()}
+    scores |= {name: floor.scores for name, floor in known.items()}
     preview = next(outcome.preview for outcome in outcomes if outcome.preview is not None)
     card = ScoreCard(
         header=header,
@@ -130,6 +136,7 @@ def _outcomes(
     exam: ScoredTask,
     path: Path,
     metrics: tuple[str, ...],
+    floors: tuple[str, ...],
     workers: int | None,
     scheduler: str | None,
     meter: Meter,
@@ -138,7 +145,7 @@ def _outcomes(
     ids, horizon = exam.scenarios, exam.setting.horizon
     jobs = {
         f"scenario {i}": ScenarioJob(
-            exam=exam, scenario=i, predictions=path, metrics=metrics, pictured=i == ids[0]
+            exam=exam, scenario=i, predictions=path, metrics=metrics, floors=floors, pictured=i == ids[0]
         )
         for i in ids
     }
@@ -155,6 +162,6 @@ def _flags(
     traces = [outcome.trace for outcome in outcomes]
     error, still = (
         np.asarray(np.mean(scores[row]["position_rmse"].per_frame, axis=0))
-        for row in (SUBMISSION, PERSISTENCE)
+        for row in (SUBMISSION, persistence.FLOOR.name)
     )
     return copy_suspect(traces), below_twin_floor(error, still, exam.twin_floor), physics(traces)

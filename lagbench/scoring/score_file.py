@@ -3,14 +3,15 @@
 Every score of the submission follows from it: ``read_statistics(path).scores()`` gives the
 digits of scores.json. Statistics are float32 and NaN where undefined, those of long rollouts
 rounded to 11 significant bits (see :func:`lagbench.scoring.scenario.as_stored`), so that no full size takes
-more than 0.3 MB; ``measured`` tells which were measured at all.
+more than 0.3 MB; ``measured`` tells which were measured at all. What the best floor scores in
+the ranking metric stands beside them, so that the skill can be formed again.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +20,12 @@ from numpy.typing import NDArray
 
 from lagbench.atomic import atomic_path
 from lagbench.errors import WorkFailedError
+from lagbench.floors import FLOORS
 from lagbench.metrics import Score, Tally, aggregate, available
 
 from .card import FORMAT, IDENTITY, ScoreCard, unreadable_scores
 from .scenario import SUBMISSION, Preview
+from .skill import Skill, skill
 
 __all__ = [
     "NETCDF_NAME",
@@ -78,6 +81,10 @@ def _define(file: Any, card: ScoreCard) -> None:  # noqa: ANN401
     )
     _store(file, "scenario", ("scenario",), np.array(card.scenarios, np.int32))
     _store(file, "frame", ("frame",), np.array(frames, np.int32))
+    if card.skill is not None:
+        file.best_floor = card.skill.floor
+        values = card.scores[card.skill.floor][card.ranking].values
+        _store(file, "best_floor_value", ("scenario",), values)
     dims = ("statistic", "scenario", "frame")
     values = np.stack([np.stack([tally.series(name) for tally in tallies]) for name in names])
     measured = np.stack([np.stack([tally.measured(name) for tally in tallies]) for name in names])
@@ -158,6 +165,17 @@ class StoredScores:
     predictions_sha256: str  # content hash of the predicted positions
     ranking: str  # name of the metric that ranks
     tallies: Mapping[int, Tally]  # statistics of the submission by scenario
+    best_floor: str | None = None  # name of the best floor; None where none that counts has a score
+    # what it scores in the ranking metric, NaN where undefined, shape [scenario]
+    best_floor_values: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+
+    def skill(self) -> Skill | None:
+        """Return how much better than the best floor; None where none that counts has a score."""
+        ours = self.scores().get(self.ranking)
+        if self.best_floor is None or ours is None:
+            return None
+        floor = replace(ours, values=self.best_floor_values)
+        return skill(ours, {self.best_floor: floor})
 
     def scores(self) -> dict[str, Score]:
         """Return the scores of all installed metrics whose statistics are here, by name."""
@@ -177,6 +195,8 @@ def read_statistics(path: Path) -> StoredScores:
                 raise ValueError(f"layout {file.lagbench_scores!r}, not {FORMAT}")
             names = tuple(str(file.statistics).split())
             frames = tuple(file["frame"][:].tolist())
+            scenarios = file["scenario"][:].tolist()
+            floor, of_floor = _best_floor(file, len(scenarios))
             values, measured = file["value"][:].astype(np.float64), file["measured"][:]
             return StoredScores(
                 identity={name: str(file.getncattr(name)) for name in IDENTITY},
@@ -184,11 +204,22 @@ def read_statistics(path: Path) -> StoredScores:
                 ranking=str(file.ranking_metric),
                 tallies={
                     scenario: _tally(names, frames, values[:, i], measured[:, i])
-                    for i, scenario in enumerate(file["scenario"][:].tolist())
+                    for i, scenario in enumerate(scenarios)
                 },
+                best_floor=floor,
+                best_floor_values=of_floor,
             )
     except Exception as error:  # HDF5 on damaged bytes raises nearly any type
         raise unreadable_scores(path, error) from error
+
+
+def _best_floor(file: Any, scenarios: int) -> tuple[str | None, NDArray[np.float64]]:  # noqa: ANN401
+    if "best_floor" not in file.ncattrs():
+        return None, np.empty(0)
+    name, values = str(file.best_floor), np.asarray(file["best_floor_value"][:], np.float64)
+    if name not in FLOORS or values.shape != (scenarios,) or np.isinf(values).any():
+        raise ValueError("not the scores of a floor")
+    return name, values
 
 
 def _tally(

@@ -17,6 +17,7 @@ __all__ = [
     "card_tables",
     "comparison_table",
     "flag_lines",
+    "skill_line",
 ]
 
 
@@ -61,7 +62,7 @@ def _ranked_first(card: ScoreCard, names: Collection[str]) -> list[str]:
 
 def _over_horizon(card: ScoreCard, names: Collection[str], title: str) -> Table:
     floors = [row for row in card.scores if row != SUBMISSION]
-    rows = []
+    rows = [_skill_row(card, len(floors))]
     for name in names:
         score = card.submission[name]
         undefined = sum(score.undefined)
@@ -70,7 +71,10 @@ def _over_horizon(card: ScoreCard, names: Collection[str], title: str) -> Table:
                 name,
                 _number(score.mean),
                 _interval(score),
-                *(_number(card.scores[row][name].mean) for row in floors),
+                *(
+                    _number(card.scores[row][name].mean) if name in card.scores[row] else "-"
+                    for row in floors
+                ),
                 _better(score),
                 f"{undefined} of {len(score.scenarios) * len(score.frames)}" if undefined else "",
                 score.metric.unit,
@@ -79,6 +83,25 @@ def _over_horizon(card: ScoreCard, names: Collection[str], title: str) -> Table:
     heads = (row.replace("-", "-\n") for row in floors)  # narrow enough for 120 characters
     columns = ("metric", SUBMISSION, "95 % interval", *heads, "better", "undefined", "unit")
     return Table(title, columns, tuple(rows))
+
+
+def _skill_row(card: ScoreCard, floors: int) -> tuple[str, ...]:
+    found = card.skill
+    if found is None:
+        return ("skill", "-", "", *("" for _ in range(floors)), "higher", "", "1")
+    low, high = found.interval
+    interval = "" if math.isnan(low) else f"{low:.3g} to {high:.3g}"
+    return ("skill", _number(found.value), interval, *("" for _ in range(floors)), "higher", "", "1")
+
+
+def skill_line(card: ScoreCard) -> str:
+    """Return the skill in one line."""
+    found = card.skill
+    if found is None:
+        return "skill: undefined, no floor that counts has a score"
+    low, high = found.interval
+    interval = "" if math.isnan(low) else f" ({low:.3g} to {high:.3g})"
+    return f"skill {found.value:.3g}{interval}: 1 - {found.metric} / {found.metric} of {found.floor}"
 
 
 def _at_frames(card: ScoreCard, names: Collection[str], title: str) -> Table:

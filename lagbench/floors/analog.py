@@ -1,0 +1,167 @@
+"""Analog: the scenario of train that starts most like this one, its future as the answer.
+
+After Lorenz, J. Atmos. Sci. 26 (1969) 636. Scenarios are compared at the last given frame by
+
+    d^2 = W2^2(positions) / std(x)^2 + mean |u_a - u_b|^2 / std(u)^2,
+
+the sliced Wasserstein distance of their clouds (material by material where both have the same)
+and the difference of their velocity fields on the score grid, each over the spread of what is
+given here. In a full box the analog's motion carries the particles: from frame to frame they
+move as the analog does where they are. On a free surface the analog's particles are assigned to
+those given so that the sum of squared distances is least, and their paths are the answer.
+
+Memorising looks like this, and so does a leak from train to test.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagbench.data.grid import Grid, Placement, node_velocity, transfer
+from lagbench.data.layout import ScenarioKey, scenario_path
+from lagbench.data.scenario import ScenarioFile, read_scenario
+from lagbench.errors import DataError
+from lagbench.store.copy import bring
+
+from .carried import linear_field, mirrored
+from .floor import Floats, Floor, Given, Prediction, fills_box, given_in, wall_motion
+
+__all__ = ["FLOOR", "assigned", "distance", "nearest", "predict"]
+
+ANGLES = np.arange(64) * (np.pi / 64)
+DIRECTIONS = np.stack([np.cos(ANGLES), np.sin(ANGLES)])
+"""Directions on which clouds are projected, shape [2, direction]."""
+
+LEVELS = (np.arange(256) + 0.5) / 256
+"""Levels at which distributions along a direction are compared; clouds may differ in number."""
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """How a scenario starts, as scenarios are compared."""
+
+    clouds: dict[int, Floats]  # quantiles along each direction by material [length], [level, direction]
+    shares: dict[int, float]  # share of each material in the particles [1]
+    field: Floats  # velocity at the nodes [length/frame], shape [x node, y node, 2]
+
+
+def start_of(given: Given) -> Start:
+    """Return how a scenario starts."""
+    task = given.size.task.score_grid
+    grid = Grid(task.cells, Placement(task.placement))
+    clouds = {
+        int(kind): np.quantile(given.last[given.material == kind] @ DIRECTIONS, LEVELS, axis=0)
+        for kind in np.unique(given.material)
+    }
+    shares = {kind: float(np.mean(given.material == kind)) for kind in clouds}
+    sums = transfer(given.last, given.step, grid)
+    return Start(clouds, shares, node_velocity(sums, float(sums.weight.max())))
+
+
+def distance(one: Start, other: Start) -> float:
+    """Return how unlike two starts are, in units of the first one's spread; infinite for other materials."""
+    if one.clouds.keys() != other.clouds.keys():
+        return float("inf")
+    apart = sum(one.shares[k] * np.mean((c - other.clouds[k]) ** 2) for k, c in one.clouds.items())
+    spread = sum(one.shares[k] * np.var(c) for k, c in one.clouds.items())
+    differ = np.mean((one.field - other.field) ** 2)
+    speed = np.mean(one.field**2)
+    return float(np.sqrt(apart / spread + differ / (speed or 1.0)))
+
+
+def nearest(given: Given) -> int:
+    """Return the id of the scenario of train that starts most like this one.
+
+    Raises:
+        DataError: a scenario of train is missing or damaged, or none is long enough.
+    """
+    size, own = given.size, start_of(given)
+    needed = size.task.input_frames + size.task.horizon
+    bring(size, given.root, size.subsets["train"])
+    found = {}
+    for scenario in size.subsets["train"]:
+        if size.frame_count(scenario) >= needed:
+            with _open(given, scenario) as file:
+                found[scenario] = distance(own, start_of(given_in(file, size, given.root)))
+    if not found:
+        raise DataError(
+            "no scenario of train is as long as the task",
+            where=f"{size.split} {size.name}",
+            expected=f"{needed} frames",
+        )
+    return min(found, key=lambda scenario: (found[scenario], scenario))
+
+
+def predict(given: Given) -> Prediction:
+    """Yield where the analog takes the particles."""
+    with _open(given, nearest(given)) as file:
+        yield from _carried(given, file) if fills_box(given.size) else _matched(given, file)
+
+
+def _carried(given: Given, file: ScenarioFile) -> Iterator[NDArray[np.float32]]:
+    """Move the particles as the analog's neighbours move from each frame to the next."""
+    last = given.predicted_frames[-1]
+    walls, now = wall_motion(file, given.size, last + 1), given.last
+    before = _frame(file, given.predicted_frames[0] - 1)
+    for frame in given.predicted_frames:
+        after = _frame(file, frame)
+        field = linear_field(*mirrored(given, before, after - before, walls[frame]))
+        now, before = given.inside(now + field(now)), after
+        yield now.astype("float32")
+
+
+def _matched(given: Given, file: ScenarioFile) -> Iterator[NDArray[np.float32]]:
+    """Follow the analog's particles that are assigned to those given."""
+    theirs = _frame(file, given.predicted_frames[0] - 1)
+    partner = assigned(given.last, theirs, given.material, file.read("material"))
+    for frame in given.predicted_frames:
+        yield _frame(file, frame)[partner].astype("float32")
+
+
+def assigned(
+    position: Floats, theirs: Floats, material: NDArray[np.integer], of_theirs: NDArray[np.integer]
+) -> NDArray[np.intp]:
+    """Return a particle of theirs for each of ours: least sum of squared distances, material by material.
+
+    Where there are fewer or more of theirs, some are taken more than once, or not at all, evenly
+    over their numbers. A material that they lack is matched to all of theirs.
+    """
+    from scipy.optimize import linear_sum_assignment
+    from scipy.spatial.distance import cdist
+
+    partner = np.empty(len(position), np.intp)
+    for kind in np.unique(material):
+        ours = np.flatnonzero(material == kind)
+        pool = np.flatnonzero(of_theirs == kind)
+        pool = pool if pool.size else np.arange(len(theirs))
+        chosen = pool[np.arange(len(ours)) * len(pool) // len(ours)]
+        cost = cdist(position[ours], theirs[chosen], "sqeuclidean")
+        partner[ours] = chosen[linear_sum_assignment(cost)[1]]
+    return partner
+
+
+def _frame(file: ScenarioFile, frame: int) -> Floats:
+    return np.asarray(file.read("position", frame), np.float64)
+
+
+def _open(given: Given, scenario: int) -> ScenarioFile:
+    size = given.size
+    key = ScenarioKey(
+        split=size.split, size=size.name, version=size.version, scenario=scenario, subset="train"
+    )
+    return read_scenario(scenario_path(given.root, key))
+
+
+FLOOR = Floor(
+    name="analog",
+    title="Analog",
+    definition="The scenario of train whose given frames are nearest to those given here: its motion carries"
+    " the particles of a full box, its matched particles are the answer on a free surface.",
+    applies=lambda _: True,
+    predict=predict,
+    reads_train=True,
+)

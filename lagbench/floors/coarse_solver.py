@@ -1,0 +1,178 @@
+"""Coarse solver: the same equations on the grid of the next smaller size, with its time step.
+
+What a surrogate must be compared with: accuracy against cost. It learns nothing either, but it
+knows the equations, the viscosity, the materials and the motion of the walls to the end. A seeded
+subset of the particles, as many as the smaller size has and as evenly spread as they are, carries
+the mass. In a full box the others move as those around them do (see :mod:`.carried`); on a free
+surface each keeps its offset to the nearest of its material that carries mass.
+
+The solver starts from displacements alone: in full boxes the velocity of the last given frame is
+extrapolated from two of them, ``(3 u(f) - u(f-1)) / 2``; in free fall it is ``u(f) + g / 2``.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagbench.data.registry import Size, load
+from lagbench.errors import require
+
+from .carried import linear_field, mirrored
+from .floor import Floats, Floor, Given, Prediction, fills_box
+
+if TYPE_CHECKING:
+    from lagbench.generators.solver import Solver
+    from lagbench.generators.split import ClosedBoxParameters, FreeSurfaceParameters, InitialState
+
+__all__ = ["FLOOR", "coarser", "predict", "predict_with", "spread_subset"]
+
+NEXT = {"full": "mini", "mini": "tiny"}
+"""The next smaller size of each size."""
+
+SPLITS = {"cavity": ("full",), "fluid": ("full", "mini"), "multimaterial": ("full", "mini")}
+"""Sizes that are solved; the effective viscosity of curl noise is its grid's, so it is not."""
+
+
+def coarser(size: Size) -> Size | None:
+    """Return the size whose grid is used; None where a size is not solved or has no coarser grid."""
+    if size.name not in SPLITS.get(size.split, ()):
+        return None
+    found = load().size(size.split, NEXT[size.name])
+    return found if found.grid < size.grid else None
+
+
+def predict(given: Given) -> Prediction:
+    """Yield positions that the solver on the coarser grid finds."""
+    coarse = coarser(given.size)
+    if coarse is None:
+        raise ValueError(f"{given.size.split} {given.size.name} has no coarser size")
+    return predict_with(given, coarse)
+
+
+def predict_with(given: Given, coarse: Size) -> Prediction:
+    """Yield positions that the solver finds with the constants of a size.
+
+    Raises:
+        UsageError: Taichi is not installed.
+        WorkFailedError: the simulation blew up.
+    """
+    require("taichi", extra="generate")
+    from lagbench.generators.batch import solver_constants
+
+    constants = solver_constants(coarse)
+    count = min(coarse.particles, len(given.last))
+    carriers = spread_subset(given.last, given.material, count)
+    solver = _solver(replace(constants, particles=count))
+    solver.load([_state(given, carriers)])
+    paths = _paths(given, solver, coarse.substeps_per_frame)
+    yield from _all_moved(given, carriers, paths)
+
+
+@functools.lru_cache(maxsize=1)
+def _solver(constants: ClosedBoxParameters | FreeSurfaceParameters) -> Solver:
+    """Build a solver, or take the last one again: building compiles."""
+    from lagbench.generators.solver import build
+
+    return build(constants, threads=1)
+
+
+def spread_subset(position: Floats, material: NDArray[np.integer], count: int) -> NDArray[np.intp]:
+    """Return the numbers of particles spread evenly over each material: one, drawn, of each small group.
+
+    Groups are neighbours in columns of nearly equal counts, as the lattices of full boxes are.
+    """
+    rank = np.empty(len(position), np.intp)
+    for kind in np.unique(material):
+        own = np.flatnonzero(material == kind)
+        columns = math.isqrt(math.ceil(count * len(own) / len(position)))
+        place = np.argsort(np.argsort(position[own, 0], kind="stable"), kind="stable")
+        rank[own] = place * columns // len(own)
+    order = np.lexsort((position[:, 1], rank, material))
+    draws = np.random.Generator(np.random.PCG64(0)).random(count)
+    groups = np.array_split(order, count)
+    return np.sort([group[int(u * len(group))] for u, group in zip(draws, groups, strict=True)])
+
+
+def _state(given: Given, carriers: NDArray[np.intp]) -> InitialState:
+    """Return the last given frame as the solver starts from it."""
+    from lagbench.generators.split import InitialState
+
+    interval, count = given.size.frame_interval, len(carriers)
+    if fills_box(given.size):
+        step = 1.5 * given.step - 0.5 * (given.position[-2] - given.position[-3])
+        velocity = step / interval
+    else:
+        fall = np.array([0.0, -0.5 * float(given.size.value("gravity")) * interval])
+        velocity = given.step / interval + fall
+    return InitialState(
+        position=given.last[carriers],
+        velocity=velocity[carriers],
+        affine=np.zeros((count, 2, 2)),
+        material=given.material[carriers],
+        area=given.area,
+        viscosity=float(str(given.parameters.get("viscosity", 0.0))),
+        friction=float(str(given.parameters.get("friction", 0.0))),
+        wall_velocity=given.walls[given.predicted_frames[0]] / interval,
+    )
+
+
+def _paths(given: Given, solver: Solver, substeps: int) -> Iterator[Floats]:
+    """Yield the positions of the particles that carry mass, frame by frame."""
+    from lagbench.generators.closed_box import ClosedBox
+
+    for frame in given.predicted_frames:
+        if isinstance(solver, ClosedBox):
+            walls = given.walls[frame] / given.size.frame_interval
+            solver.move_walls(walls[None].astype(np.float32))
+        solver.advance(substeps)
+        yield solver.position()[0].astype(np.float64)
+
+
+def _all_moved(
+    given: Given, carriers: NDArray[np.intp], paths: Iterator[Floats]
+) -> Iterator[NDArray[np.float32]]:
+    """Yield the positions of all particles, those that carry mass where the solver has them."""
+    now = given.last.copy()
+    others = np.setdiff1d(np.arange(len(now)), carriers)
+    leader = _leaders(given, carriers, others)
+    offset = now[others] - now[carriers][leader]
+    before = now[carriers]
+    for frame, after in zip(given.predicted_frames, paths, strict=True):
+        if fills_box(given.size) and others.size:
+            field = linear_field(*mirrored(given, before, after - before, given.walls[frame]))
+            now[others] = now[others] + field(now[others])
+        else:
+            now[others] = after[leader] + offset
+        now[carriers], before = after, after
+        now = given.inside(now)
+        yield now.astype("float32")
+
+
+def _leaders(given: Given, carriers: NDArray[np.intp], others: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Return for each other particle the index of the nearest of its material that carries mass."""
+    from scipy.spatial import KDTree
+
+    leader = np.zeros(len(others), np.intp)
+    for kind in np.unique(given.material[others]):
+        pool = np.flatnonzero(given.material[carriers] == kind)
+        led = np.flatnonzero(given.material[others] == kind)
+        leader[led] = pool[KDTree(given.last[carriers[pool]]).query(given.last[others[led]])[1]]
+    return leader
+
+
+FLOOR = Floor(
+    name="coarse-solver",
+    title="Coarse solver",
+    definition="The solver itself on the grid of the next smaller size, with its time step: it knows the"
+    " equations, the materials and what drives the flow.",
+    applies=lambda size: coarser(size) is not None,
+    predict=predict,
+    counts=False,
+)

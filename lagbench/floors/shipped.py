@@ -1,0 +1,193 @@
+"""Scores of the floors, measured once per data set and shipped with the package.
+
+``measured/<split>-<size>.json`` is bound to the hash of the data set. It has the value of every
+metric per scenario, and of what is told frame by frame the mean over scenarios: at the reported
+frames, and for the metrics in :data:`CURVES` at all frames (of long rollouts at a hundred, linear
+between). Numbers have five significant digits, means at frames four, curves three.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagbench.atomic import write_atomically
+from lagbench.data.registry import Size
+from lagbench.metrics import Score, available
+
+__all__ = ["CURVES", "FOLDER", "FloorScores", "correlation_of", "shipped", "shipped_path", "write_shipped"]
+
+FOLDER = Path(__file__).parent / "measured"
+
+FORMAT = 1
+"""Number of the layout of these files; stored as ``lagbench_floors``."""
+
+CURVES = (
+    *("vorticity_nrmse", "cloud_distance"),
+    *("vorticity_mse", "vorticity_rmse", "vorticity_pearson", "attribute_mse"),
+    *("position_rmse", "velocity_rmse", "energy_ratio", "energy_retention", "density_rmse"),
+    *("divergence_rms", "shape_error", "connectivity"),
+)
+"""Metrics of which reports and boards draw curves."""
+
+KNOTS = 100
+"""Frames of a curve that are kept."""
+
+CORRELATED = 54
+"""Frame at which the correlation of vorticity is kept of every scenario; the last one of shorter tasks."""
+
+DIGITS, FRAME_DIGITS, CURVE_DIGITS = 5, 4, 3
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FloorScores:
+    """What a floor scores on one split and size."""
+
+    name: str  # name of the floor
+    # scores by metric; per_frame has one row, the mean over scenarios, NaN where it is not kept
+    scores: Mapping[str, Score]
+    # CPU time to predict a frame on the machine that measured [s], which is no score
+    seconds_per_frame: float
+    correlation: NDArray[np.float64]  # of vorticity at frame 54 [1], NaN where undefined, shape [scenario]
+
+
+def correlation_of(scores: Mapping[str, Score]) -> NDArray[np.float64]:
+    """Return the correlation of vorticity at frame 54, or the last one, shape [scenario]."""
+    pearson = scores["vorticity_pearson"]
+    return pearson.at(min(CORRELATED, pearson.frames[-1]))
+
+
+def shipped_path(size: Size, folder: Path = FOLDER) -> Path:
+    """Return the file with the scores of the floors of a split and size."""
+    return folder / f"{size.split}-{size.name}.json"
+
+
+def shipped(size: Size, folder: Path = FOLDER) -> Mapping[str, FloorScores] | None:
+    """Return what the floors of a split and size score, by name.
+
+    Args:
+        size: the split and size.
+        folder: where the measured scores are; those of the package by default.
+
+    Returns:
+        None where none were measured on the data set that the registry describes.
+    """
+    path = shipped_path(size, folder)
+    if size.measured is None or not path.is_file():
+        return None
+    held = json.loads(path.read_text(encoding="utf-8"))
+    if held["lagbench_floors"] != FORMAT or held["dataset_sha256"] != size.measured.dataset_sha256:
+        return None
+    frames = range(held["frames"][0], held["frames"][1] + 1)
+    return {
+        name: FloorScores(
+            name=name,
+            scores=dict(_scores(said, tuple(held["scenarios"]), frames, held["reported_frames"])),
+            seconds_per_frame=said["seconds_per_frame"],
+            correlation=_floats(said["correlation"]),
+        )
+        for name, said in held["floors"].items()
+    }
+
+
+def _scores(
+    said: Mapping[str, Any], scenarios: tuple[int, ...], frames: range, reported: Sequence[int]
+) -> Iterable[tuple[str, Score]]:
+    """Yield the scores of a floor; metrics that are not installed here are left out."""
+    known, none = available(), [0] * len(scenarios)
+    for name, values in said["values"].items():
+        if name not in known:
+            continue
+        per_frame = np.full((1, len(frames)), np.nan)
+        if name in said["curves"]:
+            per_frame[0] = np.interp(frames, _knots(frames), _floats(said["curves"][name]))
+        if name in said["at"]:
+            per_frame[0, [frames.index(f) for f in reported]] = _floats(said["at"][name])
+        yield (
+            name,
+            Score(
+                metric=known[name],
+                scenarios=scenarios,
+                frames=tuple(frames),
+                per_frame=per_frame,
+                values=_floats(values),
+                undefined=tuple(said["undefined"].get(name, none)),
+            ),
+        )
+
+
+def _knots(frames: Sequence[int]) -> NDArray[np.intp]:
+    """Return the frames at which a curve is kept, first and last included."""
+    return np.rint(np.linspace(frames[0], frames[-1], min(len(frames), KNOTS))).astype(np.intp)
+
+
+def _floats(values: Sequence[float | None]) -> NDArray[np.float64]:
+    return np.array([math.nan if value is None else value for value in values])
+
+
+def write_shipped(
+    size: Size,
+    floors: Mapping[str, FloorScores],
+    *,
+    dataset_sha256: str,
+    reported: Sequence[int],
+    folder: Path = FOLDER,
+) -> Path:
+    """Write what the floors of a data set score, equal bytes for equal scores and costs."""
+    first = next(iter(next(iter(floors.values())).scores.values()))
+    held = {
+        "lagbench_floors": FORMAT,
+        "split": size.split,
+        "size": size.name,
+        "dataset_version": size.version,
+        "dataset_sha256": dataset_sha256,
+        "scenarios": list(first.scenarios),
+        "frames": [first.frames[0], first.frames[-1]],
+        "reported_frames": list(reported),
+        "floors": {name: _said(floor, reported) for name, floor in floors.items()},
+    }
+    path = shipped_path(size, folder)
+    write_atomically(path, f"{_spelled(held)}\n".encode(), option="--folder")
+    return path
+
+
+def _said(floor: FloorScores, reported: Sequence[int]) -> dict[str, Any]:
+    scores = floor.scores
+    told = {name: score for name, score in scores.items() if score.metric.per_frame}
+    return {
+        "seconds_per_frame": _number(floor.seconds_per_frame, 3),
+        "correlation": [_number(value, FRAME_DIGITS) for value in floor.correlation.tolist()],
+        "values": {name: [_number(v, DIGITS) for v in s.values.tolist()] for name, s in scores.items()},
+        "undefined": {name: list(s.undefined) for name, s in scores.items() if any(s.undefined)},
+        "at": {name: [_number(_mean(s.at(f)), FRAME_DIGITS) for f in reported] for name, s in told.items()},
+        "curves": {
+            name: [_number(_mean(told[name].at(f)), CURVE_DIGITS) for f in _knots(told[name].frames).tolist()]
+            for name in CURVES
+            if name in told
+        },
+    }
+
+
+def _mean(values: NDArray[np.float64]) -> float:
+    """Return the mean over the scenarios that have a value."""
+    defined = values[np.isfinite(values)]
+    return float(np.mean(defined)) if defined.size else math.nan
+
+
+def _number(value: float, digits: int) -> float | None:
+    return float(f"{value:.{digits}g}") if math.isfinite(value) else None
+
+
+def _spelled(value: object, depth: int = 0) -> str:
+    """Return JSON with an entry of a mapping in a line, so that a change shows where it is."""
+    if not isinstance(value, dict) or not value:
+        return json.dumps(value, allow_nan=False, separators=(",", ":"))
+    inner = (f"{' ' * (depth + 1)}{json.dumps(k)}: {_spelled(v, depth + 1)}" for k, v in value.items())
+    return "{\n" + ",\n".join(inner) + f"\n{' ' * depth}}}"

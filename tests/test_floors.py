@@ -1,0 +1,285 @@
+"""Floors against closed forms: parabolas, rotations, exponentials, copies, the solver itself."""
+
+from __future__ import annotations
+
+import math
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lagbench.data.layout import ScenarioKey, scenario_path
+from lagbench.data.registry import Registry, Size, load
+from lagbench.data.scenario import read_scenario
+from lagbench.errors import DataError
+from lagbench.floors import FLOORS, Given, floors_of, given_in
+from lagbench.floors.analog import assigned, nearest
+from lagbench.floors.carried import linear_field, mirrored
+from lagbench.floors.coarse_solver import coarser, predict_with, spread_subset
+from lagbench.floors.frozen_field import decay
+from lagbench.generators.batch import solver_constants
+from lagbench.generators.solver import build
+from lagbench.generators.split import InitialState
+from lagbench.make.generate import GenerationResult
+
+Floats = NDArray[np.float64]
+
+
+def given(split: str, position: Floats, *, size: str = "tiny", root: Path = Path(), **changes: Any) -> Given:
+    """Return what a made-up scenario gives; its walls are at rest unless told otherwise."""
+    tier = load().size(split, size)
+    frames = tier.task.input_frames + tier.task.horizon
+    walls = np.zeros((frames, 4, 2))
+    walls[:, :] = changes.pop("wall", 0.0)
+    (left, right), (bottom, top) = tier.bounds
+    return Given(
+        size=tier,
+        root=root,
+        position=np.asarray(position, np.float64),
+        material=changes.pop("material", np.zeros(position.shape[1], np.int8)),
+        walls=walls,
+        area=changes.pop("area", (right - left) * (top - bottom)),
+        parameters=changes,
+    )
+
+
+def scattered(count: int, low: float, high: float, seed: int = 0) -> Floats:
+    """Return points of a square, shape [point, 2]."""
+    return np.asarray(low + (high - low) * np.random.default_rng(seed).random((count, 2)))
+
+
+def predicted(name: str, held: Given) -> NDArray[np.float32]:
+    """Return what a floor predicts, shape [frame, particle, 2]."""
+    return np.array(list(FLOORS[name].predict(held)))
+
+
+def test_the_table_says_all_of_every_floor() -> None:
+    """Names are those of the rows, sentences end; the coarse solver alone is never the best floor."""
+    for name, floor in FLOORS.items():
+        assert floor.name == name
+        assert floor.title
+        assert floor.definition.endswith(".")
+    assert [floor.name for floor in FLOORS.values() if not floor.counts] == ["coarse-solver"]
+
+
+@pytest.mark.parametrize(
+    ("split", "size", "names"),
+    [
+        ("cavity", "full", "persistence constant-velocity frozen-field analog coarse-solver"),
+        ("cavity", "mini", "persistence constant-velocity frozen-field analog"),
+        ("curl-noise", "full", "persistence constant-velocity frozen-field analog"),
+        ("fluid", "mini", "persistence constant-velocity free-flight analog coarse-solver"),
+        ("multimaterial", "full", "persistence constant-velocity free-flight analog coarse-solver"),
+        ("fluid", "tiny", "persistence constant-velocity free-flight analog"),
+    ],
+)
+def test_which_floors_a_size_has(split: str, size: str, names: str) -> None:
+    """Full boxes have the frozen field, free surfaces free flight; what is solved has a coarser grid."""
+    tier = load().size(split, size)
+    assert " ".join(floor.name for floor in floors_of(tier)) == names
+    solved = coarser(tier)
+    assert solved is None or solved.grid < tier.grid
+
+
+def test_every_floor_predicts_its_frames_inside_the_walls() -> None:
+    """Fast particles stop at the walls; positions are float32, one frame per frame of the horizon."""
+    start = scattered(300, 0.2, 0.8)
+    fast = np.stack([start, start + 0.05])
+    for name in ("persistence", "constant-velocity", "free-flight"):
+        found = predicted(name, held := given("fluid", fast))
+        (left, right), (bottom, top) = held.size.bounds
+        assert found.dtype == np.float32
+        assert found.shape == (held.size.task.horizon, 300, 2)
+        assert found[..., 0].max() <= np.float32(right)
+        assert found[..., 1].max() <= np.float32(top)
+        assert found.min() >= np.float32(min(left, bottom))
+
+
+def test_free_flight_is_a_parabola() -> None:
+    """Frames of y = y0 + v t - g t^2 / 2 continue on the same parabola."""
+    size = load().size("fluid", "tiny")
+    time = np.arange(size.task.input_frames + size.task.horizon) * size.frame_interval
+    start = scattered(50, 0.4, 0.6)
+    path = np.repeat(start[None], len(time), axis=0)
+    path[..., 0] += 0.1 * time[:, None]
+    path[..., 1] += (0.8 * time - 0.5 * size.value("gravity") * time**2)[:, None]
+    n = size.task.input_frames
+    found = predicted("free-flight", given("fluid", path[:n]))
+    np.testing.assert_allclose(found, path[n:], atol=2e-6)
+
+
+def test_a_frozen_rotation_stays_a_rotation() -> None:
+    """Particles of a rigid rotation by 0.05 a frame keep their distance and turn by 0.05 a frame."""
+    centre, angle = np.array([0.5, 0.5]), 0.05
+    offset = scattered(4000, -0.4, 0.4)
+    turned = [
+        centre + offset @ np.array([[math.cos(a), math.sin(a)], [-math.sin(a), math.cos(a)]])
+        for a in (-angle, 0.0)
+    ]
+    held = given("cavity", np.stack([*([turned[0]] * 4), *turned]), wall=1e-9)
+    found = predicted("frozen-field", held)
+    inner = np.hypot(*offset.T) < 0.25
+    now, steps = found[-1][inner] - centre, held.size.task.horizon
+    np.testing.assert_allclose(np.hypot(*now.T), np.hypot(*offset[inner].T), rtol=2e-3)
+    gone = np.arctan2(now[:, 1], now[:, 0]) - np.arctan2(offset[inner, 1], offset[inner, 0])
+    np.testing.assert_allclose(np.cos(gone - steps * angle), 1.0, atol=1e-3)
+
+
+def test_decay_of_an_exponential() -> None:
+    """Displacements that shrink by 0.9 a frame decay by 0.9; growing ones and rest do not decay."""
+    step = scattered(20, -0.01, 0.01)
+    shrinking = np.cumsum([step * 0.9**k for k in range(6)], axis=0)
+    assert decay(shrinking) == pytest.approx(0.9)
+    assert decay(np.cumsum([step * 1.1**k for k in range(6)], axis=0)) == 1.0
+    assert decay(np.repeat(step[None], 6, axis=0)) == 1.0
+
+
+@pytest.mark.parametrize("speed", [0.0, 0.02])
+def test_the_mirrored_field_meets_the_wall(speed: float) -> None:
+    """A shear flow goes on through a wall that slides at 0.02; one at rest lets a stagnation flow slide."""
+    wall = np.zeros((4, 2))
+    wall[3, 0] = speed
+    held = given("cavity", np.zeros((6, 1, 2)), wall=wall)
+    low, high = held.size.bounds[0]
+    points = scattered(3000, low, high)
+    depth = high - points[:, 1]
+    tangential = speed + 0.3 * depth if speed else np.full_like(depth, 0.01)
+    field = linear_field(*mirrored(held, points, np.stack([tangential, 0.2 * depth], axis=1), wall))
+    at_wall = np.stack([np.linspace(0.3, 0.7, 20), np.full(20, high)], axis=1)
+    np.testing.assert_allclose(field(at_wall), np.tile((speed or 0.01, 0.0), (20, 1)), atol=1e-12)
+
+
+def test_the_field_is_linear_and_has_no_holes() -> None:
+    """A linear field is met exactly between the points; far outside, the nearest point answers."""
+    points = scattered(200, 0.0, 1.0)
+    gradient = np.array([[0.1, -0.3], [0.2, 0.05]])
+    field = linear_field(points, points @ gradient)
+    inside = scattered(50, 0.3, 0.7, seed=1)
+    np.testing.assert_allclose(field(inside), inside @ gradient, atol=1e-12)
+    beyond = np.array([[5.0, 5.0]])
+    corner = points[np.argmin(np.sum((points - beyond) ** 2, axis=1))]
+    np.testing.assert_allclose(field(beyond)[0], corner @ gradient)
+
+
+def opened(root: Path, size: Size, scenario: int) -> tuple[Given, NDArray[np.float32]]:
+    """Return what a scenario of a generated data set gives, and its future."""
+    key = ScenarioKey(
+        split=size.split,
+        size=size.name,
+        version=size.version,
+        scenario=scenario,
+        subset=size.subset_of(scenario),
+    )
+    n = size.task.input_frames
+    with read_scenario(scenario_path(root, key)) as file:
+        future = file.read("position", slice(n, n + size.task.horizon))
+        return given_in(file, size, root), future
+
+
+def test_the_analog_of_a_copy_is_exact(generated: GenerationResult, unmeasured: Registry) -> None:
+    """A full box that stands in train is its own analog, and its motion carries it where it goes."""
+    size = unmeasured.size(generated.split, generated.size)
+    own = size.subsets["train"][1]
+    held, future = opened(generated.root, size, own)
+    assert nearest(held) == own
+    np.testing.assert_allclose(predicted("analog", held), future, atol=1e-5)
+
+
+def test_the_analog_of_another_is_of_train(generated: GenerationResult, unmeasured: Registry) -> None:
+    """A test scenario gets another one's motion: particles start where they are and stay in the box."""
+    size = unmeasured.size(generated.split, generated.size)
+    held, future = opened(generated.root, size, size.subsets["test"][0])
+    assert nearest(held) in size.subsets["train"]
+    found = predicted("analog", held)
+    assert found.shape == future.shape
+    assert np.abs(found[0] - held.last).max() < 0.1
+
+
+def test_the_analog_says_what_is_missing(copied: Callable[[], Path], unmeasured: Registry) -> None:
+    """Without train there is no analog: a data error."""
+    size = unmeasured.size("curl-noise", "tiny")
+    root = copied()
+    held, _ = opened(root, size, size.subsets["test"][0])
+    shutil.rmtree(root / "curl-noise" / "tiny" / f"v{size.major}" / "train")
+    with pytest.raises(DataError):
+        predicted("analog", held)
+
+
+def test_assignment_undoes_a_permutation_by_material() -> None:
+    """A permuted, slightly moved cloud is matched particle by particle, each material on its own."""
+    points, rng = scattered(120, 0.0, 1.0), np.random.default_rng(1)
+    material, order = np.repeat([0, 2], 60), rng.permutation(120)
+    partner = assigned(points, points[order] + 1e-6, material, material[order])
+    np.testing.assert_array_equal(order[partner], np.arange(120))
+
+
+def test_assignment_of_unequal_counts() -> None:
+    """Fewer particles are taken more than once, more are left out; a lacking material takes any."""
+    points = scattered(90, 0.0, 1.0)
+    zeros = np.zeros(90, np.int64)
+    fewer = assigned(points, points[:30], zeros, zeros[:30])
+    assert np.bincount(fewer, minlength=30).tolist() == [3] * 30
+    more = assigned(points[:30], points, zeros[:30], zeros)
+    assert len(set(more.tolist())) == 30
+    assert set(assigned(points[:9], points[:9], zeros[:9] + 3, zeros[:9]).tolist()) == set(range(9))
+
+
+def test_the_subset_that_carries_mass_is_spread_evenly() -> None:
+    """A quarter of a jittered lattice has four in 4 x 4 spacings, far more evenly than by chance."""
+    side = np.stack(np.meshgrid(np.arange(48), np.arange(48)), axis=-1).reshape(-1, 2)
+    points = (side + 0.5 + 0.2 * scattered(48 * 48, -0.5, 0.5)) / 48
+    material = (points[:, 0] > 0.5).astype(np.int8)
+    chosen = spread_subset(points, material, 576)
+    assert len(set(chosen.tolist())) == 576
+    assert np.count_nonzero(material[chosen]) == 288
+    cell = (points[chosen] * 12).astype(int)
+    counts = np.bincount(cell[:, 0] * 12 + cell[:, 1], minlength=144)
+    assert counts.min() >= 1
+    assert counts.std() < 1.4  # a random choice: 2
+    np.testing.assert_array_equal(chosen, spread_subset(points, material, 576))
+
+
+def test_the_coarse_solver_at_full_resolution_is_the_solver() -> None:
+    """With the grid, time step and particles of its own size it moves them as the solver does."""
+    size = load().size("fluid", "tiny")
+    n, count = size.task.input_frames, size.particles
+    block = np.stack(np.meshgrid(np.arange(16), np.arange(16)), axis=-1).reshape(-1, 2) / 80 + 0.4
+    speed = np.tile([0.5, 0.2], (count, 1))
+    path = np.stack([block - speed * size.frame_interval * k for k in range(n)[::-1]])
+    held = given("fluid", path, area=0.04)
+    found = list(predict_with(held, size))
+    fall = np.array([0.0, -0.5 * size.value("gravity") * size.frame_interval])
+    solver = build(solver_constants(size))
+    solver.load(
+        [
+            InitialState(
+                position=path[-1],
+                velocity=(path[-1] - path[-2]) / size.frame_interval + fall,
+                affine=np.zeros((count, 2, 2)),
+                material=np.zeros(count, np.int8),
+                area=0.04,
+            )
+        ]
+    )
+    for frame in found:
+        solver.advance(size.substeps_per_frame)
+        np.testing.assert_array_equal(frame, solver.position()[0])
+
+
+def test_the_coarse_solver_moves_all_particles() -> None:
+    """A falling block on the coarser grid falls as a whole: bodies in flight keep their parabola."""
+    size = load().size("fluid", "mini")
+    coarse = coarser(size)
+    assert coarse is not None
+    side = np.stack(np.meshgrid(np.arange(25), np.arange(25)), axis=-1).reshape(-1, 2)
+    block = side / 120 + np.array([0.4, 0.6])
+    held = given("fluid", np.stack([block, block]), size="mini", area=(25 / 120) ** 2)
+    frames = predict_with(held, coarse)
+    for k, frame in zip(range(1, 11), frames, strict=False):
+        fallen = 0.5 * size.value("gravity") * size.frame_interval**2 * k * (k + 1)
+        np.testing.assert_allclose(np.mean(block - frame, axis=0), [0.0, fallen], atol=5e-4)
+        assert frame.shape == block.shape

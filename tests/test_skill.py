@@ -1,0 +1,185 @@
+"""Skill against hand-worked ratios, and shipped scores of floors against measured ones."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from score_bench import ScoreBench, bench_of, right, still, straight
+
+from lagbench.data.registry import Measured, Registry, Size
+from lagbench.floors import FLOORS, floors_of, shipped
+from lagbench.floors.shipped import shipped_path, write_shipped
+from lagbench.make.generate import GenerationResult
+from lagbench.metrics import METRICS, Score
+from lagbench.scoring import score as scoring
+from lagbench.scoring.card import ScoreCard
+from lagbench.scoring.floors import differences, kept_in, measurable, measure
+from lagbench.scoring.scenario import SUBMISSION
+from lagbench.scoring.score_file import read_statistics
+from lagbench.scoring.skill import best_floor, ratio_interval, skill
+from lagbench.scoring.tables import card_tables, skill_line
+
+
+def scored(values: list[float], metric: str = "vorticity_rmse", first: int = 0) -> Score:
+    """Return a score with these values over scenarios."""
+    ids = tuple(range(first, first + len(values)))
+    empty = np.empty((len(values), 0))
+    return Score(METRICS[metric], ids, (), empty, np.array(values), (0,) * len(values))
+
+
+def test_skill_is_one_minus_the_ratio_of_means() -> None:
+    """Means 1 and 4: skill 3/4 beside the better floor; a perfect score has 1, twice the floor's -1."""
+    floors = {"persistence": scored([6.0, 6.0]), "frozen-field": scored([3.0, 5.0])}
+    found = skill(scored([0.5, 1.5]), floors)
+    assert found is not None
+    assert (found.floor, found.value) == ("frozen-field", 0.75)
+    perfect, worse = skill(scored([0.0, 0.0]), floors), skill(scored([6.0, 10.0]), floors)
+    assert perfect is not None
+    assert worse is not None
+    assert (perfect.value, perfect.interval, worse.value) == (1.0, (1.0, 1.0), -1.0)
+
+
+def test_the_coarse_solver_is_no_best_floor() -> None:
+    """It knows the equations: however good, skill is measured against what does not; nor are strangers."""
+    floors = {"analog": scored([2.0]), "coarse-solver": scored([0.1]), "stranger": scored([0.1])}
+    assert best_floor(floors) == "analog"
+
+
+def test_skill_is_undefined_without_a_floor() -> None:
+    """No floor, an undefined one, a perfect one, other scenarios, or a metric of which more is better."""
+    ours = scored([1.0, 1.0])
+    assert skill(ours, {}) is None
+    assert skill(ours, {"analog": scored([math.nan, math.nan])}) is None
+    assert skill(ours, {"analog": scored([0.0, 0.0])}) is None
+    assert skill(ours, {"analog": scored([1.0, 1.0], first=7)}) is None
+    pearson = scored([0.5, 0.5], "vorticity_pearson")
+    assert skill(pearson, {"analog": pearson}) is None
+
+
+def test_skill_takes_the_scenarios_that_both_have() -> None:
+    """An undefined scenario is left out on both sides: 1 of 4, not (1 + 9) of anything."""
+    found = skill(scored([1.0, 9.0]), {"analog": scored([4.0, math.nan])})
+    assert found is not None
+    assert found.value == 0.75
+    assert all(math.isnan(bound) for bound in found.interval)
+
+
+def test_the_interval_of_a_ratio() -> None:
+    """A ratio that is 1/2 in every scenario is certain; else the interval holds the ratio of means."""
+    base = np.array([1.0, 2.0, 5.0, 3.0])
+    assert ratio_interval(base / 2.0, base) == (0.5, 0.5)
+    low, high = ratio_interval([1.0, 1.0, 4.0, 1.0], base)
+    assert low < 7.0 / 11.0 < high
+    # scenarios are drawn together: no resample is beyond the extreme ratios of single scenarios
+    assert low >= 1.0 / 3.0
+    assert high <= 1.0
+
+
+@pytest.fixture(scope="module")
+def bench(generated: GenerationResult, unmeasured: Registry) -> ScoreBench:
+    """Tiny curl noise."""
+    return bench_of(generated, unmeasured)
+
+
+def recorded(size: Size, sha256: str = "a" * 64) -> Size:
+    """Return a size as if its data set were recorded."""
+    statistics = {"position_std": (0.3, 0.3), "velocity_std": (1e-3, 1e-3)}
+    measured = Measured(
+        dataset_sha256=sha256, subset_sha256={}, scenario_sha256={}, statistics=statistics, twin_floor=()
+    )
+    return size.model_copy(update={"measured": measured})
+
+
+def test_shipped_scores_are_the_measured_ones(bench: ScoreBench, tmp_path: Path) -> None:
+    """Written and read again they are equal to five digits, curves to three; another data set has none."""
+    found = measure(bench.size, bench.root)
+    assert list(found) == [floor.name for floor in floors_of(bench.size)]
+    size, frames = recorded(bench.size), (15, 25)
+    path = write_shipped(size, found, dataset_sha256="a" * 64, reported=frames, folder=tmp_path)
+    held = shipped(size, tmp_path)
+    assert held is not None
+    assert differences(held, found) == {}
+    for name, floor in found.items():
+        for metric, score in floor.scores.items():
+            told = held[name].scores[metric]
+            assert told.undefined == score.undefined
+            if score.metric.per_frame:
+                at = [np.nanmean(s.at(25)) if np.isfinite(s.at(25)).any() else 0.0 for s in (told, score)]
+                assert at[0] == pytest.approx(at[1], rel=1e-3)
+    last = found["frozen-field"].scores["vorticity_pearson"].per_frame[:, -1]
+    np.testing.assert_allclose(held["frozen-field"].correlation, last, rtol=1e-3)
+    curve = found["frozen-field"].scores["position_rmse"].per_frame.mean(axis=0)
+    told = held["frozen-field"].scores["position_rmse"].per_frame[0]
+    np.testing.assert_allclose(told, curve, rtol=6e-3)
+    assert path == shipped_path(size, tmp_path)
+    assert shipped(recorded(bench.size, "b" * 64), tmp_path) is None
+    assert shipped(bench.size, tmp_path) is None
+
+
+def test_a_forged_shipped_score_is_found(bench: ScoreBench, tmp_path: Path) -> None:
+    """One value changed by 1 % differs from what is measured; so does a floor that is left out."""
+    found = measure(bench.size, bench.root, floors=["persistence", "constant-velocity"])
+    size = recorded(bench.size)
+    path = write_shipped(size, found, dataset_sha256="a" * 64, reported=(15,), folder=tmp_path)
+    said = json.loads(path.read_text())
+    said["floors"]["persistence"]["values"]["position_rmse"][1] *= 1.01
+    del said["floors"]["constant-velocity"]
+    path.write_text(json.dumps(said))
+    held = shipped(size, tmp_path)
+    assert held is not None
+    unlike = differences(held, found)
+    assert unlike["persistence"] == ("position_rmse",)
+    assert set(unlike["constant-velocity"]) == set(found["constant-velocity"].scores)
+
+
+def test_an_interrupted_measurement_goes_on(bench: ScoreBench, copied: Callable[[], Path]) -> None:
+    """What is kept is taken as it is: a file altered on purpose shows in the second run."""
+    size, root = recorded(bench.size), copied()
+    first = measure(size, root, floors=["persistence"], resume=True)
+    kept = sorted(kept_in(size, root).glob("*.npz"))
+    assert len(kept) == len(size.subsets["test"])
+    with np.load(kept[0]) as held:
+        values = dict(held)
+    np.savez(kept[0], **{**values, "total": 4.0 * values["total"]})
+    again = measure(size, root, floors=["persistence"], resume=True)
+    fresh = measure(size, root, floors=["persistence"])
+    one, two, three = (m["persistence"].scores["position_mse"].values for m in (first, again, fresh))
+    np.testing.assert_allclose(two[0], 4.0 * one[0])
+    np.testing.assert_array_equal(one, three)
+
+
+def test_scoring_takes_what_is_shipped(
+    bench: ScoreBench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With shipped scores nothing but the submission is measured, and the card says the same."""
+    path = bench.submit(tmp_path / "predictions.nc", straight)
+    measured = bench.evaluate(path)
+    held = measure(bench.size, bench.root)
+    monkeypatch.setattr(scoring, "shipped", lambda size: held)
+    card = bench.evaluate(path)
+    assert list(card.tallies) == [SUBMISSION]
+    assert set(measured.tallies) == {SUBMISSION, *measurable(bench.size, bench.root)}
+    assert card.as_json() == measured.as_json()
+
+
+def test_skill_stands_in_the_card(bench: ScoreBench, tmp_path: Path) -> None:
+    """The truth has skill 1; persistence has none above 0; line, first row and JSON say the same."""
+    perfect = bench.evaluate(bench.submit(tmp_path / "right.nc", right))
+    standing: ScoreCard = bench.score(bench.submit(tmp_path / "still.nc", still))
+    assert perfect.skill is not None
+    assert standing.skill is not None
+    assert perfect.skill.value == 1.0
+    assert standing.skill.value <= 0.0
+    said = standing.as_json()["skill"]
+    assert said["floor"] == standing.skill.floor
+    assert FLOORS[said["floor"]].counts
+    assert said["value"] == pytest.approx(standing.skill.value)
+    again = read_statistics(standing.files[1]).skill()
+    assert again == standing.skill
+    assert next(iter(card_tables(standing))).rows[0][0] == "skill"
+    assert standing.skill.floor in skill_line(standing)
