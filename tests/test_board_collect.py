@@ -17,11 +17,12 @@ from lagbench.board.collect import CURVE_FRAMES, RESIDUAL_BINS, collect, curve, 
 from lagbench.board.floors import floor_names
 from lagbench.board.model import Board, Row
 from lagbench.board.page import build
-from lagbench.board.ranking import Combined, combine, holm, standings
+from lagbench.board.ranking import Combined, combine
 from lagbench.board.score_file import read_stored
 from lagbench.board.show import as_plain, chosen_tabs, tables
 from lagbench.errors import ChecksFailedError, UsageError
 from lagbench.metrics import METRICS, Score, bootstrap_interval
+from lagbench.metrics.significance import standings
 from lagbench.scoring.card import ScoreCard, digits
 from lagbench.scoring.score_file import read_statistics
 
@@ -136,16 +137,6 @@ def holm_by_definition(p: list[float]) -> list[float]:
     return [
         next((level for level in levels if i in rejected(level * (1 + 1e-12))), 1.0) for i in range(len(p))
     ]
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_p_values_are_corrected_by_holm(seed: int) -> None:
-    """Against the definition: the level at which the steps reject; gaps stay and do not count."""
-    rng = np.random.Generator(np.random.PCG64(seed))
-    p = (rng.random(7) ** 3).tolist()
-    assert holm(p) == pytest.approx(holm_by_definition(p))
-    assert holm([math.nan, *p])[1:] == pytest.approx(holm(p))
-    assert math.isnan(holm([math.nan, *p])[0])
 
 
 def test_ranks_follow_the_numbers_and_ties_are_a_sign() -> None:
