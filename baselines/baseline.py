@@ -34,8 +34,9 @@ class Batch:
     position: Tensor  # particle positions [length], float32, shape [particle, frame, 2]
     sample: Tensor  # window that each particle belongs to, ascending, int64, shape [particle]
     material: Tensor  # 0 liquid, 1 jelly, 2 snow, 3 rope, int64, shape [particle]
-    # velocity of the walls over the frames of the windows [length/s], shape [window, frame, wall, 2]; None in
-    # a split without moving walls
+    # what acts on the way to each frame of the windows, and to those after them as far as it is known: the
+    # forcing of a scenario is given for all frames. Velocity of the walls [length/s], shape
+    # [window, frame, wall, 2]; None in a split without moving walls.
     wall_velocity: Tensor | None
     scenario: Tensor  # scenario id of each window, int64, shape [window]
     frame: Tensor  # absolute number of each window's first frame, int64, shape [window]
@@ -51,9 +52,9 @@ class Batch:
         return self.position.shape[1]
 
     def part(self, frames: slice) -> Self:
-        """Return some frames of every window; `frame` follows."""
+        """Return some frames of every window; `frame` follows, and the forcing of later frames stays."""
         first = range(self.frames)[frames][0]
-        walls = None if self.wall_velocity is None else self.wall_velocity[:, frames]
+        walls = None if self.wall_velocity is None else self.wall_velocity[:, first:]
         return replace(self, position=self.position[:, frames], wall_velocity=walls, frame=self.frame + first)
 
     def to(self, device: torch.device | str) -> Self:

@@ -17,6 +17,7 @@ import json
 import pickle
 import re
 import warnings
+import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -33,6 +34,7 @@ from torch.nn.parameter import is_lazy
 from lagbench.atomic import atomic_path
 from lagbench.data.registry import Registry
 from lagbench.errors import DataError, LagbenchError, UnreadableFileError, WorkFailedError
+from lagbench.submission.hdf5 import check_regular
 
 from .baseline import Baseline
 from .catalogue import find
@@ -273,33 +275,54 @@ def check_data(checkpoint: Checkpoint, *, root: Path, registry: Registry | None 
     return here
 
 
-def _is_pickle(file: Path) -> bool:
-    """Tell whether a file begins as pickles, or archives of them, do."""
-    with file.open("rb") as stream:
-        return stream.read(2)[:2] in {b"PK", *(b"\x80" + bytes([protocol]) for protocol in range(2, 6))}
+def _check_archive(file: Path) -> None:
+    """Refuse what is no archive as torch writes them, before anything in it is unpickled.
+
+    Members are stored as they are, so all of them together are no longer than the file, and each
+    has the checksum that it states: nothing unpacks to more, and no damaged byte is read.
+    """
+    inside = f"name the file: {file / 'weights.pt'}" if file.is_dir() else None
+    length = check_regular(file, fix=inside)
+    if not zipfile.is_zipfile(file):
+        with file.open("rb") as stream:
+            head = stream.read(2)
+        if head in {b"\x80" + bytes([protocol]) for protocol in range(2, 6)}:
+            raise _unsafe(file, "a pickle of something else")
+        raise _unfit(file, SAFE, "something else")
+    with zipfile.ZipFile(file) as archive:
+        members = archive.infolist()
+        packed = [one.filename for one in members if one.compress_type != zipfile.ZIP_STORED]
+        total = sum(max(one.file_size, one.compress_size) for one in members)
+        if packed or total > length or len({one.filename for one in members}) < len(members):
+            got = f"{packed[0][:100]!a} is compressed" if packed else f"members of {total} bytes in {length}"
+            raise _unfit(file, "an archive whose members are stored as they are, each once", got)
+        broken = archive.testzip()
+    if broken is not None:
+        raise _unfit(file, SAFE, f"{broken[:100]!a} has another checksum than it states")
+
+
+def _unsafe(file: Path, got: str) -> LagbenchError:
+    return UnreadableFileError(
+        "the file holds more than tensors and plain values, and was not opened",
+        where=str(file),
+        expected=SAFE,
+        got=got,
+        fix="do not load it otherwise either: such a file can run code",
+    )
 
 
 def _content(file: Path) -> dict[str, Any]:
     try:
+        _check_archive(file)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             content = torch.load(file, map_location="cpu", weights_only=True)
-    except OSError as error:
-        inside = f"name the file: {file / 'weights.pt'}" if file.is_dir() else None
-        raise UnreadableFileError(
-            "cannot read the checkpoint", where=str(file), got=error.strerror or error, fix=inside
-        ) from None
+    except LagbenchError:
+        raise
     except pickle.UnpicklingError as error:
         named = _FOREIGN.search(str(error))
-        if named is None and not _is_pickle(file):
-            raise _unfit(file, SAFE, "something else") from None
-        raise UnreadableFileError(
-            "the file holds more than tensors and plain values, and was not opened",
-            where=str(file),
-            expected=SAFE,
-            got=f"a pickle that names {named[1][:100]!a}" if named else "a pickle of something else",
-            fix="do not load it otherwise either: such a file can run code",
-        ) from None
+        got = f"a pickle that names {named[1][:100]!a}" if named else "a pickle of something else"
+        raise _unsafe(file, got) from None
     except Exception as error:  # damaged archives raise nearly any type
         raise _unfit(file, SAFE, f"{type(error).__name__}: {str(error)[:200]}") from None
     if not isinstance(content, dict) or KEY not in content:

@@ -15,7 +15,7 @@ from lagbench.data.manifest import Manifest, read_manifest
 from lagbench.data.registry import Registry, Size
 from lagbench.data.scenario import read_scenario
 from lagbench.errors import DataError
-from lagbench.store.bringing import bring
+from lagbench.store.copy import bring
 
 __all__ = ["Facts", "facts_of"]
 

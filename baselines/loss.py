@@ -53,14 +53,17 @@ class State:
     velocity: Tensor  # last velocities, oldest first [length/frame], shape [particle, 5, 2]
     material: Tensor  # material of each particle, int64, shape [particle]
     sample: Tensor  # window of each particle, ascending, int64, shape [particle]
-    # velocity of the walls in the last given frame, as each particle sees them [length/frame], shape
-    # [particle, 4, 2]; None where walls rest or do not matter
+    # velocity of the walls in the coming frames, the next one first [length/frame], shape
+    # [window, frame, 4, 2]; beyond them the last one stays. None where walls rest or do not matter.
     wall_velocity: Tensor | None
 
     def moved(self, position: Tensor, velocity: Tensor) -> Self:
         """Return the state one frame on."""
         last = torch.cat([self.velocity[:, 1:], velocity.unsqueeze(1)], dim=1)
-        return replace(self, position=position, velocity=last)
+        walls = self.wall_velocity
+        if walls is not None and walls.shape[1] > 1:
+            walls = walls[:, 1:]
+        return replace(self, position=position, velocity=last, wall_velocity=walls)
 
 
 def integrate(position: Tensor, velocity: Tensor, acceleration: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,4 +1,4 @@
-"""Rollouts: a model fed with its own predictions, frozen where it ceases to be finite.
+"""Rollouts: a model fed with its own predictions, frozen where it ceases to be finite or leaves for far.
 
 One function serves validation during training and the predictions that are scored.
 
@@ -13,6 +13,8 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
+
+from lagbench.submission.checks import MAX_DISTANCE
 
 from .baseline import Baseline, Batch
 from .job import TrainingJob
@@ -98,13 +100,14 @@ def _alone(model: Baseline, given: Batch, frames: int) -> Rollout:
 
 
 def _advance(model: Baseline, given: Batch, frames: int) -> tuple[Tensor, int]:
-    """Return positions, shape [frame, particle, 2], and how many frames are finite."""
+    """Return positions, shape [frame, particle, 2], and how many frames are finite and near the box."""
     predicted = torch.empty((frames, len(given.position), 2), dtype=torch.float32)
     state = model.start(given)
     for frame in range(frames):
         state, position = model.advance(state)
         predicted[frame] = position
-        if not torch.isfinite(predicted[frame]).all():
+        # The scorer refuses what lies farther out; of NaN nothing is true.
+        if not ((predicted[frame] - 0.5).abs() <= MAX_DISTANCE).all():
             return predicted, frame
     return predicted, frames
 

@@ -69,7 +69,7 @@ class GraphNetworkOptions(Options):
     link_weight: float | None = Field(default=None, ge=0.0, allow_inf_nan=False)
     # own steps that the loss is averaged over; gradients pass through all
     rollout_loss_steps: int = Field(default=1, ge=1)
-    wall_velocity: bool = False  # whether the velocities of moving walls are features
+    wall_velocity: bool = False  # whether the velocities of moving walls in the next frame are features
     symmetry: Symmetry = Symmetry.NONE  # images that training windows are replaced by at random
     # connectivity radius [length]; the data set's when None
     radius: float | None = Field(default=None, gt=0.0, allow_inf_nan=False)
@@ -200,7 +200,8 @@ class GraphNetwork(Baseline):
         velocity = torch.cat([velocity[:, :1].expand(-1, missing, -1), velocity], dim=1)
         walls = None
         if self.options.wall_velocity and given.wall_velocity is not None:
-            walls = (given.wall_velocity[:, -1] * self.facts.frame_interval)[given.sample]
+            known = given.wall_velocity.shape[1]
+            walls = given.wall_velocity[:, min(given.frames, known - 1) :] * self.facts.frame_interval
         return State(
             position=position[:, -1],
             velocity=velocity,
@@ -233,7 +234,8 @@ class GraphNetwork(Baseline):
         self, state: State, edge_index: Tensor, generator: torch.Generator | None = None
     ) -> tuple[Tensor, Losses]:
         """Return the standardised target [1], shape [particle, 2], and the operator's own losses."""
-        node = self.features(state.position, state.velocity, state.material, state.wall_velocity)
+        walls = None if state.wall_velocity is None else state.wall_velocity[:, 0][state.sample]
+        node = self.features(state.position, state.velocity, state.material, walls)
         edge = edge_features(state.position, edge_index, self.radius)
         output: tuple[Tensor, Losses] = self.network(node, edge_index, edge, generator)
         return output

@@ -133,7 +133,8 @@ class Window(NamedTuple):
 
     position: Tensor  # particle positions [length], float32, shape [particle, frame, 2]
     material: Tensor  # 0 liquid, 1 jelly, 2 snow, 3 rope, int64, shape [particle]
-    # velocity of the walls [length/s], float32, shape [frame, wall, 2]; None in a split without moving walls
+    # velocity of the walls [length/s], float32, shape [frame, wall, 2], of these frames and perhaps of later
+    # ones; None in a split without moving walls
     wall_velocity: Tensor | None
     scenario: int  # scenario id
     frame: int  # absolute number of the first frame
@@ -231,7 +232,7 @@ def collate(windows: Sequence[Window]) -> Batch:
         position=torch.cat([window.position for window in windows]),
         sample=torch.arange(len(windows)).repeat_interleave(particles),
         material=torch.cat([window.material for window in windows]),
-        wall_velocity=torch.stack(walls) if walls else None,
+        wall_velocity=torch.stack([wall[: min(map(len, walls))] for wall in walls]) if walls else None,
         scenario=torch.tensor([window.scenario for window in windows]),
         frame=torch.tensor([window.frame for window in windows]),
     )
@@ -270,7 +271,8 @@ def _read(path: Path, frames: slice) -> Window:
         held = file.variables
         position = file.read("position", run)
         material = file.read("material") if "material" in held else np.zeros(position.shape[1], np.int8)
-        walls = file.read("wall_velocity", run) if "wall_velocity" in held else None
+        # The forcing is given for all frames, so that a rollout from these knows what comes.
+        walls = file.read("wall_velocity", slice(run.start, None)) if "wall_velocity" in held else None
         return _window(list(position), material, walls, file.header.key.scenario, numbers.start)
 
 

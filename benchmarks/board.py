@@ -1,13 +1,12 @@
 """Build a leaderboard of 50 made-up entries and say how long it takes and how large the page is.
 
-    python benchmarks/board.py [--entries 50] [--output FOLDER] [--board leaderboard]
+    python benchmarks/board.py [--entries 50] [--output FOLDER]
 
-The entries are the committed floors of every `mini`, made better or worse: statistics are scaled per
-scenario, films and maps get a random walk of their own, so that nothing of them compresses away
-because two entries are alike. Every fifth has three seeds, some are superseded, withdrawn or
-flagged, and their texts hold markup. The same call gives the same bytes. `lagbench leaderboard
-check` passes on the result. Exit code 1 if the page has 2 MB or more, if the build takes 20 s of
-processor time or more, or if a second build, in another order of files, gives other bytes.
+Entries stand on every split's `mini`: errors grow over the frames by a law of their own, films and maps are
+noise, so that nothing compresses away because two entries are alike. Every fifth has three seeds, some
+are superseded, withdrawn or flagged, and their texts hold markup. The same call gives the same bytes.
+Exit code 1 if `lagbench leaderboard check` finds anything, if the page has 2 MB or more, if the build
+takes 20 s of processor time or more, or if a second build, in another order of files, gives other bytes.
 """
 
 from __future__ import annotations
@@ -18,30 +17,44 @@ import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 
-from lagbench.board.build import build
 from lagbench.board.check import check_board
-from lagbench.board.entry import CostEntry, Entry, FlagEntry, PredictionEntry, ScoredFile, Status
-from lagbench.board.entry_file import read_entry, spell_entry
+from lagbench.board.entry import (
+    Budget,
+    Cost,
+    DataSet,
+    Entry,
+    Flag,
+    Prediction,
+    ScoreBlock,
+    ScoredFile,
+    Status,
+)
+from lagbench.board.entry_file import spell
+from lagbench.board.floors import floor_names, write_floors
 from lagbench.board.folder import Folder, score_paths
-from lagbench.board.scored import score_block
-from lagbench.board.seeds import combine, summarise
-from lagbench.board.stored import read_stored
+from lagbench.board.page import build
+from lagbench.board.ranking import combine, summarise
+from lagbench.board.score_file import read_stored, reported_frames
 from lagbench.cli.output import spell_bytes
 from lagbench.data.checksums import file_sha256
-from lagbench.floors import constant_velocity, persistence
-from lagbench.scoring.scenario import SUBMISSION, as_stored
+from lagbench.data.grid import Grid, Placement
+from lagbench.data.registry import Size, load
+from lagbench.metrics import METRICS, Direction, Setting, Tally
+from lagbench.metrics.distributions import BINS
+from lagbench.scoring.card import ScoreCard
+from lagbench.scoring.scenario import FRAMES, PARTICLES, SUBMISSION, Preview, as_stored
 from lagbench.scoring.score_file import write_statistics
+from lagbench.scoring.task import ranking_metric
+from lagbench.submission import Header
+from lagbench.submission.task_checks import frames_to_predict
 
 MOST_BYTES, MOST_SECONDS = 2_000_000, 20.0
 SEEDS = 3
+SIZE = "mini"
 NAMES = ("Graph <b>network</b>", "Ünïcode & co.", "A model with a rather long name, as they have", "MLP")
 
 
@@ -50,22 +63,26 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--entries", type=int, default=50)
     parser.add_argument("--output", type=Path, help="folder to make; a temporary one by default")
-    parser.add_argument("--board", type=Path, default=Path(__file__).parent.parent / "leaderboard")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
-        return _measured(given.board, given.output or Path(scratch) / "board", given.entries)
+        return _measured(given.output or Path(scratch) / "board", given.entries)
 
 
-def _measured(source: Path, target: Path, entries: int) -> int:
-    make_board(source, target, entries)
+def _measured(target: Path, entries: int) -> int:
+    splits = [name for name, split in load().splits.items() if SIZE in split.sizes]
+    for number in range(entries):
+        make_entry(load().size(splits[number % len(splits)], SIZE), target, number)
     wall, cpu = time.perf_counter(), time.process_time()
     result = build(target)
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     again = target.with_name(f"{target.name}-again")
-    _copy_backwards(target, again)
+    for path in sorted((p for p in target.rglob("*.*") if p.suffix in (".yaml", ".nc")), reverse=True):
+        copy = again / path.relative_to(target)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(path, copy)
     same = build(again).page.read_bytes() == result.page.read_bytes()
     shutil.rmtree(again)
-    findings = check_board(target).findings
+    findings = check_board(target, page=True).findings
     for finding in findings:
         print(finding, file=sys.stderr)
     files = [path.stat().st_size for path in target.glob("scores/*/*/*.nc")]
@@ -78,134 +95,150 @@ def _measured(source: Path, target: Path, entries: int) -> int:
     return 0 if same and not findings and result.bytes < MOST_BYTES and cpu < MOST_SECONDS else 1
 
 
-def make_board(source: Path, target: Path, count: int) -> None:
-    """Copy the floors of every mini and add made-up entries until there are so many.
-
-    Args:
-        source: a leaderboard's folder with both floors on every mini.
-        target: folder to make.
-        count: entries in all.
-    """
-    held = [read_entry(source / path) for path in Folder(source).entries()]
-    floors = [entry for entry in held if entry.floor and entry.size == "mini"]
-    for entry in floors:
-        for path in (entry.yaml_path, *entry.score_paths):
-            (target / path).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(source / path, target / path)
-    bases = {entry.split: entry for entry in floors if entry.method == constant_velocity.FLOOR.name}
-    splits = sorted(bases)
-    for number in range(count - len(floors)):
-        _make(bases[splits[number % len(splits)]], target, number)
-
-
-def _make(base: Entry, target: Path, number: int) -> None:
-    """Write a made-up entry and its score files."""
+def make_entry(size: Size, target: Path, number: int) -> None:
+    """Write a made-up entry, its score files, and the floors beside it."""
     rng = np.random.Generator(np.random.PCG64(number))
-    place = (base.split, base.size, f"model-{number}")
-    seeds: Sequence[int | None] = [None] if number % 5 else list(range(SEEDS))
-    paths = [target / path for path in score_paths(place, seeds)]
-    hashes = [f"{number * SEEDS + i:064x}" for i in range(len(seeds))]
-    quality = 10.0 ** rng.uniform(-1.5, 0.3)
-    for i, (path, sha256) in enumerate(zip(paths, hashes, strict=True)):
-        near = quality * 10.0 ** rng.uniform(-0.05, 0.05)
-        _write(target / base.score_paths[0], path, near, sha256, place[2], number * SEEDS + i)
-    made = tuple(
-        PredictionEntry(
-            seed=seed, sha256=sha256, url=f"https://example.org/{sha256[-6:]}.nc", bytes=1_000_000
-        )
-        for seed, sha256 in zip(seeds, hashes, strict=True)
-    )
-    entry = _described(base, place, number, made, rng)
-    scores = combine([read_stored(path).scores for path in paths])
-    flags = (FlagEntry(name="physics", reasons=("made up",)),) if number % 7 == 0 else ()
-    files = [
-        ScoredFile(sha256=file_sha256(path), predictions_sha256=sha256, flags=flags)
-        for path, sha256 in zip(paths, hashes, strict=True)
+    place = (size.split, size.name, f"model-{number}")
+    seeds: list[int | None] = [None] if number % 5 else list(range(SEEDS))
+    cards = [
+        made_up(size, place[2], number * SEEDS + i, 10.0 ** rng.uniform(-1.5, 0.3)) for i in range(len(seeds))
     ]
-    block = score_block(
-        place,
-        base.dataset,
-        made,
-        files,
-        summarise(scores),
-        about=entry,
-        ranking=base.score.ranking_metric,
-        scored_by="nobody",
+    paths = [target / path for path in score_paths(place, seeds)]
+    flags = (Flag(name="physics", reasons=("made up",)),) if number % 7 == 0 else ()
+    for card, path in zip(cards, paths, strict=True):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_statistics(card, path)
+    write_floors(cards[0], Folder(target))
+    files = tuple(
+        ScoredFile(sha256=file_sha256(path), predictions_sha256=card.predictions_sha256, flags=flags)
+        for card, path in zip(cards, paths, strict=True)
     )
-    entry = entry.model_copy(update={"score": block})
-    (target / entry.yaml_path).write_bytes(spell_entry(entry))
+    header = cards[0].header
+    superseded, withdrawn = number % 13 == 12, number % 11 == 10
+    entry = Entry(
+        format=2,
+        split=size.split,
+        size=size.name,
+        method=place[2],
+        name=f"{NAMES[number % len(NAMES)]} {number}",
+        authors=("A. Author", "B. <script>alert(1)</script>", f"C. {number}"),
+        affiliation="An institute",
+        code=f"https://example.org/{place[2]}",
+        date=datetime.date(2026, 1, 1) + datetime.timedelta(days=number),
+        notes="Made up. " * (number % 9),
+        training="a little noise",
+        budget=Budget(windows=1000 * number, cpu_hours=0.25),
+        parameters=int(10.0 ** rng.uniform(4, 8)),
+        hardware="none",
+        command=f"python benchmarks/board.py  # number {number}",
+        cost=Cost(
+            seconds_per_frame=float(f"{10.0 ** rng.uniform(-3, 0):.4g}"),
+            device="a machine",
+            solver_seconds_per_frame=0.05 if number % 3 else None,
+        ),
+        status=Status.SUPERSEDED if superseded else Status.WITHDRAWN if withdrawn else Status.ACTIVE,
+        superseded_by=f"model-{number % 4}" if superseded else None,
+        reason="made up" if superseded or withdrawn else "",
+        dataset=DataSet(version=header.dataset_version, sha256=header.dataset_sha256),
+        predictions=tuple(
+            Prediction(
+                seed=seed, sha256=card.predictions_sha256, url="https://example.org/x.nc", bytes=1_000_000
+            )
+            for seed, card in zip(seeds, cards, strict=True)
+        ),
+        score=ScoreBlock(
+            lagbench="0.0.0",
+            dataset_sha256=header.dataset_sha256,
+            ranking_metric=cards[0].ranking,
+            files=files,
+            metrics=summarise(combine([read_stored(path).scores for path in paths])),
+        ),
+    )
+    (target / entry.yaml_path).parent.mkdir(parents=True, exist_ok=True)
+    (target / entry.yaml_path).write_bytes(spell(entry))
 
 
-def _described(
-    base: Entry,
-    place: tuple[str, str, str],
-    number: int,
-    made: tuple[PredictionEntry, ...],
-    rng: np.random.Generator,
-) -> Entry:
-    status = Status.WITHDRAWN if number % 11 == 10 else Status.ACTIVE
-    superseded = number % 13 == 12
-    return base.model_copy(
-        update={
-            "method": place[2],
-            "name": f"{NAMES[number % len(NAMES)]} {number}",
-            "authors": ("A. Author", "B. <script>alert(1)</script>", f"C. {number}"),
-            "affiliation": "An institute",
-            "code": f"https://example.org/{place[2]}",
-            "date": datetime.date(2026, 1, 1) + datetime.timedelta(days=number),
-            "notes": "Made up. " * (number % 9),
-            "training": "a little noise",
-            "parameters": int(10.0 ** rng.uniform(4, 8)),
-            "hardware": "none",
-            "command": f"python benchmarks/board.py  # number {number}",
-            "cost": CostEntry(
-                seconds_per_frame=float(f"{10.0 ** rng.uniform(-3, 0):.4g}"),
-                device="a machine",
-                solver_seconds_per_frame=0.05 if number % 3 else None,
-            ),
-            "status": Status.SUPERSEDED if superseded else status,
-            "superseded_by": persistence.FLOOR.name if superseded else None,
-            "reason": "made up" if superseded or status is Status.WITHDRAWN else "",
-            "predictions": made,
-        }
+def made_up(size: Size, method: str, seed: int, quality: float) -> ScoreCard:
+    """Return a score card of nobody's predictions: errors that grow, pictures of noise."""
+    rng, rows = np.random.Generator(np.random.PCG64(seed)), {SUBMISSION: quality}
+    rows |= {name: 3.0 + i for i, name in enumerate(floor_names())}
+    task, frames = size.task, tuple(frames_to_predict(size))
+    header = Header(
+        split=size.split,
+        size=size.name,
+        dataset_version=size.version,
+        dataset_sha256=size.measured.dataset_sha256 if size.measured else "0" * 64,
+        method=method,
+        scenarios=size.subsets["test"],
+        frames=frames,
+        particles=size.particles,
+        seconds_per_frame=None,
+        device=None,
+        seed=None,
+        parameters=None,
+        training=None,
+        diverged_at={},
+    )
+    grid = Grid(task.score_grid.cells, Placement(task.score_grid.placement))
+    return ScoreCard(
+        header=header,
+        predictions_sha256=f"{seed:064x}",
+        setting=Setting(
+            grid=grid,
+            input_frames=task.input_frames,
+            horizon=task.horizon,
+            frames_of_interest=task.frames_of_interest,
+            attribute_std=(1.0, 1.0, 1.0, 1.0),
+            radius=task.radius,
+            materials=(),
+            centre=(0.5, 0.5),
+        ),
+        ranking=ranking_metric(size),
+        tallies={
+            row: {
+                i: _tally(frames, value, np.random.Generator(np.random.PCG64([i, int(1e6 * value)])))
+                for i in size.subsets["test"]
+            }
+            for row, value in rows.items()
+        },
+        scores={},
+        flags=(),
+        warnings=(),
+        preview=_preview(size, grid.nodes, rng),
     )
 
 
-def _write(base: Path, path: Path, quality: float, sha256: str, method: str, seed: int) -> None:
-    """Write a score file with the errors of another one scaled, and a noise of its own in the pictures."""
-    rng = np.random.Generator(np.random.PCG64(seed))
-    held = read_stored(base)
-    names = next(iter(held.scores.tallies.values())).names
-    errors = np.array(
-        [name.endswith(("_mse", "_mae")) or "_mse_" in name or "_mae_" in name for name in names]
-    )
-    tallies = {}
-    for scenario, tally in held.scores.tallies.items():
-        factor = quality * 10.0 ** rng.uniform(-0.1, 0.1, (1, len(tally.frames)))
-        tallies[scenario] = as_stored(
-            replace(tally, total=tally.total * np.where(errors[:, None], factor, 1.0))
-        )
-    preview = held.preview
-    film, vorticity = preview.film.copy(), preview.vorticity.copy()
-    film[1] += np.cumsum(rng.normal(0.0, 1e-3, film[1].shape), axis=0).astype(np.float32)
-    vorticity[1] += rng.normal(0.0, 0.1 * np.nanstd(vorticity[0]), vorticity[1].shape).astype(np.float32)
-    card: Any = SimpleNamespace(
-        header=SimpleNamespace(**{**held.scores.identity, "method": method}),
-        predictions_sha256=sha256,
-        ranking=held.scores.ranking,
-        scenarios=tuple(sorted(tallies)),
-        tallies={SUBMISSION: tallies},
-        preview=replace(preview, film=film, vorticity=vorticity),
-    )
-    write_statistics(card, path)
+def _tally(frames: tuple[int, ...], quality: float, rng: np.random.Generator) -> Tally:
+    """Return statistics that grow with the frames; correlations fall."""
+    metrics = [m for m in METRICS.values() if m.statistic is not None and m.extra is None]
+    share = np.linspace(0.01, 1.0, len(frames))
+    total = 1e-3 * quality * 10.0 ** rng.uniform(-0.1, 0.1, (len(metrics), len(frames))) * share
+    falling = np.array([metric.direction is Direction.HIGHER for metric in metrics])
+    total[falling] = 1.0 / (1.0 + quality * share)
+    ones = np.ones(total.shape, np.int64)
+    return as_stored(Tally(tuple(metric.name for metric in metrics), frames, total, ones, 0 * ones))
 
 
-def _copy_backwards(source: Path, target: Path) -> None:
-    """Copy entries and score files in descending order of their names."""
-    for path in sorted((p for p in source.rglob("*.*") if p.suffix in (".yaml", ".nc")), reverse=True):
-        copy = target / path.relative_to(source)
-        copy.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(path, copy)
+def _preview(size: Size, nodes: int, rng: np.random.Generator) -> Preview:
+    frames, maps = tuple(frames_to_predict(size)), reported_frames(size)
+    shown = [frames[i] for i in np.linspace(0, len(frames) - 1, min(FRAMES, len(frames))).astype(int)]
+    truth = np.random.Generator(np.random.PCG64(size.particles))
+    vorticity = 0.1 * truth.normal(size=(1, len(maps), nodes, nodes)) * np.ones((2, 1, 1, 1))
+    vorticity[1] += 0.02 * rng.normal(size=vorticity[1].shape)
+    film = truth.random((1, 1, PARTICLES, 2)) * np.ones((2, len(shown), 1, 1))
+    film[1] += np.cumsum(rng.normal(0.0, 1e-3, film[1].shape), axis=0)
+    shares = rng.random((2, len(maps), BINS))
+    return Preview(
+        scenario=min(size.subsets["test"]),
+        map_frames=maps,
+        vorticity=vorticity.astype(np.float32),
+        histogram=(shares / shares.sum(axis=-1, keepdims=True)).astype(np.float32),
+        histogram_range=np.array([[-0.3, 0.3]] * len(maps), np.float32),
+        film_frames=tuple(shown),
+        particles=tuple(range(PARTICLES)),
+        material=np.zeros(PARTICLES, np.int8),
+        film=np.clip(film, -0.5, 1.5).astype(np.float32),
+    )
 
 
 if __name__ == "__main__":

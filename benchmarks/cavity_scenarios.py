@@ -1,9 +1,10 @@
-"""Print what each cavity scenario is: wall, direction, speed, Reynolds number, start, energy.
+"""Print what each cavity scenario is: walls and their speeds, Reynolds number, start, energy.
 
     python benchmarks/cavity_scenarios.py --root FOLDER [--size full] [--subset train]
 
-The mean kinetic energy per unit mass is that of the solver's particle velocities over all
-frames [length^2/s^2]. Exits with 1 if two scenarios have the same draws or the same energy.
+The RMS speed is that of the moving walls over all frames, reversals how often they change direction.
+The mean kinetic energy per unit mass is that of the solver's particle velocities over all frames
+[length^2/s^2]. Exits with 1 if two scenarios have the same draws or the same energy.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 from lagbench.data.registry import Size, load
 from lagbench.data.writer import ScenarioKey, read_scenario, scenario_path
 
-NAMES = ("wall", "direction", "speed", "reynolds_number", "start_substep")
+NAMES = ("wall", "motion", "reynolds_number", "start_frame")
 
 
 def main() -> int:
@@ -29,11 +30,14 @@ def main() -> int:
     size = load().size("cavity", given.size)
     ids = size.subsets[given.subset]
     rows = [_row(size, given.root, given.subset, scenario) for scenario in ids]
-    print("| id | wall | direction | speed [length/s] | Re | start substep | mean kinetic energy |")
-    print("|---:|---|---|---:|---:|---:|---:|")
-    for scenario, (wall, direction, speed, reynolds, start, energy) in zip(ids, rows, strict=True):
+    print(
+        "| id | walls | motion | Re | start frame | RMS speed [length/s] | reversals | mean kinetic energy |"
+    )
+    print("|---:|---|---|---:|---:|---:|---:|---:|")
+    for scenario, (wall, motion, reynolds, start, speed, reversals, energy) in zip(ids, rows, strict=True):
         print(
-            f"| {scenario} | {wall} | {direction} | {speed:.4f} | {reynolds:.1f} | {start} | {energy:.3e} |"
+            f"| {scenario} | {wall} | {motion} | {reynolds:.1f} | {start} | {speed:.4f} | {reversals} "
+            f"| {energy:.3e} |"
         )
     alike = len(rows) - min(len({row[:-1] for row in rows}), len({row[-1] for row in rows}))
     print(f"\n{len(rows)} scenarios, {alike} alike")
@@ -50,7 +54,10 @@ def _row(size: Size, root: Path, subset: str, scenario: int) -> tuple:
             0.5 * float((file.read("velocity", f).astype(np.float64) ** 2).sum(-1).mean())
             for f in range(size.frame_count(scenario))
         ]
-    return *drawn, float(np.mean(energy))
+        walls = file.read("wall_velocity").astype(np.float64).reshape(len(energy), -1)
+    moving = walls[:, walls.any(axis=0)]
+    reversals = int(np.count_nonzero(np.diff(np.sign(moving), axis=0)))
+    return *drawn, float(np.sqrt(np.mean(moving**2))), reversals, float(np.mean(energy))
 
 
 if __name__ == "__main__":

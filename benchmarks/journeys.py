@@ -1,8 +1,10 @@
-"""How many rooms lie between a command and its effect: python benchmarks/journeys.py
+"""How many rooms lie between a command and its effect.
 
-Runs each command in this process on a made-up root, prints the files of ours in which a function ran, and how many
-functions: class bodies, imports and child processes are left out. Then what the source says: files, lines, comments,
-the longest chain of imports. Markdown, for the table in CONTRIBUTING.md.
+    python benchmarks/journeys.py
+
+Runs each command in this process on a made-up root and prints in how many files of ours a function
+ran, and how many functions: class bodies, imports and child processes are left out. Then what the
+source says: files, lines, comments, the longest chain of imports. Its table stands in CONTRIBUTING.md.
 """
 
 from __future__ import annotations

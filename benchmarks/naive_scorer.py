@@ -1,7 +1,7 @@
 """A plain scorer of five metrics, as one would write it after the thesis: SciPy griddata, cubic.
 
 It reads whole arrays and interpolates the velocities of truth and prediction to the 40x40
-grid, frame by frame; five metrics against our eighty, and no floors.
+grid, frame by frame; five metrics against our sixty.
 """
 
 from __future__ import annotations

@@ -87,7 +87,7 @@ def _write_truth(path: Path, key: ScenarioKey, frames: int, particles: int) -> s
         frame_interval=0.1,
         material=np.zeros(particles),
         particle_mass=1e-4 * BOX[1] ** 2 / particles,
-        parameters={"start_substep": 0},
+        parameters={"start_frame": 0},
         seed="made up",
         device="cpu",
         generator="benchmarks",

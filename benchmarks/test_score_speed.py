@@ -3,7 +3,7 @@
     OMP_NUM_THREADS=1 pytest benchmarks/test_score_speed.py -s
 
 Ours runs in a fresh process as ``lagbench score`` would: six scenarios, 90 or 600 frames, all
-metrics but Sinkhorn, both floors, two workers. The naive one scores two scenarios' first frames
+metrics but Sinkhorn, one worker and two. The naive one scores two scenarios' first frames
 of the same files in the same run; its time is scaled to all frames.
 """
 
@@ -21,13 +21,10 @@ from score_data import ScoreData, make_score_data
 
 from lagbench.scoring.task import load_scored_task
 
-WALL_SECONDS = 2.0
-"""Target after imports on two idle cores [s]."""
+CPU_SECONDS = 2.5
+"""Target of processor time after imports with one worker, where version 1 took 9.5 [s]."""
 
-CPU_SECONDS = 2 * WALL_SECONDS
-"""Target of processor time with one worker: what two cores have in that time [s]."""
-
-MEMORY = 500e6
+MEMORY = 200e6
 """Target for the largest process [bytes]."""
 
 NAIVE_FRAMES = 4
@@ -70,7 +67,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> ScoreData:
 
 
 def test_score_beside_a_naive_scorer(data: ScoreData) -> None:
-    """All metrics of three rows take a fifth of the time of five naive ones of one row, or less."""
+    """All metrics take a tenth of the time of five naive ones, or less."""
     folder = data.predictions.parent
     one, two = run_ours(folder, 1), run_ours(folder, 2)
     exam = load_scored_task(data.registry.size("cavity", "full"), data.root)
@@ -82,16 +79,16 @@ def test_score_beside_a_naive_scorer(data: ScoreData) -> None:
     for name, found in (("one worker", one), ("two workers", two)):
         print(
             f"\n{name}: {found['wall']:.2f} s, {found['cpu']:.2f} CPU-s, {found['memory'] / 1e6:.0f} MB,"
-            f" {found['metrics']} metrics x 3 rows, scores.nc {found['bytes'] / 1e3:.0f} kB"
-            f" (targets {WALL_SECONDS} s on two idle cores, {MEMORY / 1e6:.0f} MB, 300 kB)"
+            f" {found['metrics']} metrics, scores.nc {found['bytes'] / 1e3:.0f} kB"
+            f" (targets {CPU_SECONDS} CPU-s, {MEMORY / 1e6:.0f} MB, 300 kB)"
         )
     # Idle BLAS threads count as processor time of the naive side, other processes as its wall time.
     ratio = min(naive["cpu"], naive["wall"]) / one["cpu"]
     print(
-        f"naive, 5 metrics x 1 row: {naive['wall']:.0f} s, {naive['cpu']:.0f} CPU-s,"
+        f"naive, 5 metrics: {naive['wall']:.0f} s, {naive['cpu']:.0f} CPU-s,"
         f" extrapolated from {2 * NAIVE_FRAMES} of {SCENARIOS * 90} frames: {ratio:.0f} times ours"
     )
-    assert ratio >= 5
+    assert ratio >= 10
     assert one["cpu"] <= CPU_SECONDS
     assert max(one["memory"], two["memory"]) <= MEMORY
     assert two["bytes"] <= 300_000

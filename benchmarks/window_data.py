@@ -70,7 +70,7 @@ def _write_scenario(path: Path, key: ScenarioKey) -> None:
         material=np.zeros(PARTICLES),
         particle_mass=1e-8,
         wall_velocity=np.zeros((4, 2)),
-        parameters={"start_substep": 0},
+        parameters={"start_frame": 0},
         seed="made up",
         device="cpu",
         generator="benchmarks",

@@ -1,6 +1,6 @@
 """Scenarios of one size that a solver advances together, from frame to frame.
 
-Every scenario starts recording at a substep of its own, so a batch advances from one frame
+Every scenario starts recording after frames of its own, so a batch advances from one frame
 to the next, whichever scenario it belongs to. On ``Device.CPU`` a batch is one scenario.
 """
 
@@ -103,8 +103,8 @@ def _placed(error: WorkFailedError, where: str) -> WorkFailedError:
 
 def substeps_of(size: Size, scenario: int) -> int:
     """Return how many substeps a scenario takes, those before frame 0 included."""
-    recorded = (size.frame_count(scenario) - 1) * size.substeps_per_frame
-    return draw(size, scenario).start_substep + recorded
+    last = draw(size, scenario).start_frame + size.frame_count(scenario) - 1
+    return last * size.substeps_per_frame
 
 
 @dataclass
@@ -158,7 +158,7 @@ class Batch:
     def _schedule(self) -> list[tuple[int, int, int]]:
         interval = self.job.size.substeps_per_frame
         return sorted(
-            (state.start_substep + frame * interval, index, frame)
+            ((state.start_frame + frame) * interval, index, frame)
             for index, (state, count) in enumerate(zip(self.states, self._frames, strict=True))
             for frame in range(count)
         )
@@ -197,8 +197,8 @@ class Batch:
         interval = self.job.size.substeps_per_frame
         running = 0
         for index, health in enumerate(self.solver.health()):
-            end = self.states[index].start_substep + (self._frames[index] - 1) * interval
-            if self._now <= end:
+            last = self.states[index].start_frame + self._frames[index] - 1
+            if self._now <= last * interval:
                 running += 1
                 widest = self.extremes[index]
                 widest.max_speed = max(widest.max_speed, health.max_speed)

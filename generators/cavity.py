@@ -1,10 +1,16 @@
 """Lid-driven cavity: a full box, one wall or two opposite ones slide (thesis §5.8).
 
-Expected behaviour: a vortex fills the box from the moving wall inwards; two opposite walls
-make one vortex (directions opposed) or two (alike). Which walls move goes by id, so that every
-subset of ``full`` holds all six choices; direction, speed, Reynolds number and start are drawn.
-Recording starts anywhere between rest and the nearly steady flow. The Reynolds number is
-U L / nu with the box's width L.
+Every moving wall follows a program of its own: knots with speeds drawn from [-U, U], to the other
+side at each (else half of the walls would slide as before when it matters, and the frozen flow would
+do for an answer), and between two of them, at frames t0 and t1 with speeds a and b,
+
+    u(t) = a + (b - a) s^2 (3 - 2 s),    s = (t - t0) / (t1 - t0).
+
+One scenario in eight is the classic: lid at rest, then a constant speed. Expected behaviour: vortices
+grow from the moving walls, are cut off where a wall turns and merge; the flow never settles. Which
+walls move goes by id, so that every subset holds all six choices alike; two that meet in a corner
+never move both, because their corner blows up. The Reynolds number is (U/2) L / nu: U/2 is the mean
+absolute speed of a wall, L the box's width.
 """
 
 from __future__ import annotations
@@ -14,7 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from .constants import closed_box_walls, constants
+from .constants import closed_box_walls, constants, interval
 from .draws import RandomSource, choice, log_uniform, quantise, uniform
 from .lattice import fill
 from .split import WALLS, ClosedBoxParameters, InitialState, Material
@@ -22,13 +28,12 @@ from .split import WALLS, ClosedBoxParameters, InitialState, Material
 if TYPE_CHECKING:
     from lagbench.data.registry import Size
 
-__all__ = ["DRIVEN", "initial_state", "solver_parameters"]
+__all__ = ["DRIVEN", "initial_state", "is_classic", "solver_parameters"]
 
 DRIVEN = (("top",), ("bottom",), ("left",), ("right",), ("left", "right"), ("bottom", "top"))
 """The sets of walls that move, by id % 6: six consecutive scenarios hold each once."""
 
 _TANGENT = {"left": 1, "right": 1, "bottom": 0, "top": 0}
-_DIRECTION = {(0, 1): "right", (0, -1): "left", (1, 1): "up", (1, -1): "down"}
 
 
 def solver_parameters(size: Size) -> ClosedBoxParameters:
@@ -36,33 +41,62 @@ def solver_parameters(size: Size) -> ClosedBoxParameters:
     return constants(ClosedBoxParameters, size, no_slip=True)
 
 
-def _wall_motion(
-    rng: RandomSource, walls: tuple[str, ...], speed: float
-) -> tuple[NDArray[np.float64], str, str]:
-    """Draw which way the walls move."""
-    signs = [2 * choice(rng, 2) - 1 for _ in walls]
-    velocity = np.zeros((len(WALLS), 2))
-    for wall, sign in zip(walls, signs, strict=True):
-        velocity[WALLS.index(wall), _TANGENT[wall]] = sign * speed
-    directions = [_DIRECTION[_TANGENT[w], s] for w, s in zip(walls, signs, strict=True)]
-    return velocity, "+".join(walls), "+".join(directions)
+def is_classic(scenario: int) -> bool:
+    """Tell whether the lid starts once and keeps its speed: once in eight ids.
+
+    The remainder moves on by one every 24 ids, else these ids would always be odd, and only half of
+    :data:`DRIVEN` would occur among them.
+    """
+    return (scenario + scenario // 24) % 8 == 7
 
 
-def _start_substep(rng: RandomSource, size: Size) -> int:
-    """Draw the substep at which recording starts, end points included."""
-    last = round(float(size.value("start_time_max")) / size.dt)
-    return choice(rng, last + 1)
+def _whole(rng: RandomSource, low: float, high: float) -> int:
+    """Draw an integer, end points included."""
+    return int(low) + choice(rng, int(high) - int(low) + 1)
+
+
+def _program(rng: RandomSource, size: Size, frames: int) -> NDArray[np.float64]:
+    """Draw the speed of a wall towards each frame [length/s], shape [frame]."""
+    fastest, gap = size.value("speed_max"), interval(size, "knot_gap")
+    speed = np.empty(frames)
+    start, before = 0, uniform(rng, -fastest, fastest)
+    while start < frames:
+        end, after = start + _whole(rng, *gap), uniform(rng, 0.0, fastest)
+        after = -after if before > 0.0 else after
+        s = np.arange(min(end, frames) - start) / (end - start)
+        speed[start:end] = before + (after - before) * (s * s * (3.0 - 2.0 * s))
+        start, before = end, after
+    return quantise(speed)
+
+
+def _classic(rng: RandomSource, size: Size, frames: int, start: int) -> NDArray[np.float64]:
+    """Return rest, then a speed of [U/2, U] to either side from frame ``start`` on; as :func:`_program`."""
+    fastest, sign = size.value("speed_max"), 2 * choice(rng, 2) - 1
+    return np.where(np.arange(frames) >= start, sign * uniform(rng, 0.5 * fastest, fastest), 0.0)
+
+
+def _motion(rng: RandomSource, size: Size, scenario: int, start: int) -> NDArray[np.float64]:
+    """Draw the velocity of each wall towards each frame, ``start`` frames before frame 0 included."""
+    walls, frames = DRIVEN[scenario % len(DRIVEN)], start + size.frame_count(scenario)
+    velocity = np.zeros((frames, len(WALLS), 2))
+    if is_classic(scenario):
+        # In the last given frame at the latest: what is to be predicted is never at rest.
+        first = _whole(rng, start - size.value("lid_lead"), start + size.task.input_frames - 1)
+        speeds = [_classic(rng, size, frames, first) for _ in walls]
+    else:
+        speeds = [_program(rng, size, frames) for _ in walls]
+    for wall, speed in zip(walls, speeds, strict=True):
+        velocity[:, WALLS.index(wall), _TANGENT[wall]] = speed
+    return velocity
 
 
 def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     """Draw a fluid at rest and the wall motion that drives it through all frames."""
     low, high = closed_box_walls(size)
-    factor = size.value("speed_factor")
-    speed = float(quantise(uniform(rng, factor * size.value("speed_min"), factor * size.value("speed_max"))))
-    reynolds = log_uniform(rng, size.value("reynolds_min"), size.value("reynolds_max"))
-    wall_velocity, wall, direction = _wall_motion(rng, DRIVEN[scenario % len(DRIVEN)], speed)
-    start = _start_substep(rng, size)
-    viscosity = speed * (high - low) / reynolds
+    start = _whole(rng, *interval(size, "start_frame"))
+    motion = _motion(rng, size, scenario, start)
+    reynolds = log_uniform(rng, *interval(size, "reynolds"))
+    viscosity = 0.5 * size.value("speed_max") * (high - low) / reynolds
     return InitialState(
         position=fill(rng, size.particles, low=low, high=high, jitter=size.value("jitter")),
         velocity=np.zeros((size.particles, 2)),
@@ -70,15 +104,13 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
         material=np.full(size.particles, Material.LIQUID, dtype=np.int8),
         area=(high - low) * (high - low),
         viscosity=viscosity,
-        wall_velocity=wall_velocity,
-        start_substep=start,
+        wall_velocity=motion,
+        start_frame=start,
         parameters={
-            "wall": wall,
-            "direction": direction,
-            "speed": speed,
+            "wall": "+".join(DRIVEN[scenario % len(DRIVEN)]),
+            "motion": "constant" if is_classic(scenario) else "varying",
             "reynolds": reynolds,
             "viscosity": viscosity,
             "dynamic_viscosity": size.value("density") * viscosity,
-            "start_substep": start,
         },
     )

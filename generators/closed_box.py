@@ -39,7 +39,8 @@ class ClosedBox(Driver[ClosedBoxParameters]):
             slope = np.zeros_like(carried)
             slope[:, :, :2] = stack(states, "affine")[:, :, :, axis]
             field.from_numpy(slope)
-        self.move_walls(stack(states, "wall_velocity"))
+        self._states = list(states)
+        self._move_walls_towards(0)
         cells = np.array([state.area / p.particles for state in states]) * p.grid**2
         k.fill.from_numpy(cells.astype(np.float32))
         spread = np.array([state.viscosity for state in states]) * p.dt * p.grid**2
@@ -49,8 +50,22 @@ class ClosedBox(Driver[ClosedBoxParameters]):
         self.restart_mean()
 
     def move_walls(self, velocity: NDArray[np.float32]) -> None:
-        """Let the walls slide with these velocities from now on [length/s], shape [scenario, 4, 2]."""
+        """Let the walls slide with these velocities [length/s], shape [scenario, 4, 2].
+
+        They do so from now on, or where a scenario has a program, up to its next frame.
+        """
         self._kernels.walls.speed.from_numpy(velocity[:, (0, 1, 2, 3), (1, 1, 0, 0)])
+
+    def _move_walls_towards(self, frame: int) -> None:
+        self.move_walls(np.stack([state.walls_towards(frame) for state in self._states]).astype(np.float32))
+
+    def _drive(self, end: int) -> int:
+        if all(state.wall_velocity.ndim == 2 for state in self._states):
+            return end
+        frame, past = divmod(self._substeps, self.parameters.substeps_per_frame)
+        if past == 0:
+            self._move_walls_towards(frame + 1)
+        return min(end, (frame + 1) * self.parameters.substeps_per_frame)
 
     def advance(self, substeps: int, *, average: bool = False) -> None:
         """Advance every scenario."""
@@ -114,7 +129,7 @@ class ClosedBox(Driver[ClosedBoxParameters]):
     def _check_state(self, index: int, state: InitialState) -> None:
         super()._check_state(index, state)
         fastest = self._kernels.speed_bound / 2.0
-        normal = state.wall_velocity[(0, 1, 2, 3), (0, 0, 1, 1)]
+        normal = state.wall_velocity[..., (0, 1, 2, 3), (0, 0, 1, 1)]
         sliding = bool(np.any(state.wall_velocity != 0.0))
         steady = bool(np.all(np.abs(state.wall_velocity) <= fastest))
         if np.any(normal != 0.0) or not steady or (sliding and not self.parameters.no_slip):
@@ -122,5 +137,5 @@ class ClosedBox(Driver[ClosedBoxParameters]):
                 "walls can only slide along themselves, and only no-slip walls can move",
                 where=f"scenario {index}, wall_velocity in the order {', '.join(WALLS)}",
                 expected=f"speeds up to dx/(2 dt) = {fastest:.6g}",
-                got=state.wall_velocity.tolist(),
+                got=f"speeds up to {np.abs(state.wall_velocity).reshape(-1, 4, 2).max(axis=0).tolist()}",
             )

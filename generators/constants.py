@@ -42,6 +42,7 @@ LIMITS = {
     "particles": Limit(low=1, whole=True),
     "grid": Limit(low=4, whole=True),
     "wall": Limit(low=0, whole=True),
+    "substeps_per_frame": Limit(low=1, whole=True),
     "dt": _POSITIVE,
     "density": _POSITIVE,
     "modulus": _POSITIVE,

@@ -1,14 +1,15 @@
-"""Decaying curl noise: an inviscid fluid stirred once, in a free-slip box (thesis §5.9).
+"""Decaying curl noise: a fluid stirred once, in a free-slip box (thesis §5.9).
 
 The initial velocity is the rotated gradient of one stream function,
 
     u = dpsi/dy,  v = -dpsi/dx,  psi = s L Perlin(F X, F Y) w(X) w(1 - X) w(Y) w(1 - Y),
 
 with X, Y in [0, 1] across the box of width L, lattice frequency F = id % count + least
-(Eq. 5.55), Bridson's ramp w over the first half cell from a wall, and one scale s for all
-frequencies, so that a higher frequency has more energy. psi is 0 on the walls, hence no flow
-crosses them; u_x + v_y = 0 holds to the bit. Larger vortices live longer: about three quarters
-of the energy is left after 600 frames at frequency 4, a few per cent at 13.
+(Eq. 5.55), and Bridson's ramp w over the first half cell from a wall. The scale is s = s0 (F0 / F)^k:
+with k = 0 a higher frequency has more energy (full), with k = 2 all have one vorticity (mini, whose
+slow flows would be frozen ones). psi is 0 on the walls, hence no flow crosses them; u_x + v_y = 0
+holds to the bit. The equations have no viscosity, the transfers have: larger vortices live longer,
+about three quarters of the energy is left after 600 frames at frequency 4 of full, a few per cent at 13.
 """
 
 from __future__ import annotations
@@ -76,7 +77,7 @@ def _root_mean_square(values: Array) -> float:
     return math.sqrt(math.fsum(v * v for v in flat) / len(flat))
 
 
-def _grid_rates(lattice: Array, size: Size) -> tuple[float, float]:
+def _grid_rates(lattice: Array, size: Size, scale: float) -> tuple[float, float]:
     """Return RMS divergence (Eq. 5.54) and vorticity [1/s] as the solver's grid sees them.
 
     Central differences between nodes inside the walls: what is not zero of the divergence is
@@ -86,12 +87,20 @@ def _grid_rates(lattice: Array, size: Size) -> tuple[float, float]:
     first, last = size.value("wall") + 1, size.grid - size.value("wall")
     node = np.arange(first, last) / size.grid
     points = np.stack([side.ravel() for side in np.meshgrid(node, node, indexing="ij")], axis=-1)
-    psi = stream_function(points, lattice, low=low, high=high, scale=size.value("velocity_scale"))
+    psi = stream_function(points, lattice, low=low, high=high, scale=scale)
     u, v = (part.reshape(len(node), len(node)) for part in (psi.y, -psi.x))
     slope = 0.5 * size.grid
     divergence = (u[2:, 1:-1] - u[:-2, 1:-1] + v[1:-1, 2:] - v[1:-1, :-2]) * slope
     vorticity = (v[2:, 1:-1] - v[:-2, 1:-1] - u[1:-1, 2:] + u[1:-1, :-2]) * slope
     return _root_mean_square(divergence), _root_mean_square(vorticity)
+
+
+def _scale(size: Size, frequency: int) -> float:
+    """Return s at a frequency F [length/s]: s0 (F0 / F)^k."""
+    scale = float(size.value("velocity_scale"))
+    for _ in range(size.value("scale_falloff")):
+        scale = scale * size.value("frequency_min") / frequency
+    return scale
 
 
 def _positions(rng: RandomSource, size: Size, low: float, high: float) -> Array:
@@ -113,9 +122,10 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     frequency = scenario % size.value("frequency_count") + size.value("frequency_min")
     position = _positions(rng, size, low, high)
     lattice = gradients(rng, frequency)
-    psi = stream_function(position, lattice, low=low, high=high, scale=size.value("velocity_scale"))
+    scale = _scale(size, frequency)
+    psi = stream_function(position, lattice, low=low, high=high, scale=scale)
     velocity, affine = _flow(psi)
-    divergence, vorticity = _grid_rates(lattice, size)
+    divergence, vorticity = _grid_rates(lattice, size, scale)
     energy = 0.5 * math.fsum(v * v for v in velocity.ravel().tolist()) / size.particles
     return InitialState(
         position=position,
@@ -125,6 +135,7 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
         area=(high - low) * (high - low),
         parameters={
             "frequency": frequency,
+            "scale": scale,
             "initial_kinetic_energy": energy,
             "initial_divergence_rms": divergence,
             "initial_vorticity_rms": vorticity,

@@ -115,14 +115,24 @@ class Driver(ABC, Generic[Parameters]):
         if substeps == 0:
             return
         self._kernels.restart_extremes()
+        end = self._substeps + substeps
+        while self._substeps < end:
+            until = self._drive(end)
+            self._run(until - self._substeps)
+            self._substeps = until
+        for index, health in enumerate(self.health()):
+            self._check_health(index, health, substeps)
+
+    def _run(self, substeps: int) -> None:
         if self.device is Device.CPU:
             self._kernels.run_serially(substeps)
         else:
             for _ in range(substeps):
                 self._kernels.run_in_parallel()
-        self._substeps += substeps
-        for index, health in enumerate(self.health()):
-            self._check_health(index, health, substeps)
+
+    def _drive(self, end: int) -> int:
+        """Set what acts from outside now; return the substep up to which it does, ``end`` at most."""
+        return end
 
     def position(self) -> NDArray[np.float32]:
         """Particle positions [length], shape [scenario, particle, 2]."""

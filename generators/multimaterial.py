@@ -1,10 +1,10 @@
-"""Two bodies of different materials fall and collide (thesis §4.3, §4.8.2, Fig. 4.2).
+"""Two bodies of different materials collide and fall (thesis §4.3, §4.8.2, Fig. 4.2).
 
 Pairs by id % 6: 0 liquid-snow, 1 rope-snow, 2 rope-liquid, 3 snow-snow, 4 rope-jelly ball,
 5 liquid-liquid. The bodies start apart; an attractor has acted before the first frame
-(§4.3.2): each moves towards one common point, at a rate drawn for the scenario. Expected
-behaviour: liquid splashes and settles, snow breaks and stays, rope bends, jelly rebounds.
-Two snow bodies rest after about 65 frames.
+(§4.3.2): each moves towards one common point high in the box, at a rate drawn for the scenario, so
+that they meet in flight and from the side. Expected behaviour: liquid splashes and settles, snow
+breaks and stays, rope bends, jelly rebounds. Two snow bodies rest after about 100 frames.
 """
 
 from __future__ import annotations

@@ -163,7 +163,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--split", required=True)
     parser.add_argument("--size", required=True)
     parser.add_argument("--root", type=Path)
-    parser.add_argument("--registry", type=Path, default=default_path())
+    parser.add_argument("--registry", type=Path, default=default_path().resolve())
     parser.add_argument("--released", type=Path)
     parser.add_argument("--allow-change", action="store_true")
     return parser

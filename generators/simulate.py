@@ -17,22 +17,24 @@ trajectories diverge. A prediction that lies below it has seen the answer.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.data.registry import Size
+from lagbench.data.registry import Size, Task
 from lagbench.data.writer import ScenarioFile, ScenarioKey, ScenarioWriter, read_scenario, scenario_path
 
 from .batch import Batch, Report, SimulationJob, split_module, substeps_of
 from .draws import QUANTUM, entropy, seed_text
-from .split import ClosedBoxParameters, InitialState
+from .split import ClosedBoxParameters, FreeSurfaceParameters, InitialState
 
 __all__ = [
     "Facts",
     "Simulated",
+    "active_frames",
     "file_parameters",
     "scenario_key",
     "scenario_writer",
@@ -43,6 +45,9 @@ __all__ = [
 ]
 
 
+STILL = 0.01
+"""Share of its greatest kinetic energy from which on a free surface moves."""
+
 _FILE_NAMES = {"reynolds": "reynolds_number"}
 """Drawn parameters that files call by their CF-like long name."""
 
@@ -51,7 +56,7 @@ _FILE_NAMES = {"reynolds": "reynolds_number"}
 class Facts:
     """What one simulated scenario went through; the manifest states it."""
 
-    start_substep: int  # substeps before frame 0
+    start_frame: int  # frames simulated before frame 0
     kinetic_energy_first: float  # sum of m v^2 / 2 at frame 0
     kinetic_energy_last: float  # the same at the last frame
     kinetic_energy_max: float  # the largest of any frame
@@ -91,7 +96,7 @@ def file_parameters(size: Size, state: InitialState) -> dict[str, object]:
     """Return what a scenario's file states and hashes: constants, then what was drawn."""
     constants = {name: parameter.value for name, parameter in size.parameters.items()}
     drawn = {_FILE_NAMES.get(name, name): value for name, value in state.parameters.items()}
-    return {**constants, **drawn, "start_substep": state.start_substep}
+    return {**constants, **drawn, "start_frame": state.start_frame}
 
 
 def scenario_writer(job: SimulationJob, scenario: int, state: InitialState) -> ScenarioWriter:
@@ -107,12 +112,29 @@ def scenario_writer(job: SimulationJob, scenario: int, state: InitialState) -> S
         frame_interval=size.frame_interval,
         material=state.material,
         particle_mass=_particle_mass(size, state),
-        wall_velocity=state.wall_velocity if closed else None,
+        wall_velocity=_recorded_walls(size, scenario, state) if closed else None,
         parameters=file_parameters(size, state),
         seed=seed_text(size.split, size.name, size.major, scenario),
         device=job.device.value,
         generator=size.generator,
     )
+
+
+def _recorded_walls(size: Size, scenario: int, state: InitialState) -> NDArray[np.float64]:
+    """Return the velocity of each wall towards each recorded frame [length/s], shape [frame, 4, 2]."""
+    frames = range(state.start_frame, state.start_frame + size.frame_count(scenario))
+    return np.stack([state.walls_towards(frame) for frame in frames])
+
+
+def active_frames(energies: Sequence[float], task: Task) -> int:
+    """Return how many frames of the horizon pass until a free surface lies still.
+
+    Counted up to and including the last at which the kinetic energy is at least 1 % of its greatest
+    value from frame 0 to the end of the horizon.
+    """
+    span = energies[: task.input_frames + task.horizon]
+    last = max(frame for frame, energy in enumerate(span) if energy >= STILL * max(span))
+    return max(0, last + 1 - task.input_frames)
 
 
 @dataclass
@@ -125,15 +147,16 @@ class _Recording:
 
     def append(self, position: NDArray[np.float32], velocity: NDArray[np.float32]) -> None:
         self.writer.append(position, velocity)
-        speed = velocity.astype(np.float64)
-        self.energies.append(0.5 * self.mass * float(np.sum(speed * speed)))
+        speed = velocity.astype(np.float64).ravel()
+        # An exact sum: which frames are active enters the content hash.
+        self.energies.append(0.5 * self.mass * math.fsum((speed * speed).tolist()))
 
 
 def _facts(batch: Batch, index: int, energies: list[float]) -> Facts:
     extremes, size = batch.extremes[index], batch.job.size
     largest = max(energies)
     return Facts(
-        start_substep=batch.states[index].start_substep,
+        start_frame=batch.states[index].start_frame,
         kinetic_energy_first=energies[0],
         kinetic_energy_last=energies[-1],
         kinetic_energy_max=largest,
@@ -158,6 +181,10 @@ def simulate(job: SimulationJob, report: Report) -> list[Simulated]:
         ]
         for index, _ in batch.recordings():
             recordings[index].append(*batch.frame(index))
+        if isinstance(batch.solver.parameters, FreeSurfaceParameters):
+            for recording in recordings:
+                active = active_frames(recording.energies, job.size.task)
+                recording.writer.state(active_frames=active)
     return [
         Simulated(
             scenario=scenario,

@@ -57,6 +57,7 @@ class ClosedBoxParameters:
     jacobian_relaxation: float  # kappa, share of the nodal J mixed into J_p per substep [1]
     density_coupling: float  # theta, pull of J_p towards the grid density per substep [1]
     shift: float  # beta, strength of the particle shift [1]
+    substeps_per_frame: int = 1  # substeps for which one row of a wall program acts
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,12 +108,19 @@ class InitialState:
     material: NDArray[np.int8]  # Material of each particle, shape [particle], int8
     area: float  # area that the material covers [length^2]; particle volume is area / particles
     viscosity: float = 0.0  # kinematic viscosity nu of a closed box [length^2/s]; free surfaces ignore it
-    # velocity of each wall in the order of WALLS [length/s], shape [4, 2]
+    # velocity of each wall in the order of WALLS [length/s], shape [4, 2], or a program
+    # of shape [frame, 4, 2]: row f acts from frame f-1 to f after the first substep, row
+    # 0 never, the last one for good
     wall_velocity: NDArray[np.float64] = field(default_factory=lambda: np.zeros((4, 2)))
     friction: float = 0.0  # Coulomb friction of the walls (free surface only) [1]
-    start_substep: int = 0  # substeps simulated before frame 0 is recorded
+    start_frame: int = 0  # frames simulated before frame 0 is recorded
     # what was drawn for this scenario; stored as attributes and hashed
     parameters: Mapping[str, int | float | str] = field(default_factory=dict)
+
+    def walls_towards(self, frame: int) -> NDArray[np.float64]:
+        """Return the velocity of each wall from the frame before up to this one [length/s], shape [4, 2]."""
+        program = self.wall_velocity
+        return program if program.ndim == 2 else program[min(frame, len(program) - 1)]
 
 
 class Split(Protocol):

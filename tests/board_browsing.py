@@ -7,7 +7,6 @@ import time
 
 from browser import Page
 
-from lagbench.board.columns import COSTS
 from lagbench.board.model import Row
 
 KEYS = {
@@ -65,25 +64,26 @@ def restored(page: Page, address: str) -> None:
     page.browser.wait("Page.loadEventFired")
 
 
-def seen(page: Page, body: str = "tbody") -> list[list[str]]:
+def seen(page: Page) -> list[list[str]]:
     """Return the texts of the table in view: rank, name, numbers."""
+    rows = "section.tab:not([hidden]) tr:is([data-entry], [data-floor]):not([hidden])"
     found: list[list[str]] = page.value(
-        f"[...document.querySelectorAll('section.tab:not([hidden]) .board {body} tr[data-entry]')].map(tr =>"
-        " [tr.cells[0], tr.querySelector('.name'), ...tr.querySelectorAll('td .n')].map(e => e.textContent))"
+        f"[...document.querySelectorAll('{rows}')].map(tr =>"
+        " [tr.cells[0], tr.querySelector('.name'), ...tr.querySelectorAll('td:not([hidden]) .n')]"
+        ".map(e => e.textContent))"
     )
     return found
 
 
 def names(page: Page) -> list[str]:
     """Return the names of the entries in view, in order."""
-    return [row[1] for row in seen(page, ".entries")]
+    found: list[str] = page.value(
+        "[...document.querySelectorAll('section.tab:not([hidden]) tr[data-entry]:not([hidden]) .name')]"
+        ".map(e => e.textContent)"
+    )
+    return found
 
 
 def active(rows: tuple[Row, ...]) -> list[Row]:
     """Return the entries that are shown at first."""
-    return [row for row in rows if not row.floor and row.status == "active"]
-
-
-def form(key: str) -> str:
-    """Return how a column is written."""
-    return next((column.form for column in COSTS if column.key == key), "number")
+    return [row for row in rows if row.active]

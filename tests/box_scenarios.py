@@ -68,13 +68,19 @@ def scenario(
     walls: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0),
     viscosity: float = 1e-3,
     jitter: float = 0.25,
+    frames: int = 0,
 ) -> InitialState:
-    """Return a full box: random particle velocities up to ``speed``, walls sliding along themselves."""
+    """Return a full box: random particle velocities up to ``speed``, walls sliding along themselves.
+
+    With ``frames`` they slide up to that fast, as a random program of so many frames says.
+    """
     rng = np.random.default_rng([seed, 1])
     low, high = box(constants)
     count = constants.particles
     wall_velocity = np.zeros((4, 2))
     wall_velocity[(0, 1, 2, 3), (1, 1, 0, 0)] = walls
+    if frames:
+        wall_velocity = quantise(wall_velocity * (2.0 * rng.random((frames, 4, 1)) - 1.0))
     return InitialState(
         position=lattice(constants, seed, jitter),
         velocity=quantise((2.0 * rng.random((count, 2)) - 1.0) * speed),

@@ -162,3 +162,23 @@ def unknown_filter(bench: Bench) -> Path:
         space = h5py.h5s.create_simple(SHAPE)
         h5py.h5d.create(file.id, b"position", h5py.h5t.IEEE_F32LE, space, plist)
     return path
+
+
+def _filtered(name: str, codes: tuple[int, ...], variable: str) -> None:
+    """Register a fault whose variable passes through filters in this order."""
+
+    def change(file: h5py.File) -> None:
+        shape, kind = (SHAPE, h5py.h5t.IEEE_F32LE) if variable == "position" else ((3,), h5py.h5t.STD_I32LE)
+        plist = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        plist.set_chunk((1, 1, PARTICLES, 2) if variable == "position" else shape)
+        for code in codes:
+            plist.set_filter(code, h5py.h5z.FLAG_OPTIONAL, (9,) if code == h5py.h5z.FILTER_DEFLATE else ())
+        del file[variable]
+        h5py.h5d.create(file.id, variable.encode(), kind, h5py.h5s.create_simple(shape), plist)
+
+    simple("format", name, change, says="more than once")
+
+
+_filtered("deflated_thirty_one_times", (h5py.h5z.FILTER_DEFLATE,) * 31, "position")
+_filtered("shuffled_twice", (h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_DEFLATE) * 2, "position")
+_filtered("ids_deflated_twice", (h5py.h5z.FILTER_DEFLATE,) * 2, "scenario")

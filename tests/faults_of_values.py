@@ -11,7 +11,8 @@ import netCDF4
 import numpy as np
 from faulty import DIMS, SHAPE, built, fault, positions, replace, simple, store
 from numpy.typing import ArrayLike, NDArray
-from submission_data import PARTICLES, Bench
+from scenario_factory import frames_of
+from submission_data import FRAMES, GIVEN, PARTICLES, TESTS, Bench
 
 
 @fault("particles", says="47")
@@ -86,6 +87,11 @@ def _permuted(values: NDArray[np.float32]) -> ArrayLike:
     return values[:, :, np.random.Generator(np.random.PCG64(1)).permutation(PARTICLES)]
 
 
+def _last_given() -> NDArray[np.float32]:
+    """Return the last given frame of every scenario, shape [scenario, 1, particle, 2]."""
+    return np.stack([frames_of(i, FRAMES, PARTICLES)[GIVEN - 1 : GIVEN] for i in TESTS])
+
+
 def _displacements(values: NDArray[np.float32]) -> ArrayLike:
     return np.diff(values, axis=1, prepend=values[:, :1])
 
@@ -105,8 +111,11 @@ _value(
 )
 _value("start", "displacements", _displacements, "displacements")
 _value("start", "all_zero", np.zeros_like, "displacements")
-_value("start", "huge_values", lambda v: v + np.float32(1e30), "follow")
-_value("start", "scenarios_mixed_up", lambda v: v[[1, 2, 0]], "follow")
+_value("start", "scenarios_mixed_up", lambda v: v[[1, 2, 0]], "of scenario")
+_value("start", "frames_early", lambda v: np.concatenate([_last_given(), v[:, :-1]], axis=1), "shifted")
+_value("in_domain", "huge_values", lambda v: v + np.float32(1e30), "far beyond")
+_value("in_domain", "one_huge_value", _put((1, 2, 3, 1), 3e38), "scenario 4, frame 5, particle 3")
+_value("in_domain", "eleven_boxes_away", _put((1, 2, 3, 0), -11.0), "far beyond")
 
 
 def _marks(*marks: int, dim: str = "scenario") -> Callable[[h5py.File], object]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -69,7 +70,7 @@ class _Handler(BaseHTTPRequestHandler):
         if fault == "chopped":  # and the length is that of what is sent
             data = data[: len(data) // 2]
         start, whole = 0, len(data)
-        if wanted and fault != "no ranges":
+        if wanted and fault not in ("no ranges", "drops and starts over"):
             start = int(wanted.removeprefix("bytes=").split("-")[0])
             if start >= whole:
                 return self._send(416, b"", {"Content-Range": f"bytes */{whole}"})
@@ -80,6 +81,8 @@ class _Handler(BaseHTTPRequestHandler):
             case "drops" | "no ranges":  # after a third of the file, at the first two requests for it
                 late = self.mirror.count(self.path) > 2
                 return self._send(status, body, headers, only=None if late else whole // 3)
+            case "drops and starts over":
+                return self._send(status, body, headers, only=whole // 3)
             case "drops always":
                 return self._send(status, body, headers, only=0)
             case "announces more":
@@ -92,6 +95,8 @@ class _Handler(BaseHTTPRequestHandler):
                 headers["Content-Range"] = f"bytes {start + 7}-{whole - 1}/{whole}"
             case "endless":
                 return self._endless()
+            case "slow":
+                return self._slow(body)
         return self._send(status, body, headers)
 
     def _endless(self) -> None:
@@ -101,6 +106,18 @@ class _Handler(BaseHTTPRequestHandler):
             self.wfile.write(b"\x89HDF\r\n\x1a\n")
             for _ in range(1000):
                 self.wfile.write(bytes(1 << 16))
+        except OSError:
+            return
+
+    def _slow(self, body: bytes) -> None:
+        """Announce all of it, and send a hundred bytes a second one by one."""
+        self.send_response(200)
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        try:
+            for place in range(len(body)):
+                self.wfile.write(body[place : place + 1])
+                time.sleep(0.01)
         except OSError:
             return
 

@@ -34,7 +34,8 @@ class ReferenceClosedBox:
         self.fill = f(state.area / p.particles * p.grid**2)
         self.gradient, self.shift, self.shift_bound = f(4.0 * p.grid), f(-p.shift * dx * dx), f(0.1 * dx)
         self.sign = -1 if p.no_slip else 1
-        self.wall = state.wall_velocity.astype(f)
+        self.program = state.wall_velocity.reshape(-1, 4, 2).astype(f)
+        self.wall, self.done = self.program[0], 0
         self.x = np.clip(state.position.astype(f), *self.bounds)
         self.v = state.velocity.astype(f)
         self.c = state.affine.astype(f)
@@ -43,6 +44,9 @@ class ReferenceClosedBox:
     def step(self, count: int) -> None:
         """Advance by some substeps."""
         for _ in range(count):
+            frame = self.done // self.p.substeps_per_frame + 1
+            self.wall = self.program[min(frame, len(self.program) - 1)]
+            self.done += 1
             sums = self.to_grid()
             v, r, jbar = self.fold(sums)
             self.fill_ghosts(r, even=True)

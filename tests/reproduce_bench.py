@@ -1,14 +1,15 @@
-"""Pretended runs on the tiny cavity, for tests of reproduction scripts."""
+"""Pretended models and runs on the cavity, for tests of reproduction."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 from score_bench import Floats, Predict, ScoreBench
 
-from lagbench.baselines.reproduce.method import Method, Seeded
+from lagbench.baselines.reproduce.evidence import Evidence, Method, Seeded, Sources
 from lagbench.metrics import METRICS, Score
 
 SPLIT, SIZE = "cavity", "tiny"
@@ -28,31 +29,34 @@ RECORD = {
     "parameters": 123,
     "cpu_seconds": 7200.0,
     "step": 40,
-    "best_step": 30,
     "windows": 100,
     "recipe": {"name": "cavity/tiny", "training": {"batch": 2}},
     "hardware": {"device": "cpu", "processor": "a core", "threads": 1},
+    "validation": [{"step": 10, "rmse": 4.0}, {"step": 20, "rmse": 2.0}, {"step": 40, "rmse": 0.5}],
 }
 """What a pretended training recorded."""
 
-SCORED = ("vorticity_rmse", "vorticity_pearson", "mse_avg", "mse_end", "position_rmse", "energy_error")
 
-
-def a_score(values: list[float], metric: str = "vorticity_rmse") -> Score:
-    """Return a score with values over the horizon, the same at its only frame."""
+def a_score(values: list[float], metric: str) -> Score:
+    """Return a score with values over the horizon, the same at the cavity's frame 54, its only one."""
     held = np.array(values)
-    ids = tuple(range(len(values)))
-    return Score(METRICS[metric], ids, (54,), held[:, None], held, (0,) * len(values))
+    return Score(METRICS[metric], tuple(range(len(values))), (54,), held[:, None], held, (0,) * len(values))
 
 
 def a_method(name: str, *seeds: list[float]) -> Method:
     """Return a model whose every metric has these values, one list per seed."""
-    record = {"cpu_seconds": 1800.0}
     held = [
-        Seeded(seed=i, scores={m: a_score(values, m) for m in SCORED}, record=record, path=Path())
+        Seeded(seed=i, scores={m: a_score(values, m) for m in METRICS}, record={}, path=Path())
         for i, values in enumerate(seeds)
     ]
     return Method(name=name, seeds=tuple(held))
+
+
+def known(models: Mapping[str, list[float]]) -> Evidence:
+    """Return what is known of the mini cavity: models and floors of one seed each."""
+    evidence = Evidence(Sources(board=None), SPLIT, "mini")
+    evidence.methods |= {name: a_method(name, values) for name, values in models.items()}
+    return evidence
 
 
 def noisy(noise: float) -> Predict:
@@ -75,3 +79,20 @@ def pretend(bench: ScoreBench, folder: Path) -> Path:
         (home / "training.json").write_text(json.dumps(RECORD))
         (home / "predictions.json").write_text(json.dumps({"seconds_per_frame": 0.5, "device": "a core"}))
     return folder
+
+
+def markdown_rows(text: str, head: str) -> list[dict[str, str]]:
+    """Return the rows of the first Markdown table that has a column of this name."""
+    lines = iter(text.splitlines())
+    for line in lines:
+        heads = [cell.strip() for cell in line.strip("| ").split(" | ")]
+        if line.startswith("|") and head in heads:
+            next(lines)
+            rows = []
+            for row in lines:
+                if not row.startswith("|"):
+                    return rows
+                cells = [cell.strip() for cell in row.strip("| ").split(" | ")]
+                rows.append(dict(zip(heads, cells, strict=True)))
+            return rows
+    raise AssertionError(f"no table with a column {head}")

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lagbench.data.writer import ScenarioKey, ScenarioWriter, scenario_path
 
-PARAMETERS = {"dt": 0.002, "grid": 16, "start_substep": 40, "wall_moving": "top"}
+PARAMETERS = {"dt": 0.002, "grid": 16, "start_frame": 2, "wall_moving": "top"}
 
 DIMS = {
     "frame": ("frame",),
@@ -31,7 +31,7 @@ def make_key(
     scenario: int = 3, *, split: str = "cavity", size: str = "tiny", subset: str = "test"
 ) -> ScenarioKey:
     """Return the key of a cavity tiny scenario unless told otherwise."""
-    return ScenarioKey(split=split, size=size, version="1.2.0", scenario=scenario, subset=subset)
+    return ScenarioKey(split=split, size=size, version="2.2.0", scenario=scenario, subset=subset)
 
 
 def frames_of(scenario: int, frames: int, particles: int) -> NDArray[np.float32]:

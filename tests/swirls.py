@@ -51,7 +51,7 @@ def write_swirl(
         material=np.arange(count) * materials // count,
         particle_mass=float(tier.value("density")) * np.pi * 0.4**2 / count,
         wall_velocity=walls,
-        parameters={"start_substep": 0, **(parameters or {})},
+        parameters={"start_frame": 0, **(parameters or {})},
         seed="none",
         device="cpu",
         generator=tier.generator,

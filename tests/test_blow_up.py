@@ -180,11 +180,11 @@ def test_a_failure_keeps_the_manifest_of_the_others(
 ) -> None:
     """Files of an earlier generation and their manifest stay as they were."""
     root = copied()
-    manifest = read_manifest(root, SPLIT, SIZE, 1)
+    manifest = read_manifest(root, SPLIT, SIZE, 2)
     assert manifest is not None
-    (root / SPLIT / SIZE / "v1" / "valid" / "0002.nc").unlink()
+    (root / SPLIT / SIZE / "v2" / "valid" / "0002.nc").unlink()
     with pytest.raises(WorkFailedError, match="blew up"):
         generate(SPLIT, SIZE, scenarios="2", root=root, workers=1, registry=stiff_registry)
-    after = read_manifest(root, SPLIT, SIZE, 1)
+    after = read_manifest(root, SPLIT, SIZE, 2)
     assert after is not None
     assert [e.scenario for e in after.files] == [0, 1, 3, 4]

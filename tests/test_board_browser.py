@@ -12,13 +12,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from board_browsing import active, close, form, names, press, restored, run, seen, still, until
-from board_factory import make_board
+from board_browsing import active, close, names, press, restored, run, seen, still, until
+from board_worlds import make_board, with_entry
 from browser import CHROMIUM, Browser, Page, browser
 from PIL import Image
 
-from lagbench.board.columns import presets_of, value_of, written
-from lagbench.board.model import Board, Row
+from lagbench.board.columns import columns_of, presets_of, value_of, written
+from lagbench.board.model import Board, Floor, Row, Tab
 from lagbench.board.page import render
 from lagbench.metrics import METRICS, Direction
 
@@ -57,13 +57,20 @@ def page(running: Browser, file: Path) -> Iterator[Page]:
     close(opened)
 
 
+def go(page: Page, tab: Tab) -> None:
+    """Choose a tab as a reader does."""
+    run(page, f"document.querySelector('.tabs a[data-tab=\"{tab.id}\"]').click()")
+    until(page, f"!document.getElementById('{tab.id}').hidden")
+
+
 @pytest.mark.parametrize(("width", "dark"), [(1280, False), (390, True), (320, False)])
 def test_page_opens_in_silence(running: Browser, file: Path, width: int, dark: bool) -> None:
     """No message, no request but the page itself, no sideways scrolling, its scheme as asked."""
     page = running.open(file, width=width, dark=dark)
     for opened in (False, True):
         if opened:
-            run(page, "document.querySelector('section:not([hidden]) .entries .name').click()")
+            run(page, "document.querySelector('.across td a').click()")
+            until(page, "document.getElementById('panel').open")
             assert page.value("document.getElementById('panel').scrollWidth") <= width
         assert page.value("document.documentElement.scrollWidth") <= width
         picture = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("L"))
@@ -77,34 +84,59 @@ def test_long_author_lines_clip_no_column(running: Browser, board: Board, tmp_pa
     """At 1280 pixels all main columns are in view, whatever the names; the title has the whole line."""
     authors = tuple(f"A. Rather Long Name of Somebody {i}" for i in range(4))
     tab = board.tabs[0]
-    rows = tuple(replace(row, authors=authors, affiliation="An institute " * 12) for row in tab.rows)
+    said = {
+        "authors": authors,
+        "affiliation": "An institute " * 12,
+        "name": "A name as long as names may be " * 3,
+    }
+    rows = tuple(with_entry(row, **said) for row in tab.rows)
     columns = (*tab.columns, "velocity_rmse", "mse_avg")
     path = tmp_path / "long.html"
     path.write_text(render(replace(board, tabs=(replace(tab, rows=rows, columns=columns),))), "utf-8")
     page = running.open(path, width=1280)
+    restored(page, f"#tab={tab.id}")
     table = "document.querySelector('section:not([hidden]) .table')"
     assert page.value(f"{table}.scrollWidth") <= page.value(f"{table}.clientWidth")
-    heads = page.value(f"[...{table}.querySelectorAll('thead th')].map(th => th.textContent)")
-    assert len(heads) == 2 + 7 + 2
-    assert heads[-1] == "parametersself\u2011reported"
-    titles = page.value(f"[...{table}.querySelectorAll('.entries .sub')].map(e => e.title)")
+    heads = page.value(f"[...{table}.querySelectorAll('thead th:not([hidden])')].map(th => th.textContent)")
+    assert len(heads) == 2 + 1 + 5 + 3
+    assert heads[-2:] == ["budgetself\u2011reported", "scores"]
+    titles = page.value(f"[...{table}.querySelectorAll('tr[data-entry] .sub')].map(e => e.title)")
     assert all(", ".join(authors) in title for title in titles)
     close(page)
 
 
 def test_badges_say_what_is_wrong(page: Page, board: Board) -> None:
-    """A warning is called by the fault, not by the check that failed; its title says more."""
-    flags = "document.querySelectorAll('section:not([hidden]) .entries .flag')"
+    """A warning is called by the fault, with its share as a percentage; its title says more."""
+    go(page, board.tabs[0])
+    flags = "document.querySelectorAll('section:not([hidden]) tr[data-entry] .flag')"
     chips = dict(page.value(f"[...{flags}].map(e => [e.textContent, e.title])"))
-    assert "in domain" not in chips
-    assert chips["leaves the box"].startswith("Predicted particles lie outside the box")
+    assert chips["leaves the box: 5.9 %"].startswith("Predicted particles lie outside the box")
     assert chips["unphysical"].endswith("14 times the truth's kinetic energy.")
-    run(page, "document.querySelector('section:not([hidden]) .entries .flag.warn').closest('tr').click()")
+    run(
+        page,
+        "document.querySelector('section:not([hidden]) tr[data-entry] .flag.warn').closest('tr').click()",
+    )
+    until(page, "document.getElementById('panel').open")
     assert "leaves the box" in page.value("document.querySelector('#panel .flags').textContent")
 
 
-def test_script_writes_what_the_html_holds(running: Browser, file: Path, page: Page) -> None:
-    """Without JavaScript all tabs show the rows and digits that the script shows later."""
+def test_overview_leads_to_every_board(page: Page, board: Board) -> None:
+    """One row per method with its skill on every data set; a cell opens the entry there."""
+    assert page.value("document.querySelector('section.tab:not([hidden])').id") == "overview"
+    lines = "[...document.querySelectorAll('.across tbody tr')]"
+    cells = f"{lines}.map(tr => [...tr.cells].map(td => td.textContent))"
+    rows = {row[0]: row[1:] for row in page.value(cells)}
+    ranked = [row for row in board.tabs[1].rows if row.rank is not None]
+    for row in ranked:
+        skill = written(row.skill.mean, "number") if row.skill else ""
+        assert rows[row.entry.name][1] == f"{skill}rank {row.rank}{' ≈' if row.tied else ''} of {len(ranked)}"
+    run(page, "document.querySelector('.across tbody td:nth-child(3) a').click()")
+    until(page, "document.getElementById('panel').open")
+    assert page.value("document.querySelector('section.tab:not([hidden])').id") == board.tabs[1].id
+
+
+def test_the_table_needs_no_script(running: Browser, file: Path, page: Page, board: Board) -> None:
+    """Without JavaScript all tabs show the rows and main columns that the script shows later."""
     plain = running.open(file, width=1280)
     plain.call("Emulation.setScriptExecutionDisabled", value=True)
     plain.call("Page.reload")
@@ -113,75 +145,83 @@ def test_script_writes_what_the_html_holds(running: Browser, file: Path, page: P
     html = plain.call("DOM.getOuterHTML", nodeId=root)["outerHTML"]
     before = page.value(
         f"[...new DOMParser().parseFromString({json.dumps(html)}, 'text/html')"
-        ".querySelectorAll('section.tab')]"
-        ".map(tab => [...tab.querySelectorAll('tbody tr')].map(tr =>"
-        " [tr.cells[0], tr.querySelector('.name'), ...tr.querySelectorAll('td .n')].map(e => e.textContent)))"
+        ".querySelectorAll('section.tab:not(#overview)')]"
+        ".map(tab => [...tab.querySelectorAll('tbody tr:not([hidden])')]"
+        ".map(tr => [tr.cells[0], tr.querySelector('.name'), ...tr.querySelectorAll('td:not([hidden]) .n')]"
+        ".map(e => e.textContent)))"
     )
-    for i, rows in enumerate(before):
-        run(page, f"document.querySelectorAll('.tabs a')[{i}].click()")
+    assert len(before) == len(board.tabs)
+    for tab, rows in zip(board.tabs, before, strict=True):
+        go(page, tab)
         assert seen(page) == rows
         assert len(rows) == 8
 
 
 def test_every_preset_shows_the_board(page: Page, board: Board) -> None:
-    """Each preset shows the values of its columns, floors first."""
+    """Each preset shows the values of its columns, floors where their score puts them."""
     tab = board.tabs[0]
-    rows = [*(row for row in tab.rows if row.floor), *active(tab.rows)]
-    for name, keys in presets_of(tab, board.metrics).items():
-        run(page, f"document.querySelector('[data-preset={name}]').click()")
-        expected = [[written(value_of(row, key), form(key)) or "–" for key in keys] for row in rows]
+    go(page, tab)
+    columns = columns_of(tab, board.metrics)
+    shown = [row for row in tab.lines if isinstance(row, Floor) or row.active]
+    shown.sort(key=lambda row: row.values[tab.ranking].mean)
+    for name, keys in presets_of(tab, columns).items():
+        run(page, f"document.querySelector('section:not([hidden]) [data-preset={name}]').click()")
+        chosen = [columns[key] for key in keys]
+        expected = [[written(value_of(row, one), one.form) for one in chosen] for row in shown]
         assert [row[2:] for row in seen(page)] == expected
-        assert page.value("document.querySelector('[aria-pressed=true]').textContent") == name
+        pressed = "document.querySelector('section:not([hidden]) [aria-pressed=true]').textContent"
+        assert page.value(pressed) == name
 
 
 @pytest.mark.parametrize(
     "key", ["position_rmse", "vorticity_pearson", "energy_ratio", "speed_up", "parameters"]
 )
 def test_sorting(page: Page, board: Board, key: str) -> None:
-    """A click sorts best first, another worst first; gaps stay last, floors stay where they are."""
-    floors = seen(page, ".floors")
-    run(page, "document.querySelector('[data-preset=all]').click()")
+    """A click sorts best first, another worst first; gaps stay last, floors are sorted with the others."""
+    tab = board.tabs[0]
+    go(page, tab)
+    column = columns_of(tab, board.metrics)[key]
+    run(page, "document.querySelector('section:not([hidden]) [data-preset=all]').click()")
     direction = METRICS[key].direction if key in METRICS else Direction.HIGHER
 
     def loss(row: Row) -> float:
-        value = float(value_of(row, key))
+        value = float(value_of(row, column))
         return {Direction.HIGHER: -value, Direction.TARGET: abs(value - 1.0)}.get(direction, value)
 
-    rows = active(board.tabs[0].rows)
+    rows = active(tab.rows)
     known = sorted((row for row in rows if not np.isnan(loss(row))), key=loss)
-    gaps = [row.name for row in rows if np.isnan(loss(row))]
+    gaps = [row.entry.name for row in rows if np.isnan(loss(row))]
     heading = f"section:not([hidden]) [data-sort={key}]"
     run(page, f"document.querySelector('{heading}').click()")
-    assert names(page) == [row.name for row in known] + gaps
+    assert names(page) == [row.entry.name for row in known] + gaps
     first = page.value(f"document.querySelector('{heading}').closest('th').ariaSort")
     assert first == ("descending" if direction is Direction.HIGHER else "ascending")
     assert page.value(f"document.activeElement === document.querySelector('{heading}')")
     run(page, f"document.querySelector('{heading}').click()")
-    assert names(page) == [row.name for row in known[::-1]] + gaps
+    assert names(page) == [row.entry.name for row in known[::-1]] + gaps
     assert page.value("document.querySelectorAll('section:not([hidden]) th[aria-sort]').length") == 1
-    run(page, "document.querySelector('[data-preset=main]').click()")
-    assert seen(page, ".floors") == floors
+    assert len(seen(page)) == len(rows) + len(tab.floors)
 
 
 def test_filter_by_keyboard(page: Page, board: Board) -> None:
     """A slash leads to the filter; every word must occur; the floors stay."""
+    go(page, board.tabs[0])
     press(page, "/")
     page.call("Input.insertText", text="examples GAT")
     run(page, "0")
-    assert names(page) == [row.name for row in active(board.tabs[0].rows) if "GAT" in row.name]
-    assert len(seen(page, ".floors")) == 2
+    assert names(page) == [row.entry.name for row in active(board.tabs[0].rows) if "GAT" in row.entry.name]
+    assert len(seen(page)) == len(names(page)) + 2
     assert "of 6 entries" in page.value("document.querySelector('section:not([hidden]) .count').textContent")
     page.call("Input.insertText", text=" nobody")
     run(page, "0")
     assert names(page) == []
-    assert "No entry matches" in page.value(
-        "document.querySelector('section:not([hidden]) .entries').textContent"
-    )
+    assert len(seen(page)) == 2
 
 
 def test_tabs_by_keyboard(page: Page, board: Board) -> None:
     """Arrows move between tabs, one section is shown at a time, going back goes back."""
     run(page, "document.querySelector('.tabs a').focus()")
+    press(page, "ArrowRight")
     press(page, "ArrowRight")
     shown = "[...document.querySelectorAll('section.tab')].filter(s => !s.hidden).map(s => s.id)"
     assert page.value(shown) == ["cavity-mini"]
@@ -191,14 +231,14 @@ def test_tabs_by_keyboard(page: Page, board: Board) -> None:
     assert page.value("[...document.querySelectorAll('[aria-selected=true]')].map(a => a.dataset.tab)") == [
         "fluid-mini"
     ]
-    assert names(page) == [row.name for row in active(board.tabs[2].rows)]
+    assert names(page) == [row.entry.name for row in active(board.tabs[2].rows)]
     run(page, "history.back()")
     until(page, f"String({shown}) === 'cavity-mini'")
 
 
 def test_address_restores_the_state(page: Page) -> None:
     """What was chosen stands in the address; loading that address shows the same."""
-    run(page, "document.querySelectorAll('.tabs a')[2].click()")
+    run(page, "document.querySelectorAll('.tabs a')[3].click()")
     run(page, "document.querySelector('section:not([hidden]) [data-preset=energy]').click()")
     run(page, "document.querySelector('section:not([hidden]) [data-sort=energy_error]').click()")
     run(page, "document.querySelector('section:not([hidden]) .check input').click()")
@@ -222,53 +262,53 @@ def test_address_restores_the_state(page: Page) -> None:
 def test_odd_addresses_do_no_harm(page: Page, board: Board, address: str) -> None:
     """The name of a tab alone is enough; what is unknown is passed over."""
     restored(page, address)
-    assert names(page) == [row.name for row in active(board.tabs[2].rows)]
+    assert names(page) == [row.entry.name for row in active(board.tabs[2].rows)]
     assert page.value("document.getElementById('panel').open") is False
 
 
 def test_inactive_entries_hide_behind_a_toggle(page: Page, board: Board) -> None:
     """Withdrawn and superseded entries show on demand, unranked and named so."""
-    gone = [row for row in board.tabs[0].rows if row.status != "active"]
+    go(page, board.tabs[0])
+    gone = [row for row in board.tabs[0].rows if not row.active]
     assert len(gone) == 2
-    assert not {row.name for row in gone} & set(names(page))
+    assert not {row.entry.name for row in gone} & set(names(page))
     run(page, "document.querySelector('section:not([hidden]) .check input').click()")
-    rows = {row[1]: row for row in seen(page, ".entries")}
-    assert [rows[row.name][0] for row in gone] == ["–", "–"]
-    chips = page.value(
-        "[...document.querySelectorAll('tr.inactive .flag')].map(e => [e.textContent, e.title])"
-    )
-    assert [row.reason for row in gone] == [
-        title for label, title in chips if label in ("withdrawn", "superseded")
-    ]
+    rows = {row[1]: row for row in seen(page)}
+    assert [rows[row.entry.name][0] for row in gone] == ["–", "–"]
+    flags = "document.querySelectorAll('section:not([hidden]) tr.inactive .flag')"
+    chips = page.value(f"[...{flags}].map(e => [e.textContent, e.title])")
+    told = [title for label, title in chips if label in ("withdrawn", "superseded")]
+    assert all(title.startswith(row.entry.reason) for row, title in zip(gone, told, strict=True))
 
 
 @pytest.mark.parametrize("preset", ["main", "cost"])
 def test_csv_equals_the_table(page: Page, board: Board, tmp_path: Path, preset: str) -> None:
     """The file has the rows and columns of the table in its order, with all digits."""
+    tab = board.tabs[0]
+    go(page, tab)
+    columns = columns_of(tab, board.metrics)
     page.call("Page.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
-    run(page, f"document.querySelector('[data-preset={preset}]').click()")
+    run(page, f"document.querySelector('section:not([hidden]) [data-preset={preset}]').click()")
     run(page, "document.querySelector('section:not([hidden]) [data-sort=speed_up]').click()")
     run(page, "document.querySelector('section:not([hidden]) .csv').click()")
-    path = tmp_path / f"lagbench-cavity-full-{preset}.csv"
+    path = tmp_path / f"lagbench-{tab.id}-{preset}.csv"
     for _ in range(100):
         if path.exists():
             break
         time.sleep(0.05)
     head, *lines = list(csv.reader(io.StringIO(path.read_text(encoding="utf-8"), newline="")))
-    keys = list(presets_of(board.tabs[0], board.metrics)[preset])
+    keys = list(presets_of(tab, columns)[preset])
     assert head == ["rank", "method", "status", *keys, "vorticity_rmse_low", "vorticity_rmse_high"]
     shown = seen(page)
     assert [line[1] for line in lines] == [row[1] for row in shown]
-    assert [line[0] for line in lines] == [row[0].lstrip("=") for row in shown]
-    rows = {row.name: row for row in board.tabs[0].rows}
+    assert [line[0] for line in lines] == [row[0].rstrip("≈") for row in shown]
+    values = {row.entry.name: row.values for row in tab.rows} | {row.name: row.values for row in tab.floors}
     for line, texts in zip(lines, shown, strict=True):
-        cells = [
-            cell if form(key) == "text" else float(cell or "nan")
-            for key, cell in zip(keys, line[3:-2], strict=True)
-        ]
-        assert [written(cell, form(key)) or "–" for key, cell in zip(keys, cells, strict=True)] == texts[2:]
-        value = rows[line[1]].values["vorticity_rmse"]
-        assert float(line[3]) == pytest.approx(value.mean, rel=1e-8)
+        for key, cell, said in zip(keys, line[3:-2], texts[2:], strict=True):
+            form = columns[key].form
+            assert written(cell if form == "text" else float(cell or "nan"), form) == said
+        value = values[line[1]]["vorticity_rmse"]
+        assert float(line[3 + keys.index("vorticity_rmse")]) == pytest.approx(value.mean, rel=1e-8)
         assert [float(cell) for cell in line[-2:]] == pytest.approx([value.low, value.high], rel=1e-5)
 
 

@@ -15,12 +15,10 @@ import yaml
 from conftest import SIZE, SPLIT
 from typer.testing import CliRunner, Result
 
-from lagbench.board.check import CHECKS
-from lagbench.board.entry import Entry
-from lagbench.board.meta import Meta
+from lagbench.board.entry import Budget, Entry, Meta
+from lagbench.board.findings import CHECKS
 from lagbench.cli.app import app
 from lagbench.make.generate import GenerationResult
-from lagbench.scoring import score
 
 DOCS = Path(__file__).parent.parent / "docs"
 TOY = DOCS / "examples" / "toy_model"
@@ -53,69 +51,73 @@ def test_a_strangers_path(run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: P
     """From an own model to a page, each command as documented, nothing asked on stdin."""
     make_toy(monkeypatch)
     assert run("validate", "predictions.nc").exit_code == 0
-    submitted = run("submit", "predictions.nc", "--from", TOY / "meta.yaml")
+    assert run("submit", "predictions.nc", "--from", TOY / "meta.yaml").exit_code == 2
+    submitted = run("submit", "predictions.nc", "--from", TOY / "meta.yaml", "--new-board")
     assert submitted.exit_code == 0, submitted.output
     assert "toy-model on curl-noise tiny: vorticity_rmse" in submitted.stdout
     entry = tmp_path / "leaderboard/submissions" / SPLIT / SIZE / "toy-model.yaml"
     assert yaml.safe_load(entry.read_text())["parameters"] == 1
-    stale = run("leaderboard", "check")
+    assert run("leaderboard", "check").exit_code == 0
+    stale = run("leaderboard", "check", "--page")
     assert stale.exit_code == 1
     assert "error [page]" in stale.stderr
     built = run("leaderboard", "build")
     assert built.exit_code == 0, built.output
     assert re.search(r"index.html: 1 entries, 1 tabs, .* written", built.stdout)
     assert run("leaderboard", "build", "--check").exit_code == 0
-    checked = run("leaderboard", "check", "--predictions", "predictions.nc")
+    checked = run("leaderboard", "check", "--page", "--predictions", "predictions.nc")
     assert checked.exit_code == 0, checked.output
     assert "1 entries, nothing wrong" in checked.stdout
-    assert "floors" not in checked.stdout
+    assert f"confirms scores/{SPLIT}/{SIZE}/toy-model.nc of" in checked.stdout
     shown = run("leaderboard", "show", SPLIT, "--size", SIZE)
     assert "toy-model" in shown.stdout
     assert "Toy model" in (tmp_path / "leaderboard" / "index.html").read_text()
 
 
 def test_machines_are_answered_in_json(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every command has --json; floors are submitted by name; a drifted page fails with exit code 1."""
-    floor = run("submit", "--floor", "persistence", "--split", SPLIT, "--size", SIZE, "--json")
-    assert floor.exit_code == 0, floor.output
-    assert json.loads(floor.stdout)["ranking"] == "vorticity_rmse"
-    built = json.loads(run("leaderboard", "build", "--json").stdout)
+    """Every command has --json; the next step keeps --board; a drifted page fails with exit code 1."""
+    make_toy(monkeypatch)
+    words = ("submit", "predictions.nc", "--from", TOY / "meta.yaml", "--board", "trial", "--new-board")
+    submitted = run(*words)
+    assert submitted.stdout.count("--board trial") == 2
+    again = run(*words, "--replace", "--json")
+    assert json.loads(again.stdout)["ranking"] == "vorticity_rmse"
+    board = ("--board", "trial")
+    built = json.loads(run("leaderboard", "build", *board, "--json").stdout)
     assert (built["rows"], built["tabs"]) == (1, 1)
-    assert json.loads(run("leaderboard", "check", "--json").stdout)["findings"] == []
-    trusted = run("leaderboard", "check")
-    assert f"aggregated again only, not scored again: {SPLIT} {SIZE}" in trusted.stdout
-    seen = json.loads(run("leaderboard", "check", "--floors", "--json").stdout)
-    assert (seen["findings"], seen["floors_rescored"], seen["floors_trusted"]) == (
-        [],
-        [f"{SPLIT} {SIZE}"],
-        [],
+    seen = json.loads(run("leaderboard", "check", *board, "--page", "--json").stdout)
+    assert (seen["findings"], seen["page_checked"]) == ([], True)
+    told = json.loads(
+        run("leaderboard", "check", *board, "--predictions", "predictions.nc", "--record", "--json").stdout
     )
-    shown = json.loads(run("leaderboard", "show", "--json").stdout)
-    assert shown["tabs"][0]["rows"][0]["floor"] is True
-    Path("leaderboard/index.html").write_text("stale")
-    result = run("leaderboard", "build", "--check")
+    assert told["recorded"] == [f"submissions/{SPLIT}/{SIZE}/toy-model.yaml"]
+    shown = json.loads(run("leaderboard", "show", *board, "--json").stdout)
+    assert shown["tabs"][0]["rows"][0]["verified"] is True
+    Path("trial/index.html").write_text("stale")
+    result = run("leaderboard", "build", *board, "--check")
     assert result.exit_code == 1
     assert "lagbench leaderboard build" in result.stderr
-    assert run("leaderboard", "build", "--quiet").output == ""
-    monkeypatch.setattr(score, "validate", None)  # a usage error comes before any work
-    result = run("submit", "--floor", "persistence", "--split", SPLIT, "--author", "A")
-    assert result.exit_code == 2
-    assert "described by lagbench itself" in result.stderr
+    assert run("leaderboard", "build", *board, "--quiet").output == ""
+    assert run("leaderboard", "check", *board, "--base", "main").exit_code == 2
+
+
+def test_an_empty_board_is_well(run: Run, tmp_path: Path) -> None:
+    """Without any entry it is built, checked and shown."""
+    (tmp_path / "leaderboard" / "submissions").mkdir(parents=True)
+    for words in (["build"], ["check", "--page"], ["show"], ["show", "--json"]):
+        result = run("leaderboard", *words)
+        assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout) == {"tabs": []}
 
 
 @pytest.mark.parametrize(
     ("words", "code", "message"),
     [
-        (["submit"], 2, "nothing to submit"),
-        (["submit", "none.nc", "--author", "A", "--command", "x"], 3, "none.nc"),
-        (["submit", "x.nc", "--split", "cavity"], 2, "name split and size themselves"),
-        (
-            ["submit", "x.nc", "--code", "javascript:alert(1)"],
-            2,
-            "is not an http:// or https:// address",
-        ),
+        (["submit"], 2, "FILE"),
+        (["submit", "none.nc", "--author", "A", "--command", "x"], 2, "--new-board"),
+        (["submit", "none.nc", "--author", "A", "--command", "x", "--new-board"], 3, "none.nc"),
+        (["submit", "x.nc", "--url", "javascript:alert(1)"], 2, "is not an http:// or https:// address"),
         (["submit", "x.nc", "--from", "none.yaml"], 3, "none.yaml"),
-        (["submit", "--floor", "median", "--split", SPLIT, "--size", SIZE], 2, "no floor 'median'"),
         (["leaderboard", "build"], 2, "no leaderboard here"),
         (["leaderboard", "check"], 2, "--board FOLDER"),
         (["leaderboard", "show"], 2, "no leaderboard here"),
@@ -142,9 +144,9 @@ def test_help_has_an_example_that_parses(run: Run, words: list[str]) -> None:
 def test_the_page_of_docs_is_true(run: Run) -> None:
     """docs/submitting.md names every check and key; its commands are accepted, its example is the file's."""
     text = (DOCS / "submitting.md").read_text()
-    for name, meaning in CHECKS.items():
-        assert f"| `{name}` | {meaning} |" in text
-    for key in (*Meta.model_fields, *Entry.model_fields):
+    for name, check in CHECKS.items():
+        assert f"| `{name}` | {check.meaning} |" in text
+    for key in (*Meta.model_fields, *Entry.model_fields, *Budget.model_fields):
         assert f"`{key}`" in text
     assert (TOY / "meta.yaml").read_text() in text
     blocks = re.findall(r"```(?:bash|console)\n(.*?)```", text, re.DOTALL)

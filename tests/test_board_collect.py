@@ -10,17 +10,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from board_bench import PLACE, BoardBench, copied, master
+from board_worlds import PLACE, BoardBench, copied, master
 from report_bench import noisy
 
-from lagbench.board.build import build
-from lagbench.board.collect import collect
+from lagbench.board.collect import CURVE_FRAMES, RESIDUAL_BINS, collect, curve, residuals
+from lagbench.board.floors import floor_names
 from lagbench.board.model import Board, Row
-from lagbench.board.pictures import CURVE_FRAMES, RESIDUAL_BINS, curve, residuals
-from lagbench.board.seeds import Combined, combine
+from lagbench.board.page import build
+from lagbench.board.ranking import Combined, combine, holm, standings
+from lagbench.board.score_file import read_stored
 from lagbench.board.show import as_plain, chosen_tabs, tables
-from lagbench.board.standing import standings
-from lagbench.board.stored import read_stored
 from lagbench.errors import ChecksFailedError, UsageError
 from lagbench.metrics import METRICS, Score, bootstrap_interval
 from lagbench.scoring.card import ScoreCard, digits
@@ -72,13 +71,14 @@ def test_values_are_those_of_the_scorer(board: Board, card: ScoreCard) -> None:
 
 
 def test_floors_stand_as_the_scorer_sees_them(board: Board, card: ScoreCard) -> None:
-    """A floor submitted as an entry has the scores of that floor beside any submission."""
-    for name in ("persistence", "constant-velocity"):
-        row = row_of(board, name)
-        assert row.floor
-        assert row.rank is None
+    """Every floor of the scorer is there, with the scores that it has beside any submission."""
+    floors = {floor.name: floor for floor in board.tabs[0].floors}
+    assert set(floors) == set(floor_names())
+    for name, floor in floors.items():
+        assert set(floor.values) == set(card.scores[name])
         for metric, score in card.scores[name].items():
-            assert digits(row.values[metric].mean) == digits(score.mean)
+            assert digits(floor.values[metric].mean) == digits(score.mean)
+            assert floor.values[metric].per_scenario == pytest.approx(score.values, rel=1e-6, nan_ok=True)
 
 
 def test_seeds_are_averaged(bench: BoardBench, board: Board) -> None:
@@ -86,8 +86,7 @@ def test_seeds_are_averaged(bench: BoardBench, board: Board) -> None:
     files = [bench.folder / f"scores/cavity/tiny/damped_{seed}.nc" for seed in (0, 3)]
     first, second = (read_statistics(path).scores() for path in files)
     row = row_of(board, "damped")
-    assert row.seeds == 2
-    assert [found.seed for found in row.detail.predictions] == [0, 3]
+    assert [made.seed for made in row.entry.predictions] == [0, 3]
     for name in ("vorticity_rmse", "position_rmse", "energy_error"):
         one, two = first[name].values, second[name].values
         held = row.values[name]
@@ -95,8 +94,7 @@ def test_seeds_are_averaged(bench: BoardBench, board: Board) -> None:
         assert held.mean == pytest.approx((one + two).mean() / 2.0)
         assert held.std == pytest.approx(abs(one.mean() - two.mean()) / math.sqrt(2.0))
         assert (held.low, held.high) == bootstrap_interval((one + two) / 2.0)
-    means = [found.mean for found in row.detail.predictions]
-    assert means == pytest.approx([first["vorticity_rmse"].mean, second["vorticity_rmse"].mean])
+    assert row.seed_means == pytest.approx((first["vorticity_rmse"].mean, second["vorticity_rmse"].mean))
 
 
 def made_up(values: list[float], per_frame: Any = None) -> Score:
@@ -122,8 +120,36 @@ def brute_force_p(first: list[float], second: list[float]) -> float:
     )
 
 
-def test_ranks_are_shared_where_the_test_cannot_decide() -> None:
-    """Whoever differs from the leader by the listed sign patterns stands behind; others share rank 1."""
+def holm_by_definition(p: list[float]) -> list[float]:
+    """Return Holm's p-values as the smallest level at which each hypothesis is rejected, by search."""
+
+    def rejected(level: float) -> set[int]:
+        order = sorted(range(len(p)), key=lambda i: p[i])
+        found = set()
+        for step, i in enumerate(order):
+            if p[i] > level / (len(p) - step):
+                break
+            found.add(i)
+        return found
+
+    levels = sorted({min(1.0, k * value) for value in p for k in range(1, len(p) + 1)})
+    return [
+        next((level for level in levels if i in rejected(level * (1 + 1e-12))), 1.0) for i in range(len(p))
+    ]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_p_values_are_corrected_by_holm(seed: int) -> None:
+    """Against the definition: the level at which the steps reject; gaps stay and do not count."""
+    rng = np.random.Generator(np.random.PCG64(seed))
+    p = (rng.random(7) ** 3).tolist()
+    assert holm(p) == pytest.approx(holm_by_definition(p))
+    assert holm([math.nan, *p])[1:] == pytest.approx(holm(p))
+    assert math.isnan(holm([math.nan, *p])[0])
+
+
+def test_ranks_follow_the_numbers_and_ties_are_a_sign() -> None:
+    """Ranks are the order of the means; p-values are those of all sign patterns, corrected."""
     rng = np.random.Generator(np.random.PCG64(5))
     best = (1.0 + 0.1 * rng.random(8)).tolist()
     held = {
@@ -134,27 +160,24 @@ def test_ranks_are_shared_where_the_test_cannot_decide() -> None:
     }
     found = standings({name: made_up(values) for name, values in held.items()})
     assert math.isnan(found["best"].p)
-    for name in ("close", "worse", "worst"):
-        assert found[name].p == pytest.approx(brute_force_p(held[name], best))
-    assert {name: standing.rank for name, standing in found.items()} == {
-        "best": 1,
-        "close": 1,
-        "worse": 3,
-        "worst": 4,
-    }
-    assert [found[name].shared for name in held] == [True, True, False, False]
+    others = ["close", "worse", "worst"]
+    plain = [brute_force_p(held[name], best) for name in others]
+    assert [found[name].p for name in others] == pytest.approx(holm_by_definition(plain))
+    assert [found[name].rank for name in held] == [1, 2, 3, 4]
+    assert [found[name].tied for name in held] == [False, True, False, False]
+    assert standings({}) == {}
 
 
 def test_few_scenarios_decide_nothing(board: Board) -> None:
-    """With two scenarios all ranked rows share rank 1, without a p-value, and the tab says so."""
+    """With two scenarios there is no p-value, so no sign, and the tab says so; ranks are the order."""
     (tab,) = board.tabs
     assert not tab.decided
     ranked = [row for row in tab.rows if row.rank is not None]
     assert {row.id for row in ranked} == {"damped", "noisy", "flipping"}
-    assert all(row.rank == 1 and row.shared and math.isnan(row.p) for row in ranked)
+    assert [row.rank for row in ranked] == [1, 2, 3]
+    assert all(math.isnan(row.p) and not row.tied for row in ranked)
     means = [row.values[tab.ranking].mean for row in ranked]
     assert means == sorted(means)
-    assert [row.floor for row in tab.rows[-2:]] == [True, True]
 
 
 def test_withdrawn_superseded_and_outdated_are_not_ranked(own: BoardBench) -> None:
@@ -164,30 +187,31 @@ def test_withdrawn_superseded_and_outdated_are_not_ranked(own: BoardBench) -> No
     own.edit("flipping", lambda held: held["dataset"].update(sha256="0" * 64))
     rows = {row.id: row for row in collect(own.folder, registry=own.registry).tabs[0].rows}
     assert all(row.rank is None for row in rows.values())
-    assert (rows["noisy"].status, rows["noisy"].reason) == ("withdrawn", "leaked")
-    assert rows["damped"].superseded_by == "flipping"
+    assert not any(row.active for row in rows.values())
+    assert rows["noisy"].entry.reason == "leaked"
     assert not rows["flipping"].current
 
 
 def test_cost_and_speed_up(board: Board) -> None:
     """Mean seconds per frame of the seeds, and the solver's time over it."""
-    cost = row_of(board, "damped").cost
+    cost = row_of(board, "damped").entry.cost
     assert cost is not None
     assert (cost.seconds_per_frame, cost.solver_seconds_per_frame, cost.speed_up) == (0.5, 2.0, 4.0)
-    assert row_of(board, "noisy").cost is None
+    assert row_of(board, "noisy").entry.cost is None
 
 
 def test_the_truth_is_not_that_of_an_explosion(bench: BoardBench, board: Board) -> None:
-    """Maps of truth and prediction share one packing: the tab's truth is that of a floor."""
-    names = ("flipping", "persistence")
+    """Maps of truth and prediction share one packing: the tab's truth is the finest."""
+    names = ("flipping", "noisy")
     coarse, fine = (read_stored(bench.folder / f"scores/cavity/tiny/{name}.nc") for name in names)
     assert coarse.precision > 5.0 * fine.precision
-    assert np.array_equal(board.tabs[0].truth.vorticity, fine.preview.vorticity[0], equal_nan=True)
+    step = fine.precision
+    np.testing.assert_allclose(board.tabs[0].truth.vorticity, fine.preview.vorticity[0], atol=step)
 
 
 def test_pictures_are_those_that_were_taken(board: Board, card: ScoreCard) -> None:
     """Film and maps come back within half a step of their packing; energy is the scorer's."""
-    detail = row_of(board, "noisy").detail
+    detail = row_of(board, "noisy")
     assert np.abs(detail.pictures.film - card.preview.film[1]).max() <= 2.0 / 65534
     known = ~np.isnan(card.preview.vorticity[1])
     span = np.nanmax(card.preview.vorticity) - np.nanmin(card.preview.vorticity)
@@ -226,7 +250,8 @@ def test_curves_keep_the_ends() -> None:
 def test_undefined_seeds_are_left_out(bench: BoardBench) -> None:
     """A scenario that one seed has no value for takes the other's; none stays undefined."""
     held = [
-        read_statistics(bench.folder / f"scores/cavity/tiny/{name}.nc") for name in ("noisy", "persistence")
+        read_statistics(bench.folder / path)
+        for path in ("scores/cavity/tiny/noisy.nc", "floors/cavity/tiny/persistence.nc")
     ]
     found: dict[str, Combined] = combine(held)
     alone = held[0].scores()["vorticity_pearson"]
@@ -262,15 +287,29 @@ def test_tables_and_json(board: Board) -> None:
     (table,) = tables(board, chosen_tabs(board, "cavity", None), ["position_rmse"])
     assert table.columns[:4] == ("rank", "method", "vorticity_rmse", "position_rmse")
     rows = {row[1]: row for row in table.rows}
-    assert rows["persistence"][0] == "-"
-    assert "floor" in rows["persistence"][-1]
-    assert rows["damped"][0] == "1="
+    for name in floor_names():
+        assert (rows[name][0], rows[name][-1]) == ("-", "floor")
+    assert rows["damped"][0] == str(row_of(board, "damped").rank)
     assert " ± " in rows["damped"][2]
     assert rows["damped"][4:6] == ("0.5", "4")
-    plain = as_plain(board.tabs)["tabs"][0]["rows"]
-    means = {row["id"]: row["metrics"]["position_rmse"]["mean"] for row in plain}
+    (plain,) = as_plain(board.tabs)["tabs"]
+    means = {row["id"]: row["metrics"]["position_rmse"]["mean"] for row in plain["rows"]}
     assert means["damped"] == digits(row_of(board, "damped").values["position_rmse"].mean)
+    assert [floor["id"] for floor in plain["floors"]] == sorted(floor_names())
+    assert {row["id"]: row["cost"] for row in plain["rows"]}["damped"]["speed_up"] == 4.0
     with pytest.raises(UsageError, match="did you mean 'cavity tiny'"):
         chosen_tabs(board, "cavity", "tyni")
     with pytest.raises(UsageError, match="no metric"):
         list(tables(board, board.tabs, ["position_rmsee"]))
+
+
+def test_boards_without_an_entry_are_named(bench: BoardBench, board: Board, tmp_path: Path) -> None:
+    """Every size with scenarios enough to rank is a tab or is named; an empty folder has no tab."""
+    assert ("cavity", "mini") in board.empty
+    assert ("cavity", "tiny") not in board.empty
+    (tmp_path / "submissions").mkdir()
+    empty = collect(tmp_path, registry=bench.registry)
+    assert empty.tabs == ()
+    assert set(board.empty) <= set(empty.empty)
+    assert chosen_tabs(empty, None, None) == ()
+    assert build(tmp_path, registry=bench.registry).rows == 0

@@ -11,18 +11,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from board_factory import make_board
+from board_worlds import make_board, with_entry
 from html_check import read_html
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from lagbench.board.embedding import embedded
-from lagbench.board.model import Board, Cost
-from lagbench.board.packing import LEVELS, coarse, pack
+from lagbench.board.entry import Cost
+from lagbench.board.model import Board
 from lagbench.board.page import BUDGET, FEWEST, render
-from lagbench.board.payload import FINENESS, payload
-from lagbench.report.html import text
+from lagbench.board.payload import FINENESS, LEVELS, coarse, embedded, pack, payload
 
 DIGITS = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789-_"
 
@@ -90,23 +88,20 @@ def test_coarse_field_keeps_its_mean() -> None:
 
 
 def test_board_arrives_at_the_script(board: Board, page: str) -> None:
-    """Scores to six digits, curves and films to their steps are what the board holds."""
+    """Curves and films are what the board holds, up to the steps of their packing."""
     held = held_by(page)
     pool = held["pool"]
     assert [tab["id"] for tab in held["tabs"]] == ["cavity-full", "fluid-mini"]
     for tab, shown in zip(board.tabs, held["tabs"], strict=True):
         for row, given_row in zip(tab.rows, shown["rows"], strict=True):
-            for name, told in zip(shown["metrics"], given_row["values"], strict=True):
-                mean = np.nan if not told or told[0] is None else told[0]
-                assert mean == pytest.approx(row.values[name].mean, rel=1e-8, nan_ok=True)
-            curve = row.detail.curves[tab.curves[0]]
+            curve = row.curves[tab.curves[0]]
             packed = given_row["curves"][tab.curves[0]]
             assert pool[packed["frames"]] == list(curve.frames)
             np.testing.assert_allclose(unpack(pool[packed["mean"]]), curve.mean, rtol=2e-3)
             film = unpack(pool[given_row["pictures"]["film"]])
             count = len(pool[given_row["pictures"]["material"]])
-            np.testing.assert_allclose(film[:2], row.detail.pictures.film[0, 0], atol=3e-4)
-            np.testing.assert_allclose(film[-2:], row.detail.pictures.film[-1, -1], atol=3e-4)
+            np.testing.assert_allclose(film[:2], row.pictures.film[0, 0], atol=3e-4)
+            np.testing.assert_allclose(film[-2:], row.pictures.film[-1, -1], atol=3e-4)
             assert film.size == 2 * count * len(pool[given_row["pictures"]["filmFrames"]])
 
 
@@ -122,28 +117,76 @@ def test_page_is_html(page: str) -> None:
     assert read_html(page).faults == []
 
 
-def test_tables_need_no_script(board: Board, page: str) -> None:
-    """The main scores of every active entry stand in the HTML as text."""
-    reading = read_html(page)
-    tables = [element for element in reading.named("table") if element.attributes["class"] == "board"]
-    assert len(tables) == len(board.tabs)
-    for tab, table in zip(board.tabs, tables, strict=True):
-        for row in tab.rows:
-            assert (row.name in table.text) is (row.status == "active")
-            if row.status == "active":
-                assert text(row.values[tab.ranking].mean) in table.text
+def lines_of(page: str) -> dict[str, dict[str, str]]:
+    """Return name to column to value of the first table's rows, read as text."""
+    table = page[page.index('<table class="board"') if '<table class="board"' in page else 0 :]
+    table = table[table.index('class="board">') : table.index("</table>")]
+    keys = re.findall(r'<th [^>]*?data-key="([^"]*)"', table)
+    found = {}
+    for line in re.findall(r"<tr[^>]*>.*?</tr>", table)[1:]:
+        cells = re.findall(r"<t[dh]([^>]*)>", line)
+        values = {k: re.search(r'data-value="([^"]*)"', c) for k, c in zip(keys, cells, strict=True)}
+        found[values["name"][1]] = {k: v[1] for k, v in values.items() if v}  # type: ignore[index]
+    return found
+
+
+def test_every_number_stands_in_the_table(board: Board, page: str) -> None:
+    """Every metric of every row is the value of a cell, to nine digits, floors and inactive ones too."""
+    tab = board.tabs[0]
+    lines = lines_of(page[page.index('id="cavity-full"') :])
+    assert len(lines) == len(tab.lines)
+    for row in tab.lines:
+        name = row.name if hasattr(row, "name") else row.entry.name
+        cells = lines[name.lower()]
+        for metric, value in row.values.items():
+            told = float(cells.get(metric, "nan"))
+            assert told == pytest.approx(value.mean, rel=1e-8, nan_ok=True)
+
+
+def test_floors_are_judged_like_entries(board: Board) -> None:
+    """A floor that is better than every entry takes the bold, and the deepest colour, from them."""
+    tab = board.tabs[0]
+    floor = tab.floors[0]
+    best = {name: replace(value, mean=1e-9) for name, value in floor.values.items()}
+    page = render(replace(board, tabs=(replace(tab, floors=(replace(floor, values=best), *tab.floors[1:])),)))
+    first = re.search(r"<tbody><tr class=\"floor\"[^>]*>.*?</tr>", page)
+    assert first is not None
+    assert f'data-floor="{floor.name}"' in first[0]
+    cell = re.search(r'<td class="([^"]*)"[^>]*data-value="1e-09"', first[0])
+    assert cell is not None
+    assert cell[1].split() == ["best", "heat0"]
+    assert '<td class="rank" data-value="0"></td>' in first[0]
+
+
+def test_rows_say_who_scored_them(board: Board, page: str) -> None:
+    """Verified where the maintainers' list has the entry, as submitted elsewhere."""
+    lines = lines_of(page[page.index('id="cavity-full"') :])
+    for row in board.tabs[0].rows:
+        assert lines[row.entry.name.lower()]["checked"] == ("verified" if row.verified else "as submitted")
+
+
+def test_rows_lead_to_code_paper_and_weights(board: Board, page: str) -> None:
+    """A link each where the entry has one, and to nothing but the web."""
+    for row in board.tabs[0].rows:
+        line = re.search(f'<tr[^>]*data-entry="{row.id}".*?</tr>', page)
+        assert line is not None
+        links = re.findall(r'<a href="(http[^"]*)"[^>]*>(\w+)</a>', line[0])
+        entry = row.entry
+        wanted = {"code": entry.code, "paper": entry.paper, "weights": entry.weights}
+        assert {name: address for address, name in links} == {k: v for k, v in wanted.items() if v}
+    bad = with_entry(board.tabs[0].rows[0], code="javascript:alert(1)")
+    shown = render(replace(board, tabs=(replace(board.tabs[0], rows=(bad,)),)))
+    assert 'href="javascript' not in shown
 
 
 def test_costs_are_marked_as_self_reported(board: Board, page: str) -> None:
-    """Headings of what nothing can compute again say so, with and without the script; scores do not."""
-    reported = {"speed_up", "seconds_per_frame", "solver_seconds_per_frame", "parameters", "device"}
-    columns = held_by(page)["columns"]
-    assert {key for key, held in columns.items() if held["reported"]} == reported
-    assert all("Self-reported" in columns[key]["meaning"] for key in reported)
-    heads = [e.text for e in read_html(page).named("th") if e.attributes.get("scope") == "col"]
-    marked = [head for head in heads if "self\u2011reported" in head]
-    assert len(marked) == 2 * len(board.tabs)
-    assert all("speed" in head or "parameters" in head for head in marked)
+    """Headings of what nothing can compute again say so; scores do not."""
+    heads = [e for e in read_html(page).named("th") if e.attributes.get("data-key")]
+    marked = {e.attributes["data-key"] for e in heads if "self\u2011reported" in e.text}
+    assert marked == {
+        *("speed_up", "seconds_per_frame", "solver_seconds_per_frame", "parameters", "device"),
+        *("budget", "track", "windows", "epochs", "cpu_hours", "gpu_hours"),
+    }
 
 
 @pytest.mark.parametrize(
@@ -152,11 +195,8 @@ def test_costs_are_marked_as_self_reported(board: Board, page: str) -> None:
 def test_speed_is_told_against_the_solver(board: Board, speed: float, said: str) -> None:
     """The tile of the fastest entry says what 1 stands for, and on which side of it the entry is."""
     tab = board.tabs[0]
-    row = replace(
-        tab.rows[0],
-        cost=Cost(seconds_per_frame=2.0, device="a machine", solver_seconds_per_frame=0.2, speed_up=speed),
-    )
-    page = render(replace(board, tabs=(replace(tab, rows=(row, *tab.rows[-2:])),)))
+    cost = Cost(seconds_per_frame=2.0, device="a machine", solver_seconds_per_frame=2.0 * speed)
+    page = render(replace(board, tabs=(replace(tab, rows=(with_entry(tab.rows[0], cost=cost),)),)))
     (tile,) = [e.text for e in read_html(page).named("li") if "fastest" in e.text]
     assert "solver = 1×" in tile
     assert said in tile
@@ -173,7 +213,8 @@ def test_policy_allows_only_our_script_and_style(page: str) -> None:
     for _, body in inline:
         digest = base64.b64encode(hashlib.sha256(body.encode()).digest()).decode()
         assert f"'sha256-{digest}'" in policy
-    assert not re.search(r"""(src|href)=["']?(https?:)?//""", page)
+    assert not re.search(r"""src=["']?(https?:)?//""", page)
+    assert [e.attributes.get("rel") for e in read_html(page).named("link")] == ["icon"]
     assert not re.search(r"url\(|@import|innerHTML|eval\(|\bfetch\(|XMLHttpRequest|new Function", page)
 
 
@@ -181,11 +222,11 @@ def test_hostile_text_stays_text(board: Board) -> None:
     """Whatever a name holds, the page has the same elements as without it."""
     board = replace(board, tabs=(replace(board.tabs[0], rows=board.tabs[0].rows[:1]),))
     first = board.tabs[0].rows[0]
-    bad = replace(first, name=HOSTILE, authors=(HOSTILE,), affiliation=HOSTILE, code="javascript:alert(1)")
+    bad = with_entry(first, name=HOSTILE, authors=(HOSTILE,), affiliation=HOSTILE, command=HOSTILE)
     page = render(replace(board, tabs=(replace(board.tabs[0], rows=(bad,)),)))
     names = [element.name for element in read_html(page).elements]
     assert names == [element.name for element in read_html(render(board)).elements]
-    assert held_by(page)["tabs"][0]["rows"][0]["name"] == HOSTILE
+    assert held_by(page)["tabs"][0]["rows"][0]["command"] == HOSTILE
     assert "\u2028" not in page.split('id="board">')[1]
 
 
@@ -211,7 +252,18 @@ def test_finer_is_longer(board: Board) -> None:
 
 
 def test_empty_board_is_a_page() -> None:
-    """A board without entries says so."""
-    page = render(Board(tabs=(), metrics={}))
+    """A board without entries has no tabs, and names what could be begun and how."""
+    page = render(Board(tabs=(), empty=(("cavity", "mini"), ("fluid", "full")), metrics={}))
+    reading = read_html(page)
+    assert reading.faults == []
+    assert "cavity mini, fluid full" in page
+    assert "lagbench generate --split cavity --size mini" in page
+    assert reading.named("table") == []
+    assert 'role="tab' not in page
+
+
+def test_without_skill_there_is_no_such_column(board: Board) -> None:
+    """Score files that do not say a skill leave no gap on the page."""
+    page = render(make_board((("cavity", "full"),), skill=False))
+    assert 'data-key="skill"' not in page
     assert read_html(page).faults == []
-    assert "There are no entries yet." in page

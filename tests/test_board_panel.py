@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 from board_browsing import active, close, names, press, restored, run, still, until
-from board_factory import make_board
+from board_worlds import make_board, with_entry
 from browser import CHROMIUM, Browser, Page, browser
 
-from lagbench.board.columns import value_of
+from lagbench.board.entry import Flag
 from lagbench.board.model import Board
 from lagbench.board.page import render
 
@@ -58,11 +58,13 @@ def page(running: Browser, file: Path) -> Iterator[Page]:
 def test_panel_by_keyboard(page: Page, board: Board) -> None:
     """Enter on a name opens its panel, Escape closes it; the focus comes back to the name."""
     row = next(row for row in board.tabs[0].rows if row.flags)
+    restored(page, "#tab=cavity-full")
     run(page, f"document.querySelector('section:not([hidden]) [data-entry={row.id}] .name').focus()")
     press(page, "Enter")
     until(page, "document.getElementById('panel').open")
     text = page.value("document.getElementById('panel').textContent")
-    for said in (row.name, row.detail.command, row.detail.training, row.flags[0].reasons[0], row.authors[0]):
+    entry = row.entry
+    for said in (entry.name, entry.command, entry.training, row.flags[0].reasons[0], entry.authors[0]):
         assert said in text
     assert f"entry={row.id}" in page.value("location.hash")
     assert page.value("document.getElementById('panel').contains(document.activeElement)")
@@ -70,7 +72,7 @@ def test_panel_by_keyboard(page: Page, board: Board) -> None:
     assert page.value("document.getElementById('panel').contains(document.activeElement)")
     press(page, "Escape")
     until(page, "!document.getElementById('panel').open && !location.hash.includes('entry=')")
-    assert page.value("document.activeElement.textContent") == row.name
+    assert page.value("document.activeElement.textContent") == entry.name
 
 
 def test_panel_draws_everything(page: Page, board: Board) -> None:
@@ -80,7 +82,8 @@ def test_panel_draws_everything(page: Page, board: Board) -> None:
     drawn = page.value("[...document.querySelectorAll('#panel [data-figure]')].map(f => f.dataset.figure)")
     assert drawn == ["errors", "scenarios", "maps", "film", "energy", "residual", "distribution"]
     count = "document.querySelectorAll('#panel [data-figure={}] {}').length"
-    assert page.value(count.format("errors", ".line:not(.swatch *)")) == 3
+    lines = 1 + (tab.rows[0].id != "gns") + len(tab.floors)
+    assert page.value(count.format("errors", ".line:not(.swatch *)")) == lines
     assert page.value(count.format("errors", ".band")) == 1
     assert page.value(count.format("scenarios", ".chart .spot.s0")) == len(tab.scenarios)
     assert page.value(count.format("energy", ".chart .line")) == 4
@@ -88,7 +91,8 @@ def test_panel_draws_everything(page: Page, board: Board) -> None:
         "[...document.querySelectorAll('#panel canvas')].map(c =>"
         " new Set(c.getContext('2d').getImageData(0, 0, c.width, c.height).data).size)"
     )
-    assert len(fields) == 4 * 3 + 2
+    maps = min(4, len(tab.truth.map_frames))
+    assert len(fields) == maps * 3 + 2
     assert min(fields) > 4
     run(page, "document.querySelector('#panel [data-figure=errors] select').value = 'vorticity_pearson'")
     run(
@@ -144,25 +148,33 @@ def test_command_is_copied(page: Page, board: Board) -> None:
     until(page, "document.querySelector('.copy').textContent === 'Copied'")
     held = page.call("Runtime.evaluate", expression="navigator.clipboard.readText()", awaitPromise=True)
     row = next(row for row in board.tabs[0].rows if row.id == "gns")
-    assert held["result"]["value"] == row.detail.command
+    assert held["result"]["value"] == row.entry.command
 
 
 def test_scatter_leads_to_entries(page: Page, board: Board) -> None:
     """Every entry with a cost is a dot that is a link; the best in both are joined."""
+    restored(page, "#tab=cavity-full")
     dots: Any = page.value(
         "[...document.querySelectorAll('section:not([hidden]) [data-figure=cost] a.dot')]"
         ".map(a => [a.href.baseVal, a.classList.contains('best')])"
     )
-    rows = [row for row in active(board.tabs[0].rows) if row.cost is not None]
+    rows = [row for row in active(board.tabs[0].rows) if row.entry.cost is not None]
     assert len(dots) == len(rows)
-    points = {row.id: (-float(value_of(row, "speed_up")), row.values["vorticity_rmse"].mean) for row in rows}
+    points = {
+        row.id: (-float(row.entry.cost.speed_up or 0.0), row.values["vorticity_rmse"].mean)
+        for row in rows
+        if row.entry.cost
+    }
     best = {
         i
         for i, (x, y) in points.items()
         if not any(a <= x and b <= y and (a, b) != (x, y) for a, b in points.values())
     }
     assert {href.partition("entry=")[2] for href, front in dots if front} == best
+    press(page, "Tab")
     run(page, "document.querySelector('section:not([hidden]) [data-figure=cost] a.dot').focus()")
+    ring = "getComputedStyle(document.activeElement.querySelector('.reach')).stroke"
+    assert page.value(ring) != "none"
     press(page, "Enter")
     until(page, "document.getElementById('panel').open")
 
@@ -170,25 +182,22 @@ def test_scatter_leads_to_entries(page: Page, board: Board) -> None:
 def test_hostile_text_does_nothing(running: Browser, board: Board, tmp_path: Path) -> None:
     """Scripts, images and odd addresses in a submission show as text in table, panel and CSV."""
     tab = board.tabs[0]
-    detail = replace(
-        tab.rows[0].detail,
-        command=HOSTILE,
-        notes=HOSTILE,
-        training=HOSTILE,
-        hardware="{{script}}",
-        scored_by=HOSTILE,
-    )
-    bad = replace(
+    texts = dict.fromkeys(("command", "notes", "training", "name"), HOSTILE)
+    bad = with_entry(
         tab.rows[0],
-        name=HOSTILE,
+        **texts,
+        hardware="{{script}}",
         authors=(HOSTILE, "__proto__", "\u202eright to left"),
         affiliation="=HYPERLINK(1)",
         code="javascript:console.error(3)",
         paper="data:text/html,<script>console.error(4)</script>",
-        flags=(replace(board.tabs[0].rows[4].flags[0], name="__proto__", reasons=(HOSTILE,)),),
-        detail=detail,
     )
-    long = replace(tab.rows[1], name="=1+1" + "W" * 10_000)
+    first = bad.entry.score.files[0]
+    odd = first.model_copy(
+        update={"flags": (Flag.model_construct(name="__proto__", reasons=(HOSTILE,), share=None),)}
+    )
+    bad = with_entry(bad, score=bad.entry.score.model_copy(update={"files": (odd,)}))
+    long = with_entry(tab.rows[1], name="=1+1" + "W" * 10_000)
     path = tmp_path / "index.html"
     shown = replace(board, tabs=(replace(tab, rows=(bad, long, *tab.rows[2:])),))
     path.write_text(render(shown), encoding="utf-8")
@@ -200,10 +209,12 @@ def test_hostile_text_does_nothing(running: Browser, board: Board, tmp_path: Pat
         assert page.value("document.scripts.length") == 3
         assert page.value("[...document.links].every(a => ['file:', 'https:'].includes(a.protocol))")
         assert page.value("document.documentElement.scrollWidth") <= 390
-        assert HOSTILE in page.value("document.querySelector('.entries .name').textContent")
+        assert HOSTILE in page.value(
+            "document.querySelector('section:not([hidden]) tr[data-entry] .name').textContent"
+        )
         if hash_.endswith(bad.id):
+            until(page, "document.getElementById('panel').open")
             assert HOSTILE in page.value("document.querySelector('#panel h2').textContent")
-            assert "javascript:console.error(3)" in page.value("document.querySelector('#panel').textContent")
     assert page.messages == []
     assert {request.partition("#")[0] for request in page.requests} == {path.absolute().as_uri()}
     close(page)

@@ -8,21 +8,18 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from board_bench import BoardBench, copied
+from board_worlds import SCORES, BoardBench, copied
 
-from lagbench.board import isolation
+from lagbench.board import score_file as isolation
 from lagbench.board.check import check_board
-from lagbench.board.isolation import unreadable_in_child
-from lagbench.board.stored import read_stored
+from lagbench.board.score_file import read_stored, unreadable_in_child
 from lagbench.errors import UnreadableFileError
-
-SCORES = "scores/cavity/tiny"
 
 
 @pytest.fixture
 def own(tmp_path_factory: pytest.TempPathFactory, tmp_path: Path) -> BoardBench:
     """A copy of the leaderboard that the test may damage."""
-    return copied(tmp_path_factory, tmp_path, without=["constant-velocity", "damped", "flipping"])
+    return copied(tmp_path_factory, tmp_path, without=["damped"])
 
 
 def hostile(path: Path, kind: str, secret: Path) -> None:
@@ -36,6 +33,13 @@ def hostile(path: Path, kind: str, secret: Path) -> None:
             return
         if kind == "extra group":
             file.create_group("more")
+            return
+        if kind == "packed twice":
+            plist = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+            plist.set_chunk((64,))
+            plist.set_deflate(9)
+            plist.set_deflate(9)
+            h5py.h5d.create(file.id, b"twice", h5py.h5t.NATIVE_FLOAT, h5py.h5s.create_simple((64,)), plist)
             return
         if kind == "bomb":
             options = {"dtype": "f4", "compression": "gzip", "chunks": (1 << 20,), "fillvalue": 0}
@@ -66,7 +70,7 @@ def hostile(path: Path, kind: str, secret: Path) -> None:
     "kind",
     [
         *("external link", "soft link", "external storage", "virtual", "bomb", "extra group", "strings"),
-        *("infinite", "another type", "another shape"),
+        *("infinite", "another type", "another shape", "packed twice"),
     ],
 )
 def test_hostile_score_files_are_refused(kind: str, own: BoardBench) -> None:
@@ -78,14 +82,14 @@ def test_hostile_score_files_are_refused(kind: str, own: BoardBench) -> None:
     assert path.stat().st_size <= 300_000
     with pytest.raises(UnreadableFileError):
         read_stored(path)
-    own.reseal("noisy")
+    own.rehash("noisy")
     result = check_board(own.folder, registry=own.registry, page=False, isolated=False)
     assert [finding.check for finding in result.findings] == ["score_file"]
 
 
 def test_the_child_is_limited_and_started_anew(own: BoardBench, monkeypatch: pytest.MonkeyPatch) -> None:
     """It tells which file is damaged; a file that stops it costs that file only."""
-    good, bad = own.folder / SCORES / "noisy.nc", own.folder / SCORES / "persistence.nc"
+    good, bad = own.folder / SCORES / "noisy.nc", own.folder / SCORES / "flipping.nc"
     bad.write_bytes(bad.read_bytes()[:5000])
     assert set(unreadable_in_child([good, bad, good])) == {bad}
     program = own.folder.parent / "fake"
@@ -93,7 +97,7 @@ def test_the_child_is_limited_and_started_anew(own: BoardBench, monkeypatch: pyt
     (program / "child_that_stops.py").write_text(
         "import json, os, sys\n"
         "for path in json.load(sys.stdin):\n"
-        "    if 'persistence' in path: os.kill(os.getpid(), 11)\n"
+        "    if 'flipping' in path: os.kill(os.getpid(), 11)\n"
         "    print('null', flush=True)\n"
     )
     monkeypatch.setenv("PYTHONPATH", str(program))

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import datetime
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
-from board_bench import DAY, BoardBench, copied
-from report_bench import damped, noisy, still
+from board_worlds import DAY, BoardBench, copied, in_process, nearer
+from report_bench import damped, motion, noisy, still
 
-from lagbench import __version__, submission
+from lagbench import __version__
 from lagbench.board import submit as submitting
 from lagbench.board.check import check_board
+from lagbench.board.entry import Meta
 from lagbench.board.entry_file import read_entry
-from lagbench.board.publishing import batch
+from lagbench.board.floors import floor_names
+from lagbench.board.score_file import read_stored
 from lagbench.data.checksums import file_sha256
 from lagbench.errors import ChecksFailedError, UnreadableFileError, UsageError, WorkFailedError
 from lagbench.submission import open_predictions
@@ -31,7 +33,7 @@ def own(tmp_path_factory: pytest.TempPathFactory, tmp_path: Path) -> BoardBench:
 def predictions(own: BoardBench) -> Path:
     """Predictions of a model that is not on the board yet."""
     labels = {"device": "a laptop", "seconds_per_frame": 0.25, "parameters": 9, "training": "train"}
-    return own.predict(noisy, "my-model", **labels)
+    return own.predict(nearer, "my-model", **labels)
 
 
 def test_the_entry_says_all_that_is_known(own: BoardBench, predictions: Path) -> None:
@@ -50,7 +52,7 @@ def test_the_entry_says_all_that_is_known(own: BoardBench, predictions: Path) ->
         assert [made.sha256 for made in entry.predictions] == [opened.content_sha256()]
         assert entry.dataset.sha256 == opened.header.dataset_sha256
     assert entry.predictions[0].bytes == predictions.stat().st_size
-    assert (entry.score.scored_by, entry.score.lagbench) == ("A. Author", __version__)
+    assert entry.score.lagbench == __version__
     (score_file,) = entry.score_paths
     assert entry.score.files[0].sha256 == file_sha256(own.folder / score_file)
     card = own.data.card(predictions)
@@ -77,7 +79,7 @@ def test_predictions_in_the_folder_are_referred_to(own: BoardBench) -> None:
     """A file inside the leaderboard's folder is named by its path there, one elsewhere is not."""
     inside = own.folder / "predictions" / "mine.nc"
     inside.parent.mkdir()
-    own.data.submit(inside, noisy, "inside")
+    own.data.submit(inside, nearer, "inside")
     own.submit(inside)
     assert read_entry(own.entry("inside")).predictions[0].path == "predictions/mine.nc"
     assert read_entry(own.entry("noisy")).predictions[0].path is None
@@ -144,33 +146,26 @@ def test_invalid_predictions_leave_nothing(own: BoardBench, predictions: Path, t
     assert tree(own.folder) == before
 
 
-def _renew(folder: Path) -> None:
-    with batch(folder) as files:
-        files.prepare(Path("a/old")).write_text("new a")
-        files.prepare(Path("b/new")).write_text("new b")
-        files.publish(remove=[Path("gone"), Path("a/old"), Path("never")])
+def test_an_interruption_is_found(
+    own: BoardBench, predictions: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Score files come first, the entry last: what a full disk leaves is a score file without an entry."""
+    before = own.state()
 
+    def full(*_: object, **__: object) -> None:
+        raise WorkFailedError("no space left")
 
-@pytest.mark.parametrize("step", range(4))
-def test_a_failure_while_publishing_undoes_everything(step: int, tmp_path: Path, monkeypatch: Any) -> None:
-    """Whichever rename fails, new files are gone and old ones are back, byte for byte."""
-    (tmp_path / "a").mkdir()
-    (tmp_path / "a" / "old").write_text("old a")
-    (tmp_path / "gone").write_text("old gone")
-    rename: Callable[..., Path] = Path.rename
-    calls = iter(range(100))
-
-    def failing(self: Path, target: Path) -> Path:
-        if next(calls) == step:
-            raise OSError(28, "No space left on device")
-        return rename(self, target)
-
-    before = {path: path.read_text() for path in tmp_path.rglob("*") if path.is_file()}
     with monkeypatch.context() as patch:
-        patch.setattr(Path, "rename", failing)
-        with pytest.raises(WorkFailedError, match="No space left"):
-            _renew(tmp_path)
-    assert {path: path.read_text() for path in tmp_path.rglob("*") if path.is_file()} == before
+        patch.setattr(submitting, "write_atomically", full)
+        with pytest.raises(WorkFailedError):
+            own.submit(predictions)
+    assert own.state() == before | {
+        "scores/cavity/tiny/my-model.nc": own.state()["scores/cavity/tiny/my-model.nc"]
+    }
+    result = check_board(own.folder, registry=own.registry, isolated=False)
+    assert [finding.check for finding in result.findings] == ["stray"]
+    own.submit(predictions)
+    assert not check_board(own.folder, registry=own.registry, isolated=False).findings
 
 
 def test_a_score_file_that_is_too_long_is_not_published(
@@ -184,19 +179,56 @@ def test_a_score_file_that_is_too_long_is_not_published(
     assert tree(own.folder) == before
 
 
-def test_floors_are_written_anew(own: BoardBench) -> None:
-    """A floor needs no words and no --replace; its positions are those of the template."""
-    before = own.state()
-    own.submit_floor("persistence")
-    assert own.state() == before
-    entry = read_entry(own.entry("persistence"))
-    assert entry.command == "lagbench submit --floor persistence --split cavity --size tiny"
-    path = own.folder.parent / "template.nc"
-    submission.template("cavity", "tiny", output=path, root=own.data.root, registry=own.registry)
-    with open_predictions(path) as opened:
-        assert entry.predictions[0].sha256 == opened.content_sha256()
-    with pytest.raises(UsageError, match="did you mean 'persistence'"):
-        own.submit_floor("persistance")
+def test_floors_are_added_by_themselves(own: BoardBench, predictions: Path) -> None:
+    """Those that are missing, or of another data set, are written anew, the same bytes whoever submits."""
+    folder = own.folder / "floors/cavity/tiny"
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    assert set(before) == {f"{name}.nc" for name in floor_names()}
+    first = min(before)
+    (folder / first).unlink()
+    (folder / max(before)).write_bytes(b"something else")
+    result = own.submit(predictions)
+    assert set(result.files) >= {folder / name for name in before}
+    for path in folder.iterdir():
+        scores = read_stored(path).scores
+        assert scores.identity["method"] == path.stem
+    assert not check_board(own.folder, registry=own.registry, isolated=False).findings
+
+
+def test_leaving_the_box_comes_with_its_share(own: BoardBench) -> None:
+    """One particle in 2048, say, that lies outside at all frames but some: the share is that of positions."""
+
+    def leaving(truth: Any, n: int, h: int) -> Any:
+        guess = np.array(nearer(truth, n, h))
+        guess[1:, :3, 0] += np.linspace(0.0, 3.0, h - 1)[:, None]
+        return guess
+
+    own.submit(own.predict(leaving, "leaving"))
+    (warning,) = (
+        w for w in read_entry(own.entry("leaving")).score.files[0].warnings if w.name == "in_domain"
+    )
+    size = own.data.size
+    room = size.bounds[0][1] + 1.0 / size.grid
+    outside = 0
+    for scenario in size.subsets["test"]:
+        task = size.task
+        guess = leaving(motion(size, scenario), task.input_frames, task.horizon)
+        outside += int((guess.astype(np.float32)[..., 0] > room).sum())
+    count = len(size.subsets["test"]) * task.horizon * size.particles
+    assert 0.0 < outside < count
+    assert warning.share == pytest.approx(outside / count, rel=1e-3)
+
+
+def test_no_board_is_begun_by_mistake(own: BoardBench, predictions: Path, tmp_path: Path) -> None:
+    """Where there is no leaderboard one has to be asked for."""
+    meta = Meta(authors=("A. Author",), command="make", date=DAY)
+    where = own.where | {"board": tmp_path / "elsewhere"}
+    with in_process():
+        with pytest.raises(UsageError) as error:
+            submitting.submit([predictions], meta, **where)
+        assert "--new-board" in str(error.value.fix)
+        assert not (tmp_path / "elsewhere").exists()
+        assert submitting.submit([predictions], meta, new_board=True, **where).board == tmp_path / "elsewhere"
 
 
 def test_what_is_not_given(own: BoardBench) -> None:

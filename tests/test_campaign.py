@@ -27,7 +27,7 @@ Copy = Callable[[], Path]
 
 def manifest_of(root: Path) -> Manifest:
     """Return the manifest of the tiny data set."""
-    manifest = read_manifest(root, SPLIT, SIZE, 1)
+    manifest = read_manifest(root, SPLIT, SIZE, 2)
     assert manifest is not None
     return manifest
 
@@ -46,7 +46,7 @@ def right(generated: GenerationResult) -> Measured:
 
 def card_of(root: Path) -> str:
     """Return the text of the data set's card."""
-    return (root / SPLIT / SIZE / "v1" / "README.md").read_text()
+    return (root / SPLIT / SIZE / "v2" / "README.md").read_text()
 
 
 def elsewhere(root: Path, machine: str = "aarch64") -> None:
@@ -97,7 +97,7 @@ def test_equal_hashes_are_told(copied: Copy, unmeasured: Registry, right: Measur
 def test_a_forged_file_is_made_anew(copied: Copy, unmeasured: Registry, generated: GenerationResult) -> None:
     """Without a recorded hash the manifest's counts: a file that agrees with itself is not adopted."""
     root = copied()
-    forge(root / SPLIT / SIZE / "v1" / "test" / "0003.nc")
+    forge(root / SPLIT / SIZE / "v2" / "test" / "0003.nc")
     result = generate(SPLIT, SIZE, root=root, workers=1, registry=unmeasured)
     assert result.simulated == (3,)
     assert result.dataset_sha256 == generated.dataset_sha256
@@ -149,7 +149,7 @@ def test_a_broken_promise_leaves_no_card(tmp_path: Path, unmeasured: Registry, r
         generate(SPLIT, SIZE, scenarios="4", root=tmp_path, workers=1, registry=registry)
     assert caught.value.exit_code == 4
     assert manifest_of(tmp_path).identity == "bitwise"
-    assert not (tmp_path / SPLIT / SIZE / "v1" / "README.md").exists()
+    assert not (tmp_path / SPLIT / SIZE / "v2" / "README.md").exists()
 
 
 # --- what an existing manifest says ----------------------------------------------------------
@@ -168,7 +168,7 @@ def test_wrong_statistics_are_mended(copied: Copy, unmeasured: Registry, right: 
 def test_paths_of_a_manifest_are_not_published(copied: Copy, unmeasured: Registry) -> None:
     """A manifest that names a file elsewhere is written anew from the files."""
     root = copied()
-    folder = root / SPLIT / SIZE / "v1"
+    folder = root / SPLIT / SIZE / "v2"
     told = json.loads((folder / "manifest.json").read_text())
     told["files"][3]["path"] = "../../../../../etc/passwd"
     (folder / "manifest.json").write_text(json.dumps(told))
@@ -195,7 +195,7 @@ def test_a_second_call_hashes_each_file_once_and_draws_nothing(
     def refuse(*_: object) -> list[str]:
         pytest.fail("pictures are drawn again")
 
-    for module in ("inventory", "manifest"):
+    for module in ("make.verify", "data.manifest"):
         monkeypatch.setattr(f"lagbench.{module}.file_sha256", counted)
     monkeypatch.setattr(cards, "_draw", refuse)
     generate(SPLIT, SIZE, root=root, registry=unmeasured, progress=news.append)
@@ -207,7 +207,7 @@ def test_a_second_call_hashes_each_file_once_and_draws_nothing(
 @pytest.mark.parametrize("name", ["README.md", "croissant.json", "pictures/frame.png"])
 def test_a_card_that_is_gone_or_changed_is_made_anew(name: str, copied: Copy, unmeasured: Registry) -> None:
     """Only cards that are there and the same are left alone."""
-    path = copied() / SPLIT / SIZE / "v1" / name
+    path = copied() / SPLIT / SIZE / "v2" / name
     before = path.read_bytes()
     path.unlink()
     generate(SPLIT, SIZE, root=path.parents[4 if "/" in name else 3], registry=unmeasured)

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import os
 import pickle
+import struct
+import tracemalloc
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -248,3 +252,66 @@ def test_data_of_another_version(generated: GenerationResult, unmeasured: Regist
         check_data(example(), root=generated.root, registry=unmeasured, where="a.pt")
     with pytest.raises(DataError, match="lagbench generate"):
         check_data(example(), root=generated.root / "nowhere", registry=unmeasured, where="a.pt")
+
+
+def repacked(source: Path, target: Path, *, compression: int = zipfile.ZIP_STORED, **more: bytes) -> Path:
+    """Write an archive anew, with other compression and further members."""
+    with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w", compression) as new:
+        for member in old.infolist():
+            new.writestr(member.filename, old.read(member))
+        for name, data in more.items():
+            new.writestr(name, data)
+    return target
+
+
+def test_an_archive_that_unpacks_to_more_is_refused(tmp_path: Path) -> None:
+    """100 MB of zeros in 100 kB: refused by its directory, before they are unpacked."""
+    save(tmp_path / "a.pt", example())
+    bomb = repacked(
+        tmp_path / "a.pt", tmp_path / "bomb.pt", compression=zipfile.ZIP_DEFLATED, big=bytes(10**8)
+    )
+    assert bomb.stat().st_size < 10**6
+    tracemalloc.start()
+    with pytest.raises(UnreadableFileError) as caught:
+        load(bomb)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert caught.value.where == str(bomb)
+    assert peak < 10**7
+
+
+def test_overlapping_members_are_refused(tmp_path: Path) -> None:
+    """A directory that names the same bytes many times promises more than the file holds."""
+    with zipfile.ZipFile(tmp_path / "a.pt", "w") as archive:
+        archive.writestr("kernel", bytes(10**5))
+        first = archive.infolist()[0]
+        for number in range(50):
+            twin = copy.copy(first)
+            twin.filename = f"twin{number}"
+            archive.filelist.append(twin)
+    with pytest.raises(UnreadableFileError):
+        load(tmp_path / "a.pt")
+
+
+def test_a_fifo_is_refused_at_once(tmp_path: Path) -> None:
+    """Nobody writes to it; opening it would wait for ever."""
+    os.mkfifo(tmp_path / "a.pt")
+    with pytest.raises(UnreadableFileError) as caught:
+        load(tmp_path / "a.pt")
+    assert caught.value.where == str(tmp_path / "a.pt")
+
+
+def test_a_flipped_byte_is_seen(tmp_path: Path) -> None:
+    """Any byte of any member: its checksum is another. Bytes between members are padding."""
+    save(tmp_path / "a.pt", example())
+    data = (tmp_path / "a.pt").read_bytes()
+    with zipfile.ZipFile(tmp_path / "a.pt") as archive:
+        for member in archive.infolist():
+            if not member.file_size:
+                continue
+            name, extra = struct.unpack_from("<HH", data, member.header_offset + 26)
+            flipped = bytearray(data)
+            flipped[member.header_offset + 30 + name + extra + member.file_size // 2] ^= 1
+            (tmp_path / "b.pt").write_bytes(flipped)
+            with pytest.raises(UnreadableFileError):
+                load(tmp_path / "b.pt")

@@ -137,7 +137,7 @@ def test_generate_and_verify(run: Run, tmp_path: Path) -> None:
 def test_verify_reports_as_json_too(run: Run, copied: Callable[[], Path]) -> None:
     """A damaged data set is described on stdout, named on stderr, exit code 4."""
     root = copied()
-    path = root / SPLIT / SIZE / "v1" / "valid" / "0002.nc"
+    path = root / SPLIT / SIZE / "v2" / "valid" / "0002.nc"
     path.write_bytes(path.read_bytes()[:-500])
     result = run("verify", SPLIT, "--size", SIZE, "--root", root, "--json")
     assert result.exit_code == 4
@@ -186,7 +186,7 @@ def test_an_interruption_exits_130(run: Run, monkeypatch: pytest.MonkeyPatch) ->
 def test_cite_names_version_hash_and_works(run: Run) -> None:
     """What a paper needs: the split's version and what it builds on."""
     text = run("cite", "cavity").stdout
-    assert "version 1.0.0" in text
+    assert "version 2.0.0" in text
     assert "Ghia" in text
     assert json.loads(run("cite", "cavity", "--json").stdout)["licence"] == "CC-BY-4.0"
 
@@ -205,7 +205,7 @@ def test_doctor_finds_this_machine_fit(run: Run, tmp_path: Path) -> None:
 def test_clean_removes_ours_only(run: Run, copied: Callable[[], Path]) -> None:
     """A dry run says what would go; then all of it is gone but a stranger's file."""
     root = copied()
-    folder = root / SPLIT / SIZE / "v1"
+    folder = root / SPLIT / SIZE / "v2"
     (folder / "notes.txt").write_text("mine")
     (folder / "test" / ".0003.nc.1.partial").write_text("")
     options = [SPLIT, "--size", SIZE, "--root", root]

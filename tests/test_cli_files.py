@@ -35,7 +35,7 @@ def files_below(folder: Path) -> set[str]:
 def test_clean_leaves_the_pictures_of_others(run: Run, copied: Callable[[], Path]) -> None:
     """A user's own PNG files, beside our cards and among our pictures, stay."""
     root = copied()
-    folder = root / SPLIT / SIZE / "v1"
+    folder = root / SPLIT / SIZE / "v2"
     mine = {"mine.png", "pictures/mine.png", "README.txt"}
     for name in mine:
         (folder / name).write_bytes(b"mine")
@@ -79,7 +79,7 @@ def test_a_file_that_the_user_names_and_cannot_be_read_exits_3(
 def test_a_damaged_scenario_of_a_split_exits_4(run: Run, copied: Callable[[], Path], tmp_path: Path) -> None:
     """The same damage below the root folder is a damaged data set, whose remedy is to generate."""
     root = copied()
-    (root / SPLIT / SIZE / "v1" / "test" / "0003.nc").write_text("no netCDF")
+    (root / SPLIT / SIZE / "v2" / "test" / "0003.nc").write_text("no netCDF")
     result = run("plot", SPLIT, "--size", SIZE, "--root", root, "-o", tmp_path / "x.png")
     assert result.exit_code == 4
     assert "lagbench generate" in result.stderr
@@ -118,7 +118,7 @@ def test_verify_says_as_json_whether_all_is_there(run: Run, copied: Callable[[],
     root = copied()
     words = ("verify", SPLIT, "--size", SIZE, "--root", root, "--json")
     assert json.loads(run(*words).stdout)["complete"] is True
-    (root / SPLIT / SIZE / "v1" / "test" / "0003.nc").unlink()
+    (root / SPLIT / SIZE / "v2" / "test" / "0003.nc").unlink()
     assert json.loads(run(*words).stdout)["complete"] is False
 
 

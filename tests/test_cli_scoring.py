@@ -194,7 +194,7 @@ def test_an_unusable_folder_is_told_before_the_work(
     def measured(*_: object, **__: object) -> None:
         raise AssertionError("scenarios were measured")
 
-    monkeypatch.setattr(score, "spread", measured)
+    monkeypatch.setattr(score, "run_all", measured)
     taken = predictions.parent / "taken"
     taken.write_text("")
     result = run("score", predictions, option, taken)

@@ -12,24 +12,25 @@ from pathlib import Path
 import pytest
 from conftest import SIZE, SPLIT
 
+from lagbench.data.layout import NOTES_NAME
 from lagbench.data.manifest import merge, read_manifest, write_manifest
 from lagbench.data.registry import Registry
 from lagbench.errors import DataError, UsageError
 from lagbench.make.generate import GenerationResult, generate
 
-FOLDER = Path(SPLIT) / SIZE / "v1"
+FOLDER = Path(SPLIT) / SIZE / "v2"
 
 
 def everything(root: Path) -> dict[str, bytes]:
-    """Return path and bytes of every file of the tiny data set but its lock."""
+    """Return path and bytes of every file of the tiny data set but its lock and notes of this machine."""
     folder = root / FOLDER
     found = {str(path.relative_to(folder)): path for path in folder.rglob("*") if path.is_file()}
-    return {name: path.read_bytes() for name, path in found.items() if name != ".lock"}
+    return {name: path.read_bytes() for name, path in found.items() if name not in (".lock", NOTES_NAME)}
 
 
 def part(generated: GenerationResult, root: Path, registry: Registry, ids: tuple[int, ...]) -> Path:
     """Return a root that holds some scenarios only, as a job of an array leaves it."""
-    size, whole = registry.size(SPLIT, SIZE), read_manifest(generated.root, SPLIT, SIZE, 1)
+    size, whole = registry.size(SPLIT, SIZE), read_manifest(generated.root, SPLIT, SIZE, 2)
     assert whole is not None
     entries = [entry for entry in whole.files if entry.scenario in ids]
     for entry in entries:

@@ -16,6 +16,7 @@ import pytest
 from cluster_bench import Sabotage, gone, local_cluster, scheduler_process, writers
 from conftest import SIZE, SPLIT
 
+from lagbench.data.layout import NOTES_NAME
 from lagbench.data.lock import Holder, read_holder
 from lagbench.data.manifest import read_manifest
 from lagbench.data.registry import Registry
@@ -38,9 +39,9 @@ def workers() -> Iterator[Any]:
 
 
 def everything(folder: Path) -> dict[str, bytes]:
-    """Return path and bytes of every file of a data set but its lock."""
+    """Return path and bytes of every file of a data set but its lock and notes of this machine."""
     found = {str(path.relative_to(folder)): path for path in folder.rglob("*") if path.is_file()}
-    return {name: path.read_bytes() for name, path in found.items() if name != ".lock"}
+    return {name: path.read_bytes() for name, path in found.items() if name not in (".lock", NOTES_NAME)}
 
 
 def test_a_worker_killed_and_one_slowed(
@@ -55,7 +56,7 @@ def test_a_worker_killed_and_one_slowed(
     The client says that it is another machine: the manifest names those that simulated.
     """
     monkeypatch.setattr(campaign, "environment_of", lambda device: {"machine": "aarch64", "device": device})
-    folder, holders = tmp_path / SPLIT / SIZE / "v1", list[Holder | None]()
+    folder, holders = tmp_path / SPLIT / SIZE / "v2", list[Holder | None]()
     news: list[Progress] = []
     with Sabotage(tmp_path, lambda: holders.append(read_holder(folder))) as sabotage:
         result = generate(
@@ -94,7 +95,7 @@ def test_a_lost_scheduler_is_an_error_and_resumed(
             )
     assert caught.value.exit_code == 5
     assert "run the same command again" in str(caught.value)
-    manifest = read_manifest(tmp_path, SPLIT, SIZE, 1)
+    manifest = read_manifest(tmp_path, SPLIT, SIZE, 2)
     assert manifest is not None
     assert len(manifest.files) >= 1
     assert writers(tmp_path) == {}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from score_bench import ScoreBench, bench_of, half_right, still, straight
 from lagbench.data.registry import Registry
 from lagbench.errors import DataError, UnreadableFileError, UsageError
 from lagbench.make.generate import GenerationResult
+from lagbench.metrics import differ
 from lagbench.scoring.compare import ComparisonResult, compare
 from lagbench.scoring.tables import card_tables, comparison_table, flag_lines
 
@@ -67,8 +69,36 @@ def test_six_wins_of_six(tmp_path: Path) -> None:
     assert found.test.difference == pytest.approx(-7 / 6)
     assert found.first == pytest.approx(21 / 6)
     assert found.second == pytest.approx(28 / 6)
-    assert result.verdict == "mse_avg: a is better (p = 0.0312, 6 scenarios)"
+    assert result.verdict.startswith("mse_avg: a is better (p = 0.0312, 6 scenarios, one seed each")
     assert compare(b, a).verdict == result.verdict
+    assert result.seeds == (1, 1)
+
+
+def test_a_folder_of_seeds_is_a_method(tmp_path: Path) -> None:
+    """Three seeds against two: the two-way test over all of them, and means over seeds."""
+    rng = np.random.default_rng(0)
+    values = {"a": rng.gamma(9.0, size=(3, 8)), "b": rng.gamma(12.0, size=(2, 8))}
+    for method, seeds in values.items():
+        for i, row in enumerate(seeds):
+            place = tmp_path / method / str(i)
+            path = published(place, row.tolist(), method=method, predictions_sha256=f"{method}{i}")
+            path.rename(place / "scores.json")
+    result = compare(tmp_path / "a", tmp_path / "b")
+    found = result.metrics["mse_avg"]
+    assert result.seeds == found.test.seeds == (3, 2)
+    assert found.first == pytest.approx(values["a"].mean())
+    assert found.test.p == differ(values["a"], values["b"])
+    assert "3 and 2 seeds" in result.verdict
+    assert result.as_json()["seeds"] == [3, 2]
+
+
+def test_seeds_of_two_methods_are_not_one(tmp_path: Path) -> None:
+    """A folder that mixes methods is refused: the mean over them is that of neither."""
+    for method in ("a", "b"):
+        path = published(tmp_path / method, [1.0] * 6, method=method)
+        path.rename(tmp_path / method / "scores.json")
+    with pytest.raises(UsageError):
+        compare(tmp_path, tmp_path)
 
 
 def test_five_of_six_is_no_difference(tmp_path: Path) -> None:
@@ -87,7 +117,7 @@ def test_under_six_scenarios_nothing_is_claimed(tmp_path: Path) -> None:
     b = published(tmp_path, [2, 3, 4, 5, 7], method="b")
     result = compare(a, b)
     assert np.isnan(result.metrics["mse_avg"].test.p)
-    assert result.metrics["mse_avg"].test.interval[1] < 0.0
+    assert result.metrics["mse_avg"].test.interval[0] < -1.2
     assert "no significance is claimed under 6" in result.verdict
     assert result.as_json()["metrics"]["mse_avg"]["p"] is None
 
@@ -147,7 +177,7 @@ def test_unknown_metrics_name_the_nearest(scored: dict[str, Path]) -> None:
     with pytest.raises(UsageError, match="vorticity_rmse"):
         compare(scored["still"], scored["straight"], metrics=["vorticity_rsme"])
     only: ComparisonResult = compare(scored["still"], scored["straight"], metrics=["mse_end"])
-    assert list(only.metrics) == ["vorticity_rmse", "mse_end"]
+    assert list(only.metrics) == ["vorticity_nrmse", "mse_end"]
 
 
 def test_equal_names_are_told_apart(tmp_path: Path) -> None:
@@ -247,7 +277,7 @@ def test_comparison_table(scored: dict[str, Path]) -> None:
     """The short table leads with the ranking metric; all metrics come when asked for."""
     result = compare(scored["still"], scored["straight"])
     short, whole = comparison_table(result), comparison_table(result, every=True)
-    assert short.rows[0][0] == "vorticity_rmse"
+    assert short.rows[0][0] == "vorticity_nrmse"
     assert len(short.rows) < len(whole.rows) == len(result.metrics)
 
 
@@ -255,11 +285,34 @@ def test_comparison_table(scored: dict[str, Path]) -> None:
 def test_how_much_better_lies_in_its_interval(
     bench: ScoreBench, tmp_path: Path, predict: Any, row: int, word: str
 ) -> None:
-    """The printed interval is that of the printed number: it has its sign and holds it."""
+    """The printed interval is that of the printed number, which it holds; the number has its sign."""
     card = bench.evaluate(bench.submit(tmp_path / "predictions.nc", predict))
     line = list(flag_lines(card))[row]
     number = r"(-?[\d.e-]+)"
     found = re.search(rf"{word} by {number} \({number} to {number}", line)
     assert found, line
     by, low, high = map(float, found.groups())
-    assert 0.0 < low <= by <= high
+    assert by > 0.0
+    assert low <= by <= high
+
+
+def test_pipes_and_devices_are_refused_at_once(tmp_path: Path) -> None:
+    """A FIFO that nobody writes to, a device that never ends, a file too long, by any name."""
+    os.mkfifo(tmp_path / "fifo.json")
+    (tmp_path / "zero.json").symlink_to("/dev/zero")
+    with (tmp_path / "long.json").open("wb") as stream:
+        stream.truncate(1 << 40)
+    for name in ("fifo.json", "zero.json", "long.json", "x" * 300, "y" * 300 + ".json"):
+        with pytest.raises(UnreadableFileError) as caught:
+            compare(tmp_path / name, tmp_path / name)
+        assert caught.value.where == str(tmp_path / name)
+
+
+def test_booleans_are_no_ids_and_no_values(tmp_path: Path) -> None:
+    """True is no scenario 1, nor an error of 1."""
+    whole = published(tmp_path, [1.0, 2.0], method="a")
+    for number, task in enumerate(({"scenarios": [False, True]}, {"scenarios": [0, 1]})):
+        values = [True, 2.0] if number else [1.0, 2.0]
+        odd = published(tmp_path, values, method=f"b{number}", task=task)
+        with pytest.raises(UnreadableFileError):
+            compare(whole, odd)

@@ -77,7 +77,7 @@ def test_it_is_lazy_and_bounded(tmp_path: Path) -> None:
 
 def test_missing_scenarios_name_the_command(ragged: Path) -> None:
     """The error counts what is missing, lists the ids and gives the generate command."""
-    (ragged / "cavity/tiny/v1/test" / f"{TEST_IDS[1]:04d}.nc").unlink()
+    (ragged / "cavity/tiny/v2/test" / f"{TEST_IDS[1]:04d}.nc").unlink()
     with pytest.raises(DataError) as caught:
         open_split("cavity", size="tiny", root=ragged)
     assert caught.value.exit_code == 4
@@ -88,7 +88,7 @@ def test_missing_scenarios_name_the_command(ragged: Path) -> None:
 
 def test_damaged_and_foreign_files_are_named(ragged: Path) -> None:
     """A truncated file and a file of another scenario are told by path."""
-    path = ragged / "cavity/tiny/v1/test" / f"{TEST_IDS[0]:04d}.nc"
+    path = ragged / "cavity/tiny/v2/test" / f"{TEST_IDS[0]:04d}.nc"
     sound = path.read_bytes()
     path.write_bytes(sound[: len(sound) // 2])
     with pytest.raises(DataError, match=rf"(?s)damaged.*{path.name}"):

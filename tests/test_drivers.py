@@ -108,3 +108,45 @@ def test_taichi_is_imported_late_and_quietly() -> None:
     )
     result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert result.stdout == ""
+
+
+@pytest.mark.parametrize("device", [Device.CPU, Device.PARALLEL])
+def test_a_wall_program_is_a_wall_moved_by_hand(device: Device) -> None:
+    """Two programs, one shorter than the run, in calls that end within frames, act frame by frame."""
+    constants = parameters(substeps_per_frame=10)
+    states = [
+        scenario(constants, seed=seed, walls=ALL_LIDS, frames=count) for seed, count in ((1, 9), (2, 5))
+    ]
+    states = states[: 1 if device is Device.CPU else 2]
+    solver = loaded(constants, states, device=device)
+    for substeps in (3, 17, 25, 20, 5):
+        solver.advance(substeps)
+    programmed = snapshot(solver)
+    health = solver.health()
+    resting = [dataclasses.replace(state, wall_velocity=np.zeros((4, 2))) for state in states]
+    by_hand = loaded(constants, resting, device=device, copy=1)
+    for frame in range(1, 8):
+        rows = [state.wall_velocity[min(frame, len(state.wall_velocity) - 1)] for state in states]
+        by_hand.move_walls(np.stack(rows).astype(np.float32))
+        by_hand.advance(10)
+    for name, values in snapshot(by_hand).items():
+        np.testing.assert_array_equal(values, programmed[name], err_msg=name)
+    assert np.abs(programmed["velocity"]).max() > 0.01
+    assert health[0].max_speed > 0.0
+
+
+def test_extremes_of_an_advance_span_its_frames() -> None:
+    """A wall that is fast in the first of three frames only shows in the health of the whole advance."""
+    constants = parameters(substeps_per_frame=20)
+    state = scenario(constants, seed=3, viscosity=1e-2)
+    program = np.zeros((4, 4, 2))
+    program[1, 3, 0] = 0.5
+    state = dataclasses.replace(state, wall_velocity=program)
+    solver = loaded(constants, [state])
+    solver.advance(60)
+    fastest = solver.health()[0].max_speed
+    solver.load([state])
+    solver.advance(20)
+    first = solver.health()[0].max_speed
+    solver.advance(40)
+    assert solver.health()[0].max_speed < first == fastest

@@ -23,7 +23,7 @@ from lagbench.errors import DataError, LagbenchError, UnreadableFileError, Usage
 from lagbench.exchange import adopt, local_split
 from lagbench.exchange.adoption import _by_subset
 from lagbench.exchange.local_split import LocalSplit
-from lagbench.exchange.measure import Measure, estimate_spacing
+from lagbench.exchange.trajectory import Measure, estimate_spacing
 
 BASIC: dict[str, Any] = {"radius": 0.1, "frame_interval": 0.25}
 

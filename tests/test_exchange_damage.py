@@ -5,6 +5,7 @@ from __future__ import annotations
 import codecs
 import contextlib
 import json
+import resource
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from exchange_readers import straight_runs
 from exchange_writers import METADATA, write_gns, write_h5
 
 from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError
-from lagbench.exchange import import_split, inflation
+from lagbench.exchange import import_split, trajectory
 
 
 class _Trap:
@@ -75,10 +76,10 @@ MANY = [np.zeros(1)] * 4
         ),
         (
             _Reduced(np.float64(0).__reduce__()[0], (OBJECTS_WITHOUT_FLAGS, ADDRESSES[:8])),
-            "values of type 'O8'",
+            "wants to call",
         ),
         (_Reduced(np.ndarray, ((1 << 45,), np.dtype("f8"))), "make an array by itself"),
-        (_Reduced(codecs.encode, ("x", "punycode")), "encode a text as punycode"),
+        (_Reduced(codecs.encode, ("x", "punycode")), "wants to call"),
         ("text", "holds a str"),
         (MANY, "holds a list"),
     ],
@@ -93,9 +94,58 @@ def test_no_pickle_gets_at_memory(tmp_path: Path, item: Any, words: str) -> None
         import_split(source, format="gns-npz", output=tmp_path / "own", allow_pickle=True)
 
 
+@pytest.mark.parametrize(
+    "program",
+    [
+        b"\x80\x04Nr\xf0\xff\xff\xff.",  # remembers nothing, under the number 4294967280
+        b"\x80\x04\x8e" + (1 << 40).to_bytes(8, "little") + b"short.",  # announces a terabyte
+        b"\x80\x04\x8e" + b"\xff" * 8 + b".",
+        b"\x80\x04(" * 99 + b".",  # marks that nothing ends
+        b"\x80\x04" + b"]" * (1 << 25) + b".",  # lists, 56 bytes for each byte
+    ],
+)
+def test_no_pickle_reserves_memory(tmp_path: Path, program: bytes) -> None:
+    """What a pickle announces and does not hold is refused before anything is reserved for it."""
+    source = write_gns(tmp_path / "in", straight_runs(3))
+    with (
+        zipfile.ZipFile(source / "train.npz", "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
+        archive.open("simulation_0.npy", "w") as stream,
+    ):
+        header = {"descr": "|O", "fortran_order": False, "shape": (2,)}
+        np.lib.format.write_array_header_1_0(stream, header)
+        stream.write(program)
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    mapped = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (mapped + (1 << 30), hard))
+    try:
+        with pytest.raises(UnreadableFileError) as caught:
+            import_split(source, format="gns-npz", output=tmp_path / "own", allow_pickle=True)
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+    assert "MemoryError" not in str(caught.value)
+
+
+def test_filters_upon_filters_are_refused(tmp_path: Path) -> None:
+    """Deflated four times, a chunk of a few hundred bytes would fill the memory on its way."""
+    source = write_h5(tmp_path / "in", straight_runs(3))
+    with h5py.File(source / "train.h5", "w") as file:
+        group = file.create_group("00000")
+        group["particle_type"] = np.zeros(40, int)
+        created = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        created.set_chunk((1, 40, 2))
+        for _ in range(4):
+            created.set_deflate(9)
+        space = h5py.h5s.create_simple((12, 40, 2))
+        stored = h5py.h5d.create(group.id, b"position", h5py.h5t.IEEE_F32LE, space, dcpl=created)
+        h5py.Dataset(stored)[:] = straight_runs(1)[0]
+    with pytest.raises(UnreadableFileError) as caught:
+        import_split(source, format="lagrangebench-h5", output=tmp_path / "own")
+    assert "position" in str(caught.value.where)
+
+
 def test_a_file_that_unpacks_to_far_more_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A member of 8 MB of zeros in 8 kB of npz, and arrays of 10^11 particles in an empty HDF5 file."""
-    monkeypatch.setattr(inflation, "HARMLESS", 1 << 20)
+    monkeypatch.setattr(trajectory, "HARMLESS", 1 << 20)
     source = write_gns(tmp_path / "in", straight_runs(3))
     with (
         zipfile.ZipFile(source / "train.npz", "w", zipfile.ZIP_DEFLATED) as archive,

@@ -20,6 +20,7 @@ WHOLE = replace(
 )
 
 SMALL: dict[str, dict[str, Any]] = {
+    "neuralmpm": {"cells": 8, "width": 4, "materials": [0, 1, 2, 3]},
     "mlp": {"widths": [4]},
     "lstm": {"latent": 4, "decoder": [4]},
     "lstm-mlp": {"latent": 4, "decoder": [4]},
@@ -30,6 +31,7 @@ SMALL: dict[str, dict[str, Any]] = {
 
 LARGE: dict[str, dict[str, Any]] = {
     "mlp": {"widths": [10**7, 10**7]},
+    "neuralmpm": {"width": 4 * 10**5},
     "var": {"lags": 10**9},
     "var-stable": {},
 }

@@ -285,6 +285,38 @@ def test_an_error_leaves_nothing_behind(tmp_path: Path) -> None:
     assert list(path.parent.iterdir()) == [path]
 
 
+def test_what_is_known_at_last_is_hashed_like_what_is_known_at_first(tmp_path: Path) -> None:
+    """A parameter stated after the frames gives the file that has it from the start."""
+    frames = frames_of(3, 4, 8)
+    digests = []
+    for place, (first, last) in enumerate([({"a": 1, "b": 2}, {}), ({"a": 1}, {"b": 2})]):
+        path = tmp_path / f"{place}.nc"
+        writer = ScenarioWriter(
+            path,
+            KEY,
+            particles=8,
+            frames=4,
+            frame_interval=0.1,
+            material=np.zeros(8),
+            particle_mass=1.0,
+            parameters=first,
+            seed="s",
+            device="cpu",
+            generator="g",
+        )
+        with writer:
+            for position in frames:
+                writer.append(position, -position)
+            with pytest.raises(DataError):
+                writer.state(seed=1)
+            writer.state(**last)
+        digests.append(writer.content_sha256)
+        assert check_scenario(path) == writer.content_sha256
+        with read_scenario(path) as file:
+            assert file.header.parameters == {"a": 1, "b": 2}
+    assert digests[0] == digests[1]
+
+
 def test_incomplete_files_do_not_appear(tmp_path: Path) -> None:
     """Fewer frames than announced is an error that names the variable; no file appears."""
     path = scenario_path(tmp_path, KEY)

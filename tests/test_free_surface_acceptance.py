@@ -145,11 +145,7 @@ def test_sound_stays_within_a_cell(size: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("split", "scenario_id"), EVERY)
 def test_energy_falls(split: str, scenario_id: int) -> None:
-    """Energy never rises above its running minimum by 2 % of what was dissipated; motion dies out.
-
-    One scenario of multimaterial, id 22, still has its jelly ball bouncing at frame 600 (0.053 of
-    the peak); it is not among these (docs/acceptance.md).
-    """
+    """Energy never rises above its running minimum by 2 % of what was dissipated; motion dies out."""
     run = history(split, "full", scenario_id, 600)
     rise = (run.total - np.minimum.accumulate(run.total)).max()
     assert rise <= 0.02 * (run.total[0] - run.total.min())
@@ -183,7 +179,7 @@ def test_settled_liquid(split: str, scenario_id: int) -> None:
     width = 1.0 - 2.0 * low
     column = np.clip((run.position[:, 0] - low) / width * columns, 0, columns - 1).astype(int)
     top = np.array([np.quantile(run.position[column == c, 1], 0.98) for c in range(columns)]) - low
-    np.testing.assert_allclose(top, run.state.area / width, rtol=0.2)
+    np.testing.assert_allclose(top, run.state.area / width, rtol=0.25)
     below = low + top[column] - run.position[:, 1]
     deep = below > 2.0 * cell
     density = relative_density(run.position, run.state.area, p)[deep]

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from conftest import SIZE, SPLIT
@@ -16,10 +17,12 @@ from independent_hash import content_hash, dumps
 
 from lagbench.data.manifest import read_manifest
 from lagbench.data.registry import Registry, load
-from lagbench.data.scenario import read_scenario
+from lagbench.data.scenario import check_scenario, read_scenario
+from lagbench.errors import DataError
 from lagbench.generators.batch import draw, substeps_of
 from lagbench.generators.draws import generator
-from lagbench.generators.simulate import nudge
+from lagbench.generators.simulate import active_frames, nudge
+from lagbench.generators.split import WALLS
 from lagbench.make.generate import GenerationResult, generate
 from lagbench.make.plan import estimate, select
 from lagbench.work.progress import Progress
@@ -27,7 +30,7 @@ from lagbench.work.progress import Progress
 
 def folder_of(root: Path) -> Path:
     """Return the folder of the tiny data set."""
-    return root / SPLIT / SIZE / "v1"
+    return root / SPLIT / SIZE / "v2"
 
 
 def contents(root: Path) -> dict[str, bytes]:
@@ -80,15 +83,56 @@ def test_a_file_holds_what_its_scenario_says(generated: GenerationResult, unmeas
     np.testing.assert_array_equal(material, state.material)
     words = [int(word) for word in header.seed.split(", ")]
     again = np.random.Generator(np.random.PCG64(np.random.SeedSequence(words)))
-    assert again.random() == generator(SPLIT, SIZE, 1, 3).random()
+    assert again.random() == generator(SPLIT, SIZE, 2, 3).random()
     assert header.parameters["frequency"] == 2
-    assert header.parameters["start_substep"] == 0
+    assert header.parameters["start_frame"] == 0
     assert header.parameters["modulus"] == size.value("modulus")
+
+
+def test_cavity_files_hold_the_walls_of_every_frame(tmp_path: Path, unmeasured: Registry) -> None:
+    """Row f of ``wall_velocity`` is what the program says of frame f, counted from where recording starts."""
+    generate("cavity", "tiny", scenarios="3", root=tmp_path, registry=unmeasured)
+    size = unmeasured.size("cavity", "tiny")
+    state = draw(size, 3)
+    with read_scenario(tmp_path / "cavity" / "tiny" / "v2" / "test" / "0003.nc") as file:
+        walls, start = file.read("wall_velocity"), file.header.parameters["start_frame"]
+        assert "active_frames" not in file.header.parameters
+    assert start == state.start_frame
+    np.testing.assert_array_equal(walls, state.wall_velocity[-26:].astype(np.float32))
+    assert len(np.unique(walls[:, WALLS.index(str(state.parameters["wall"]))], axis=0)) > 13
+
+
+def test_active_frames_end_when_little_energy_is_left() -> None:
+    """Two frames given, six to predict: the last above 1 % counts, later peaks beyond the horizon do not."""
+    task = load().size("fluid", "tiny").task.model_copy(update={"input_frames": 2, "horizon": 6})
+    assert active_frames([1.0, 2.0, 1.0, 0.5, 0.3, 0.1, 0.05, 0.02, 90.0], task) == 6
+    assert active_frames([1.0, 2.0, 1.0, 0.5, 0.0199, 0.1, 0.0199, 0.0, 0.5], task) == 4
+    assert active_frames([1.0, 0.001, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], task) == 0
+
+
+@pytest.mark.parametrize("split", ["fluid", "multimaterial"])
+def test_active_frames_stand_in_the_file_and_its_hash(
+    split: str, tmp_path: Path, unmeasured: Registry
+) -> None:
+    """They follow from the stored velocities; another number is another content hash."""
+    generate(split, "tiny", subset="test", root=tmp_path, registry=unmeasured)
+    task = unmeasured.size(split, "tiny").task
+    for path in sorted((tmp_path / split / "tiny" / "v2" / "test").glob("*.nc")):
+        with read_scenario(path) as file:
+            energy = (file.read("velocity").astype(np.float64) ** 2).sum(axis=(1, 2))
+            stated = file.header.parameters["active_frames"]
+        span = energy[: task.input_frames + task.horizon]
+        assert stated == np.flatnonzero(span >= 0.01 * span.max())[-1] + 1 - task.input_frames
+        check_scenario(path)
+        with h5py.File(path, "r+") as raw:
+            raw.attrs.modify("active_frames", stated + 1)
+        with pytest.raises(DataError, match="attributes differ"):
+            check_scenario(path)
 
 
 def test_facts_of_the_manifest_follow_from_the_files(generated: GenerationResult) -> None:
     """Energies are sums over the stored velocities; speed, CFL number and J stay in their bounds."""
-    manifest = read_manifest(generated.root, SPLIT, SIZE, 1)
+    manifest = read_manifest(generated.root, SPLIT, SIZE, 2)
     assert manifest is not None
     for entry in manifest.files:
         with read_scenario(generated.folder / entry.path) as file:
@@ -106,7 +150,7 @@ def test_facts_of_the_manifest_follow_from_the_files(generated: GenerationResult
 
 def test_the_twin_starts_a_nudge_away(generated: GenerationResult, unmeasured: Registry) -> None:
     """One RMSE per predicted frame; after one frame it is still near 2^-20."""
-    manifest = read_manifest(generated.root, SPLIT, SIZE, 1)
+    manifest = read_manifest(generated.root, SPLIT, SIZE, 2)
     assert manifest is not None
     horizon = unmeasured.size(SPLIT, SIZE).task.horizon
     for entry in manifest.files:
@@ -122,7 +166,7 @@ def test_the_nudge_has_a_stream_of_its_own(unmeasured: Registry) -> None:
     assert set(np.unique(signs)) == {-1.0, 1.0}
     assert abs(signs.mean()) < 0.1
     assert not np.array_equal(signs, nudge(size, 4) * 2**20)
-    plain = generator(SPLIT, SIZE, 1, 3).random((size.particles, 2))
+    plain = generator(SPLIT, SIZE, 2, 3).random((size.particles, 2))
     assert not np.array_equal(signs > 0, plain >= 0.5)
 
 
@@ -215,16 +259,14 @@ def test_progress_ends_at_its_total(tmp_path: Path, unmeasured: Registry) -> Non
     assert simulating[-1].scenarios_done == 1
 
 
-def test_batches_start_each_scenario_at_its_own_substep(tmp_path: Path, unmeasured_path: Path) -> None:
-    """Three cavities that start at 3, 6 and 30 substeps or so: one batch and single runs, equal hashes."""
-    registry = varied(
-        unmeasured_path, tmp_path / "own.yaml", "start_time_max: {value: 120.0", "start_time_max: {value: 0.4"
-    )
-    options = {"scenarios": "0-2", "registry": registry}
+def test_batches_start_each_scenario_at_its_own_frame(tmp_path: Path, unmeasured: Registry) -> None:
+    """Three cavities with programs and starts of their own: one batch and single runs, equal hashes."""
+    size = unmeasured.size("cavity", "tiny")
+    options = {"scenarios": "0-2", "registry": unmeasured}
     one = generate("cavity", "tiny", root=tmp_path / "cpu", workers=2, **options)  # type: ignore[arg-type]
     generate("cavity", "tiny", root=tmp_path / "parallel", device="parallel", **options)  # type: ignore[arg-type]
-    assert len({draw(registry.size("cavity", "tiny"), i).start_substep for i in range(3)}) == 3
-    manifests = [read_manifest(tmp_path / device, "cavity", "tiny", 1) for device in ("cpu", "parallel")]
+    assert len({draw(size, i).start_frame for i in range(3)}) == 3
+    manifests = [read_manifest(tmp_path / device, "cavity", "tiny", 2) for device in ("cpu", "parallel")]
     hashes = [[entry.content_sha256 for entry in manifest.files] for manifest in manifests if manifest]
     assert one.simulated == (0, 1, 2)
     assert hashes[0] == hashes[1]
@@ -245,10 +287,10 @@ def test_parallel_driver_gives_the_same_data_set(split: str, tmp_path: Path, unm
 def test_selection_by_subset_and_id(unmeasured: Registry) -> None:
     """Both narrow the choice; ids come back ascending and once."""
     size = unmeasured.size("multimaterial", "full")
-    assert select(size, subset="valid,test") == tuple(range(48, 60))
-    assert select(size, subset=["extra"], scenarios="61,60") == (60, 61)
+    assert select(size, subset="valid,test") == tuple(range(48, 72))
+    assert select(size, subset=["extra"], scenarios="73,72") == (72, 73)
     assert select(size, scenarios=[5, 3, 5]) == (3, 5)
-    assert len(select(size)) == 75
+    assert len(select(size)) == 87
 
 
 def test_estimates_add_up(unmeasured: Registry) -> None:
@@ -265,12 +307,12 @@ def test_estimates_add_up(unmeasured: Registry) -> None:
 WORKER = """
 import re, sys
 from pathlib import Path
-from lagbench.generators.batch import Job
+from lagbench.generators.batch import SimulationJob
 from lagbench.generators.simulate import simulate
 from lagbench.data.registry import load
 size = load(Path(sys.argv[1])).size(sys.argv[2], "full")
 short = size.model_copy(update={"frames": 3, "parameters": {**size.parameters}})
-simulate(Job(size=short, scenarios=(int(sys.argv[3]),), root=Path(sys.argv[4])), lambda units: None)
+simulate(SimulationJob(size=short, scenarios=(int(sys.argv[3]),), root=Path(sys.argv[4])), lambda units: None)
 heavy = {"xarray", "pandas", "matplotlib", "torch", "dask", "scipy"} & sys.modules.keys()
 # ru_maxrss would be that of the test process, from which this one was forked.
 peak = re.search(r"VmHWM:\\s+(\\d+) kB", Path("/proc/self/status").read_text())[1]
@@ -278,7 +320,7 @@ print(peak, sorted(heavy))
 """
 
 
-@pytest.mark.parametrize(("split", "scenario"), [("curl-noise", 50), ("multimaterial", 54)])
+@pytest.mark.parametrize(("split", "scenario"), [("curl-noise", 50), ("multimaterial", 54), ("cavity", 50)])
 def test_a_worker_stays_small(split: str, scenario: int, unmeasured_path: Path, tmp_path: Path) -> None:
     """Simulating and writing three frames of the full size takes at most 400 MB and no heavy library."""
     command = [sys.executable, "-c", WORKER, str(unmeasured_path), split, str(scenario), str(tmp_path)]

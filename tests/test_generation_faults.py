@@ -110,7 +110,7 @@ def test_a_disk_that_fills_up_leaves_whole_files_only(
     assert "free disk space" in str(caught.value)
     assert caught.value.exit_code == 5
     assert partial_files(small_disk) == []
-    manifest = read_manifest(small_disk, SPLIT, SIZE, 1)
+    manifest = read_manifest(small_disk, SPLIT, SIZE, 2)
     assert manifest is not None
     assert not manifest.complete
     assert [name for name in files(small_disk) if name.endswith(".nc")] == [
@@ -123,7 +123,7 @@ def test_a_worker_on_a_full_disk_names_the_file(tmp_path: Path, unmeasured: Regi
     if not Path("/dev/full").exists():
         pytest.skip("this system has no /dev/full")
     job = SimulationJob(size=unmeasured.size(SPLIT, SIZE), scenarios=(2,), root=tmp_path)
-    folder = tmp_path / SPLIT / SIZE / "v1" / "valid"
+    folder = tmp_path / SPLIT / SIZE / "v2" / "valid"
     folder.mkdir(parents=True)
     temporary_name(folder / "0002.nc").symlink_to("/dev/full")
     with pytest.raises(WorkFailedError) as caught:
@@ -145,12 +145,12 @@ def test_two_generations_at_once(tmp_path: Path, unmeasured: Registry, generated
             SPLIT, SIZE, root=tmp_path, workers=1, registry=unmeasured, on_wait=told.append
         )
 
-    with dataset_lock(tmp_path, SPLIT, SIZE, 1):
+    with dataset_lock(tmp_path, SPLIT, SIZE, 2):
         waiting = threading.Thread(target=second)
         waiting.start()
         while not told:
             time.sleep(0.01)
-        shutil.copytree(generated.folder, tmp_path / SPLIT / SIZE / "v1", dirs_exist_ok=True)
+        shutil.copytree(generated.folder, tmp_path / SPLIT / SIZE / "v2", dirs_exist_ok=True)
     waiting.join(timeout=60)
     assert f"process {os.getpid()} on" in told[0]
     assert results["second"].simulated == ()
@@ -219,7 +219,7 @@ def test_control_c_is_resumable(
     assert "interrupted" in errors
     assert "Traceback" not in errors
     assert partial_files(tmp_path) == []
-    manifest = read_manifest(tmp_path, SPLIT, SIZE, 1)
+    manifest = read_manifest(tmp_path, SPLIT, SIZE, 2)
     assert manifest is not None
     assert manifest.complete is False
     rest = generate(SPLIT, SIZE, root=tmp_path, workers=2, registry=unmeasured)
@@ -295,7 +295,7 @@ def test_other_bits_than_recorded_are_an_error(
     copied: Callable[[], Path], generated: GenerationResult, tmp_path: Path, unmeasured_path: Path
 ) -> None:
     """Against a registry with other hashes of one scenario, that scenario is made anew, and named."""
-    manifest = read_manifest(generated.root, SPLIT, SIZE, 1)
+    manifest = read_manifest(generated.root, SPLIT, SIZE, 2)
     assert manifest is not None
     from lagbench.generators.record import measured_values, replace_measured
 

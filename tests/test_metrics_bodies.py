@@ -14,7 +14,7 @@ from scipy.optimize import minimize_scalar
 
 from lagbench.metrics import METRICS, FramePair
 from lagbench.metrics.bodies import rigid_residual
-from lagbench.metrics.bonds import Bonds
+from lagbench.metrics.frame import Bonds
 
 ALL = ("liquid", "jelly", "snow", "rope")
 

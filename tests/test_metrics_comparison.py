@@ -10,9 +10,20 @@ import pytest
 import scipy.stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from statsmodels.stats.multitest import multipletests
 
 from lagbench.errors import UsageError
-from lagbench.metrics import METRICS, Score, bootstrap_interval, compare, shared_ranks, sign_flip_p
+from lagbench.metrics import (
+    METRICS,
+    Score,
+    bootstrap_interval,
+    compare,
+    differ,
+    holm,
+    resample,
+    sign_flip_p,
+    standings,
+)
 
 DIFFERENCES = st.lists(st.integers(-5, 5).map(float), min_size=1, max_size=9)
 
@@ -73,19 +84,52 @@ def test_too_few_or_too_many_scenarios(differences: list[float]) -> None:
         sign_flip_p(differences)
 
 
+def widening(freedom: float) -> float:
+    """Return Student's 97.5 % quantile over the normal one."""
+    return float(scipy.stats.t.ppf(0.975, freedom) / scipy.stats.norm.ppf(0.975))
+
+
 def test_interval_is_scipys_percentile_bootstrap() -> None:
-    """The same interval as scipy.stats.bootstrap but for its draws: within 5 % of the width."""
+    """SciPy's percentiles about the mean, stretched by sqrt(n/(n-1)) and Student's quantile."""
     x = np.random.default_rng(1).gamma(2.0, size=12)
     low, high = bootstrap_interval(x)
     theirs = scipy.stats.bootstrap(
         (x,), np.mean, n_resamples=20_000, method="percentile", rng=np.random.default_rng(2)
     ).confidence_interval
-    assert [low, high] == pytest.approx([theirs.low, theirs.high], abs=0.05 * (high - low))
+    stretch = math.sqrt(12 / 11) * widening(11)
+    expected = [x.mean() + stretch * (bound - x.mean()) for bound in (theirs.low, theirs.high)]
+    assert [low, high] == pytest.approx(expected, abs=0.05 * (high - low))
 
 
-def test_interval_of_two_by_enumeration() -> None:
-    """Of values 0 and 1 a quarter of the resamples are all 0, a quarter all 1: the interval is [0, 1]."""
-    assert bootstrap_interval([0.0, 1.0]) == (0.0, 1.0)
+def test_the_two_way_bootstrap_of_a_closed_case() -> None:
+    """For value = a_s + b_i the variance is var(a)/S + var(b)/N, and so is that of the draws."""
+    seeds, scenarios = np.array([0.0, 1.0, 5.0]), np.array([1.0, 2.0, 4.0, 4.0, 9.0, 10.0])
+    found = resample(seeds[:, None] + scenarios)
+    assert found is not None
+    parts = [np.var(seeds, ddof=1) / 3, np.var(scenarios, ddof=1) / 6]
+    assert found.mean == pytest.approx(2.0 + 5.0)
+    assert found.error**2 == pytest.approx(sum(parts))
+    assert np.var(found.deviations) == pytest.approx(sum(parts), rel=0.03)
+    # Satterthwaite: (v1 + v2)^2 / (v1^2 / 2 + v2^2 / 5)
+    assert found.freedom == pytest.approx(sum(parts) ** 2 / (parts[0] ** 2 / 2 + parts[1] ** 2 / 5))
+
+
+def test_the_two_way_bootstrap_holds_what_it_promises() -> None:
+    """Of 300 draws of 3 seeds and 16 scenarios, 95 % of the intervals hold the true mean."""
+    rng = np.random.default_rng(5)
+    held = 0
+    for _ in range(300):
+        a, b, rest = rng.normal(0, 0.3, (3, 1)), rng.normal(0, 1, 16), rng.normal(0, 0.3, (3, 16))
+        low, high = bootstrap_interval(a + b + rest)
+        held += low <= 0.0 <= high
+    assert held / 300 == pytest.approx(0.95, abs=0.04)
+
+
+def test_one_row_of_seeds_is_one_seed() -> None:
+    """With one seed the scenarios alone are drawn, whichever way they are given."""
+    x = [3.0, 1.0, 4.0, 1.0, 5.0, 9.0]
+    assert bootstrap_interval([x]) == bootstrap_interval(x)
+    assert bootstrap_interval(x, minus=[1.0] * 6) == pytest.approx([v - 1.0 for v in bootstrap_interval(x)])
 
 
 def test_intervals_repeat_and_scale() -> None:
@@ -96,6 +140,56 @@ def test_intervals_repeat_and_scale() -> None:
     assert bootstrap_interval([2 * v + 1 for v in x]) == pytest.approx((2 * low + 1, 2 * high + 1))
     assert bootstrap_interval([*x[:2], math.nan, *x[2:]]) == (low, high)
     assert low < np.mean(x) < high
+
+
+def test_differ_is_a_t_test_of_seeds_where_scenarios_do_not_matter() -> None:
+    """Methods whose seeds alone scatter: Welch's test of their means, by SciPy."""
+    a, b = np.array([1.0, 1.2, 1.5]), np.array([2.0, 2.6, 2.1, 2.9])
+    ours = differ(np.repeat(a[:, None], 12, axis=1), np.repeat(b[:, None], 12, axis=1))
+    assert ours == pytest.approx(scipy.stats.ttest_ind(a, b, equal_var=False).pvalue)
+
+
+def test_differ_is_a_paired_t_test_where_seeds_agree() -> None:
+    """Three equal seeds of each: SciPy's paired test over scenarios."""
+    a, b = np.random.default_rng(3).gamma(3.0, size=(2, 9))
+    ours = differ(np.tile(a, (3, 1)), np.tile(b, (3, 1)))
+    assert ours == pytest.approx(scipy.stats.ttest_rel(a, b).pvalue)
+
+
+def test_differ_with_one_seed_is_the_sign_flip_test() -> None:
+    """Weights against weights: exact over scenarios; a missing scenario is left out, five claim nothing."""
+    a, b = np.random.default_rng(3).gamma(3.0, size=(2, 9))
+    assert differ(a, b) == differ([a], [b]) == sign_flip_p(a - b)
+    a[2] = math.nan
+    assert differ(a, b) == sign_flip_p(np.delete(a - b, 2))
+    assert math.isnan(differ(a[3:8], b[3:8]))
+    with pytest.raises(UsageError):
+        differ(a, b[:4])
+
+
+def test_seeds_of_one_method_seldom_differ() -> None:
+    """Two draws of 3 seeds of the same method: at most 5 % of 400 pairs differ, with room for chance."""
+    rng = np.random.default_rng(11)
+    told = 0
+    for _ in range(400):
+        scenario = rng.normal(0, 1, 16)
+        one, two = (scenario + rng.normal(0, 0.2, (3, 1)) + rng.normal(0, 0.2, (3, 16)) for _ in range(2))
+        told += differ(one, two) < 0.05
+    assert told / 400 <= 0.05
+
+
+@settings(deadline=None)
+@given(st.lists(st.floats(0.0, 1.0), min_size=1, max_size=9))
+def test_holm_is_that_of_statsmodels(p: list[float]) -> None:
+    """The corrected p-values are those of statsmodels' step-down method."""
+    assert holm(p) == pytest.approx(multipletests(p, method="holm")[1].tolist())
+
+
+def test_holm_passes_over_what_is_not_claimed() -> None:
+    """NaN is not counted as a comparison and stays."""
+    first, second, third = holm([0.02, math.nan, 0.01])
+    assert (first, third) == (0.02, 0.02)
+    assert math.isnan(second)
 
 
 @pytest.mark.parametrize("values", [[], [1.0], [math.nan, 2.0]])
@@ -133,22 +227,47 @@ def test_direction_decides_who_is_better() -> None:
     assert nearer.difference == pytest.approx(-0.2)
 
 
-def test_ranks_are_shared_with_the_leader_only() -> None:
-    """Method b differs from a in two scenarios only (p = 0.5): it shares rank 1; c and d are 3 and 4."""
-    a = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
+def test_ranks_are_numbers_in_order() -> None:
+    """B differs from a in two scenarios only (p = 0.5): it cannot be told from the leader; c and d can.
+
+    c and d win no scenario: p = 2/64 each, times the comparisons left: 3 and 2 of three.
+    """
+    a = [float(v) for v in range(1, 10)]
     scores = {
         "d": score_of(*(v + 2.001 for v in a)),
         "c": score_of(*(v + 2 for v in a)),
-        "b": score_of(*a[:4], 5.5, 6.5),
+        "b": score_of(*a[:7], 8.5, 9.5),
         "a": score_of(*a),
     }
-    assert shared_ranks(scores) == {"a": 1, "b": 1, "c": 3, "d": 4}
+    found = standings(scores)
+    assert {name: place.rank for name, place in found.items()} == {"a": 1, "b": 2, "c": 3, "d": 4}
+    assert {name for name, place in found.items() if place.tied} == {"b"}
+    assert math.isnan(found["a"].p)
+    assert found["b"].p == 0.5
+    assert found["c"].p == found["d"].p == pytest.approx(3 * 2.0**-8)
 
 
 def test_ranks_without_significance_or_values() -> None:
-    """With two scenarios all share the lead; a method without a value comes last."""
+    """With two scenarios nobody can be told from the leader; a method without a value comes last."""
     scores = {"x": score_of(1.0, 1.0), "y": score_of(5.0, 5.0), "none": score_of(math.nan, math.nan)}
-    assert shared_ranks(scores) == {"x": 1, "y": 1, "none": 3}
+    found = standings(scores)
+    assert [(name, place.rank, place.tied) for name, place in found.items()] == [
+        ("x", 1, False),
+        ("y", 2, True),
+        ("none", 3, False),
+    ]
+
+
+def test_seeds_of_a_method_are_compared_together() -> None:
+    """Two seeds against one: means over seeds, number of seeds stated, p of the two-way test."""
+    seeds = [score_of(*(v + s for v in range(1, 8))) for s in (0.0, 1.0)]
+    other = score_of(*(v + 10.0 for v in range(1, 8)))
+    found = compare(seeds, other)
+    assert found.seeds == (2, 1)
+    assert found.difference == pytest.approx(-9.5)
+    values = [score.values for score in seeds]
+    assert found.p == differ(values, other.values)
+    assert found.interval == bootstrap_interval(values, minus=other.values)
 
 
 def test_observables_and_different_metrics_are_not_compared() -> None:

@@ -9,7 +9,6 @@ import pytest
 from metric_flows import Floats, lattice, pair_of, pairs_of, rollout, scenario_of, swirl
 
 from lagbench.metrics import METRICS, Score, aggregate, select, tally
-from lagbench.metrics.energy import energy_error
 
 
 def measured(name: str, *args: object, **kwargs: object) -> float:
@@ -50,7 +49,7 @@ def test_a_prediction_twice_as_fast_has_four_times_the_energy() -> None:
 
 def test_energy_error_has_a_floor() -> None:
     """E_true = 1, 0: the second frame is scaled by 1e-3, so an excess of 1e-4 there is 0.1."""
-    found = energy_error(np.array([0.5, 1e-4]), np.array([1.0, 0.0]))
+    found = METRICS["energy_error"].series(np.array([0.5, 1e-4]), np.array([1.0, 0.0]))
     np.testing.assert_allclose(found, [0.5, 0.1])
 
 

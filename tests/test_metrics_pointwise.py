@@ -47,7 +47,7 @@ def test_attribute_error_equals_that_of_standardised_arrays() -> None:
     mean, std = np.array([0.5, 0.4, 0.001, -0.002]), np.array(SETTING.attribute_std)
     z = (np.hstack([x, u]) - mean) / std
     z_predicted = (np.hstack([y, v]) - mean) / std
-    assert attribute_mse(pair_of(x, u, v, predicted_position=y)) == pytest.approx(
+    assert attribute_mse.measure(pair_of(x, u, v, predicted_position=y)) == pytest.approx(
         np.mean((z - z_predicted) ** 2)
     )
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.fft
 import scipy.stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -15,9 +16,8 @@ from metric_flows import lattice, pair_of, swirl
 from numpy.testing import assert_allclose
 
 from lagbench.metrics import METRICS, FramePair
-from lagbench.metrics.distributions import histograms, kl, normalised, wasserstein1
-from lagbench.metrics.reductions import frames_before_fall
-from lagbench.metrics.vorticity import pearson, slope
+from lagbench.metrics.distributions import energy_spectrum, histograms, kl, normalised, wasserstein1
+from lagbench.metrics.vorticity import frames_before_fall, pearson, slope
 
 VALUES = arrays(np.float64, 40, elements=st.floats(-1e3, 1e3).map(lambda v: round(v, 3)))
 
@@ -197,16 +197,75 @@ def test_wasserstein_grows_where_the_histogram_saturates() -> None:
 @pytest.mark.parametrize(
     ("correlations", "frames"),
     [
-        ([0.9, 0.85, 0.79, 0.95], 2.0),
-        ([0.9, math.nan, 0.5], 1.0),
-        ([0.8, 0.8], 2.0),
+        ([0.99, 0.96, 0.94, 0.99], 2.0),
+        ([0.99, math.nan, 0.5], 1.0),
+        ([0.95, 0.95], 2.0),
         ([0.1], 0.0),
-        ([0.9, math.nan], 1.0),
+        ([0.99, math.nan], 1.0),
     ],
 )
 def test_stable_frames_by_hand(correlations: list[float], frames: float) -> None:
-    """Frames before the first value under 0.8; undefined ones do not count, the threshold itself holds."""
+    """Frames before the first value under 0.95; undefined ones do not count, the threshold itself holds."""
     assert frames_before_fall(np.array(correlations)) == frames
+
+
+def test_nrmse_is_the_ratio_of_sums_over_frames() -> None:
+    """MSE 1, 9 over mean squares 4, 16: sqrt(10 / 20); the frame in which the truth rests counts too."""
+    metric = METRICS["vorticity_nrmse"]
+    mse, square = np.array([1.0, 9.0]), np.array([4.0, 16.0])
+    assert metric.over_frames(metric.series(mse, square)) == pytest.approx(math.sqrt(0.5))
+    still = metric.series(np.array([1.0, 9.0]), np.array([20.0, 0.0]))
+    assert metric.over_frames(still) == pytest.approx(math.sqrt(0.5))
+
+
+@pytest.mark.parametrize(("scale", "error"), [(0.0, 1.0), (1.0, 0.0), (1.5, 0.5), (-1.0, 2.0)])
+def test_nrmse_of_a_scaled_flow(scale: float, error: float) -> None:
+    """A flow turning ``s`` times as fast is off by |s - 1| of its own strength, whatever that is."""
+    metric = METRICS["vorticity_nrmse"]
+    mse, square = (np.array([v]) for v in measured(swirls(scale), "vorticity_mse", "vorticity_square_true"))
+    assert metric.over_frames(metric.series(mse, square)) == pytest.approx(error, abs=1e-12)
+
+
+@pytest.mark.parametrize("mode", [1, 3, 6])
+def test_the_spectrum_finds_a_cosine_in_its_shell(mode: int) -> None:
+    """cos(pi k x) has all its energy in shell k, and Parseval's sum of squares."""
+    nodes = 16
+    wave = np.cos(np.pi * mode * (np.arange(nodes) + 0.5) / nodes)
+    velocity = np.stack([np.tile(wave[:, None], (1, nodes)), np.zeros((nodes, nodes))], axis=-1)
+    energy = energy_spectrum(velocity)
+    assert energy[mode - 1] == pytest.approx(np.sum(velocity**2))
+    assert np.delete(energy, mode - 1) == pytest.approx(0.0, abs=1e-20)
+
+
+def test_the_spectrum_is_scipys_cosine_transform() -> None:
+    """Shell sums of squared DCT-II coefficients (orthonormal) of both components."""
+    velocity = np.random.default_rng(2).standard_normal((9, 12, 2))
+    power = np.sum(scipy.fft.dctn(velocity, axes=(0, 1), norm="ortho") ** 2, axis=-1)
+    shell = np.rint(np.hypot(*np.meshgrid(np.arange(9), np.arange(12), indexing="ij")))
+    expected = [power[shell == k].sum() for k in range(1, 9)]
+    assert_allclose(energy_spectrum(velocity), expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("scale", "decades"), [(1.0, 0.0), (10.0, 2.0), (0.1, 2.0), (0.0, 6.0)])
+def test_spectrum_error_is_in_decades_of_energy(scale: float, decades: float) -> None:
+    """Ten times the speed is a hundred times the energy in every shell; rest counts six decades."""
+    pair = replace(swirls(scale), frame=3)
+    assert measured(pair, "spectrum_error") == pytest.approx([decades], abs=1e-9)
+
+
+def test_the_spectrum_forgives_place_and_punishes_smoothing() -> None:
+    """A mirrored flow has the same energy at every scale; one that lost its small eddies has not."""
+    rng = np.random.default_rng(4)
+    x = lattice(40)
+    u = 0.01 * swirl(x) + 0.003 * rng.standard_normal(x.shape)
+    mirrored = u.reshape(40, 40, 2)[::-1].reshape(-1, 2) * [-1.0, 1.0]
+    smooth = 0.01 * swirl(x)
+    errors = [
+        measured(replace(pair_of(x, u, v, frames_of_interest=(2,)), frame=2), "spectrum_error")[0]
+        for v in (mirrored, smooth)
+    ]
+    assert errors[0] < 1e-9
+    assert errors[1] > 0.5
 
 
 def test_stable_frames_of_nothing_defined() -> None:

@@ -81,7 +81,7 @@ def test_a_scenario_of_an_opened_split_draws_what_its_file_draws(tmp_path: Path)
         write_swirl(tmp_path, "fluid", scenario, frames=frames, walls=None, parameters={"family": "disc"})
     split = open_split("fluid", subset="train", size="tiny", root=tmp_path)
     from_split = plot_frame(split.sel(scenario=0), -1, tmp_path / "split.png")
-    from_file = plot_frame(tmp_path / "fluid/tiny/v1/train/0000.nc", 3, tmp_path / "file.png")
+    from_file = plot_frame(tmp_path / "fluid/tiny/v2/train/0000.nc", 3, tmp_path / "file.png")
     assert from_split.read_bytes() == from_file.read_bytes()
 
 
@@ -133,7 +133,7 @@ def test_moving_walls_are_marked_and_point_where_they_slide(tmp_path: Path) -> N
     for name, walls in (("right", TOP_TO_THE_RIGHT), ("left", -TOP_TO_THE_RIGHT)):
         path = write_swirl(tmp_path / name, walls=walls)
         with open_recording(path) as recording, figure(2.0, 2.0) as page:
-            draw_walls(page.add_axes((0, 0, 1, 1)), recording)
+            draw_walls(page.add_axes((0, 0, 1, 1)), recording, 0)
             drawn[name] = pixels_of(page)
     side = drawn["right"].shape[0]
     band = int(0.025 * side)  # middle of the wall of tiny, which is 0.05 wide

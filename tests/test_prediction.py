@@ -12,7 +12,8 @@ import netCDF4
 import numpy as np
 import pytest
 import torch
-from simple_models import FACTS, Bursting, Drift, install
+from simple_models import FACTS, Bursting, Drift, State, install
+from torch import Tensor
 
 from lagbench.baselines import predict as prediction
 from lagbench.baselines.baseline import Batch
@@ -61,7 +62,7 @@ def run(
 def truth(root: Path) -> dict[int, np.ndarray]:
     """Return the positions of the test scenarios by id, read without our code."""
     found = {}
-    for file in sorted((root / "curl-noise/tiny/v1/test").glob("*.nc")):
+    for file in sorted((root / "curl-noise/tiny/v2/test").glob("*.nc")):
         with netCDF4.Dataset(file) as data:
             found[int(file.stem)] = np.asarray(data["position"][:], np.float64)
     return found
@@ -179,6 +180,23 @@ def test_a_diverging_scenario_leaves_others_alone() -> None:
     assert good.position.shape == bad.position.shape == (8, 3, 2)
 
 
+class Fleeing(Drift):
+    """A Drift whose particles go a box farther to the right in every frame."""
+
+    def advance(self, state: State) -> tuple[State, Tensor]:
+        """Advance by one frame."""
+        state, position = super().advance(state)
+        return state, position + torch.tensor([float(state[2] - 1), 0.0])
+
+
+def test_a_rollout_is_frozen_before_it_is_too_far(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the scorer would refuse is frozen within ten boxes, as what ceases to be finite is."""
+    found = roll_out(Fleeing.build({"start": 0.0}, FACTS), windows([0.9]), 30)[0]
+    assert found.diverged_at is not None
+    assert 8.0 < float(found.position.max()) < 10.6
+    assert torch.isfinite(found.position).all()
+
+
 def test_rollouts_keep_the_mode() -> None:
     """A model in training is rolled out without dropout, and is in training afterwards."""
     model = Drift.build({}, FACTS).train()
@@ -188,7 +206,7 @@ def test_rollouts_keep_the_mode() -> None:
 
 def test_validation_error(run: Predict, generated: GenerationResult) -> None:
     """The RMSE is the mean over scenarios of the root of the mean squared error, with bf16 weights."""
-    folder = generated.root / "curl-noise/tiny/v1/train"
+    folder = generated.root / "curl-noise/tiny/v2/train"
     model = Drift.build({"start": 1 / 3}, FACTS)
     found = validate(model, scenario_batch(sorted(folder.glob("*.nc")), slice(0, 10)))
     a = float(torch.tensor(1 / 3).bfloat16())
@@ -216,7 +234,7 @@ def test_only_the_given_frames_are_read(run: Predict, copied: Callable[[], Path]
     """With all later frames of test overwritten the predictions are the same."""
     root = copied()
     whole = run(name="a.nc", root=root)
-    for file in (root / "curl-noise/tiny/v1/test").glob("*.nc"):
+    for file in (root / "curl-noise/tiny/v2/test").glob("*.nc"):
         file.chmod(0o644)
         with netCDF4.Dataset(file, "r+") as data:
             data["position"][6:] = 0.5

@@ -23,7 +23,7 @@ RELEASED = Path(__file__).parent / "data" / "released_hashes.json"
 
 def manifest_of(root: Path) -> Manifest:
     """Return the manifest of the tiny data set."""
-    manifest = read_manifest(root, SPLIT, SIZE, 1)
+    manifest = read_manifest(root, SPLIT, SIZE, 2)
     assert manifest is not None
     return manifest
 
@@ -82,7 +82,7 @@ def test_recording_again_changes_no_byte(generated: GenerationResult, registry: 
     assert run(generated.root, registry) == 0
     assert registry.read_text() == first
     released = json.loads((registry.parent / "released.json").read_text())
-    assert released == {f"{SPLIT}/{SIZE}/v1": generated.dataset_sha256}
+    assert released == {f"{SPLIT}/{SIZE}/v2": generated.dataset_sha256}
 
 
 def test_numbers_are_floats_in_any_yaml(generated: GenerationResult) -> None:
@@ -104,7 +104,7 @@ def test_changed_bits_need_another_version(
     run(generated.root, registry)
     text = registry.read_text()
     registry.write_text(text.replace(str(generated.dataset_sha256), "0" * 64))
-    (registry.parent / "released.json").write_text(json.dumps({f"{SPLIT}/{SIZE}/v1": "0" * 64}))
+    (registry.parent / "released.json").write_text(json.dumps({f"{SPLIT}/{SIZE}/v2": "0" * 64}))
     capsys.readouterr()
     assert run(generated.root, registry) == 4
     message = capsys.readouterr().err
@@ -117,8 +117,8 @@ def test_changed_bits_need_another_version(
 def test_another_major_is_another_name(generated: GenerationResult, registry: Path) -> None:
     """A new MAJOR has an entry of its own beside the old one."""
     size = load(registry).size(SPLIT, SIZE)
-    assert released_name(size) == f"{SPLIT}/{SIZE}/v1"
-    assert released_name(size.model_copy(update={"version": "2.0.0"})) == f"{SPLIT}/{SIZE}/v2"
+    assert released_name(size) == f"{SPLIT}/{SIZE}/v2"
+    assert released_name(size.model_copy(update={"version": "3.0.0"})) == f"{SPLIT}/{SIZE}/v3"
 
 
 def test_incomplete_or_changed_data_are_not_recorded(
@@ -126,7 +126,7 @@ def test_incomplete_or_changed_data_are_not_recorded(
 ) -> None:
     """A file that is not the manifest's, no manifest, or a part of a data set: exit code 4."""
     root = copied()
-    folder = root / SPLIT / SIZE / "v1"
+    folder = root / SPLIT / SIZE / "v2"
     (folder / "test" / "0003.nc").write_bytes(b"other")
     assert run(root, registry) == 4
     assert "0003.nc" in capsys.readouterr().err

@@ -236,7 +236,7 @@ def test_scores_on_the_page_are_those_of_the_card(
     card = bench.card(path)
     page = write_report(tmp_path, [card], [path], root=bench.root, registry=bench.registry)
     reading = read_html(page.read_text("utf-8"))
-    ranked = [scores["vorticity_rmse"] for scores in card.scores.values()]
+    ranked = [scores[card.ranking] for scores in card.scores.values()]
     means = [element.text for element in reading.of_class("n")]
     intervals = [element.text for element in reading.of_class("ci")]
     assert means[:3] == [text(score.mean) for score in ranked]

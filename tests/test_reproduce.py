@@ -10,18 +10,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from reproduce_bench import NOISE, SIZE, SPLIT, pretend
+from reproduce_bench import NOISE, SIZE, SPLIT, markdown_rows, pretend
 from score_bench import ScoreBench
 
 from lagbench.baselines.reproduce import results
 from lagbench.baselines.reproduce.__main__ import main
-from lagbench.baselines.reproduce.catalogue import ITEMS
+from lagbench.baselines.reproduce.catalogue import FIGURES
+from lagbench.baselines.reproduce.drawing import opened
 from lagbench.baselines.reproduce.evidence import Evidence, Sources
-from lagbench.baselines.reproduce.plan import Plan
-from lagbench.baselines.reproduce.roster import EXPECTED, ROSTER
-from lagbench.baselines.reproduce.stage import staged
+from lagbench.baselines.reproduce.runs import Plan
+from lagbench.baselines.reproduce.thesis import EXPECTED, ROSTER
 from lagbench.data.grid import fields
-from lagbench.data.registry import Registry, load
+from lagbench.data.registry import Registry, Size, load
 from lagbench.make.generate import generate
 from lagbench.scoring.score_file import read_statistics
 
@@ -50,7 +50,7 @@ def plan(cavity: ScoreBench, runs: Path, tmp_path: Path) -> Plan:
 def test_runs_are_read_with_their_costs(plan: Plan) -> None:
     """Scores, hours, parameters and seconds are those of the files."""
     found = plan.evidence(SPLIT)
-    assert list(found.models()) == sorted(NOISE)
+    assert list(found.models) == sorted(NOISE)
     held = found.methods["gns"]
     direct = read_statistics(held.seeds[0].path).scores()["vorticity_mse"]
     assert held.at("vorticity_mse", 15) == pytest.approx(float(np.mean(direct.at(15))))
@@ -81,22 +81,19 @@ def test_the_board_comes_first(plan: Plan, tmp_path: Path) -> None:
     # another entry's solver may have run on another machine
     assert held["gat"].cost is not None
     assert held["gat"].cost.speed_up is None
-    (plan.home(SPLIT) / "gat-0" / "predictions.json").write_text(
-        json.dumps({"seconds_per_frame": 0.5, "device": "a core", "solver_seconds_per_frame": 0.05})
-    )
-    measured = Evidence(sources, SPLIT, SIZE).methods["gat"].cost
-    assert measured is not None
-    assert measured.speed_up == pytest.approx(0.1)
 
 
-def test_scores_of_other_data_are_left_out(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scores_of_other_data_are_left_out(runs: Path) -> None:
     """Where the registry records another hash than the score files hold, all of them are stale."""
-    recorded = load().size(SPLIT, SIZE)
-    assert recorded.measured is not None
-    measured = recorded.measured.model_copy(update={"dataset_sha256": "0" * 64})
-    other = recorded.model_copy(update={"measured": measured})
-    monkeypatch.setattr(Sources, "size", lambda *_: other)
-    found = Evidence(Sources(board=None, runs=plan.runs), SPLIT, SIZE)
+
+    class Elsewhere(Sources):
+        def size(self, split: str, size: str) -> Size:
+            held = load().size(split, size)
+            assert held.measured is not None
+            measured = held.measured.model_copy(update={"dataset_sha256": "0" * 64})
+            return held.model_copy(update={"measured": measured})
+
+    found = Evidence(Elsewhere(board=None, runs=runs), SPLIT, SIZE)
     assert not found.methods
     assert len(found.stale) == len(NOISE)
 
@@ -117,41 +114,50 @@ def sources(plan: Plan, tmp_path: Path) -> Sources:
     )
 
 
-def test_the_page_tells_what_there_is_and_what_is_missing(sources: Sources) -> None:
-    """Models stand best first, the thesis's numbers beside them, and the missing ones are listed."""
-    page = results.render(sources, ("tiny",))
-    rows = [line.split(" | ")[0].removeprefix("| ") for line in page.splitlines() if line.startswith("| ")]
-    first = rows.index("model")
-    assert rows[first + 2 : first + 5] == ["SuperGAT", "GAT", "GNS"]
+def test_the_page_tells_what_there_is(sources: Sources) -> None:
+    """Models stand best first with their skill, the thesis's numbers and their training beside them."""
+    page = results.render(sources, (SIZE,))
+    rows = markdown_rows(page.split(f"## {SPLIT} {SIZE}\n")[1], "seeds")
+    assert [row["model"] for row in rows[:3]] == ["SuperGAT", "GAT", "GNS"]
+    assert rows[0]["skill"] == "-"  # no floor was scored
     assert "0.007715" in page  # SuperGAT's MAE in Table 5.4
-    assert "- cavity tiny: 7 trainings, 14 CPU hours" in page
-    assert (
-        "- cavity tiny: SuperGAT with link loss, SuperGAT with link loss of weight 0, MLP and LSTM + MLP."
-        in page
-    )
-    assert "- fluid tiny: all models." in page
-    assert "with fewer than 6 scenarios nothing is claimed" in page
-    assert page == results.render(sources, ("tiny",))
+    (learned,) = (row for row in markdown_rows(page, "last doubling") if row["model"] == "GNS")
+    assert learned["epochs"] == "0.8"  # 40 steps of 2 of 100 windows
+    assert [learned[head] for head in ("validation at 1/4", "1/2", "1", "last doubling")] == [
+        *("4", "2", "0.5", "75 %")
+    ]
+    assert {row["the first is"] for row in markdown_rows(page, "the first is")} == {"too few scenarios"}
+    assert page == results.render(sources, (SIZE,))
 
 
-def test_a_training_without_scores_is_not_called_missing(plan: Plan, tmp_path: Path) -> None:
-    """A model whose record is committed and whose predictions were refused is told apart."""
+def test_what_is_missing_is_listed_with_its_command(plan: Plan, tmp_path: Path) -> None:
+    """Where entries are missing stands the command; a training whose predictions were refused is no gap."""
     (tmp_path / SPLIT / SIZE).mkdir(parents=True)
     (tmp_path / SPLIT / SIZE / "mlp-0.json").write_text("{}")
     sources = Sources(board=None, weights=tmp_path, runs=plan.runs, registry=plan.described)
-    page = results.render(sources, (SIZE,))
-    assert f"- {SPLIT} {SIZE}: MLP: trained, and refused by the scorer" in page
-    assert (
-        f"- {SPLIT} {SIZE}: SuperGAT with link loss, SuperGAT with link loss of weight 0 and LSTM + MLP."
-        in page
+    missing = results.render(sources, (SIZE,)).split("## Missing")[1].splitlines()
+    refused, absent = (
+        line for line in missing if line.startswith(f"- {SPLIT} {SIZE}: ") and "floors" not in line
     )
+    assert ROSTER["mlp"].label in refused
+    assert ROSTER["supergat-unlinked"].label in absent
+    for split in EXPECTED:
+        command = f"python -m lagbench.baselines.reproduce --size {SIZE} --split {split}"
+        assert sum(command in line for line in missing) == 1
 
 
-def test_the_page_works_without_anything(tmp_path: Path) -> None:
-    """No board and no runs: a page that says so."""
-    page = results.render(Sources(board=tmp_path / "board", weights=tmp_path, runs=None))
-    assert "No model has been scored yet." in page
-    assert page.count("all models") == 8
+@pytest.mark.parametrize("floor", [False, True])
+def test_the_page_works_without_entries(plan: Plan, tmp_path: Path, floor: bool) -> None:
+    """Nothing on the board, or floors alone: a page without claims that names the command for every size."""
+    if floor:
+        home = tmp_path / SPLIT / SIZE / "persistence-0"
+        shutil.copytree(plan.folder(SPLIT, "gns", 0), home)
+    sources = Sources(board=tmp_path / "board", weights=tmp_path, runs=tmp_path, registry=plan.described)
+    page = results.render(sources, (SIZE,))
+    for split in EXPECTED:
+        assert f"--size {SIZE} --split {split}" in page
+    assert "the first is" not in page
+    assert (f"## {SPLIT} {SIZE}" in page) is floor
 
 
 def test_a_stale_page_is_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -167,27 +173,30 @@ def test_a_stale_page_is_found(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert "stale" in capsys.readouterr().out
 
 
-def test_an_entry_that_is_none_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """An entry without predictions ends with exit code 3 and the file's name."""
+@pytest.mark.parametrize("text", ["name: gns", "[1]", "words", "predictions: 3"])
+def test_an_entry_that_is_none_is_named(
+    text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A file that is no entry ends with exit code 3 and its name."""
     entry = tmp_path / "board" / "submissions" / "cavity" / "mini" / "gns.yaml"
     entry.parent.mkdir(parents=True)
-    entry.write_text("name: gns\n")
+    entry.write_text(text)
     assert results.main(["-o", str(tmp_path / "r.md"), "--board", str(tmp_path / "board")]) == 3
     assert "gns.yaml" in capsys.readouterr().err
 
 
-def test_a_stage_shows_truth_and_prediction(plan: Plan, cavity: ScoreBench) -> None:
+def test_rollouts_show_truth_and_prediction(plan: Plan, cavity: ScoreBench) -> None:
     """Positions are those of the files, velocities their differences, fields the scorer's own."""
     scenario = cavity.size.subsets["test"][0]
     truth = cavity.truth(scenario).astype(float)
-    with staged(plan, SPLIT, scenario, ("supergat", "gns", "mlp")) as stage:
-        assert stage.names == ("supergat", "gns")  # mlp has no run
-        assert np.array_equal(stage.position("gns", 5), truth[5])  # given
-        assert not np.array_equal(stage.position("gns", 6), truth[6])
-        assert np.array_equal(stage.position("supergat", 9), truth[9])
-        pair = stage.pair("supergat", 15)
+    with opened(plan, SPLIT, scenario, ("supergat", "gns", "mlp")) as rollouts:
+        assert tuple(rollouts.predictions) == ("supergat", "gns")  # mlp has no run
+        assert np.array_equal(rollouts.position("gns", 5), truth[5])  # given
+        assert not np.array_equal(rollouts.position("gns", 6), truth[6])
+        assert np.array_equal(rollouts.position("supergat", 9), truth[9])
+        pair = rollouts.pair("supergat", 15)
         assert float(np.abs(pair.vorticity_residual).max()) == 0.0
-        scene = stage.scene("supergat", 6)
+        scene = rollouts.scene("supergat", 6)
         assert np.allclose(scene.displacement, truth[6] - truth[5], atol=0)
         again = fields(truth[15], truth[15] - truth[14], pair.truth.grid, full=pair.truth.full)
         assert np.array_equal(again.vorticity, pair.truth.fields.vorticity, equal_nan=True)
@@ -199,9 +208,9 @@ def test_every_figure_of_the_contract_is_there() -> None:
     wanted = {f"fig_{chapter}_{number}" for chapter, numbers in figures.items() for number in numbers}
     wanted |= {f"table_4_{number}" for number in (2, 3, 4, 5, 7, 8)} | {"table_3_1", "section_4_8_3"}
     wanted |= {f"table_5_{number}" for number in (1, 3, 4, 5)}
-    assert set(ITEMS) == wanted
-    for item in ITEMS.values():
-        for split, names in item.needs.items():
+    assert set(FIGURES) == wanted
+    for figure in FIGURES.values():
+        for split, names in figure.needs.items():
             assert set(names) <= set(EXPECTED[split])
     assert {name for names in EXPECTED.values() for name in names} <= set(ROSTER)
 
@@ -298,11 +307,11 @@ def test_everything_is_made_at_tiny(tmp_path: Path, unmeasured: Registry) -> Non
         generate(split, SIZE, root=root, workers=2, registry=unmeasured)
     places = ["--size", SIZE, "--root", str(root), "--runs", str(tmp_path / "runs"), "--device", "cpu"]
     short = [*places, "--threads", "1", "--set", "training.steps=2"]
-    frames = {name for name, item in ITEMS.items() if {"fluid", "multimaterial"} & set(item.splits)}
+    frames = {name for name, figure in FIGURES.items() if {"fluid", "multimaterial"} & figure.needs.keys()}
     # untrained networks of states start so far off that the validation refuses them
     near = ["--set", "model.target=change", "--only", ",".join(sorted(frames))]
     assert main([*short, *near], registry=unmeasured) == 0
-    assert main([*short, "--only", ",".join(sorted(ITEMS.keys() - frames))], registry=unmeasured) == 0
-    for name in ITEMS:
+    assert main([*short, "--only", ",".join(sorted(FIGURES.keys() - frames))], registry=unmeasured) == 0
+    for name in FIGURES:
         assert "no run" not in (folder / f"{name}.md").read_text()
     assert "| - |" not in (folder / "table_5_4.md").read_text().split("SciPy")[1].split("link")[0]

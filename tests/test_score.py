@@ -17,6 +17,7 @@ from lagbench.data.registry import Registry
 from lagbench.errors import ChecksFailedError, DataError, UnreadableFileError, UsageError, WorkFailedError
 from lagbench.make.generate import GenerationResult
 from lagbench.metrics import Direction
+from lagbench.scoring import score as scoring
 from lagbench.scoring.card import ScoreCard, digits
 from lagbench.scoring.scenario import SUBMISSION
 from lagbench.scoring.score import score
@@ -108,7 +109,7 @@ def test_json_says_what_the_card_says(standing: ScoreCard) -> None:
         "direction": "lower",
         "perfect": 0.0,
         "source": "Eq. 3.3, Table 5.4",
-        "summary": "root mean squared vorticity error over the counted nodes",
+        "summary": "Root mean squared vorticity error over the counted nodes",
     }
 
 
@@ -169,19 +170,33 @@ def test_order_of_scenarios_does_not_matter(bench: ScoreBench, standing: ScoreCa
 
 
 def test_a_wild_prediction_gets_finite_scores(bench: ScoreBench, tmp_path: Path) -> None:
-    """Positions of 1e30 saturate statistics; scores.json still is JSON without infinities."""
+    """Positions nine boxes away are scored and flagged; scores.json still is JSON without infinities."""
 
     def wild(truth: Any, n: int, h: int) -> Any:
         guess = np.array(straight(truth, n, h))
-        guess[h // 2 :] *= 1e30
+        guess[h // 2 :] += 9.0
         return guess
 
     card = bench.score(bench.submit(tmp_path / "predictions.nc", wild))
     entry = held(card)["rows"][SUBMISSION]["position_mse"]
     assert math.isfinite(entry["mean"])
-    assert entry["mean"] > 1e30
+    assert entry["mean"] > 40.0  # half of the frames are off by 9 along both axes
     assert {warning["check"] for warning in held(card)["warnings"]} >= {"in_domain", "max_displacement"}
     assert dict(held(card)["flags"])["physics"]["raised"]
+
+
+def test_what_was_validated_is_not_validated_again(
+    bench: ScoreBench, standing: ScoreCard, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same card, from the result of the validation; one of another file is refused."""
+    source = standing.files[0].parent / "predictions.nc"
+    found = validate(source, root=bench.root, require_truth=True, registry=bench.registry)
+    monkeypatch.setattr(scoring, "validate", None)
+    card = bench.evaluate(source, validated=found)
+    assert card.predictions_sha256 == found.sha256 == standing.predictions_sha256
+    assert card.as_json()["rows"] == standing.as_json()["rows"]
+    with pytest.raises(UsageError):
+        bench.evaluate(source.with_name("other.nc"), validated=found)
 
 
 def test_progress_reaches_its_total(bench: ScoreBench, standing: ScoreCard) -> None:
@@ -261,4 +276,4 @@ def test_optional_metrics_name_their_extra(bench: ScoreBench, standing: ScoreCar
         with pytest.raises(UsageError, match=r"lagbench\[transport\]"):
             bench.evaluate(source, extras=("transport",))
     else:
-        assert bench.evaluate(source, extras=("transport",)).submission["sinkhorn"].mean > 0.0
+        assert bench.evaluate(source, extras=("transport",)).submission["sinkhorn_pot"].mean > 0.0

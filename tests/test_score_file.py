@@ -165,7 +165,7 @@ def test_preview_shows_the_truth_beside_the_prediction(bench: ScoreBench, card: 
 def test_json_read_back(card: ScoreCard) -> None:
     """What compare needs comes back from scores.json: values per scenario, identity, ranking."""
     published = read_scores(card.files[0])
-    assert published.ranking == "vorticity_rmse"
+    assert published.ranking == "vorticity_nrmse"
     assert published.identity["method"] == card.header.method
     for row, scores in card.scores.items():
         for name, score in scores.items():

@@ -151,9 +151,23 @@ def test_walls_move_per_frame() -> None:
     given.wall_velocity[1] *= 3.0
     state = network(wall_velocity=True).start(given)
     assert state.wall_velocity is not None
-    torch.testing.assert_close(state.wall_velocity[0], torch.arange(1.0, 9.0).reshape(4, 2) / 200)
-    torch.testing.assert_close(state.wall_velocity[-1], 3.0 * state.wall_velocity[0])
+    torch.testing.assert_close(state.wall_velocity[0, 0], torch.arange(1.0, 9.0).reshape(4, 2) / 200)
+    torch.testing.assert_close(state.wall_velocity[1], 3.0 * state.wall_velocity[0])
     assert network().start(given).wall_velocity is None
+
+
+def test_a_step_sees_the_walls_of_the_next_frame() -> None:
+    """A predicted frame moves with its own wall velocity; after the last known one that stays."""
+    whole = batch(swirl(0, 8), walls=True)
+    assert whole.wall_velocity is not None
+    whole.wall_velocity.mul_(torch.arange(8.0)[:, None, None])
+    state = network(wall_velocity=True).start(whole.part(slice(6)))
+    seen = []
+    for _ in range(3):
+        assert state.wall_velocity is not None
+        seen.append(float(state.wall_velocity[0, 0, 0, 0]))
+        state = state.moved(state.position, state.velocity[:, -1])
+    assert seen == pytest.approx([6 * 0.005, 7 * 0.005, 7 * 0.005])
 
 
 def test_walls_that_rest_are_no_features() -> None:

@@ -8,11 +8,12 @@ import importlib
 import os
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
 import pytest
-from scenario_draws import EVERY, SPLITS, all_of, digest, draw, state_of
+from scenario_draws import EVERY, SIZES, SPLITS, all_of, digest, draw, state_of
 
 from lagbench.data import registry
 from lagbench.generators import draws
@@ -20,7 +21,7 @@ from lagbench.generators.split import ClosedBoxParameters
 
 GENERATORS = Path(draws.__file__).parent
 DRAWN = (
-    "draws", "lattice", "jets", "perlin", "shapes", "parameters", "cavity", "curl_noise", "fluid",
+    "draws", "lattice", "noise", "shapes", "constants", "cavity", "curl_noise", "fluid",
     "multimaterial",
 )  # fmt: skip
 
@@ -50,6 +51,38 @@ def test_scenarios_differ_and_repeat(split: str) -> None:
     assert len({digest(state) for state in states}) == len(states)
     again = draw(registry.load().size(split, "full"), 3)
     assert digest(again) == digest(state_of(split, "full", 3))
+
+
+@pytest.mark.parametrize("size", ["full", "mini"])
+@pytest.mark.parametrize(
+    ("split", "kind", "count"),
+    [
+        ("cavity", "wall", 20),
+        ("curl-noise", "frequency", 16),
+        ("fluid", "family", 16),
+        ("multimaterial", "pair", 16),
+    ],
+)
+def test_kinds_are_spread_evenly_over_test(split: str, kind: str, count: int, size: str) -> None:
+    """Every kind of scenario occurs in test, none more than once more often than another."""
+    entry = registry.load().size(split, size)
+    assert (len(entry.subsets["test"]), len(entry.subsets["valid"])) == (count, 8)
+    everywhere = {state.parameters[kind] for state in all_of(split, size)}
+    found = Counter(state_of(split, size, i).parameters[kind] for i in entry.subsets["test"])
+    assert found.keys() == everywhere
+    assert max(found.values()) - min(found.values()) <= 1
+
+
+@pytest.mark.parametrize("split", SPLITS)
+def test_boxes_of_all_sizes_are_one(split: str) -> None:
+    """Walls lie at 1/16 in the cavity and 1/32 on the free surface, whatever the grid, and bounds say so."""
+    place = {"cavity": 1 / 16, "fluid": 1 / 32, "multimaterial": 1 / 32}.get(split)
+    for name in SIZES:
+        entry = registry.load().size(split, name)
+        offset = 0.0 if split in ("fluid", "multimaterial") else 0.5
+        low = (entry.value("wall") + offset) / entry.grid
+        assert entry.bounds == ((low, 1 - low), (low, 1 - low))
+        assert place in (None, low)
 
 
 @pytest.mark.parametrize(("split", "size"), EVERY)

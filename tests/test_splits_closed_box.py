@@ -3,58 +3,93 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scenario_draws import all_of, changed, draw, neighbours, state_of
+from scipy.interpolate import CubicHermiteSpline
 
 from lagbench.data import registry
 from lagbench.errors import UsageError
 from lagbench.generators import draws, lattice
+from lagbench.generators.cavity import is_classic
 from lagbench.generators.split import WALLS
 
 
 def test_cavity_scenarios_draw_what_the_design_says() -> None:
-    """Ranges of speed, Reynolds number and start hold; all six sets of walls occur."""
+    """Ranges of speed, Reynolds number and start hold; a program covers all frames; fluid rests first."""
+    size = registry.load().size("cavity", "full")
+    fastest = size.value("speed_max")
     states = all_of("cavity")
-    factor = registry.load().size("cavity", "full").value("speed_factor")
-    keys = [tuple(s.parameters[k] for k in ("wall", "direction", "speed", "reynolds")) for s in states]
-    assert len(set(keys)) == 60
-    assert {wall for wall, *_ in keys} == {"left", "right", "bottom", "top", "left+right", "bottom+top"}
-    for state in states:
+    for scenario, state in zip(size.scenarios, states, strict=True):
         drawn = state.parameters
-        assert 0.06 * factor - 1e-6 <= float(drawn["speed"]) <= 0.16 * factor + 1e-6
         assert 20.0 <= float(drawn["reynolds"]) <= 400.0
-        assert 0 <= state.start_substep <= 60_000
-        # Re = U L / nu with L = 0.875 and mu = rho nu with rho = 1e-4.
-        assert float(drawn["speed"]) * 0.875 / state.viscosity == pytest.approx(drawn["reynolds"])
+        # Re = (U / 2) L / nu with L = 0.875 and mu = rho nu with rho = 1e-4.
+        assert 0.5 * fastest * 0.875 / state.viscosity == pytest.approx(drawn["reynolds"])
         assert drawn["dynamic_viscosity"] == pytest.approx(1e-4 * state.viscosity)
         assert state.area == 0.875**2
         assert not state.velocity.any()
+        assert 60 <= state.start_frame <= 120
+        assert state.wall_velocity.shape == (state.start_frame + size.frame_count(scenario), 4, 2)
+        assert np.abs(state.wall_velocity).max() <= fastest
+    assert len({state.start_frame for state in states}) > 30
+    assert len({drawn.parameters["reynolds"] for drawn in states}) == len(states)
+    speeds = np.abs(np.concatenate([s.wall_velocity[s.wall_velocity != 0.0] for s in states]))
+    assert speeds.max() > 0.98 * fastest
 
 
-def test_cavity_wall_velocity_is_what_its_words_say() -> None:
-    """Named walls slide along themselves at the drawn speed; the others rest."""
-    unit = {"right": (1, 0), "left": (-1, 0), "up": (0, 1), "down": (0, -1)}
+def test_cavity_walls_slide_along_themselves_and_never_meet_in_a_corner() -> None:
+    """The named walls move, the others rest; those that move together face each other."""
     for state in all_of("cavity"):
-        walls = str(state.parameters["wall"]).split("+")
-        words = str(state.parameters["direction"]).split("+")
-        expected = np.zeros((4, 2))
-        for wall, word in zip(walls, words, strict=True):
-            expected[WALLS.index(wall)] = np.multiply(unit[word], state.parameters["speed"])
-            assert (word in ("up", "down")) == (wall in ("left", "right"))
-        np.testing.assert_array_equal(state.wall_velocity, expected)
+        moving = {wall for wall, v in zip(WALLS, state.wall_velocity.swapaxes(0, 1), strict=True) if v.any()}
+        assert moving == set(str(state.parameters["wall"]).split("+"))
+        assert moving <= {"left", "right"} or moving <= {"bottom", "top"}
+        assert not state.wall_velocity[:, (0, 1, 2, 3), (0, 0, 1, 1)].any()
 
 
-def test_cavity_speed_factor_scales_every_speed() -> None:
-    """The one factor that tunes the velocity statistics multiplies all wall speeds."""
-    size = registry.load().size("cavity", "tiny")
-    one, two = (draw(changed(size, speed_factor=f), 2) for f in (1.0, 2.0))
-    np.testing.assert_allclose(two.wall_velocity, 2.0 * one.wall_velocity, atol=2.0**-19)
-    assert two.start_substep == one.start_substep
+def test_cavity_programs_are_hermite_splines_at_rest_in_their_knots() -> None:
+    """With knots every 25 frames, SciPy's spline that is flat in each is the program; signs alternate."""
+    size = changed(registry.load().size("cavity", "mini"), knot_gap_min=25, knot_gap_max=25)
+    for scenario in (0, 3, 4):
+        state = draw(size, scenario)
+        for speed in (s for s in state.wall_velocity.reshape(-1, 8).T if s.any()):
+            knots = np.arange(0, len(speed), 25)
+            spline = CubicHermiteSpline(knots, speed[knots], np.zeros(len(knots)))
+            frames = np.arange(knots[-1])
+            np.testing.assert_allclose(speed[: knots[-1]], spline(frames), atol=2.0**-20)
+            assert (np.sign(speed[knots][1:]) == -np.sign(speed[knots][:-1])).all()
+            assert len(np.unique(speed[knots])) == len(knots)
+
+
+def test_cavity_walls_differ_from_each_other() -> None:
+    """Two walls that move have programs of their own."""
+    for state in all_of("cavity"):
+        if state.parameters["wall"] == "bottom+top":
+            assert not np.array_equal(state.wall_velocity[:, 2, 0], state.wall_velocity[:, 3, 0])
+
+
+@pytest.mark.parametrize(("size", "expected"), [("full", 9), ("mini", 6)])
+def test_one_cavity_in_eight_is_the_classic(size: str, expected: int) -> None:
+    """There the lid rests, then keeps a speed, at the latest in the last given frame; train has all walls."""
+    tier = registry.load().size("cavity", size)
+    states = dict(zip(tier.scenarios, all_of("cavity", size), strict=True))
+    classic = {i: state for i, state in states.items() if state.parameters["motion"] == "constant"}
+    assert len(classic) == expected
+    assert {i for i in states if is_classic(i)} == classic.keys()
+    for state in classic.values():
+        speed = np.abs(state.wall_velocity).max(axis=2)
+        starts = np.argmax(speed > 0.0, axis=0)
+        for wall in np.flatnonzero(speed.any(axis=0)):
+            start = starts[wall]
+            assert state.start_frame - 15 <= start <= state.start_frame + 5
+            assert (speed[start:, wall] == speed[-1, wall]).all()
+            assert 0.5 * tier.value("speed_max") <= speed[-1, wall] <= tier.value("speed_max")
+    if size == "full":
+        train = Counter(state.parameters["wall"] for i, state in classic.items() if i < 48)
+        assert sorted(train.values()) == [1] * 6
 
 
 @given(st.integers(4, 3000), st.integers(0, 2**30))
@@ -72,14 +107,24 @@ def test_lattice_fills_the_box_evenly(count: int, scenario: int) -> None:
 
 
 def test_curl_noise_frequencies_follow_the_thesis() -> None:
-    """Eq. 5.55 with 4 to 13, subsets as the design lists them; tiny and mini cycle lower."""
+    """Eq. 5.55 with 4 to 13 at full; mini holds those that its grid resolves, tiny two."""
     size = registry.load().size("curl-noise", "full")
     found = {i: s.parameters["frequency"] for i, s in zip(size.scenarios, all_of("curl-noise"), strict=True)}
-    assert found == {i: i % 10 + 4 for i in range(60)}
-    assert [found[i] for i in size.subsets["test"]] == [4, 6, 8, 9, 11, 13]
-    assert [found[i] for i in size.subsets["valid"]] == [5, 7, 8, 10, 12, 13]
-    assert [s.parameters["frequency"] for s in all_of("curl-noise", "mini")[:6]] == [2, 3, 4, 5, 6, 2]
+    assert found == {i: i % 10 + 4 for i in size.scenarios}
+    assert [s.parameters["frequency"] for s in all_of("curl-noise", "mini")[:6]] == [2, 3, 4, 2, 3, 4]
     assert [s.parameters["frequency"] for s in all_of("curl-noise", "tiny")[:3]] == [1, 2, 1]
+
+
+def test_curl_noise_mini_has_one_vorticity() -> None:
+    """There the scale falls as frequency squared: 0.08 to 0.12 per frame at each; full has one scale."""
+    vorticity = defaultdict(list)
+    for state in all_of("curl-noise", "mini"):
+        vorticity[state.parameters["frequency"]].append(
+            0.1 * float(state.parameters["initial_vorticity_rms"])
+        )
+    assert sorted(vorticity) == [2, 3, 4]
+    assert all(0.08 < np.mean(values) < 0.12 for values in vorticity.values())
+    assert {state.parameters["scale"] for state in all_of("curl-noise")} == {0.0052}
 
 
 def test_curl_noise_velocity_gradient_is_traceless_to_the_bit() -> None:
@@ -108,7 +153,7 @@ def test_curl_noise_energy_grows_with_frequency() -> None:
     energy = np.array([float(s.parameters["initial_kinetic_energy"]) for s in states])
     for state, recorded in zip(states[:10], energy, strict=False):
         assert recorded == pytest.approx(0.5 * np.mean(np.sum(state.velocity**2, axis=1)), rel=1e-12)
-    mean = energy.reshape(6, 10).mean(axis=0)
+    mean = energy[:70].reshape(7, 10).mean(axis=0)
     assert (np.diff(mean) > 0).all()
     slope = np.polyfit(np.log(np.arange(4, 14)), np.log(mean), 1)[0]
     assert 1.6 < slope < 2.4

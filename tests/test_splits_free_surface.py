@@ -66,9 +66,9 @@ def test_fluid_families_follow_the_id() -> None:
     """The id modulo 4; ids 0 and 26 are the falling rectangle and circle of Table 4.8."""
     size = registry.load().size("fluid", "full")
     found = [s.parameters["family"] for s in all_of("fluid")]
-    assert found == ["falling-rectangle", "thrown", "falling-circle", "splash"] * 10
+    assert found == ["falling-rectangle", "thrown", "falling-circle", "splash"] * 13
     assert (found[0], found[26]) == ("falling-rectangle", "falling-circle")
-    assert Counter(found[i] for i in size.subsets["test"]) == dict.fromkeys(found[:4], 2)
+    assert Counter(found[i] for i in size.subsets["test"]) == dict.fromkeys(found[:4], 4)
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -108,7 +108,7 @@ def test_fluid_bodies_cover_their_area_in_one_piece() -> None:
 def test_fluid_splash_has_blobs_and_noise() -> None:
     """Neighbours share their blob's velocity; their difference is the noise, N(0, 0.5)."""
     differences, speeds = [], []
-    for scenario in range(3, 40, 4):
+    for scenario in range(3, 52, 4):
         state = state_of("fluid", "full", scenario)
         nearest = neighbours(state.position, 2)[1][:, 1]
         differences.append((state.velocity - state.velocity[nearest]).ravel())
@@ -116,17 +116,18 @@ def test_fluid_splash_has_blobs_and_noise() -> None:
         speeds.append(smooth - [0.0, 0.5])
     # Variance of a difference of two: 2 x 0.25, plus a little of the blend.
     assert np.std(np.concatenate(differences)) == pytest.approx(math.sqrt(0.5), rel=0.03)
-    assert 0.4 < np.std(np.concatenate(speeds)) < 0.8
+    # Where discs of N(0, 0.7) meet, their velocities are blended.
+    assert 0.3 < np.std(np.concatenate(speeds)) < 0.8
 
 
 def test_multimaterial_pairs_follow_the_id() -> None:
-    """The id modulo 6, in the order of Table 4.8; the test subset has each once."""
+    """The id modulo 6, in the order of Table 4.8; every pair occurs in test."""
     pairs = ["liquid-snow", "rope-snow", "rope-liquid", "snow-snow", "rope-jelly", "liquid-liquid"]
     for size in SIZES:
         entry = registry.load().size("multimaterial", size)
         found = {i: state_of("multimaterial", size, i).parameters["pair"] for i in entry.scenarios}
         assert found == {i: pairs[i % 6] for i in entry.scenarios}
-        assert sorted(found[i] for i in entry.subsets["test"]) == sorted(pairs)
+        assert {found[i] for i in entry.subsets["test"]} == set(pairs)
 
 
 def halves(state: InitialState, size: registry.Size) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -172,10 +173,10 @@ def test_multimaterial_shares_particles_and_areas() -> None:
 
 
 def test_multimaterial_friction_only_without_liquid() -> None:
-    """Coulomb friction 0.3 where no body is liquid, none otherwise, recorded either way."""
+    """Coulomb friction 0.05 where no body is liquid, none otherwise, recorded either way."""
     for state in all_of("multimaterial"):
         dry = "liquid" not in str(state.parameters["pair"])
-        assert state.friction == state.parameters["friction"] == (0.3 if dry else 0.0)
+        assert state.friction == state.parameters["friction"] == (0.05 if dry else 0.0)
 
 
 def test_multimaterial_bodies_move_towards_one_point() -> None:
@@ -186,7 +187,7 @@ def test_multimaterial_bodies_move_towards_one_point() -> None:
             approach = p[f"first_velocity_{axis}"] - p[f"second_velocity_{axis}"]
             apart = p[f"second_centre_{axis}"] - p[f"first_centre_{axis}"]
             assert approach == pytest.approx(p["attraction"] * apart, abs=4 * 2.0**-20)
-        assert np.abs(state.velocity).max() < 1.5
+        assert np.abs(state.velocity).max() < 2.5
 
 
 def test_multimaterial_gives_up_when_there_is_no_room() -> None:

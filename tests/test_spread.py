@@ -94,7 +94,7 @@ def test_cluster_gives_the_same_bytes_though_a_worker_is_killed(
         held = {name: Deadly(job, marker if name == first else None) for name, job in jobs.items()}
         return run.run_all(sit_after_dying_once, held, **options)
 
-    monkeypatch.setattr(score, "spread", killing)
+    monkeypatch.setattr(score, "run_all", killing)
     survived = bench.score(source, output_dir=tmp_path / "survived", scheduler=address)
     assert marker.exists()
     for card in (there, survived):
@@ -144,7 +144,7 @@ def test_a_killed_process_changes_nothing(
 
         return run.run_all(sit_after_dying_once, held, report=count, **options)
 
-    monkeypatch.setattr(score, "spread", killing)
+    monkeypatch.setattr(score, "run_all", killing)
     there = bench.score(source, output_dir=tmp_path / "there", workers=2)
     assert marker.exists()
     assert sum(counted) == 2 * bench.size.task.horizon

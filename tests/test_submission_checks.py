@@ -22,7 +22,7 @@ from lagbench.data.registry import Registry
 from lagbench.data.writer import scenario_path
 from lagbench.errors import ChecksFailedError, DataError, UnreadableFileError
 from lagbench.submission import Severity, ValidationResult, validate
-from lagbench.submission.guesses import guess_frames, guess_scenarios
+from lagbench.submission.task_checks import guess_frames, guess_scenarios
 from lagbench.submission.truth import Truth
 
 Values = NDArray[np.float32]
@@ -96,19 +96,23 @@ def test_a_jump_from_the_last_given_frame_is_flagged(bench: Bench) -> None:
 
 
 def test_the_limit_of_the_start_is_ten_displacements(bench: Bench) -> None:
-    """Scenarios moved by 0.9 and 1.1 times the limit at their first frame: the second is far."""
+    """Scenarios moved by 0.9 and 1.1 times the limit at their first frame: the second is flagged."""
     size = bench.registry.size("cavity", "tiny")
     source = Truth(size, bench.root)
     limit = 10 * source.largest_displacement(3, enough=np.inf)
+    flagged: list[list[float]] = []
     steps = np.diff(np.concatenate([source.given(3), truth(3)]).astype("f8"), axis=0)
     assert limit == pytest.approx(10 * np.sqrt((steps**2).sum(-1)).max())
-    for factor, far in ((0.9, False), (1.1, True)):
+    for factor in (0.9, 1.1):
 
         def edit(values: Values, factor: float = factor) -> Values:
             values[0] = source.given(3)[-1] + np.array([factor * limit, 0], np.float32)
             return values
 
-        assert (changed(bench, edit).exit_code == 1) == far
+        result = changed(bench, edit)
+        assert result.exit_code == 0
+        flagged.append([float(f.got) for f in result.warnings if f.check == "discontinuous_start"])
+    assert flagged == [[], [pytest.approx(1.1 * limit, rel=0.01)]]
 
 
 def test_scanning_the_truth_stops_when_it_knows_enough(bench: Bench) -> None:
@@ -135,7 +139,7 @@ def test_without_the_data_set_what_needs_no_truth_is_checked(bench: Bench, tmp_p
     elsewhere = replace(bench, root=tmp_path)
     result = elsewhere.validate(bench.valid)
     assert result.exit_code == 0
-    assert set(result.skipped) == {"start", "max_displacement"}
+    assert set(result.skipped) == {"start", "discontinuous_start", "max_displacement"}
     assert "lagbench generate --split cavity" in result.skipped["start"]
     required = elsewhere.validate(bench.valid, require_truth=True)
     assert required.exit_code == 4
@@ -157,7 +161,7 @@ def test_a_damaged_data_set_is_told_from_a_bad_submission(bench: Bench, tmp_path
     result = replace(bench, root=root).validate(bench.valid)
     assert result.exit_code == 4
     assert str(path) in result.errors[0].where
-    assert set(result.skipped) == {"start", "max_displacement"}
+    assert set(result.skipped) == {"start", "discontinuous_start", "max_displacement"}
 
 
 def test_without_a_recorded_hash_the_check_warns(unmeasured: Registry, bench: Bench, tmp_path: Path) -> None:

@@ -88,7 +88,7 @@ def same(first: Path, second: Path) -> bool:
 
 def train_positions(root: Path) -> list[np.ndarray]:
     """Return the positions of the train scenarios, read without our code."""
-    files = sorted((root / "curl-noise/tiny/v1/train").glob("*.nc"))
+    files = sorted((root / "curl-noise/tiny/v2/train").glob("*.nc"))
     found = []
     for file in files:
         with netCDF4.Dataset(file) as data:
@@ -123,7 +123,7 @@ def test_the_record(run: Run) -> None:
     assert list((result.folder / "tensorboard").iterdir())
 
 
-@pytest.mark.parametrize("baseline", ["supergat-link", "drift"])
+@pytest.mark.parametrize("baseline", ["supergat-link", "neuralmpm", "drift"])
 def test_resumed_equals_uninterrupted(run: Run, baseline: str, tmp_path: Path) -> None:
     """Interrupted twice and resumed, a training ends with the bits of an uninterrupted one."""
     settings = ("steps=7", "validate_every=3", "schedule=cosine")
@@ -218,7 +218,7 @@ def test_the_test_subset_is_never_read(run: Run, generated: GenerationResult, tm
     """Training and validation work where no test scenario is on the disk."""
     root = tmp_path / "root"
     shutil.copytree(generated.root, root)
-    shutil.rmtree(root / "curl-noise/tiny/v1/test")
+    shutil.rmtree(root / "curl-noise/tiny/v2/test")
     assert run("drift", "run", "steps=2", root=root).best_rmse is not None
 
 

@@ -30,12 +30,12 @@ Copy = Callable[[], Path]
 
 def file_of(root: Path, scenario: str = "test/0003") -> Path:
     """Return the path of a scenario file."""
-    return root / SPLIT / SIZE / "v1" / f"{scenario}.nc"
+    return root / SPLIT / SIZE / "v2" / f"{scenario}.nc"
 
 
 def manifest_of(root: Path) -> Manifest:
     """Return the manifest of the tiny data set."""
-    manifest = read_manifest(root, SPLIT, SIZE, 1)
+    manifest = read_manifest(root, SPLIT, SIZE, 2)
     assert manifest is not None
     return manifest
 

@@ -1,5 +1,6 @@
 """YAML from strangers: what is read, what is refused, and how it is said."""
 
+import math
 from pathlib import Path
 
 import pytest
@@ -43,6 +44,32 @@ def test_what_is_not_plain_is_refused(tmp_path: Path, text: str | bytes, says: s
     """Bombs, doubled keys, Python objects and broken text end in one clear error."""
     with pytest.raises(UnreadableFileError, match=says):
         read_yaml(_write(tmp_path, text))
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("59:59:59:1.5", "59:59:59:1.5"),
+        ("1:30", "1:30"),
+        (":".join(["59"] * 200) + ":1.5", ":".join(["59"] * 200) + ":1.5"),
+        ("1_000", "1_000"),
+        ("0b11", "0b11"),
+        ("010", 10),
+        ("0o10", 8),
+        ("-12", -12),
+        ("0xfF", 255),
+        ("1e-4", 1e-4),
+        ("2.", 2.0),
+        ("-.5E+1", -5.0),
+        ("-.inf", -math.inf),
+        ("1e999", math.inf),
+        ("yes", True),
+    ],
+)
+def test_numbers_are_those_of_yaml_1_2(tmp_path: Path, text: str, value: object) -> None:
+    """Base 60, underscores and binary are text, 010 is ten, an exponent needs no point."""
+    found = read_yaml(_write(tmp_path, f"a: {text}\n"))["a"]
+    assert (found, type(found)) == (value, type(value))
 
 
 def test_large_files_are_not_even_opened(tmp_path: Path) -> None:

@@ -1,38 +1,142 @@
-"""What is known of each trained model: scores, costs, training; from the leaderboard and from runs.
+"""What is known of each model: scores, costs, training; from the leaderboard and from runs.
 
-The committed files suffice: score files and entries of ``leaderboard/``, and what each training
-recorded, ``baselines/weights/<split>/<size>/<name>-<seed>.json``. Folders of runs,
-``runs/<split>/<size>/<name>-<seed>/``, add what is not committed yet. A *name* is that of a
-baseline, or of a baseline and a variant, as in ``gns-novorticity``.
+The committed files suffice: entries and score files of ``leaderboard/``, and what each training recorded,
+``<weights>/<split>/<size>/<name>-<seed>.json``. Folders of runs, ``runs/<split>/<size>/<name>-<seed>/``, add
+what is not committed yet. A *name* is that of a baseline, or of a baseline and a variant, as in
+``gns-novorticity``.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import re
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+import warnings
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from lagbench.data.registry import Registry, Size, load
 from lagbench.data.yamlfile import read_yaml
 from lagbench.errors import UnreadableFileError
 from lagbench.floors import FLOORS
+from lagbench.metrics import Score
+from lagbench.metrics.metric import mean
 from lagbench.scoring.score_file import NETCDF_NAME, read_statistics
+from lagbench.scoring.task import ranking_metric
 
-from .method import Cost, Method, Seeded
-
-__all__ = ["Evidence", "Sources", "read_json"]
+__all__ = ["BOARD", "WEIGHTS", "Cost", "Evidence", "Method", "Seeded", "Sources", "ordered", "read_json"]
 
 BOARD = Path("leaderboard")
 WEIGHTS = Path("baselines/weights")
-RUN = re.compile(r"([a-z0-9]+(?:-[a-z0-9]+)*?)-(\d+)")
-UNDER_WAY = ("running", "interrupted")
-"""States of a training that is not over."""
+"""Where committed weights and the records of their trainings lie; the one place that names it."""
 
+RUN = re.compile(r"([a-z0-9]+(?:-[a-z0-9]+)*?)-(\d+)")
 RECORD_NAME = "training.json"
 COST_NAME = "predictions.json"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cost:
+    """What a predicted frame costs."""
+
+    seconds_per_frame: float  # of the model [s]
+    device: str  # where it ran
+    solver_seconds_per_frame: float | None = (
+        None  # of the solver on the same machine [s]; None if not measured
+    )
+
+    @property
+    def speed_up(self) -> float | None:
+        """Solver time over model time; None where the solver was not measured."""
+        solver = self.solver_seconds_per_frame
+        return None if solver is None else solver / self.seconds_per_frame
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Seeded:
+    """One training of a model."""
+
+    seed: int | None  # None for what has none
+    scores: Mapping[str, Score]  # by metric
+    record: Mapping[str, Any]  # what training.json says; empty where it is not there
+    path: Path  # file of the scores
+
+    @property
+    def cpu_hours(self) -> float | None:
+        """Processor time of the training [h]."""
+        seconds = self.record.get("cpu_seconds")
+        return None if seconds is None else float(seconds) / 3600.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Method:
+    """A model with all its seeds."""
+
+    name: str  # as in gns or gns-novorticity
+    seeds: tuple[Seeded, ...]  # one per training
+    cost: Cost | None = None  # of a predicted frame; None where it was not measured
+    parameters: int | None = None  # trained numbers; None where unknown
+
+    @cached_property
+    def scores(self) -> Mapping[str, Score]:
+        """Scores by metric: the mean over the seeds that have a value, per scenario and frame."""
+        common = [n for n in self.seeds[0].scores if all(n in held.scores for held in self.seeds)]
+        return {name: _joined([held.scores[name] for held in self.seeds]) for name in common}
+
+    @property
+    def cpu_hours(self) -> float | None:
+        """Processor time of all trainings [h]; None where none was recorded."""
+        known = [hours for held in self.seeds if (hours := held.cpu_hours) is not None]
+        return sum(known) if known else None
+
+    def of_seeds(self, seeds: Collection[int | None]) -> Method:
+        """Return this model with the trainings of some seeds only."""
+        return replace(self, seeds=tuple(held for held in self.seeds if held.seed in seeds))
+
+    def spread(self, metric: str) -> float:
+        """Return the sample deviation over seeds of the mean over scenarios; NaN for one seed."""
+        means = [held.scores[metric].mean for held in self.seeds]
+        return float(np.std(means, ddof=1)) if len(means) > 1 else math.nan
+
+    def at(self, metric: str, frame: int, scenario: int | None = None) -> float:
+        """Return a metric at an absolute frame, of one scenario or the mean over all; NaN if not measured."""
+        if metric not in self.scores:
+            return math.nan
+        values = self.scores[metric].at(frame)
+        return (
+            mean(values) if scenario is None else float(values[self.scores[metric].scenarios.index(scenario)])
+        )
+
+    def over_horizon(self, metric: str, scenario: int) -> float:
+        """Return a metric of one scenario over the horizon; NaN if not measured."""
+        score = self.scores.get(metric)
+        return math.nan if score is None else float(score.values[score.scenarios.index(scenario)])
+
+
+def _joined(scores: Sequence[Score]) -> Score:
+    if len(scores) == 1:
+        return scores[0]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # undefined for all seeds: NaN
+        frames = np.nanmean([score.per_frame for score in scores], axis=0)
+        values = np.nanmean([score.values for score in scores], axis=0)
+    undefined = tuple(map(sum, zip(*(score.undefined for score in scores), strict=True)))
+    return replace(scores[0], per_frame=frames, values=values, undefined=undefined)
+
+
+def ordered(scores: Mapping[str, Score]) -> list[str]:
+    """Return names from the least mean loss to the greatest; undefined ones last."""
+
+    def loss(name: str) -> float:
+        value = scores[name].mean
+        return math.inf if math.isnan(value) else scores[name].metric.loss(value)
+
+    return sorted(scores, key=lambda name: (loss(name), name))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,6 +153,15 @@ class Sources:
         """Return what the registry says of a split and size."""
         return (self.registry or load()).size(split, size)
 
+    def entries(self, split: str, size: str) -> dict[str, Path]:
+        """Return the entries of the board by name."""
+        folder = self.board / "submissions" / split / size if self.board else None
+        return {path.stem: path for path in sorted(folder.glob("*.yaml"))} if folder else {}
+
+    def record(self, split: str, size: str, name: str, seed: int | None) -> Mapping[str, Any]:
+        """Return what a committed training recorded; nothing where it is not there."""
+        return read_json(self.weights / split / size / f"{name}-{seed or 0}.json")
+
     def run_folders(self, split: str, size: str) -> Iterator[tuple[str, int, Path]]:
         """Yield name, seed and folder of the runs of a size.
 
@@ -56,121 +169,127 @@ class Sources:
         """
         if self.runs is None:
             return
-        homes = {f"-{self.recipe}" if self.recipe else "": self.runs / split / self._home(size)}
+        home = self.runs / split
+        homes = {"": home / (f"{size}-{self.recipe}" if self.recipe else size)}
         if self.recipe is None:
-            homes |= {path.name[len(size) :]: path for path in sorted((self.runs / split).glob(f"{size}-*"))}
-        for recipe, home in homes.items():
-            for folder in sorted(home.glob("*-*")):
-                found = RUN.fullmatch(folder.name)
-                if found:
-                    yield found[1] + (recipe if self.recipe is None else ""), int(found[2]), folder
-
-    def _home(self, size: str) -> str:
-        return f"{size}-{self.recipe}" if self.recipe else size
+            homes |= {path.name[len(size) :]: path for path in sorted(home.glob(f"{size}-*"))}
+        for variant, folder in homes.items():
+            for run in sorted(folder.glob("*-*")):
+                if found := RUN.fullmatch(run.name):
+                    yield found[1] + variant, int(found[2]), run
 
 
 class Evidence:
     """What is known of the models on one split and size."""
 
     def __init__(self, sources: Sources, split: str, size: str) -> None:
-        """Read entries, score files and records."""
-        self.size = sources.size(split, size)  # what the registry says
-        # files of scores that belong to another version of the data, which are left out
-        self.stale: list[Path] = []
-        self._sources = sources
-        board = sources.board
-        entries = {path.stem: read_yaml(path) for path in self._entries(board)} if board else {}
-        found: dict[str, dict[int | None, Seeded]] = {}
-        costs: dict[str, Cost] = {}
-        for name, entry in entries.items():
-            for seed, path in _score_files(Path(board or ""), split, size, name, entry):
-                self._add(found, name, seed, path, self._record(name, seed))
-            costs |= _board_cost(name, entry)
-        for name, seed, folder in sources.run_folders(split, size):
-            path = folder / NETCDF_NAME
-            if path.is_file() and not {seed, None} & found.get(name, {}).keys():
+        """Read entries, score files and records; committed ones win over runs of the same seed."""
+        self.size = sources.size(split, size)
+        self.methods: dict[str, Method] = {}  # by name, floors among them
+        self.stale: list[Path] = []  # score files of another version of the data, which are left out
+        self._weights = sources.weights / split / size
+        for name, path in sources.entries(split, size).items():
+            entry = read_yaml(path)
+            files = list(_score_files(path, entry))  # refuses what is no entry
+            cost = Cost(**entry["cost"]) if entry.get("cost") else None
+            for seed, file in files:
                 self._add(
-                    found, name, seed, path, read_json(folder / RECORD_NAME) or self._record(name, seed)
+                    name, seed, file, sources.record(split, size, name, seed), cost, entry.get("parameters")
                 )
-                costs = _run_cost(name, folder) | costs
-        # models by name, floors among them
-        self.methods = {
-            name: Method(
-                name=name,
-                seeds=tuple(seeds.values()),
-                cost=costs.get(name),
-                parameters=_parameters(seeds.values(), entries.get(name)),
-            )
-            for name, seeds in found.items()
-        }
-
-    def floors(self) -> dict[str, Method]:
-        """Return the floors that were scored."""
-        return {name: method for name, method in self.methods.items() if name in FLOORS}
-
-    def models(self) -> dict[str, Method]:
-        """Return everything else, in the order of names."""
-        return {name: self.methods[name] for name in sorted(self.methods) if name not in FLOORS}
-
-    def trained(self, name: str) -> bool:
-        """Return whether there is a record of a training, with scores or without."""
-        folder = self._sources.weights / self.size.split / self.size.name
-        return any(folder.glob(f"{name}-[0-9]*.json"))
-
-    def _entries(self, board: Path) -> list[Path]:
-        return sorted((board / "submissions" / self.size.split / self.size.name).glob("*.yaml"))
+        committed = {(name, held.seed) for name, method in self.methods.items() for held in method.seeds}
+        for name, seed, folder in sources.run_folders(split, size):
+            file = folder / NETCDF_NAME
+            if file.is_file() and not {(name, seed), (name, None)} & committed:
+                record = read_json(folder / RECORD_NAME) or sources.record(split, size, name, seed)
+                self._add(name, seed, file, record, _run_cost(folder))
 
     def _add(
         self,
-        found: dict[str, dict[int | None, Seeded]],
         name: str,
         seed: int | None,
         path: Path,
         record: Mapping[str, Any],
+        cost: Cost | None,
+        parameters: int | None = None,
     ) -> None:
-        stored = read_statistics(path)
-        measured = self.size.measured
+        """Add one training to a method, unless its scores are of other data."""
+        stored, measured = read_statistics(path), self.size.measured
         if measured and stored.identity["dataset_sha256"] != measured.dataset_sha256:
             self.stale.append(path)
             return
-        held = Seeded(seed=seed, scores=stored.scores(), record=record, path=path)
-        found.setdefault(name, {})[seed] = held
+        known = self.methods.get(name) or Method(name=name, seeds=())
+        self.methods[name] = Method(
+            name=name,
+            seeds=(*known.seeds, Seeded(seed=seed, scores=stored.scores(), record=record, path=path)),
+            cost=known.cost or cost,
+            parameters=known.parameters or record.get("parameters") or parameters,
+        )
 
-    def _record(self, name: str, seed: int | None) -> Mapping[str, Any]:
-        folder = self._sources.weights / self.size.split / self.size.name
-        return read_json(folder / f"{name}-{seed or 0}.json")
+    @property
+    def where(self) -> str:
+        """Split and size, as in "cavity mini"."""
+        return f"{self.size.split} {self.size.name}"
+
+    @property
+    def ranking(self) -> str:
+        """Name of the metric that ranks."""
+        return ranking_metric(self.size)
+
+    @property
+    def floors(self) -> dict[str, Method]:
+        """The floors that were scored."""
+        return {name: method for name, method in self.methods.items() if name in FLOORS}
+
+    @property
+    def models(self) -> dict[str, Method]:
+        """Everything else, in the order of names."""
+        return {name: self.methods[name] for name in sorted(self.methods) if name not in FLOORS}
+
+    def order(self, names: Collection[str] | None = None) -> list[str]:
+        """Return those of some models, of all methods by default, that are ranked, best first."""
+        chosen = {n: self.methods[n] for n in (self.methods if names is None else names) if n in self.methods}
+        return ordered({n: m.scores[self.ranking] for n, m in chosen.items() if self.ranking in m.scores})
+
+    @property
+    def best_floor(self) -> str | None:
+        """Name of the floor that is best by the ranking metric; None where none was scored."""
+        return next(iter(self.order(self.floors)), None)
+
+    def skill(self, name: str) -> float:
+        """Return ``1 - score / score of the best floor`` by the ranking metric: 1 perfect, 0 no learning."""
+        floor = self.best_floor
+        if floor is None or self.ranking not in self.methods[name].scores:
+            return math.nan
+        return (
+            1.0 - self.methods[name].scores[self.ranking].mean / self.methods[floor].scores[self.ranking].mean
+        )
+
+    def trained(self, name: str) -> bool:
+        """Return whether there is a committed record of a training, with scores or without."""
+        return any(self._weights.glob(f"{name}-[0-9]*.json"))
 
 
-def _score_files(
-    board: Path, split: str, size: str, name: str, entry: object
-) -> Iterator[tuple[int | None, Path]]:
-    """Yield seed and score file of every prediction of an entry."""
+def _score_files(path: Path, entry: Any) -> Iterator[tuple[int | None, Path]]:  # noqa: ANN401
+    """Yield seed and score file of every prediction of an entry, submissions/<split>/<size>/<name>.yaml."""
     try:
-        seeds = [made.get("seed") for made in entry["predictions"]]  # type: ignore[index]
+        seeds = [made.get("seed") for made in entry["predictions"]]
     except (TypeError, KeyError, AttributeError) as error:
-        where = str(board / "submissions" / split / size / f"{name}.yaml")
-        raise UnreadableFileError("no entry of a leaderboard", where=where, got=error) from None
+        raise UnreadableFileError("no entry of a leaderboard", where=str(path), got=error) from None
+    board = path.parents[3]
+    scores = board / "scores" / path.parent.relative_to(board / "submissions")
     for seed in seeds:
-        file = f"{name}.nc" if len(seeds) == 1 else f"{name}_{seed}.nc"
-        yield seed, board / "scores" / split / size / file
+        yield seed, scores / (f"{path.stem}.nc" if len(seeds) == 1 else f"{path.stem}_{seed}.nc")
 
 
-def _board_cost(name: str, entry: Mapping[str, Any]) -> dict[str, Cost]:
-    return {name: Cost(**entry["cost"])} if entry.get("cost") else {}
-
-
-def _run_cost(name: str, folder: Path) -> dict[str, Cost]:
+def _run_cost(folder: Path) -> Cost | None:
     said = read_json(folder / COST_NAME)
     if "seconds_per_frame" not in said:
-        return {}
-    seconds, device = float(said["seconds_per_frame"]), str(said.get("device", ""))
-    solver = said.get("solver_seconds_per_frame")
-    return {name: Cost(seconds_per_frame=seconds, device=device, solver_seconds_per_frame=solver)}
-
-
-def _parameters(seeds: Iterable[Seeded], entry: Mapping[str, Any] | None) -> int | None:
-    known = [held.record.get("parameters") for held in seeds] + [(entry or {}).get("parameters")]
-    return next((int(value) for value in known if value is not None), None)
+        return None
+    return Cost(
+        seconds_per_frame=float(said["seconds_per_frame"]),
+        device=str(said.get("device", "")),
+        solver_seconds_per_frame=said.get("solver_seconds_per_frame"),
+    )
 
 
 def read_json(path: Path) -> dict[str, Any]:

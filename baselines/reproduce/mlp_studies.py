@@ -9,22 +9,18 @@ Table 4.5) exist at full only.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 from lagbench.atomic import write_atomically
 from lagbench.scoring.tables import Table
-from lagbench.work.progress import Progress
 
-from .evidence import read_json
-from .making import check_training, make_training
-from .plan import Plan
-from .roster import Model
-from .sheet import Sheet
-from .thesis import STUDIES, Study
-from .wording import number
+from .evidence import RECORD_NAME, read_json
+from .runs import Plan, budget, check_training, make_training
+from .sheet import Figure, Sheet, number
+from .thesis import STUDIES, Model, Study
 
-__all__ = ["TABLES", "make_studies", "study_folder", "study_rows", "tables"]
+__all__ = ["TABLES", "draw", "make_studies", "study_folder", "study_rows"]
 
 TABLES: Mapping[str, tuple[str, str]] = {
     "table_4_2": ("4.2", "fluid"),
@@ -46,26 +42,23 @@ FILE = "errors.json"
 def study_model(plan: Plan, study: Study) -> Model:
     """Return what to train for a row: at ``full`` its own recipe, else the size's recipe with changes."""
     name = f"mlp-{study.table.replace('.', '-')}-{study.row}"
-    settings = ["training.validate_every=0"]
+    unvalidated = "training.validate_every=0"
     if plan.size == "full":
-        variant = f"table-{study.table}-{_variant(study)}"
-        return Model(name=name, baseline="mlp", label=name, settings=tuple(settings), recipe=variant)
+        # what tells a row's recipe from the others of its table
+        ends = {"4.2": study.activation, "4.3": study.widths[0], "4.4": len(study.widths), "4.5": study.row}
+        variant = f"table-{study.table}-{ends[study.table]}"
+        return Model(name, name, varied="mlp", settings=(unvalidated,), recipe=variant)
     share, divisor = SHARES[plan.size]
-    settings += [
+    settings = (
+        unvalidated,
         f"model.widths={list(study.widths)}",
         f"model.activation={study.activation}",
         *("model.target=state", "model.noise_std=0", "model.material=false"),
         f"training.epochs={max(1.0, share * study.epochs):g}",
         f"training.batch={study.batch // divisor}",
         *("training.learning_rate=0.001", "training.schedule=constant"),
-    ]
-    return Model(name=name, baseline="mlp", label=name, settings=tuple(settings))
-
-
-def _variant(study: Study) -> str:
-    """Return what ends the name of a row's recipe."""
-    ends = {"4.2": study.activation, "4.3": str(study.widths[0]), "4.4": str(len(study.widths))}
-    return ends.get(study.table, str(study.row))
+    )
+    return Model(name, name, varied="mlp", settings=settings)
 
 
 def study_rows(name: str) -> tuple[Study, ...]:
@@ -78,14 +71,14 @@ def study_folder(plan: Plan, name: str, study: Study) -> Path:
     return plan.home(TABLES[name][1]) / "studies" / f"{study_model(plan, study).name}-{plan.seeds[0]}"
 
 
-def make_studies(plan: Plan, name: str, progress: Callable[[Progress], None] | None = None) -> None:
+def make_studies(plan: Plan, name: str) -> None:
     """Train the rows of a table and measure their errors, unless that was done."""
     split = TABLES[name][1]
     for study in study_rows(name):
         folder, model = study_folder(plan, name, study), study_model(plan, study)
         check_training(plan, split, model, plan.seeds[0], folder=folder)
         if not (folder / FILE).is_file():
-            make_training(plan, split, model, plan.seeds[0], folder=folder, progress=progress)
+            make_training(plan, split, model, plan.seeds[0], folder=folder)
             found = {subset: one_step_error(plan, split, folder, subset) for subset in ("train", "valid")}
             write_atomically(folder / FILE, json.dumps(found).encode())
 
@@ -112,10 +105,28 @@ def one_step_error(plan: Plan, split: str, folder: Path, subset: str) -> float:
     return total / count
 
 
-def tables(plan: Plan, name: str) -> Sheet:
+def draw(plan: Plan, figure: Figure) -> Sheet:
     """Return a table with ours beside it."""
-    number_, split = TABLES[name]
-    rows = [_row(plan, name, study) for study in study_rows(name)]
+    (printed, split), rows = TABLES[figure.studies], []
+    for study in study_rows(figure.studies):
+        folder = study_folder(plan, figure.studies, study)
+        errors, record = read_json(folder / FILE), read_json(folder / RECORD_NAME)
+        rows.append(
+            (
+                str(study.row),
+                " x ".join(map(str, study.widths)),
+                study.activation,
+                f"{study.parameters:,}",
+                f"{record['parameters']:,}" if record else "-",
+                f"{study.epochs} x {study.batch}" if study.table != "4.2" else f"{study.epochs}",
+                budget(record),
+                number(record["cpu_seconds"] / 3600.0 if record else None),
+                number(study.train, 4),
+                number(errors.get("train")),
+                number(study.valid, 4),
+                number(errors.get("valid")),
+            )
+        )
     heads = (
         *("no", "hidden layers", "activation", "parameters at full, thesis", "parameters, ours"),
         *("epochs x batch, thesis", "steps x batch, ours", "CPU hours"),
@@ -123,28 +134,8 @@ def tables(plan: Plan, name: str) -> Sheet:
     )
     share, _ = SHARES.get(plan.size, (1.0, 1))
     note = (
-        f"Table {number_} on {split} {plan.size}: mean squared error of one step [standardised^2]; {share:g}"
+        f"Table {printed} on {split} {plan.size}: mean squared error of one step [standardised^2]; {share:g}"
         " of the thesis's epochs, constant rate 1e-3. Standardisation and data differ from the thesis's:"
         " compare orders."
     )
     return Sheet(notes=(note,), tables=(Table("", heads, tuple(rows)),))
-
-
-def _row(plan: Plan, name: str, study: Study) -> tuple[str, ...]:
-    folder = study_folder(plan, name, study)
-    errors, record = read_json(folder / FILE), read_json(folder / "training.json")
-    steps = f"{record['step']:,} x {record['recipe']['training']['batch']}" if "step" in record else "-"
-    return (
-        str(study.row),
-        " x ".join(map(str, study.widths)),
-        study.activation,
-        f"{study.parameters:,}",
-        f"{record['parameters']:,}" if "parameters" in record else "-",
-        f"{study.epochs} x {study.batch}" if study.table != "4.2" else f"{study.epochs}",
-        steps,
-        number(record["cpu_seconds"] / 3600.0) if "cpu_seconds" in record else "-",
-        number(study.train, 4),
-        number(errors.get("train")),
-        number(study.valid, 4),
-        number(errors.get("valid")),
-    )

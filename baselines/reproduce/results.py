@@ -1,48 +1,53 @@
-"""Write docs/results.md: every model's scores beside the thesis's numbers, from committed files.
+"""Write docs/results.md from committed files: claims, scores beside the thesis's numbers, costs.
 
     python -m lagbench.baselines.reproduce.results -o docs/results.md [--board leaderboard]
-        [--weights baselines/weights] [--runs RUNS] [--check]
+        [--weights FOLDER] [--runs RUNS] [--check]
 
-Score files and entries of the leaderboard and what trainings recorded suffice: no data set is
-read. ``--runs`` adds what is not committed yet. The same files give the same bytes; ``--check``
-writes nothing and fails where the page is stale.
+Score files and entries of the leaderboard and what trainings recorded suffice: no data set is read.
+``--runs`` adds what is not committed yet. The same files give the same bytes; ``--check`` writes nothing
+and fails where the page is stale.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 from lagbench.atomic import write_atomically
 from lagbench.draw.markdown import table
 from lagbench.errors import LagbenchError
-from lagbench.scoring.task import ranking_metric
+from lagbench.floors import FLOORS
+from lagbench.metrics import CHOSEN, Direction, Metric
+from lagbench.scoring.tables import ARROWS, Table
 
-from .evidence import BOARD, WEIGHTS, Evidence, Sources, read_json
-from .result_tables import costs, horizon, rollout_errors, totals, vorticity_at
-from .roster import EXPECTED, SIZES, label
-from .section_4_8_3 import FILE, SPLIT, beside
-from .statements import key_frame, statements
-from .wording import listed
+from .claims import CLAIMS, answer, claim_rows, comparison_table, floors_ahead
+from .evidence import BOARD, WEIGHTS, Evidence, Method, Sources, read_json
+from .runs import budget, hardware
+from .sheet import interval, number
+from .tables import rollout_table
+from .thesis import EXPECTED, OPERATORS, ROSTER, SIZES, TABLE_4_8, TABLE_5_4, key_frame, label, scenario_of
+from .var_protocol import FILE, beside_thesis
 
-__all__ = ["render"]
+__all__ = ["agreement", "main", "render"]
 
 HEAD = """# Results
 
-Ten reference models, their variants and two floors on the test scenarios of each data set, beside the
-numbers of the thesis (D. Dharma, PhD thesis, University of Leeds, 2025). Written by
-`python -m lagbench.baselines.reproduce.results -o docs/results.md` from the score files in `leaderboard/`
-and the records of the trainings in `baselines/weights/`; do not edit.
+The reference models, their variants and floors on the test scenarios of each data set, beside the numbers
+of the thesis (D. Dharma, PhD thesis, University of Leeds, 2025). Written by
+`python -m lagbench.baselines.reproduce.results -o docs/results.md` from the entries and score files in
+`leaderboard/` and the records of their trainings; do not edit.
 
-How to read it. Cells are means over test scenarios with 95 % bootstrap intervals, and ± the deviation
-over seeds where there are several. Differences are tested by the exact sign-flip test over scenarios,
-two-sided, uncorrected for the number of comparisons; with fewer than six scenarios nothing is claimed. The
-thesis trained on its own data, at what is here size `full`, for hours on GPUs, and prints one scenario
-per table: its absolute numbers are beside ours for orientation, and only orders can be compared at
-size `mini` (a quarter of the particles, half the grid: vorticity is resolved half as finely, and a
-node covers four times the area). `docs/scoring.md` defines every metric."""
+How to read it. `skill` is 1 - score / score of the best floor: 1 perfect, 0 nothing learned, below 0 worse
+than what costs no learning. Cells are means over test scenarios with 95 % bootstrap intervals, and ± the
+deviation over seeds where there are several. Differences are tested by the exact sign-flip test over
+scenarios, two-sided, corrected for the number of rivals (Holm); with fewer than six scenarios nothing is
+claimed. The thesis trained on its own data, at what is here size `full`, for hours on GPUs, and prints one
+scenario per table: its absolute numbers are beside ours for orientation, and only orders can be compared
+at size `mini` (a quarter of the particles, half the grid). `docs/scoring.md` defines every metric."""
 
 COMMANDS = """## How to make these again
 
@@ -51,111 +56,240 @@ lagbench generate --split cavity --size mini
 lagbench train --baseline supergat --split cavity --size mini --seed 0
 lagbench predict runs/cavity/mini/supergat-0/weights.pt -o runs/cavity/mini/supergat-0/predictions.nc
 lagbench score runs/cavity/mini/supergat-0/predictions.nc
+lagbench submit runs/cavity/mini/supergat-0/predictions.nc --from meta.yaml
 ```
 
 All models, tables and figures of a size, resumable: `python -m lagbench.baselines.reproduce --size mini
---root DATA --runs runs`. Variants change one option: `gns-novorticity` is `--baseline gns --set
-model.loss.vorticity=0`, `supergat-unlinked` is `--baseline supergat-link --set model.link_weight=0`
-(SuperGAT with link loss starts from smaller weights, so that the loss of links does not drown the
-others), `mlp-change` is `--baseline mlp --recipe change`."""
+--root DATA --runs runs`; `lagbench submit` makes entries of them. Variants change one option:"""
 
 
 def render(sources: Sources, sizes: Sequence[str] = SIZES) -> str:
     """Return the page."""
     found = [Evidence(sources, split, size) for size in sizes for split in EXPECTED]
     known = [evidence for evidence in found if evidence.methods]
-    parts = [HEAD, _findings(known), *(part for evidence in known for part in _chapter(evidence))]
+    learned = [evidence for evidence in known if evidence.models]
+    parts = [HEAD, *_claims(learned), *(part for evidence in known for part in _chapter(evidence))]
     protocols = [part for size in sizes for part in _protocol(sources, size)]
     parts += ["## VAR by the thesis's protocol (section 4.8.3)", *protocols] if protocols else []
-    hours = [f"- {line}" for line in totals(known)]
-    parts += [COMMANDS, "\n".join(["## Hours", "", *hours])] if hours else [COMMANDS]
-    return "\n\n".join([*parts, _missing(found)]) + "\n"
+    variants = (
+        f"- `{model.name}`: `--baseline {model.baseline} --{'recipe' if model.recipe else 'set'}"
+        f" {model.recipe or ' --set '.join(model.settings)}`"
+        for model in ROSTER.values()
+        if model.varied
+    )
+    parts += [COMMANDS, "\n".join(variants), "## Missing", "\n".join(_missing(found)) or "Nothing."]
+    return "\n\n".join(parts) + "\n"
 
 
-def _findings(known: Sequence[Evidence]) -> str:
-    lines = ["## Findings"]
-    for evidence in known:
-        said = list(statements(evidence))
-        if evidence.models() and said:
-            lines += ["", f"### {_title(evidence)}", "", *_paragraphs(said)]
-    return "\n".join(lines if len(lines) > 1 else [*lines, "", "No model has been scored yet."])
+def _claims(learned: Sequence[Evidence]) -> Iterator[str]:
+    """Yield an overview of all claims, then the comparisons behind each."""
+    yield "## Claims"
+    if not learned:
+        yield "No model has been scored yet; the end of this page has the commands."
+        return
+    rows = {claim: {e.where: claim_rows(claim, e) for e in learned} for claim in CLAIMS}
+    yield (
+        "By the ranking metric over the horizon: ahead in the mean; better and worse at 5 %. A dash where an"
+        " entry is missing."
+    )
+    yield table(
+        ["", *(e.where for e in learned)],
+        [
+            [claim.question, *(answer(found) or "-" for found in held.values())]
+            for claim, held in rows.items()
+        ],
+    )
+    for claim, held in rows.items():
+        compared = [row for found in held.values() for row in found]
+        yield f"### {claim.question}"
+        if compared:
+            yield _markdown(comparison_table(compared))
+        else:
+            yield f"Nothing to compare: it takes entries of {label(claim.first)} and of a rival on one split."
+    ahead = floors_ahead(learned)
+    if ahead.rows:
+        yield "### In which metrics is a floor better than every model, in the mean?"
+        yield _markdown(ahead)
+    yield "### What does a CPU hour buy?"
+    yield (
+        "Validation: the least value up to a quarter, half and all of the steps, and what the last doubling"
+        " gained; of the first seed. Models whose last doubling gained more than 2 % have not converged."
+    )
+    heads = ("model", "steps x windows", "epochs", "CPU hours per seed", "skill")
+    learning = ("validation at 1/4", "1/2", "1", "last doubling")
+    yield table(("where", *heads, *learning), [row for e in learned for row in _training_rows(e)])
 
 
-def _paragraphs(said: Sequence[str]) -> Iterator[str]:
-    """Yield one list item per claim, with the sentences that follow it."""
-    items: list[list[str]] = []
-    for sentence in said:
-        if sentence.startswith("**") or not items:
-            items.append([])
-        items[-1].append(sentence)
-    yield from (f"- {' '.join(item)}" for item in items)
+def _training_rows(evidence: Evidence) -> Iterator[list[str]]:
+    """Yield what each model was trained for and what that brought, best first."""
+    for name in evidence.order(evidence.models):
+        method = evidence.models[name]
+        record, hours = method.seeds[0].record, method.cpu_hours
+        best = [_validated(record, share) for share in (0.25, 0.5, 1.0)]
+        seen = record["step"] * record["recipe"]["training"]["batch"] if "windows" in record else None
+        gain = 1.0 - best[2] / best[1] if best[1] and best[2] is not None else None
+        yield [
+            evidence.where,
+            label(name),
+            budget(record),
+            number(seen / record["windows"] if seen else None),
+            number(None if hours is None else hours / len(method.seeds)),
+            number(evidence.skill(name)),
+            *map(number, best),
+            "-" if gain is None else f"{100.0 * gain:.2g} %",
+        ]
 
 
-def _title(evidence: Evidence) -> str:
-    return f"{evidence.size.split} {evidence.size.name}"
+def _validated(record: Mapping[str, Any], share: float) -> float | None:
+    """Return the least validation error up to a share of the steps; None where there was none."""
+    held = record.get("validation", ())
+    # beside the step an entry holds one number, the metric that was validated
+    values = [
+        value
+        for entry in held
+        if entry["step"] <= share * record["step"]
+        for name, value in entry.items()
+        if name != "step"
+    ]
+    return min(values, default=None)
 
 
 def _chapter(evidence: Evidence) -> Iterator[str]:
+    """Yield what was scored on one split and size: over the horizon, beside the thesis, costs."""
     size, task = evidence.size, evidence.size.task
-    yield f"## {_title(evidence)}"
+    yield f"## {evidence.where}"
     yield (
         f"{size.particles} particles, {task.input_frames} frames given, {task.horizon} predicted,"
         f" {len(size.subsets['test'])} test scenarios, {len(size.subsets['train'])} to train on; data set"
-        f" {size.version}. Best first by `{ranking_metric(size)}`."
+        f" {size.version}. Best first by `{evidence.ranking}`."
     )
-    yield horizon(evidence)
-    if evidence.models():
-        yield from _beside_thesis(evidence)
-        yield "Cost. Speed-up: our solver's time for a frame on one core over the model's, same machine."
-        yield costs(evidence)
-
-
-def _beside_thesis(evidence: Evidence) -> Iterator[str]:
-    if ranking_metric(evidence.size) == "vorticity_rmse":
-        frame = key_frame(evidence)
-        text = f"vorticity at frame {frame}, mean over scenarios, in brackets the first test scenario (T0)"
-        thesis = evidence.size.split == "cavity"
-        yield (
-            f"Tables 5.4, 5.5 and Fig. 5.13: {text}; the thesis's T0 beside it."
-            if thesis
-            else f"By frame: {text}."
-        )
-        yield vorticity_at(evidence)
-    else:
+    yield _horizon(evidence)
+    if not evidence.models:
+        return
+    if size.split in TABLE_4_8:
         yield "Table 4.8: errors of a rollout by scene, ours / the thesis's."
-        yield rollout_errors(evidence)
+        yield _markdown(rollout_table(evidence, TABLE_4_8[size.split]))
+    else:
+        yield from _vorticity_at(evidence)
+    yield "Cost. Speed-up: our solver's time for a frame on one core over the model's, same machine."
+    heads = ("recipe", "changed", "parameters", "seeds", "CPU hours", "hardware", "s/frame", "solver s/frame")
+    rows = [_cost_row(name, method) for name, method in evidence.models.items()]
+    yield table(("model", *heads, "speed-up"), rows)
+
+
+def _horizon(evidence: Evidence) -> str:
+    """Return the scores over the horizon of models and floors: skill, ranking metric, the chosen ones."""
+    free = evidence.size.split in TABLE_4_8
+    held: dict[str, Metric] = {}
+    for method in evidence.methods.values():
+        held |= {name: score.metric for name, score in method.scores.items()}
+    chosen = [held[name] for name in dict.fromkeys((evidence.ranking, *CHOSEN)) if name in held]
+    # vorticity says little where the material does not fill the box
+    hidden = ("vorticity", "distributions") if free else ()
+    shown = [m for m in chosen if m.direction is not Direction.NONE and m.family not in hidden]
+    rows = []
+    for name in evidence.order():
+        method = evidence.methods[name]
+        seeds = "floor" if name in FLOORS else str(len(method.seeds))
+        cells = [_cell(method, metric.name) for metric in shown]
+        rows.append([label(name), number(evidence.skill(name)), seeds, *cells])
+    return table(["model", "skill", "seeds", *map(_head, shown)], rows)
+
+
+def _head(metric: Metric) -> str:
+    """Return name, unit and direction, as in "position_rmse [length], lower"."""
+    goal = f" {metric.perfect:g}" if metric.direction is Direction.TARGET else ""
+    return f"{metric.name} [{metric.unit}], {ARROWS[metric.direction]}{goal}"
+
+
+def _cell(method: Method, metric: str) -> str:
+    if metric not in method.scores:
+        return "-"
+    spread = f" ± {number(method.spread(metric), 2)}" if len(method.seeds) > 1 else ""
+    undefined = sum(method.scores[metric].undefined)
+    return interval(method.scores[metric]) + spread + (f", {undefined} undefined" if undefined else "")
+
+
+def _vorticity_at(evidence: Evidence) -> Iterator[str]:
+    """Yield Tables 5.4 and 5.5 and Fig. 5.13's correlations: ours, T0 in brackets, the thesis's beside."""
+    frame, first = key_frame(evidence.size), scenario_of(evidence.size, 0)
+    thesis = TABLE_5_4 if evidence.size.split == "cavity" else {}
+    measures = ("mae", "mse", "rmse", "kl", "pearson")
+    yield (
+        f"Tables 5.4, 5.5 and Fig. 5.13: vorticity at frame {frame}, mean over scenarios, in brackets the"
+        f" first test scenario (T0){'; the thesis has T0' if thesis else ''}."
+    )
+    heads = [f"{m.upper()}{who}" for m in measures for who in (("", ", thesis") if thesis else ("",))]
+    models, rows = evidence.models, []
+    for name in dict.fromkeys(n for n in (*OPERATORS, *models) if n in models):
+        row = [label(name)]
+        for measure in measures:
+            values = [models[name].at(f"vorticity_{measure}", frame, where) for where in (None, first)]
+            row.append(f"{number(values[0])} ({number(values[1])})")
+            row += [number(thesis.get(name, {}).get(measure), 4)] if thesis else []
+        rows.append(row)
+    yield table(["model", *heads], rows)
+    both = [name for name in thesis if name in models]
+    if len(both) > 1:
+        ours = {name: models[name].at("vorticity_mse", frame) for name in both}
+        tau = agreement([thesis[name]["mse"] for name in both], list(ours.values()))
+        yield f"Kendall's tau of the two orders by MSE: {number(tau, 2)} (1: the same order, -1: reversed)."
+
+
+def agreement(first: Sequence[float], second: Sequence[float]) -> float:
+    """Return Kendall's tau of two rankings without ties: 1 the same order, -1 reversed, 0 unrelated."""
+    pairs = list(combinations(zip(first, second, strict=True), 2))
+    turned = sum((a - b) * (x - y) < 0.0 for (a, x), (b, y) in pairs)
+    return 1.0 - 2.0 * turned / len(pairs)
+
+
+def _cost_row(name: str, method: Method) -> list[str]:
+    record, cost = method.seeds[0].record, method.cost
+    return [
+        label(name),
+        record.get("recipe", {}).get("name", "-"),
+        "; ".join(ROSTER[name].settings if name in ROSTER else ()) or "-",
+        "-" if method.parameters is None else f"{method.parameters:,}",
+        ", ".join("-" if held.seed is None else str(held.seed) for held in method.seeds),
+        number(method.cpu_hours),
+        hardware(record),
+        number(cost.seconds_per_frame if cost else None),
+        number(cost.solver_seconds_per_frame if cost else None),
+        number(cost.speed_up if cost else None),
+    ]
 
 
 def _protocol(sources: Sources, size: str) -> Iterator[str]:
     """Yield what the thesis's own protocol gave for VAR, where it was measured."""
     for home in (sources.weights, sources.runs):
-        path = home / SPLIT / size / FILE if home else None
+        path = home / "fluid" / size / FILE if home else None
         if path and path.is_file():
-            sheet = beside(read_json(path))
-            yield "\n\n".join([*sheet.notes, *(table(held.columns, held.rows) for held in sheet.tables)])
+            sheet = beside_thesis(read_json(path))
+            yield "\n\n".join([*sheet.notes, *map(_markdown, sheet.tables)])
             return
 
 
-def _missing(found: Sequence[Evidence]) -> str:
-    lines = ["## Missing", ""]
+def _missing(found: Sequence[Evidence]) -> Iterator[str]:
+    """Yield what has no entry on each split and size, and the command that makes it."""
     for evidence in found:
         split, size = evidence.size.split, evidence.size.name
         absent = [name for name in EXPECTED[split] if name not in evidence.methods]
-        refused = [name for name in absent if evidence.trained(name)]
+        refused = [label(name) for name in absent if evidence.trained(name)]
+        missing = [label(name) for name in absent if not evidence.trained(name)]
         if refused:
-            names = listed(map(label, refused))
-            lines.append(
-                f"- {split} {size}: {names}: trained, and refused by the scorer (baselines.md says why)."
-            )
-        absent = [name for name in absent if name not in refused]
-        if absent:
-            what = "all models" if len(absent) == len(EXPECTED[split]) else listed(map(label, absent))
-            short = " --recipe short" if size == "full" and "gns" in EXPECTED[split] else ""
-            command = f"python -m lagbench.baselines.reproduce --size {size} --split {split}{short}"
-            lines.append(f"- {split} {size}: {what}. `{command}` makes what is missing.")
+            yield f"- {evidence.where}: {', '.join(refused)}: trained, no score (docs/baselines.md says why)."
+        if missing:
+            what = "all models" if len(missing) == len(EXPECTED[split]) else ", ".join(missing)
+            command = f"python -m lagbench.baselines.reproduce --size {size} --split {split}"
+            yield f"- {evidence.where}: {what}: `{command}`, then `lagbench submit`."
+        if not evidence.floors:
+            yield f"- {evidence.where}: floors: `lagbench submit --floor NAME --split {split} --size {size}`."
         if evidence.stale:
-            lines.append(f"- {split} {size}: {len(evidence.stale)} score files of other data, left out.")
-    return "\n".join(lines if len(lines) > 2 else [*lines, "Nothing."])
+            yield f"- {evidence.where}: {len(evidence.stale)} score files of other data, left out."
+
+
+def _markdown(held: Table) -> str:
+    return table(held.columns, held.rows)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -1,189 +1,137 @@
-"""Numbers that the thesis prints, by table: D. Dharma, PhD thesis, University of Leeds, 2025.
+"""Numbers that the thesis prints, models that results speak of, and our scenarios that stand for its own.
 
-Models have our names: ``supergat`` is the thesis's own model ("OURS"), ``transformer`` its graph
-transformer. Where the thesis contradicts itself, the reading that holds here is said beside
-the number.
+D. Dharma, PhD thesis, University of Leeds, 2025. Models have our names: ``supergat`` is the thesis's own
+model ("OURS"), ``transformer`` its graph transformer. Where the thesis contradicts itself, the reading that
+holds here is said beside the number.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
+from lagbench.data.registry import Size
+from lagbench.draw.style import MUTED
+
 __all__ = [
+    "EXPECTED",
     "FRAME_MODELS",
     "LOSS_SNAPSHOTS",
     "OPERATORS",
+    "ROSTER",
     "SECTION_4_8_3",
+    "SIZES",
     "STATISTICS",
     "STUDIES",
     "TABLE_4_7",
     "TABLE_4_8",
     "TABLE_5_4",
+    "Model",
     "Rollout",
     "Study",
-    "VorticityRow",
+    "colour",
+    "key_frame",
+    "label",
+    "predicted",
+    "scenario_of",
 ]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Study:
     """One row of Tables 4.2 to 4.5: an MLP from frame to frame."""
 
-    table: str  # number of the table, as in "4.2"
-    row: int  # number of the row, from 1
+    table: str  # its number, as in "4.2"
+    row: int  # from 1
     widths: tuple[int, ...]  # units of the hidden layers
-    activation: str  # elu, relu, tanh or sigmoid
     parameters: int  # as printed
-    epochs: int  # passes over the data
+    epochs: int
     batch: int  # frames of an optimiser step
     train: float  # mean squared error of training [standardised^2]
     valid: float  # of validation
+    activation: str = "elu"
 
-
-def _study(
-    table: str,
-    row: int,
-    widths: tuple[int, ...],
-    parameters: int,
-    budget: tuple[int, int],
-    errors: tuple[float, float],
-    activation: str = "elu",
-) -> Study:
-    (epochs, batch), (train, valid) = budget, errors
-    return Study(
-        table=table,
-        row=row,
-        widths=widths,
-        activation=activation,
-        parameters=parameters,
-        epochs=epochs,
-        batch=batch,
-        train=train,
-        valid=valid,
-    )
-
-
-_4_2 = {
-    "sigmoid": (0.1405, 0.1547),
-    "tanh": (0.1312, 0.1467),
-    "relu": (0.1161, 0.1204),
-    "elu": (0.1131, 0.1187),
-}
-_4_3 = {
-    100: (2_030_300, 0.1915, 0.1968),
-    200: (4_090_600, 0.1147, 0.1194),
-    400: (8_331_200, 0.0591, 0.0657),
-    800: (17_292_400, 0.0290, 0.0362),
-    1000: (22_013_000, 0.0235, 0.0309),
-    1600: (37_134_800, 1.0036, 1.0247),
-}
-_4_4 = {
-    3: (22_013_000, 0.0197, 0.0268),
-    4: (23_014_000, 0.0185, 0.0267),
-    5: (24_015_000, 0.0200, 0.0279),
-    6: (25_016_000, 0.0241, 0.0306),
-    7: (26_017_000, 0.0244, 0.0322),
-}
-_4_5 = (
-    ((1000,) * 3, 22_013_000, 250, 0.0287, 0.0345),
-    ((1000,) * 4, 23_014_000, 400, 0.0339, 0.0282),  # printed with the training error above the other
-    ((2500, 1250, 1250, 2500), 57_830_000, 600, 0.0091, 0.0152),
-    ((2500,) * 4, 68_770_000, 500, 0.0107, 0.0162),
-)
 
 STUDIES = (
-    *(
-        # the batch is not stated; that of Table 4.3 stands here
-        _study("4.2", row, (200,) * 3, 4_090_600, (500, 512), errors, activation)
-        for row, (activation, errors) in enumerate(_4_2.items(), start=1)
-    ),
-    *(
-        _study("4.3", row, (width,) * 3, parameters, (200, 512), (train, valid))
-        for row, (width, (parameters, train, valid)) in enumerate(_4_3.items(), start=1)
-    ),
-    *(
-        _study("4.4", row, (1000,) * layers, parameters, (250, 1024), (train, valid))
-        for row, (layers, (parameters, train, valid)) in enumerate(_4_4.items(), start=1)
-    ),
-    *(
-        _study("4.5", row, widths, parameters, (epochs, 4096), (train, valid))
-        for row, (widths, parameters, epochs, train, valid) in enumerate(_4_5, start=1)
-    ),
+    # the batch of Table 4.2 is not stated; that of Table 4.3 stands here
+    Study("4.2", 1, (200,) * 3, 4_090_600, 500, 512, 0.1405, 0.1547, "sigmoid"),
+    Study("4.2", 2, (200,) * 3, 4_090_600, 500, 512, 0.1312, 0.1467, "tanh"),
+    Study("4.2", 3, (200,) * 3, 4_090_600, 500, 512, 0.1161, 0.1204, "relu"),
+    Study("4.2", 4, (200,) * 3, 4_090_600, 500, 512, 0.1131, 0.1187, "elu"),
+    Study("4.3", 1, (100,) * 3, 2_030_300, 200, 512, 0.1915, 0.1968),
+    Study("4.3", 2, (200,) * 3, 4_090_600, 200, 512, 0.1147, 0.1194),
+    Study("4.3", 3, (400,) * 3, 8_331_200, 200, 512, 0.0591, 0.0657),
+    Study("4.3", 4, (800,) * 3, 17_292_400, 200, 512, 0.0290, 0.0362),
+    Study("4.3", 5, (1000,) * 3, 22_013_000, 200, 512, 0.0235, 0.0309),
+    Study("4.3", 6, (1600,) * 3, 37_134_800, 200, 512, 1.0036, 1.0247),
+    Study("4.4", 1, (1000,) * 3, 22_013_000, 250, 1024, 0.0197, 0.0268),
+    Study("4.4", 2, (1000,) * 4, 23_014_000, 250, 1024, 0.0185, 0.0267),
+    Study("4.4", 3, (1000,) * 5, 24_015_000, 250, 1024, 0.0200, 0.0279),
+    Study("4.4", 4, (1000,) * 6, 25_016_000, 250, 1024, 0.0241, 0.0306),
+    Study("4.4", 5, (1000,) * 7, 26_017_000, 250, 1024, 0.0244, 0.0322),
+    Study("4.5", 1, (1000,) * 3, 22_013_000, 250, 4096, 0.0287, 0.0345),
+    Study("4.5", 2, (1000,) * 4, 23_014_000, 400, 4096, 0.0339, 0.0282),  # training printed above validation
+    Study("4.5", 3, (2500, 1250, 1250, 2500), 57_830_000, 600, 4096, 0.0091, 0.0152),
+    Study("4.5", 4, (2500,) * 4, 68_770_000, 500, 4096, 0.0107, 0.0162),
 )
 """Tables 4.2 to 4.5."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Rollout:
-    """One row of Table 4.8: errors of a rollout (Eqs. 4.17, 4.18) [standardised^2]."""
-
-    scenario: int  # id in the thesis, and in our size 'full'
-    scene: str  # what moves
-    average: Mapping[str, float]  # average error by model
-    end: Mapping[str, float]  # error at the last frame by model
-
 
 FRAME_MODELS = ("mlp", "lstm", "lstm-mlp")
 
 
-def _rollout(
-    scenario: int, scene: str, average: tuple[float, float, float], end: tuple[float, float, float]
-) -> Rollout:
-    return Rollout(
-        scenario=scenario,
-        scene=scene,
-        average=dict(zip(FRAME_MODELS, average, strict=True)),
-        end=dict(zip(FRAME_MODELS, end, strict=True)),
-    )
+@dataclass(frozen=True)
+class Rollout:
+    """One row of Table 4.8: errors (Eqs. 4.17, 4.18) of :data:`FRAME_MODELS` [standardised^2]."""
+
+    scenario: int  # id in the thesis, and in our size full
+    scene: str  # what moves
+    average: tuple[float, float, float]
+    end: tuple[float, float, float]  # at the last frame
 
 
-TABLE_4_7 = _rollout(26, "falling circle of liquid", (3.342, 3.583, 1.485), (2.127, 4.489, 0.222))
+TABLE_4_7 = Rollout(26, "falling circle of liquid", (3.342, 3.583, 1.485), (2.127, 4.489, 0.222))
 """As printed; it swaps average and end of MLP and LSTM+MLP, see :data:`TABLE_4_8`, which holds."""
 
-TABLE_4_8 = (
-    _rollout(0, "falling rectangle of liquid", (4.413, 2.58, 0.58), (5.019, 3.74, 2.274)),
-    _rollout(26, "falling circle of liquid", (2.127, 3.583, 0.222), (3.342, 4.489, 1.485)),
-    _rollout(54, "liquid and snow", (2.344, 2.485, 1.019), (4.231, 3.891, 2.668)),
-    _rollout(55, "rope and snow", (3.156, 3.132, 1.279), (3.521, 4.132, 2.886)),
-    _rollout(56, "rope and liquid", (2.123, 2.987, 0.63), (4.124, 3.798, 2.775)),
-    _rollout(57, "snow and snow", (3.891, 3.567, 1.571), (3.277, 4.235, 3.04)),
-    _rollout(58, "rope and jelly ball", (3.325, 2.576, 0.998), (4.362, 3.234, 2.549)),
-    _rollout(59, "liquid and liquid", (2.315, 3.478, 0.494), (3.897, 4.561, 2.756)),
+TABLE_4_8: Mapping[str, tuple[Rollout, ...]] = MappingProxyType(
+    {
+        "fluid": (
+            Rollout(0, "falling rectangle of liquid", (4.413, 2.58, 0.58), (5.019, 3.74, 2.274)),
+            Rollout(26, "falling circle of liquid", (2.127, 3.583, 0.222), (3.342, 4.489, 1.485)),
+        ),
+        "multimaterial": (
+            Rollout(54, "liquid and snow", (2.344, 2.485, 1.019), (4.231, 3.891, 2.668)),
+            Rollout(55, "rope and snow", (3.156, 3.132, 1.279), (3.521, 4.132, 2.886)),
+            Rollout(56, "rope and liquid", (2.123, 2.987, 0.63), (4.124, 3.798, 2.775)),
+            Rollout(57, "snow and snow", (3.891, 3.567, 1.571), (3.277, 4.235, 3.04)),
+            Rollout(58, "rope and jelly ball", (3.325, 2.576, 0.998), (4.362, 3.234, 2.549)),
+            Rollout(59, "liquid and liquid", (2.315, 3.478, 0.494), (3.897, 4.561, 2.756)),
+        ),
+    }
 )
-"""Table 4.8: the first two are fluid, the others multimaterial."""
+"""Table 4.8 by split."""
 
 SECTION_4_8_3: Mapping[str, float] = MappingProxyType({"minutes": 33.0, "gigabytes": 19.0, "mse": 3.5e18})
 """VAR(1) of 10,000 dimensions: time, virtual memory, error of the forecast (section 4.8.3)."""
 
+_MEASURES = ("mae", "mse", "rmse", "kl", "pearson")
 
-@dataclass(frozen=True, kw_only=True)
-class VorticityRow:
-    """One row of Tables 5.4 and 5.5 and Fig. 5.13: test scenario T0 of the cavity at frame 54."""
-
-    mae: float  # mean absolute error of the vorticity [1/frame]
-    mse: float  # mean squared error
-    rmse: float  # its root
-    kl: float  # divergence of the magnitudes per node [nat]
-    pearson: float  # correlation with the truth
-
-
-def _vorticity(mae: float, mse: float, rmse: float, kl: float, pearson: float) -> VorticityRow:
-    return VorticityRow(mae=mae, mse=mse, rmse=rmse, kl=kl, pearson=pearson)
-
-
-TABLE_5_4: Mapping[str, VorticityRow] = MappingProxyType(
+TABLE_5_4: Mapping[str, Mapping[str, float]] = MappingProxyType(
     {
-        "supergat": _vorticity(0.007715, 0.000151, 0.012297, 0.127755, 0.956670),
-        "gat": _vorticity(0.010443, 0.000289, 0.017006, 0.354617, 0.918301),
-        "pointnet": _vorticity(0.012597, 0.000420, 0.020484, 0.296943, 0.885932),
-        "gns": _vorticity(0.009757, 0.000449, 0.021191, 0.172230, 0.883097),
-        "gatv2": _vorticity(0.011476, 0.000447, 0.021138, 0.269795, 0.877435),
-        "transformer": _vorticity(0.014519, 0.000724, 0.026903, 0.391100, 0.811620),
+        name: dict(zip(_MEASURES, row, strict=True))
+        for name, row in {
+            "supergat": (0.007715, 0.000151, 0.012297, 0.127755, 0.956670),
+            "gat": (0.010443, 0.000289, 0.017006, 0.354617, 0.918301),
+            "pointnet": (0.012597, 0.000420, 0.020484, 0.296943, 0.885932),
+            "gns": (0.009757, 0.000449, 0.021191, 0.172230, 0.883097),
+            "gatv2": (0.011476, 0.000447, 0.021138, 0.269795, 0.877435),
+            "transformer": (0.014519, 0.000724, 0.026903, 0.391100, 0.811620),
+        }.items()
     }
 )
-"""Tables 5.4 and 5.5 and the correlations of Fig. 5.13, in the order of Table 5.4."""
+"""Tables 5.4 and 5.5 and the correlations of Fig. 5.13 in the order of Table 5.4: vorticity of test case T0
+of the cavity at frame 54. MAE and RMSE [1/frame], divergence of the magnitudes per node [nat],
+correlation."""
 
 OPERATORS = tuple(TABLE_5_4)
 """The six operators, as in the thesis without a link loss."""
@@ -208,26 +156,119 @@ STATISTICS: Mapping[str, Mapping[str, tuple[float, float]]] = MappingProxyType(
 )
 """Tables 5.1 (taken as curl-noise) and 5.3 (cavity), per frame."""
 
+_TERMS = ("acceleration", "velocity", "density", "position", "divergence", "vorticity", "total")
+
 LOSS_SNAPSHOTS: Mapping[str, Mapping[str, float]] = MappingProxyType(
     {
-        "step 507": {
-            "acceleration": 0.035660,
-            "velocity": 0.000256,
-            "density": 0.017083963,
-            "position": 0.0,
-            "divergence": 0.120924,
-            "vorticity": 0.127761,
-            "total": 0.301686,
-        },
-        "end": {
-            "acceleration": 0.16061589,
-            "velocity": 0.000623,
-            "density": 0.0268355,
-            "position": 0.0000000249,
-            "divergence": 0.25397250,
-            "vorticity": 0.2022085,
-            "total": 0.64425,
-        },
+        when: dict(zip(_TERMS, values, strict=True))
+        for when, values in {
+            "step 507": (0.035660, 0.000256, 0.017083963, 0.0, 0.120924, 0.127761, 0.301686),
+            "end": (0.16061589, 0.000623, 0.0268355, 0.0000000249, 0.25397250, 0.2022085, 0.64425),
+        }.items()
     }
 )
 """Raw terms of the loss on curl-noise (section 5.9.3, Fig. 5.21); the total rises: no yardstick."""
+
+SIZES = ("mini", "full")
+"""Sizes that are reported; ``tiny`` is for tests."""
+
+
+@dataclass(frozen=True)
+class Model:
+    """A baseline, or a variant of one, that results speak of."""
+
+    name: str  # as in gns-novorticity; it names folders of runs and entries of the board
+    label: str  # what tables call it
+    colour: str = MUTED
+    varied: str = ""  # baseline of which it is a variant
+    settings: tuple[str, ...] = ()  # changes to the recipe, as in model.loss.vorticity=0
+    recipe: str | None = None  # variant of the recipe, as in change; None for the size's own
+
+    @property
+    def baseline(self) -> str:
+        """What ``lagbench train --baseline`` is given."""
+        return self.varied or self.name
+
+
+_MODELS = (
+    # Okabe & Ito (2008) and shades of them; SuperGAT is red, as in the thesis
+    Model("supergat", "SuperGAT", "#d55e00"),
+    Model("gat", "GAT", "#56b4e9"),
+    Model("pointnet", "PointNet", "#009e73"),
+    Model("gns", "GNS", "#b0569a"),
+    Model("gatv2", "GATv2", "#0072b2"),
+    Model("transformer", "graph transformer", "#e69f00"),
+    Model("supergat-link", "SuperGAT with link loss", "#8c3b00"),
+    Model(
+        "supergat-unlinked",
+        "SuperGAT with link loss of weight 0",
+        "#d9a46a",
+        "supergat-link",
+        ("model.link_weight=0",),
+    ),
+    Model("gns-novorticity", "GNS without vorticity loss", "#e3b4d6", "gns", ("model.loss.vorticity=0",)),
+    Model("mlp", "MLP", "#0072b2"),
+    Model("lstm", "LSTM", "#009e73"),
+    Model("lstm-mlp", "LSTM + MLP", "#d55e00"),
+    Model("mlp-change", "MLP of changes", varied="mlp", recipe="change"),
+    Model("lstm-change", "LSTM of changes", varied="lstm", recipe="change"),
+    Model("lstm-mlp-change", "LSTM + MLP of changes", varied="lstm-mlp", recipe="change"),
+    Model("var", "VAR(1)", "#7f7f7f"),
+    Model("var-stable", "stable VAR", "#b0569a"),
+)
+
+ROSTER: Mapping[str, Model] = MappingProxyType({model.name: model for model in _MODELS})
+"""Models by name."""
+
+_GRAPHS = (*OPERATORS, "supergat-link", "supergat-unlinked", "gns-novorticity", "mlp", "lstm-mlp")
+_FRAMES = (*FRAME_MODELS, "var", "var-stable")
+
+EXPECTED: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {"cavity": _GRAPHS, "curl-noise": _GRAPHS, "fluid": _FRAMES, "multimaterial": _FRAMES}
+)
+"""Names by split, in the order in which they are trained; other variants are shown where they are."""
+
+
+def label(name: str | None) -> str:
+    """Return what tables call a model, its name where the roster has none; None is the truth."""
+    return "truth" if name is None else ROSTER[name].label if name in ROSTER else name
+
+
+def colour(name: str) -> str:
+    """Return a model's colour."""
+    return ROSTER[name].colour if name in ROSTER else MUTED
+
+
+_FAMILIES = {"fluid": 4, "multimaterial": 6}
+"""Scenes repeat with the id, on the free surface: four families, six pairs of materials."""
+
+_KEY_FRAMES = {"cavity": 54, "curl-noise": 40}
+"""Frames at which the thesis compares models: 54; and 35 after the last of six given ones."""
+
+
+def scenario_of(size: Size, case: int) -> int | None:
+    """Return the test scenario that stands for one of the thesis; None where there is none alike.
+
+    In a full box cases are T0, T1, ...: ours in ascending order. On the free surface they are ids, which size
+    ``full`` shares; elsewhere the first test scenario of the same family or pair stands in.
+    """
+    test = sorted(size.subsets["test"])
+    families = _FAMILIES.get(size.split)
+    if families is None:
+        return test[case] if case < len(test) else None
+    if case in test and size.name == "full":
+        return case
+    return next((i for i in test if i % families == case % families), None)
+
+
+def key_frame(size: Size) -> int:
+    """Return the frame of interest nearest to the one at which the thesis compares models."""
+    frames = size.task.frames_of_interest
+    wanted = _KEY_FRAMES.get(size.split, frames[0])
+    return min(frames, key=lambda frame: (abs(frame - wanted), frame))
+
+
+def predicted(size: Size, frames: Iterable[int]) -> tuple[int, ...]:
+    """Return those absolute frames that are predicted; the last predicted one if none is."""
+    first, last = size.task.input_frames, size.task.input_frames + size.task.horizon - 1
+    return tuple(frame for frame in frames if first <= frame <= last) or (last,)

@@ -18,25 +18,36 @@ import math
 import resource
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.baselines.least_squares import LeastSquares, solve
-from lagbench.baselines.var import LaggedRows
-from lagbench.baselines.windows import scenario_paths
+from lagbench.atomic import write_atomically
 from lagbench.data.registry import load
 from lagbench.data.scenario import read_scenario
+from lagbench.draw.markdown import table as markdown_table
+from lagbench.scoring.tables import Table
 
-__all__ = ["ProtocolResult", "forecast_errors", "measure"]
+from .runs import Plan
+from .sheet import Figure, Sheet, number
+from .thesis import SECTION_4_8_3
+
+if TYPE_CHECKING:
+    from lagbench.baselines.least_squares import LeastSquares
+    from lagbench.baselines.var import LaggedRows
+
+__all__ = ["FILE", "ProtocolResult", "beside_thesis", "draw", "forecast_errors", "measure", "table"]
 
 TRAIN, VALID = 0.70, 0.15
 """Shares of the frames that are fitted and forecast."""
 
-THESIS = {"minutes": 33.0, "peak_gb": 19.0, "forecast_mse": 3.5e18}
+FILE = "var_protocol.json"
+"""What ``--json`` prints, in a folder of runs and beside committed weights."""
+
 GROWTH_FRAMES = 100
 
 States = NDArray[np.float32]
@@ -46,17 +57,17 @@ States = NDArray[np.float32]
 class ProtocolResult:
     """What the thesis states, and what explains it."""
 
-    split: str  # name of the split
-    size: str  # name of the size
+    split: str
+    size: str
     features: int  # dimensions of the VAR
     frames: int  # frames fitted
     fit_seconds: float  # wall time of the fit [s]
     cpu_seconds: float  # CPU time of the fit, all threads [s]
     peak_gb: float  # largest resident memory of the process [GB]
     condition: float  # condition number of the regressors
-    floor: float  # see LeastSquares
+    floor: float  # as LeastSquares has it
     fit_mse: float  # mean squared error of one step over the frames fitted [standardised^2]
-    forecast_frames: int
+    forecast_frames: int  # frames forecast
     forecast_mse: float  # mean over them [standardised^2]; infinite once a forecast overflows
     mse_at: dict[int, float]  # mean squared error of single frames of the forecast, by frame [standardised^2]
     growth: float  # factor per frame by which the last frames of the forecast grow; above 1 it diverges
@@ -66,7 +77,11 @@ class ProtocolResult:
 def measure(
     split: str = "fluid", size: str = "full", *, root: str | Path | None = None, lags: int = 1
 ) -> ProtocolResult:
-    """Fit and forecast by the thesis's protocol."""
+    """Fit a VAR of so many lags and forecast by the thesis's protocol."""
+    # torch is loaded here, so that pages of results are written without it
+    from lagbench.baselines.least_squares import solve
+    from lagbench.baselines.var import LaggedRows
+
     states = _all_states(split, size, root)
     train = int(TRAIN * len(states))
     valid = states[train : train + int(VALID * len(states))]
@@ -97,6 +112,8 @@ def measure(
 
 def _all_states(split: str, size: str, root: str | Path | None) -> States:
     """Return the standardised states of all frames, shape [frame, feature]."""
+    from lagbench.baselines.windows import scenario_paths
+
     paths: dict[int, Path] = {}
     for subset in ("train", "valid", "test"):
         paths |= scenario_paths(split, subset=subset, size=size, root=root)
@@ -125,10 +142,9 @@ def forecast_errors(
 ) -> tuple[NDArray[np.float64], float]:
     """Forecast and return the mean squared error of each frame and the growth per frame at the end.
 
-    Args:
-        coefficients: as :class:`~lagbench.baselines.var.VAR` lays them out.
-        last: states before the forecast, the latest last, shape [lag, feature].
-        truth: states to compare with, shape [frame, feature].
+    Coefficients are as :class:`~lagbench.baselines.var.VAR` lays them out; ``last``, shape [lag, feature],
+    are the states before the forecast, the latest last, and ``truth``, shape [frame, feature], those to
+    compare with.
     """
     history = list(last[::-1].astype(np.float64))
     errors, norms = np.full(len(truth), np.inf), np.full(len(truth), np.nan)
@@ -150,22 +166,37 @@ def _fit_mse(rows: LaggedRows, found: LeastSquares) -> float:
     return float(math.fsum(errors) / (rows.rows * len(found.coefficients[0])))
 
 
+def draw(plan: Plan, figure: Figure) -> Sheet:
+    """Return time, memory and error of the fit and its forecast; measured once per size."""
+    path = plan.home(figure.split) / FILE
+    if not path.is_file():
+        found = asdict(measure(figure.split, plan.size, root=plan.root))
+        write_atomically(path, json.dumps(found, indent=1, sort_keys=True).encode())
+    return beside_thesis(json.loads(path.read_text(encoding="utf-8")))
+
+
+def beside_thesis(held: Mapping[str, Any]) -> Sheet:
+    """Return what was measured beside the thesis's figures."""
+    ours = {"minutes": held["fit_seconds"] / 60.0, "gigabytes": held["peak_gb"], "mse": held["forecast_mse"]}
+    rows = [(what, number(SECTION_4_8_3[what]), number(value)) for what, value in ours.items()]
+    more = ("frames", "cpu_seconds", "condition", "floor", "fit_mse", "growth", "persistence_mse")
+    rows += [(what, "-", number(float(held[what]), 6)) for what in more]
+    at = sorted((int(frame), value) for frame, value in held["mse_at"].items())
+    rows += [(f"mse after {frame} frames", "-", number(value)) for frame, value in at]
+    answer = "diverges" if held["growth"] > 1.0 else "does not diverge"
+    note = (
+        f"VAR of {held['features']} dimensions on {held['split']} {held['size']} by the thesis's protocol:"
+        f" all frames concatenated, the first 70 % fitted, the next {held['forecast_frames']} forecast."
+        f" The forecast {answer}: at its end it grows by a factor of {number(held['growth'], 5)} per frame."
+    )
+    return Sheet(notes=(note,), tables=(Table("", ("", "thesis", "ours"), tuple(rows)),))
+
+
 def table(result: ProtocolResult) -> str:
     """Return the thesis's figures beside ours, as Markdown."""
-    ours = {
-        "minutes": result.fit_seconds / 60,
-        "peak_gb": result.peak_gb,
-        "forecast_mse": result.forecast_mse,
-    }
-    head = (
-        f"VAR of {result.features} dimensions on {result.split} {result.size}, {result.frames} frames fitted,"
-        f" {result.forecast_frames} forecast\n\n| | thesis | ours |\n|---|---:|---:|\n"
-    )
-    lines = [f"| {name} | {THESIS[name]:.3g} | {value:.3g} |" for name, value in ours.items()]
-    names = ("cpu_seconds", "condition", "floor", "fit_mse", "growth", "persistence_mse")
-    lines += [f"| {name} | | {getattr(result, name):.6g} |" for name in names]
-    lines += [f"| mse after {frame} frames | | {value:.3g} |" for frame, value in result.mse_at.items()]
-    return head + "\n".join(lines) + "\n"
+    sheet = beside_thesis(asdict(result))
+    tables = (markdown_table(held.columns, held.rows) for held in sheet.tables)
+    return "\n\n".join([*sheet.notes, *tables]) + "\n"
 
 
 def main() -> int:

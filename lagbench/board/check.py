@@ -1,59 +1,40 @@
 """Check a leaderboard's folder: ``lagbench leaderboard check``, for every pull request.
 
-All findings together, each with a name: what, where, expected, got, how to fix it. Nothing that
-strangers sent is run; their score files are first read in a child process under limits.
+All findings together, each with a name: what, where, expected, got, how to fix it; one bad file
+hides nothing of the others. Nothing that strangers sent is run; their score files are first read
+in a child process under limits. Whoever makes every hash and number anew is found by scoring the
+predictions again, and by nothing else: that is what verified.yaml says of an entry.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+import datetime
+import math
+import stat
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from types import MappingProxyType
+from typing import Any
 
-from lagbench.data.layout import resolve_root
+from lagbench.data.checksums import file_sha256
 from lagbench.data.registry import Registry, Size, load
-from lagbench.errors import LagbenchError
-from lagbench.floors import FLOORS
+from lagbench.errors import LagbenchError, UnreadableFileError, UsageError
 from lagbench.submission import Finding
 from lagbench.work.progress import Progress
 
-from .build import build
-from .entry import Entry, Status
-from .entry_checks import check_entry, finding, parsed, size_of
-from .folder import Folder
-from .isolation import unreadable_in_child
-from .lives import check_lives
-from .rescoring import Rescoring, within_reach
-from .score_checks import ScoreChecks
-from .standing import is_current
+from .base import check_base
+from .entry import Entry, Status, Summary
+from .entry_file import examine, load_plain
+from .findings import finding, finding_of, impossible, print_of, skeleton
+from .floors import dataset_of, floor_names
+from .folder import VERIFIED, Folder, Place, entry_path
+from .page import build
+from .ranking import combine, is_current, summarise
+from .rescore import TOLERANCE, Confirmation, Rescoring
+from .score_file import MAX_SCORE_BYTES, Stored, read_stored, unreadable_in_child
+from .verified import read_verified, record, verification_of
 
-__all__ = ["CHECKS", "CheckResult", "check_board"]
-
-CHECKS: Mapping[str, str] = MappingProxyType(
-    {
-        "folder": "a file, link or folder that has no place under submissions/ or scores/",
-        "readable": "an entry that is no plain YAML of at most 64 kB",
-        "schema": "unknown or missing keys, values that do not fit, links that are not http(s)",
-        "split": "a split or size that datasets.yaml does not have",
-        "place": "an entry whose split, size or method is not that of its path",
-        "version": "an active entry that was scored on another data set than that of today",
-        "lifecycle": "an entry that is superseded by one that is not there, or in the end by itself",
-        "predictions": "predictions said to lie in the folder that do not, or of another length",
-        "missing": "a score file that is not there",
-        "oversize": "a score file of more than 300 kB",
-        "score_file": "a score file that was edited, cannot be read, or belongs to something else",
-        "statistics": "a score file without a statistic, or without frames, that the scorer measures",
-        "truth": "score files of one data set that disagree about what the truth alone decides",
-        "score": "a score block or cost that was edited, or a block that the score files do not give",
-        "stray": "a score file that no entry has",
-        "rescored": "predictions or floors that, scored again, give something else",
-        "page": "a page or schema.json that is not what the submissions give",
-    }
-)
-"""Checks by name."""
-
-Known = tuple[Entry, Size]
+__all__ = ["CheckResult", "check_board"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,10 +43,10 @@ class CheckResult:
 
     folder: Path
     entries: int  # entries that were looked at
-    findings: tuple[Finding, ...]  # all that is wrong
+    findings: tuple[Finding, ...]
     page_checked: bool  # whether the page was compared; it is not while anything else is wrong
-    floors_rescored: tuple[str, ...] = ()  # splits and sizes whose floors were predicted and scored anew
-    floors_trusted: tuple[str, ...] = ()  # those whose floors' numbers were only aggregated again
+    confirmed: tuple[Confirmation, ...] = ()  # predictions that gave the same when scored again
+    recorded: tuple[str, ...] = ()  # entries that were added to verified.yaml
 
     @property
     def exit_code(self) -> int:
@@ -77,132 +58,321 @@ def check_board(
     board: str | Path,
     *,
     registry: Registry | None = None,
-    page: bool = True,
+    page: bool = False,
+    base: str | None = None,
+    own: Collection[str] = (),
     isolated: bool = True,
     predictions: Sequence[str | Path] = (),
-    floors: bool = False,
+    recording: bool = False,
     root: str | Path | None = None,
+    today: datetime.date | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> CheckResult:
-    """Check entries, score files, aggregates and page of a leaderboard's folder.
+    """Check entries, score files and aggregates of a leaderboard's folder.
 
     Args:
         board: the leaderboard's folder.
         registry: where splits are described; ours when None.
         page: whether to compare the page too, once nothing else is wrong.
+        base: git revision; entries that were there and that the folder alters are findings.
+        own: methods that may be altered all the same.
         isolated: whether to read score files in a child process first.
         predictions: predictions of entries to score again.
-        floors: whether to predict and score the floors again, where the data are there.
-        root: folder of all data sets, for both.
+        recording: whether to note entries thus confirmed in verified.yaml.
+        root: folder of all data sets, for that.
+        today: the last day that entries may be of; by default tomorrow, as somewhere it is.
         progress: told how far that scoring is.
 
     Raises:
-        UsageError: no leaderboard there.
+        UsageError: no leaderboard there, or git does not know the base.
         DataError: the test subset is missing, or predictions were made from another data set.
     """
     folder, described = Folder(board), registry or load()
     folder.require()
-    files = [folder.path / path for path in folder.score_files()]
-    scores = ScoreChecks(folder, unreadable_in_child(files) if isolated else {})
-    found = list(_oddities(folder))
-    known = _entries(folder, described, scores, found)
+    files = [folder.path / path for path in (*folder.score_files(), *folder.floor_files())]
+    broken = unreadable_in_child(files) if isolated else {}
+    last = today or datetime.datetime.now(datetime.UTC).date() + datetime.timedelta(days=1)
+    look = _Look(folder=folder, registry=described, broken=broken, last=last)
+    for path in folder.entries():
+        look.guarded(path, look.entry)
+    for path in folder.floor_files():
+        look.guarded(path, look.floor)
+    look.together()
+    if base is not None:
+        look.found += check_base(folder, base, own)
     again = Rescoring(
         folder=folder,
-        entries=[entry for entry, _ in known],
-        sound=scores.sound,
+        entries=[entry for entry, _ in look.known],
+        sound=look.sound,
         registry=described,
         root=root,
         progress=progress,
     )
-    found += again.of_files(predictions)
-    rescored, trusted = _floors(known, again, found, wanted=floors)
-    looked = page and not found
+    for one in predictions:
+        look.found += again.of_file(one)
+    recorded = again.entries_confirmed() if recording and not look.found else []
+    record(folder, recorded, datetime.datetime.now(datetime.UTC).date())
+    looked = page and not look.found
     if looked:
-        found += _page_drift(folder, described)
+        try:
+            build(folder.path, check=True, registry=described)
+        except LagbenchError as error:
+            look.found.append(finding_of("page", error, error.where))
     return CheckResult(
         folder=folder.path,
         entries=len(folder.entries()),
-        findings=tuple(found),
+        findings=tuple(look.found),
         page_checked=looked,
-        floors_rescored=rescored,
-        floors_trusted=trusted,
+        confirmed=tuple(again.confirmed),
+        recorded=tuple(entry.yaml_path.as_posix() for entry in recorded),
     )
 
 
-def _entries(folder: Folder, registry: Registry, scores: ScoreChecks, found: list[Finding]) -> list[Known]:
-    """Return the entries that can be read and their sizes; add what is wrong with any."""
-    known: list[Known] = []
-    paths = folder.entries()
-    # floors first: what other entries say of the truth is compared with them
-    for path in sorted(paths, key=lambda path: (path.stem not in FLOORS, path.parts)):
-        entry = parsed(folder, path, found)
-        size = None if entry is None else size_of(entry, registry, found)
-        if entry is None or size is None:
-            continue
-        known.append((entry, size))
-        found += check_entry(folder, path, entry, size)
-        found += scores.of(entry, size)
-    found += check_lives(folder, [entry for entry, _ in known])
-    found += _strays(folder, known)
-    return known
+@dataclass(kw_only=True)
+class _Look:
+    """One look at a folder: what is known of it, and what was found."""
+
+    folder: Folder
+    registry: Registry
+    broken: Mapping[Path, str]  # files that cannot be read, and why, as a child process found
+    last: datetime.date
+    found: list[Finding] = field(default_factory=list)
+    known: list[tuple[Entry, Size]] = field(default_factory=list)
+    sound: set[Path] = field(default_factory=set)  # score files that were read
+    prints: dict[str, list[tuple[Entry, Path]]] = field(default_factory=dict)  # by what was predicted
+
+    def add(self, check: str, where: object, got: object, **said: Any) -> None:  # noqa: ANN401
+        """Add a finding."""
+        self.found.append(finding(check, where, got, **said))
+
+    def guarded(self, path: Path, check: Callable[[Path], None]) -> None:
+        """Look at one file; whatever goes wrong with it must not hide what is wrong with others."""
+        try:
+            check(path)
+        except Exception as error:
+            self.add("readable", path, f"{type(error).__name__}: {ascii(str(error)[:200])[1:-1]}")
+
+    def entry(self, path: Path) -> None:
+        """Check the YAML file of an entry and its score files."""
+        try:
+            entry, mistakes = examine(Entry, load_plain(self.folder.path / path))
+        except UnreadableFileError as error:
+            self.found.append(finding_of("readable", error, path))
+            return
+        for told in mistakes:
+            self.add("schema", f"{path}, {told.where}", told.got, what=told.what, fix=told.fix)
+        if entry is None:
+            return
+        try:
+            size = self.registry.size(entry.split, entry.size)
+        except UsageError as error:
+            self.add("split", path, f"{entry.split} {entry.size}", fix=error.fix)
+            return
+        self.known.append((entry, size))
+        self._place(path, entry, size)
+        self._scores(path, entry, size)
+
+    def _place(self, path: Path, entry: Entry, size: Size) -> None:
+        """Check place, data set, date and predictions of an entry."""
+        if entry.yaml_path != path:
+            self.add("place", path, path, expected=entry.yaml_path)
+        if entry.status is Status.ACTIVE and not is_current(entry.dataset, size):
+            recorded = size.measured.dataset_sha256[:16] if size.measured else "no recorded hash"
+            other = f"version {entry.dataset.version}, {entry.dataset.sha256[:16]}"
+            self.add("version", path, other, expected=f"version {size.version}, {recorded}")
+        if entry.date > self.last:
+            self.add("date", path, entry.date, expected=f"at most {self.last}")
+        for number, made in enumerate(entry.predictions):
+            if made.path is not None and (got := self._length(Path(made.path))) != made.bytes:
+                expected = f"{made.path}, a file of {made.bytes} bytes"
+                self.add("predictions", f"{path}, predictions.{number}", got, expected=expected)
+
+    def _length(self, path: Path) -> str | int:
+        """Return the length of a file in the folder [bytes], or what is there instead."""
+        if self.folder.link_in(path) is not None:
+            return "a symbolic link"
+        try:
+            status = (self.folder.path / path).lstat()
+        except OSError:
+            return "no such file"
+        return status.st_size if stat.S_ISREG(status.st_mode) else "something that is no regular file"
+
+    def _scores(self, path: Path, entry: Entry, size: Size) -> None:
+        """Check the score files of an entry, and its score block against them."""
+        task = size if is_current(entry.dataset, size) else None
+        stored = []
+        for inner, said, made in zip(entry.score_paths, entry.score.files, entry.predictions, strict=True):
+            held = self._read(inner, said.sha256, task)
+            if held is None:
+                continue
+            expected = {
+                "split": entry.split,
+                "size": entry.size,
+                "dataset_version": entry.dataset.version,
+                "dataset_sha256": entry.dataset.sha256,
+                "predictions_sha256": made.sha256,
+            }
+            found = {**held.scores.identity, "predictions_sha256": held.scores.predictions_sha256}
+            for name in (name for name, wanted in expected.items() if found[name] != wanted):
+                self.add("score_file", inner, f"{name} {ascii(found[name])[:80]}, not {expected[name]!a}")
+            odd = list(impossible(held))
+            if odd:
+                self.add("values", inner, odd[0] + f" and {len(odd) - 1} more" * (len(odd) > 1))
+            else:
+                stored.append(held)
+            for print_ in (made.sha256, print_of(held)):
+                self.prints.setdefault(print_, []).append((entry, inner))
+        if entry.score.dataset_sha256 != entry.dataset.sha256:
+            self.add("score", f"{path}, score", entry.score.dataset_sha256, expected=entry.dataset.sha256)
+        if len(stored) == len(entry.predictions) and self._alike(entry, stored):
+            self._numbers(path, entry, stored)
+
+    def _read(self, path: Path, sha256: str, task: Size | None) -> Stored | None:
+        """Return a score file; None, and a finding, where it cannot be one."""
+        file = self.folder.path / path
+        if not file.is_file() or self.folder.link_in(path) is not None:
+            self.add("missing", path, "no such file")
+        elif (length := file.stat().st_size) > MAX_SCORE_BYTES:
+            self.add("oversize", path, f"{length} bytes")
+        elif (found := file_sha256(file)) != sha256:
+            self.add("score_file", path, f"SHA-256 {found[:16]}, not {sha256[:16]} as the entry says")
+        elif file in self.broken:
+            self.add("score_file", path, self.broken[file])
+        else:
+            try:
+                held = read_stored(file, task)
+            except UnreadableFileError as error:
+                self.add("score_file", path, f"{error.what}: {error.got}")
+            else:
+                self.sound.add(path)
+                return held
+        return None
+
+    def _alike(self, entry: Entry, stored: Sequence[Stored]) -> bool:
+        """Tell whether seeds are of the same scenarios and frames, so that they have a mean."""
+
+        def extent(held: Stored) -> tuple[object, ...]:
+            tallies = held.scores.tallies
+            return sorted(tallies), next(iter(tallies.values())).frames, held.scores.ranking
+
+        odd = [
+            path
+            for path, held in zip(entry.score_paths, stored, strict=True)
+            if extent(held) != extent(stored[0])
+        ]
+        for path in odd:
+            self.add("score_file", path, "other scenarios, frames or ranking metric than the first seed has")
+        return not odd
+
+    def _numbers(self, path: Path, entry: Entry, stored: Sequence[Stored]) -> None:
+        """Form the aggregates again and compare."""
+        ranking, where = stored[0].scores.ranking, f"{path}, score"
+        if entry.score.ranking_metric != ranking:
+            self.add("score", where, entry.score.ranking_metric, expected=f"ranking_metric {ranking}")
+        formed, said = summarise(combine([held.scores for held in stored])), entry.score.metrics
+        differing = [name for name in {**formed, **said} if not _same(formed.get(name), said.get(name))]
+        if differing:
+            name, more = differing[0], len(differing) - 1
+            got = _spelt(said.get(name)) + f", and {more} more metrics differ" * (more > 0)
+            self.add("score", where, got, expected=f"{name}: {_spelt(formed.get(name))}")
+
+    def floor(self, path: Path) -> None:
+        """Check the scores of a floor."""
+        try:
+            size = self.registry.size(*path.parts[1:3])
+            if path.stem not in floor_names() or self.folder.path / path in self.broken:
+                got = self.broken.get(self.folder.path / path, "an unknown name")
+                self.add("floor", path, got, expected=", ".join(floor_names()))
+                return
+            identity = read_stored(self.folder.path / path, size).scores.identity
+            if not is_current(dataset_of(identity), size):
+                self.add("floor", path, identity["dataset_sha256"], what="scores on another data set")
+        except LagbenchError as error:
+            self.found.append(finding_of("floor", error, path))
+
+    def together(self) -> None:
+        """Check what entries are to each other, and what else lies in the folder."""
+        named = [Path(made.path) for entry, _ in self.known for made in entry.predictions if made.path]
+        for path, reason in self.folder.odd(named):
+            self.add("folder", ascii(path.as_posix())[1:-1], reason)
+        self._lives()
+        self._twins()
+        self._names()
+        self._strays()
+        self._verified()
+
+    def _lives(self) -> None:
+        """Find entries whose successor is not there, and those that follow each other in a circle."""
+        after: dict[Place, Place] = {
+            entry.place: (entry.split, entry.size, entry.superseded_by)
+            for entry, _ in self.known
+            if entry.superseded_by is not None
+        }
+        for place, successor in after.items():
+            line = [successor]
+            while line[-1] in after and after[line[-1]] not in line:
+                line.append(after[line[-1]])
+            if not (self.folder.path / entry_path(successor)).is_file():
+                self.add("lifecycle", entry_path(place), f"{successor[2]}, which is not there")
+            elif place in line:
+                self.add("lifecycle", entry_path(place), " -> ".join(name for *_, name in line))
+
+    def _twins(self) -> None:
+        """Find predictions that stand under two names or seeds."""
+        told = set()
+        for held in self.prints.values():
+            files = list(dict.fromkeys(path for entry, path in held if entry.status is Status.ACTIVE))
+            for path in files[1:]:
+                if path not in told and path.parts[1:3] == files[0].parts[1:3]:
+                    told.add(path)
+                    self.add("twin", path, f"those of {files[0]}")
+
+    def _names(self) -> None:
+        """Find names that readers cannot tell apart."""
+        seen: dict[tuple[str, str, str], str] = {}
+        for entry, size in self.known:
+            if entry.status is not Status.ACTIVE:
+                continue
+            for floor in floor_names():
+                seen[size.split, size.name, skeleton(floor)] = f"that of the floor {floor}"
+            own = f"that of {entry.method}, {entry.name!a}"
+            other = seen.setdefault((size.split, size.name, skeleton(entry.name)), own)
+            if other != own:
+                self.add("name", entry.yaml_path, other)
+
+    def _strays(self) -> None:
+        """Find score files that belong to nothing, those of entries that cannot be read aside."""
+        named = {path for entry, _ in self.known for path in entry.score_paths}
+        unread = self.folder.claims() - {entry.place for entry, _ in self.known}
+        for path in self.folder.score_files():
+            if path not in named and (*path.parts[1:3], path.stem.partition("_")[0]) not in unread:
+                self.add("stray", path, "none")
+
+    def _verified(self) -> None:
+        """Find lines of the maintainers' list that hold for no entry."""
+        try:
+            lines = read_verified(self.folder)
+        except LagbenchError as error:
+            self.found.append(finding_of("verified", error, VERIFIED))
+            return
+        sound = {entry.yaml_path.as_posix() for entry, _ in self.known if verification_of(entry, lines)}
+        for path in sorted(lines.keys() - sound):
+            self.add("verified", VERIFIED, ascii(path)[:120])
 
 
-def _floors(
-    known: Sequence[Known], again: Rescoring, found: list[Finding], *, wanted: bool
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Score floors again where wanted and possible; return the sizes where it was done, and others."""
-    floors = [
-        (entry, size)
-        for entry, size in known
-        if entry.floor and entry.status is Status.ACTIVE and is_current(entry.dataset, size)
-    ]
-    done: dict[str, bool] = {}
-    for entry, size in sorted(floors, key=lambda pair: pair[0].place):
-        near = wanted and within_reach(size, resolve_root(again.root))
-        done[f"{size.split} {size.name}"] = near
-        if near:
-            found += again.of_floor(entry)
-    return tuple(name for name in done if done[name]), tuple(name for name in done if not done[name])
+def _same(first: Summary | None, second: Summary | None) -> bool:
+    if first is None or second is None:
+        return False
+    pairs = zip(first.model_dump().values(), second.model_dump().values(), strict=True)
+    return all(
+        one is two
+        if one is None or two is None
+        else math.isclose(one, two, rel_tol=TOLERANCE, abs_tol=1e-300)
+        for one, two in pairs
+    )
 
 
-def _oddities(folder: Folder) -> Iterator[Finding]:
-    for path, reason in folder.odd():
-        yield finding(
-            "folder",
-            "something that has no place here",
-            where=ascii(path.as_posix())[1:-1],
-            expected="submissions/<split>/<size>/<method>.yaml and scores/<split>/<size>/<name>.nc",
-            got=reason,
-            fix="remove it; predictions and code are kept elsewhere",
-        )
-
-
-def _strays(folder: Folder, known: Sequence[Known]) -> Iterator[Finding]:
-    """Yield score files that belong to nothing, those of entries that cannot be read aside."""
-    named = {path for entry, _ in known for path in entry.score_paths}
-    unread = folder.claims() - {entry.place for entry, _ in known}
-    for path in folder.score_files():
-        split, size, name = *path.parts[1:3], path.stem
-        if path not in named and (split, size, name.partition("_")[0]) not in unread:
-            yield finding(
-                "stray",
-                "a score file that no entry has",
-                where=path,
-                expected="an entry that names these predictions",
-                got="none that can be read",
-                fix="add its entry, or remove it",
-            )
-
-
-def _page_drift(folder: Folder, registry: Registry) -> Iterator[Finding]:
-    try:
-        build(folder.path, check=True, registry=registry)
-    except LagbenchError as error:
-        yield finding(
-            "page",
-            error.what,
-            where=error.where,
-            expected=error.expected,
-            got=error.got,
-            fix=error.fix or "",
-        )
+def _spelt(summary: Summary | None) -> str:
+    if summary is None:
+        return "no such metric"
+    return ", ".join(f"{key} {value}" for key, value in summary.model_dump().items())

@@ -1,4 +1,4 @@
-"""Read submissions and score files, and form the board: every number from score files anew.
+"""Read entries and score files, and form the board: every number from score files anew.
 
 What the YAML files say of scores is not used; ``lagbench leaderboard check`` compares it.
 """
@@ -6,35 +6,67 @@ What the YAML files say of scores is not used; ``lagbench leaderboard check`` co
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
 
 from lagbench.data.registry import Registry, Size, load
 from lagbench.errors import ChecksFailedError, UnreadableFileError
-from lagbench.floors import FLOORS
-from lagbench.metrics import METRICS
-from lagbench.metrics.comparison import FEWEST_SCENARIOS
+from lagbench.metrics import METRICS, Score
+from lagbench.metrics.metric import mean
+from lagbench.metrics.significance import FEWEST_SCENARIOS, Standing, mean_loss, standings
+from lagbench.scoring.scenario import Preview
 from lagbench.submission.task_checks import frames_to_predict
 
-from .entry import Entry
+from .entry import Entry, Status
 from .entry_file import read_entry
+from .floors import FloorScores, read_floors
 from .folder import Folder
-from .model import Board, Row, Tab
-from .pictures import TRUTH, curve, pictures
-from .row import CURVES, Ingredients, make_row
-from .seeds import combine
-from .standing import is_current, is_ranked, mean_loss, standings
-from .stored import read_stored
+from .model import Board, Curve, Floor, Histogram, Pictures, Row, Tab, Value
+from .payload import spaced
+from .ranking import Combined, combine, is_current
+from .score_file import Stored, read_stored, reported_frames
+from .verified import Verification, read_verified, verification_of
 
-__all__ = ["COLUMNS", "collect"]
+__all__ = ["COLUMNS", "CURVES", "CURVE_FRAMES", "RESIDUAL_BINS", "collect", "curve", "residuals"]
 
 COLUMNS = (
-    *("vorticity_rmse", "mse_avg", "vorticity_pearson", "stable_frames", "position_rmse", "velocity_rmse"),
-    *("energy_error", "density_rmse", "momentum_error", "shape_error", "connectivity", "sliced_w2"),
+    *("vorticity_nrmse", "cloud_distance", "vorticity_rmse", "mse_avg", "vorticity_pearson"),
+    *("stable_frames", "position_rmse_20", "position_rmse", "spectrum_error", "velocity_rmse"),
+    *("density_rmse", "momentum_error", "shape_error", "connectivity", "sliced_w2"),
 )
-"""Metrics to show at first, the ranking one aside."""
+"""Metrics to show at first where a data set has them, the ranking one aside."""
+
+CURVES = (
+    *("vorticity_rmse", "attribute_mse", "position_rmse", "vorticity_pearson", "energy_ratio"),
+    *("density_rmse", "divergence_rms"),
+)
+"""Metrics that details have curves of, beside the ranking one."""
 
 ENERGIES = ("energy_true", "energy_predicted")
+
+TRUTH, PREDICTION = 0, 1
+"""Sides of a preview."""
+
+CURVE_FRAMES = 120
+"""Most frames of a curve."""
+
+RESIDUAL_BINS = 41
+"""Bins of the histogram of residuals; odd, so that one holds 0."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Held:
+    """What a row is made of."""
+
+    entry: Entry
+    current: bool
+    stored: Sequence[Stored]  # score file of each seed
+    scores: Mapping[str, Combined]  # by metric, all seeds together
 
 
 def collect(
@@ -57,35 +89,35 @@ def collect(
     """
     place, described = Folder(folder), registry or load()
     place.require()
-    found: dict[tuple[str, str], list[Ingredients]] = {}
+    found: dict[tuple[str, str], list[_Held]] = {}
     for path in place.entries():
-        entry = _entry(place, path)
-        size = described.size(entry.split, entry.size)
-        held = _ingredients(place, entry, size)
+        entry = read_entry(place.path / path)
+        if entry.yaml_path != path:
+            raise ChecksFailedError(
+                "an entry lies in another place than it says",
+                where=str(path),
+                expected=str(entry.yaml_path),
+                fix="let split, size and method be those of the path",
+            )
+        held = _held(place, entry, described.size(entry.split, entry.size))
         if held is not None:
             found.setdefault((entry.split, entry.size), []).append(held)
         report(1)
-    order = [(split, size) for split, held in described.splits.items() for size in held.sizes]
-    tabs = [
-        _tab(described.size(*key), described.split(key[0]).title, found[key]) for key in order if key in found
-    ]
-    seen = {name for tab in tabs for row in tab.rows for name in row.values}
-    return Board(tabs=tuple(tabs), metrics={name: metric for name, metric in METRICS.items() if name in seen})
+    verified, tabs, empty = read_verified(place), [], []
+    for split, about in described.splits.items():
+        for name in about.sizes:
+            size = described.size(split, name)
+            if (split, name) in found:
+                floors = read_floors(place, size)
+                tabs.append(_tab(size, about.title, found[split, name], floors, verified))
+            elif len(size.subsets["test"]) >= FEWEST_SCENARIOS:
+                empty.append((split, name))
+    seen = {name for tab in tabs for row in tab.lines for name in row.values}
+    metrics = {name: metric for name, metric in METRICS.items() if name in seen}
+    return Board(tabs=tuple(tabs), empty=tuple(empty), metrics=metrics)
 
 
-def _entry(place: Folder, path: Path) -> Entry:
-    entry = read_entry(place.path / path)
-    if entry.yaml_path != path:
-        raise ChecksFailedError(
-            "an entry lies in another place than it says",
-            where=str(path),
-            expected=str(entry.yaml_path),
-            fix="let split, size and method be those of the path",
-        )
-    return entry
-
-
-def _ingredients(place: Folder, entry: Entry, size: Size) -> Ingredients | None:
+def _held(place: Folder, entry: Entry, size: Size) -> _Held | None:
     """Return what a row is made of; None for old scores that do not fit the task of today."""
     current = is_current(entry.dataset, size)
     try:
@@ -103,67 +135,156 @@ def _ingredients(place: Folder, entry: Entry, size: Size) -> Ingredients | None:
             expected=", ".join(lacking),
             fix="score the predictions again: lagbench submit",
         )
-    return Ingredients(entry=entry, current=current, stored=stored, scores=scores)
+    return _Held(entry=entry, current=current, stored=stored, scores=scores)
 
 
-def _tab(size: Size, title: str, found: Sequence[Ingredients]) -> Tab:
-    witness = min(found, key=_trust)
-    ranking, scenarios = witness.stored[0].scores.ranking, tuple(sorted(size.subsets["test"]))
+def _tab(
+    size: Size,
+    title: str,
+    found: Sequence[_Held],
+    floors: Sequence[FloorScores],
+    verified: Mapping[str, Verification],
+) -> Tab:
+    # maps of truth and prediction share one packing: an explosion leaves nothing of the truth
+    witness = min(found, key=lambda held: (held.stored[0].precision, held.entry.method))
+    ranking = witness.stored[0].scores.ranking
     ranked = {
-        held.entry.method: held.scores[ranking].score
+        held.entry.method: held.scores[ranking].seeds
         for held in found
-        if is_ranked(held.entry, size) and ranking in held.scores
+        if held.current and held.entry.status is Status.ACTIVE and ranking in held.scores
     }
     places = standings(ranked)
-    frames = tuple(frames_to_predict(size))
-    order = sorted(found, key=lambda held: _order(held, ranking, set(ranked)))
-    rows = tuple(make_row(held, places.get(held.entry.method), size) for held in order)
+
+    def order(held: _Held) -> tuple[bool, float, str]:
+        loss = mean_loss(held.scores[ranking].seeds) if ranking in held.scores else math.inf
+        return held.entry.method not in ranked, loss, held.entry.method
+
+    rows = [
+        _row(held, size, places.get(held.entry.method), verification_of(held.entry, verified))
+        for held in sorted(found, key=order)
+    ]
+    shown = {name for row in rows for name in row.values}
+    standing_for = (ranking, *METRICS[ranking].of, *CURVES)
+    frames, scenarios = tuple(frames_to_predict(size)), tuple(sorted(size.subsets["test"]))
     return Tab(
-        split=size.split,
-        size=size.name,
+        size=size,
         title=title,
-        dataset_version=size.version,
-        dataset_sha256=size.measured.dataset_sha256 if size.measured else witness.entry.dataset.sha256,
-        particles=size.particles,
-        input_frames=size.task.input_frames,
-        frames=frames,
-        frames_of_interest=tuple(sorted({*size.task.frames_of_interest, frames[-1]}.intersection(frames))),
-        frame_interval=size.frame_interval,
         scenarios=scenarios,
+        frames=frames,
+        marked=reported_frames(size),
         ranking=ranking,
         decided=len(scenarios) >= FEWEST_SCENARIOS,
-        columns=_present(dict.fromkeys((ranking, *COLUMNS)), rows),
-        curves=_present(sorted(CURVES, key=lambda name: name != _per_frame(ranking)), rows),
+        columns=_known((ranking, *COLUMNS), shown),
+        curves=_known(standing_for, {name for row in rows for name in row.curves}),
         energy=curve(witness.scores[ENERGIES[0]].score),
-        truth=pictures(witness.stored[0].preview, TRUTH),
-        rows=rows,
+        truth=_pictures(witness.stored[0].preview, TRUTH),
+        rows=tuple(rows),
+        floors=tuple(_floor(held, size, ranking) for held in floors),
     )
 
 
-def _trust(held: Ingredients) -> tuple[int, float, str]:
-    """Order by whose picture of the truth to take: a floor's first, then the finest packed.
-
-    Maps of truth and prediction share one packing, so that a prediction that explodes leaves
-    nothing of the truth.
-    """
-    method = held.entry.method
-    floor = list(FLOORS).index(method) if method in FLOORS else len(FLOORS)
-    return floor, held.stored[0].precision, method
+def _known(names: Iterable[str], known: set[str]) -> tuple[str, ...]:
+    return tuple(name for name in dict.fromkeys(names) if name in known)
 
 
-def _order(held: Ingredients, ranking: str, ranked: set[str]) -> tuple[int, float, str]:
-    """Order rows: ranked ones by their mean, floors, then what is not ranked."""
-    method = held.entry.method
-    group = 0 if method in ranked else 1 if held.entry.floor else 2
-    loss = mean_loss(held.scores[ranking].score) if ranking in held.scores else math.inf
-    return group, loss, method
+def _row(held: _Held, size: Size, standing: Standing | None, verified: Verification | None) -> Row:
+    preview, ranking = held.stored[0].preview, held.stored[0].scores.ranking
+    scores = {name: found.score for name, found in held.scores.items()}
+    return Row(
+        entry=held.entry,
+        current=held.current,
+        rank=standing.rank if standing else None,
+        tied=standing.tied if standing else False,
+        p=standing.p if standing else math.nan,
+        verified=verified,
+        skill=_skill(held.stored),
+        values={
+            name: _value(found.score, found.interval, found.std, size) for name, found in held.scores.items()
+        },
+        seed_means=held.scores[ranking].means,
+        curves=_curves(scores, ranking),
+        energy=curve(scores[ENERGIES[1]]),
+        pictures=_pictures(preview, PREDICTION),
+        residuals=residuals(preview),
+    )
 
 
-def _present(names: Sequence[str] | Mapping[str, None], rows: Sequence[Row]) -> tuple[str, ...]:
-    known = {name for row in rows for name in row.values}
-    return tuple(name for name in names if name in known)
+def _skill(stored: Sequence[Stored]) -> Value | None:
+    """Return the skill that score files say. None does yet: here it enters, and the page shows it."""
+    del stored
+    return None
 
 
-def _per_frame(ranking: str) -> str:
-    """Return the metric per frame that stands for the ranking one."""
-    return "attribute_mse" if ranking == "mse_avg" else ranking
+def _floor(held: FloorScores, size: Size, ranking: str) -> Floor:
+    energy = held.scores.get(ENERGIES[1])
+    return Floor(
+        name=held.name,
+        definition=held.definition,
+        values={name: _value(score, score.interval, math.nan, size) for name, score in held.scores.items()},
+        curves=_curves(held.scores, ranking),
+        energy=curve(energy) if energy is not None and np.isfinite(energy.per_frame).mean() > 0.5 else None,
+        counts=held.counts,
+    )
+
+
+def _value(score: Score, interval: tuple[float, float], std: float, size: Size) -> Value:
+    low, high = interval
+    frames = [frame for frame in reported_frames(size) if frame in score.frames]
+    return Value(
+        mean=score.mean,
+        std=std,
+        low=low,
+        high=high,
+        per_scenario=tuple(score.values.tolist()),
+        at={frame: mean(score.at(frame)) for frame in frames} if score.metric.per_frame else {},
+        undefined=sum(score.undefined),
+    )
+
+
+def _curves(scores: Mapping[str, Score], ranking: str) -> dict[str, Curve]:
+    names = dict.fromkeys((ranking, *METRICS[ranking].of, *CURVES))
+    known = {name: scores[name] for name in names if name in scores}
+    return {name: curve(score) for name, score in known.items() if score.metric.per_frame and score.frames}
+
+
+def curve(score: Score) -> Curve:
+    """Return the mean of a metric over scenarios per frame, and the lowest and highest of them."""
+    chosen = spaced(len(score.frames), CURVE_FRAMES)
+    values = score.per_frame[:, chosen]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a frame where nothing is defined is NaN
+        middle, low, high = np.nanmean(values, axis=0), np.nanmin(values, axis=0), np.nanmax(values, axis=0)
+    return Curve(frames=tuple(score.frames[i] for i in chosen), mean=middle, low=low, high=high)
+
+
+def _pictures(preview: Preview, side: int) -> Pictures:
+    ranges = preview.histogram_range.astype(np.float64).tolist()
+    shares = preview.histogram[side].astype(np.float64)
+    return Pictures(
+        scenario=preview.scenario,
+        map_frames=preview.map_frames,
+        vorticity=preview.vorticity[side],
+        histograms=tuple(
+            Histogram(low=a, high=b, shares=s) for (a, b), s in zip(ranges, shares, strict=True)
+        ),
+        film_frames=preview.film_frames,
+        material=preview.material,
+        film=preview.film[side],
+    )
+
+
+def residuals(preview: Preview) -> tuple[Histogram, ...]:
+    """Return the histogram of predicted minus true vorticity at each map frame."""
+    truth, prediction = preview.vorticity.astype(np.float64)
+    return tuple(_histogram((p - t)[~np.isnan(p - t)]) for t, p in zip(truth, prediction, strict=True))
+
+
+def _histogram(values: NDArray[np.float64]) -> Histogram:
+    """Return shares over +-max abs value; NaN without values."""
+    if not values.size:
+        return Histogram(low=0.0, high=0.0, shares=np.full(RESIDUAL_BINS, np.nan))
+    end = float(np.max(np.abs(values)))
+    # a field without any error is one bin, not a division by 0
+    bins = np.rint((values / end if end else values) * (RESIDUAL_BINS // 2)).astype(int) + RESIDUAL_BINS // 2
+    counts = np.bincount(bins, minlength=RESIDUAL_BINS)
+    return Histogram(low=-end, high=end, shares=counts / values.size)

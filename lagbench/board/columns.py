@@ -1,35 +1,34 @@
-"""Columns of the board's tables and the presets that choose among them."""
+"""Columns of the board's tables, what a row has in each, and the presets that choose among them."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
 from lagbench.metrics import Direction, Metric
-from lagbench.report.html import sentence, text, words
+from lagbench.report.html import MISSING, sentence, text, words
 
-from .model import Row, Tab
+from .entry import Budget
+from .model import Floor, Row, Tab, Value
 
-__all__ = ["COSTS", "Column", "columns_of", "metric_column", "presets_of", "value_of", "written"]
+__all__ = ["Column", "columns_of", "held", "presets_of", "value_of", "written"]
 
-MAIN_METRICS = 7
-"""Metrics of the first table; with more it would be wider than a screen."""
-
-MAIN_COSTS = ("speed_up", "parameters")
+MAIN_METRICS = 5
+"""Metrics of the first table, the ranking one among them; with more it would be wider than a screen."""
 
 PRESETS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         "position": (
-            *("position_rmse", "position_mae", "velocity_rmse", "velocity_mae"),
-            *("attribute_mse", "mse_avg", "mse_end", "sliced_w2", "sinkhorn"),
+            *("cloud_distance", "position_rmse_20", "position_rmse", "position_mae", "velocity_rmse"),
+            *("velocity_mae", "attribute_mse", "mse_avg", "mse_end", "sliced_w2", "sinkhorn", "sinkhorn_pot"),
             *(f"position_rmse_{material}" for material in ("liquid", "jelly", "snow", "rope")),
         ),
         "vorticity": (
-            *("vorticity_rmse", "vorticity_mae", "vorticity_pearson", "stable_frames"),
-            *("vorticity_residual_std", "vorticity_residual_max", "vorticity_residual_slope"),
-            *("vorticity_kl", "vorticity_kl_hist", "vorticity_w1"),
+            *("vorticity_nrmse", "vorticity_rmse", "vorticity_mae", "vorticity_pearson", "stable_frames"),
+            *("spectrum_error", "vorticity_residual_std", "vorticity_residual_max"),
+            *("vorticity_residual_slope", "vorticity_kl", "vorticity_kl_hist", "vorticity_w1"),
         ),
         "energy": (
             *("energy_error", "energy_ratio", "energy_retention", "energy_retention_true"),
@@ -39,9 +38,11 @@ PRESETS: Mapping[str, tuple[str, ...]] = MappingProxyType(
             *("momentum_error", "angular_momentum_error", "density_rmse"),
             *("divergence_rms", "divergence_rms_true", "shape_error", "connectivity"),
         ),
+        "training": ("track", "windows", "epochs", "cpu_hours", "gpu_hours", "parameters", "seeds"),
+        "cost": ("speed_up", "seconds_per_frame", "solver_seconds_per_frame", "parameters", "device"),
     }
 )
-"""Metrics by preset; those that a data set lacks are left out, the ranking one stands first."""
+"""Columns by preset; those that a data set lacks are left out, the ranking one stands first."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,64 +50,128 @@ class Column:
     """One column."""
 
     key: str  # unique name, that of the metric where it shows one
-    label: str  # heading
-    unit: str = ""  # unit, empty for pure numbers
-    direction: Direction = Direction.NONE  # what better means
-    perfect: float | None = None  # value of a perfect prediction, None where it depends
-    form: str = "number"  # how cells are written: "number", "count", "factor" or "text"
-    reported: bool = False  # whether the submitter says it and nothing can compute it again
-    meaning: str  # what it says, one or two sentences
+    label: str
+    unit: str = ""
+    direction: Direction = Direction.NONE
+    perfect: float | None = None
+    form: str = "number"  # how cells are written: number, count, factor or text
+    reported: bool = False  # said by the submitter, computed again by nobody
+    meaning: str
+    of: Callable[[Row], object] | None = None  # what an entry has there, where no metric stands behind
+
+    @property
+    def quantity(self) -> str:
+        """Label and unit, as an axis has them."""
+        return f"{self.label} [{self.unit}]" if self.unit else self.label
+
+    def loss(self, value: float) -> float:
+        """Return the value turned so that smaller is better; NaN for what is not judged."""
+        if self.direction is Direction.TARGET and self.perfect is not None:
+            return abs(value - self.perfect)
+        return {Direction.LOWER: value, Direction.HIGHER: -value}.get(self.direction, math.nan)
 
 
-REPORTED = "Self-reported: said by the submitter, computed again by nobody."
+SKILL = Column(
+    key="skill",
+    label="skill",
+    direction=Direction.HIGHER,
+    perfect=1.0,
+    meaning="1 - score / score of the best floor, by the ranking metric: 0 is nothing learned, 1 perfect.",
+)
 
-COSTS = (
-    Column(
-        key="speed_up",
-        label="speed\u2011up",
-        direction=Direction.HIGHER,
-        form="factor",
-        reported=True,
-        meaning=f"Time of the solver over time of the model per frame, both on the same machine: below 1×"
-        f" the model is slower than the solver. {REPORTED}",
+
+def _of(part: str, key: str) -> Callable[[Row], object]:
+    return lambda row: getattr(getattr(row.entry, part) if part else row.entry, key, None)
+
+
+def _reported(part: str, held: Mapping[str, tuple[str, str, str, Direction, str]]) -> Iterator[Column]:
+    """Yield columns of what submitters say: key to label, unit, form, direction and meaning."""
+    for key, (label, unit, form, direction, meaning) in held.items():
+        yield Column(
+            key=key,
+            label=label,
+            unit=unit,
+            direction=direction,
+            form=form,
+            reported=True,
+            meaning=meaning,
+            of=_of(part, key),
+        )
+
+
+LOWER, HIGHER, NONE = Direction.LOWER, Direction.HIGHER, Direction.NONE
+COST = {
+    "speed_up": (
+        "speed\u2011up",
+        "",
+        "factor",
+        HIGHER,
+        "Time of the solver over that of the model per frame.",
     ),
+    "seconds_per_frame": ("time per frame", "s", "number", LOWER, "Wall time of a frame of one scenario."),
+    "solver_seconds_per_frame": ("solver time per frame", "s", "number", NONE, "On the same machine."),
+    "device": ("device", "", "text", NONE, "Machine of both times."),
+}
+TRAINING = {
+    "track": ("track", "", "text", NONE, "Equal compute for all, or trained until it no longer helped."),
+    "windows": ("windows", "", "count", NONE, "Training windows seen."),
+    "epochs": ("epochs", "", "number", NONE, "Passes over the training subset."),
+    "cpu_hours": ("CPU time", "h", "number", NONE, "Of one training."),
+    "gpu_hours": ("GPU time", "h", "number", NONE, "Of one training."),
+}
+PARAMETERS = {"parameters": ("parameters", "", "count", NONE, "Trainable parameters of the model.")}
+
+OF_ENTRY = (
+    *_reported("cost", COST),
+    *_reported("", PARAMETERS),
     Column(
-        key="seconds_per_frame",
-        label="time per frame",
-        unit="s",
-        direction=Direction.LOWER,
-        reported=True,
-        meaning=f"Wall time of one predicted frame of one scenario. {REPORTED}",
-    ),
-    Column(
-        key="solver_seconds_per_frame",
-        label="solver time per frame",
-        unit="s",
-        reported=True,
-        meaning=f"Wall time of one frame of the solver on the same machine. {REPORTED}",
-    ),
-    Column(
-        key="parameters",
-        label="parameters",
-        form="count",
-        reported=True,
-        meaning=f"Trainable parameters of the model. {REPORTED}",
-    ),
-    Column(key="seeds", label="seeds", form="count", meaning="Trainings behind the row."),
-    Column(
-        key="device",
-        label="device",
+        key="budget",
+        label="budget",
         form="text",
         reported=True,
-        meaning=f"Machine of both times. {REPORTED}",
+        meaning="Computing time of one training.",
+        of=lambda row: _budget(row.entry.budget),
     ),
-    Column(key="date", label="date", form="text", meaning="When the entry was submitted."),
+    *_reported("budget", TRAINING),
+    Column(
+        key="seeds",
+        label="seeds",
+        form="count",
+        meaning="Trainings behind the row; with one it speaks of these weights only.",
+        of=lambda row: len(row.entry.predictions),
+    ),
+    Column(
+        key="checked",
+        label="scores",
+        form="text",
+        meaning="Verified: the maintainers scored these predictions again. As submitted: they did not.",
+        of=lambda row: "verified" if row.verified else "as submitted",
+    ),
+    Column(key="date", label="date", form="text", meaning="Of the submission.", of=_of("", "date")),
 )
 """Columns that no metric stands behind."""
 
 
-def metric_column(metric: Metric) -> Column:
-    """Return the column of a metric."""
+def _budget(budget: Budget | None) -> str:
+    """Return the computing time of a training in words."""
+    if budget is None:
+        return ""
+    hours = {"CPU": budget.cpu_hours, "GPU": budget.gpu_hours}
+    said = [f"{text(value)} {kind} h" for kind, value in hours.items() if value]
+    weights = f"{_count(float(budget.windows))} windows" if budget.windows else ""
+    return " + ".join(said) or weights
+
+
+def columns_of(tab: Tab, metrics: Mapping[str, Metric]) -> dict[str, Column]:
+    """Return all columns of a tab by key: skill, the metrics to show at first, the others, then the rest."""
+    found = {name for row in tab.lines for name in row.values}
+    names = [name for name in dict.fromkeys((*tab.columns, *metrics)) if name in found]
+    columns = [SKILL] if any(row.skill for row in tab.rows) else []
+    columns += [_metric_column(metrics[name]) for name in names]
+    return {column.key: column for column in (*columns, *OF_ENTRY)}
+
+
+def _metric_column(metric: Metric) -> Column:
     return Column(
         key=metric.name,
         label=words(metric.name),
@@ -117,37 +182,30 @@ def metric_column(metric: Metric) -> Column:
     )
 
 
-def columns_of(tab: Tab, metrics: Mapping[str, Metric]) -> tuple[str, ...]:
-    """Return the keys of all columns that a tab can show: metrics in the table's order, then costs."""
-    found = {name for row in tab.rows for name in row.values}
-    return (*(name for name in metrics if name in found), *(column.key for column in COSTS))
-
-
-def presets_of(tab: Tab, metrics: Mapping[str, Metric]) -> dict[str, tuple[str, ...]]:
+def presets_of(tab: Tab, columns: Mapping[str, Column]) -> dict[str, tuple[str, ...]]:
     """Return the keys of each preset that has something to show, main first, all last."""
-    known = columns_of(tab, metrics)
-    costs = tuple(column.key for column in COSTS)
-    chosen = {"main": (*tab.columns[:MAIN_METRICS], *MAIN_COSTS), **PRESETS, "cost": costs, "all": known}
+    main = ("skill", *tab.columns[:MAIN_METRICS], "speed_up", "budget", "checked")
+    chosen = {"main": main, **PRESETS, "all": tuple(columns)}
     presets = {}
     for name, keys in chosen.items():
-        if any(key in known for key in keys):
-            wanted = dict.fromkeys((tab.ranking, *keys))
-            presets[name] = tuple(key for key in wanted if key in known)
+        if any(key in columns for key in keys):
+            presets[name] = tuple(key for key in columns if key in ("skill", tab.ranking, *keys))
     return presets
 
 
-def value_of(row: Row, key: str) -> float | str:
-    """Return what a row has in a column; NaN where it has nothing."""
-    if key in row.values:
-        return row.values[key].mean
-    if key == "date":
-        return row.date
-    if key == "device":
-        return row.cost.device if row.cost else ""
-    if key == "seeds":
-        return math.nan if row.floor else float(row.seeds)
-    found = row.parameters if key == "parameters" else getattr(row.cost, key, None)
-    return math.nan if found is None else float(found)
+def value_of(row: Row | Floor, column: Column) -> float | str:
+    """Return what a row has in a column; NaN, or an empty text, where it has nothing."""
+    if (value := held(row, column.key)) is not None:
+        return value.mean
+    found = column.of(row) if column.of and isinstance(row, Row) else None
+    if column.form == "text":
+        return str(found or "")
+    return math.nan if found is None else float(str(found))
+
+
+def held(row: Row | Floor, key: str) -> Value | None:
+    """Return the value of a metric, or the skill; None where a row has none."""
+    return row.skill if key == "skill" and isinstance(row, Row) else row.values.get(key)
 
 
 def written(value: float | str, form: str) -> str:
@@ -157,7 +215,7 @@ def written(value: float | str, form: str) -> str:
     ('0.0123', '1.61 M', '17.2×')
     """
     if isinstance(value, str):
-        return value
+        return value or MISSING
     if form == "count":
         return _count(value)
     said = text(value)

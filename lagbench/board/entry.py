@@ -2,17 +2,21 @@
 
 Everything but the score block is written by whoever submits; the score block is written by
 ``lagbench submit`` alone. Strangers write these files, so every text has a length, every
-number a range, links are http(s) and nothing else, and unknown keys are refused.
+number a range, links are http(s) and nothing else, and unknown keys are refused. Whether the
+maintainers scored the predictions again is said elsewhere: verified.py.
 """
 
 from __future__ import annotations
 
 import datetime
 import enum
+import ipaddress
+import unicodedata
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
+from urllib.parse import urlsplit
 
 from pydantic import (
     AfterValidator,
@@ -24,33 +28,34 @@ from pydantic import (
     model_validator,
 )
 
-from lagbench.floors import FLOORS
-
-from .folder import entry_path, score_paths
+from .folder import Place, entry_path, score_paths
 
 __all__ = [
     "ID",
+    "LONGEST_ID",
     "LONGEST_TEXT",
     "MOST_SEEDS",
     "PATTERNS",
     "About",
-    "CostEntry",
+    "Budget",
+    "Cost",
     "DataSet",
+    "Date",
     "Entry",
-    "FlagEntry",
-    "PredictionEntry",
+    "Flag",
+    "Hash",
+    "Meta",
+    "Prediction",
     "ScoreBlock",
     "ScoredFile",
+    "Short",
     "Status",
+    "Strict",
     "Summary",
 ]
 
 ID = r"^[a-z0-9]+(-[a-z0-9]+)*$"
-"""What names a method: in file names, addresses and the page."""
-
-WEB = r"^https?://[A-Za-z0-9][!#-&(-;=?-\[\]_a-z~]*$"
-"""An address of the web, without spaces, quotes and what could end an HTML attribute."""
-
+WEB = r"^https?://[A-Za-z0-9][!#-&(-;=?-\[\]_a-z~]*$"  # nothing that could end an HTML attribute
 SHA256 = r"^[0-9a-f]{64}$"
 RELEASE = r"^[1-9]\d{0,5}\.\d{1,6}\.\d{1,6}$"
 LABEL = r"^[a-z0-9_]+$"
@@ -68,24 +73,57 @@ PATTERNS: Mapping[str, str] = MappingProxyType(
 
 LONGEST_ID = 60
 LONGEST_TEXT = 1000
-"""Longest text of an entry [characters]."""
-
 MOST_SEEDS = 20
-"""Most predictions, one per seed, of an entry."""
-
 MOST_BYTES = 2**40
+MOST_MARKS = 3
+"""Combining marks on one letter; no script needs more, piles of them cover the neighbours."""
+
+BLANKS = frozenset("\u115f\u1160\u2800\u3164\uffa0")
+"""Letters and symbols that show nothing, though Unicode counts them as printable."""
 
 
 def _line(text: str) -> str:
-    if not text.isprintable():
+    marks = 0
+    for letter in unicodedata.normalize("NFC", text):
+        marks = marks + 1 if unicodedata.category(letter).startswith("M") else 0
+        if marks > MOST_MARKS:
+            raise ValueError("holds letters under piles of marks")
+    if not text.isprintable() or BLANKS.intersection(text):
         raise ValueError("holds characters that cannot be printed, such as line breaks")
     return text
 
 
 def _lines(text: str) -> str:
-    if not text.replace("\n", "").isprintable():
-        raise ValueError("holds characters that cannot be printed")
+    _line(text.replace("\n", ""))
     return text
+
+
+def _visible(text: str) -> str:
+    if text != text.strip() or not any(letter.isalnum() for letter in text):
+        raise ValueError("holds no letter or digit, or begins or ends with a blank")
+    return text
+
+
+def _named_host(address: str) -> str:
+    """Refuse hosts that read as another one, or that are no name that anybody could look up."""
+    try:
+        host = urlsplit(address).hostname or ""
+    except ValueError:
+        host = ""
+    labels = host.split(".")
+    try:
+        ipaddress.ip_address(host.strip("[]"))
+        labels = []
+    except ValueError:
+        pass
+    if (
+        "@" in address
+        or "" in labels[:-1]
+        or len(labels) < 2
+        or any(part.startswith("xn--") for part in labels)
+    ):
+        raise ValueError("is not the address of a named host, without user and punycode")
+    return address
 
 
 def _inside(path: str) -> str:
@@ -99,9 +137,13 @@ def _date(value: object) -> object:
 
 
 Name = Annotated[str, StringConstraints(pattern=ID, max_length=LONGEST_ID)]
-Short = Annotated[str, StringConstraints(min_length=1, max_length=100), AfterValidator(_line)]
+Label = Annotated[str, StringConstraints(pattern=LABEL, max_length=LONGEST_ID)]
+Short = Annotated[
+    str, StringConstraints(min_length=1, max_length=100), AfterValidator(_line), AfterValidator(_visible)
+]
+Line = Annotated[str, StringConstraints(max_length=200), AfterValidator(_line)]
 Long = Annotated[str, StringConstraints(max_length=LONGEST_TEXT), AfterValidator(_lines)]
-Link = Annotated[str, StringConstraints(pattern=WEB, max_length=300)]
+Link = Annotated[str, StringConstraints(pattern=WEB, max_length=300), AfterValidator(_named_host)]
 InnerPath = Annotated[
     str, StringConstraints(min_length=1, max_length=200), AfterValidator(_line), AfterValidator(_inside)
 ]
@@ -109,7 +151,9 @@ Hash = Annotated[str, StringConstraints(pattern=SHA256)]
 Version = Annotated[str, StringConstraints(pattern=RELEASE)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Seconds = Annotated[float, Field(ge=1e-7, lt=1e9, allow_inf_nan=False)]
+Amount = Annotated[float, Field(ge=0, lt=1e12, allow_inf_nan=False)]
 Number = Annotated[float, Field(allow_inf_nan=False)]
+Date = Annotated[datetime.date, BeforeValidator(_date)]
 
 
 class Status(enum.StrEnum):
@@ -120,18 +164,20 @@ class Status(enum.StrEnum):
     WITHDRAWN = "withdrawn"
 
 
-class _Strict(BaseModel):
+class Strict(BaseModel):
+    """Frozen, without other keys and without conversions."""
+
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
 
-class DataSet(_Strict):
+class DataSet(Strict):
     """The data set that was predicted."""
 
     version: Version
     sha256: Hash
 
 
-class PredictionEntry(_Strict):
+class Prediction(Strict):
     """One predictions.nc: where it is kept, if anywhere, and what it holds."""
 
     seed: Seed | None = None
@@ -141,90 +187,119 @@ class PredictionEntry(_Strict):
     bytes: int | None = Field(default=None, gt=0, lt=MOST_BYTES, description="length of the file")
 
 
-class CostEntry(_Strict):
+class Cost(Strict):
     """What a predicted frame costs, and what the solver takes on the same machine."""
 
     seconds_per_frame: Seconds
     device: Short
     solver_seconds_per_frame: Seconds | None = None
 
+    @property
+    def speed_up(self) -> float | None:
+        """Solver time over model time; None without the former."""
+        solver = self.solver_seconds_per_frame
+        return None if solver is None else solver / self.seconds_per_frame
 
-class FlagEntry(_Strict):
+
+class Budget(Strict):
+    """What the training of one seed took."""
+
+    track: Literal["equal compute", "converged"] | None = None
+    windows: int | None = Field(default=None, ge=0, lt=10**15, description="training windows seen")
+    epochs: Amount | None = None
+    cpu_hours: Amount | None = None
+    gpu_hours: Amount | None = None
+
+
+class Flag(Strict):
     """A flag of the scorer or a warning of the validation."""
 
-    name: Annotated[str, StringConstraints(pattern=LABEL, max_length=LONGEST_ID)]
+    name: Label
     reasons: Annotated[tuple[Long, ...], Field(max_length=20, strict=False)] = ()
+    share: Annotated[float, Field(ge=0, le=1)] | None = Field(default=None, description="of what it is about")
 
 
-class Summary(_Strict):
+class Summary(Strict):
     """A metric over scenarios and seeds; null where undefined."""
 
     mean: Number | None
     std: Number | None = Field(description="sample standard deviation over seeds; null for one")
-    low: Number | None = Field(description="lower bound of the 95 % interval over scenarios")
+    low: Number | None = Field(description="lower bound of the 95 % interval")
     high: Number | None
 
 
-class ScoredFile(_Strict):
+class ScoredFile(Strict):
     """The score file of one predictions.nc, and what the scorer said beside its numbers."""
 
     sha256: Hash = Field(description="of the score file")
     predictions_sha256: Hash
     diverged_at: Annotated[dict[int, int], Field(max_length=10_000)] = Field(default_factory=dict)
-    flags: Annotated[tuple[FlagEntry, ...], Field(max_length=20, strict=False)] = ()
-    warnings: Annotated[tuple[FlagEntry, ...], Field(max_length=100, strict=False)] = ()
+    flags: Annotated[tuple[Flag, ...], Field(max_length=20, strict=False)] = ()
+    warnings: Annotated[tuple[Flag, ...], Field(max_length=100, strict=False)] = ()
 
 
-class ScoreBlock(_Strict):
-    """What `lagbench submit` writes; `lagbench leaderboard check` finds any change to it."""
+class ScoreBlock(Strict):
+    """What `lagbench submit` writes; `lagbench leaderboard check` forms its numbers again."""
 
-    scored_by: Short
     lagbench: Short = Field(description="version of the scorer")
     dataset_sha256: Hash
-    ranking_metric: Annotated[str, StringConstraints(pattern=LABEL, max_length=LONGEST_ID)]
+    ranking_metric: Label
     files: Annotated[tuple[ScoredFile, ...], Field(min_length=1, max_length=MOST_SEEDS, strict=False)]
     metrics: Annotated[dict[str, Summary], Field(max_length=500)]
-    digest: Hash = Field(description="of this block and the predictions it belongs to")
 
 
-class About(_Strict):
-    """What a submitter says of a method; `lagbench submit --from` reads a file of these keys."""
+class About(Strict):
+    """What a submitter says of a method."""
 
     name: Short | None = Field(default=None, description="what the method is called")
     authors: Annotated[tuple[Short, ...], Field(max_length=50, strict=False)] = ()
-    affiliation: Annotated[str, StringConstraints(max_length=200), AfterValidator(_line)] = ""
-    licence: Annotated[str, StringConstraints(max_length=60), AfterValidator(_line)] = ""
+    affiliation: Line = ""
+    licence: Annotated[Line, Field(max_length=60)] = ""
     code: Link | None = None
     paper: Link | None = None
-    date: Annotated[datetime.date, BeforeValidator(_date)] | None = None
+    weights: Link | None = None
+    date: Date | None = None
     notes: Long = ""
     training: Long = Field(default="", description="what it was trained on, in words")
+    budget: Budget | None = None
     parameters: int | None = Field(default=None, ge=0, lt=10**15, description="trainable parameters")
-    hardware: Annotated[str, StringConstraints(max_length=200), AfterValidator(_line)] = Field(
-        default="", description="machine of the training"
-    )
+    hardware: Line = Field(default="", description="machine of the training")
     command: Long = Field(default="", description="shell commands that make the predictions again")
-    cost: CostEntry | None = None
+    cost: Cost | None = None
+
+
+class Meta(About):
+    """What a submitter says of a method and of this submission of it: keys of ``--from``."""
+
+    method: Name | None = Field(
+        default=None, description="names the entry; by default what the predictions say"
+    )
+    urls: Annotated[tuple[Link, ...], Field(max_length=MOST_SEEDS, strict=False)] = ()
+    solver_seconds_per_frame: Seconds | None = None
 
 
 class Entry(About):
     """The whole file leaderboard/submissions/<split>/<size>/<method>.yaml."""
 
-    format: Literal[1]
+    ORDER: ClassVar[tuple[str, ...]] = (
+        *("format", "split", "size", "method", "name", "authors", "affiliation", "licence", "code", "paper"),
+        *("weights", "date", "notes", "status", "superseded_by", "reason", "training", "budget"),
+        *("parameters", "hardware", "command", "dataset", "predictions", "cost", "score"),
+    )
+
+    format: Literal[2]
     split: Name
     size: Name
     method: Name
     name: Short
     authors: Annotated[tuple[Short, ...], Field(min_length=1, max_length=50, strict=False)]
-    date: Annotated[datetime.date, BeforeValidator(_date)]
-    command: Annotated[str, StringConstraints(min_length=1, max_length=LONGEST_TEXT), AfterValidator(_lines)]
+    date: Date
+    command: Annotated[Long, Field(min_length=1)]
     status: Annotated[Status, Field(strict=False)] = Status.ACTIVE
     superseded_by: Name | None = None
     reason: Long = Field(default="", description="why it was superseded or withdrawn")
     dataset: DataSet
-    predictions: Annotated[
-        tuple[PredictionEntry, ...], Field(min_length=1, max_length=MOST_SEEDS, strict=False)
-    ]
+    predictions: Annotated[tuple[Prediction, ...], Field(min_length=1, max_length=MOST_SEEDS, strict=False)]
     score: ScoreBlock
 
     @model_validator(mode="after")
@@ -239,12 +314,7 @@ class Entry(About):
         return self
 
     @property
-    def floor(self) -> bool:
-        """Whether it is one of the scorer's own floors."""
-        return self.method in FLOORS
-
-    @property
-    def place(self) -> tuple[str, str, str]:
+    def place(self) -> Place:
         """Split, size and method."""
         return self.split, self.size, self.method
 
@@ -257,24 +327,3 @@ class Entry(About):
     def score_paths(self) -> tuple[Path, ...]:
         """Where its score files lie, relative to the folder, in the order of the predictions."""
         return score_paths(self.place, [made.seed for made in self.predictions])
-
-    def plain(self) -> dict[str, Any]:
-        """Return the entry as what YAML holds; optional keys at their default are left out."""
-        plain: dict[str, Any] = _plain(self.model_dump(mode="python", exclude_defaults=True))
-        return {key: plain[key] for key in _ORDER if key in plain}
-
-
-_ORDER = (
-    *("format", "split", "size", "method", "name", "authors", "affiliation", "licence", "code", "paper"),
-    *("date", "notes", "status", "superseded_by", "reason", "training", "parameters", "hardware", "command"),
-    *("dataset", "predictions", "cost", "score"),
-)
-"""Keys in the order in which they are written."""
-
-
-def _plain(value: Any) -> Any:  # noqa: ANN401
-    if isinstance(value, dict):
-        return {key: _plain(held) for key, held in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(held) for held in value]
-    return str(value) if isinstance(value, enum.Enum) else value

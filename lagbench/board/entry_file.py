@@ -1,7 +1,10 @@
-"""Read and write the YAML file of an entry; whatever a stranger put there stays text."""
+"""Read and write YAML files of submitters; whatever a stranger put there stays text."""
 
 from __future__ import annotations
 
+import enum
+import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar, get_args
@@ -10,13 +13,22 @@ import yaml
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from lagbench.data.yamlfile import read_yaml
-from lagbench.errors import ChecksFailedError, UnreadableFileError, nearest
+from lagbench.data.yamlfile import NUMBERS, read_yaml
+from lagbench.errors import ChecksFailedError, UnreadableFileError, UsageError, nearest
 from lagbench.submission.findings import quoted
 
-from .entry import PATTERNS, Entry
+from .entry import PATTERNS, Entry, Meta
 
-__all__ = ["MAX_ENTRY_BYTES", "Mistake", "examine", "load_plain", "read_entry", "spell_entry"]
+__all__ = [
+    "MAX_ENTRY_BYTES",
+    "Mistake",
+    "examine",
+    "load_plain",
+    "read_entry",
+    "read_meta",
+    "schema_bytes",
+    "spell",
+]
 
 MAX_ENTRY_BYTES = 64_000
 """Longest YAML file of an entry [bytes]; twenty seeds and all metrics take half of it."""
@@ -24,27 +36,26 @@ MAX_ENTRY_BYTES = 64_000
 MOST_MISTAKES = 20
 """Mistakes of one file that are told."""
 
-WIDTH = 110
-
-Model = TypeVar("Model", bound=BaseModel)
-
 
 @dataclass(frozen=True, kw_only=True)
 class Mistake:
-    """One thing in an entry that does not fit the schema."""
+    """One thing in a file that does not fit its schema."""
 
     where: str  # key, as in "predictions.0.url"
-    what: str  # what is wrong
+    what: str
     got: str  # what stands there, shortened and escaped
-    fix: str | None = None  # the nearest known key where one is unknown, else None
+    fix: str | None = None  # the nearest known key where one is unknown
 
     def __str__(self) -> str:
         """Return the mistake as one line."""
         return f"{self.where}: {self.what}; got {self.got}" + (f"; {self.fix}" if self.fix else "")
 
 
+Model = TypeVar("Model", bound=BaseModel)
+
+
 def load_plain(path: Path) -> Any:  # noqa: ANN401
-    """Return what a YAML file of a submitter holds, after looking at its length."""
+    """Return what a YAML file of a submitter holds, after looking at its kind and length."""
     try:
         regular, length = path.is_file(), path.stat().st_size
     except OSError as error:
@@ -69,7 +80,7 @@ def examine(kind: type[Model], value: object) -> tuple[Model | None, tuple[Mista
     # a list with a faulty member is said to be too short as well
     inner = {item["loc"][:depth] for item in found for depth in range(1, len(item["loc"]))}
     told = [item for item in found if item["loc"] not in inner][:MOST_MISTAKES]
-    return None, tuple(_mistake(kind, it["loc"], it["type"], _said(it), it["input"]) for it in told)
+    return None, tuple(_mistake(kind, item) for item in told)
 
 
 def read_entry(path: Path) -> Entry:
@@ -85,44 +96,85 @@ def read_entry(path: Path) -> Entry:
     return entry
 
 
-def spell_entry(entry: Entry) -> bytes:
-    """Return an entry as the bytes of its YAML file; equal entries give equal bytes."""
+def read_meta(path: Path | None, options: Mapping[str, object]) -> Meta:
+    """Return what a YAML file and options say; options win.
+
+    Args:
+        path: a YAML file, or None.
+        options: keys of :class:`Meta` to values; None and empty ones are not given.
+
+    Raises:
+        UnreadableFileError: no regular file, too long, or no plain YAML.
+        UsageError: an unknown key or a value that does not fit.
+    """
+    held = {} if path is None else load_plain(path)
+    if not isinstance(held, dict):
+        raise UsageError(
+            "the file does not describe a method", where=str(path), expected="lines of key: value"
+        )
+    given = {key: value for key, value in options.items() if value not in (None, "", (), [])}
+    meta, mistakes = examine(Meta, {**held, **given})
+    if meta is None:
+        raise UsageError(
+            "what is said of the method does not fit",
+            where="options" if path is None else f"{path}, or options",
+            got="\n    ".join(["", *map(str, mistakes)]),
+            fix="docs/submitting.md describes the keys",
+        )
+    return meta
+
+
+def schema_bytes() -> bytes:
+    """Return the JSON schema of an entry as the bytes of leaderboard/schema.json."""
+    schema = Entry.model_json_schema()
+    schema |= {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "Entry of the lagbench leaderboard",
+    }
+    return f"{json.dumps(schema, indent=1, ensure_ascii=False)}\n".encode()
+
+
+def spell(value: Any) -> bytes:  # noqa: ANN401
+    """Return an entry, or plain values, as the bytes of a YAML file; equal ones give equal bytes."""
+    if isinstance(value, Entry):
+        held = value.model_dump(mode="python", exclude_defaults=True)
+        value = {key: held[key] for key in Entry.ORDER if key in held}
     text = yaml.dump(
-        entry.plain(),
-        Dumper=_Dumper,
-        sort_keys=False,
-        allow_unicode=True,
-        width=WIDTH,
-        default_flow_style=None,
+        _plain(value), Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=110, default_flow_style=None
     )
     return text.encode()
 
 
+def _plain(value: Any) -> Any:  # noqa: ANN401
+    if isinstance(value, dict):
+        return {key: _plain(held) for key, held in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(held) for held in value]
+    return str(value) if isinstance(value, enum.Enum) else value
+
+
 class _Dumper(yaml.SafeDumper):
-    """Writes twice what stands twice; our reader refuses aliases."""
+    """Knows the numbers that our reader knows, and writes no aliases, which it refuses."""
 
     def ignore_aliases(self, data: object) -> bool:
         return True
 
 
-def _mistake(
-    kind: type[BaseModel], place: tuple[int | str, ...], code: str, message: str, given: object
-) -> Mistake:
+for _tag, _pattern in NUMBERS.items():
+    _Dumper.add_implicit_resolver(_tag, _pattern, list("-+.0123456789"))
+
+
+def _mistake(kind: type[BaseModel], item: ErrorDetails) -> Mistake:
+    place, given = item["loc"], quoted(item["input"])
     where = quoted(".".join(map(str, place)))[1:-1] or "the file"
-    if code == "extra_forbidden":
-        known = _fields(kind, place[:-1])
-        return Mistake(
-            where=where, what="unknown key", got=quoted(given), fix=nearest(str(place[-1])[:100], known)
-        )
-    if code == "missing":
+    if item["type"] == "extra_forbidden":
+        fix = nearest(str(place[-1])[:100], _fields(kind, place[:-1]))
+        return Mistake(where=where, what="unknown key", got=given, fix=fix)
+    if item["type"] == "missing":
         return Mistake(where=where, what="this key is missing", got="no such key")
-    return Mistake(where=where, what=message, got=quoted(given))
-
-
-def _said(item: ErrorDetails) -> str:
-    """Return what is wrong in words, without a regular expression."""
     wanted = PATTERNS.get(item.get("ctx", {}).get("pattern", ""))
-    return item["msg"].removeprefix("Value error, ") if wanted is None else f"is not {wanted}"
+    what = item["msg"].removeprefix("Value error, ") if wanted is None else f"is not {wanted}"
+    return Mistake(where=where, what=what, got=given)
 
 
 def _fields(kind: type[BaseModel], place: tuple[int | str, ...]) -> list[str]:

@@ -1,6 +1,10 @@
-"""The leaderboard's folder: where entries and score files lie, and nothing outside it.
+"""The leaderboard's folder: where its files lie, and nothing outside it.
 
-``submissions/<split>/<size>/<method>.yaml`` and ``scores/<split>/<size>/<method>[_<seed>].nc``.
+    submissions/<split>/<size>/<method>.yaml      entries
+    scores/<split>/<size>/<method>[_<seed>].nc    their score files
+    floors/<split>/<size>/<name>.nc               scores of the floors
+    verified.yaml, schema.json, index.html, README.md
+
 Symbolic links are never followed: one could lead out of the folder.
 """
 
@@ -9,17 +13,31 @@ from __future__ import annotations
 import os
 import re
 import stat
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
 from lagbench.errors import UsageError
 
-__all__ = ["PAGE_NAME", "SCORES", "SUBMISSIONS", "Folder", "entry_path", "score_paths"]
+__all__ = [
+    "FLOORS",
+    "PAGE",
+    "SCHEMA",
+    "SCORES",
+    "SUBMISSIONS",
+    "VERIFIED",
+    "Folder",
+    "Place",
+    "entry_path",
+    "score_paths",
+]
 
-SUBMISSIONS, SCORES = "submissions", "scores"
-PAGE_NAME = "index.html"
+Place = tuple[str, str, str]
+"""Split, size and method."""
 
-ENDINGS = {SUBMISSIONS: ".yaml", SCORES: ".nc"}
+SUBMISSIONS, SCORES, FLOORS = "submissions", "scores", "floors"
+PAGE, SCHEMA, VERIFIED, README = "index.html", "schema.json", "verified.yaml", "README.md"
+
+ENDINGS = {SUBMISSIONS: ".yaml", SCORES: ".nc", FLOORS: ".nc"}
 KEPT = ".gitkeep"
 PART = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 """What a folder or file may be called: nothing that a terminal or a CI log would obey."""
@@ -28,7 +46,7 @@ DEPTH = 4
 """Parts of a path: submissions or scores, split, size, file name."""
 
 
-def entry_path(place: tuple[str, str, str]) -> Path:
+def entry_path(place: Place) -> Path:
     """Return where an entry lies, relative to the folder.
 
     >>> entry_path(("cavity", "mini", "gns")).as_posix()
@@ -38,7 +56,7 @@ def entry_path(place: tuple[str, str, str]) -> Path:
     return Path(SUBMISSIONS, split, size, f"{method}.yaml")
 
 
-def score_paths(place: tuple[str, str, str], seeds: Sequence[int | None]) -> tuple[Path, ...]:
+def score_paths(place: Place, seeds: Sequence[int | None]) -> tuple[Path, ...]:
     """Return where the score files of an entry lie, relative to the folder.
 
     The names follow from the entry, so that nothing in it can point elsewhere. An underscore,
@@ -58,44 +76,45 @@ class Folder:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
 
-    @property
-    def page(self) -> Path:
-        """The page that ``lagbench leaderboard build`` writes."""
-        return self.path / PAGE_NAME
-
-    def require(self) -> None:
+    def require(
+        self, fix: str = "run it from the root of the repository, or name it: --board FOLDER"
+    ) -> None:
         """Refuse a folder that is no leaderboard."""
         if not (self.path / SUBMISSIONS).is_dir():
             raise UsageError(
                 "no leaderboard here",
                 where=str(self.path),
                 expected=f"a folder that holds {SUBMISSIONS}/",
-                fix="run it from the root of the repository, or name the folder: --board FOLDER",
+                fix=fix,
             )
 
     def entries(self) -> tuple[Path, ...]:
         """Return the YAML files of entries, relative to the folder, in the order of their names."""
-        return tuple(path for path in self._files(SUBMISSIONS) if self.oddity(path) is None)
+        return self._sound(SUBMISSIONS)
 
     def score_files(self) -> tuple[Path, ...]:
         """Return the score files, relative to the folder, in the order of their names."""
-        return tuple(path for path in self._files(SCORES) if self.oddity(path) is None)
+        return self._sound(SCORES)
 
-    def claims(self) -> set[tuple[str, str, str]]:
+    def floor_files(self, split: str = "", size: str = "") -> tuple[Path, ...]:
+        """Return the scores of floors, of one split and size or all, in the order of their names."""
+        return tuple(path for path in self._sound(FLOORS) if path.parts[1:3] == (split, size) or not split)
+
+    def claims(self) -> set[Place]:
         """Return split, size and method of all that lies where an entry would, whatever it is."""
         ends = ENDINGS[SUBMISSIONS]
-        files = [
-            path for path in self._files(SUBMISSIONS) if len(path.parts) == DEPTH and path.suffix == ends
-        ]
+        files = [p for p in self._files(SUBMISSIONS) if len(p.parts) == DEPTH and p.suffix == ends]
         return {(path.parts[1], path.parts[2], path.stem) for path in files}
 
-    def odd(self) -> Iterator[tuple[Path, str]]:
-        """Yield what should not lie under submissions and scores, and why."""
-        for top in (SUBMISSIONS, SCORES):
-            for path in self._files(top):
-                reason = self.oddity(path)
-                if reason is not None:
-                    yield path, reason
+    def odd(self, expected: Collection[Path]) -> Iterator[tuple[Path, str]]:
+        """Yield what should not lie in the folder, and why."""
+        known = {Path(name) for name in (PAGE, SCHEMA, VERIFIED, README)} | set(expected)
+        for path in self._files(""):
+            reason = self.oddity(path) if path.parts[0] in ENDINGS else "nothing here knows it"
+            if path in known:
+                reason = f"{path} is a symbolic link" if path == self.link_in(path) else None
+            if reason is not None:
+                yield path, reason
 
     def oddity(self, path: Path) -> str | None:
         """Return why a relative path cannot be an entry or a score file, None if it can."""
@@ -104,7 +123,7 @@ class Folder:
             return f"{link} is a symbolic link"
         if not stat.S_ISREG((self.path / path).lstat().st_mode):
             return "no regular file"
-        ending = ENDINGS.get(path.parts[0])
+        ending = ENDINGS[path.parts[0]]
         if not all(PART.fullmatch(part) for part in path.parts):
             return "a name with other characters than letters, digits, '-', '_' and '.'"
         if path.suffix != ending or len(path.parts) != DEPTH:
@@ -113,20 +132,19 @@ class Folder:
 
     def link_in(self, path: Path) -> Path | None:
         """Return the first part of a relative path that is a symbolic link, None without any."""
-        here = Path()
-        for part in path.parts:
-            here = here / part
-            if (self.path / here).is_symlink():
-                return here
-        return None
+        whole = [*reversed(path.parents), path][1:]
+        return next((part for part in whole if (self.path / part).is_symlink()), None)
+
+    def _sound(self, top: str) -> tuple[Path, ...]:
+        return tuple(path for path in self._files(top) if self.oddity(path) is None)
 
     def _files(self, top: str) -> list[Path]:
         """Return everything under a subfolder that is no folder, links to folders included."""
+        if top and (self.path / top).is_symlink():
+            return [Path(top)]
         found: list[Path] = []
         for folder, names, files in os.walk(self.path / top, followlinks=False):
             here = Path(folder)
             links = [name for name in names if (here / name).is_symlink()]
             found += [(here / name).relative_to(self.path) for name in (*links, *files) if name != KEPT]
-        if (self.path / top).is_symlink():
-            found = [Path(top)]
         return sorted(found, key=lambda path: path.parts)

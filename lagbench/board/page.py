@@ -1,8 +1,8 @@
 """The page of the leaderboard: one HTML file that asks nothing of the network.
 
-Tables of the main scores are plain HTML; a script of our own sorts, filters and draws. A
-content security policy lets only that script and style sheet run, by their hashes, so that
-text of strangers could do nothing even if it were not escaped. Equal boards give equal bytes.
+All text and every number of the tables is plain HTML; a script of our own sorts, filters and
+draws. A content security policy lets only that script and style sheet run, by their hashes, so
+that text of strangers could do nothing even if it were not escaped. Equal boards give equal bytes.
 """
 
 from __future__ import annotations
@@ -12,16 +12,24 @@ import bisect
 import functools
 import hashlib
 import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from importlib.resources import files
+from pathlib import Path
 
-from lagbench.report.html import tag
+from lagbench.atomic import write_atomically
+from lagbench.data.registry import Registry
+from lagbench.errors import ChecksFailedError
+from lagbench.report.html import join, tag
 
-from .embedding import embedded
-from .listing import EXPLAINED, lede, navigation, sections
+from .collect import collect
+from .entry_file import schema_bytes
+from .folder import PAGE, SCHEMA, Folder
 from .model import Board
-from .payload import FINENESS, Fineness, payload
+from .payload import FINENESS, embedded, payload
+from .sections import empty, lede, navigation, overview, section
 
-__all__ = ["BUDGET", "FEWEST", "render"]
+__all__ = ["BUDGET", "FEWEST", "LINKS", "BuildResult", "build", "render"]
 
 BUDGET = 39_000
 """Most bytes an entry may take, all in all: 50 of them make a page of less than 2 MB."""
@@ -30,48 +38,121 @@ FEWEST = 50
 """Fewer entries than these share what so many may take."""
 
 SCRIPTS = (
-    *("codec", "text", "scale", "chart", "state", "table", "csv"),
-    *("overview", "maps", "film", "origin", "detail", "main"),
+    *("codec", "text", "scale", "chart", "state", "table"),
+    *("overview", "maps", "film", "detail", "main"),
 )
 """Parts of the script, in this order."""
+
+LINKS: Mapping[str, str] = {
+    "Repository": "../README.md",
+    "Documentation": "../docs",
+    "How to submit": "../docs/submitting.md",
+    "Citation": "../CITATION.cff",
+}
+"""What the page leads to, from the leaderboard's folder; what is not there is left out."""
 
 FOOT = (
     "Velocity and vorticity are per frame; lengths are in units of the box. Times are of each entry's own"
     " machine.",
     "This page is one file, built by lagbench leaderboard build from the score files, and asks nothing of the"
-    " network.",
+    " network. How to cite a data set: lagbench cite.",
 )
 
 
-def render(board: Board) -> str:
+@dataclass(frozen=True, kw_only=True)
+class BuildResult:
+    """A page that was drawn."""
+
+    page: Path
+    bytes: int
+    tabs: int  # splits and sizes on it
+    rows: int  # entries on it
+    written: tuple[Path, ...]  # files that were missing or had other bytes
+
+
+def build(
+    board: str | Path,
+    *,
+    check: bool = False,
+    registry: Registry | None = None,
+    report: Callable[[int], None] = lambda _: None,
+) -> BuildResult:
+    """Write the page and schema.json of a leaderboard's folder; files that are right stay untouched.
+
+    Args:
+        board: the leaderboard's folder.
+        check: write nothing, fail where a file would change.
+        registry: where splits are described; ours when None.
+        report: told the entries read.
+
+    Raises:
+        UsageError: no leaderboard there.
+        UnreadableFileError: an entry or a score file cannot be read.
+        ChecksFailedError: an entry does not fit, or with ``check`` a file is stale.
+        WorkFailedError: the disk is full or not writable.
+    """
+    folder, held = Folder(board), collect(board, registry=registry, report=report)
+    links = {label: path for label, path in LINKS.items() if (folder.path / path).exists()}
+    page = folder.path / PAGE
+    wanted = {page: render(held, links).encode(), folder.path / SCHEMA: schema_bytes()}
+    stale = [
+        path
+        for path, data in wanted.items()
+        if path.is_symlink()
+        or not path.is_file()
+        or path.stat().st_size != len(data)
+        or path.read_bytes() != data
+    ]
+    if stale and check:
+        raise ChecksFailedError(
+            "the page is not what the submissions give",
+            where=", ".join(str(path) for path in stale),
+            expected=f"{len(wanted[page])} bytes, tabs {len(held.tabs)}",
+            got="another content, or no file",
+            fix="lagbench leaderboard build",
+        )
+    for path in stale:
+        write_atomically(path, wanted[path], option="--board")
+    return BuildResult(
+        page=page,
+        bytes=len(wanted[page]),
+        tabs=len(held.tabs),
+        rows=sum(len(tab.rows) for tab in held.tabs),
+        written=tuple(stale),
+    )
+
+
+def render(board: Board, links: Mapping[str, str] = LINKS) -> str:
     """Return the page."""
     style, theme, script = _style(), _part("theme.js"), _script()
+    allowed = " ".join(_source(one) for one in (theme, script))
     held = {
-        "policy": _policy(style, theme, script),
+        "policy": f"default-src 'none'; script-src {allowed}; style-src {_source(style)}; img-src data:;"
+        " base-uri 'none'; form-action 'none'",
         "style": style,
         "theme": theme,
         "script": script,
+        "links": join(tag("a", label, href=address) for label, address in links.items()),
         "lede": lede(board),
         "navigation": navigation(board),
-        "sections": sections(board),
-        "foot": "".join(tag("p", line) for line in FOOT),
+        "sections": join([overview(board), *(section(tab, board.metrics) for tab in board.tabs)], "\n"),
+        "empty": empty(board),
+        "foot": join(tag("p", line) for line in FOOT),
     }
-    entries = sum(not row.floor for tab in board.tabs for row in tab.rows)
-    room = BUDGET * max(FEWEST, entries) - sum(len(text.encode()) for text in held.values())
+    entries = sum(len(tab.rows) for tab in board.tabs)
+    room = BUDGET * max(FEWEST, entries) - sum(len(one.encode()) for one in held.values())
     return _filled(_part("page.html"), {**held, "payload": _fitting(board, room)})
 
 
 def _fitting(board: Board, room: int) -> str:
     """Return the finest data that take no more bytes, else the coarsest."""
-    data = _data(board, FINENESS[0])
-    if len(data) > room:
-        found = bisect.bisect_left(FINENESS[1:-1], True, key=lambda one: len(_data(board, one)) <= room)
-        data = _data(board, FINENESS[1 + found])
-    return data.decode()
-
-
-def _data(board: Board, fineness: Fineness) -> bytes:
-    return embedded({**payload(board, fineness), "explained": dict(EXPLAINED)}).encode()
+    first = embedded(payload(board, FINENESS[0]))
+    if len(first.encode()) <= room:
+        return first
+    found = bisect.bisect_left(
+        FINENESS[1:-1], True, key=lambda one: len(embedded(payload(board, one)).encode()) <= room
+    )
+    return embedded(payload(board, FINENESS[1 + found]))
 
 
 def _filled(template: str, held: dict[str, str]) -> str:
@@ -102,13 +183,5 @@ def _style() -> str:
     return report + chosen + _part("page.css")
 
 
-def _policy(style: str, *scripts: str) -> str:
-    allowed = " ".join(_source(script) for script in scripts)
-    return (
-        f"default-src 'none'; script-src {allowed}; style-src {_source(style)}; img-src data:;"
-        " base-uri 'none'; form-action 'none'"
-    )
-
-
-def _source(text: str) -> str:
-    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+def _source(said: str) -> str:
+    return f"'sha256-{base64.b64encode(hashlib.sha256(said.encode()).digest()).decode()}'"

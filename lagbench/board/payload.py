@@ -1,40 +1,48 @@
-"""What the page's script reads: the board as plain values.
+"""What the page's script draws: curves, films, maps and what opens for an entry.
 
-Means keep nine significant digits, other numbers six; arrays are packed, and whatever occurs twice (frames,
-fields of the truth) stands once, in ``pool``.
+Scores stand in the table's cells and nowhere else. Arrays are packed, twelve bits a number, two
+letters each; whatever occurs twice (frames, fields of the truth) stands once, in ``pool``.
+
+>>> pack([0.0, 0.5, 1.0, float("nan")])
+['AAf__-__', 0.0, 1.0, 0]
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from lagbench.report.html import words
+from lagbench.report.html import MISSING as NOTHING
+from lagbench.report.html import text, words
 
-from .columns import COSTS, Column, columns_of, metric_column, presets_of
-from .embedding import clean
-from .model import Board, Cost, Curve, Detail, Histogram, Pictures, Prediction, RaisedFlag, Row, Tab, Value
-from .packing import coarse, pack, rounded, spaced
+from .model import Board, Curve, Floor, Histogram, Pictures, Row, Tab, Value
 
-__all__ = ["FINENESS", "MEAN_DIGITS", "Fineness", "payload", "tab_id"]
-
-MEAN_DIGITS = 9
-"""Significant digits of means, as in scores.json; other numbers have six."""
+__all__ = [
+    "FINENESS",
+    "LEVELS",
+    "Fineness",
+    "coarse",
+    "embedded",
+    "pack",
+    "payload",
+    "rounded",
+    "spaced",
+]
 
 
 class Fineness(NamedTuple):
     """How much of the pictures the page holds."""
 
     film_frames: int
-    particles: int  # particles of a film
+    particles: int  # of a film
     maps: int  # frames of vorticity maps and histograms
-    nodes: int  # nodes of a map a side
+    nodes: int  # of a map, a side
 
 
 FINENESS = (
@@ -53,127 +61,92 @@ FINENESS = (
 )
 """From the finest to the coarsest; the page takes the finest that fits."""
 
+DIGITS = np.frombuffer(b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789-_", np.uint8)
+"""Letters that need no escape in HTML, JSON or a URL."""
 
-def tab_id(tab: Tab) -> str:
-    """Return the name of a tab in addresses."""
-    return f"{tab.split}-{tab.size}"
+LEVELS = 4094
+"""Greatest packed value."""
+
+MISSING = 4095
+"""What stands for NaN."""
+
+DEEPEST = 1e-9
+"""A logarithmic range reaches no lower than this share of its top."""
+
+Packed = list[str | float | int]
+"""Text, least value, greatest value, and 1 where the steps are those of the logarithm."""
 
 
 def payload(board: Board, fineness: Fineness = FINENESS[0]) -> dict[str, Any]:
-    """Return everything that the page's script draws."""
+    """Return everything that the page's script draws beside the tables."""
     writer = _Writer(fineness)
-    tabs = [writer.tab(tab, board) for tab in board.tabs]
-    columns = [*(metric_column(metric) for metric in board.metrics.values()), *COSTS]
-    return {
-        "columns": {column.key: _column(column) for column in columns},
-        "tabs": tabs,
-        "pool": writer.pool,
-    }
+    return {"tabs": [writer.tab(tab) for tab in board.tabs], "pool": writer.pool}
 
 
-def _column(column: Column) -> dict[str, Any]:
-    return {
-        "label": clean(column.label),
-        "unit": clean(column.unit),
-        "direction": str(column.direction),
-        "perfect": column.perfect,
-        "form": column.form,
-        "reported": column.reported,
-        "meaning": clean(column.meaning),
-    }
-
-
-def _number(value: float | None, digits: int = 6) -> float | str | None:
-    """Return a number as JSON knows it: None for NaN, text for what is infinite."""
-    if value is None or math.isnan(value):
-        return None
-    short = rounded(value, digits)
-    if math.isinf(short):
-        return "Infinity" if short > 0 else "-Infinity"
-    return int(short) if short == int(short) and abs(short) < 1e15 else short
-
-
-def _numbers(values: Sequence[float]) -> list[float | str | None]:
-    return [_number(value) for value in values]
+def _numbers(values: Sequence[float], digits: int) -> list[float | str | None]:
+    """Return numbers as JSON knows them: None for NaN, text for what is infinite."""
+    return [
+        None if math.isnan(value) else rounded(value, digits) if math.isfinite(value) else f"{value}"
+        for value in values
+    ]
 
 
 @dataclass
 class _Writer:
     """Turns a board into plain values."""
 
-    fineness: Fineness  # how much of the pictures is kept
+    fineness: Fineness
     pool: list[Any] = field(default_factory=list)  # what is referred to by number
     _known: dict[str, int] = field(default_factory=dict)
 
-    def tab(self, tab: Tab, board: Board) -> dict[str, Any]:
+    def tab(self, tab: Tab) -> dict[str, Any]:
         """Return a tab."""
-        keys = columns_of(tab, board.metrics)
-        names = [key for key in keys if key in board.metrics]
         scale = float(np.nanmax(np.abs(tab.truth.vorticity), initial=0.0)) or 1.0
         return {
-            "id": tab_id(tab),
-            "split": tab.split,
-            "size": tab.size,
-            "title": clean(tab.title),
+            "id": tab.id,
+            "split": tab.size.split,
+            "size": tab.size.name,
             "scenarios": list(tab.scenarios),
             "frames": [tab.frames[0], tab.frames[-1]],
-            "marked": list(tab.frames_of_interest),
-            "interval": tab.frame_interval,
+            "marked": list(tab.marked),
             "ranking": tab.ranking,
-            "metrics": names,
-            "presets": {name: list(chosen) for name, chosen in presets_of(tab, board.metrics).items()},
             "curves": [{"key": name, "label": words(name)} for name in tab.curves],
             "energy": self._curve(tab.energy),
-            "scale": rounded(scale),
             "truth": self._pictures(tab.truth, scale),
-            "rows": [self._row(row, names, tab, scale) for row in tab.rows],
+            "floors": [self._floor(floor, tab) for floor in tab.floors],
+            "rows": [self._row(row, tab, scale) for row in tab.rows],
         }
 
-    def _row(self, row: Row, names: Sequence[str], tab: Tab, scale: float) -> dict[str, Any]:
+    def _floor(self, floor: Floor, tab: Tab) -> dict[str, Any]:
+        energy = floor.energy
+        return {
+            "id": floor.name,
+            "name": floor.name,
+            "curves": {name: self._curve(curve) for name, curve in floor.curves.items()},
+            "energy": None if energy is None else self._curve(energy),
+            "spread": _spread(floor.values, tab),
+        }
+
+    def _row(self, row: Row, tab: Tab, scale: float) -> dict[str, Any]:
+        entry = row.entry
         return {
             "id": row.id,
-            "name": clean(row.name),
-            "authors": clean(", ".join(row.authors)),
-            **{key: clean(getattr(row, key)) for key in ("affiliation", "licence", "date", "reason")},
-            "code": row.code and clean(row.code),
-            "paper": row.paper and clean(row.paper),
-            "floor": row.floor,
-            "status": row.status,
-            "by": row.superseded_by,
-            "current": row.current,
-            "version": clean(row.dataset_version),
-            "rank": row.rank,
-            "shared": row.shared,
-            "p": _number(row.p),
-            "seeds": row.seeds,
-            "parameters": row.parameters,
-            "cost": _cost(row.cost),
-            "flags": [_flag(flag) for flag in row.flags],
-            "warnings": [_flag(flag) for flag in row.warnings],
-            "diverged": row.diverged,
-            "values": [_value(row.values[name]) if name in row.values else None for name in names],
-            "spread": {
-                name: _numbers([rounded(v, 4) for v in row.values[name].per_scenario])
-                for name in tab.columns
-                if name in row.values
-            },
+            "name": entry.name,
+            "active": row.active,
+            "standing": _standing(row),
+            "curves": {name: self._curve(curve) for name, curve in row.curves.items()},
+            "energy": self._curve(row.energy),
+            "spread": _spread(row.values, tab),
             "at": {
-                name: _numbers([rounded(row.values[name].at[f], 4) for f in tab.frames_of_interest])
+                name: _numbers([value.at.get(frame, math.nan) for frame in tab.marked], 4)
                 for name in tab.columns
-                if name in row.values and row.values[name].at
+                if (value := row.values.get(name)) and value.at
             },
-            **self._detail(row.detail, tab, scale),
-        }
-
-    def _detail(self, detail: Detail, tab: Tab, scale: float) -> dict[str, Any]:
-        return {
-            "curves": {name: self._curve(curve) for name, curve in detail.curves.items()},
-            "energy": self._curve(detail.energy),
-            "pictures": self._pictures(detail.pictures, scale),
-            "residuals": [self._histogram(detail.residuals[i]) for i in self._shown(tab.truth.map_frames)],
-            **{key: clean(getattr(detail, key)) for key in ("command", "training", "hardware", "notes")},
-            "predictions": [_prediction(found) for found in detail.predictions],
-            "scored": clean(f"{detail.scored_by}, lagbench {detail.lagbench_version}"),
+            "pictures": self._pictures(row.pictures, scale),
+            "residuals": [self._histogram(row.residuals[i]) for i in self._shown(tab.truth.map_frames)],
+            "command": entry.command,
+            "about": [[name, said] for name, said in _about(row).items() if said],
+            "predictions": _predictions(row),
         }
 
     def _curve(self, curve: Curve) -> dict[str, int]:
@@ -187,10 +160,8 @@ class _Writer:
 
     def _pictures(self, pictures: Pictures, scale: float) -> dict[str, Any]:
         """Return maps and film; values beyond four times the truth's greatest are cut off."""
-        maps, film = (
-            self._shown(pictures.map_frames),
-            spaced(len(pictures.film_frames), self.fineness.film_frames),
-        )
+        maps = self._shown(pictures.map_frames)
+        film = spaced(len(pictures.film_frames), self.fineness.film_frames)
         particles = spaced(len(pictures.material), self.fineness.particles)
         fields = coarse(pictures.vorticity[maps], self.fineness.nodes)
         limits = (-4.0 * scale, 4.0 * scale)
@@ -212,46 +183,145 @@ class _Writer:
         return self._pooled(pack(values, **options))
 
     def _pooled(self, value: list[Any]) -> int:
-        text = json.dumps(value)
-        if text not in self._known:
-            self._known[text] = len(self.pool)
+        said = json.dumps(value)
+        if said not in self._known:
+            self._known[said] = len(self.pool)
             self.pool.append(value)
-        return self._known[text]
+        return self._known[said]
 
 
-def _value(value: Value) -> list[float | str | int | None]:
-    """Return mean, interval, deviation over seeds, undefined frames; trailing gaps are left out."""
-    mean = _number(value.mean, MEAN_DIGITS)
-    listed = [mean, *_numbers([value.low, value.high, value.std]), value.undefined or None]
-    return listed[: max((i + 1 for i, found in enumerate(listed) if found is not None), default=0)]
+def _spread(values: Mapping[str, Value], tab: Tab) -> dict[str, list[float | str | None]]:
+    """Return the means of each scenario of the main metrics."""
+    return {name: _numbers(values[name].per_scenario, 4) for name in tab.columns if name in values}
 
 
-def _cost(cost: Cost | None) -> dict[str, Any] | None:
-    if cost is None:
-        return None
+def _standing(row: Row) -> str:
+    """Return how an entry stands, in a sentence."""
+    if row.rank is None:
+        return "Not ranked."
+    weights = "These weights: one seed only. " if len(row.entry.predictions) == 1 else ""
+    if math.isnan(row.p):
+        return f"{weights}Rank {row.rank}."
+    told = "cannot be told from the leader at 5 %" if row.tied else "differs from the leader"
+    return f"{weights}Rank {row.rank}; it {told} (p = {text(row.p, 2)}, corrected)."
+
+
+def _about(row: Row) -> dict[str, str]:
+    entry, line = row.entry, row.verified
+    checked = (
+        f"verified by the maintainers, lagbench {line.lagbench}, {line.date}" if line else "as submitted"
+    )
     return {
-        "seconds_per_frame": _number(cost.seconds_per_frame),
-        "solver_seconds_per_frame": _number(cost.solver_seconds_per_frame),
-        "speed_up": _number(cost.speed_up),
-        "device": clean(cost.device),
+        "training": entry.training,
+        "hardware, self-reported": entry.hardware,
+        "seeds": str(len(entry.predictions)),
+        "licence": entry.licence,
+        "submitted": f"{entry.date}, scored by lagbench {entry.score.lagbench}",
+        "scores": checked,
+        "notes": entry.notes,
     }
 
 
-def _flag(flag: RaisedFlag) -> list[Any]:
-    return [clean(flag.name), list(_cleaned(flag.reasons))]
+def _predictions(row: Row) -> list[list[str | None]]:
+    """Return seed, mean, length, hash, address, path and score file of each, as text."""
+    entry = row.entry
+    return [
+        [
+            NOTHING if made.seed is None else str(made.seed),
+            text(mean),
+            NOTHING if made.bytes is None else f"{text(made.bytes / 1e6)} MB",
+            made.sha256,
+            made.url,
+            made.path,
+            path.as_posix(),
+        ]
+        for made, mean, path in zip(entry.predictions, row.seed_means, entry.score_paths, strict=True)
+    ]
 
 
-def _cleaned(texts: Sequence[str]) -> Iterator[str]:
-    return (clean(text) for text in texts)
+def pack(values: ArrayLike, *, limits: tuple[float, float] | None = None, log: bool = False) -> Packed:
+    """Return values in 4094 equal steps between the least and the greatest."""
+    x = np.asarray(values, np.float64).ravel()
+    known = x[np.isfinite(x)]
+    low, high = limits or ((float(known.min()), float(known.max())) if known.size else (0.0, 1.0))
+    logarithmic = log and bool(known.size) and low >= 0.0 and high > 0.0
+    if logarithmic:
+        positive = known[known > DEEPEST * high]
+        low = float(positive.min())
+        share = _share(np.log(np.clip(x, low, high)), math.log(low), math.log(high))
+    else:
+        share = _share(np.clip(x, low, high), low, high)
+    steps = np.where(np.isfinite(x), np.rint(np.nan_to_num(share) * LEVELS), MISSING).astype(np.int64)
+    return [_text(steps), rounded(low), rounded(high), int(logarithmic)]
 
 
-def _prediction(found: Prediction) -> dict[str, Any]:
-    return {
-        "seed": found.seed,
-        "sha256": clean(found.sha256),
-        "url": found.url and clean(found.url),
-        "path": found.path and clean(found.path),
-        "size": found.size,
-        "score": clean(found.score_file),
-        "mean": _number(found.mean),
-    }
+def _share(x: NDArray[np.float64], low: float, high: float) -> NDArray[np.float64]:
+    return (x - low) / (high - low) if high > low else np.zeros_like(x)
+
+
+def _text(steps: NDArray[np.int64]) -> str:
+    letters = np.stack([DIGITS[steps >> 6], DIGITS[steps & 63]], axis=-1)
+    return letters.tobytes().decode("ascii")
+
+
+def rounded(value: float, digits: int = 6) -> float:
+    """Return a number with so many significant digits; what is not finite stays.
+
+    >>> rounded(0.123456789), rounded(float("inf"))
+    (0.123457, inf)
+    """
+    return float(f"{value:.{digits}g}") if math.isfinite(value) else value
+
+
+def spaced(length: int, count: int) -> list[int]:
+    """Return at most so many evenly spaced indices, first and last included.
+
+    >>> spaced(10, 4), spaced(3, 5), spaced(7, 1)
+    ([0, 3, 6, 9], [0, 1, 2], [6])
+    """
+    if length <= count:
+        return list(range(length))
+    if count == 1:
+        return [length - 1]
+    return [i * (length - 1) // (count - 1) for i in range(count)]
+
+
+def coarse(field: NDArray[np.floating], nodes: int) -> NDArray[np.float64]:
+    """Return a square field with at most so many nodes a side, as means over blocks.
+
+    Args:
+        field: values at nodes, NaN where there is none, shape [..., x node, y node].
+        nodes: most nodes a side.
+
+    Returns:
+        Means of the known nodes of each block, NaN where none is known.
+    """
+    side = -(-field.shape[-1] // nodes)
+    if side == 1:
+        return field.astype(np.float64)
+    count = -(-field.shape[-1] // side)
+    room = count * side - field.shape[-1]
+    pad = [(0, 0)] * (field.ndim - 2) + [(0, room)] * 2
+    whole = np.pad(field.astype(np.float64), pad, constant_values=np.nan)
+    blocks = whole.reshape(*field.shape[:-2], count, side, count, side)
+    known = np.isfinite(blocks)
+    number = known.sum(axis=(-3, -1))
+    total = np.where(known, blocks, 0.0).sum(axis=(-3, -1))
+    return np.where(number > 0, total / np.maximum(number, 1), np.nan)
+
+
+_ESCAPED = "<>&\u2028\u2029"
+"""What could end an element, start one, or end a line of a script."""
+
+
+def embedded(value: object) -> str:
+    r"""Return JSON that may stand in an HTML element, whatever the strings in it hold.
+
+    >>> print(embedded({"name": "</script>"}))
+    {"name":"\u003c/script\u003e"}
+    """
+    text = json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+    text = text.encode("utf-8", "replace").decode("utf-8")
+    for letter in _ESCAPED:
+        text = text.replace(letter, f"\\u{ord(letter):04x}")
+    return text

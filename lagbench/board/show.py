@@ -10,7 +10,8 @@ from lagbench.errors import UsageError, nearest
 from lagbench.scoring.card import digits
 from lagbench.scoring.tables import Table
 
-from .model import Board, Row, Tab, Value
+from .columns import held
+from .model import Board, Floor, Row, Tab, Value
 
 __all__ = ["as_plain", "chosen_tabs", "tables"]
 
@@ -24,10 +25,12 @@ def chosen_tabs(board: Board, split: str | None, size: str | None) -> tuple[Tab,
     Raises:
         UsageError: there is none.
     """
-    found = tuple(tab for tab in board.tabs if split in (None, tab.split) and size in (None, tab.size))
-    if found:
+    found = tuple(
+        tab for tab in board.tabs if split in (None, tab.size.split) and size in (None, tab.size.name)
+    )
+    if found or (split is None and size is None):
         return found
-    known = [f"{tab.split} {tab.size}" for tab in board.tabs]
+    known = [f"{tab.size.split} {tab.size.name}" for tab in board.tabs]
     wanted = " ".join(name for name in (split, size) if name)
     fix = nearest(wanted, known) if known else "submit something: lagbench submit"
     raise UsageError("no entries there", where=f"leaderboard {wanted}".strip(), fix=fix)
@@ -48,7 +51,19 @@ def tables(board: Board, tabs: Collection[Tab], metrics: Collection[str] = ()) -
         if name not in board.metrics:
             raise UsageError(f"no metric {name!r} here", where="--metric", fix=nearest(name, board.metrics))
     for tab in tabs:
-        yield _table(tab, list(dict.fromkeys((tab.ranking, *(metrics or tab.columns[:SHOWN])))))
+        skill = ("skill",) if any(row.skill for row in tab.rows) else ()
+        names = list(dict.fromkeys((*skill, tab.ranking, *(metrics or tab.columns[:SHOWN]))))
+        claim = "" if tab.decided else ", too few scenarios to tell entries apart"
+        cost = "; cost self-reported" if any(row.entry.cost for row in tab.rows) else ""
+        title = f"{tab.size.split} {tab.size.name} {tab.size.version}, by {tab.ranking}{claim}{cost}"
+        ranked = [row for row in tab.rows if row.rank is not None]
+        rest = [row for row in tab.rows if row.rank is None]
+        shown: list[Row | Floor] = [*ranked, *tab.floors, *rest]
+        yield Table(
+            title,
+            ("rank", "method", *names, "s/frame", "speed-up", "remarks"),
+            tuple(_cells(row, names) for row in shown),
+        )
 
 
 def as_plain(tabs: Collection[Tab]) -> dict[str, Any]:
@@ -56,11 +71,12 @@ def as_plain(tabs: Collection[Tab]) -> dict[str, Any]:
     return {
         "tabs": [
             {
-                "split": tab.split,
-                "size": tab.size,
-                "dataset_version": tab.dataset_version,
+                "split": tab.size.split,
+                "size": tab.size.name,
+                "dataset_version": tab.size.version,
                 "ranking_metric": tab.ranking,
                 "rows": [_plain_row(row) for row in tab.rows],
+                "floors": [{"id": floor.name, "metrics": _plain_values(floor)} for floor in tab.floors],
             }
             for tab in tabs
         ]
@@ -68,40 +84,46 @@ def as_plain(tabs: Collection[Tab]) -> dict[str, Any]:
 
 
 def _plain_row(row: Row) -> dict[str, Any]:
-    fields = ("id", "name", "rank", "floor", "status", "current", "seeds", "parameters", "diverged")
+    entry = row.entry
     return {
-        **{name: getattr(row, name) for name in fields},
+        **{name: getattr(row, name) for name in ("id", "rank", "tied", "current", "diverged")},
+        "name": entry.name,
+        "status": str(entry.status),
+        "verified": row.verified is not None,
+        "seeds": len(entry.predictions),
+        "parameters": entry.parameters,
         "flags": [flag.name for flag in row.flags],
-        "cost": row.cost,
-        "metrics": {
-            name: {key: digits(getattr(value, key)) for key in ("mean", "std", "low", "high")}
-            for name, value in row.values.items()
-        },
+        "cost": entry.cost and {**entry.cost.model_dump(), "speed_up": entry.cost.speed_up},
+        "budget": entry.budget and entry.budget.model_dump(),
+        "skill": _plain_value(row.skill) if row.skill else None,
+        "metrics": _plain_values(row),
     }
 
 
-def _table(tab: Tab, names: list[str]) -> Table:
-    claim = "" if tab.decided else ", too few scenarios to tell ranks apart"
-    cost = "; cost self-reported" if any(row.cost for row in tab.rows) else ""
-    title = f"{tab.split} {tab.size} {tab.dataset_version}, by {tab.ranking}{claim}{cost}"
-    columns = ("rank", "method", *names, "s/frame", "speed-up", "remarks")
-    return Table(title, columns, tuple(_cells(row, names) for row in tab.rows))
+def _plain_values(row: Row | Floor) -> dict[str, Any]:
+    return {name: _plain_value(value) for name, value in row.values.items()}
 
 
-def _cells(row: Row, names: list[str]) -> tuple[str, ...]:
-    rank = "-" if row.rank is None else f"{row.rank}{'=' if row.shared else ''}"
-    cost = row.cost
+def _plain_value(value: Value) -> dict[str, float | None]:
+    return {key: digits(getattr(value, key)) for key in ("mean", "std", "low", "high")}
+
+
+def _cells(row: Row | Floor, names: list[str]) -> tuple[str, ...]:
+    values = tuple(_spelt(held(row, name)) for name in names)
+    if isinstance(row, Floor):
+        return ("-", row.name, *values, "", "", "floor")
+    cost = row.entry.cost
     return (
-        rank,
+        "-" if row.rank is None else f"{row.rank}{'≈' if row.tied else ''}",
         row.id,
-        *(_value(row.values.get(name)) for name in names),
+        *values,
         "" if cost is None else f"{cost.seconds_per_frame:.3g}",
         "" if cost is None or cost.speed_up is None else f"{cost.speed_up:.3g}",
         ", ".join(_remarks(row)),
     )
 
 
-def _value(value: Value | None) -> str:
+def _spelt(value: Value | None) -> str:
     """Return a mean, with its deviation over seeds where there are several."""
     if value is None or math.isnan(value.mean):
         return "-"
@@ -109,14 +131,14 @@ def _value(value: Value | None) -> str:
 
 
 def _remarks(row: Row) -> Iterator[str]:
-    if row.floor:
-        yield "floor"
-    if row.status != "active":
-        yield row.status
+    if row.verified:
+        yield "verified"
+    if str(row.entry.status) != "active":
+        yield str(row.entry.status)
     if not row.current:
-        yield f"data set {row.dataset_version}"
-    if row.seeds > 1:
-        yield f"{row.seeds} seeds"
+        yield f"data set {row.entry.dataset.version}"
+    if len(row.entry.predictions) > 1:
+        yield f"{len(row.entry.predictions)} seeds"
     if row.diverged:
         yield f"{row.diverged} diverged"
     yield from (flag.name for flag in row.flags)

@@ -1,53 +1,79 @@
 """Score predictions and write the entry: ``lagbench submit``.
 
-All or nothing: the YAML file and the score files of all seeds appear together, after every
-seed was scored. The board's page is not touched; ``lagbench leaderboard build`` draws it.
+What can be refused is refused before the work. Then score files are written, and last the YAML
+file, which names them by SHA-256, each atomically: what an interruption leaves behind is a
+score file without an entry, which ``lagbench leaderboard check`` finds. The board's page is not
+touched; ``lagbench leaderboard build`` draws it.
 """
 
 from __future__ import annotations
 
 import datetime
+import os
+import re
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from lagbench.data.registry import Registry
-from lagbench.errors import ChecksFailedError, WorkFailedError
+import numpy as np
+
+from lagbench import __version__
+from lagbench.atomic import write_atomically
+from lagbench.data.checksums import file_sha256
+from lagbench.data.registry import Registry, Size, load
+from lagbench.errors import ChecksFailedError, UsageError, WorkFailedError
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.score import score
 from lagbench.scoring.score_file import write_statistics
-from lagbench.submission import ValidationResult
+from lagbench.submission import Header, Predictions, ValidationResult, open_predictions, validate
 from lagbench.work.progress import Progress
 
-from .draft import Draft, check_needed, draft_of, headers_of
-from .entry import About, DataSet, Entry, PredictionEntry
-from .entry_file import examine, read_entry, spell_entry
-from .floor_predictions import write_floor
-from .folder import Folder, entry_path, score_paths
-from .meta import Meta
-from .publishing import batch
-from .scored import score_block, scored_file
-from .seeds import combine, summarise
-from .stored import MAX_SCORE_BYTES, read_stored
+from .entry import (
+    ID,
+    LONGEST_ID,
+    LONGEST_TEXT,
+    MOST_SEEDS,
+    About,
+    Cost,
+    DataSet,
+    Entry,
+    Flag,
+    Meta,
+    Prediction,
+    ScoreBlock,
+    ScoredFile,
+)
+from .entry_file import examine, read_entry, spell
+from .floors import floor_names, write_floors
+from .folder import SUBMISSIONS, Folder, Place, entry_path, score_paths
+from .ranking import combine, summarise
+from .score_file import MAX_SCORE_BYTES, read_stored
 
-__all__ = ["BOARD", "SubmitResult", "submit", "submit_floor"]
+__all__ = ["BOARD", "SubmitResult", "scored_file", "submit"]
 
 BOARD = Path("leaderboard")
 """The leaderboard's folder, from the root of the repository."""
+
+OUTSIDE = "in_domain"
+"""The warning that comes with a share of the positions."""
+
+STAGE = ".submit-"
+"""First letters of the folder in which score files are prepared; a killed process leaves it behind."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SubmitResult:
     """An entry that was written."""
 
-    split: str  # name of the split
-    size: str  # name of the size
-    method: str  # id of the method
+    split: str
+    size: str
+    method: str
     ranking: str  # name of the ranking metric
-    mean: float | None  # of the ranking metric over scenarios and seeds; None where undefined
+    mean: float | None  # of it over scenarios and seeds; None where undefined
     std: float | None  # over seeds; None for one seed
     flags: tuple[str, ...]  # names of flags that were raised
+    board: Path
     files: tuple[Path, ...]  # what was written, the YAML file first
 
 
@@ -58,12 +84,13 @@ def submit(
     board: str | Path = BOARD,
     root: str | Path | None = None,
     replace: bool = False,
+    new_board: bool = False,
     workers: int | None = None,
     registry: Registry | None = None,
     progress: Callable[[Progress], None] | None = None,
     examined: Callable[[ValidationResult], None] | None = None,
 ) -> SubmitResult:
-    """Score predictions and write their entry and score files.
+    """Score predictions and write their entry and score files, and those of the floors beside them.
 
     Args:
         predictions: one predictions.nc per seed.
@@ -71,6 +98,7 @@ def submit(
         board: the leaderboard's folder.
         root: folder of all data sets.
         replace: whether an entry of that name may be replaced.
+        new_board: whether to begin a leaderboard where there is none.
         workers: worker processes of the scorer.
         registry: where splits are described; ours when None.
         progress: told how far the scoring is.
@@ -78,97 +106,193 @@ def submit(
 
     Raises:
         UsageError: a key is missing, the entry is there already, the files do not belong
-            together, or the method has the name of a floor.
+            together, the method has the name of a floor, or there is no leaderboard.
         UnreadableFileError: predictions cannot be read.
         ChecksFailedError: they are not valid.
         DataError: the test subset is missing, or they were made from another data set.
         WorkFailedError: the disk is full or not writable, or a score file became too long.
     """
-    check_needed(meta)
     folder, paths = Folder(board), [Path(path) for path in predictions]
-    headers = headers_of(paths, root=root, registry=registry, examined=examined)
-    draft = draft_of(headers, meta, folder, replace=replace)
+    _check_needed(meta, folder, new_board=new_board)
+    headers, outside, described = [], [], registry or load()
+    for path in paths:
+        result = validate(path, root=root, require_truth=True, registry=registry)
+        if examined is not None:
+            examined(result)
+        result.check()
+        with open_predictions(path) as opened:
+            headers.append(opened.header)
+            size = described.size(opened.header.split, opened.header.size)
+            warned = any(found.check == OUTSIDE for found in result.warnings)
+            outside.append(_outside(opened, size) if warned else None)
+    seeds = _seeds(headers)
+    place = (headers[0].split, headers[0].size, _method(headers[0], meta))
+    if (folder.path / entry_path(place)).exists() and not replace:
+        where = str(folder.path / entry_path(place))
+        fix = "replace it with --replace, or name this one otherwise: --method NAME"
+        raise UsageError("there is such an entry already", where=where, fix=fix)
+    about, urls = _about(headers, meta), _urls(headers, meta)
+    # validated above: once `score` takes the result, no file is looked at twice
     cards = [
         score(path, root=root, workers=workers, registry=registry, progress=progress, write=False)
         for path in paths
     ]
     made = [
-        PredictionEntry(
+        Prediction(
             seed=seed,
             sha256=card.predictions_sha256,
             url=url,
             path=_inner_path(path, folder),
             bytes=path.stat().st_size,
         )
-        for card, path, seed, url in zip(cards, paths, draft.seeds, draft.urls, strict=True)
+        for card, path, seed, url in zip(cards, paths, seeds, urls, strict=True)
     ]
-    return _publish(draft, cards, made, folder)
+    try:
+        return _publish(place, about, cards, made, folder, outside)
+    except OSError as error:
+        raise WorkFailedError(
+            "cannot write there",
+            where=str(folder.path),
+            got=error.strerror or error,
+            fix="free disk space, or name a folder that you may write to: --board",
+        ) from error
 
 
-def submit_floor(
-    name: str,
-    *,
-    split: str,
-    size: str = "full",
-    board: str | Path = BOARD,
-    root: str | Path | None = None,
-    date: datetime.date | None = None,
-    workers: int | None = None,
-    registry: Registry | None = None,
-    progress: Callable[[Progress], None] | None = None,
-) -> SubmitResult:
-    """Predict with a floor of the scorer, score that and write its entry, or write it anew.
+def _check_needed(meta: Meta, folder: Folder, *, new_board: bool) -> None:
+    """Refuse a description that lacks what readers need, and to begin a board by mistake."""
+    needed = {"authors": "--author NAME", "command": "--command 'what makes the predictions again'"}
+    missing = [option for key, option in needed.items() if not getattr(meta, key)]
+    if missing:
+        raise UsageError(
+            "the entry lacks what readers need",
+            expected=" and ".join(missing),
+            fix="give them as options, or authors and command in a file: --from meta.yaml",
+        )
+    if not new_board:
+        folder.require("run it from the root of a clone, name it with --board, or begin one: --new-board")
 
-    Args:
-        name: persistence or constant-velocity.
-        split: name of the split.
-        size: name of the size.
-        board: the leaderboard's folder.
-        root: folder of all data sets.
-        date: date of the entry; today by default.
-        workers: worker processes of the scorer.
-        registry: where splits are described; ours when None.
-        progress: told how far the scoring is.
 
-    Raises:
-        UsageError: an unknown floor, split or size.
-        DataError: the test subset is missing or damaged.
-        WorkFailedError: the disk is full or not writable.
-    """
-    with tempfile.TemporaryDirectory() as scratch:
-        path = Path(scratch) / "predictions.nc"
-        write_floor(name, path, split=split, size=size, root=root, registry=registry)
-        card = score(path, root=root, workers=workers, registry=registry, progress=progress, write=False)
-    about = About(
-        name=name,
-        authors=("lagbench",),
-        licence="MIT",
-        date=date or datetime.datetime.now(datetime.UTC).date(),
-        training="none",
-        parameters=0,
-        notes="A floor: what costs nothing and every model should beat.",
-        command=f"lagbench submit --floor {name} --split {split} --size {size}",
+def _seeds(headers: Sequence[Header]) -> tuple[int | None, ...]:
+    """Return the seeds of files that belong together; refuse those that do not."""
+    if not 1 <= len(headers) <= MOST_SEEDS:
+        raise UsageError("too many files", expected=f"1 to {MOST_SEEDS}, one per seed", got=len(headers))
+    for name in ("split", "size", "dataset_sha256"):
+        found = dict.fromkeys(getattr(header, name) for header in headers)
+        if len(found) > 1:
+            fix = "submit each on its own"
+            raise UsageError(f"the files differ in {name}", got=", ".join(found), fix=fix)
+    seeds = tuple(header.seed for header in headers)
+    if any(seed is not None and not 0 <= seed < 2**63 for seed in seeds):
+        raise UsageError("a seed does not fit", expected="0 to 2^63 - 1", got=seeds)
+    if len(seeds) > 1 and (None in seeds or len(set(seeds)) < len(seeds)):
+        raise UsageError(
+            "several files need seeds that differ",
+            got=", ".join("none" if seed is None else str(seed) for seed in seeds),
+            fix="write them with submission.write(..., seed=0), seed=1 and so on",
+        )
+    return seeds
+
+
+def _method(header: Header, meta: Meta) -> str:
+    """Return the id of the method: the one given, else the label of the predictions if it can be one."""
+    name = meta.method or header.method
+    if not re.fullmatch(ID, name) or len(name) > LONGEST_ID:
+        raise UsageError(
+            "the label of the predictions cannot name an entry",
+            expected="small letters, digits and single hyphens",
+            got=ascii(name),
+            fix="name it: --method my-model",
+        )
+    if name in floor_names():
+        fix = "name your method otherwise; the floors are added by themselves"
+        raise UsageError(f"{name!r} is the name of a floor", where="--method", fix=fix)
+    return name
+
+
+def _urls(headers: Sequence[Header], meta: Meta) -> tuple[str | None, ...]:
+    if meta.urls and len(meta.urls) != len(headers):
+        raise UsageError(
+            "addresses and files differ in number",
+            where="--url",
+            expected=len(headers),
+            got=len(meta.urls),
+            fix="give one address per file, in their order, or none",
+        )
+    return meta.urls or (None,) * len(headers)
+
+
+def _about(headers: Sequence[Header], meta: Meta) -> About:
+    """Return what is said of the method, with what the predictions say where nothing is."""
+    first = headers[0]
+    held = {name: getattr(meta, name) for name in About.model_fields}
+    held["name"] = meta.name or first.method[:100]
+    held["date"] = meta.date or datetime.datetime.now(datetime.UTC).date()
+    held["training"] = meta.training or (first.training or "")[:LONGEST_TEXT]
+    if meta.parameters is None:
+        held["parameters"] = first.parameters
+    held["cost"] = meta.cost or _cost(headers, meta)
+    return About(**held)
+
+
+def _cost(headers: Sequence[Header], meta: Meta) -> Cost | None:
+    """Return the mean cost over the files; None unless all tell it and one machine."""
+    times = [header.seconds_per_frame for header in headers if header.seconds_per_frame is not None]
+    device = headers[0].device
+    if len(times) < len(headers) or not device or any(header.device != device for header in headers):
+        return None
+    return Cost(
+        seconds_per_frame=float(f"{sum(times) / len(times):.6g}"),
+        device=device[:100],
+        solver_seconds_per_frame=meta.solver_seconds_per_frame,
     )
-    draft = Draft(place=(split, size, name), about=about, seeds=(None,), urls=(None,), scored_by="lagbench")
-    return _publish(draft, [card], [PredictionEntry(sha256=card.predictions_sha256)], Folder(board))
+
+
+def _inner_path(path: Path, folder: Folder) -> str | None:
+    """Return a path relative to the leaderboard's folder, None for a file outside it."""
+    inside, outside = path.resolve(), folder.path.resolve()
+    return inside.relative_to(outside).as_posix() if inside.is_relative_to(outside) else None
+
+
+def _outside(opened: Predictions, size: Size) -> float:
+    """Return the share of positions that lie more than a solver cell outside the box."""
+    low, high = np.array(size.bounds).T + np.array([[-1.0], [1.0]]) / size.grid
+    found, count = 0, 0
+    for scenario in opened.header.scenarios:
+        for _, block in opened.blocks(scenario):
+            beyond = ((block < low) | (block > high)).any(axis=-1)
+            found, count = found + int(beyond.sum()), count + beyond.size
+    return float(f"{found / max(1, count):.4g}")
 
 
 def _publish(
-    draft: Draft, cards: Sequence[ScoreCard], made: Sequence[PredictionEntry], folder: Folder
+    place: Place,
+    about: About,
+    cards: Sequence[ScoreCard],
+    made: Sequence[Prediction],
+    folder: Folder,
+    outside: Sequence[float | None],
 ) -> SubmitResult:
-    """Write score files and entry, all together; remove those of the entry that they replace."""
-    names, yaml_path = score_paths(draft.place, draft.seeds), entry_path(draft.place)
-    before = _score_files_of(folder, yaml_path)
-    with batch(folder.path) as files:
-        staged = [files.prepare(name) for name in names]
+    """Write score files, then the entry that names them; remove those that only the old entry had."""
+    names, yaml_path = score_paths(place, [one.seed for one in made]), entry_path(place)
+    before = read_entry(folder.path / yaml_path).score_paths if (folder.path / yaml_path).exists() else ()
+    (folder.path / SUBMISSIONS).mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=STAGE, dir=folder.path) as stage:
+        staged = [Path(stage) / name.name for name in names]
         for card, target in zip(cards, staged, strict=True):
             write_statistics(card, target)
             _check_length(target, card)
-        entry = _entry(draft, cards, made, staged)
-        files.prepare(yaml_path).write_bytes(spell_entry(entry))
-        files.publish(remove=before)
+        files = tuple(map(scored_file, cards, staged, outside))
+        entry = _entry(place, about, cards, made, files, staged)
+        for source, name in zip(staged, names, strict=True):
+            (folder.path / name).parent.mkdir(parents=True, exist_ok=True)
+            os.replace(source, folder.path / name)
+    floors = write_floors(cards[0], folder)
+    (folder.path / yaml_path).parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(folder.path / yaml_path, spell(entry), option="--board")
+    for name in set(before) - set(names):
+        (folder.path / name).unlink(missing_ok=True)
     summary = entry.score.metrics[entry.score.ranking_metric]
-    split, size, method = draft.place
+    split, size, method = place
     return SubmitResult(
         split=split,
         size=size,
@@ -177,46 +301,55 @@ def _publish(
         mean=summary.mean,
         std=summary.std,
         flags=tuple(dict.fromkeys(flag.name for file in entry.score.files for flag in file.flags)),
-        files=tuple(folder.path / name for name in (yaml_path, *names)),
+        board=folder.path,
+        files=(*(folder.path / name for name in (yaml_path, *names)), *floors),
     )
 
 
 def _entry(
-    draft: Draft, cards: Sequence[ScoreCard], made: Sequence[PredictionEntry], staged: Sequence[Path]
+    place: Place,
+    about: About,
+    cards: Sequence[ScoreCard],
+    made: Sequence[Prediction],
+    files: tuple[ScoredFile, ...],
+    staged: Sequence[Path],
 ) -> Entry:
     """Return the entry with the score block that follows from the score files."""
-    split, size, method = draft.place
     header = cards[0].header
-    dataset = DataSet(version=header.dataset_version, sha256=header.dataset_sha256)
-    block = score_block(
-        draft.place,
-        dataset,
-        made,
-        [scored_file(card, target) for card, target in zip(cards, staged, strict=True)],
-        summarise(combine([read_stored(target).scores for target in staged])),
-        about=draft.about,
-        ranking=cards[0].ranking,
-        scored_by=draft.scored_by,
+    block = ScoreBlock(
+        lagbench=__version__,
+        dataset_sha256=header.dataset_sha256,
+        ranking_metric=cards[0].ranking,
+        files=files,
+        metrics=summarise(combine([read_stored(target).scores for target in staged])),
     )
-    held = {"format": 1, "split": split, "size": size, "method": method}
-    held |= {name: getattr(draft.about, name) for name in About.model_fields}
-    entry, mistakes = examine(Entry, {**held, "dataset": dataset, "predictions": tuple(made), "score": block})
+    held = {name: getattr(about, name) for name in About.model_fields}
+    held |= dict(zip(("format", "split", "size", "method"), (2, *place), strict=True))
+    held["dataset"] = DataSet(version=header.dataset_version, sha256=header.dataset_sha256)
+    entry, mistakes = examine(Entry, {**held, "predictions": tuple(made), "score": block})
     if entry is None:
-        raise ChecksFailedError("the entry does not fit the schema", got="\n    ".join(map(str, mistakes)))
+        got = "\n    ".join(["", *map(str, mistakes)])
+        fix = "say it otherwise in --from meta.yaml; docs/submitting.md describes the keys"
+        raise ChecksFailedError("the entry does not fit the schema", got=got, fix=fix)
     return entry
 
 
-def _score_files_of(folder: Folder, yaml_path: Path) -> tuple[Path, ...]:
-    """Return the score files of the entry that is there, so that none is left over."""
-    if not (folder.path / yaml_path).exists():
-        return ()
-    return read_entry(folder.path / yaml_path).score_paths
+def scored_file(card: ScoreCard, path: Path, outside: float | None = None) -> ScoredFile:
+    """Return what an entry says of the score file that was written from a card."""
 
+    def flag(name: str, reasons: Sequence[str], share: float | None = None) -> Flag:
+        return Flag(name=name, reasons=tuple(said[:LONGEST_TEXT] for said in reasons), share=share)
 
-def _inner_path(path: Path, folder: Folder) -> str | None:
-    """Return a path relative to the leaderboard's folder, None for a file outside it."""
-    inside, outside = path.resolve(), folder.path.resolve()
-    return inside.relative_to(outside).as_posix() if inside.is_relative_to(outside) else None
+    return ScoredFile(
+        sha256=file_sha256(path),
+        predictions_sha256=card.predictions_sha256,
+        diverged_at=dict(sorted(card.header.diverged_at.items())),
+        flags=tuple(flag(one.name, one.reasons) for one in card.flags if one.raised),
+        warnings=tuple(
+            flag(one.check, (f"{one.what}: {one.got}",), outside if one.check == OUTSIDE else None)
+            for one in card.warnings
+        ),
+    )
 
 
 def _check_length(path: Path, card: ScoreCard) -> None:

@@ -21,8 +21,8 @@ from lagbench.make.verify import VerificationResult, verify
 if TYPE_CHECKING:
     from lagbench.baselines.predict import PredictionResult
     from lagbench.baselines.train import TrainingResult
-    from lagbench.board.build import BuildResult
-    from lagbench.board.meta import Meta
+    from lagbench.board.entry import Meta
+    from lagbench.board.page import BuildResult
     from lagbench.board.submit import SubmitResult
     from lagbench.scoring.card import ScoreCard
 
@@ -71,7 +71,7 @@ class ModelResult:
     prediction: PredictionResult  # result of predict
     card: ScoreCard  # its scores beside those of the floors
     solver: SolverBench | None  # what our solver takes here; None where it cannot be timed
-    entries: tuple[SubmitResult, ...]  # entries of the leaderboard: the floors, then the model
+    entry: SubmitResult  # its entry of the leaderboard
     page: BuildResult  # the leaderboard's page
 
     def as_json(self) -> dict[str, Any]:
@@ -162,7 +162,7 @@ def demo_board(root: str | Path | None = None) -> Path:
 def demo_model(
     *, root: str | Path | None = None, progress: Callable[[Progress], None] | None = None
 ) -> ModelResult:
-    """Train a small model, predict, score and submit it with the floors, draw the page.
+    """Train a small model, predict, score and submit it, draw the page.
 
     The data set must be there, see :func:`demo`. One thread: a model as small as this gains
     nothing by a second, and the same machine trains the same weights.
@@ -178,10 +178,8 @@ def demo_model(
         KeyboardInterrupt: interrupted; the next call goes on with the training.
     """
     from lagbench.baselines.predict import predict
-    from lagbench.board.build import build
-    from lagbench.board.submit import submit, submit_floor
-    from lagbench.data.registry import load
-    from lagbench.floors import floors_of
+    from lagbench.board.page import build
+    from lagbench.board.submit import submit
     from lagbench.scoring.score import score
 
     folder, board = resolve_root(root), demo_board(root)
@@ -197,19 +195,20 @@ def demo_model(
         progress=progress,
     )
     solver = _solver_time()
-    floors = [
-        submit_floor(floor.name, split=MODEL_SPLIT, size=DEMO_SIZE, board=board, root=folder)
-        for floor in floors_of(load().size(MODEL_SPLIT, DEMO_SIZE))
-    ]
     entry = submit(
-        [prediction.path], _said(training, prediction, solver), board=board, root=folder, replace=True
+        [prediction.path],
+        _said(training, prediction, solver),
+        board=board,
+        root=folder,
+        replace=True,
+        new_board=True,
     )
     return ModelResult(
         training=training,
         prediction=prediction,
         card=score(prediction.path, root=folder),
         solver=solver,
-        entries=(*floors, entry),
+        entry=entry,
         page=build(board),
     )
 
@@ -247,7 +246,7 @@ def _solver_time() -> SolverBench | None:
 
 def _said(training: TrainingResult, prediction: PredictionResult, solver: SolverBench | None) -> Meta:
     """Return what the entry says of the model."""
-    from lagbench.board.meta import Meta
+    from lagbench.board.entry import Meta
 
     return Meta(
         method=MODEL,

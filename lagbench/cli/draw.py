@@ -32,7 +32,7 @@ def _source(name: str | None, split: str | None, size: str, scenario: int | None
     """Return the scenario file that a user means by its path or by split, size and id."""
     from lagbench.data.layout import ScenarioKey, scenario_path
     from lagbench.data.local import locate
-    from lagbench.store.bringing import bring
+    from lagbench.store.copy import bring
 
     if name is not None and name.endswith(".nc"):
         return Path(name)

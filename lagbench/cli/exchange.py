@@ -81,7 +81,7 @@ def download(
     split: SplitOption = None,
     size: SizeOption = "full",
     mirror: Annotated[
-        str | None, typer.Option("--from", metavar="URL", help="Mirror; else those of datasets.yaml.")
+        str | None, typer.Option("--from", metavar="URL", help="Store; else the mirrors of datasets.yaml.")
     ] = None,
     subset: SubsetOption = None,
     scenarios: ScenariosOption = None,
@@ -91,13 +91,13 @@ def download(
     ] = 4,
     or_generate: Annotated[
         bool,
-        typer.Option("--or-generate/--no-generate", help="Simulate what no mirror has, or stop there."),
+        typer.Option("--or-generate/--no-generate", help="Simulate what no store has, or stop there."),
     ] = True,
     workers: WorkersOption = None,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
-    """Fetch a split from a mirror and check its content; simulate what no mirror has."""
+    """Fetch a split from a store and check its content; simulate what no store has."""
     from lagbench.data.registry import spell_ids
     from lagbench.exchange.downloading import download as run
 
@@ -143,7 +143,15 @@ def export(
     ] = None,
     root: RootOption = None,
     from_walls: Annotated[
-        bool, typer.Option("--from-walls", help="lagrangebench-h5: measure positions from the lower walls.")
+        bool | None,
+        typer.Option(
+            "--from-walls/--unit-box",
+            help="lagrangebench-h5: measure positions from the lower walls; closed boxes do by default.",
+        ),
+    ] = None,
+    wall_particles: Annotated[
+        bool,
+        typer.Option("--wall-particles", help="Closed boxes: add particles that move along with the walls."),
     ] = False,
     force: Annotated[bool, typer.Option("--force", help="Write over an earlier export.")] = False,
     as_json: JsonFlag = False,
@@ -162,6 +170,7 @@ def export(
             output=folder,
             root=root,
             from_walls=from_walls,
+            wall_particles=wall_particles,
             force=force,
             progress=draw,
         )
@@ -206,8 +215,8 @@ def import_split(
     quiet: QuietFlag = False,
 ) -> None:
     """Make a local split of another code base's data, to train on and to score."""
-    from lagbench.exchange.importing import import_split as run
-    from lagbench.exchange.kinds import parse_kinds
+    from lagbench.exchange.adoption import import_split as run
+    from lagbench.exchange.metadata import parse_kinds
 
     with progress_bar(quiet=quiet) as draw:
         made = run(
@@ -262,7 +271,7 @@ def adopt(
 def _wishes(ctx: typer.Context) -> Any:  # noqa: ANN401 (the functions type them)
     """Return what a user says of the data: the options that import and adopt share."""
     from lagbench.data.registry import parse_ids
-    from lagbench.exchange.description import Wishes
+    from lagbench.exchange.trajectory import Wishes
 
     said = {n: v for n, v in ctx.params.items() if n in Wishes.__annotations__ and v is not None}
     if "bounds" in said:

@@ -120,7 +120,7 @@ def progress_bar(*, quiet: bool, counted: str = "scenarios") -> Iterator[Callabl
         A function to hand to ``generate``; None where stderr is no terminal or silence is wanted.
     """
     if quiet:
-        from lagbench.store.fetching import quietly
+        from lagbench.store.copy import quietly
 
         with quietly():
             yield None

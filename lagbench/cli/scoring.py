@@ -130,12 +130,11 @@ def score(
         raise UsageError("several files are scored for one report", fix="add --report FOLDER")
     targets, wanted = _targets(predictions, output), _wanted(split, root)
     root = wanted.root
-    if len(predictions) > 1:
-        _check_together(predictions, root)
+    together = _checked_together(predictions, root) if len(predictions) > 1 else [None]
     if report is not None:
         check_writable(report, option="--report")
     cards = []
-    for path, target in zip(predictions, targets, strict=True):
+    for path, target, validated in zip(predictions, targets, together, strict=True):
         with progress_bar(quiet=quiet) as draw:
             card = run(
                 path,
@@ -146,6 +145,7 @@ def score(
                 extras=tuple(name for name in extras.split(",") if name),
                 progress=draw,
                 examined=wanted.complain,
+                validated=validated,
             )
         cards.append(card)
         if not as_json and not quiet:
@@ -176,16 +176,17 @@ def _targets(predictions: Sequence[Path], output: Path | None) -> list[Path]:
     return targets
 
 
-def _check_together(predictions: Sequence[Path], root: Path | None) -> None:
+def _checked_together(predictions: Sequence[Path], root: Path | None) -> list[ValidationResult]:
     """Refuse, before any is scored, an invalid file and one to another split or size."""
     from lagbench.submission import validate as examine
 
-    first = None
+    results: list[ValidationResult] = []
     for path in predictions:
         result = examine(path, root=root, require_truth=True)
         _complain(result)
         result.check()
-        first = first or result
+        results.append(result)
+        first = results[0]
         if (result.split, result.size) != (first.split, first.size):
             raise UsageError(
                 "one report, two data sets",
@@ -194,6 +195,7 @@ def _check_together(predictions: Sequence[Path], root: Path | None) -> None:
                 got=f"{result.split} {result.size}",
                 fix="report submissions to one data set together, others on their own",
             )
+    return results
 
 
 @dataclass(frozen=True)
@@ -248,7 +250,10 @@ def _scored(card: ScoreCard, *, every: bool) -> None:
 
 
 def compare(
-    first: Annotated[str, typer.Argument(metavar="A", help="scores.json, its folder, or predictions.nc.")],
+    first: Annotated[
+        str,
+        typer.Argument(metavar="A", help="scores.json, its folder, a folder of seeds, predictions.nc."),
+    ],
     second: Annotated[str, typer.Argument(metavar="B", help="Another, or the name of a floor.")],
     metric: Annotated[
         list[str] | None, typer.Option("--metric", metavar="NAME", help="Metric to compare by; repeatable.")
@@ -259,7 +264,7 @@ def compare(
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
-    """Compare two submissions over scenarios: exact sign-flip test and intervals."""
+    """Compare two methods over scenarios, and over seeds where there are several: tests and intervals."""
     from lagbench.scoring.compare import compare as run
 
     result = run(first, second, metrics=metric or (), root=root, workers=workers)

@@ -189,6 +189,10 @@ class ContentHasher:
         self._identity = dict(identity)
         self._variables: dict[str, VariableHasher] = {}
 
+    def identify(self, identity: Mapping[str, object]) -> None:
+        """Put another identity in place of the present one."""
+        self._identity = dict(identity)
+
     def declare(self, name: str, dtype: object, dims: Sequence[object], shape: Sequence[int]) -> None:
         """Announce a variable before its values come."""
         self._variables[name] = VariableHasher(name, dtype, dims, shape)

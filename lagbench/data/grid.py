@@ -200,21 +200,27 @@ def transfer(position: ArrayLike, velocity: ArrayLike, grid: Grid) -> Transfer:
 
 def _scatter(x: Floats, u: Floats, grid: Grid) -> tuple[Floats, Floats]:
     """Return ``sum(w)`` and ``sum(w u)`` of one frame."""
-    inside = ((x >= 0.0) & (x <= 1.0)).all(axis=-1)
-    s = x[inside].T * grid.cells - grid.origin
+    inside = (x[:, 0] >= 0.0) & (x[:, 0] <= 1.0) & (x[:, 1] >= 0.0) & (x[:, 1] <= 1.0)
+    if not inside.all():
+        x, u = x[inside], u[inside]
+    s = x.T * grid.cells - grid.origin
     base = np.floor(s - 0.5)
     weight_x, weight_y = _spline(s - base)
     side = grid.nodes + _LOW + _HIGH
     column, row = base.astype(np.intp) + _LOW
     corner = column * side + row
-    u_x, u_y = u[inside].T.copy()
+    u_x, u_y = np.ascontiguousarray(u.T)
 
     sums = np.zeros((3, side * side))
-    for i, k in np.ndindex(3, 3):
-        node = corner + (i * side + k)
-        w = weight_x[i] * weight_y[k]
-        for total, weights in zip(sums, (w, w * u_x, w * u_y), strict=True):
-            total += np.bincount(node, weights, side * side)
+    weights = np.empty((3, len(corner)))
+    for i in range(3):
+        along_x = weight_x[i], weight_x[i] * u_x, weight_x[i] * u_y
+        for k in range(3):
+            # node numbers stay those of the corner; its sums are shifted to the node instead
+            shift = i * side + k
+            for total, product, factor in zip(sums, weights, along_x, strict=True):
+                np.multiply(factor, weight_y[k], out=product)
+                total[shift:] += np.bincount(corner, product, side * side)[: side * side - shift]
     inner = sums.reshape(3, side, side)[:, _LOW:-_HIGH, _LOW:-_HIGH]
     return inner[0], np.moveaxis(inner[1:], 0, -1)
 

@@ -1,7 +1,7 @@
 """Where data sets live: the root folder and the path of every scenario.
 
 ``<root>/<split>/<size>/v<MAJOR>/<subset>/<id:04d>.nc``, with ``manifest.json`` beside the
-subsets. Nothing here touches the disk, but that a root in an object store gets its working copy.
+subsets. Nothing here writes to the disk, but that a root in an object store gets its working copy.
 
 The local folder that stands for a root folder in an object store.
 
@@ -12,6 +12,7 @@ Everything works on that folder; ``lagbench.store`` brings objects there and put
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
@@ -21,6 +22,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lagbench.atomic import write_atomically
+from lagbench.errors import UsageError
 
 __all__ = [
     "CACHE_VARIABLE",
@@ -28,6 +30,7 @@ __all__ = [
     "open_copy",
     "url_of",
     "MANIFEST_NAME",
+    "NOTES_NAME",
     "ROOT_VARIABLE",
     "ScenarioKey",
     "dataset_folder",
@@ -112,6 +115,9 @@ ROOT_VARIABLE = "LAGBENCH_ROOT"
 
 MANIFEST_NAME = "manifest.json"
 
+NOTES_NAME = ".verified.json"
+"""Where a machine notes which files it has hashed; it stands beside the manifest."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ScenarioKey:
@@ -159,6 +165,7 @@ def resolve_root(root: str | Path | None = None) -> Path:
             :mod:`lagbench.data.layout`.
 
     Raises:
+        UsageError: no file system can have a folder of that name.
         WorkFailedError: the working copy of a URL cannot be made.
     """
     given = root or os.environ.get(ROOT_VARIABLE)
@@ -166,10 +173,26 @@ def resolve_root(root: str | Path | None = None) -> Path:
         url = as_url(given)
         if url is not None:
             return open_copy(url)
-        return Path(given).expanduser().absolute()
+        return _nameable(Path(given).expanduser().absolute())
     import platformdirs
 
     return platformdirs.user_data_path("lagbench", appauthor=False)
+
+
+def _nameable(folder: Path) -> Path:
+    """Return a folder, whether it is there or not; refuse a name that the operating system refuses."""
+    try:
+        folder.lstat()
+    except (OSError, ValueError) as error:
+        too_long = isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG
+        if too_long or isinstance(error, ValueError):
+            raise UsageError(
+                "no folder can have that name",
+                where=f"--root or {ROOT_VARIABLE}",
+                expected="a path",
+                got=f"{str(folder)[:60]!a}..., {len(str(folder))} characters",
+            ) from error
+    return folder
 
 
 def dataset_folder(root: Path, split: str, size: str, major: int) -> Path:

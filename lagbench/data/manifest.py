@@ -6,19 +6,22 @@ scenarios leaves ``complete: false``; a later one merges its files into what is 
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
 from lagbench.atomic import write_atomically
-from lagbench.errors import DataError
+from lagbench.errors import DataError, WorkFailedError
 from lagbench.work.machine import may_differ
 
 from .checksums import HASHED_SUBSETS, dataset_hash, file_sha256, subset_hash
-from .layout import MANIFEST_NAME, ScenarioKey, dataset_folder, major_of, scenario_path
+from .layout import MANIFEST_NAME, NOTES_NAME, ScenarioKey, dataset_folder, major_of, scenario_path
 from .scenario import read_scenario
 from .statistics import round_digits
 
@@ -27,6 +30,8 @@ __all__ = [
     "Manifest",
     "describe_file",
     "merge",
+    "note",
+    "noted_content",
     "read_manifest",
     "write_manifest",
 ]
@@ -211,3 +216,79 @@ def _subset_hashes(entries: Mapping[int, FileEntry], subsets: Mapping[str, Seque
         for name, ids in subsets.items()
         if all(i in entries for i in ids)
     }
+
+
+# --- what this machine has hashed ----------------------------------------------------------
+
+# Hashing the values of a file takes seconds where it is large, and a manifest is a claim of
+# whoever wrote it. So files whose values were hashed here are noted beside it. A note counts for
+# that very file alone: nobody can set the time of its last change of any kind (ctime), so notes
+# that came with a copied or downloaded folder count for nothing.
+
+
+@dataclass(frozen=True)
+class _Note:
+    """A file whose values were hashed."""
+
+    bytes: int
+    modified: int  # time of the last change of its bytes [ns]
+    changed: int  # time of the last change of any kind [ns]
+    file_sha256: str
+    content_sha256: str
+
+
+_seen: dict[Path, _Note] = {}
+"""Files that this process has read whole: their bytes are not read again while their times stay."""
+
+
+def note(folder: Path, contents: Mapping[Path, str]) -> None:
+    """Note the content hashes of files of a data set folder, just hashed or written by this machine.
+
+    Where the folder cannot be written to, nothing is noted.
+    """
+    if not contents:
+        return
+    found = {}
+    for path, content in contents.items():
+        stamp = _stamp(path)  # before the bytes: a file that changes meanwhile does not fit its note
+        found[path] = _seen[path] = _Note(*stamp, file_sha256(path), content)
+    rows = {_spelled(path, folder): astuple(held) for path, held in found.items()}
+    kept = {name: astuple(held) for name, held in _notes(folder).items()}
+    if not rows.items() <= kept.items():
+        with suppress(WorkFailedError):
+            write_atomically(folder / NOTES_NAME, (json.dumps(kept | rows, indent=1) + "\n").encode())
+
+
+def noted_content(folder: Path) -> Callable[[Path], str | None]:
+    """Return what tells the content hash of a file that was hashed here and is still the same.
+
+    The bytes are read to tell, once in a process; values are not unpacked.
+    """
+    notes = _notes(folder)
+
+    def content(path: Path) -> str | None:
+        held = notes.get(_spelled(path, folder))
+        if held is None or astuple(held)[:3] != _stamp(path):
+            return None
+        if _seen.get(path) != held and file_sha256(path) != held.file_sha256:
+            return None
+        _seen[path] = held
+        return held.content_sha256
+
+    return content
+
+
+def _notes(folder: Path) -> dict[str, _Note]:
+    try:
+        return {name: _Note(*row) for name, row in json.loads((folder / NOTES_NAME).read_bytes()).items()}
+    except (OSError, ValueError, TypeError, AttributeError, RecursionError):
+        return {}
+
+
+def _stamp(path: Path) -> tuple[int, int, int]:
+    status = path.stat()
+    return status.st_size, status.st_mtime_ns, status.st_ctime_ns
+
+
+def _spelled(path: Path, folder: Path) -> str:
+    return path.relative_to(folder).as_posix()

@@ -77,10 +77,11 @@ class ScenarioWriter:
         frame_interval: time between frames [s].
         material: value of :data:`MATERIALS` for each particle, shape [particle].
         particle_mass: mass of a particle, rho L^2 / n.
-        wall_velocity: [length/s], shape [wall, 2] (constant) or [frame, wall, 2], walls left,
-            right, bottom, top; None where there are no moving walls (free surface).
+        wall_velocity: [length/s], shape [wall, 2] (constant) or [frame, wall, 2], entry f being what
+            acts from frame f-1 to f; walls left, right, bottom, top; None where there are no moving
+            walls (free surface).
         parameters: physical parameters by name: finite numbers and strings. Each becomes an
-            attribute and enters the content hash. ``start_substep`` is one of them.
+            attribute and enters the content hash. ``start_frame`` is one of them.
         seed: how the random numbers were seeded.
         device: device that simulated; not hashed.
         generator: dotted path of the split's module; not hashed.
@@ -162,6 +163,15 @@ class ScenarioWriter:
             with _write_errors(self.path):
                 self._file[name][self._written] = values
         self._written += 1
+
+    def state(self, **parameters: object) -> None:
+        """State further parameters, known only after the last frame; they are hashed like the others."""
+        self._parameters |= _checked(parameters, self.path)
+        self._hasher.identify(self.key.identity(str(self._labels["seed"]), self._parameters))
+        with _write_errors(self.path):
+            self._file.setncatts(
+                {**self._parameters, "hashed_parameters": " ".join(sorted(self._parameters))}
+            )
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

@@ -1,11 +1,13 @@
 """Read YAML that strangers may have written: safe types only, bounded size, no aliases.
 
 Aliases are refused because a few hundred bytes of them can expand to gigabytes; duplicate
-keys because the second would silently replace the first.
+keys because the second would silently replace the first. Numbers are those of YAML 1.2: YAML
+1.1, which PyYAML speaks, also has base 60 (``59:59:1.5``) and reads ``010`` as eight.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Hashable
 from pathlib import Path
 from typing import Any
@@ -17,6 +19,7 @@ from lagbench.errors import UnreadableFileError
 __all__ = [
     "MAX_BYTES",
     "MAX_DEPTH",
+    "NUMBERS",
     "read_yaml",
 ]
 
@@ -28,8 +31,19 @@ MAX_DEPTH = 32
 """Deepest nesting of mappings and lists that is read."""
 
 
+INTEGER, FLOAT = "tag:yaml.org,2002:int", "tag:yaml.org,2002:float"
+NUMBERS = {
+    INTEGER: re.compile(r"^(?:[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+)$"),
+    FLOAT: re.compile(
+        r"^(?:[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?"
+        r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
+    ),
+}
+"""Numbers of YAML 1.2's core schema, by tag; integers are asked first."""
+
+
 class _StrictLoader(yaml.CSafeLoader):
-    """Safe loader that refuses duplicate keys."""
+    """Safe loader that refuses duplicate keys and knows the numbers of YAML 1.2 only."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
         seen: set[Hashable] = set()
@@ -40,6 +54,24 @@ class _StrictLoader(yaml.CSafeLoader):
                 raise yaml.constructor.ConstructorError(None, None, message, key_node.start_mark)
             seen.add(key)
         return super().construct_mapping(node, deep=deep)
+
+
+def _integer(_: _StrictLoader, node: yaml.ScalarNode) -> int:
+    return int(node.value, 0) if node.value[:2] in ("0o", "0x") else int(node.value)
+
+
+def _float(_: _StrictLoader, node: yaml.ScalarNode) -> float:
+    return float(node.value.replace(".", "", 1) if node.value[-1:].isalpha() else node.value)
+
+
+_StrictLoader.yaml_implicit_resolvers = {
+    first: [(tag, known) for tag, known in held if tag not in NUMBERS]
+    for first, held in yaml.CSafeLoader.yaml_implicit_resolvers.items()
+}
+for _tag, _pattern in NUMBERS.items():
+    _StrictLoader.add_implicit_resolver(_tag, _pattern, list("-+.0123456789"))
+_StrictLoader.add_constructor(INTEGER, _integer)
+_StrictLoader.add_constructor(FLOAT, _float)
 
 
 def _check_structure(text: str) -> None:
@@ -77,7 +109,7 @@ def read_yaml(path: Path) -> Any:  # noqa: ANN401
         raise UnreadableFileError(
             "cannot read the YAML file", where=str(path), got=error.strerror or error
         ) from error
-    except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError: a date or number that is none
+    except (yaml.YAMLError, ValueError, ArithmeticError, RecursionError) as error:  # as dates
         raise UnreadableFileError(
             "not a plain YAML file",
             where=str(path),

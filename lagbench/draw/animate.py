@@ -124,9 +124,7 @@ class Painter:
         self._side = side * OVERSAMPLING
         self._disc = _Disc.of(DOT * recording.spacing * self._side)
         self._margin = int(self._disc.rows.max(initial=0)) + 1
-        with figure(self._side / DPI, self._side / DPI) as drawn:
-            draw_walls(drawn.add_axes((0, 0, 1, 1)), recording)
-            self._walls = pack(pixels_of(drawn))
+        self._drawn_walls: dict[bytes, Packed] = {}
         self._materials = pack(np.array([rgb(colour) for colour in MATERIAL_COLOURS]))[recording.material]
         self._colours = _table(vorticity_map() if panel is Panel.VORTICITY else speed_map())
         self._inside = _inside(recording, self._side)
@@ -137,10 +135,20 @@ class Painter:
             return halve(self._field(scene))
         return halve(self._dots(scene))
 
+    def _walls(self, scene: Scene) -> Packed:
+        """Return the empty box; it changes only where a wall turns."""
+        signs = np.sign(scene.recording.wall_velocity[scene.frame]).tobytes()
+        if signs not in self._drawn_walls:
+            with figure(self._side / DPI, self._side / DPI) as drawn:
+                draw_walls(drawn.add_axes((0, 0, 1, 1)), scene.recording, scene.frame)
+                self._drawn_walls[signs] = pack(pixels_of(drawn))
+        return self._drawn_walls[signs]
+
     def _dots(self, scene: Scene) -> Packed:
         """Draw a dot for every particle, cut off at the walls; later particles lie on earlier ones."""
         margin = self._margin
-        image = np.pad(self._walls, margin)
+        walls = self._walls(scene)
+        image = np.pad(walls, margin)
         shown = ((scene.position >= 0.0) & (scene.position <= 1.0)).all(axis=-1)
         x, y = scene.position[shown].T
         column = np.minimum((x * self._side).astype(np.intp), self._side - 1) + margin
@@ -150,7 +158,7 @@ class Painter:
         colours = self._materials if self.panel is Panel.MATERIAL else self._by_speed(scene)
         places = (row * width + column)[:, None] + stamp
         image.reshape(-1)[places] = colours[shown][:, None]
-        return np.where(self._inside, image[margin:-margin, margin:-margin], self._walls)
+        return np.where(self._inside, image[margin:-margin, margin:-margin], walls)
 
     def _by_speed(self, scene: Scene) -> Packed:
         return self._colours[_level(scene.speed / self.limit, len(self._colours))]
@@ -164,7 +172,7 @@ class Painter:
         omega = fields.vorticity.T[::-1][np.ix_(fields.grid.nodes - 1 - index[::-1], index)]
         defined = np.isfinite(omega) & self._inside
         level = _level(0.5 + 0.5 * np.where(defined, omega, 0.0) / self.limit, len(self._colours))
-        return np.where(defined, self._colours[level], self._walls)
+        return np.where(defined, self._colours[level], self._walls(scene))
 
 
 def _level(share: NDArray[np.float64], levels: int) -> NDArray[np.intp]:

@@ -90,7 +90,7 @@ def limit_of(panel: Panel, scene: Scene) -> float:
 
 def draw(axes: Axes, panel: Panel, scene: Scene, *, limit: float, detail: float = 1.0) -> None:
     """Draw one frame inside its box."""
-    draw_walls(axes, scene.recording)
+    draw_walls(axes, scene.recording, scene.frame)
     scale = colour_scale(panel, limit)
     if panel is Panel.MATERIAL:
         _draw_dots(axes, scene, np.array(MATERIAL_COLOURS)[scene.recording.material])
@@ -109,14 +109,14 @@ def box_of(recording: Recording) -> tuple[float, float, float, float]:
     return left, right, bottom, top
 
 
-def moving_walls(recording: Recording) -> Iterator[tuple[int, Floats]]:
-    """Yield each wall that slides with its velocity along itself [length/s], shape [2]."""
-    for wall, velocity in enumerate(recording.wall_velocity * _ALONG):
+def moving_walls(recording: Recording, frame: int) -> Iterator[tuple[int, Floats]]:
+    """Yield each wall that slides towards a frame with its velocity along itself [length/s], shape [2]."""
+    for wall, velocity in enumerate(recording.wall_velocity[frame] * _ALONG):
         if velocity.any():
             yield wall, velocity
 
 
-def draw_walls(axes: Axes, recording: Recording) -> None:
+def draw_walls(axes: Axes, recording: Recording, frame: int) -> None:
     """Draw the walls as bands around the box; arrowheads show which way a moving one slides."""
     from matplotlib.patches import Rectangle
 
@@ -130,7 +130,7 @@ def draw_walls(axes: Axes, recording: Recording) -> None:
     ]
     axes.add_patch(Rectangle((0, 0), 1, 1, color=WALL, lw=0, zorder=0))
     axes.add_patch(Rectangle((left, bottom), right - left, top - bottom, color=PAPER, lw=0, zorder=0.5))
-    for wall, velocity in moving_walls(recording):
+    for wall, velocity in moving_walls(recording, frame):
         x, y, width, height = bands[wall]
         axes.add_patch(Rectangle((x, y), width, height, color=MOVING, lw=0, zorder=0.6))
         _draw_arrowheads(axes, bands[wall], velocity / np.abs(velocity).max())

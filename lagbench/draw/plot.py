@@ -21,7 +21,7 @@ from lagbench.data.local import locate, remedy
 from lagbench.data.registry import Registry, Size
 from lagbench.data.writer import ScenarioKey, scenario_path
 from lagbench.errors import DataError, UsageError, nearest
-from lagbench.store.bringing import bring
+from lagbench.store.copy import bring
 
 from .panels import TITLES, Panel, colour_bar, draw, limit_of, material_key, moving_walls
 from .recording import Recording, Scene, open_recording
@@ -277,14 +277,14 @@ def describe(recording: Recording) -> str:
 
 def _moment(scene: Scene) -> list[str]:
     """Return frame and time, and which walls move, which way, how fast."""
-    return [f"frame {scene.frame}", f"t = {scene.time:.2f} s", *_motions(scene.recording)]
+    return [f"frame {scene.frame}", f"t = {scene.time:.2f} s", *_motions(scene)]
 
 
-def _motions(recording: Recording) -> list[str]:
+def _motions(scene: Scene) -> list[str]:
     """Say which walls move, which way, how fast."""
     return [
         f"{WALLS[wall]} wall moves {DIRECTIONS[_sign(v[0]), _sign(v[1])]} at {np.abs(v).max():.3g} length/s"
-        for wall, v in moving_walls(recording)
+        for wall, v in moving_walls(scene.recording, scene.frame)
     ]
 
 

@@ -91,8 +91,10 @@ class Recording:
         # material of each particle, shape [particle]
         self.material = read("material", slice(None))[self._present].astype(np.int8)
         moving = "wall_velocity" in variables
-        # [length/s], shape [wall, 2]; zeros where the file has none
-        self.wall_velocity = read("wall_velocity", 0).astype(np.float64) if moving else np.zeros((4, 2))
+        # [length/s], shape [frame, wall, 2]; zeros where the file has none
+        self.wall_velocity = np.zeros((frames, 4, 2))
+        if moving:
+            self.wall_velocity[:] = read("wall_velocity", slice(frames))
         self._mass = float(read("particle_mass", slice(None)))
 
     @property

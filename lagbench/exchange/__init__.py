@@ -13,10 +13,9 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from .adoption import adopt
+    from .adoption import adopt, import_split
     from .downloading import download
     from .exporting import export
-    from .importing import import_split
 
 __all__ = ["adopt", "download", "export", "import_split"]
 
@@ -24,7 +23,7 @@ _HOMES = {
     "adopt": "adoption",
     "download": "downloading",
     "export": "exporting",
-    "import_split": "importing",
+    "import_split": "adoption",
 }
 
 

@@ -1,33 +1,35 @@
-"""Adopt a user's own trajectories: arrays or netCDF in, a hashed local split out."""
+"""Trajectories from elsewhere in, a hashed local split out: a user's own, or another code base's."""
 
 from __future__ import annotations
 
 import re
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import IO, TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.data.checksums import HASHED_SUBSETS
+from lagbench.data.checksums import HASHED_SUBSETS, file_sha256
 from lagbench.data.scenario import MATERIALS
 from lagbench.errors import DataError, UnreadableFileError, UsageError
 from lagbench.work.progress import Progress
 
-from .description import Description, Wishes
-from .inflation import check_inflation
+from . import gns_npz, lagrangebench_h5
+from .exporting import ENDINGS
 from .local_split import LocalSplit, make_local_split, output_name
-from .trajectory import Frame, Trajectory, check_array, frames_of
+from .metadata import DROP, Format, Source, parse_format, read_source
+from .trajectory import Description, Frame, Trajectory, Wishes, check_array, check_inflation
 
 if TYPE_CHECKING:
     import netCDF4
 
-__all__ = ["ENDINGS", "adopt"]
+__all__ = ["adopt", "import_split"]
 
-ENDINGS = (".npy", ".npz", ".nc")
-"""Files that are read: an array, named arrays, netCDF."""
+READABLE = (".npy", ".npz", ".nc")
+"""Files that are adopted: an array, named arrays, netCDF."""
 
 POSITION, VELOCITY, MATERIAL, WALLS = "position", "velocity", "material", "wall_velocity"
 
@@ -59,7 +61,7 @@ def adopt(
         test: trajectories for test; a tenth, at least one, when None.
         progress: called as the work advances.
         **wishes: ``radius`` and ``frame_interval``, which must be given, and what else is known,
-            see :class:`lagbench.exchange.description.Description`.
+            see :class:`lagbench.exchange.trajectory.Description`.
 
     Raises:
         UsageError: no radius or frame interval, too few trajectories, a folder that is there, a
@@ -77,6 +79,73 @@ def adopt(
     about = Description(name=output_name(output), source=f"{count} trajectories of the user's own", **wishes)
     subsets = {subset: (_open(path, row) for path, row in rows) for subset, rows in files.items()}
     return make_local_split(about, subsets, output, command="adopt", progress=progress)
+
+
+def import_split(
+    source: str | Path,
+    *,
+    format: str,
+    output: str | Path,
+    allow_pickle: bool = False,
+    kinds: Mapping[int, str] | None = None,
+    progress: Callable[[Progress], None] | None = None,
+    **wishes: Unpack[Wishes],
+) -> LocalSplit:
+    """Make a local split of train, valid and test in another code base's format.
+
+    Positions are taken over as they are, as float32; velocities are their differences over the
+    frame interval. A ``force.py`` beside the data is left alone.
+
+    Args:
+        source: folder of the three files and metadata.json.
+        format: "gns-npz" or "lagrangebench-h5".
+        output: folder to make; its last part is the name of the split.
+        allow_pickle: whether arrays that are stored as pickled objects (all of gns-npz) may be
+            rebuilt; whatever else a pickle calls is refused even then.
+        kinds: number of a kind of particles to the material that it stands for, or to "drop".
+        progress: called as the work advances.
+        **wishes: what shall hold instead of what the metadata say, see
+            :class:`lagbench.exchange.trajectory.Description`.
+
+    Raises:
+        UsageError: unknown format, pickled objects that may not be rebuilt, a folder that is
+            there, a task that does not fit the data.
+        UnreadableFileError: a file is missing, damaged or laid out otherwise, or holds particles
+            of a kind that no material is known for.
+        DataError: positions are not plane, not finite, outside the unit box, or cross a
+            periodic one.
+        WorkFailedError: the disk is full or not writable.
+    """
+    form, folder = parse_format(format), Path(source)
+    files = {subset: folder / f"{subset}{ENDINGS[form]}" for subset in HASHED_SUBSETS}
+    missing = [path.name for path in files.values() if not path.is_file()]
+    if missing:
+        raise UnreadableFileError(
+            "files are missing",
+            where=str(folder),
+            expected=", ".join(p.name for p in files.values()),
+            got=f"no {', no '.join(missing)}",
+            fix=_other_format(folder, form),
+        )
+    if form is Format.GNS_NPZ and not allow_pickle:
+        next(gns_npz.trajectories(files["train"], allow_pickle=False, kinds={}))
+    stated = read_source(folder, form)
+    about = Description(
+        name=output_name(output),
+        source=f"{form.value}: " + ", ".join(f"{p.name} {file_sha256(p)[:16]}" for p in files.values()),
+        **_stated(stated, wishes),
+    )
+    walls = dict.fromkeys(stated.hints.wall_particle_type, DROP)
+    given = {**walls, **(kinds or {})}
+
+    def read(path: Path) -> Iterator[Trajectory]:
+        if form is Format.GNS_NPZ:
+            return gns_npz.trajectories(path, allow_pickle=allow_pickle, kinds=given)
+        found = lagrangebench_h5.trajectories(path, kinds=given, origin=stated.hints.origin)
+        return (_unbroken(trajectory, stated) for trajectory in found)
+
+    subsets = {subset: read(path) for subset, path in files.items()}
+    return make_local_split(about, subsets, output, command="import", progress=progress)
 
 
 Row = tuple[Path, int | None]
@@ -122,11 +191,11 @@ def _natural(paths: Sequence[Path]) -> list[Path]:
 def _rows(path: Path) -> list[Row]:
     """Return the trajectories of a file, or of the files of a folder by name."""
     if path.is_dir():
-        found = _natural([file for file in path.iterdir() if file.suffix in ENDINGS and file.is_file()])
+        found = _natural([file for file in path.iterdir() if file.suffix in READABLE and file.is_file()])
         return [row for file in found for row in _rows(file)]
-    if path.suffix not in ENDINGS or not path.is_file():
+    if path.suffix not in READABLE or not path.is_file():
         raise UnreadableFileError(
-            "this is no file of trajectories", where=str(path), expected=f"a folder, or {', '.join(ENDINGS)}"
+            "this is no file of trajectories", where=str(path), expected=f"a folder, or {', '.join(READABLE)}"
         )
     if path.suffix != ".npy":
         return [(path, None)]
@@ -140,11 +209,19 @@ def _open(path: Path, row: int | None) -> Trajectory:
         array = _array(path)
         name = str(path) if row is None else f"{path}, trajectory {row}"
         held = {POSITION: array if row is None else array[row]}
-        return _trajectory(name, held, lambda: frames_of(held[POSITION]))
+        return _trajectory(name, held, lambda: _frames(held))
     if path.suffix == ".npz":
         arrays = _arrays(path)
-        return _trajectory(str(path), arrays, lambda: frames_of(arrays[POSITION], arrays.get(VELOCITY)))
+        return _trajectory(str(path), arrays, lambda: _frames(arrays))
     return _netcdf(path)
+
+
+def _frames(arrays: Mapping[str, Any]) -> Iterator[Frame]:
+    """Yield the frames of arrays, in memory or mapped or in a file, of shape [frame, particle, 2]."""
+    velocity = arrays.get(VELOCITY)
+    for number in range(arrays[POSITION].shape[0]):
+        frame = np.asarray(arrays[POSITION][number])
+        yield frame, None if velocity is None else np.asarray(velocity[number])
 
 
 def _trajectory(name: str, arrays: Mapping[str, Any], read: Callable[[], Iterator[Frame]]) -> Trajectory:
@@ -185,7 +262,9 @@ def _trajectory(name: str, arrays: Mapping[str, Any], read: Callable[[], Iterato
 def _array(path: Path) -> NDArray[Any]:
     """Return the mapped array of a .npy file."""
     try:
-        array: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
+        with path.open("rb") as stream:
+            _refuse_objects(str(path), stream)
+        array: NDArray[Any] = np.lib.format.open_memmap(path, mode="r")
     except (OSError, ValueError, EOFError) as error:
         raise _unreadable(path, error) from error
     return array
@@ -196,13 +275,26 @@ def _arrays(path: Path) -> dict[str, NDArray[Any]]:
     try:
         with zipfile.ZipFile(path) as archive:
             for member in archive.infolist():
-                check_inflation(
-                    f"{path}, {member.filename}", packed=member.compress_size, unpacked=member.file_size
-                )
+                name = f"{path}, {member.filename}"
+                check_inflation(name, packed=member.compress_size, unpacked=member.file_size)
+                if member.filename.removesuffix(".npy") in (POSITION, VELOCITY, MATERIAL, WALLS):
+                    with archive.open(member) as stream:
+                        _refuse_objects(name, stream)
         with np.load(path, allow_pickle=False) as held:
             return {name: held[name] for name in (POSITION, VELOCITY, MATERIAL, WALLS) if name in held}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise _unreadable(path, error) from error
+
+
+def _refuse_objects(name: str, stream: IO[bytes]) -> None:
+    _, _, dtype = gns_npz.read_header(stream)
+    if dtype.hasobject:
+        raise UnreadableFileError(
+            "the file holds pickled objects",
+            where=name,
+            expected="arrays of numbers",
+            fix="lagbench import --format gns-npz reads trajectories of GNS code bases",
+        )
 
 
 def _netcdf(path: Path) -> Trajectory:
@@ -219,13 +311,10 @@ def _netcdf(path: Path) -> Trajectory:
     }
 
     def read() -> Iterator[Frame]:
-        for number in range(held[POSITION].shape[0]):
-            try:
-                frame = np.asarray(held[POSITION][number])
-                velocity = np.asarray(held[VELOCITY][number]) if VELOCITY in held else None
-            except (OSError, RuntimeError) as error:
-                raise _unreadable(path, error) from error
-            yield frame, velocity
+        try:
+            yield from _frames(held)
+        except (OSError, RuntimeError) as error:
+            raise _unreadable(path, error) from error
 
     return _trajectory(str(path), held, read)
 
@@ -244,11 +333,64 @@ def _check_plain(path: Path, file: netCDF4.Dataset) -> None:
 
 
 def _unreadable(path: Path, error: Exception) -> UnreadableFileError:
-    pickled = any(words in str(error) for words in ("allow_pickle", "Python objects"))
     return UnreadableFileError(
-        "the file holds pickled objects" if pickled else "cannot read the file",
+        "cannot read the file",
         where=str(path),
         expected="arrays of numbers",
-        got=None if pickled else f"{type(error).__name__}: {error}",
-        fix="lagbench import --format gns-npz reads trajectories of GNS code bases" if pickled else None,
+        got=f"{type(error).__name__}: {error}",
     )
+
+
+def _other_format(folder: Path, form: Format) -> str | None:
+    """Return the format that the files of a folder do have, as a remedy; None where none fits."""
+    for other, ending in ENDINGS.items():
+        if other is not form and all((folder / f"{subset}{ending}").is_file() for subset in HASHED_SUBSETS):
+            return f"the folder holds {HASHED_SUBSETS[0]}{ending}: --format {other.value}"
+    return None
+
+
+def _stated(stated: Source, wishes: Wishes) -> dict[str, Any]:
+    """Return the facts of the metadata, those of our own exports, and over both the user's."""
+    hints = stated.hints
+    if wishes.keys() & {"input_frames", "horizon"}:  # the frames belong to the exported task
+        hints = hints.model_copy(update={"frames_of_interest": None})
+    found: dict[str, Any] = {
+        "radius": stated.radius,
+        "frame_interval": stated.frame_interval,
+        "bounds": hints.bounds or stated.bounds,
+        "spacing": hints.spacing or stated.spacing,
+        "density": hints.density,
+        "input_frames": hints.input_frames,
+        "horizon": hints.horizon,
+        "frames_of_interest": hints.frames_of_interest,
+        "cells": hints.cells,
+        "full_box": hints.placement == "cell_centres",
+        **wishes,
+    }
+    if found["frame_interval"] is None:
+        raise UsageError("the metadata state no time between frames", fix="say it: --frame-interval SECONDS")
+    return {name: value for name, value in found.items() if value is not None}
+
+
+def _unbroken(trajectory: Trajectory, stated: Source) -> Trajectory:
+    """Return a trajectory that raises where particles cross a periodic boundary."""
+    if not any(stated.periodic):
+        return trajectory
+    sides = np.array([high - low for low, high in stated.bounds])
+    half = np.where(stated.periodic, sides / 2.0, np.inf)
+
+    def read() -> Iterator[Frame]:
+        before: NDArray[np.floating] | None = None
+        for number, (position, velocity) in enumerate(trajectory.read()):
+            if before is not None and (np.abs(position - before) > half).any():
+                raise DataError(
+                    "particles cross a periodic boundary",
+                    where=f"{trajectory.name}, frame {number}",
+                    expected="positions that move on: velocities are their differences",
+                    got="a jump of more than half the box",
+                    fix="lagbench has no periodic boxes: leave such data out",
+                )
+            before = position
+            yield position, velocity
+
+    return replace(trajectory, read=read)

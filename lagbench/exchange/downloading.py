@@ -1,31 +1,46 @@
-"""Download a data set from a mirror, check its content, and simulate what no mirror has."""
+"""Download a data set from the first store that has it, and simulate what none has."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
-from lagbench.data.layout import dataset_folder
+from lagbench.data.layout import MANIFEST_NAME, dataset_folder, scenario_path
 from lagbench.data.local import locate
 from lagbench.data.lock import dataset_lock
-from lagbench.data.manifest import read_manifest
-from lagbench.data.registry import Registry, spell_ids
-from lagbench.errors import UsageError
+from lagbench.data.manifest import FileEntry, Manifest, describe_file, read_manifest, write_manifest
+from lagbench.data.registry import Registry, Size, spell_ids
+from lagbench.errors import DataError, UsageError, WorkFailedError
+from lagbench.generators.simulate import scenario_key
 from lagbench.make.cards import write_cards
 from lagbench.make.generate import generate
-from lagbench.make.plan import Scenarios, Selection, select
-from lagbench.make.verify import compare, told
+from lagbench.make.plan import Scenarios, Selection, check_disk, scenario_bytes, select
+from lagbench.make.verify import State, compare, examine, told
+from lagbench.store.copy import (
+    MANIFEST_LIMIT,
+    address_of,
+    merged,
+    parse_manifest,
+    read_or_empty,
+    refuse_strangers,
+)
+from lagbench.store.fetch import CONNECTIONS, Wanted, fetch_scenarios, fetch_text
+from lagbench.store.objects import NotInStoreError, StoreUnreachableError
 from lagbench.store.publication import publication
 from lagbench.work.progress import Meter, Progress
 
-from .errand import Errand, Reason
-
 __all__ = ["CONNECTIONS", "DownloadResult", "download"]
 
-CONNECTIONS = 4
-"""Files that are fetched side by side."""
+SLACK = 1.25
+"""Share by which a compressed file may be longer than its values."""
+
+REMEDY = "try again; if it stays so, name another store: --from"
+
+Reason = DataError | WorkFailedError | UsageError
+"""Why something could not be downloaded."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,11 +50,11 @@ class DownloadResult:
     split: str  # name of the split
     size: str  # name of the size
     folder: Path  # folder of the data set
-    mirror: str | None  # base URL that files came from; None where none was needed or reached
+    mirror: str | None  # store that files came from; None where none was needed or reached
     downloaded: tuple[int, ...]  # ids that were downloaded
     kept: tuple[int, ...]  # ids whose files were there and right
     generated: tuple[int, ...]  # ids that were simulated instead
-    bytes: int  # bytes that came from the mirror
+    bytes: int  # bytes that came from stores
     seconds: float  # time that it took [s]
     complete: bool  # whether train, valid and test are all there
     dataset_sha256: str | None  # data set hash, once complete
@@ -61,7 +76,7 @@ def download(
     announce: Callable[[str], None] | None = None,
     registry: Registry | None = None,
 ) -> DownloadResult:
-    """Fetch the scenarios of a split that are not on disk yet; simulate those no mirror has.
+    """Fetch the scenarios of a split that are not on disk yet; simulate those no store has.
 
     Every file has a temporary name until its content hash is that of datasets.yaml. What was
     fetched before an interruption is not fetched again.
@@ -69,61 +84,58 @@ def download(
     Args:
         split: name of the split, or path of a local split's folder.
         size: name of the size.
-        mirror: base URL of a copy of a root folder; else those of datasets.yaml, in order.
+        mirror: URL of a copy of a root folder; else the mirrors of datasets.yaml, in order.
         subset: some subsets only.
         scenarios: some ids only.
         root: folder of all data sets, see :func:`lagbench.data.layout.resolve_root`.
         connections: files that are fetched side by side.
-        or_generate: whether to simulate what no mirror has, or when none answers.
+        or_generate: whether to simulate what no store has, or when none answers.
         workers: worker processes of the simulation.
         progress: called as the work advances.
         announce: told in a sentence when the simulation takes over, and why.
         registry: where splits are described; ours when None.
 
     Raises:
-        UsageError: unknown split, size, subset or scenario, or no mirror is known and nothing
+        UsageError: unknown split, size, subset or scenario, or no store is known and nothing
             may be simulated.
-        DataError: the mirror sent what is no data or has another length or content, see
-            :mod:`lagbench.store.mirror`; the file is gone, all that were right stay.
-        WorkFailedError: the connection kept breaking, the disk is full, no mirror answers and
-            nothing may be simulated.
+        DataError: the store sent what is no data or has another length or content, see
+            :mod:`lagbench.store.objects`; the file is gone, all that were right stay.
+        WorkFailedError: the connection kept breaking, the disk is full, no store answers or is
+            fast enough and nothing may be simulated.
     """
     started = time.monotonic()
     if connections < 1:
         raise UsageError("no file comes without a connection", where="--connections", expected=">= 1")
     tier, folder, splits = locate(split, size, root=root, registry=registry)
     wanted = select(tier, subset=subset, scenarios=scenarios)
-    bases = (mirror,) if mirror else splits.split(tier.split).mirrors
-    with (
-        dataset_lock(folder, tier.split, tier.name, tier.major),
-        publication(tier, folder) as store,
-    ):
+    urls = (mirror,) if mirror else splits.split(tier.split).mirrors
+    with dataset_lock(folder, tier.split, tier.name, tier.major), publication(tier, folder) as store:
         held = [i for i in wanted if store and i in store.held]
-        lacking = [i for i in wanted if i not in held]
-        errand = Errand(tier, folder, lacking, Meter(progress), connections)
+        work = _Download(tier, folder, [i for i in wanted if i not in held], Meter(progress), connections)
         try:
-            reason = errand.run(bases)
+            reason = work.run(urls)
         finally:
-            manifest = errand.record()
+            manifest = work.record()
             if store:
                 store.follow(manifest, at_once=True)
-        if not errand.missing:
+        if not work.missing:
             verdict = told(compare(tier, manifest), tier)
-            if errand.downloaded and tier.simulated:
+            if work.downloaded and tier.simulated:
                 if store:
                     store.bring(held)
                 cards = write_cards(folder, tier, splits.split(tier.split), manifest)
                 if store:
                     store.finish(manifest, cards)
-    if errand.missing:
+    if work.missing:
         if not or_generate:
             raise reason
         if announce is not None:
-            announce(f"{_sentence(reason)}: simulating scenarios {spell_ids(errand.missing)}")
+            place = f" ({reason.where})" if reason.where else ""
+            announce(f"{reason.what}{place}: simulating scenarios {spell_ids(work.missing)}")
         rest = generate(
             tier.split,
             tier.name,
-            scenarios=errand.missing,
+            scenarios=work.missing,
             root=folder,
             workers=workers,
             progress=progress,
@@ -135,11 +147,11 @@ def download(
         split=tier.split,
         size=tier.name,
         folder=dataset_folder(folder, tier.split, tier.name, tier.major),
-        mirror=errand.mirror,
-        downloaded=tuple(sorted(errand.downloaded)),
-        kept=tuple(sorted((*held, *errand.kept))),
-        generated=tuple(errand.missing),
-        bytes=errand.bytes,
+        mirror=work.url,
+        downloaded=tuple(sorted(work.downloaded)),
+        kept=tuple(sorted((*held, *work.kept))),
+        generated=tuple(work.missing),
+        bytes=work.bytes,
         seconds=time.monotonic() - started,
         complete=manifest.complete,
         dataset_sha256=manifest.dataset_sha256,
@@ -147,6 +159,111 @@ def download(
     )
 
 
-def _sentence(reason: Reason) -> str:
-    place = f" ({reason.where})" if reason.where else ""
-    return f"{reason.what}{place}"
+class _Download:
+    """What is there, what is fetched, what is recorded."""
+
+    def __init__(self, size: Size, root: Path, wanted: Sequence[int], meter: Meter, connections: int) -> None:
+        self.size, self.root, self._meter, self._connections = size, root, meter, connections
+        self.url: str | None = None  # store that files came from
+        self.downloaded: list[int] = []
+        self.bytes = 0
+        self._recorded = dict(size.measured.scenario_sha256) if size.measured else {}
+        self._old = read_or_empty(size, root)
+        meter.begin("checking", total=len(wanted), scenarios=len(wanted))
+        findings = [examine(root, size, i, manifest=self._old, quick=True) for i in wanted]
+        self._entries = [finding.entry for finding in findings if finding.entry]
+        self.kept = [f.scenario for f in findings if f.state is State.GOOD]
+        self.missing = [f.scenario for f in findings if f.state is not State.GOOD]
+
+    def run(self, urls: Iterable[str]) -> Reason:
+        """Fetch what is missing from stores in turn; return why something still is.
+
+        A store that lies, or a connection that keeps breaking, ends it.
+        """
+        place = f"{self.size.split} {self.size.name}"
+        reason: Reason = UsageError(
+            "no store is known to download from",
+            where=place,
+            fix="name one: --from URL; or let it be simulated: leave out --no-generate",
+        )
+        unknown = [i for i in self.missing if i not in self._recorded]
+        if unknown:
+            what = "datasets.yaml has no hash to check downloads against"
+            return DataError(what, where=f"{place}, scenarios {spell_ids(unknown)}")
+        for url in urls:
+            if not self.missing:
+                break
+            try:
+                reason = self._fetch_from(url.rstrip("/")) or reason
+            except StoreUnreachableError as error:
+                reason = error
+        return reason
+
+    def _fetch_from(self, url: str) -> NotInStoreError | None:
+        """Fetch what one store has; return the error of the last file that it has not."""
+        claims = self._claims(url)
+        check_disk(self.root, sum(scenario_bytes(self.size, i) for i in self.missing))
+        wanted = {i: self._wanted(url, i, claims.get(i)) for i in self.missing}
+        total = sum(one.length or scenario_bytes(self.size, i) for i, one in wanted.items())
+        self._meter.begin("downloading", total=total, scenarios=len(wanted))
+        last: NotInStoreError | None = None
+        try:
+            with closing(fetch_scenarios(wanted, self._count, connections=self._connections)) as arrivals:
+                for scenario, absent in arrivals:
+                    if absent is None:
+                        self._take(url, scenario, claims.get(scenario))
+                    last = absent or last
+        finally:
+            self.missing = [i for i in self.missing if i not in self.downloaded]
+        return last
+
+    def _claims(self, url: str) -> dict[int, FileEntry]:
+        """Return what the store's manifest says of the files that datasets.yaml means."""
+        place = address_of(self.size, url, MANIFEST_NAME)
+        try:
+            text = fetch_text(place, limit=MANIFEST_LIMIT, remedy=REMEDY)
+        except NotInStoreError:
+            return {}
+        manifest = parse_manifest(text, where=place, remedy=REMEDY)
+        found = {entry.scenario: entry for entry in manifest.files}
+        other = [i for i in self.missing if i in found and not found[i].has_hash(self._recorded[i])]
+        refuse_strangers(manifest, other, where=place, remedy=REMEDY)
+        return found
+
+    def _wanted(self, url: str, scenario: int, claim: FileEntry | None) -> Wanted:
+        key = scenario_key(self.size, scenario)
+        return Wanted(
+            url=address_of(self.size, url, f"{key.subset}/{scenario:04d}.nc"),
+            target=scenario_path(self.root, key),
+            limit=round(SLACK * scenario_bytes(self.size, scenario)) + (1 << 20),
+            content_sha256=self._recorded[scenario],
+            length=claim.bytes if claim else None,
+            file_sha256=claim.file_sha256 if claim else None,
+            remedy=REMEDY,
+        )
+
+    def _take(self, url: str, scenario: int, claim: FileEntry | None) -> None:
+        """Note a new file; what cannot be told from it is the store's word."""
+        entry = describe_file(self.root, scenario_key(self.size, scenario))
+        if claim is not None:
+            entry = entry.model_copy(update={"facts": claim.facts, "twin_floor": claim.twin_floor})
+        self._entries.append(entry)
+        self.downloaded.append(scenario)
+        self.url = url
+        self._meter.count(scenarios=1)
+
+    def _count(self, count: int) -> None:
+        self.bytes += count
+        self._meter.count(count)
+
+    def record(self) -> Manifest:
+        """Write the manifest of what is there now; return it."""
+        there = {entry.scenario for entry in self._entries}
+        kept = [e for e in self._old.files if e.scenario not in self.missing or e.scenario in there]
+        manifest = merged(self.size, self._old.model_copy(update={"files": tuple(kept)}), self._entries)
+        if self.size.measured and "train" in manifest.subset_sha256:
+            rows = {name: tuple(row) for name, row in self.size.measured.statistics.items()}
+            manifest = manifest.model_copy(update={"statistics": rows})
+        if manifest.files:
+            write_manifest(self.root, manifest)
+        return manifest

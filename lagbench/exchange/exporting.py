@@ -4,26 +4,39 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from lagbench.data.checksums import HASHED_SUBSETS
-from lagbench.data.layout import ScenarioKey, scenario_path
+from lagbench.data.layout import scenario_path
 from lagbench.data.local import locate, remedy
 from lagbench.data.manifest import read_manifest
 from lagbench.data.registry import Registry, Size, spell_ids
-from lagbench.data.scenario import read_scenario
-from lagbench.errors import DataError, UsageError, nearest
+from lagbench.data.scenario import ScenarioFile, read_scenario
+from lagbench.errors import DataError, UsageError
 from lagbench.generators.batch import solver_constants
-from lagbench.store.bringing import bring
+from lagbench.generators.simulate import scenario_key
+from lagbench.store.copy import bring
 from lagbench.work.progress import Meter, Progress
 
 from . import gns_npz, lagrangebench_h5
-from .kinds import Format
-from .metadata import NAME, describe, floor_of, write_metadata
+from .metadata import NAME, WALL_NUMBERS, Format, describe, floor_of, numbers_of, parse_format, write_metadata
+from .trajectory import Box
 
-__all__ = ["ExportResult", "export", "parse_format"]
+__all__ = ["ENDINGS", "ExportResult", "export"]
+
+ENDINGS = {Format.GNS_NPZ: gns_npz.ENDING, Format.LAGRANGEBENCH_H5: lagrangebench_h5.ENDING}
+
+LAYERS = 3
+"""Layers of particles of a wall, as LagrangeBench's own lid-driven cavity has them."""
+
+ALONG = (1, 1, 0, 0)
+"""Axis along each wall: left, right, bottom, top."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,19 +47,11 @@ class ExportResult:
     split: str  # name of the split
     size: str  # name of the size
     folder: Path  # folder of the files
-    files: tuple[Path, ...]
+    files: tuple[Path, ...]  # the files
     trajectories: dict[str, int]  # number of trajectories by subset
     frames: dict[str, int]  # frames by subset, over all trajectories
     left_out: int  # frames that are not in the files, because that format needs equal lengths
     bytes: int  # length of the files together [bytes]
-
-
-def parse_format(name: str) -> Format:
-    """Return a format by name."""
-    known = [form.value for form in Format]
-    if name not in known:
-        raise UsageError(f"no format {name!r}", where="--format", fix=nearest(name, known))
-    return Format(name)
 
 
 def export(
@@ -56,14 +61,15 @@ def export(
     format: str,
     output: str | Path,
     root: str | Path | None = None,
-    from_walls: bool = False,
+    from_walls: bool | None = None,
+    wall_particles: bool = False,
     force: bool = False,
     progress: Callable[[Progress], None] | None = None,
     registry: Registry | None = None,
 ) -> ExportResult:
     """Write train, valid and test of a data set, and metadata.json, in another format.
 
-    A few frames are in memory at a time. The same data give the same bytes.
+    One trajectory is in memory at a time. The same data give the same bytes with one version of NumPy.
 
     Args:
         split: name of the split, or path of a local split's folder.
@@ -74,34 +80,46 @@ def export(
         from_walls: lagrangebench-h5 only: measure positions from the lower walls, so that the
             bounds that its models see are the walls; no bit is lost. Else positions are ours,
             and the bounds those of the unit box, which that program's neighbour search needs.
+            None: from the walls in closed boxes.
+        wall_particles: closed boxes only: add particles beside the walls that move along with
+            them, since neither format has wall velocities.
         force: write over an earlier export.
         progress: called as the work advances.
         registry: where splits are described; ours when None.
 
     Raises:
         UsageError: unknown split, size or format, files are there already, or a ``force.py`` is,
-            which the program that reads lagrangebench-h5 would run.
+            which the program that reads lagrangebench-h5 would run; or there are no walls.
         DataError: scenarios are missing or damaged, or their statistics are recorded nowhere.
         WorkFailedError: the disk is full or not writable.
     """
     form = parse_format(format)
+    if from_walls and form is not Format.LAGRANGEBENCH_H5:
+        raise UsageError("only lagrangebench-h5 needs it", where="--from-walls", got=form.value)
     tier, home, splits = locate(split, size, root=root, registry=registry)
-    folder, ending = Path(output), _ENDINGS[form]
-    _claim_target(folder, [f"{subset}{ending}" for subset in HASHED_SUBSETS], force=force)
+    folder, ending = Path(output), ENDINGS[form]
+    _check_target(folder, [f"{subset}{ending}" for subset in HASHED_SUBSETS], force=force)
     bring(tier, home, [i for subset in HASHED_SUBSETS for i in tier.subsets[subset]])
     statistics, digest = _recorded(tier, home)
-    paths = {subset: _paths(tier, home, subset) for subset in HASHED_SUBSETS}
-    origin = _origin(tier, form, from_walls=from_walls)
+    frames_of = {subset: _files(tier, home, subset) for subset in HASHED_SUBSETS}
+    with read_scenario(next(iter(frames_of["train"]))) as file:
+        spacing = math.sqrt(float(file.read("particle_mass")) / float(tier.value("density")))
+        closed = "wall_velocity" in file.variables
+    walls = _walls(tier, spacing, form, closed=closed, from_walls=from_walls) if wall_particles else None
+    origin = _origin(tier, form, walls, from_walls=closed if from_walls is None else from_walls)
+    with contextlib.suppress(OSError):  # written last, it says that an export is whole
+        (folder / NAME).unlink()
     meter = Meter(progress)
-    meter.begin("exporting", total=len(paths), scenarios=sum(map(len, paths.values())))
+    meter.begin("exporting", total=len(frames_of), scenarios=sum(map(len, frames_of.values())))
     shapes: dict[str, list[tuple[int, int]]] = {}
-    for subset, files in paths.items():
-        target = folder / f"{subset}{ending}"
+    for subset, files in frames_of.items():
+        target, runs = folder / f"{subset}{ending}", _runs(files, form, tier.frame_interval, walls)
         if form is Format.GNS_NPZ:
-            shapes[subset] = gns_npz.write(target, files)
+            shapes[subset] = []
+            gns_npz.write(target, _whole(runs, shapes[subset]))
         else:
-            length = min(map(_frames, files))
-            shapes[subset] = lagrangebench_h5.write(target, files, length=length, origin=origin)
+            length = min(files.values())
+            shapes[subset] = lagrangebench_h5.write(target, runs, length=length, origin=origin)
         meter.count(1, scenarios=len(files))
     metadata = describe(
         tier,
@@ -110,11 +128,12 @@ def export(
         statistics,
         title=splits.split(tier.split).title,
         dataset_sha256=digest,
-        spacing=_spacing(paths["train"][0], tier),
+        spacing=spacing,
         origin=origin,
-        free_slip=_free_slip(tier),
+        free_slip=not (tier.simulated and getattr(solver_constants(tier), "no_slip", False)),
+        wall=walls.thickness if walls else None,
     )
-    written = (*(folder / f"{subset}{ending}" for subset in paths), write_metadata(folder, metadata))
+    written = (*(folder / f"{subset}{ending}" for subset in frames_of), write_metadata(folder, metadata))
     frames = {subset: sum(count for count, _ in rows) for subset, rows in shapes.items()}
     return ExportResult(
         format=form.value,
@@ -124,16 +143,118 @@ def export(
         files=written,
         trajectories={subset: len(rows) for subset, rows in shapes.items()},
         frames=frames,
-        left_out=sum(_frames(path) for files in paths.values() for path in files) - sum(frames.values()),
+        left_out=sum(sum(files.values()) for files in frames_of.values()) - sum(frames.values()),
         bytes=sum(path.stat().st_size for path in written),
     )
 
 
-_ENDINGS = {Format.GNS_NPZ: gns_npz.ENDING, Format.LAGRANGEBENCH_H5: lagrangebench_h5.ENDING}
+class WallParticles:
+    """Layers of particles beside each wall of a box, at the spacing of the fluid's.
+
+    They go along with the wall's tangential velocity and come in again at its other end, so that they
+    stay beside it. The normal component, which closed boxes do not have, is left out.
+    """
+
+    def __init__(self, bounds: Box, spacing: float) -> None:
+        self.thickness = LAYERS * spacing
+        self._bounds = np.array(bounds)
+        low, high = self._bounds.T
+        rows: list[tuple[int, float, float]] = []  # wall, place along it, place across it
+        for wall, axis in enumerate(ALONG):
+            count = max(1, round((high[axis] - low[axis]) / spacing))
+            pitch = (high[axis] - low[axis]) / count
+            for depth in spacing * (np.arange(LAYERS) + 0.5):
+                across = low[1 - axis] - depth if wall in (0, 2) else high[1 - axis] + depth
+                rows += [(wall, low[axis] + pitch * (n + 0.5), across) for n in range(count)]
+        walls, along, across = np.array(rows).T
+        self._wall, self._along, self._across = walls.astype(int), along, across
+
+    def numbers(self, form: Format, velocity: NDArray[np.floating]) -> NDArray[np.int64]:
+        """Return the number of each particle: of a wall that ever moves, or of one at rest."""
+        moves = (velocity != 0.0).any(axis=(0, 2))
+        table = np.array([WALL_NUMBERS[form][moving] for moving in moves.astype(int)], np.int64)
+        numbers: NDArray[np.int64] = table[self._wall]
+        return numbers
+
+    def travel(self, velocity: NDArray[np.floating], interval: float) -> NDArray[np.float64]:
+        """Return how far each wall has gone along itself since frame 0, shape [frame, wall].
+
+        ``velocity[f]`` acts from frame f-1 to f, shape [frame, wall, space].
+        """
+        steps = interval * velocity[:, range(len(ALONG)), ALONG].astype(np.float64)
+        steps[0] = 0.0
+        return np.cumsum(steps, axis=0)
+
+    def place(self, travel: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Return the positions where walls have gone so far, shape [particle, 2]."""
+        axis = np.array(ALONG)[self._wall]
+        low, high = self._bounds[axis].T
+        along = low + (self._along - low + travel[self._wall]) % (high - low)
+        places = np.stack(
+            [np.where(axis == 0, along, self._across), np.where(axis == 0, self._across, along)]
+        )
+        return places.T.astype(np.float32)
 
 
-def _claim_target(folder: Path, names: Sequence[str], *, force: bool) -> None:
-    """Refuse a folder that must not be written to; begin to write over an earlier export."""
+def _walls(
+    size: Size, spacing: float, form: Format, *, closed: bool, from_walls: bool | None
+) -> WallParticles:
+    if not closed:
+        raise UsageError("the box has no walls that could move", where="--wall-particles", got=size.split)
+    if from_walls is False and form is Format.LAGRANGEBENCH_H5:
+        raise UsageError(
+            "wall particles lie outside the unit box's bounds",
+            where="--wall-particles and --unit-box",
+            fix="leave out --unit-box",
+        )
+    return WallParticles(size.bounds, spacing)
+
+
+def _origin(
+    size: Size, form: Format, walls: WallParticles | None, *, from_walls: bool
+) -> tuple[float, float]:
+    """Return what is taken off every position, so that none is below 0 where bounds start there."""
+    if form is not Format.LAGRANGEBENCH_H5 or not (from_walls or walls):
+        return 0.0, 0.0
+    beyond = walls.thickness if walls else 0.0
+    (x, _), (y, _) = size.bounds
+    return floor_of(x - beyond), floor_of(y - beyond)
+
+
+def _runs(
+    files: Iterable[Path], form: Format, interval: float, walls: WallParticles | None
+) -> Iterator[lagrangebench_h5.Run]:
+    """Yield the scenarios of a subset, each open until the next one is asked for."""
+    for path in files:
+        with read_scenario(path) as file:
+            kinds, position = numbers_of(form, file.read("material")), partial(file.read, "position")
+            if walls is not None:
+                velocity = file.read("wall_velocity")
+                kinds = np.concatenate([kinds, walls.numbers(form, velocity)])
+                position = partial(_with_walls, file, walls, walls.travel(velocity, interval))
+            yield file.header.frames, position, kinds
+
+
+def _with_walls(
+    file: ScenarioFile, walls: WallParticles, travel: NDArray[np.float64], frame: int
+) -> NDArray[np.float32]:
+    return np.concatenate([file.read("position", frame), walls.place(travel[frame])])
+
+
+def _whole(
+    runs: Iterator[lagrangebench_h5.Run], shapes: list[tuple[int, int]]
+) -> Iterator[tuple[NDArray[np.float32], NDArray[np.int64]]]:
+    """Yield positions [frame, particle, 2] and kinds of each run; note its shape."""
+    for frames, position, kinds in runs:
+        shapes.append((frames, len(kinds)))
+        whole = np.empty((frames, len(kinds), 2), np.float32)
+        for number in range(frames):
+            whole[number] = position(number)
+        yield whole, kinds
+
+
+def _check_target(folder: Path, names: Sequence[str], *, force: bool) -> None:
+    """Refuse a folder that must not be written to."""
     if (folder / lagrangebench_h5.FORCE).exists():
         raise UsageError(
             "the folder holds a program that readers of this format run",
@@ -148,8 +269,6 @@ def _claim_target(folder: Path, names: Sequence[str], *, force: bool) -> None:
             got=", ".join(there),
             fix="name another folder, or write over them: --force",
         )
-    with contextlib.suppress(OSError):  # written last, it says that an export is whole
-        (folder / NAME).unlink()
 
 
 def _recorded(size: Size, root: Path) -> tuple[dict[str, tuple[float, ...]], str]:
@@ -166,14 +285,10 @@ def _recorded(size: Size, root: Path) -> tuple[dict[str, tuple[float, ...]], str
     return dict(manifest.statistics), manifest.dataset_sha256
 
 
-def _paths(size: Size, root: Path, subset: str) -> list[Path]:
-    """Return the files of a subset by id, after a look at each one's header."""
+def _files(size: Size, root: Path, subset: str) -> dict[Path, int]:
+    """Return the files of a subset by id and the frames of each, after a look at its header."""
     ids = sorted(size.subsets[subset])
-    keys = [
-        ScenarioKey(split=size.split, size=size.name, version=size.version, scenario=i, subset=subset)
-        for i in ids
-    ]
-    paths = [scenario_path(root, key) for key in keys]
+    paths = [scenario_path(root, scenario_key(size, i)) for i in ids]
     missing = [i for i, path in zip(ids, paths, strict=True) if not path.is_file()]
     if missing:
         raise DataError(
@@ -183,41 +298,19 @@ def _paths(size: Size, root: Path, subset: str) -> list[Path]:
             fix=remedy(size, f"--subset {subset}", root=root),
         )
     known = size.measured.scenario_sha256 if size.measured else {}
-    for key, path in zip(keys, paths, strict=True):
+    frames = {}
+    for scenario, path in zip(ids, paths, strict=True):
         with read_scenario(path) as file:
             found = file.header
-        if (found.key.major, found.key.scenario) != (key.major, key.scenario) or not (
-            found.content_sha256.startswith(known.get(key.scenario, ""))
+        if (found.key.major, found.key.scenario) != (size.major, scenario) or not (
+            found.content_sha256.startswith(known.get(scenario, ""))
         ):
             raise DataError(
                 "a scenario is not that of the registry",
                 where=str(path),
-                expected=f"scenario {key.scenario}, content hash {known.get(key.scenario, 'any')}",
+                expected=f"scenario {scenario}, content hash {known.get(scenario, 'any')}",
                 got=f"scenario {found.key.scenario}, content hash {found.content_sha256[:16]}",
                 fix=f"lagbench verify --split {size.split} --size {size.name}",
             )
-    return paths
-
-
-def _frames(path: Path) -> int:
-    with read_scenario(path) as file:
-        return file.header.frames
-
-
-def _spacing(path: Path, size: Size) -> float:
-    """Return the distance of neighbouring particles at first [length]."""
-    with read_scenario(path) as file:
-        return math.sqrt(float(file.read("particle_mass")) / float(size.value("density")))
-
-
-def _origin(size: Size, form: Format, *, from_walls: bool) -> tuple[float, float]:
-    if not from_walls:
-        return 0.0, 0.0
-    if form is not Format.LAGRANGEBENCH_H5:
-        raise UsageError("only lagrangebench-h5 needs it", where="--from-walls", got=form.value)
-    (x, _), (y, _) = size.bounds
-    return floor_of(x), floor_of(y)
-
-
-def _free_slip(size: Size) -> bool:
-    return not (size.simulated and getattr(solver_constants(size), "no_slip", False))
+        frames[path] = found.frames
+    return frames

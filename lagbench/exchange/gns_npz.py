@@ -1,30 +1,34 @@
 """The format of the PyTorch GNS code bases: npz files of pickled pairs, and metadata.json.
 
 ``train.npz``, ``valid.npz``, ``test.npz`` hold one object array per trajectory: positions
-[frame, particle, space] and the kind of each particle; ``metadata.json`` the box, the number of
-frames, the radius, and mean and deviation of velocity and acceleration per frame over train.
+[frame, particle, space] and the kind of each particle. NumPy stores such an array as a pickle: a
+program for a small machine, which can be made to call any function.
+
+The reader lets a program name what NumPy writes for arrays and nothing else, and NumPy's own
+constructors are not among what it may call: told a type's flags by a file, they take bytes for
+addresses of objects. Stand-ins note what the file says, and arrays of numbers are made of it.
 """
 
 from __future__ import annotations
 
-import io
+import pickle
+import pickletools
+import re
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.atomic import atomic_path
-from lagbench.data.scenario import ScenarioFile, read_scenario
 from lagbench.errors import UnreadableFileError, UsageError
 
-from .inflation import check_inflation
-from .kinds import Format, materials_of, numbers_of
-from .object_array import read_objects, write_pair
-from .trajectory import Trajectory, check_array, frames_of
+from .metadata import Format, materials_of
+from .trajectory import Trajectory, check_array, check_inflation
 
-__all__ = ["ENDING", "trajectories", "write"]
+__all__ = ["ENDING", "read_header", "trajectories", "write"]
 
 ENDING = ".npz"
 JOINT = "gns_data"
@@ -33,34 +37,45 @@ JOINT = "gns_data"
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 """Time of every member: the earliest that zip knows, so that equal data give equal bytes."""
 
+_NUMBERS = re.compile("[iu][1248]|f[248]|b1")
+"""Codes of the types of numbers that may be in a file."""
 
-def write(path: Path, scenarios: Iterable[Path]) -> list[tuple[int, int]]:
-    """Write one subset; the file appears whole or not at all.
+_MOST_STEPS = 1 << 18
+"""Steps of a pickle at the most; NumPy takes about fifty for a trajectory, each makes one object."""
+
+_PARTS = 3
+"""Parts of a trajectory at the most: positions, kinds, a material property."""
+
+_DEPTH = 3
+"""How deep arrays may lie in each other: trajectories in a joint array, parts, and a spare."""
+
+
+def write(path: Path, runs: Iterable[tuple[NDArray[np.float32], NDArray[np.int64]]]) -> None:
+    """Write positions and kinds of one subset's trajectories; the file appears whole or not at all.
 
     Members are stored uncompressed, as ``numpy.savez`` stores them: compressed bytes would
-    change with the version of zlib.
+    change with the version of zlib. One trajectory is in memory at a time.
     """
     with atomic_path(path, option="--output") as temporary, zipfile.ZipFile(temporary, "w") as archive:
-        return [_add(archive, f"simulation_{number}", file) for number, file in enumerate(scenarios)]
-
-
-def _add(archive: zipfile.ZipFile, key: str, path: Path) -> tuple[int, int]:
-    with read_scenario(path) as file:
-        shape = (file.header.frames, file.header.particles, 2)
-        kinds = numbers_of(Format.GNS_NPZ, file.read("material"))
-        member = zipfile.ZipInfo(f"{key}.npy", date_time=_EPOCH)
-        member.external_attr = 0o644 << 16
-        with archive.open(member, "w", force_zip64=True) as stream:
-            write_pair(stream, _frames(file), shape, kinds)
-    return shape[:2]
-
-
-def _frames(file: ScenarioFile) -> Iterator[NDArray[np.float32]]:
-    return (frame for block in file.blocks("position") for frame in block)
+        for number, parts in enumerate(runs):
+            pair = np.empty(2, dtype=object)
+            pair[0], pair[1] = parts
+            member = zipfile.ZipInfo(f"simulation_{number}.npy", date_time=_EPOCH)
+            member.external_attr = 0o644 << 16
+            with archive.open(member, "w", force_zip64=True) as stream:
+                np.lib.format.write_array_header_1_0(
+                    stream, {"descr": "|O", "fortran_order": False, "shape": (2,)}
+                )
+                pickle.dump(pair, stream, protocol=4)
 
 
 def trajectories(path: Path, *, allow_pickle: bool, kinds: Mapping[int, str]) -> Iterator[Trajectory]:
-    """Yield the trajectories of a file, one in memory at a time."""
+    """Yield the trajectories of a file, one in memory at a time.
+
+    Kinds say what numbers of particles stand for, see :func:`.metadata.materials_of`. Without
+    ``allow_pickle`` the file is refused by a UsageError, damage by an UnreadableFileError, positions
+    that are not of two components by a DataError.
+    """
     if not allow_pickle:
         raise UsageError(
             "the trajectories in this format are pickled objects",
@@ -68,40 +83,21 @@ def trajectories(path: Path, *, allow_pickle: bool, kinds: Mapping[int, str]) ->
             expected="leave to rebuild them",
             fix="add --allow-pickle: arrays are rebuilt, any other call in the file is refused",
         )
-    with _opened(path) as archive:
-        for name, item in _items(archive, path):
-            yield _trajectory(name, item, kinds)
-
-
-def _opened(path: Path) -> zipfile.ZipFile:
     try:
-        return zipfile.ZipFile(path)
+        archive = zipfile.ZipFile(path)
     except (OSError, zipfile.BadZipFile) as error:
         raise UnreadableFileError(
             "cannot read an npz file", where=str(path), got=f"{type(error).__name__}: {error}"
         ) from error
-
-
-def _items(archive: zipfile.ZipFile, path: Path) -> Iterator[tuple[str, object]]:
-    """Yield name and object of each trajectory, in the order of the zip file."""
-    for member in archive.namelist():
-        key = member.removesuffix(".npy")
-        name = f"{path}, key {key!r}"
-        with _member(archive, member, name) as stream:
-            array = read_objects(stream, name)
-        if key == JOINT and array.ndim:
-            yield from ((f"{name}, item {i}", item) for i, item in enumerate(array))
-        else:
-            yield name, array
-
-
-def _member(archive: zipfile.ZipFile, member: str, name: str) -> io.BufferedReader:
-    about = archive.getinfo(member)
-    check_inflation(name, packed=about.compress_size, unpacked=about.file_size)
-    try:
-        return io.BufferedReader(archive.open(member))  # type: ignore[arg-type]
-    except (OSError, RuntimeError, zipfile.BadZipFile, NotImplementedError) as error:
-        raise UnreadableFileError("a member of an npz file is damaged", where=name, got=error) from error
+    with archive:
+        for member in archive.namelist():
+            key = member.removesuffix(".npy")
+            name = f"{path}, key {key!r}"
+            array = _load(archive, member, name)
+            if key == JOINT and array.ndim:
+                yield from (_trajectory(f"{name}, item {i}", item, kinds) for i, item in enumerate(array))
+            else:
+                yield _trajectory(name, array, kinds)
 
 
 def _trajectory(name: str, item: object, given: Mapping[int, str]) -> Trajectory:
@@ -114,25 +110,7 @@ def _trajectory(name: str, item: object, given: Mapping[int, str]) -> Trajectory
         )
     position = parts[0]
     check_array(name, position.shape, position.dtype)
-    numbers = _kinds(name, parts[1], position.shape[1])
-    material, kept = materials_of(Format.GNS_NPZ, numbers, given=given, where=name)
-    parameters = {}
-    if len(parts) == 3:
-        values = np.unique(np.asarray(parts[2], dtype=np.float64))
-        parameters = {"material_property": values[0]} if len(values) == 1 else {}
-    chosen = position if kept.all() else position[:, kept]
-    return Trajectory(
-        name=name,
-        frames=len(position),
-        material=material,
-        read=lambda: frames_of(chosen),
-        parameters=parameters,
-    )
-
-
-def _kinds(name: str, value: object, particles: int) -> NDArray[np.integer]:
-    """Return the kind of each particle; one number stands for all."""
-    numbers = np.asarray(value)
+    numbers, particles = np.asarray(parts[1]), position.shape[1]
     if numbers.dtype.kind not in "iu" or numbers.shape not in ((), (1,), (particles,)):
         raise UnreadableFileError(
             "these are no kinds of particles",
@@ -140,4 +118,164 @@ def _kinds(name: str, value: object, particles: int) -> NDArray[np.integer]:
             expected=f"an integer, or {particles} of them",
             got=f"{numbers.dtype} of shape {numbers.shape}",
         )
-    return np.broadcast_to(numbers, (particles,))
+    numbers = np.broadcast_to(numbers, (particles,))
+    material, kept = materials_of(Format.GNS_NPZ, numbers, given=given, where=name)
+    values = np.unique(np.asarray(parts[2:], dtype=np.float64))
+    chosen = position if kept.all() else position[:, kept]
+    return Trajectory(
+        name=name,
+        frames=len(position),
+        material=material,
+        read=lambda: ((frame, None) for frame in chosen),
+        parameters={"material_property": values[0]} if len(values) == 1 else {},
+    )
+
+
+def _load(archive: zipfile.ZipFile, member: str, name: str) -> NDArray[Any]:
+    """Return the array of a member, whose objects may be arrays and numbers only."""
+    about = archive.getinfo(member)
+    check_inflation(name, packed=about.compress_size, unpacked=about.file_size)
+    try:
+        with archive.open(member) as stream:
+            shape, fortran, dtype = read_header(stream)
+            if not dtype.hasobject:
+                return np.frombuffer(stream.read(), dtype).reshape(shape, order="F" if fortran else "C")
+            _check_program(stream)
+        with archive.open(member) as stream:
+            read_header(stream)
+            found = _Arrays(stream, encoding="latin1").load()
+        if not isinstance(found, _Array):
+            message = f"the pickle holds a {type(found).__name__}"
+            raise pickle.UnpicklingError(message)
+        return found.value().reshape(shape)
+    except Exception as error:  # damaged pickles and zip files raise nearly any type
+        raise UnreadableFileError(
+            "an npz file is damaged, or holds more than arrays",
+            where=name,
+            expected="an object array of arrays",
+            got=f"{type(error).__name__}: {error}",
+        ) from error
+
+
+def read_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Return shape, whether the order is Fortran's, and type of a .npy stream."""
+    first = np.lib.format.read_magic(stream) == (1, 0)
+    read = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
+    return read(stream)
+
+
+def _check_program(stream: IO[bytes]) -> None:
+    """Refuse a pickle that makes the unpickler reserve far more memory than the file holds.
+
+    Reading it as text finds lengths beyond the end; a memo is reserved up to its highest index; and
+    a byte is enough to make an empty list.
+    """
+    for step, (code, argument, place) in enumerate(pickletools.genops(stream)):
+        if step > _MOST_STEPS:
+            message = f"the pickle has more than {_MOST_STEPS} steps"
+            raise pickle.UnpicklingError(message)
+        if code.name.endswith("PUT") and isinstance(argument, int) and argument > (place or 0):
+            message = "the pickle wants a memo larger than itself"
+            raise pickle.UnpicklingError(message)
+
+
+class _Type:
+    """What a pickle says of a type: its code and its order of bytes; never its flags."""
+
+    def __init__(self, code: str, *_: object) -> None:
+        self.code, self.order = str(code), "|"
+
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        self.order = str(state[1])
+
+    def numbers(self) -> np.dtype[Any]:
+        """Return the type where it is one of numbers."""
+        if not _NUMBERS.fullmatch(self.code) or self.order not in ("<", ">", "|", "="):
+            message = f"the pickle holds values of type {self.code!r}"
+            raise pickle.UnpicklingError(message)
+        return np.dtype(self.order + self.code)
+
+
+class _Array:
+    """What a pickle says of an array; its state comes later: version, shape, type, order, values."""
+
+    def __init__(self, *_: object) -> None:
+        self._state: tuple[Any, ...] = ()
+        self._value: NDArray[Any] | None = None
+
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        self._state, self._value = state[1:], None
+
+    def value(self, depth: int = _DEPTH) -> NDArray[Any]:
+        """Return the array, made once however often it is named."""
+        if self._value is None:
+            shape, kind, fortran, data = self._state
+            flat = _objects(data, depth) if kind.code.startswith("O") else _numbers(data, kind)
+            self._value = flat.reshape(shape, order="F" if fortran else "C")
+        return self._value
+
+
+def _objects(items: object, depth: int) -> NDArray[Any]:
+    """Return the elements of an object array, which NumPy pickles as a list."""
+    if not isinstance(items, list):
+        message = f"the pickle has a {type(items).__name__} for the objects of an array"
+        raise pickle.UnpicklingError(message)
+    flat = np.empty(len(items), dtype=object)
+    for number, item in enumerate(items):
+        flat[number] = _resolved(item, depth - 1)
+    return flat
+
+
+def _numbers(data: object, kind: _Type) -> NDArray[Any]:
+    """Return raw values; Python 2 pickled them as text, a letter for a byte."""
+    raw = data.encode("latin1") if isinstance(data, str) else data
+    if not isinstance(raw, bytes):
+        message = f"the pickle has a {type(data).__name__} for the values of an array"
+        raise pickle.UnpicklingError(message)
+    return np.frombuffer(raw, kind.numbers())
+
+
+def _resolved(item: object, depth: int) -> object:
+    """Return an element of an object array: an array, a number, or a few of both."""
+    if depth < 0:
+        message = "the pickle holds arrays in arrays without end"
+        raise pickle.UnpicklingError(message)
+    if isinstance(item, _Array):
+        return item.value(depth)
+    if isinstance(item, tuple | list) and len(item) <= _PARTS:
+        return tuple(_resolved(part, depth - 1) for part in item)
+    if isinstance(item, int | float):
+        return item
+    message = f"the pickle holds a {type(item).__name__}"
+    raise pickle.UnpicklingError(message)
+
+
+class _Maker:
+    """What a name of a pickle stands for: a call that makes a stand-in, and that no pickle can change."""
+
+    __slots__ = ("_kind",)
+
+    def __init__(self, kind: type[_Array | _Type] | None) -> None:
+        self._kind = kind
+
+    def __call__(self, *arguments: Any) -> object:  # noqa: ANN401
+        if self._kind is None:
+            message = "the pickle wants to make an array by itself"
+            raise pickle.UnpicklingError(message)
+        return self._kind(*arguments)
+
+    def __setstate__(self, state: object) -> None:
+        message = "the pickle wants to change a function"
+        raise pickle.UnpicklingError(message)
+
+
+class _Arrays(pickle.Unpickler):
+    """Unpickler for what NumPy writes of arrays: three names, all of them stand-ins."""
+
+    def find_class(self, module: str, name: str) -> Any:  # noqa: ANN401
+        if name == "_reconstruct" and module in ("numpy.core.multiarray", "numpy._core.multiarray"):
+            return _Maker(_Array)
+        if module == "numpy" and name in ("ndarray", "dtype"):
+            return _Maker(_Type if name == "dtype" else None)  # ndarray is named, and never called
+        message = f"the pickle wants to call {module}.{name}"
+        raise pickle.UnpicklingError(message)

@@ -8,7 +8,7 @@ write none and run none.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,12 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.atomic import atomic_path
-from lagbench.data.scenario import ScenarioFile, read_scenario
 from lagbench.errors import UnreadableFileError
 
-from .inflation import check_inflation
-from .kinds import Format, materials_of, numbers_of
-from .trajectory import Frame, Trajectory, check_array
+from .metadata import Format, materials_of
+from .trajectory import Frame, Trajectory, check_array, check_inflation
 
 if TYPE_CHECKING:
     import h5py
@@ -33,16 +31,18 @@ ENDING = ".h5"
 FORCE = "force.py"
 """Name of the program that the other side would run."""
 
+Run = tuple[int, Callable[[int], NDArray[np.float32]], NDArray[np.int64]]
+"""Frames of a trajectory, what returns the positions of one of them, and the kind of each particle."""
+
 _LEVEL = 1
 
 
-def write(
-    path: Path, scenarios: Sequence[Path], *, length: int, origin: Sequence[float]
-) -> list[tuple[int, int]]:
-    """Write one subset; the file appears whole or not at all.
+def write(path: Path, runs: Iterable[Run], *, length: int, origin: Sequence[float]) -> list[tuple[int, int]]:
+    """Write one subset; the file appears whole or not at all; return frames and particles of each trajectory.
 
-    Chunks of one frame, with gzip and shuffle, are read there 5 to 10 times faster than those
-    that HDF5 chooses.
+    Every trajectory has ``length`` frames: longer runs become several, and what is left over at their
+    end is not written. ``origin`` is taken off every position [length]. Chunks of one frame, with gzip
+    and shuffle, are read there 5 to 10 times faster than those that HDF5 chooses.
     """
     import h5py
 
@@ -51,37 +51,35 @@ def write(
         atomic_path(path, option="--output") as temporary,
         h5py.File(temporary, "w", libver="earliest") as out,
     ):
-        for source in scenarios:
-            with read_scenario(source) as file:
-                for start in range(0, file.header.frames - length + 1, length):
-                    group = out.create_group(f"{len(shapes):05d}")
-                    _add(group, file, range(start, start + length), np.asarray(origin, np.float32))
-                    shapes.append((length, file.header.particles))
+        for frames, position, kinds in runs:
+            for start in range(0, frames - length + 1, length):
+                group = out.create_group(f"{len(shapes):05d}")
+                stored = group.create_dataset(
+                    "position",
+                    shape=(length, len(kinds), 2),
+                    dtype="<f4",
+                    chunks=(1, len(kinds), 2),
+                    compression="gzip",
+                    compression_opts=_LEVEL,
+                    shuffle=True,
+                    track_times=False,
+                )
+                for row in range(length):
+                    stored[row] = position(start + row) - np.asarray(origin, np.float32)
+                group.create_dataset("particle_type", data=kinds.astype("<i8"), track_times=False)
+                shapes.append((length, len(kinds)))
     return shapes
-
-
-def _add(group: h5py.Group, file: ScenarioFile, frames: range, origin: NDArray[np.float32]) -> None:
-    frame = (file.header.particles, 2)
-    position = group.create_dataset(
-        "position",
-        shape=(len(frames), *frame),
-        dtype="<f4",
-        chunks=(1, *frame),
-        compression="gzip",
-        compression_opts=_LEVEL,
-        shuffle=True,
-        track_times=False,
-    )
-    for row, number in enumerate(frames):
-        position[row] = file.read("position", number) - origin
-    kinds = numbers_of(Format.LAGRANGEBENCH_H5, file.read("material"))
-    group.create_dataset("particle_type", data=kinds.astype("<i8"), track_times=False)
 
 
 def trajectories(
     path: Path, *, kinds: Mapping[int, str], origin: Sequence[float] = (0.0, 0.0)
 ) -> Iterator[Trajectory]:
-    """Yield the trajectories of a file; frames are read when asked for."""
+    """Yield the trajectories of a file; frames are read when asked for.
+
+    Kinds say what numbers of particles stand for, see :func:`.metadata.materials_of`; ``origin`` is added
+    to every position [length]. A group that is no trajectory is an UnreadableFileError, positions that
+    are not of two components are a DataError.
+    """
     import h5py
 
     try:
@@ -135,6 +133,11 @@ def _array(name: str, group: h5py.Group, part: str) -> h5py.Dataset:
     if not isinstance(found, h5py.Dataset) or found.shape is None:
         raise UnreadableFileError("this is no trajectory", where=name, expected="position and particle_type")
     check_inflation(f"{name}, {part}", packed=found.id.get_storage_size(), unpacked=found.nbytes)
+    created = found.id.get_create_plist()
+    filters = [created.get_filter(number)[0] for number in range(created.get_nfilters())]
+    if len(filters) > len({*filters}):
+        # Each round of the same filter may unpack to a thousand times its length.
+        raise UnreadableFileError("a filter is applied twice", where=f"{name}, {part}", got=filters)
     return found
 
 

@@ -8,35 +8,49 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
 
 from lagbench.atomic import temporary_name
 from lagbench.data.checksums import HASHED_SUBSETS
+from lagbench.data.layout import ScenarioKey, scenario_path
 from lagbench.data.local import DESCRIPTION
-from lagbench.data.manifest import Manifest
-from lagbench.data.registry import load
+from lagbench.data.manifest import FileEntry, Manifest, describe_file, merge, write_manifest
+from lagbench.data.registry import MAX_ID, NO_GENERATOR, load, spell_ids
+from lagbench.data.statistics import file_statistics
+from lagbench.data.writer import ScenarioWriter
 from lagbench.errors import DataError, UsageError, WorkFailedError
+from lagbench.work.machine import environment_of
 from lagbench.work.progress import Meter, Progress
 
-from .building import Building
-from .description import SIZE, Description
-from .trajectory import Trajectory
+from .trajectory import FEWEST_CELLS, MOST_CELLS, Description, Trajectory, estimate_spacing
 
-__all__ = ["LocalSplit", "Subsets", "make_local_split", "output_name"]
+__all__ = ["LocalSplit", "make_local_split", "output_name"]
 
-Subsets = Mapping[str, Iterable[Trajectory]]
-"""Trajectories of train, valid and test, in order."""
+SIZE = "full"
+"""Size of every local split."""
+
+VERSION = "1.0.0"
+DEVICE = "cpu"
+HEAD = '# A local split of lagbench, written by `lagbench {}`; its hashes stand under "measured".\n'
+
+PER_CELL = 2.5
+"""Spacings of particles across a cell of the score grid where the user gives none; the splits of
+lagbench have 1.8 to 2.6."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LocalSplit:
     """A local split that was made."""
 
-    folder: Path  # its folder, which --split takes
-    name: str
+    folder: Path  # its folder, which ``--split`` takes
+    name: str  # its name
     size: str  # its only size
     scenarios: dict[str, int]  # number of scenarios by subset
     frames: int  # frames of all scenarios
@@ -56,13 +70,16 @@ def output_name(output: str | Path) -> str:
 
 def make_local_split(
     about: Description,
-    subsets: Subsets,
+    subsets: Mapping[str, Iterable[Trajectory]],
     output: str | Path,
     *,
     command: str,
     progress: Callable[[Progress], None] | None = None,
 ) -> LocalSplit:
-    """Write a local split; it appears whole or not at all."""
+    """Write a local split of the trajectories of train, valid and test; it appears whole or not at all.
+
+    The last part of ``output`` is the name of the split, ``command`` stands in the head of its description.
+    """
     folder = Path(os.path.abspath(Path(output).expanduser()))
     if about.name in load().splits:
         raise UsageError(
@@ -74,7 +91,7 @@ def make_local_split(
         )
     meter = Meter(progress)
     with _scratch(folder) as root:
-        building = Building(about, root)
+        building = _Building(about, root)
         for subset in HASHED_SUBSETS:
             before = len(building.entries)
             meter.begin(f"writing {subset}", total=0, scenarios=0)
@@ -87,6 +104,11 @@ def make_local_split(
         size = load(root / about.name / DESCRIPTION).size(about.name, SIZE)
         (root / about.name).replace(folder)
     counts = sorted(entry.particles for entry in manifest.files)
+    tested = {entry.particles for entry in manifest.files if entry.subset == "test"}
+    note = (
+        f"test scenarios have {min(tested)} to {max(tested)} particles: the split can be opened and "
+        "trained on; predictions and scores need one number for all"
+    )
     return LocalSplit(
         folder=folder,
         name=about.name,
@@ -99,18 +121,8 @@ def make_local_split(
         spacing=building.spacing,
         bytes=sum(entry.bytes for entry in manifest.files),
         dataset_sha256=str(manifest.dataset_sha256),
-        notes=tuple(_notes(manifest)),
+        notes=(note,) if len(tested) > 1 else (),
     )
-
-
-def _notes(manifest: Manifest) -> Iterator[str]:
-    """Yield what limits the use of the split."""
-    test = {entry.particles for entry in manifest.files if entry.subset == "test"}
-    if len(test) > 1:
-        yield (
-            f"test scenarios have {min(test)} to {max(test)} particles: the split can be opened and "
-            "trained on; predictions and scores need one number for all"
-        )
 
 
 @contextmanager
@@ -130,3 +142,212 @@ def _scratch(folder: Path) -> Iterator[Path]:
             got=error.got if isinstance(error, WorkFailedError) else error.strerror or error,
             fix="free disk space, or name another folder: --output",
         ) from error
+
+
+@dataclass
+class _Building:
+    """A local split on the way: scenario files one by one, then manifest and description."""
+
+    about: Description
+    root: Path  # root folder in which the split's folder is built
+    spacing: float = 0.0  # distance of neighbouring particles at first [length]; 0 before the first scenario
+    entries: list[FileEntry] = field(default_factory=list)  # of the scenarios written so far, by id
+    low: NDArray[np.float64] = field(default_factory=lambda: np.full(2, np.inf))  # of any particle [length]
+    high: NDArray[np.float64] = field(default_factory=lambda: np.full(2, -np.inf))
+
+    def add(self, subset: str, trajectory: Trajectory) -> None:
+        """Write the next scenario."""
+        scenario = len(self.entries)
+        if scenario > MAX_ID:
+            raise DataError("too many trajectories", where=trajectory.name, expected=f"at most {MAX_ID + 1}")
+        about, scale = self.about, self.about.measure.scale
+        if not self.spacing:
+            first = np.asarray(next(trajectory.read())[0])
+            self._check(trajectory, 0, about.measure.place(first))
+            self.spacing = (about.spacing or estimate_spacing(first, about.radius)) / scale
+        key = ScenarioKey(split=about.name, size=SIZE, version=VERSION, scenario=scenario, subset=subset)
+        walls = None if trajectory.wall_velocity is None else np.asarray(trajectory.wall_velocity) / scale
+        with ScenarioWriter(
+            scenario_path(self.root, key),
+            key,
+            particles=trajectory.particles,
+            frames=trajectory.frames,
+            frame_interval=1.0 / about.rate,
+            material=trajectory.material,
+            particle_mass=about.density * self.spacing**2,
+            wall_velocity=walls,
+            parameters={"frame_rate": about.rate, "density": about.density, **trajectory.parameters},
+            seed=NO_GENERATOR,
+            device=DEVICE,
+            generator=NO_GENERATOR,
+            licence=about.licence,
+        ) as writer:
+            for position, velocity in self._frames(trajectory):
+                writer.append(position, velocity)
+        self.entries.append(describe_file(self.root, key))
+
+    def _frames(self, trajectory: Trajectory) -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
+        """Yield positions and velocities in the unit box; without own velocities, differences.
+
+        Then ``v(f) = (x(f) - x(f-1)) / interval``, and v(0) = v(1).
+        """
+        before: NDArray[np.float32] | None = None
+        for number, (raw, own) in enumerate(trajectory.read()):
+            position = self.about.measure.place(raw)
+            self._check(trajectory, number, position)
+            if own is not None:
+                yield position, (own / self.about.measure.scale).astype(np.float32)
+            elif before is not None:
+                velocity = ((position.astype(np.float64) - before) * self.about.rate).astype(np.float32)
+                if number == 1:
+                    yield before, velocity
+                yield position, velocity
+            before = position
+
+    def _check(self, trajectory: Trajectory, number: int, position: NDArray[np.float32]) -> None:
+        """Refuse positions that are no numbers or lie outside the unit box; note their extent."""
+        where = f"{trajectory.name}, frame {number}"
+        low, high = position.min(axis=0), position.max(axis=0)
+        if not (np.isfinite(low).all() and np.isfinite(high).all()):
+            raise DataError("a position is not finite", where=where)
+        if (low < 0.0).any() or (high > 1.0).any():
+            raise DataError(
+                "particles lie outside the unit box",
+                where=where,
+                expected="[0, 1] x [0, 1]",
+                got=" x ".join(f"[{a:.6g}, {b:.6g}]" for a, b in zip(low, high, strict=True)),
+                fix="fit the box of the data into the unit box: --rescale, and --bounds if none are stated",
+            )
+        self.low, self.high = np.minimum(self.low, low), np.maximum(self.high, high)
+
+    def finish(self, command: str) -> Manifest:
+        """Write manifest and description; return the manifest."""
+        about, content = self.about, {entry.scenario: entry.content_sha256[:16] for entry in self.entries}
+        ids = {name: [e.scenario for e in self.entries if e.subset == name] for name in HASHED_SUBSETS}
+        keys = [
+            ScenarioKey(split=about.name, size=SIZE, version=VERSION, scenario=i, subset="train")
+            for i in ids["train"]
+        ]
+        manifest = merge(
+            None,
+            self.entries,
+            split=about.name,
+            size=SIZE,
+            version=VERSION,
+            subsets=ids,
+            environment=environment_of(DEVICE),
+            recorded=content,
+            statistics=file_statistics([scenario_path(self.root, key) for key in keys]),
+        )
+        write_manifest(self.root, manifest)
+        measured: dict[str, object] = {
+            "dataset_sha256": manifest.dataset_sha256,
+            "subset_sha256": manifest.subset_sha256,
+            "scenario_sha256": content,
+            "statistics": {name: list(row) for name, row in manifest.statistics.items()},
+            "twin_floor": [],
+        }
+        described = {
+            "format": 1,
+            "splits": {about.name: self._split(ids)},
+            "measured": {about.name: {SIZE: measured}},
+        }
+        text = yaml.safe_dump(described, sort_keys=False, allow_unicode=True, width=110)
+        (self.root / about.name / DESCRIPTION).write_text(HEAD.format(command) + text, encoding="utf-8")
+        return manifest
+
+    def _split(self, ids: Mapping[str, Sequence[int]]) -> dict[str, object]:
+        """Return the description of the split as plain values."""
+        about = self.about
+        box = ((self.low[0], self.high[0]), (self.low[1], self.high[1]))
+        bounds = box if about.bounds is None else about.measure.box(about.bounds)
+        frames: dict[int, list[int]] = {}
+        for entry in self.entries:
+            frames.setdefault(entry.frames, []).append(entry.scenario)
+        tested = [entry for entry in self.entries if entry.subset == "test"]
+        task = self._task(shortest=min(entry.frames for entry in tested))
+        cells = task["score_grid"]["cells"]  # type: ignore[index]
+        counts = {entry.particles for entry in tested}
+        particles = counts.pop() if len(counts) == 1 else max(entry.particles for entry in self.entries)
+        parameters = {
+            "particles": (
+                particles,
+                "1",
+                "particles in one test scenario; the most of any where they differ",
+            ),
+            "grid": (cells, "1", "cells across the unit box; predictions may leave the bounds by one"),
+            "substeps_per_frame": (1, "1", "solver steps between recorded frames, 1 where they are unknown"),
+            "frame_rate": (about.rate, "1/s", "recorded frames per second"),
+            "density": (about.density, "mass/length^2", "rest density"),
+            "spacing": (self.spacing, "length", "distance of neighbouring particles at first"),
+            "source_scale": (
+                about.measure.scale,
+                "length of the source",
+                "what a unit of length is in the source",
+            ),
+            "source_x": (
+                about.measure.corner[0],
+                "length of the source",
+                "x in the source of the lower left corner",
+            ),
+            "source_y": (
+                about.measure.corner[1],
+                "length of the source",
+                "y in the source of the lower left corner",
+            ),
+        }
+        size = {
+            "subsets": {name: spell_ids(scenarios) for name, scenarios in ids.items()},
+            "frames": next(iter(frames))
+            if len(frames) == 1
+            else {count: spell_ids(frames[count]) for count in sorted(frames)},
+            "bounds": [[float(low), float(high)] for low, high in bounds],
+            "parameters": {},
+            "task": task,
+        }
+        return {
+            "version": VERSION,
+            "title": about.title or about.name,
+            "description": about.text or about.source,
+            "citation": about.citation,
+            "licence": about.licence,
+            "generator": NO_GENERATOR,
+            "source": about.source,
+            "parameters": {
+                name: {"value": value, "unit": unit, "description": words}
+                for name, (value, unit, words) in parameters.items()
+            },
+            "sizes": {SIZE: size},
+        }
+
+    def _task(self, *, shortest: int) -> dict[str, object]:
+        """Return the task, as far as the shortest test scenario allows one."""
+        about = self.about
+        horizon = about.horizon or shortest - about.input_frames
+        last = about.input_frames + horizon - 1
+        if horizon < 1 or last >= shortest:
+            raise UsageError(
+                "a test scenario is too short for the task",
+                where="--input-frames and --horizon",
+                expected=f"together at most {shortest}",
+                got=f"{about.input_frames} and {horizon}",
+            )
+        suits = round(1.0 / (PER_CELL * self.spacing))
+        interest = sorted(set(about.frames_of_interest or (last,)))
+        if not about.input_frames <= interest[0] <= interest[-1] <= last:
+            raise UsageError(
+                "a frame of interest is not predicted",
+                where="--frames-of-interest",
+                expected=f"frames {about.input_frames} to {last}",
+                got=spell_ids(interest) if interest[0] >= 0 else interest,
+            )
+        return {
+            "input_frames": about.input_frames,
+            "horizon": horizon,
+            "frames_of_interest": interest,
+            "score_grid": {
+                "cells": about.cells or min(MOST_CELLS, max(FEWEST_CELLS, suits)),
+                "placement": "cell_centres" if about.full_box else "nodes",
+            },
+            "radius": about.radius / about.measure.scale,
+        }

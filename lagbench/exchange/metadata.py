@@ -1,37 +1,160 @@
-"""metadata.json of both formats: written from the registry, read with care.
+"""What both formats say beside positions: metadata.json, and kinds of particles.
 
-Programs of other code bases pass over keys that they do not know; ours stand together under
-``lagbench``, so that what we export comes back with its task and its place in the box.
+Programs of other code bases pass over keys of metadata.json that they do not know; ours stand
+together under ``lagbench``, so that what we export comes back with its task and its place in the box.
+
+Both formats mark each particle with a number below 9, which their models embed; only a few have
+a meaning to the programs: particles that move as prescribed, and padding. Our materials go to
+numbers without such a meaning, one each, so that nothing is lost. On the way back a number that
+no material has must be told what it stands for, or left out.
 """
 
 from __future__ import annotations
 
+import enum
 import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter, ValidationError
 
 from lagbench.atomic import write_atomically
 from lagbench.data.registry import Size
 from lagbench.data.scenario import MATERIALS
-from lagbench.errors import UnreadableFileError
+from lagbench.errors import UnreadableFileError, UsageError, nearest
 
-from .kinds import NUMBERS, Format
-
-__all__ = ["NAME", "Hints", "Shapes", "Source", "describe", "floor_of", "read_source", "write_metadata"]
+__all__ = [
+    "DROP",
+    "MEANINGS",
+    "NAME",
+    "NUMBERS",
+    "WALL_NUMBERS",
+    "Format",
+    "Shapes",
+    "Source",
+    "describe",
+    "floor_of",
+    "materials_of",
+    "numbers_of",
+    "parse_format",
+    "parse_kinds",
+    "read_source",
+    "write_metadata",
+]
 
 NAME = "metadata.json"
 OWN_KEY = "lagbench"
 MAX_BYTES = 1 << 20
 
 Pair = tuple[FiniteFloat, FiniteFloat]
+Length = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Shapes = Mapping[str, Sequence[tuple[int, int]]]
 """Frames and particles of every trajectory, by subset."""
 
 _GRANULES = 2**20
+
+
+class Format(enum.StrEnum):
+    """A format that other code bases read."""
+
+    GNS_NPZ = "gns-npz"
+    LAGRANGEBENCH_H5 = "lagrangebench-h5"
+
+
+NUMBERS: Mapping[Format, Mapping[str, int]] = {
+    Format.GNS_NPZ: {"liquid": 5, "snow": 6, "jelly": 7, "rope": 8},
+    Format.LAGRANGEBENCH_H5: {"liquid": 0, "jelly": 4, "snow": 5, "rope": 6},
+}
+"""Number of each material."""
+
+WALL_NUMBERS: Mapping[Format, tuple[int, int]] = {Format.GNS_NPZ: (3, 3), Format.LAGRANGEBENCH_H5: (1, 2)}
+"""Number of particles of a wall at rest, and of one that moves."""
+
+MEANINGS: Mapping[Format, Mapping[int, str]] = {
+    Format.GNS_NPZ: {0: "rigid", 3: "kinematic: a boundary that moves as prescribed"},
+    Format.LAGRANGEBENCH_H5: {1: "solid wall", 2: "moving wall", 3: "rigid body"},
+}
+"""What numbers without a material mean."""
+
+PADDING = -1
+"""Number of particles that are not there (lagrangebench-h5)."""
+
+DROP = "drop"
+"""What a number is mapped to whose particles are left out."""
+
+_DROPPED = -1
+
+
+def parse_format(name: str) -> Format:
+    """Return a format by name; of an unknown one the UsageError names the nearest."""
+    known = [form.value for form in Format]
+    if name not in known:
+        raise UsageError(f"no format {name!r}", where="--format", fix=nearest(name, known))
+    return Format(name)
+
+
+def numbers_of(form: Format, material: NDArray[np.integer]) -> NDArray[np.int64]:
+    """Return the number of each particle's material, shape [particle]."""
+    table = np.array([NUMBERS[form][name] for name in MATERIALS], dtype=np.int64)
+    numbers: NDArray[np.int64] = table[material]
+    return numbers
+
+
+def materials_of(
+    form: Format, numbers: NDArray[np.integer], *, given: Mapping[int, str], where: str
+) -> tuple[NDArray[np.int8], NDArray[np.bool_]]:
+    """Return the material of each particle that is kept, and a mask over all particles.
+
+    ``given`` is what the user said of numbers: a material, or "drop". A number that no material has
+    and the user did not map, or no particle left, is an UnreadableFileError that names ``where``.
+    """
+    known = {number: name for name, number in NUMBERS[form].items()} | {PADDING: DROP} | dict(given)
+    codes = {number: _DROPPED if name == DROP else _code(name) for number, name in known.items()}
+    found = np.unique(numbers).tolist()
+    strange = [number for number in found if number not in codes]
+    if strange:
+        raise UnreadableFileError(
+            "particles of a kind that no material is known for",
+            where=where,
+            expected=", ".join(f"{number} ({name})" for number, name in sorted(known.items())),
+            got=", ".join(f"{n} ({MEANINGS[form].get(n, 'unknown')})" for n in strange),
+            fix=f"say what they stand for: --kinds {strange[0]}=jelly, or leave them out: {strange[0]}=drop",
+        )
+    material = np.empty(numbers.shape, dtype=np.int8)
+    for number in found:
+        material[numbers == number] = codes[number]
+    kept = material != _DROPPED
+    if not kept.any():
+        raise UnreadableFileError("every particle is padding or left out", where=where)
+    return material[kept], kept
+
+
+def _code(name: str) -> int:
+    if name not in MATERIALS:
+        fix = nearest(name, (*MATERIALS, DROP))
+        raise UsageError(f"no material {name!r}", where="--kinds", fix=fix)
+    return MATERIALS.index(name)
+
+
+def parse_kinds(text: str | None) -> dict[int, str]:
+    """Return what a user says about numbers of particles.
+
+    >>> parse_kinds("3=jelly,0=drop")
+    {3: 'jelly', 0: 'drop'}
+    """
+    kinds: dict[int, str] = {}
+    for part in text.split(",") if text else ():
+        number, _, name = part.strip().partition("=")
+        if not number.lstrip("-").isdecimal():
+            raise UsageError("bad kinds", where="--kinds", expected="as in 3=jelly,0=drop", got=text)
+        if name != DROP:
+            _code(name)
+        kinds[int(number)] = name
+    return kinds
 
 
 class Hints(BaseModel):
@@ -41,14 +164,16 @@ class Hints(BaseModel):
 
     origin: Pair = (0.0, 0.0)  # what was taken off every position [length]
     bounds: tuple[Pair, Pair] | None = None  # walls before that [length]
-    # distance of neighbouring particles at first [length]
-    spacing: Annotated[float, Field(gt=0)] | None = None
+    spacing: Annotated[float, Field(gt=0)] | None = (
+        None  # distance of neighbouring particles at first [length]
+    )
     density: Annotated[float, Field(gt=0)] | None = None  # rest density [mass/length^2]
     input_frames: Annotated[int, Field(gt=1)] | None = None  # frames given
     horizon: Annotated[int, Field(gt=0)] | None = None  # frames to predict
     frames_of_interest: tuple[int, ...] | None = None  # absolute frames at which the scorer reports
     cells: Annotated[int, Field(gt=3)] | None = None  # cells across of the score grid
     placement: Literal["cell_centres", "nodes"] | None = None  # where its nodes lie
+    wall_particle_type: tuple[int, ...] = ()  # numbers of particles that are walls, no material
 
 
 class Source(BaseModel):
@@ -57,11 +182,9 @@ class Source(BaseModel):
     model_config = ConfigDict(frozen=True)
 
     bounds: tuple[Pair, Pair]  # box of the source [its length]
-    radius: Annotated[float, Field(gt=0, allow_inf_nan=False)]  # connectivity radius [its length]
-    # time between frames [s]; None where none is stated
-    frame_interval: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None
-    # distance of neighbouring particles at first [its length]
-    spacing: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None
+    radius: Length  # connectivity radius [its length]
+    frame_interval: Length | None  # time between frames [s]; None where none is stated
+    spacing: Length | None  # distance of neighbouring particles at first [its length]
     periodic: tuple[bool, bool]  # whether the box is periodic, along x and y
     hints: Hints  # what our own exports add
 
@@ -82,8 +205,14 @@ def describe(
     spacing: float,
     origin: tuple[float, float],
     free_slip: bool,
+    wall: float | None = None,
 ) -> dict[str, object]:
-    """Return the metadata of an export."""
+    """Return the metadata of an export.
+
+    Statistics are mean and std over train per frame, see ``lagbench.data.statistics``. ``spacing`` is the
+    distance of neighbouring particles at first, ``origin`` what was taken off every position, ``wall``
+    the thickness of wall particles where there are some [length].
+    """
     task, grid = size.task, size.task.score_grid
     common = {
         "bounds": [[low - o, high - o] for (low, high), o in zip(size.bounds, origin, strict=True)],
@@ -107,15 +236,20 @@ def describe(
         "frames_of_interest": list(task.frames_of_interest),
         "cells": grid.cells,
         "placement": grid.placement,
+        "wall_particle_type": [] if wall is None else sorted({*WALL_NUMBERS[form]}),
     }
     if form is Format.GNS_NPZ:
         shortest = min(frames for subset in shapes.values() for frames, _ in subset)
         special: dict[str, object] = {"sequence_length": shortest, "dt": size.frame_interval}
     else:
         special = _of_lagrangebench(size, shapes, spacing=spacing, free_slip=free_slip)
-        if not any(origin):
-            # Its cell lists start at 0 and are as long as the bounds are apart: with those of
-            # the walls, particles beyond the difference would lose their neighbours.
+        # Its cell lists start at 0 and are as long as the bounds are apart: particles beyond the
+        # difference would lose their neighbours.
+        if wall is not None:
+            special["bounds"] = [
+                [0.0, high + wall - o] for (_, high), o in zip(size.bounds, origin, strict=True)
+            ]
+        elif not any(origin):
             special["bounds"] = [[0.0, 1.0], [0.0, 1.0]]
     return {**common, **special, OWN_KEY: own}
 
@@ -164,7 +298,7 @@ def write_metadata(folder: Path, metadata: Mapping[str, object]) -> Path:
 
 
 def read_source(folder: Path, form: Format) -> Source:
-    """Return what a metadata.json says."""
+    """Return what a metadata.json says; what is missing, no JSON or incomplete is an UnreadableFileError."""
     path = folder / NAME
     values = _values(path)
     # Newer GNS programs keep one block for training and one for rollouts.

@@ -1,23 +1,57 @@
-"""A trajectory from anywhere: what formats are read into, and what a local split is made of."""
+"""Data from elsewhere: trajectories, which formats are read into, and what a user says of them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+import math
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.errors import DataError, UnreadableFileError
+from lagbench.data.local import is_name
+from lagbench.errors import DataError, UnreadableFileError, UsageError
 
-__all__ = ["Frame", "Trajectory", "check_array", "frames_of"]
+__all__ = [
+    "FEWEST_CELLS",
+    "MOST_CELLS",
+    "Box",
+    "Description",
+    "Frame",
+    "Measure",
+    "Trajectory",
+    "Wishes",
+    "check_array",
+    "check_inflation",
+    "estimate_spacing",
+]
 
 Array = NDArray[np.floating]
 Frame = tuple[Array, Array | None]
 """Positions [length of the source] and, where the source has them, velocities [its length/s]."""
 
+Box = tuple[tuple[float, float], tuple[float, float]]
+"""Low and high walls along x and y."""
+
 PLANE = 2
 """Components of a position."""
+
+HARMLESS = 1 << 28
+"""Bytes that may come of anything."""
+
+MOST_INFLATION = 200
+"""Times its own length that a larger array may unpack to."""
+
+LEAST, MOST = 1e-30, 1e30
+"""Least and greatest number that a length, a time or a density may be: squares of them are floats."""
+
+FEWEST_CELLS, MOST_CELLS = 4, 4096
+"""Cells across of a score grid."""
+
+WIDE = 3.0
+"""Radii within which neighbours are counted to estimate the spacing."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,22 +60,163 @@ class Trajectory:
 
     name: str  # file and key, for messages
     frames: int  # recorded frames
-    # value of lagbench.data.scenario.MATERIALS of each particle, int8, shape [particle]
-    material: NDArray[np.int8]
+    material: NDArray[np.int8]  # value of ``lagbench.data.scenario.MATERIALS`` of each particle, [particle]
     read: Callable[[], Iterator[Frame]]  # returns the frames in order, one at a time
-    # [length/s], shape [wall, 2] or [frame, wall, 2]; None where there is none
-    wall_velocity: Array | None = None
-    # facts that the scenario's file states and hashes
-    parameters: Mapping[str, object] = field(default_factory=dict)
+    wall_velocity: Array | None = None  # [length/s], [wall, 2] or [frame, wall, 2]; None without walls
+    parameters: Mapping[str, object] = field(default_factory=dict)  # facts that the file states and hashes
 
     @property
     def particles(self) -> int:
         """Particles in every frame."""
         return len(self.material)
 
-    def first(self) -> Array:
-        """Return the positions of the first frame, shape [particle, 2]."""
-        return next(self.read())[0]
+
+@dataclass(frozen=True, kw_only=True)
+class Measure:
+    """How lengths of the source become lengths of the unit box: ``(x - corner) / scale``.
+
+    A scale that is a power of two, with the corner 0, loses no bit.
+    """
+
+    scale: float = 1.0
+    corner: tuple[float, float] = (0.0, 0.0)
+
+    @classmethod
+    def fitting(cls, bounds: Box) -> Measure:
+        """Return the measure by which a box fits into the unit box.
+
+        The scale is the least power of two that holds it; the corner stays 0 where that is enough.
+        """
+        low, high = np.array(bounds, dtype=np.float64).T
+        corner = low
+        if (low >= 0.0).all() and (high <= _power(float(high.max()))).all():
+            corner = np.zeros(2)
+        return cls(scale=_power(float((high - corner).max())), corner=(float(corner[0]), float(corner[1])))
+
+    def place(self, position: Array) -> NDArray[np.float32]:
+        """Return positions in the unit box, float32."""
+        if self.scale != 1.0 or any(self.corner):
+            position = (position.astype(np.float64) - self.corner) / self.scale
+        with np.errstate(over="ignore"):  # what is beyond float32 becomes infinite
+            return position.astype(np.float32, copy=False)
+
+    def box(self, bounds: Box) -> Box:
+        """Return a box of the source in the unit box."""
+        (left, right), (bottom, top) = (
+            tuple((value - corner) / self.scale for value in pair)
+            for pair, corner in zip(bounds, self.corner, strict=True)
+        )
+        return (left, right), (bottom, top)
+
+
+def _power(length: float) -> float:
+    """Return the least power of two that is not below a length, at least 1."""
+    return 2.0 ** max(0, math.ceil(math.log2(length))) if length > 1.0 else 1.0
+
+
+class Wishes(TypedDict, total=False):
+    """What a user may say of data from elsewhere; see :class:`Description`."""
+
+    title: str
+    text: str
+    citation: str
+    licence: str
+    radius: float
+    frame_interval: float
+    bounds: Box
+    rescale: bool
+    density: float
+    spacing: float
+    input_frames: int
+    horizon: int
+    frames_of_interest: Sequence[int]
+    cells: int
+    full_box: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class Description:
+    """What is known of data from elsewhere; lengths are those of the source.
+
+    What cannot be (a name, a number out of range, a scale without bounds) is a UsageError.
+    """
+
+    name: str  # name of the split
+    title: str = ""  # title of the split; its name when empty
+    text: str = ""  # what the data are
+    citation: str = "none"  # whom to cite
+    licence: str = "unknown"  # licence of the data
+    source: str  # where they come from
+    radius: float  # connectivity radius
+    frame_interval: float  # time between frames [s]
+    bounds: Box | None = None  # box that holds the particles; None where the positions say
+    rescale: bool = False  # whether to fit the bounds into the unit box
+    density: float = 1.0  # rest density [mass/length^2]
+    spacing: float | None = None  # distance of neighbouring particles at first; None to estimate it
+    input_frames: int = 6  # frames given to a model
+    horizon: int | None = None  # frames to predict; None for all that every test scenario has
+    frames_of_interest: Sequence[int] | None = None  # absolute frames that are reported; None for the last
+    cells: int | None = None  # cells across of the score grid; None for one that suits the spacing
+    full_box: bool = False  # whether material fills the box, so that vorticity ranks; else positions rank
+    measure: Measure = field(init=False, default=Measure())
+
+    def __post_init__(self) -> None:
+        """Check what the user gave."""
+        if not is_name(self.name):
+            proposal = re.sub(r"[^a-z0-9_-]+", "-", self.name.lower()).strip("-_0123456789") or "own"
+            raise UsageError(
+                "a split cannot have that name",
+                where="--output, its last part",
+                expected="small letters, digits, - and _, a letter first",
+                got=self.name,
+                fix=f"--output {proposal}",
+            )
+        positive = {
+            "--radius": self.radius,
+            "--frame-interval": self.frame_interval,
+            "--density": self.density,
+            "--spacing": 1.0 if self.spacing is None else self.spacing,
+        }
+        for option, value in positive.items():
+            if not (LEAST <= value <= MOST):
+                raise UsageError("not a number above 0 that computes", where=option, got=value)
+        if self.bounds is not None and any(not -MOST <= low < high <= MOST for low, high in self.bounds):
+            raise UsageError("bounds run from low to high", where="--bounds", got=self.bounds)
+        if self.cells is not None and not FEWEST_CELLS <= self.cells <= MOST_CELLS:
+            expected = f"{FEWEST_CELLS} to {MOST_CELLS}"
+            raise UsageError("no such score grid", where="--cells", expected=expected, got=self.cells)
+        if self.rescale:
+            if self.bounds is None:
+                raise UsageError("what is to fit the unit box?", where="--rescale", fix="add --bounds")
+            object.__setattr__(self, "measure", Measure.fitting(self.bounds))
+
+    @property
+    def rate(self) -> float:
+        """Frames per second to 12 digits: 1 / (0.1 / 12 * 12) is 10."""
+        return float(f"{1.0 / self.frame_interval:.12g}")
+
+
+def estimate_spacing(position: Array, radius: float) -> float:
+    """Return the distance of neighbouring particles in one frame, ``sqrt(area / particles)``.
+
+    The density deep inside the material is that within three radii of a particle, where the
+    upper quartile over particles leaves surfaces out.
+    """
+    from scipy.spatial import cKDTree
+
+    points = position.astype(np.float64)
+    reach = WIDE * radius
+    counts = cKDTree(points).query_ball_point(points, reach, return_length=True)
+    inside = float(np.quantile(counts, 0.75))
+    if inside < 2.0 and len(points) > 1:  # a particle counts itself
+        raise UsageError(
+            "particles have no neighbours: their spacing cannot be estimated",
+            where="--radius",
+            expected=f"neighbours within {WIDE:g} radii",
+            got=radius,
+            fix="a larger --radius, or say how far particles are apart: --spacing",
+        )
+    return math.sqrt(math.pi * reach**2 / inside)
 
 
 def check_array(name: str, shape: tuple[int, ...], dtype: np.dtype[np.generic]) -> None:
@@ -64,7 +239,16 @@ def check_array(name: str, shape: tuple[int, ...], dtype: np.dtype[np.generic]) 
         raise DataError("too little for a trajectory", where=name, expected="2 frames, 1 particle", got=shape)
 
 
-def frames_of(position: Array, velocity: Array | None = None) -> Iterator[Frame]:
-    """Yield the frames of arrays, in memory or mapped, of shape [frame, particle, 2]."""
-    for number, frame in enumerate(position):
-        yield np.asarray(frame), None if velocity is None else np.asarray(velocity[number])
+def check_inflation(where: str, *, packed: int, unpacked: int) -> None:
+    """Refuse an array [bytes] that is far larger than what a file holds of it.
+
+    Positions of particles that move compress by a factor of two or so, of particles at rest by a
+    hundred: what promises more, and much of it, was made to fill the memory, or is damaged.
+    """
+    if unpacked > max(HARMLESS, MOST_INFLATION * packed):
+        raise UnreadableFileError(
+            "the file would unpack to far more than it holds",
+            where=where,
+            expected=f"at most {MOST_INFLATION} times {packed} bytes",
+            got=f"{unpacked} bytes",
+        )

@@ -25,7 +25,7 @@ from lagbench.data.grid import Grid, Placement, node_velocity, transfer
 from lagbench.data.layout import ScenarioKey, scenario_path
 from lagbench.data.scenario import ScenarioFile, read_scenario
 from lagbench.errors import DataError
-from lagbench.store.bringing import bring
+from lagbench.store.copy import bring
 
 from .carried import linear_field, mirrored
 from .floor import Floats, Floor, Given, Prediction, fills_box, given_in, wall_motion

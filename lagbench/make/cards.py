@@ -143,12 +143,23 @@ PICTURES: Mapping[str, str] = {
 """Pictures of a card, relative to it, and what they show."""
 
 NOTES: Mapping[str, str] = {
-    "multimaterial": (
-        "In the pair snow-snow everything comes to rest after about 65 frames: the rest of these scenarios "
-        "holds almost no motion, and a model that stands still looks good there."
+    "cavity": (
+        "The wall velocities of all frames, those to be predicted included, are part of what is given: they "
+        "are the forcing. `wall_velocity` at frame f is what acts from frame f-1 to f."
     ),
-    "fluid": "Scenarios differ in length: the longer ones are those that still move.",
-    "curl-noise": "Energy only decays: the higher the frequency, the faster.",
+    "multimaterial": (
+        "Pairs with snow come to rest first. `active_frames` of a file says for how many predicted frames "
+        "its scenario moves: up to the last with at least 1 % of the greatest kinetic energy."
+    ),
+    "fluid": (
+        "Scenarios of train differ in length: the longer ones are those that still move. `active_frames` of "
+        "a file says for how many predicted frames it moves: up to the last with at least 1 % of the "
+        "greatest kinetic energy."
+    ),
+    "curl-noise": (
+        "Energy only decays: the higher the frequency, the faster. The equations have no viscosity, the grid "
+        "has: benchmarks/effective_viscosity.py fits it to the decay of each size."
+    ),
 }
 """What a reader of one split's card must know beside its description."""
 
@@ -162,7 +173,7 @@ VARIABLES = (
         "frame, wall, space",
         "float32",
         "length/s",
-        "closed box: walls left, right, bottom, top",
+        "closed box: what acts towards each frame; walls left, right, bottom, top",
     ),
     ("`time`", "frame", "float64", "s", "time since frame 0"),
 )

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lagbench.atomic import SUFFIX
-from lagbench.data.layout import MANIFEST_NAME, dataset_folder
+from lagbench.data.layout import MANIFEST_NAME, NOTES_NAME, dataset_folder
 from lagbench.data.local import DESCRIPTION, locate
 from lagbench.data.lock import LOCK_NAME, dataset_lock
 from lagbench.data.registry import Registry, Size
@@ -95,7 +95,8 @@ def _remove(paths: Iterable[Path]) -> None:
 
 def _remove_empty(folder: Path, *, stop: Path) -> None:
     """Remove folders that hold nothing any more, up to the root folder."""
-    (folder / LOCK_NAME).unlink(missing_ok=True)
+    for name in (LOCK_NAME, NOTES_NAME):
+        (folder / name).unlink(missing_ok=True)
     for place in (*(child for child in folder.iterdir() if child.is_dir()), folder, *folder.parents):
         if place == stop or any(place.iterdir()):
             continue

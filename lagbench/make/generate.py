@@ -21,7 +21,15 @@ from lagbench.atomic import remove_leftovers
 from lagbench.data.layout import MANIFEST_NAME, dataset_folder, scenario_path
 from lagbench.data.local import locate
 from lagbench.data.lock import dataset_lock
-from lagbench.data.manifest import FileEntry, Manifest, describe_file, merge, read_manifest, write_manifest
+from lagbench.data.manifest import (
+    FileEntry,
+    Manifest,
+    describe_file,
+    merge,
+    note,
+    read_manifest,
+    write_manifest,
+)
 from lagbench.data.registry import Registry, Size, Split, spell_ids
 from lagbench.data.statistics import file_moments, round_digits, statistics
 from lagbench.errors import DataError, UsageError, check_installed, nearest
@@ -233,11 +241,13 @@ class Generation:
             describe_file(self.root, scenario_key(self.size, outcome.scenario), outcome.facts)
             for outcome in outcomes
         ]
+        tested = [outcome for outcome in outcomes if self._is_test(outcome.scenario)]
+        folder = dataset_folder(self.root, self.size.split, self.size.name, self.size.major)
+        note(folder, {self._path(outcome.scenario): outcome.content_sha256 for outcome in tested})
         self._keep(self._merged(self.manifest, entries, environment))
         self._meter.count(scenarios=len(entries))
-        for outcome in outcomes:
-            if self._is_test(outcome.scenario):
-                crew.submit(self._twin(outcome.scenario))
+        for outcome in tested:
+            crew.submit(self._twin(outcome.scenario))
 
     def _take_floors(self, floors: dict[int, tuple[float, ...]]) -> None:
         entries = [
@@ -351,8 +361,7 @@ def generate(
         UsageError: unknown split, size, subset, scenario or device, fewer than one worker, or
             Taichi is not installed; or nothing can be gathered from a folder.
         WorkFailedError: disk full or not writable, a scenario blew up, workers keep dying, the
-            cluster is lost or does not see the root folder; or the store refuses, does not answer,
-            or knows no conditional put.
+            cluster is lost or does not see the root folder; or the store refuses or does not answer.
         DataError: the result has other hashes than datasets.yaml, or there is no such bucket.
     """
     started = time.monotonic()
@@ -378,7 +387,7 @@ def generate(
             check_installed("taichi", extra="generate")
         with (
             dataset_lock(folder, tier.split, size, tier.major, on_wait=on_wait),
-            publication(tier, folder, on_wait=on_wait) as campaign.store,
+            publication(tier, folder) as campaign.store,
         ):
             campaign.run(wanted, force=force)
     seconds = time.monotonic() - started

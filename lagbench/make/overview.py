@@ -7,7 +7,7 @@ from pathlib import Path
 
 from lagbench.data.layout import dataset_folder, url_of
 from lagbench.data.registry import Size
-from lagbench.store.bringing import remote_manifest
+from lagbench.store.copy import remote_manifest
 from lagbench.work.pool import available_cores
 
 from .cards import PICTURES

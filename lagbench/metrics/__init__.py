@@ -6,25 +6,36 @@ functions of their series over frames. :data:`METRICS` holds name, unit and dire
 
 from __future__ import annotations
 
-from .aggregate import Score, aggregate, score
-from .comparison import Comparison, compare, shared_ranks, sign_flip_p
+from .aggregate import (
+    Resampling,
+    Score,
+    Tally,
+    aggregate,
+    bootstrap_interval,
+    measure,
+    resample,
+    score,
+    tally,
+)
 from .frame import FramePair, Scenario, Setting, Snapshot, snapshots
-from .intervals import bootstrap_interval
-from .metric import Direction, Metric, always, at_slow_frames, enough_nodes
-from .table import FAMILIES, METRICS, available, select
-from .tally import Tally, measure, tally
+from .metric import Direction, Metric, always, at_slow_frames, enough_nodes, mean, metric
+from .significance import Comparison, Standing, compare, differ, holm, sign_flip_p, standings
+from .table import CHOSEN, FAMILIES, METRICS, available, select
 
 __all__ = [
+    "CHOSEN",
     "FAMILIES",
     "METRICS",
     "Comparison",
     "Direction",
     "FramePair",
     "Metric",
+    "Resampling",
     "Scenario",
     "Score",
     "Setting",
     "Snapshot",
+    "Standing",
     "Tally",
     "aggregate",
     "always",
@@ -32,12 +43,17 @@ __all__ = [
     "available",
     "bootstrap_interval",
     "compare",
+    "differ",
     "enough_nodes",
+    "holm",
+    "mean",
     "measure",
+    "metric",
+    "resample",
     "score",
     "select",
-    "shared_ranks",
     "sign_flip_p",
     "snapshots",
+    "standings",
     "tally",
 ]

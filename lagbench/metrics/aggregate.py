@@ -1,4 +1,4 @@
-"""From tallies to scores: frames become one number per scenario, scenarios a mean.
+"""From frames to scores: tallies that add, one number per scenario, a mean with its interval.
 
 RMSE is the root of the frame mean of MSE within a scenario, then the mean over scenarios;
 every other metric is the mean over frames, then over scenarios. Undefined frames are left
@@ -7,20 +7,212 @@ out and counted; so is a scenario without a defined frame. Scenarios are taken i
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import functools
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from .frame import Floats
-from .intervals import bootstrap_interval
-from .metric import Metric
-from .reductions import mean
-from .tally import Tally
+from lagbench.errors import UsageError
 
-__all__ = ["Score", "aggregate", "score"]
+from .frame import Floats, FramePair
+from .metric import Metric, mean
+
+__all__ = [
+    "LEVEL",
+    "RESAMPLES",
+    "Resampling",
+    "Score",
+    "Tally",
+    "aggregate",
+    "bootstrap_interval",
+    "measure",
+    "resample",
+    "score",
+    "tally",
+]
+
+LEVEL = 0.95
+"""Share of the resampled means that an interval holds."""
+
+RESAMPLES = 10_000
+"""Resamples of scenarios and of seeds."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tally:
+    """Statistics of a scenario as sums that add, so that chunks and workers combine.
+
+    Every (statistic, frame) holds a sum and its weight. Pieces measured apart have disjoint
+    frames, and adding a zero changes no bit: any chunking, in any order, gives the same bytes.
+    """
+
+    names: tuple[str, ...]  # of the statistics
+    frames: tuple[int, ...]  # absolute frame numbers
+    total: Floats  # sum of the defined values, shape [statistic, frame]
+    weight: NDArray[np.int64]  # how many defined values that is, shape [statistic, frame]
+    undefined: NDArray[np.int64]  # how many values were NaN, shape [statistic, frame]
+
+    @classmethod
+    def of(
+        cls, names: Sequence[str], frames: Sequence[int], measured: Mapping[int, Mapping[str, float]]
+    ) -> Self:
+        """Return the tally of values by frame and name; what is missing weighs nothing."""
+        row = {name: i for i, name in enumerate(names)}
+        column = {frame: i for i, frame in enumerate(frames)}
+        values = np.zeros((len(row), len(column)))
+        seen = np.zeros(values.shape, np.int64)
+        for frame, statistics in measured.items():
+            for name, value in statistics.items():
+                if name not in row or frame not in column:
+                    raise UsageError(f"statistic {name!r} at frame {frame} has no place in the tally")
+                values[row[name], column[frame]] = value
+                seen[row[name], column[frame]] = 1
+        nan = np.isnan(values)
+        return cls(tuple(names), tuple(frames), np.where(nan, 0.0, values), seen * ~nan, seen * nan)
+
+    def __add__(self, other: Tally) -> Tally:
+        """Combine two pieces of the same scenario."""
+        if (self.names, self.frames) != (other.names, other.frames):
+            raise UsageError("tallies of different statistics or frames do not add")
+        return Tally(
+            self.names,
+            self.frames,
+            self.total + other.total,
+            self.weight + other.weight,
+            self.undefined + other.undefined,
+        )
+
+    def series(self, name: str) -> Floats:
+        """Return a statistic per frame, NaN where it has no value, shape [frame]."""
+        i = self.names.index(name)
+        values = np.full(len(self.frames), np.nan)
+        np.divide(self.total[i], self.weight[i], out=values, where=self.weight[i] > 0)
+        return values
+
+    def measured(self, name: str) -> NDArray[np.bool_]:
+        """Tell at which frames a statistic was measured, defined or not, shape [frame]."""
+        i = self.names.index(name)
+        return np.asarray(self.weight[i] + self.undefined[i] > 0, np.bool_)
+
+
+def measure(pair: FramePair, metrics: Iterable[Metric]) -> dict[str, float]:
+    """Return the statistics of one frame pair by name, NaN where one is undefined."""
+    return {m.name: m.measure(pair) for m in metrics if m.statistic is not None and m.applies(pair)}
+
+
+def tally(pairs: Iterable[FramePair], metrics: Sequence[Metric], frames: Sequence[int]) -> Tally:
+    """Measure consecutive frame pairs, holding one at a time."""
+    names = [m.name for m in metrics if m.statistic is not None]
+    return Tally.of(names, frames, {pair.frame: measure(pair, metrics) for pair in pairs})
+
+
+@functools.cache
+def _shares(count: int, stream: int) -> Floats:
+    """Return the share of each of some things in draws with replacement, shape [resample, thing]."""
+    # Generator.random is the one distribution whose stream NumPy keeps across versions
+    uniform = np.random.Generator(np.random.PCG64(stream)).random((RESAMPLES, count))
+    drawn = np.floor(uniform * count).astype(np.intp) + count * np.arange(RESAMPLES)[:, None]
+    return np.bincount(drawn.ravel(), minlength=RESAMPLES * count).reshape(RESAMPLES, count) / count
+
+
+@dataclass(frozen=True, eq=False)
+class Resampling:
+    """A mean over seeds and scenarios, and how far others of both would lead it."""
+
+    mean: float
+    parts: Mapping[int, Floats]  # deviations of the things that are drawn, by stream: scenarios, seeds
+
+    @cached_property
+    def deviations(self) -> Floats:
+        """Resampled means minus the mean, shape [resample]."""
+        drawn = [
+            math.sqrt(len(part) / (len(part) - 1)) * np.einsum("rn,n->r", _shares(len(part), stream), part)
+            for stream, part in self.parts.items()
+        ]
+        return np.asarray(np.sum(drawn, axis=0))
+
+    @property
+    def _variances(self) -> list[float]:
+        return [float(np.sum(x**2)) / (len(x) * (len(x) - 1)) for x in self.parts.values()]
+
+    @property
+    def error(self) -> float:
+        """Standard deviation of the resampled means, without drawing."""
+        return math.sqrt(math.fsum(self._variances))
+
+    @property
+    def freedom(self) -> float:
+        """Degrees of freedom behind the error, after Satterthwaite."""
+        drawn = zip(self._variances, self.parts.values(), strict=True)
+        squares = math.fsum(v**2 / (len(x) - 1) for v, x in drawn)
+        return math.fsum(self._variances) ** 2 / squares if squares else math.inf
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """95 % percentile interval, as much wider as Student's quantile exceeds the normal one's."""
+        if not self.error:
+            return self.mean, self.mean
+        from scipy.special import ndtri, stdtrit
+
+        tails = (1.0 - LEVEL) / 2.0, (1.0 + LEVEL) / 2.0
+        wider = float(stdtrit(self.freedom, tails[1]) / ndtri(tails[1]))
+        low, high = self.mean + wider * np.quantile(self.deviations, tails)
+        return float(low), float(high)
+
+
+def resample(values: ArrayLike, minus: ArrayLike | None = None) -> Resampling | None:
+    """Draw scenarios and seeds with replacement: the two-way bootstrap of a mean.
+
+    The value of seed s in scenario i is read as ``mean + b_i + a_s`` and a rest. The means over
+    seeds ``b_i`` and those over scenarios ``a_s`` are drawn independently of each other, each
+    stretched by ``sqrt(n / (n - 1))`` so that few seeds do not look alike by being few::
+
+        Var = sum_i b_i^2 / (N (N - 1)) + sum_s a_s^2 / (S (S - 1))
+
+    The rest enters both sums once, which errs on the side of too wide. With one seed only the
+    scenarios are drawn: the mean is then that of these weights, not of the method. The draws are
+    seeded; two calls with as many scenarios draw the same ones, so that ratios can be formed of
+    them.
+
+    Args:
+        values: NaN where undefined, shape [scenario] or [seed, scenario].
+        minus: values of another method in the same scenarios: the mean is that of the difference.
+
+    Returns:
+        None where fewer than two scenarios are defined.
+    """
+    sides = [np.atleast_2d(np.asarray(side, np.float64)) for side in (values, minus) if side is not None]
+    defined = np.all([~np.isnan(side).all(axis=0) for side in sides], axis=0)
+    if np.count_nonzero(defined) < 2:
+        return None
+    means, seeds = np.zeros(np.count_nonzero(defined)), []
+    for sign, side in zip((1.0, -1.0), sides, strict=False):
+        kept = side[:, defined]
+        over_seeds = np.nanmean(kept, axis=0)
+        means += sign * over_seeds
+        rows = np.array([mean(row) for row in kept - over_seeds])
+        seeds.append(sign * rows[~np.isnan(rows)])
+    parts = {stream: part - np.mean(part) for stream, part in enumerate([means, *seeds]) if len(part) > 1}
+    return Resampling(mean=float(np.mean(means)), parts=parts)
+
+
+def bootstrap_interval(values: ArrayLike, minus: ArrayLike | None = None) -> tuple[float, float]:
+    """Return the 95 % interval of a mean by the two-way bootstrap, :func:`resample`.
+
+    Args:
+        values: NaN where undefined (left out), shape [scenario] or [seed, scenario].
+        minus: values of another method: the interval is that of the difference.
+
+    Returns:
+        Lower and upper bound; NaN when fewer than two scenarios are defined.
+    """
+    found = resample(values, minus)
+    return (math.nan, math.nan) if found is None else found.interval
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,10 +220,10 @@ class Score:
     """What a metric says of one prediction."""
 
     metric: Metric
-    scenarios: tuple[int, ...]  # scenario ids, ascending
+    scenarios: tuple[int, ...]  # ids, ascending
     frames: tuple[int, ...]  # absolute numbers of the predicted frames
-    per_frame: Floats  # value at each frame, NaN where not measured or undefined, shape [scenario, frame]
-    values: Floats  # value over the horizon, shape [scenario]
+    per_frame: Floats  # NaN where not measured or undefined, shape [scenario, frame]
+    values: Floats  # over the horizon, shape [scenario]
     undefined: tuple[int, ...]  # measured frames without a value, shape [scenario]
 
     @property
@@ -41,7 +233,7 @@ class Score:
 
     @cached_property
     def interval(self) -> tuple[float, float]:
-        """95 % interval of the mean, by bootstrap over scenarios."""
+        """95 % interval of the mean of these weights, by bootstrap over scenarios."""
         return bootstrap_interval(self.values)
 
     def at(self, frame: int) -> Floats:

@@ -67,7 +67,7 @@ class OverBodies:
     """Mean of a statistic over the elastic bodies of a scenario, or over those of one material."""
 
     statistic: Callable[[FramePair, str], float]  # value of one body, given its material
-    materials: tuple[str, ...]  # materials whose bodies are taken
+    materials: tuple[str, ...]  # whose bodies are taken
 
     def _present(self, pair: FramePair) -> list[str]:
         return [name for name in self.materials if name in pair.scenario.members]
@@ -83,9 +83,9 @@ class OverBodies:
 
 def _metrics() -> Iterator[Metric]:
     for statistic, unit, direction, perfect, summary in (
-        (shape_error, "length", Direction.LOWER, 0.0, "distance from the true shape after a rigid fit"),
-        (connectivity, "1", Direction.HIGHER, 1.0, "share of first neighbours within twice their distance"),
-        (connectivity_true, "1", Direction.NONE, None, "connectivity of the truth"),
+        (shape_error, "length", Direction.LOWER, 0.0, "Distance from the true shape after a rigid fit"),
+        (connectivity, "1", Direction.HIGHER, 1.0, "Share of first neighbours within twice their distance"),
+        (connectivity_true, "1", Direction.NONE, None, "Connectivity of the truth"),
     ):
         for materials in (ELASTIC, *((name,) for name in ELASTIC)):
             whose = "" if materials is ELASTIC else f"_{materials[0]}"

@@ -11,24 +11,38 @@ import enum
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
 
 from lagbench.errors import UsageError
 
 from .frame import Floats, FramePair
-from .reductions import mean
 
 __all__ = [
     "MINIMUM_NODES",
+    "SCALE_FLOOR",
     "Direction",
+    "FirstFrames",
     "Metric",
     "always",
     "at_slow_frames",
     "enough_nodes",
+    "floored_quotient",
     "identity",
+    "last",
+    "mean",
+    "metric",
+    "quotient",
+    "root_mean_square",
+    "total",
 ]
 
 MINIMUM_NODES = 16
 """With fewer compared nodes the metrics of vorticity and divergence are undefined."""
+
+SCALE_FLOOR = 1e-3
+"""Share of the truth's greatest value below which errors are no longer scaled by its value."""
 
 
 class Direction(enum.StrEnum):
@@ -60,6 +74,56 @@ def identity(values: Floats) -> Floats:
     return values
 
 
+def quotient(numerator: Floats, denominator: Floats) -> Floats:
+    """Return the ratio of two series, NaN where the denominator is 0, shape [frame]."""
+    ratio = np.full(len(numerator), np.nan)
+    np.divide(numerator, denominator, out=ratio, where=denominator != 0.0)
+    return ratio
+
+
+def floored_quotient(error: Floats, scale: Floats) -> Floats:
+    """Return ``error / max(scale, 1e-3 max(scale))``, shape [frame]; NaN where all scales are 0.
+
+    The floor keeps frames in which the truth rests from ruling the mean.
+    """
+    greatest = np.max(scale, initial=0.0, where=~np.isnan(scale))
+    return quotient(error, np.maximum(scale, SCALE_FLOOR * greatest))
+
+
+def mean(values: Floats) -> float:
+    """Return the mean over the defined frames, NaN if there are none."""
+    defined = values[~np.isnan(values)]
+    return float(np.mean(defined)) if defined.size else math.nan
+
+
+def root_mean_square(values: Floats) -> float:
+    """Return ``sqrt(mean(values^2))``: for RMSE per frame, the root of the frame mean of MSE."""
+    return math.sqrt(mean(values**2))
+
+
+def last(values: Floats) -> float:
+    """Return the value at the last frame (Eq. 4.18)."""
+    return float(values[-1])
+
+
+def total(values: Floats) -> float:
+    """Return the sum over the defined frames, NaN if there are none."""
+    defined = values[~np.isnan(values)]
+    return float(np.sum(defined)) if defined.size else math.nan
+
+
+@dataclass(frozen=True)
+class FirstFrames:
+    """A reduction of the first predicted frames only; NaN when there are fewer."""
+
+    count: int  # predicted frames that are taken
+    reduction: Callable[[Floats], float] = mean  # what is made of them
+
+    def __call__(self, values: Floats) -> float:
+        """Return the reduction of those frames."""
+        return math.nan if len(values) < self.count else self.reduction(values[: self.count])
+
+
 @dataclass(frozen=True, kw_only=True)
 class Metric:
     """One entry of the table of metrics.
@@ -67,33 +131,30 @@ class Metric:
     NaN policy: where ``applies`` says no (no such material, not a slow frame) nothing is
     measured: an expected gap, not counted. Where ``defined`` says no, or a statistic is NaN,
     the frame is undefined: left out of the mean and counted.
+
+    Raises:
+        UsageError: neither a statistic nor others' series, or a target without its value.
     """
 
-    name: str  # unique name
-    family: str  # group of metrics that are shown together
-    unit: str  # unit of the value
+    name: str  # unique
+    family: str  # metrics that are shown together
+    unit: str  # of the value
     direction: Direction  # what better means
     source: str  # equation or section that defines it
     summary: str  # what it says, one line
     perfect: float | None = None  # value of a perfect prediction; None where it depends on truth or task
-    # value for one frame pair; None where the metric follows from others' series
-    statistic: Callable[[FramePair], float] | None = None
+    statistic: Callable[[FramePair], float] | None = None  # of one frame pair; None if it follows from others
     applies: Callable[[FramePair], bool] = always  # whether the statistic is measured for a frame pair
     defined: Callable[[FramePair], bool] = always  # whether it is defined there; otherwise it is NaN
-    of: tuple[str, ...] = ()  # names of the statistics that 'series' takes, its own by default
-    # value per frame from the series of those statistics, shape [frame]
-    series: Callable[..., Floats] = identity
+    of: tuple[str, ...] = ()  # statistics that ``series`` takes, its own by default
+    series: Callable[..., Floats] = identity  # value per frame from the series of those, shape [frame]
     over_frames: Callable[[Floats], float] = mean  # one number of a scenario from the value per frame
     per_frame: bool = True  # whether the value at a single frame means anything
     horizon: int = 1  # predicted frames needed; smaller tasks do not have the metric
-    extra: str | None = None  # extra of lagbench that it needs; such a metric is measured only when asked for
+    extra: str | None = None  # extra of lagbench that it needs; measured only when asked for
 
     def __post_init__(self) -> None:
-        """Fill in ``of``; refuse a metric that nothing could be computed for or judged by.
-
-        Raises:
-            UsageError: neither statistic nor others' series, or a target without its value.
-        """
+        """Fill in ``of``; refuse a metric that nothing could be computed for or judged by."""
         if self.statistic is None and not self.of:
             raise UsageError(f"metric {self.name!r} has neither a statistic nor others to follow from")
         if self.perfect is None and self.direction is Direction.TARGET:
@@ -118,3 +179,38 @@ class Metric:
         if self.direction is Direction.TARGET and self.perfect is not None:
             return abs(value - self.perfect)
         return -value if self.direction is Direction.HIGHER else value
+
+
+def metric(
+    *,
+    unit: str,
+    source: str,
+    direction: Direction = Direction.NONE,
+    perfect: float | None = None,
+    of: tuple[str, ...] = (),
+    family: str | None = None,
+    **more: Any,  # noqa: ANN401 - further fields of Metric, as they are
+) -> Callable[[Callable[..., Any]], Metric]:
+    """Make a metric of a function; its name and the first line of its docstring are the metric's.
+
+    The function takes a frame pair and is the statistic; with ``of`` it takes the series of those
+    statistics and returns the value per frame.
+    """
+    if perfect is None and direction is Direction.LOWER:
+        perfect = 0.0
+
+    def made(function: Callable[..., Any]) -> Metric:
+        role = {"of": of, "series": function} if of else {"statistic": function}
+        return Metric(
+            name=function.__name__,
+            family=family or function.__module__.rpartition(".")[2],
+            unit=unit,
+            direction=direction,
+            source=source,
+            summary=(function.__doc__ or "").strip().partition("\n")[0].rstrip("."),
+            perfect=perfect,
+            **role,
+            **more,
+        )
+
+    return made

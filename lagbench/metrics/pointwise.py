@@ -2,11 +2,13 @@
 
 The particle of the prediction is the particle of the truth: order matters, and a swapped
 pair is an error even where the picture is the same. On chaotic flows these errors saturate
-at the size of the flow; then vorticity and transport say more.
+at the size of the flow; then vorticity and transport say more, and ``position_rmse_20`` stops
+while most flows can still be followed.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -15,8 +17,7 @@ import numpy as np
 from lagbench.data.writer import MATERIALS
 
 from .frame import Floats, FramePair
-from .metric import Direction, Metric
-from .reductions import FirstFrames, last, mean, root_mean_square
+from .metric import Direction, FirstFrames, Metric, last, mean, metric, root_mean_square
 
 __all__ = ["HORIZONS", "METRICS", "attribute_mse", "mean_absolute_error", "mean_squared_error"]
 
@@ -36,15 +37,15 @@ def mean_absolute_error(error: Floats) -> float:
     return float(np.mean(np.abs(error)))
 
 
+@metric(unit="1", direction=Direction.LOWER, source="Eqs. 4.15, 4.16")
 def attribute_mse(pair: FramePair) -> float:
-    """Return ``L = sum((y - yhat)^2) / (N k)`` over z-scores of (x, y, u, v) (Eqs. 4.15, 4.16).
+    """Mean squared error of standardised position and velocity.
 
-    The means of Eq. 4.15 cancel in the difference. 0 is perfect; 1 is the error of always
-    predicting the mean of train.
+    ``L = sum((y - yhat)^2) / (N k)`` over z-scores of (x, y, u, v); the means of Eq. 4.15 cancel
+    in the difference. 0 is perfect; 1 is the error of always predicting the mean of train.
     """
     std = np.array(pair.scenario.setting.attribute_std)
-    error = np.concatenate([np.mean(pair.position_error**2, axis=0), np.mean(pair.velocity_error**2, axis=0)])
-    return float(np.mean(error / std**2))
+    return float(np.mean(np.concatenate([pair.position_square, pair.velocity_square]) / std**2))
 
 
 def position_error(pair: FramePair) -> Floats:
@@ -61,8 +62,8 @@ def velocity_error(pair: FramePair) -> Floats:
 class ErrorMean:
     """Mean of a particle error over all particles, or over those of one material."""
 
-    error: Callable[[FramePair], Floats]  # the error of all particles, shape [particle, 2]
-    law: Callable[[Floats], float]  # mean_squared_error or mean_absolute_error
+    error: Callable[[FramePair], Floats]  # of all particles, shape [particle, 2]
+    law: Callable[[Floats], float]  # mean squared or mean absolute
     material: str | None = None  # name of a material, None for all
 
     def __call__(self, pair: FramePair) -> float:
@@ -93,7 +94,7 @@ def _errors(
             direction=Direction.LOWER,
             perfect=0.0,
             source=f"Eq. {equation}",
-            summary=f"mean {'squared' if name == 'mse' else 'absolute'} {quantity} error of {whose}",
+            summary=f"Mean {'squared' if name == 'mse' else 'absolute'} {quantity} error of {whose}",
             statistic=statistic,
             applies=statistic.applies,
         )
@@ -104,29 +105,18 @@ def _errors(
         direction=Direction.LOWER,
         perfect=0.0,
         source="Eq. 3.3",
-        summary=f"root mean squared {quantity} error of {whose}",
+        summary=f"Root mean squared {quantity} error of {whose}",
         of=(f"{quantity}_mse{suffix}",),
         series=np.sqrt,
         over_frames=root_mean_square,
     )
 
 
-def _attribute_errors() -> Iterator[Metric]:
-    """Yield ``attribute_mse`` and its mean and end over the rollout and at the horizons."""
-    yield Metric(
-        name="attribute_mse",
-        family="pointwise",
-        unit="1",
-        direction=Direction.LOWER,
-        perfect=0.0,
-        source="Eqs. 4.15, 4.16",
-        summary="mean squared error of standardised position and velocity",
-        statistic=attribute_mse,
-    )
-    whole = {"mse_avg": (mean, "4.17", "mean"), "mse_end": (last, "4.18", "last")}
+def _over_rollouts() -> Iterator[Metric]:
+    """Yield mean and end of ``attribute_mse`` over the rollout and at the horizons."""
+    whole = {"mse_avg": (mean, "4.17", "Mean"), "mse_end": (last, "4.18", "Last")}
     for name, (reduction, equation, word) in whole.items():
         for horizon in (None, *HORIZONS):
-            over = reduction if horizon is None else FirstFrames(horizon, end=reduction is last)
             frames = "the rollout" if horizon is None else f"the first {horizon} frames"
             yield Metric(
                 name=name if horizon is None else f"{name}_{horizon}",
@@ -137,15 +127,31 @@ def _attribute_errors() -> Iterator[Metric]:
                 source=f"Eq. {equation}",
                 summary=f"{word} attribute_mse of {frames}",
                 of=("attribute_mse",),
-                over_frames=over,
+                over_frames=reduction if horizon is None else FirstFrames(horizon, reduction),
                 per_frame=False,
                 horizon=horizon or 1,
             )
 
 
+EARLY = Metric(
+    name="position_rmse_20",
+    family="pointwise",
+    unit="length",
+    direction=Direction.LOWER,
+    perfect=0.0,
+    source="design 2, section 4",
+    summary="Root mean squared position error of the first 20 frames, as LagrangeBench's MSE_20",
+    of=("position_mse",),
+    over_frames=lambda mse: math.sqrt(FirstFrames(20)(mse)),
+    per_frame=False,
+    horizon=20,
+)
+
 METRICS = (
     *(m for name in (None, *MATERIALS) for m in _errors("position", "length", position_error, name)),
+    EARLY,
     *(m for name in (None, *MATERIALS) for m in _errors("velocity", "length/frame", velocity_error, name)),
-    *_attribute_errors(),
+    attribute_mse,
+    *_over_rollouts(),
 )
 """Metrics of this family."""

@@ -8,17 +8,18 @@ constant: a prediction at rest has no correlation, neither good nor bad.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
 from functools import partial
 
 import numpy as np
 
 from .frame import PERCENTILES, Floats, FramePair
-from .metric import Direction, Metric, enough_nodes
+from .metric import Direction, Metric, enough_nodes, mean, metric, quotient, root_mean_square
 from .pointwise import mean_absolute_error, mean_squared_error
-from .reductions import frames_before_fall, root_mean_square
 
-__all__ = ["METRICS", "pearson", "slope"]
+__all__ = ["METRICS", "STABLE_PEARSON", "frames_before_fall", "pearson", "slope"]
+
+STABLE_PEARSON = 0.95
+"""A rollout is stable until the vorticity correlation falls below this; at 0.8 good models saturate."""
 
 CONSTANT = 1e-12
 """A field is constant when its deviation from the mean is below this share of its size."""
@@ -50,129 +51,135 @@ def slope(x: Floats, y: Floats) -> float:
     return math.nan if dx is None else float(np.sum(dx * (y - np.mean(y))) / np.sum(dx**2))
 
 
+def frames_before_fall(values: Floats) -> float:
+    """Return how many defined frames pass before one first lies below :data:`STABLE_PEARSON`.
+
+    Undefined frames neither end the count nor count: standing still is no merit. With none
+    defined the answer is NaN. A rollout that is always defined and never falls gets the whole
+    horizon.
+    """
+    defined = values[~np.isnan(values)]
+    if not defined.size:
+        return math.nan
+    fallen = np.flatnonzero(defined < STABLE_PEARSON)
+    return float(fallen[0] if fallen.size else defined.size)
+
+
+_vorticity = partial(metric, source="Eq. 3.3, Table 5.4", direction=Direction.LOWER)
+
+
+@_vorticity(unit="1/frame^2", defined=enough_nodes)
 def vorticity_mse(pair: FramePair) -> float:
-    """Return ``mean(r^2)`` over the compared nodes [1/frame^2]."""
+    """Mean squared vorticity error over the counted nodes."""
     return mean_squared_error(pair.vorticity_residual)
 
 
+@_vorticity(unit="1/frame", source="Eq. 3.4, Table 5.4", defined=enough_nodes)
 def vorticity_mae(pair: FramePair) -> float:
-    """Return ``mean(|r|)`` over the compared nodes [1/frame]."""
+    """Mean absolute vorticity error over the counted nodes."""
     return mean_absolute_error(pair.vorticity_residual)
 
 
+@_vorticity(unit="1/frame", of=("vorticity_mse",), over_frames=root_mean_square)
+def vorticity_rmse(mse: Floats) -> Floats:
+    """Root mean squared vorticity error over the counted nodes."""
+    return np.sqrt(mse)
+
+
+@metric(unit="1/frame^2", source="design 2, section 4", defined=enough_nodes)
+def vorticity_square_true(pair: FramePair) -> float:
+    """Mean squared vorticity of the truth over the counted nodes."""
+    return mean_squared_error(pair.true_vorticity)
+
+
+@_vorticity(
+    unit="1",
+    source="design 2, section 4",
+    of=("vorticity_mse", "vorticity_square_true"),
+    over_frames=root_mean_square,
+)
+def vorticity_nrmse(mse: Floats, square: Floats) -> Floats:
+    """Vorticity RMSE over the scenario's RMS vorticity: no scenario counts more for being faster.
+
+    Per scenario ``sqrt(sum_f MSE(omega) / sum_f mean(omega_true^2))``. 0 is perfect, 1 the error of
+    a prediction at rest, sqrt(2) that of an unrelated flow of the same strength.
+    """
+    return np.sqrt(quotient(mse, np.full(len(mse), mean(square))))
+
+
+@metric(unit="1", direction=Direction.HIGHER, perfect=1.0, source="Eq. 5.21", defined=enough_nodes)
 def vorticity_pearson(pair: FramePair) -> float:
-    """Return the correlation of predicted with true vorticity (Eq. 5.21) [1]."""
+    """Correlation of predicted and true vorticity."""
     return pearson(pair.true_vorticity, pair.predicted_vorticity)
 
 
+stable_frames = Metric(
+    name="stable_frames",
+    family="vorticity",
+    unit="frame",
+    direction=Direction.HIGHER,
+    source="design 2, section 4",
+    summary=f"Defined frames before vorticity_pearson first falls below {STABLE_PEARSON:g}",
+    of=("vorticity_pearson",),
+    over_frames=frames_before_fall,
+    per_frame=False,
+)
+
+_residual = partial(metric, unit="1/frame", source="Eq. 5.22", defined=enough_nodes)
+_towards_zero = partial(_residual, direction=Direction.TARGET, perfect=0.0)
+
+
+@_towards_zero()
 def vorticity_residual_mean(pair: FramePair) -> float:
-    """Return ``mean(r)``: a bias of the rotation [1/frame]."""
+    """Mean of the vorticity residual r: a bias of the rotation."""
     return float(np.mean(pair.vorticity_residual))
 
 
+@_residual(direction=Direction.LOWER)
 def vorticity_residual_std(pair: FramePair) -> float:
-    """Return the standard deviation of r over the nodes [1/frame]."""
+    """Standard deviation of the residual."""
     return float(np.std(pair.vorticity_residual))
 
 
+@_residual(direction=Direction.LOWER)
 def vorticity_residual_max(pair: FramePair) -> float:
-    """Return ``max(|r|)`` over the nodes [1/frame]."""
+    """Greatest absolute residual."""
     return float(np.max(np.abs(pair.vorticity_residual)))
 
 
-def vorticity_residual_percentile(pair: FramePair, *, percent: int) -> float:
-    """Return a percentile of r, linear between order statistics [1/frame]."""
-    return pair.residual_percentiles[percent]
-
-
+@_towards_zero(unit="1")
 def vorticity_residual_slope(pair: FramePair) -> float:
-    """Return the slope of r on the truth: -1 for a prediction at rest, 0 is perfect [1]."""
+    """Slope of the residual on the truth: -1 for a prediction at rest."""
     return slope(pair.true_vorticity, pair.vorticity_residual)
 
 
-def _residuals() -> Iterator[Metric]:
-    """Yield what is told of the residual (Eq. 5.22): moments, extremes, percentiles, slope."""
-    told: dict[str, tuple[Callable[[FramePair], float], Direction, str, str]] = {
-        "mean": (vorticity_residual_mean, Direction.TARGET, "1/frame", "mean of the vorticity residual"),
-        "std": (vorticity_residual_std, Direction.LOWER, "1/frame", "standard deviation of the residual"),
-        "max": (vorticity_residual_max, Direction.LOWER, "1/frame", "greatest absolute residual"),
-        "slope": (vorticity_residual_slope, Direction.TARGET, "1", "slope of the residual on the truth"),
-    }
-    for percent in PERCENTILES:
-        statistic = partial(vorticity_residual_percentile, percent=percent)
-        summary = f"{percent} % quantile of the residual"
-        told[f"p{percent:02d}"] = (statistic, Direction.TARGET, "1/frame", summary)
-    for name, (told_by, direction, unit, text) in told.items():
-        yield Metric(
-            name=f"vorticity_residual_{name}",
-            family="vorticity",
-            unit=unit,
-            direction=direction,
-            perfect=0.0,
-            source="Eq. 5.22",
-            summary=text,
-            statistic=told_by,
-            defined=enough_nodes,
-        )
-
-
-METRICS = (
-    Metric(
-        name="vorticity_mse",
-        family="vorticity",
-        unit="1/frame^2",
-        direction=Direction.LOWER,
-        perfect=0.0,
-        source="Eq. 3.3, Table 5.4",
-        summary="mean squared vorticity error over the counted nodes",
-        statistic=vorticity_mse,
-        defined=enough_nodes,
-    ),
-    Metric(
-        name="vorticity_mae",
+def _percentile(percent: int) -> Metric:
+    """Return a percentile of the residual, linear between order statistics."""
+    return Metric(
+        name=f"vorticity_residual_p{percent:02d}",
         family="vorticity",
         unit="1/frame",
-        direction=Direction.LOWER,
+        direction=Direction.TARGET,
         perfect=0.0,
-        source="Eq. 3.4, Table 5.4",
-        summary="mean absolute vorticity error over the counted nodes",
-        statistic=vorticity_mae,
+        source="Eq. 5.22",
+        summary=f"{percent} % quantile of the residual",
+        statistic=lambda pair: pair.residual_percentiles[percent],
         defined=enough_nodes,
-    ),
-    Metric(
-        name="vorticity_rmse",
-        family="vorticity",
-        unit="1/frame",
-        direction=Direction.LOWER,
-        perfect=0.0,
-        source="Eq. 3.3, Table 5.4",
-        summary="root mean squared vorticity error over the counted nodes",
-        of=("vorticity_mse",),
-        series=np.sqrt,
-        over_frames=root_mean_square,
-    ),
-    Metric(
-        name="vorticity_pearson",
-        family="vorticity",
-        unit="1",
-        direction=Direction.HIGHER,
-        perfect=1.0,
-        source="Eq. 5.21",
-        summary="correlation of predicted and true vorticity",
-        statistic=vorticity_pearson,
-        defined=enough_nodes,
-    ),
-    Metric(
-        name="stable_frames",
-        family="vorticity",
-        unit="frame",
-        direction=Direction.HIGHER,
-        source="design section 8",
-        summary="defined frames before vorticity_pearson first falls below 0.8",
-        of=("vorticity_pearson",),
-        over_frames=frames_before_fall,
-        per_frame=False,
-    ),
-    *_residuals(),
+    )
+
+
+METRICS: tuple[Metric, ...] = (
+    vorticity_mse,
+    vorticity_mae,
+    vorticity_rmse,
+    vorticity_square_true,
+    vorticity_nrmse,
+    vorticity_pearson,
+    stable_frames,
+    vorticity_residual_mean,
+    vorticity_residual_std,
+    vorticity_residual_max,
+    vorticity_residual_slope,
+    *map(_percentile, PERCENTILES),
 )
 """Metrics of this family."""

@@ -10,8 +10,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.metrics import Direction, Metric, Score, bootstrap_interval
-from lagbench.metrics.reductions import mean
+from lagbench.metrics import Direction, Metric, Score, bootstrap_interval, mean
 
 from .chart import Bar, Plot, Scale, bar_chart, linear, spanning
 from .html import Markup, clipped, html, join, quantity, sentence, tag, text, words

@@ -121,7 +121,7 @@ class Subject:
     @property
     def full_box(self) -> bool:
         """Whether the material fills the box: no surface, one material."""
-        return self.ranking.name == "vorticity_rmse"
+        return self.exam.setting.full_box
 
     @property
     def scenarios(self) -> tuple[int, ...]:
@@ -314,7 +314,7 @@ def _walls(truth: OpenScenario) -> Walls:
     file = truth.file
     speed = np.zeros((4, 2))
     if "wall_velocity" in file.variables:
-        speed = np.asarray(file.read("wall_velocity", 0), np.float64) * _ALONG
+        speed = np.abs(np.asarray(file.read("wall_velocity"), np.float64)).max(axis=0) * _ALONG
     parameters = file.header.parameters
     reynolds = parameters.get("reynolds_number")
     marks = [str(parameters[name]) for name in ("family", "pair") if name in parameters]

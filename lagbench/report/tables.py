@@ -11,9 +11,19 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from lagbench.metrics import FAMILIES, Direction, Metric, Score, bootstrap_interval, compare, shared_ranks
-from lagbench.metrics.comparison import FEWEST_SCENARIOS
-from lagbench.metrics.reductions import STABLE_PEARSON, mean
+from lagbench.metrics import (
+    CHOSEN,
+    FAMILIES,
+    Direction,
+    Metric,
+    Score,
+    bootstrap_interval,
+    compare,
+    mean,
+    standings,
+)
+from lagbench.metrics.significance import FEWEST_SCENARIOS
+from lagbench.metrics.vorticity import STABLE_PEARSON
 from lagbench.scoring.flags import Flag
 from lagbench.submission import Finding
 
@@ -35,27 +45,8 @@ __all__ = [
 ]
 
 
-CHOSEN = (
-    "vorticity_rmse",
-    "vorticity_pearson",
-    "stable_frames",
-    "vorticity_kl",
-    "vorticity_w1",
-    "mse_avg",
-    "mse_end",
-    "position_rmse",
-    "velocity_rmse",
-    "energy_error",
-    "energy_ratio",
-    "density_rmse",
-    "momentum_error",
-    "shape_error",
-    "connectivity",
-)
-"""Metrics of the first table, after the one that ranks."""
-
 AT_FRAMES = ("vorticity_mae", "vorticity_mse", "vorticity_rmse", "vorticity_pearson", "vorticity_kl")
-AT_FRAMES_FREE = ("attribute_mse", "position_rmse", "velocity_rmse", "energy_ratio", "vorticity_pearson")
+AT_FRAMES_FREE = ("sliced_w2", "position_rmse", "attribute_mse", "velocity_rmse", "energy_ratio")
 
 _WORDS = {
     Direction.LOWER: "lower is better",
@@ -156,33 +147,41 @@ def scenario_table(subject: Subject) -> Markup:
 
 def verdict_table(subject: Subject) -> Markup:
     """Return how all compare with the leader: exact sign-flip test over scenarios."""
-    name, leader = subject.ranking.name, subject.leader
-    ranks = shared_ranks({row.name: row.scores[name] for row in subject.rows})
+    name = subject.ranking.name
+    by_name = {row.name: row for row in subject.rows}
+    placed = standings({row.name: row.scores[name] for row in subject.rows})
+    leader = by_name[next(iter(placed))]
     cells = []
-    for row in sorted(subject.rows, key=lambda row: (ranks[row.name], row is not leader)):
-        found, same = compare(row.scores[name], leader.scores[name]), row is leader
+    for method, place in placed.items():
+        row, same = by_name[method], place.rank == 1
+        found = compare(row.scores[name], leader.scores[name])
         cells.append(
             [
                 _heading(row),
-                str(ranks[row.name]),
+                str(place.rank),
                 html(row.scores[name].mean),
                 tag("span", "leader", class_="muted") if same else html(found.difference),
                 "" if same else interval(found.interval),
-                "" if same else html(found.p),
+                "" if same else html(place.p),
+                tag("span", "no", class_="muted") if place.tied else "" if same else "yes",
             ]
         )
-    head = ["method", "rank", words(name), "loss above leader", "95 % interval", "p"]
+    head = ["method", "rank", words(name), "loss above leader", "95 % interval", "p", "told from the leader"]
     count = len(subject.scenarios)
-    note = (
-        f"Under {FEWEST_SCENARIOS} scenarios no significance is claimed and all share the leader's rank."
-        if count < FEWEST_SCENARIOS
-        else "Methods that do not differ from the leader at 5 % share its rank."
+    few = f" Under {FEWEST_SCENARIOS} scenarios nothing is claimed." if count < FEWEST_SCENARIOS else ""
+    test = (
+        f"p: exact two-sided sign-flip test over {count} scenarios, corrected by Holm for the comparisons"
+        f" with the leader. It is about these weights: other seeds may stand otherwise.{few}"
     )
-    test = f"p: exact two-sided sign-flip test over {count} scenarios. {note}"
     return join([table(head, cells, label="Comparison"), paragraph(tag("small", test, class_="muted"))])
 
 
-TILES = ("vorticity_pearson", "position_rmse", "energy_error", "stable_frames")
+TILES = ("vorticity_pearson", "stable_frames", "spectrum_error", "position_rmse_20", "outside_share")
+
+TILE_NOTES = {
+    "spectrum_error": "decades of energy, at the frames of interest",
+    "position_rmse_20": "particle by particle, first 20 frames",
+}
 
 
 def title(subject: Subject) -> str:
@@ -228,7 +227,7 @@ def _tiles(subject: Subject) -> Iterator[Markup]:
         elif name == "vorticity_pearson":
             yield _at_frame(subject, score)
         else:
-            yield _tile(words(name), score, "mean over the horizon")
+            yield _tile(words(name), score, TILE_NOTES.get(name, "mean over the horizon"))
 
 
 def _stable_of(score: Score) -> str:

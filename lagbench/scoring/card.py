@@ -21,10 +21,20 @@ import numpy as np
 from lagbench.atomic import write_atomically
 from lagbench.data.statistics import round_digits
 from lagbench.errors import UnreadableFileError
-from lagbench.metrics import Comparison, Metric, Score, Setting, Tally, available, bootstrap_interval, compare
-from lagbench.metrics.reductions import mean
+from lagbench.metrics import (
+    Comparison,
+    Metric,
+    Score,
+    Setting,
+    Tally,
+    available,
+    bootstrap_interval,
+    compare,
+    mean,
+)
 from lagbench.submission import Finding, Header
-from lagbench.submission.format_checks import MAX_NAME
+from lagbench.submission.format import MAX_NAME
+from lagbench.submission.hdf5 import check_regular
 
 from .flags import Flag
 from .scenario import SUBMISSION, Preview
@@ -200,6 +210,10 @@ def write_json(card: ScoreCard, path: Path) -> None:
     write_atomically(path, f"{text}\n".encode(), option="--output")
 
 
+MAX_BYTES = 64 << 20
+"""Longest scores.json that is read [bytes]; those of ours take less than 2 MB."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PublishedScores:
     """What a scores.json says, as far as another submission can be compared with it."""
@@ -213,6 +227,7 @@ class PublishedScores:
 
 def read_scores(path: Path) -> PublishedScores:
     """Read a scores.json; metrics that are not installed here are left out."""
+    check_regular(path, longest=MAX_BYTES, fix="`lagbench score` writes it")
     try:
         return parse_scores(json.loads(path.read_bytes()))
     except (OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError) as error:
@@ -277,13 +292,16 @@ def _read_score(metric: Metric, ids: tuple[int, ...], said: Mapping[str, Any]) -
 
 
 def _integer(number: object, what: str) -> int:
-    if not isinstance(number, int) or not 0 <= number < 2**31:
+    if not isinstance(number, int) or isinstance(number, bool) or not 0 <= number < 2**31:
         raise ValueError(f"{what} is no integer from 0 to 2^31 - 1")
     return int(number)
 
 
 def _floats(values: Iterable[float | None]) -> list[float]:
-    found = [math.nan if value is None else float(value) for value in values]
+    held = list(values)
+    found = [math.nan if value is None else float(value) for value in held]
+    if any(isinstance(value, bool) for value in held):
+        raise ValueError("a value that is no number")
     if any(math.isinf(value) for value in found):
         raise ValueError("an infinite value")
     return found

@@ -1,25 +1,27 @@
-"""Compare two submissions over the test scenarios: ``lagbench compare A B``.
+"""Compare two methods over the test scenarios: ``lagbench compare A B``.
 
-The scenarios are the sample, paired by id. The exact sign-flip test needs six of them before
-5 % can be reached; with fewer no significance is claimed and the intervals speak alone.
-
-Names of methods that stand beside each other.
+The scenarios are the sample, paired by id; so are seeds, where a side is a folder of several.
+Six scenarios are needed before 5 % can be reached; with fewer no significance is claimed and
+the intervals speak alone. With one seed on each side these weights are compared, not methods.
 """
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from lagbench.data.registry import Registry
 from lagbench.errors import DataError, UnreadableFileError, UsageError, nearest
-from lagbench.metrics import Comparison, Direction, Score
+from lagbench.metrics import Comparison, Direction, Score, mean
 from lagbench.metrics import compare as compare_scores
-from lagbench.metrics.comparison import FEWEST_SCENARIOS
-from lagbench.submission.format_checks import MAX_NAME
+from lagbench.metrics.significance import FEWEST_SCENARIOS
+from lagbench.submission.format import MAX_NAME
 
 from .card import JSON_NAME, PublishedScores, digits, parse_scores, read_scores
 from .scenario import SUBMISSION
@@ -58,34 +60,35 @@ class Contestant:
 
     name: str  # what the user called it
     identity: Mapping[str, str]  # split, size, version and hash of the data set, and the method
-    predictions_sha256: str  # content hash of the predicted positions
+    predictions: tuple[str, ...]  # content hash of the predicted positions, by seed
     ranking: str  # name of the metric that ranks
-    scores: Mapping[str, Score]  # scores by metric
+    scores: Mapping[str, tuple[Score, ...]]  # of each seed, by metric
+    floors: Mapping[str, Mapping[str, Score]]  # rows scored beside it
 
 
 @dataclass(frozen=True, kw_only=True)
 class MetricComparison:
-    """Two submissions in one metric."""
+    """Two methods in one metric."""
 
-    unit: str  # unit of the means
-    first: float  # mean of the first over scenarios
+    unit: str  # of the means
+    first: float  # mean of the first over seeds and scenarios
     second: float  # mean of the second
     test: Comparison  # difference, interval and p-value, in the metric's loss
 
 
 @dataclass(frozen=True, kw_only=True)
 class ComparisonResult:
-    """How two submissions compare."""
+    """How two methods compare."""
 
-    split: str  # split of both
-    size: str  # size of both
+    split: str  # of both
+    size: str  # of both
     first: str  # method of the first, told apart from that of the second
     second: str  # method of the second, likewise, or the name of the floor
     same_predictions: bool  # whether both hold the same positions
     ranking: str  # name of the metric that ranks
-    scenarios: int  # how many scenarios both have in that metric
-    # comparison by metric, the ranking one first; observables are left out
-    metrics: Mapping[str, MetricComparison]
+    scenarios: int  # how many both have in that metric
+    seeds: tuple[int, int]  # of either side
+    metrics: Mapping[str, MetricComparison]  # the ranking one first; observables are left out
 
     @property
     def verdict(self) -> str:
@@ -99,9 +102,17 @@ class ComparisonResult:
                 " read the intervals"
             )
         if not said.significant:
-            return f"{self.ranking}: no difference at 5 % (p = {said.p:.3g}, {self.scenarios} scenarios)"
+            return f"{self.ranking}: no difference at 5 % ({self._sample})"
         better = self.first if said.difference < 0.0 else self.second
-        return f"{self.ranking}: {better} is better (p = {said.p:.3g}, {self.scenarios} scenarios)"
+        return f"{self.ranking}: {better} is better ({self._sample})"
+
+    @property
+    def _sample(self) -> str:
+        """What a verdict rests on, and what it is about."""
+        p, one, two = self.metrics[self.ranking].test.p, *self.seeds
+        single = one == two == 1
+        what = "one seed each: these weights, not the methods" if single else f"{one} and {two} seeds"
+        return f"p = {p:.3g}, {self.scenarios} scenarios, {what}"
 
     def as_json(self) -> dict[str, Any]:
         """Return the comparison as plain values; what is undefined is None."""
@@ -119,7 +130,8 @@ class ComparisonResult:
             for name, found in self.metrics.items()
         }
         fields = ("split", "size", "first", "second", "same_predictions", "ranking", "scenarios", "verdict")
-        return {**{name: getattr(self, name) for name in fields}, "metrics": metrics}
+        held = {name: getattr(self, name) for name in fields}
+        return {**held, "seeds": list(self.seeds), "metrics": metrics}
 
 
 def compare(
@@ -131,10 +143,11 @@ def compare(
     workers: int | None = None,
     registry: Registry | None = None,
 ) -> ComparisonResult:
-    """Compare two submissions to the same split, size and data set.
+    """Compare two methods on the same split, size and data set.
 
     Args:
-        first: a scores.json, a folder that holds one, or a predictions.nc, which is then scored.
+        first: a scores.json, a folder that holds one, a folder whose folders hold those of the
+            seeds of a method, or a predictions.nc, which is then scored.
         second: another; or the name of a floor, which stands in the first's scores.
         metrics: metrics to compare; by default all that judge.
         root: folder of all data sets, where predictions are to be scored.
@@ -146,12 +159,9 @@ def compare(
         DataError: they belong to data sets of different hashes.
         UnreadableFileError: a file is neither scores nor predictions.
     """
-    one, floors = _contestant(first, root, workers, registry)
-    floor = str(second) if str(second) in floors else None
-    if floor is not None:
-        two = _floor(one, floor, floors[floor])
-    else:
-        two, _ = _contestant(second, root, workers, registry)
+    one = _contestant(first, root, workers, registry)
+    floor = str(second) if str(second) in one.floors else None
+    two = _contestant(second, root, workers, registry) if floor is None else _floor(one, floor)
     _check_same(one, two)
     judged = _judged(one, two)
     methods = one.identity["method"], two.identity["method"]
@@ -164,34 +174,56 @@ def compare(
         size=one.identity["size"],
         first=names[0],
         second=names[1],
-        same_predictions=one.predictions_sha256 == two.predictions_sha256,
+        same_predictions=set(one.predictions) == set(two.predictions),
         ranking=one.ranking,
         scenarios=len(found[one.ranking].test.scenarios),
+        seeds=(len(one.predictions), len(two.predictions)),
         metrics=found,
     )
 
 
 def _contestant(
     source: str | Path, root: str | Path | None, workers: int | None, registry: Registry | None
-) -> tuple[Contestant, Mapping[str, Mapping[str, Score]]]:
-    """Return a submission and the floors scored beside it."""
-    path = Path(source)
-    if path.is_dir():
-        path = path / JSON_NAME
-    held = read_scores(path) if path.suffix == ".json" else _scored(path, root, workers, registry)
-    if SUBMISSION not in held.scores:
-        raise _incomplete(
-            str(path), f"a row {SUBMISSION!r}", ", ".join(map(repr, list(held.scores)[:10]))[:MAX_NAME]
+) -> Contestant:
+    """Return a method with the scores of its seeds, and the floors beside the first of them."""
+    held = []
+    for path in _seeds_of(Path(source)):
+        found = read_scores(path) if path.suffix == ".json" else _scored(path, root, workers, registry)
+        if SUBMISSION not in found.scores:
+            raise _incomplete(
+                str(path), f"a row {SUBMISSION!r}", ", ".join(map(repr, list(found.scores)[:10]))[:MAX_NAME]
+            )
+        held.append(found)
+    first = held[0]
+    sides = [
+        Contestant(
+            name=f"{source} ({one.identity['method']})" if len(held) > 1 else str(source),
+            identity=one.identity,
+            predictions=(one.predictions_sha256,),
+            ranking=one.ranking,
+            scores={name: (score,) for name, score in one.scores[SUBMISSION].items()},
+            floors={row: scores for row, scores in one.scores.items() if row != SUBMISSION},
         )
-    floors = {row: scores for row, scores in held.scores.items() if row != SUBMISSION}
-    contestant = Contestant(
+        for one in held
+    ]
+    for side in sides[1:]:
+        _check_same(sides[0], side, more=("method",))
+    common = [name for name in first.scores[SUBMISSION] if all(name in side.scores for side in sides)]
+    return replace(
+        sides[0],
         name=str(source),
-        identity=held.identity,
-        predictions_sha256=held.predictions_sha256,
-        ranking=held.ranking,
-        scores=held.scores[SUBMISSION],
+        predictions=tuple(one.predictions_sha256 for one in held),
+        scores={name: tuple(side.scores[name][0] for side in sides) for name in common},
     )
-    return contestant, floors
+
+
+def _seeds_of(path: Path) -> list[Path]:
+    """Return the score files of a folder: its own, or those of its folders; else the path itself."""
+    if not os.path.isdir(path):  # unlike Path.is_dir, it takes any name
+        return [path]
+    if (path / JSON_NAME).is_file():
+        return [path / JSON_NAME]
+    return sorted(path.glob(f"*/{JSON_NAME}")) or [path / JSON_NAME]
 
 
 def _scored(
@@ -202,18 +234,18 @@ def _scored(
     return parse_scores(card.as_json())
 
 
-def _floor(beside: Contestant, name: str, scores: Mapping[str, Score]) -> Contestant:
-    return Contestant(
+def _floor(beside: Contestant, name: str) -> Contestant:
+    return replace(
+        beside,
         name=name,
         identity={**beside.identity, "method": name},
-        predictions_sha256="",
-        ranking=beside.ranking,
-        scores=scores,
+        predictions=("",),
+        scores={metric: (score,) for metric, score in beside.floors[name].items()},
     )
 
 
-def _check_same(one: Contestant, two: Contestant) -> None:
-    for key in SAME:
+def _check_same(one: Contestant, two: Contestant, *, more: tuple[str, ...] = ()) -> None:
+    for key in (*SAME, *more):
         first, second = one.identity[key], two.identity[key]
         if first != second:
             kind = DataError if key == "dataset_sha256" else UsageError
@@ -222,13 +254,14 @@ def _check_same(one: Contestant, two: Contestant) -> None:
                 where=f"{one.name} and {two.name}",
                 expected=first,
                 got=second,
-                fix="compare submissions to the same split, size and data set",
+                fix="compare submissions to the same split, size and data set"
+                + (", and keep the seeds of each method in a folder of its own" if more else ""),
             )
 
 
 def _judged(one: Contestant, two: Contestant) -> list[str]:
     """Return the names of the metrics to compare by, the ranking one of the first among them."""
-    judging = [name for name, held in one.scores.items() if held.metric.direction is not Direction.NONE]
+    judging = [name for name, held in one.scores.items() if held[0].metric.direction is not Direction.NONE]
     for side, names in ((one, judging), (two, two.scores)):
         if one.ranking not in names:
             raise _incomplete(side.name, f"values of a ranking metric that judges, {one.ranking!r}", None)
@@ -251,10 +284,8 @@ def _known(name: str, judged: Collection[str]) -> str:
     return name
 
 
-def _compared(first: Score, second: Score) -> MetricComparison:
+def _compared(first: tuple[Score, ...], second: tuple[Score, ...]) -> MetricComparison:
+    one, two = (mean(np.array([score.mean for score in side])) for side in (first, second))
     return MetricComparison(
-        unit=first.metric.unit,
-        first=first.mean,
-        second=second.mean,
-        test=compare_scores(first, second),
+        unit=first[0].metric.unit, first=one, second=two, test=compare_scores(first, second)
     )

@@ -26,8 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.grid import counted_nodes
-from lagbench.metrics import FramePair, Scenario
-from lagbench.metrics.reductions import mean
+from lagbench.metrics import FramePair, Scenario, mean
+from lagbench.metrics.frame import dot, mean_square
 
 __all__ = [
     "SHIFTS",
@@ -60,7 +60,7 @@ class Trace:
     # nor given, shape [frame]
     shifted: Mapping[int, Floats]
     occupancy: Floats  # nodes that the prediction fills over those that the truth fills [1], shape [frame]
-    outside: Floats  # share of particles outside the unit box [1], shape [frame]
+    outside: Floats  # share of particles past a wall [1], shape [frame]
 
     def __reduce__(self) -> tuple[object, ...]:
         """Cross process borders, which a mapping proxy does not."""
@@ -86,17 +86,17 @@ class Tracer:
         i = pair.frame - self._first
         true, predicted, error = pair.truth.position, pair.prediction.position, pair.position_error
         series = self._series
-        series["error"][i] = np.mean(error**2)
+        series["error"][i] = np.mean(pair.position_square)
         if self._error is not None:
-            series["overlap"][i] = np.mean(error * self._error)
-        series["motion"][i] = np.mean(pair.truth.velocity**2)
-        series["predicted_motion"][i] = np.mean(pair.prediction.velocity**2)
+            series["overlap"][i] = sum(map(dot, error.T, self._error.T)) / error.size
+        series["motion"][i] = pair.truth.speed_square / error.size
+        series["predicted_motion"][i] = pair.prediction.speed_square / error.size
         series["occupancy"][i] = _occupancy(pair)
-        series["outside"][i] = np.mean(((predicted < 0.0) | (predicted > 1.0)).any(axis=1))
+        series["outside"][i] = pair.outside
         for back, earlier in enumerate(reversed(self._true), start=1):
-            self._shifted[-back][i] = np.mean((predicted - earlier) ** 2)
+            self._shifted[-back][i] = np.mean(mean_square(predicted - earlier))
         for back, earlier in enumerate(reversed(self._predicted), start=1):
-            self._shifted[back][i - back] = np.mean((earlier - true) ** 2)
+            self._shifted[back][i - back] = np.mean(mean_square(earlier - true))
         self._true.append(true)
         self._predicted.append(predicted)
         self._error = error

@@ -47,6 +47,7 @@ def score(
     examined: Callable[[ValidationResult], None] | None = None,
     registry: Registry | None = None,
     write: bool = True,
+    validated: ValidationResult | None = None,
 ) -> ScoreCard:
     """Score a submission and write scores.json and scores.nc.
 
@@ -61,6 +62,8 @@ def score(
         examined: told what the validation found, before anything is raised for it.
         registry: where splits are described; ours when None.
         write: whether to write the two files.
+        validated: what :func:`lagbench.validate` with ``require_truth`` said of this very file and
+            root, if it was asked before; the file is not validated again.
 
     Returns:
         The score card; ``files`` names what was written.
@@ -77,14 +80,16 @@ def score(
     path, holder = Path(predictions).absolute(), resolve_root(root)
     described = rooted(holder, registry)
     folder = Path(predictions).parent if output_dir is None else Path(output_dir)
-    result = validate(path, root=holder, require_truth=True, registry=described)
+    result = validated or validate(path, root=holder, require_truth=True, registry=described)
+    if result.path != path:
+        raise UsageError("the validation is of another file", where=str(path), got=result.path)
     if examined is not None:
         examined(result)
     result.check()
     if write:
         check_writable(folder, option="--output")
     with open_predictions(path) as opened:
-        header, content = opened.header, opened.content_sha256()
+        header, content = opened.header, result.sha256 or opened.content_sha256()
     exam = load_scored_task(described.size(header.split, header.size), holder)
     known = shipped(exam.size) or {}
     floors = () if known else measurable(exam.size, holder)

@@ -6,8 +6,7 @@ import math
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 
-from lagbench.metrics import Direction, Score
-from lagbench.metrics.reductions import mean
+from lagbench.metrics import CHOSEN, Direction, Score, mean
 
 from .card import ScoreCard
 from .compare import ComparisonResult
@@ -22,18 +21,10 @@ __all__ = [
 ]
 
 
-SHOWN = (
-    *("vorticity_rmse", "vorticity_pearson", "stable_frames", "vorticity_kl", "vorticity_w1"),
-    *("position_rmse", "velocity_rmse", "mse_avg", "mse_end"),
-    *("energy_ratio", "energy_error", "momentum_error", "angular_momentum_error"),
-    *("density_rmse", "divergence_rms", "divergence_rms_true"),
-    *("shape_error", "connectivity", "sliced_w2", "sinkhorn"),
-)
-"""Metrics in the short table, the ranking one aside."""
-
 SHOWN_AT_FRAMES = (
     *("vorticity_mse", "vorticity_mae", "vorticity_rmse", "vorticity_pearson", "vorticity_kl"),
-    *("vorticity_w1", "position_rmse", "attribute_mse", "energy_ratio", "sliced_w2"),
+    *("vorticity_w1", "spectrum_error", "position_rmse", "attribute_mse", "energy_ratio"),
+    *("outside_share", "sliced_w2"),
 )
 """Metrics in the table of frames of interest."""
 
@@ -56,7 +47,7 @@ def card_tables(card: ScoreCard, *, every: bool = False) -> Iterator[Table]:
         card: the score card.
         every: whether to show all metrics instead of the chosen ones.
     """
-    names = list(card.submission) if every else _ranked_first(card, SHOWN)
+    names = list(card.submission) if every else _ranked_first(card, CHOSEN)
     at_frames = [n for n in names if card.submission[n].metric.per_frame] if every else SHOWN_AT_FRAMES
     task = f"{card.header.split} {card.header.size}, {card.setting.horizon} frames"
     yield _over_horizon(card, names, f"{card.header.method} on {task}, mean over scenarios")
@@ -170,7 +161,7 @@ def comparison_table(result: ComparisonResult, *, every: bool = False) -> Table:
     """
     rows = []
     for name, found in result.metrics.items():
-        if not every and name not in (result.ranking, *SHOWN):
+        if not every and name not in (result.ranking, *CHOSEN):
             continue
         low, high = found.test.interval
         rows.append(

@@ -10,8 +10,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lagbench.data.grid import Grid, Placement
 from lagbench.data.local import remedy
@@ -21,15 +23,20 @@ from lagbench.data.scenario import ScenarioFile
 from lagbench.data.writer import MATERIALS
 from lagbench.errors import DataError
 from lagbench.metrics import Scenario, Setting, Snapshot, snapshots
-from lagbench.store.bringing import bring
+from lagbench.store.copy import bring
 from lagbench.submission.truth import Truth
 
 __all__ = [
+    "RANKING",
     "ScoredTask",
     "OpenScenario",
     "load_scored_task",
     "ranking_metric",
 ]
+
+
+BLOCK_BYTES = 1 << 20
+"""True positions are read in blocks of about this size: a call for each frame costs more than its bytes."""
 
 
 @dataclass(frozen=True)
@@ -40,9 +47,14 @@ class OpenScenario:
     file: ScenarioFile
 
     def snapshots(self) -> Iterator[Snapshot]:
-        """Yield the true snapshots of the predicted frames, two in memory at a time."""
+        """Yield the true snapshots of the predicted frames, a block in memory at a time."""
+        return snapshots(self.scenario, self._frames())
+
+    def _frames(self) -> Iterator[NDArray[np.float32]]:
         numbers = self.scenario.setting.predicted_frames
-        return snapshots(self.scenario, (self.file.read("position", frame) for frame in numbers))
+        step = max(1, BLOCK_BYTES // (8 * len(self.scenario.material)))
+        for first in numbers[::step]:
+            yield from self.file.read("position", slice(first, min(first + step, numbers.stop)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,14 +89,20 @@ class ScoredTask:
                 material=material,
                 particle_mass=mass,
                 area=mass * len(material) / self.density,
+                active_frames=_active_frames(file),
             )
             yield OpenScenario(held, file)
 
 
+RANKING: Mapping[Placement, str] = MappingProxyType(
+    {Placement.CELL_CENTRES: "vorticity_nrmse", Placement.NODES: "cloud_distance"}
+)
+"""Metric that ranks: of vorticity where the material fills the box, of clouds where it has a surface."""
+
+
 def ranking_metric(size: Size) -> str:
-    """Return the metric that ranks: of vorticity in a full box, of particles elsewhere."""
-    full_box = Placement(size.task.score_grid.placement) is Placement.CELL_CENTRES
-    return "vorticity_rmse" if full_box else "mse_avg"
+    """Return the metric that ranks."""
+    return RANKING[Placement(size.task.score_grid.placement)]
 
 
 def load_scored_task(size: Size, root: Path) -> ScoredTask:
@@ -92,10 +110,11 @@ def load_scored_task(size: Size, root: Path) -> ScoredTask:
     bring(size, root, size.subsets["test"])
     truth = Truth(size, root)
     truth.require()
+    truth.check()
     test = sorted(size.subsets["test"])
     present = set().union(*(_materials(truth, scenario) for scenario in test))
     manifest = None if size.measured else read_manifest(root, size.split, size.name, size.major)
-    task, (x, y) = size.task, size.bounds
+    task = size.task
     return ScoredTask(
         truth=truth,
         density=float(size.value("density")),
@@ -108,9 +127,17 @@ def load_scored_task(size: Size, root: Path) -> ScoredTask:
             attribute_std=_attribute_std(size, root, manifest),
             radius=task.radius,
             materials=tuple(name for name in MATERIALS if name in present),
-            centre=((x[0] + x[1]) / 2.0, (y[0] + y[1]) / 2.0),
+            bounds=size.bounds,
         ),
     )
+
+
+def _active_frames(file: ScenarioFile) -> int | None:
+    """Return how many predicted frames pass until the truth rests, None where the file does not say."""
+    stated = file.header.parameters.get("active_frames")
+    if stated is None or (isinstance(stated, int | np.integer) and stated >= 0):
+        return None if stated is None else int(stated)
+    raise DataError("active_frames is no number of frames", where=str(file.path), expected=">= 0", got=stated)
 
 
 def _materials(truth: Truth, scenario: int) -> set[str]:

@@ -1,6 +1,7 @@
-"""Data sets in an object store: objects by URL, their lock, the working copy that files are read from.
+"""Data sets in a store, which is any root that is a URL: ``s3://``, ``https://``, ``file://`` and others.
 
 ``--root s3://bucket/prefix`` means a folder of the user's cache that holds copies of the store's
-objects, see :mod:`lagbench.data.layout`. :mod:`.bringing` fills it for readers,
-:mod:`.publication` empties it into the store for writers. docs/scaling.md has the rules.
+objects, see :mod:`lagbench.data.layout`. *Fetching* moves bytes over a line (:mod:`.fetch`),
+*bringing* puts what is fetched and right into the working copy (:mod:`.copy`), a *publication* puts
+it back (:mod:`.publication`); :mod:`.objects` opens, lists and puts. docs/scaling.md has the rules.
 """

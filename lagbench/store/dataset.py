@@ -50,7 +50,7 @@ def load_manifest(split: str, *, size: str = "full", root: str | Path | None = N
     """
     from lagbench.data.manifest import read_manifest
 
-    from .bringing import bring
+    from .copy import bring
 
     entry, folder, _ = locate(split, size, root=root)
     bring(entry, folder)
@@ -92,7 +92,7 @@ def open_split(
     """
     import xarray as xr
 
-    from .bringing import bring
+    from .copy import bring
 
     entry, folder, _ = locate(split, size, root=root)
     if subset not in entry.subsets:

@@ -1,29 +1,37 @@
 """Write a data set to a store: whole objects first, the manifest that names them last.
 
-The data set's lock in the store is held all the while. What the store holds and is right is
-neither simulated nor fetched. Objects are put as they are finished; now and then, after
-them, and at the end, after the cards, comes the manifest, so that a machine that is lost costs
-little and the manifest never names an object that is not there.
+What the store holds and is right is neither simulated nor fetched. Objects are put as they are
+finished; now and then, after them, and at the end, after the cards, comes the manifest, so that a
+machine that is lost costs little and the manifest never names an object that is not there. There
+is no lock: whoever writes a scenario writes the same bits, and a manifest that is put keeps what
+another writer's names.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from lagbench.data.checksums import file_sha256
 from lagbench.data.layout import MANIFEST_NAME, dataset_folder, url_of
-from lagbench.data.manifest import FileEntry, Manifest, merge, write_manifest
+from lagbench.data.manifest import FileEntry, Manifest, write_manifest
 from lagbench.data.registry import Size
 from lagbench.errors import DataError, LagbenchError
 
-from .bringing import is_right, local_manifest, merged, remote_manifest, writing
-from .fetching import fetch_scenarios
-from .lease import Lease, lease
-from .mirror_errors import NotDataError
-from .remote import Remote
+from .copy import (
+    fetch_entries,
+    folder_of,
+    is_here,
+    is_right,
+    join,
+    merged,
+    remote_manifest,
+    with_local,
+    writing,
+)
+from .objects import NotDataError, Objects
 
 __all__ = ["Publication", "look_at", "publication"]
 
@@ -34,42 +42,40 @@ EVERY = 10.0
 class Publication:
     """A data set in a store, and the working copy that it is written from."""
 
-    def __init__(self, size: Size, root: Path, remote: Remote, lock: Lease | None) -> None:
-        self._size, self._root, self._remote, self._lock = size, root, remote, lock
+    def __init__(self, size: Size, root: Path, url: str) -> None:
+        self._size, self._root = size, root
         self._folder = dataset_folder(root, size.split, size.name, size.major)
-        self._names = remote.sizes()
-        found = self._read_manifest()
-        # entries of the scenarios that the store holds and that are right, by id
-        self.held = {
-            e.scenario: e
-            for e in found.files
-            if is_right(e, size, found) and self._names.get(e.path) == e.bytes
-        }
+        self._objects = Objects(url, folder_of(size))
+        lengths = self._objects.sizes()
+        self._named = self._latest = self._read_manifest()
+        # Entries of the scenarios that the store holds and that are right, by id.
+        self.held = {e.scenario: e for e in self._right(self._named) if lengths.get(e.path) == e.bytes}
         self._there = {e.path: e.file_sha256 for e in self.held.values()}
-        self._named = self._latest = found
         self._when = time.monotonic()
 
     def prepare(self) -> None:
         """Write the manifest of the working copy: what the store holds, and what only the copy does."""
-        found = self._restricted(self._named)
-        known = merged(self._size, self._root, found, local_manifest(self._size, self._root))
+        known = with_local(self._size, self._root, self._restricted(self._named))
         if known.files:
             write_manifest(self._root, known)
 
     def bring(self, scenarios: Iterable[int]) -> None:
         """Fetch what the store holds of some scenarios and the working copy does not."""
         entries = [self.held[i] for i in scenarios if i in self.held]
-        lacking = [e for e in entries if not self._is_local(e)]
-        fetch_scenarios(self._size, self._root, self._remote.root, lacking)
+        lacking = [e for e in entries if not is_here(e, self._size, self._root)]
+        fetch_entries(self._size, self._root, self._objects.root, lacking)
 
     def is_settled(self, manifest: Manifest, cards: Mapping[str, bytes]) -> bool:
         """Return whether the store has this manifest, all that it names, and the cards."""
         if manifest != self._named or self._lacking(manifest):
             return False
-        return all(self._remote.read(name) == text for name, text in cards.items())
+        return all(self._objects.read(name) == text for name, text in cards.items())
 
     def follow(self, manifest: Manifest, *, at_once: bool = False) -> None:
-        """Put what the manifest names and the store lacks; then, if it is time, the manifest."""
+        """Put what the manifest names and the store lacks; then, if it is time, the manifest.
+
+        A file that is another than the manifest says is a DataError.
+        """
         self._latest = manifest
         for entry in self._lacking(manifest):
             self._put(entry)
@@ -81,8 +87,7 @@ class Publication:
         self.follow(manifest)
         # The text comes after the pictures that it shows: where it is right, so are they.
         for path in reversed([*cards]):
-            self._check()
-            self._remote.put(path.relative_to(self._folder).as_posix(), path)
+            self._objects.put(path.relative_to(self._folder).as_posix(), path)
         self._put_manifest(manifest, anew=True)
 
     def save(self) -> None:
@@ -95,27 +100,27 @@ class Publication:
             raise DataError(
                 "a file of the working copy is another than its manifest says",
                 where=str(path),
-                fix=f"remove it, then lagbench generate with --root {self._remote.root}",
+                fix=f"remove it, then lagbench generate with --root {self._objects.root}",
             )
         if self._named.entry(entry.scenario) is not None:
             # An object that is about to change must not be named meanwhile.
             self._there.pop(entry.path, None)
             self._put_manifest(self._restricted(self._named))
-        self._check()
-        self._remote.put(entry.path, path)
+        self._objects.put(entry.path, path)
         self._there[entry.path] = entry.file_sha256
         self.held.pop(entry.scenario, None)  # it is here, and the store has ours
 
     def _put_manifest(self, manifest: Manifest, *, anew: bool = False) -> None:
+        """Put a manifest with what another writer has named since we last did."""
         if manifest == self._named and not anew:
             return
-        self._check()
-        self._remote.write(MANIFEST_NAME, (manifest.model_dump_json(indent=1) + "\n").encode())
+        found = self._read_manifest()
+        known = {e.scenario for e in (*self._named.files, *self._latest.files, *manifest.files)}
+        manifest = join(
+            self._size, manifest, found, [e for e in self._right(found) if e.scenario not in known]
+        )
+        self._objects.write(MANIFEST_NAME, (manifest.model_dump_json(indent=1) + "\n").encode())
         self._named, self._when = manifest, time.monotonic()
-
-    def _check(self) -> None:
-        if self._lock is not None:
-            self._lock.check()
 
     def _lacking(self, manifest: Manifest) -> list[FileEntry]:
         return [entry for entry in manifest.files if self._there.get(entry.path) != entry.file_sha256]
@@ -126,60 +131,42 @@ class Publication:
         if not lacking:
             return manifest
         files = tuple(entry for entry in manifest.files if entry not in lacking)
-        return self._merge(manifest.model_copy(update={"files": files}))
+        return merged(self._size, manifest.model_copy(update={"files": files}))
 
-    def _merge(self, base: Manifest | None) -> Manifest:
-        size = self._size
-        return merge(
-            base,
-            (),
-            split=size.split,
-            size=size.name,
-            version=size.version,
-            subsets=size.subsets,
-            recorded=size.measured.scenario_sha256 if size.measured else None,
-        )
+    def _right(self, manifest: Manifest) -> list[FileEntry]:
+        return [entry for entry in manifest.files if is_right(entry, self._size, manifest)]
 
     def _read_manifest(self) -> Manifest:
         try:
-            found = remote_manifest(self._size, self._remote.root, fresh=0.0)
+            found = remote_manifest(self._size, self._objects.root, fresh=0.0)
         except NotDataError:  # it is written anew from the files
             found = None
-        return found or self._merge(None)
-
-    def _is_local(self, entry: FileEntry) -> bool:
-        path = self._folder / entry.path
-        return (
-            path.is_file() and path.stat().st_size == entry.bytes and file_sha256(path) == entry.file_sha256
-        )
+        return found or merged(self._size, None)
 
 
 def look_at(size: Size, root: Path) -> Publication | None:
     """Return what a store holds of a data set, to look only; None for a root that is a plain folder."""
     url = url_of(root)
-    return None if url is None else Publication(size, root, _remote(size, url), None)
+    return None if url is None else Publication(size, root, url)
 
 
 @contextmanager
-def publication(
-    size: Size, root: Path, *, on_wait: Callable[[str], None] | None = None
-) -> Iterator[Publication | None]:
-    """Hold a data set of a store for writing; yield None for a root that is a plain folder."""
-    url = url_of(root)
-    if url is None:
+def publication(size: Size, root: Path) -> Iterator[Publication | None]:
+    """Write a data set to a store; yield None for a root that is a plain folder.
+
+    Hold the lock of the working copy. Until the end nothing is brought into it. Raises a DataError
+    where the bucket does not exist, a WorkFailedError where the store refuses or does not answer,
+    a UsageError where what reads this kind of address is not installed.
+    """
+    held = look_at(size, root)
+    if held is None:
         yield None
         return
-    remote = _remote(size, url)
-    with writing(root), lease(remote, on_wait=on_wait) as lock:
-        held = Publication(size, root, remote, lock)
-        held.prepare()
+    with writing(root):
         try:
+            held.prepare()
             yield held
         except BaseException:
             with suppress(LagbenchError):  # what is wrong is on its way to the user
                 held.save()
             raise
-
-
-def _remote(size: Size, url: str) -> Remote:
-    return Remote(url, dataset_folder(Path(), size.split, size.name, size.major).as_posix())

@@ -10,13 +10,11 @@ with one, ``open_predictions`` reads one in bounded memory. docs/predictions.md 
 
 from __future__ import annotations
 
-from .arrays import write
 from .findings import CHECKS, Finding, Severity, ValidationResult
-from .header import DIMS, FORMAT, Header
-from .persistence import TemplateResult, template
-from .reader import Predictions, open_predictions
+from .format import DIMS, FORMAT, Header
+from .predictions import Predictions, open_predictions
 from .validation import validate
-from .writer import PredictionsWriter
+from .writer import PredictionsWriter, TemplateResult, template, write
 
 __all__ = [
     "CHECKS",

@@ -24,6 +24,7 @@ CHECKS = (
     "finite",
     "diverged_at",
     "start",
+    "discontinuous_start",
     "in_domain",
     "max_displacement",
 )
@@ -56,13 +57,13 @@ class Severity(enum.StrEnum):
 class Finding:
     """One thing that is wrong with a file."""
 
-    check: str  # name of the check, one of CHECKS
+    check: str  # one of CHECKS
     severity: Severity  # errors reject the file, warnings flag it
     what: str  # what is wrong, one clause
     where: str  # variable, attribute, scenario or frame concerned
-    expected: str  # what would have been right
-    got: str  # what was found
-    fix: str  # what to do about it
+    expected: str
+    got: str
+    fix: str
 
     def __str__(self) -> str:
         """Return the finding as lines for people."""
@@ -75,13 +76,14 @@ class Finding:
 class ValidationResult:
     """What the checks say about one file."""
 
-    path: Path  # the file
+    path: Path
     split: str | None  # split that it names; None where it could not be read
     size: str | None  # size that it names
     method: str | None  # method that it names
     findings: tuple[Finding, ...]  # all that is wrong, in the order of CHECKS
     passed: tuple[str, ...]  # checks that found nothing
     skipped: Mapping[str, str]  # check to the reason why it could not be made
+    sha256: str | None = None  # content hash of the positions; None where they were not all read
 
     @property
     def errors(self) -> tuple[Finding, ...]:
@@ -138,6 +140,11 @@ class Findings:
         self._made: set[str] = set()
         self._skipped: dict[str, str] = {}
 
+    @property
+    def skipped(self) -> Mapping[str, str]:
+        """Checks that could not be made, and why."""
+        return self._skipped
+
     def made(self, *checks: str) -> None:
         """Note that checks were made."""
         self._made.update(checks)
@@ -160,32 +167,32 @@ class Findings:
         return next((check for check in checks if check in wrong), None)
 
     def result(
-        self, path: Path, *, split: str | None = None, size: str | None = None, method: str | None = None
+        self, path: Path, names: Mapping[str, str] | None = None, *, sha256: str | None = None
     ) -> ValidationResult:
-        """Return all that was collected."""
+        """Return all that was collected of a file that names split, size and method."""
+        known = names or {}
         touched = {f.check for f in self._found}
         rest = [check for check in CHECKS if check not in touched]
         return ValidationResult(
             path=path,
-            split=split,
-            size=size,
-            method=method,
+            split=known.get("split"),
+            size=known.get("size"),
+            method=known.get("method"),
             findings=tuple(sorted(self._found, key=lambda f: CHECKS.index(f.check))),
             passed=tuple(check for check in rest if check in self._made and check not in self._skipped),
             skipped={check: self._skipped[check] for check in rest if check in self._skipped},
+            sha256=sha256,
         )
+
+    def raised(self, check: str, error: LagbenchError) -> None:
+        """Add the finding that rejects the file for what one of our errors says."""
+        where, expected = error.where or "the file", error.expected or "an undamaged file"
+        fix = error.fix or "make it again"
+        self.error(check, error.what, where=where, expected=expected, got=error.got or "nothing", fix=fix)
 
     def _add(
         self, severity: Severity, check: str, what: str, where: str, expected: object, got: object, fix: str
     ) -> None:
         self._made.add(check)
-        finding = Finding(
-            check=check,
-            severity=severity,
-            what=what,
-            where=where,
-            expected=str(expected),
-            got=str(got),
-            fix=fix,
-        )
-        self._found.append(finding)
+        said = {"what": what, "where": where, "expected": str(expected), "got": str(got), "fix": fix}
+        self._found.append(Finding(check=check, severity=severity, **said))

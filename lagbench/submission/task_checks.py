@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 
 from lagbench.data.layout import major_of
 from lagbench.data.local import remedy
 from lagbench.data.manifest import read_manifest
-from lagbench.data.registry import Registry, Size
+from lagbench.data.registry import Registry, Size, spell_ids
 from lagbench.errors import DataError, UnreadableFileError, UsageError
 
-from .anatomy import Anatomy
 from .findings import Findings, quoted
-from .guesses import guess_frames, guess_scenarios, spell_numbers
+from .format import Anatomy
 
 __all__ = [
     "check_dataset",
@@ -25,10 +25,15 @@ __all__ = [
     "check_split",
     "dataset_hash_of",
     "frames_to_predict",
+    "guess_frames",
+    "guess_scenarios",
 ]
 
 _VERSION = re.compile(r"[1-9]\d{0,5}\.\d{1,6}\.\d{1,6}")
 _HASH = re.compile(r"[0-9a-f]{64}")
+
+MAX_SPELLED = 60
+"""Longest list of numbers in a message [characters]."""
 
 
 def check_split(anatomy: Anatomy, registry: Registry, out: Findings) -> Size | None:
@@ -181,3 +186,69 @@ def check_particles(anatomy: Anatomy, size: Size, out: Findings) -> bool:
         fix=f"predict every particle of {size.split} {size.name}, in the order of the given frames",
     )
     return False
+
+
+# --- guesses, so that a message can say what may have happened ------------------------------
+
+
+def spell_numbers(numbers: Sequence[int]) -> str:
+    """Return numbers as ranges, shortened in the middle where they are many.
+
+    >>> spell_numbers([6, 7, 8, 10])
+    '6-8,10'
+    """
+    text = spell_ids(numbers)
+    return text if len(text) <= MAX_SPELLED else f"{text[: MAX_SPELLED - 3]}... ({len(numbers)} numbers)"
+
+
+def guess_frames(got: Sequence[int], expected: range) -> str:
+    """Return what seems to have happened to the frame numbers."""
+    given, count = expected.start, len(expected)
+    if not got:
+        return "there are no frames"
+    number, times = Counter(got).most_common(1)[0]
+    if times > 1:
+        return f"frame {number} stands twice"
+    if sorted(got) == list(expected):
+        return "seems to hold the right frames in another order: store them ascending"
+    steps = {b - a for a, b in pairwise(got)}
+    if len(steps) == 1 and (step := steps.pop()) > 1:
+        return f"seems to skip: it holds every {_ordinal(step)} frame only"
+    return _guess_run(got, given, count)
+
+
+def _guess_run(got: Sequence[int], given: int, count: int) -> str:
+    """Guess about frame numbers that may be one run of consecutive numbers."""
+    first, last = got[0], got[-1]
+    if any(b - a != 1 for a, b in pairwise(got)):
+        missing = sorted(set(range(given, given + count)) - set(got))
+        return (
+            f"lacks the frames {spell_numbers(missing)}"
+            if missing
+            else "holds frames that are no predictions"
+        )
+    if first in (0, 1) and len(got) == count:
+        return f"seems to count from the first predicted frame, whose absolute number is {given}"
+    if first < given and last == given + count - 1:
+        return f"seems to start at the input frames: leave out the frames before {given}"
+    if first == given and last < given + count - 1:
+        return f"stops too early: the last frame is {given + count - 1}"
+    if first == given:
+        return f"goes on too long: leave out the frames after {given + count - 1}"
+    return f"seems to be shifted by {first - given} frames" if len(got) == count else "holds other frames"
+
+
+def _ordinal(number: int) -> str:
+    if number % 100 in (11, 12, 13):
+        return f"{number}th"
+    return f"{number}{ {1: 'st', 2: 'nd', 3: 'rd'}.get(number % 10, 'th') }"
+
+
+def guess_scenarios(got: Sequence[int], subsets: Mapping[str, Sequence[int]]) -> str:
+    """Return where unknown scenario ids may come from."""
+    for subset, ids in subsets.items():
+        if subset != "test" and set(got) <= set(ids):
+            return f"these are scenarios of {subset}"
+    if list(got) == list(range(len(subsets["test"]))) or list(got) == list(range(1, len(got) + 1)):
+        return "seems to count the scenarios: store their ids"
+    return "name the scenarios by their ids"

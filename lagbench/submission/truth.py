@@ -1,4 +1,4 @@
-"""The test scenarios that predictions are held against, read a few frames at a time."""
+"""The test scenarios that predictions are held against: hashed before use, read a few frames at a time."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.data.layout import ScenarioKey, scenario_path
+from lagbench.data.layout import ScenarioKey, dataset_folder, scenario_path
 from lagbench.data.local import remedy
+from lagbench.data.manifest import note, noted_content, read_manifest
 from lagbench.data.registry import Size, spell_ids
-from lagbench.data.scenario import ScenarioFile, read_scenario
+from lagbench.data.scenario import ScenarioFile, check_scenario, read_scenario
 from lagbench.errors import DataError
 
 __all__ = ["Truth"]
@@ -20,11 +21,16 @@ BLOCK = 16
 
 
 class Truth:
-    """The test subset of a data set."""
+    """The test subset of a data set under a root folder."""
 
     def __init__(self, size: Size, root: Path) -> None:
-        self.size = size  # what the registry says of the data set
-        self.root = root  # folder of all data sets
+        self.size = size
+        self.root = root
+
+    @property
+    def folder(self) -> Path:
+        """The folder of the data set."""
+        return dataset_folder(self.root, self.size.split, self.size.name, self.size.major)
 
     def require(self) -> None:
         """Check that every test scenario is there."""
@@ -38,6 +44,50 @@ class Truth:
                 got=f"missing: {spell_ids(missing)}",
                 fix=remedy(self.size, "--subset test", root=self.root),
             )
+
+    def check(self) -> None:
+        """Hash the values of every test scenario, or find that this machine has done so."""
+        known, new = noted_content(self.folder), {}
+        for scenario in sorted(self.size.subsets["test"]):
+            path, expected = self.path(scenario), self._expected(scenario)
+            try:
+                content = known(path)
+                if content is None:
+                    content = new[path] = check_scenario(path)
+            except (DataError, OSError) as error:
+                raise self._damaged(path, error) from error
+            if not content.startswith(expected):
+                raise DataError(
+                    "a test scenario has another content hash",
+                    where=str(path),
+                    expected=expected,
+                    got=content,
+                    fix=self._fix(),
+                )
+        note(self.folder, new)
+
+    def _damaged(self, path: Path, error: DataError | OSError) -> DataError:
+        if isinstance(error, OSError):
+            return DataError(
+                "cannot read a test scenario", where=str(path), got=error.strerror, fix=self._fix()
+            )
+        where = error.where or str(path)
+        return DataError(error.what, where=where, expected=error.expected, got=error.got, fix=self._fix())
+
+    def _fix(self) -> str:
+        mend = remedy(self.size, "--subset test", root=self.root)
+        return f"{mend}; lagbench verify --split {self.size.split} --size {self.size.name} says what is wrong"
+
+    def _expected(self, scenario: int) -> str:
+        """Return what is known of a content hash: its first digits, all, or nothing."""
+        if self.size.measured:
+            return self._hash(scenario)
+        try:
+            manifest = read_manifest(self.root, self.size.split, self.size.name, self.size.major)
+        except DataError:  # whoever needs the manifest says what is wrong with it
+            return ""
+        entry = manifest.entry(scenario) if manifest else None
+        return entry.content_sha256 if entry else ""
 
     def path(self, scenario: int) -> Path:
         """Return where a test scenario lies."""
@@ -64,22 +114,29 @@ class Truth:
 
     def given(self, scenario: int) -> NDArray[np.float32]:
         """Return the frames given to a model [length], shape [frame, particle, space]."""
-        task = self.size.task
+        return self._frames(scenario, 0, self.size.task.input_frames)
+
+    def around_start(self, scenario: int) -> NDArray[np.float32]:
+        """Return the last given frame and the first to be predicted [length], shape [2, particle, space]."""
+        last = self.size.task.input_frames - 1
+        return self._frames(scenario, last, last + 2)
+
+    def _frames(self, scenario: int, start: int, stop: int) -> NDArray[np.float32]:
         with self.open(scenario) as file:
-            frames: NDArray[np.float32] = file.read("position", slice(0, task.input_frames))
-            if file.header.frames >= task.input_frames and frames.shape[1] == self.size.particles:
+            frames: NDArray[np.float32] = file.read("position", slice(start, stop))
+            if len(frames) == stop - start and frames.shape[1] == self.size.particles:
                 return frames
             raise DataError(
                 "a test scenario has other frames or particles than the registry says",
                 where=str(self.path(scenario)),
-                expected=f"at least {task.input_frames} frames of {self.size.particles} particles",
+                expected=f"at least {stop} frames of {self.size.particles} particles",
                 got=frames.shape,
             )
 
     def largest_displacement(self, scenario: int, *, enough: float) -> float:
         """Return the largest distance that a particle moves from one frame to the next [length].
 
-        Reading stops as soon as one of at least ``enough`` is found, which is then returned.
+        Reading stops as soon as one of at least ``enough`` [length] is found, which is then returned.
         """
         task, largest = self.size.task, 0.0
         with self.open(scenario) as file:

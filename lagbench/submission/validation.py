@@ -1,37 +1,155 @@
-"""Validate a predictions.nc: every named check, all findings together.
+"""Validate a predictions.nc: every named check, all findings together, in a child with limits.
 
-A stranger's file can make HDF5 loop, crash or ask for all memory (HDF5 2.0 looped on 4 of 8000
-files with one to eight bytes changed at random). So the checks run in a child process with
-limits, see sandbox.py.
+HDF5 is C code that parses whatever it is given: of 8000 files with one to eight bytes changed at
+random four made HDF5 2.0 loop. What loops, crashes or asks for too much ends a child process; the
+parent says so and goes on. :func:`in_child` runs any function so; requests and answers are JSON,
+so nothing that a child sends is executed.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import importlib
+import json
+import math
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import h5py
 
 from lagbench.data.layout import resolve_root
-from lagbench.data.local import rooted
-from lagbench.data.registry import Registry
-from lagbench.errors import DataError, UnreadableFileError, UsageError
+from lagbench.data.local import RootedRegistry, rooted
+from lagbench.data.registry import Registry, Size
+from lagbench.errors import DataError, UnreadableFileError, UsageError, WorkFailedError, nearest
 
-from .anatomy import Anatomy, dissect
-from .findings import CHECKS, Findings, ValidationResult
-from .format_checks import check_dims, check_dtype, check_format, check_marks
-from .opening import check_file, opened
-from .reader import Predictions, attach
-from .sandbox import Request, run_isolated
+from .checks import check_domain, check_finite, check_frozen, check_jumps, survey
+from .findings import CHECKS, Finding, Findings, Severity, ValidationResult
+from .format import Anatomy, check_dims, check_dtype, check_format, check_marks, dissect
+from .hdf5 import check_file, opened
+from .predictions import attach
+from .start import check_start
 from .task_checks import check_dataset, check_frames, check_particles, check_scenarios, check_split
 from .truth import Truth
-from .value_checks import Survey, check_domain, check_finite, check_frozen, check_jumps, check_start, survey
 
-__all__ = ["examine", "validate"]
+__all__ = ["CPU_SECONDS", "MEMORY", "WALL_SECONDS", "Answers", "in_child", "seconds_for", "serve", "validate"]
 
-TRUE = ("start", "max_displacement")
+MEMORY = 768 << 20
+"""Address space of a child [bytes]."""
+
+CPU_SECONDS = 3.0
+"""Computing time for a small file, the start of the child aside [s]."""
+
+WALL_SECONDS = 600.0
+"""Time for a child and a small file [s]; only a child that waits gets that far.
+
+What computes too long is stopped by the kernel, which counts computing time: on a machine that is
+busy with other work a sound file may take minutes.
+"""
+
+BYTES_PER_SECOND = 20e6
+"""Larger files get more time: a slow reader's speed [bytes/s]."""
+
+OUT_OF_MEMORY = 77
+"""Exit code of a child that needed more than it may."""
+
+CHILD = "from lagbench.submission.validation import serve; serve()"
+"""The child's program; -P keeps the current folder, where strangers' files may lie, off its path."""
+
+TRUE = ("start", "discontinuous_start", "max_displacement")
 VALUES = ("finite", "in_domain", *TRUE)
 TASK = ("dataset", "scenarios", "frames", "particles")
+
+
+# --- a child process -----------------------------------------------------------------------
+
+
+class Answers(NamedTuple):
+    """What a child answered, in the order of the requests, and what stopped it, if anything did."""
+
+    values: list[Any]
+    stopped: str | None
+
+
+def in_child(
+    function: str,
+    requests: Sequence[object],
+    *,
+    memory: int = MEMORY,
+    seconds: float = CPU_SECONDS,
+    wall: float = WALL_SECONDS,
+) -> Answers:
+    """Call a function once per request in a child process with limits."""
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2"}
+    try:
+        done = subprocess.run(
+            [sys.executable, "-P", "-c", CHILD, function, str(memory), str(int(seconds))],
+            input=json.dumps(list(requests)).encode(),
+            capture_output=True,
+            timeout=wall,
+            env=environment,
+            check=False,
+        )
+    except subprocess.TimeoutExpired as error:
+        return Answers(_lines(error.stdout), f"no end after {wall:.0f} s")
+    if done.returncode == 0:
+        return Answers(_lines(done.stdout), None)
+    if done.returncode == OUT_OF_MEMORY:
+        return Answers(_lines(done.stdout), f"more than {memory >> 20} MiB of memory")
+    if done.returncode == -signal.SIGXCPU:
+        return Answers(_lines(done.stdout), "no end within the computing time allowed")
+    if done.returncode < 0:
+        name = signal.strsignal(-done.returncode) or str(-done.returncode)
+        return Answers(_lines(done.stdout), f"HDF5 crashed: {name}")
+    raise WorkFailedError(
+        "a child process itself failed",
+        where=function,
+        got=ascii(done.stderr.decode("utf-8", "replace").strip().rsplit("\n", 1)[-1][:300]),
+        fix="`lagbench doctor` checks the installation; if it finds nothing, report this with the file",
+    )
+
+
+def _lines(output: bytes | None) -> list[Any]:
+    return [json.loads(line) for line in (output or b"").splitlines(keepends=True) if line.endswith(b"\n")]
+
+
+def serve() -> None:
+    """Answer the requests of stdin, one line each, under the limits that the arguments name.
+
+    What the imports took is not counted: on a busy machine they may take seconds.
+    """
+    dotted, memory, allowed = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
+    module, _, name = dotted.rpartition(".")
+    function: Callable[[Any], object] = getattr(importlib.import_module(module), name)
+    seconds = allowed + math.ceil(time.process_time())
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
+    resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds + 1))
+    try:
+        for request in json.load(sys.stdin):
+            sys.stdout.write(json.dumps(function(request)) + "\n")
+            sys.stdout.flush()
+    except MemoryError:
+        raise SystemExit(OUT_OF_MEMORY) from None
+
+
+def seconds_for(path: Path) -> float:
+    """Return the time beyond that of a small file that a file is given [s].
+
+    A sparse file claims any length; what it occupies is what has to be read.
+    """
+    status = path.stat()
+    return min(status.st_size, 512 * status.st_blocks) / BYTES_PER_SECOND
+
+
+# --- the validation ------------------------------------------------------------------------
 
 
 def validate(
@@ -47,7 +165,7 @@ def validate(
     Args:
         path: the file.
         root: folder of all data sets, see :func:`lagbench.data.layout.resolve_root`; the checks
-            ``start`` and ``max_displacement`` need the test subset there.
+            ``start``, ``discontinuous_start`` and ``max_displacement`` need the test subset there.
         require_truth: whether a missing test subset is an error of the check ``dataset``, as it
             is for scoring; else those checks are skipped and say so.
         isolated: whether to look at the file in a child process with limits on memory and time.
@@ -55,129 +173,186 @@ def validate(
         registry: where splits are described; ours when None.
 
     Returns:
-        What was found; ``result.check()`` raises unless the file is valid.
+        What was found; ``result.check()`` raises unless the file is valid. ``lagbench.score``
+        takes it, so that nothing is read twice.
     """
-    folder = resolve_root(root)
-    request = Request(
-        path=Path(path).absolute(),
-        root=folder,
-        require_truth=require_truth,
-        registry=rooted(folder, registry),
-    )
-    if isolated:
-        try:
-            check_file(request.path)
-        except UnreadableFileError as error:
-            return _unreadable(request.path, error)
-    look = run_isolated if isolated else examine
-    result = look(request)
+    folder, file = resolve_root(root), Path(path).absolute()
+    known = rooted(folder, registry)
+
+    def look() -> ValidationResult:
+        if isolated:
+            return _isolated(file, folder, known, require_truth=require_truth)
+        return _examine(file, folder, known, require_truth=require_truth)
+
+    result = look()
+    size = _size_of(result, known)
+    if size is None:
+        return result
     # Only the file says which test subset it needs; the child that reads it fetches nothing.
-    return look(request) if _brought(result, request) else result
+    from lagbench.store.copy import bring
+
+    if bring(size, folder, size.subsets["test"]):
+        result = look()
+    return _with_hashed_truth(result, Truth(size, folder))
 
 
-def _brought(result: ValidationResult, request: Request) -> bool:
-    """Bring the test subset that a file is for, where data live in a store; return whether any came."""
-    if result.split is None or result.size is None:
-        return False
+def _size_of(result: ValidationResult, registry: Registry) -> Size | None:
+    if result.split is None or result.size is None or "split" not in result.passed:
+        return None
+    return registry.size(result.split, result.size)
+
+
+def _with_hashed_truth(result: ValidationResult, truth: Truth) -> ValidationResult:
+    """Take back what was said by a truth that is not the one of the registry."""
+    used = "discontinuous_start" not in result.skipped
     try:
-        size = request.registry.size(result.split, result.size)
-    except UsageError:
-        return False
-    from lagbench.store.bringing import bring
+        if used:
+            truth.check()
+    except DataError as error:
+        out = Findings()
+        out.raised("dataset", error)
+        findings = [f for f in result.findings if f.check not in TRUE]
+        findings += out.result(result.path).findings
+        return dataclasses.replace(
+            result,
+            findings=tuple(sorted(findings, key=lambda f: CHECKS.index(f.check))),
+            passed=tuple(check for check in result.passed if check not in ("dataset", *TRUE)),
+            skipped={**result.skipped, **dict.fromkeys(TRUE, f"{error.what}: {error.where}")},
+        )
+    return result
 
-    return bring(size, request.root, size.subsets["test"])
+
+def _isolated(path: Path, root: Path, registry: Registry, *, require_truth: bool) -> ValidationResult:
+    """Examine a file in a child process; whatever stops the child fails the check ``readable``."""
+    try:
+        check_file(path)
+        extra = seconds_for(path)
+    except UnreadableFileError as error:
+        return _unreadable(path, error)
+    request = {
+        "path": str(path),
+        "root": str(root),
+        "require_truth": require_truth,
+        "sizes": {
+            split: {name: registry.size(split, name).model_dump_json() for name in found.sizes}
+            for split, found in registry.splits.items()
+        },
+    }
+    seconds, wall = CPU_SECONDS + extra, WALL_SECONDS + extra
+    values, stopped = in_child(EXAMINE, [request], seconds=seconds, wall=wall)
+    if not values:
+        trap = UnreadableFileError(
+            "reading the file had to be stopped",
+            where=str(path),
+            expected="a file that HDF5 reads within the limits",
+            got=stopped,
+            fix="the file is damaged or made to do harm; write it again with lagbench.submission.write",
+        )
+        return _unreadable(path, trap)
+    said = values[0]
+    findings = tuple(Finding(**{**f, "severity": Severity(f["severity"])}) for f in said["findings"])
+    return ValidationResult(**{**said, "path": path, "findings": findings, "passed": tuple(said["passed"])})
 
 
-def examine(request: Request) -> ValidationResult:
-    """Make all checks in this process."""
+class _Sizes(RootedRegistry):
+    """The sizes that a parent sent, and the local splits of its root folder."""
+
+    def __init__(self, sent: Mapping[str, Mapping[str, str]], root: Path) -> None:
+        super().__init__(Registry({}, {}), root)
+        self.sent = sent
+
+    def size(self, split: str, name: str) -> Size:
+        """Return one size of a split."""
+        if split in self.sent and name in self.sent[split]:
+            return Size.model_validate_json(self.sent[split][name], strict=False)
+        if split in self.sent:
+            raise UsageError(f"split {split!r} has no size {name!r}", fix=nearest(name, self.sent[split]))
+        if split not in self.local_names():
+            raise UsageError(f"no split {split!r}", fix=nearest(split, [*self.sent, *self.local_names()]))
+        return super().size(split, name)
+
+
+def examine(request: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Make all checks in this process, for a parent."""
+    path, root = Path(request["path"]), Path(request["root"])
+    result = _examine(path, root, _Sizes(request["sizes"], root), require_truth=request["require_truth"])
+    return dataclasses.asdict(result) | {"path": str(path)}
+
+
+EXAMINE = f"{__name__}.{examine.__name__}"
+
+
+def _examine(path: Path, root: Path, registry: Registry, *, require_truth: bool) -> ValidationResult:
     out = Findings()
     names: dict[str, str] = {}
+    content = None
     try:
-        with opened(request.path) as file:
-            anatomy = dissect(file, request.path)
+        with opened(path) as file:
+            anatomy = dissect(file, path)
             texts = {name: anatomy.attributes[name] for name in ("split", "size", "method")}
             names = {name: text for name, text in texts.items() if isinstance(text, str)}
             out.made("readable")
-            _examine(request, file, anatomy, out)
+            size = _check_layout_and_task(anatomy, registry, root, out)
+            if size is not None:
+                content = _check_values(file, path, anatomy, Truth(size, root), require_truth, out)
     except UnreadableFileError as error:
-        _report_unreadable(error, out)
-    return out.result(request.path, **names)
+        out.raised("readable", error)
+        out.skip("the file cannot be read", *CHECKS)
+    return out.result(path, names, sha256=content)
 
 
-def _examine(request: Request, file: h5py.File, anatomy: Anatomy, out: Findings) -> None:
-    stored = check_format(anatomy, out)
-    laid_out = check_dims(anatomy, out)
-    typed = check_dtype(anatomy, out)
-    marked = check_marks(anatomy, out)
-    size = check_split(anatomy, request.registry, out)
+def _check_layout_and_task(anatomy: Anatomy, registry: Registry, root: Path, out: Findings) -> Size | None:
+    """Make the checks that need no values; return the size if the values can be looked at."""
+    stored, laid_out, typed = (check(anatomy, out) for check in (check_format, check_dims, check_dtype))
+    check_marks(anatomy, out)
+    size = check_split(anatomy, registry, out)
     if size is None:
         out.skip("the split is not known", *TASK, *VALUES)
-        return
-    check_dataset(anatomy, size, request.root, out)
+        return None
+    check_dataset(anatomy, size, root, out)
     check_scenarios(anatomy, size, out)
-    in_time = check_frames(anatomy, size, out)
+    check_frames(anatomy, size, out)
     sized = check_particles(anatomy, size, out)
     # Frames far beyond the horizon would make the work as long as the file claims to be.
     bounded = len(anatomy.integers.get("frame", ())) <= 2 * (size.task.input_frames + size.task.horizon)
-    if not (stored and laid_out and typed and sized and bounded):
-        out.skip(f"{out.failed('format', 'dims', 'dtype', 'particles', 'frames')} failed", *VALUES)
-        return
+    if stored and laid_out and typed and sized and bounded:
+        return size
+    out.skip(f"{out.failed('format', 'dims', 'dtype', 'particles', 'frames')} failed", *VALUES)
+    return None
+
+
+def _check_values(
+    file: h5py.File, path: Path, anatomy: Anatomy, truth: Truth, require_truth: bool, out: Findings
+) -> str | None:
+    """Make the checks that read positions; return the content hash where all were read."""
     with ExitStack() as stack:
-        predictions = attach(file, request.path, anatomy, stack)
-        surveys = survey(predictions, size)
+        predictions = attach(file, path, anatomy, stack)
+        surveys, content = survey(predictions, truth.size)
         check_finite(surveys, out)
-        if marked:
+        if not out.failed("diverged_at") and "diverged_at" not in out.skipped:
             check_frozen(predictions, surveys, out)
-        check_domain(surveys, size, out)
-        if not in_time:
+        check_domain(surveys, truth.size, out)
+        if out.failed("frames") or "frames" in out.skipped:
             out.skip("frames failed", *TRUE)
-            return
-        _compare(predictions, surveys, Truth(size, request.root), request.require_truth, out)
-
-
-def _compare(
-    predictions: Predictions, surveys: list[Survey], truth: Truth, require_truth: bool, out: Findings
-) -> None:
-    try:
-        truth.require()
-    except DataError as error:
-        if require_truth:
-            _report_dataset(error, out)
-        reason = f"{error.what} in {truth.root}"
-        out.skip(f"{reason}: {error.fix}", *TRUE)
-        return
-    try:
-        check_start(predictions, truth, out)
-        check_jumps(surveys, truth, out)
-    except DataError as error:
-        _report_dataset(error, out)
-        out.skip(f"{error.what}: {error.where}", *TRUE)
-
-
-def _report_dataset(error: DataError, out: Findings) -> None:
-    out.error(
-        "dataset",
-        error.what,
-        where=error.where or "the data set",
-        expected=error.expected or "an undamaged data set",
-        got=error.got or "a damaged one",
-        fix=error.fix or "lagbench verify says what is wrong",
-    )
-
-
-def _report_unreadable(error: UnreadableFileError, out: Findings) -> None:
-    out.error(
-        "readable",
-        error.what,
-        where=error.where or "the file",
-        expected=error.expected or "a netCDF4 file",
-        got=error.got,
-        fix=error.fix or "write it again",
-    )
-    out.skip("the file cannot be read", *CHECKS)
+            return content
+        try:
+            truth.require()
+        except DataError as error:
+            if require_truth:
+                out.raised("dataset", error)
+            out.skip(f"{error.what} in {truth.root}: {error.fix}", *TRUE)
+            return content
+        try:
+            check_start(predictions, truth, out)
+            check_jumps(surveys, truth, out)
+        except DataError as error:
+            out.raised("dataset", error)
+            out.skip(f"{error.what}: {error.where}", *TRUE)
+        return content
 
 
 def _unreadable(path: Path, error: UnreadableFileError) -> ValidationResult:
     out = Findings()
-    _report_unreadable(error, out)
+    out.raised("readable", error)
+    out.skip("the file cannot be read", *CHECKS)
     return out.result(path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -15,12 +16,13 @@ from lagbench.atomic import atomic_path
 from lagbench.data.local import locate, remedy
 from lagbench.data.registry import Registry, Size, spell_ids
 from lagbench.errors import DataError, UsageError, WorkFailedError, nearest
-from lagbench.store.bringing import bring
+from lagbench.store.copy import bring
 
-from .header import DIMS, FORMAT, NEVER, OPTIONAL, SPACE, fits, kind_of
+from .format import DIMS, FORMAT, NEVER, OPTIONAL, SPACE, fits, kind_of
 from .task_checks import dataset_hash_of, frames_to_predict
+from .truth import Truth
 
-__all__ = ["Label", "PredictionsWriter"]
+__all__ = ["Label", "PredictionsWriter", "TemplateResult", "template", "write"]
 
 CHUNK_CACHE = 1 << 20
 """Chunk cache while writing [bytes]; frames are written once, in order."""
@@ -278,3 +280,133 @@ def _known_hash(size: Size, root: Path) -> str:
             fix=f"{remedy(size)}, or give dataset_sha256",
         )
     return known
+
+
+def write(
+    path: str | Path,
+    positions: Mapping[int, ArrayLike] | ArrayLike,
+    *,
+    split: str,
+    size: str = "full",
+    method: str,
+    velocities: Mapping[int, ArrayLike] | ArrayLike | None = None,
+    diverged_at: Mapping[int, int] | None = None,
+    dataset_sha256: str | None = None,
+    root: str | Path | None = None,
+    registry: Registry | None = None,
+    **labels: Label,
+) -> Path:
+    """Write a predictions.nc from arrays.
+
+    Args:
+        path: file to write.
+        positions: scenario id to positions [length], shape [frame, particle, space]; or one
+            array [scenario, frame, particle, space] with the test scenarios by ascending id.
+        split: name of the split.
+        size: name of the size.
+        method: what made the predictions.
+        velocities: velocities [length/s], in the same form; stored, not scored.
+        diverged_at: scenario id to the absolute frame from which its rollout is frozen.
+        dataset_sha256: hash of the data set that the model was given; else the recorded one.
+        root: folder of all data sets; asked only where no hash is recorded.
+        registry: where splits are described; ours when None.
+        **labels: seconds_per_frame, device, seed, parameters, training.
+
+    Returns:
+        The path.
+
+    Raises:
+        UsageError: unknown names, wrong shapes, missing scenarios, values that are not finite.
+        DataError: the hash of the data set is not known.
+        WorkFailedError: the disk is full or not writable.
+    """
+    writer = PredictionsWriter(
+        path,
+        split=split,
+        size=size,
+        method=method,
+        velocity=velocities is not None,
+        dataset_sha256=dataset_sha256,
+        root=root,
+        registry=registry,
+        **labels,
+    )
+    ids = sorted(writer.size.subsets["test"])
+    placed, moving = _by_id(positions, ids), None if velocities is None else _by_id(velocities, ids)
+    with writer:
+        for scenario, values in placed.items():
+            velocity = None if moving is None else moving.get(scenario)
+            writer.add(scenario, values, velocity, diverged_at=(diverged_at or {}).get(scenario))
+    return writer.path
+
+
+def _by_id(values: Mapping[int, ArrayLike] | ArrayLike, ids: list[int]) -> Mapping[int, ArrayLike]:
+    if isinstance(values, Mapping):
+        return values
+    array = np.asarray(values)
+    if array.ndim != len(DIMS) or len(array) != len(ids):
+        raise UsageError(
+            "the array does not hold one entry per test scenario",
+            expected=f"{len(ids)} scenarios ({spell_ids(ids)}) first, 4 dimensions",
+            got=f"shape {array.shape}",
+            fix="or give a mapping of scenario id to array",
+        )
+    return dict(zip(ids, array, strict=True))
+
+
+@dataclass(frozen=True, kw_only=True)
+class TemplateResult:
+    """A template that was written."""
+
+    path: Path
+    split: str
+    size: str
+    scenarios: tuple[int, ...]
+    frames: tuple[int, int]  # absolute numbers of the first and the last frame to predict
+    particles: int
+    bytes: int
+
+
+def template(
+    split: str,
+    size: str = "full",
+    *,
+    output: str | Path = "predictions.nc",
+    root: str | Path | None = None,
+    registry: Registry | None = None,
+) -> TemplateResult:
+    """Write a valid predictions.nc to fill: the last given frame, repeated.
+
+    Args:
+        split: name of the split.
+        size: name of the size.
+        output: file to write.
+        root: folder of all data sets, see :func:`lagbench.data.layout.resolve_root`.
+        registry: where splits are described; ours when None.
+
+    Raises:
+        UsageError: unknown split or size.
+        DataError: test scenarios are missing or damaged, or their data set has no recorded hash.
+        WorkFailedError: the disk is full or not writable.
+    """
+    entry, folder, described = locate(split, size, root=root, registry=registry)
+    bring(entry, folder, entry.subsets["test"])
+    truth = Truth(entry, folder)
+    truth.require()
+    writer = PredictionsWriter(
+        output, split=entry.split, size=size, method="persistence", root=folder, registry=described
+    )
+    ids = tuple(sorted(entry.subsets["test"]))
+    with writer:
+        for scenario in ids:
+            writer.add(scenario, np.broadcast_to(truth.given(scenario)[-1], writer.shape))
+    task = entry.task
+    return TemplateResult(
+        path=writer.path,
+        split=entry.split,
+        size=size,
+        scenarios=ids,
+        frames=(task.input_frames, task.input_frames + task.horizon - 1),
+        particles=entry.particles,
+        bytes=writer.path.stat().st_size,
+    )

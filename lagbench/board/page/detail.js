@@ -5,55 +5,42 @@ function drawDetail(tab, state, row) {
   const [filmFigure, film] = drawFilm(tab, row);
   const content = [
     drawTiles(tab, row),
-    drawFlags(row),
+    drawFlags(tab, row),
     el("div", { class: "figures" }, [drawErrors(tab, row), drawScenarios(tab, row), drawMaps(tab, row), filmFigure, drawEnergy(tab, row), drawHistograms(tab, row)]),
     drawFrames(tab, row),
     drawNumbers(tab, row),
-    drawOrigin(tab, row),
+    drawOrigin(row),
   ];
   return [content, film];
 }
 
-function floorsOf(tab, row) {
-  return tab.rows.filter((one) => one.floor && one !== row).map((one, i) => [`floor${i}`, one]);
+function floorsOf(tab) {
+  return tab.floors.map((one, i) => [`floor${i}`, one]);
 }
 
 function leaderOf(tab) {
-  return tab.rows.find((row) => !row.floor && row.rank !== null && isActive(row));
+  return tab.rows.find((row) => row.active);
 }
 
 function drawTiles(tab, row) {
-  const tile = (what, big, more) => el("li", {}, el("span", { class: "what" }, what), el("span", { class: "big" }, big), el("span", { class: "more" }, more));
-  const tiles = tab.presets.main.slice(0, 4).filter((name) => tab.metrics.includes(name)).map((name) => {
-    const [, low, high, std] = row.values[tab.metrics.indexOf(name)] ?? [];
-    const interval = low === null || low === undefined ? "" : `${written(number(low))} … ${written(number(high))}`;
-    const seeds = std ? `, ± ${written(std)} over ${row.seeds} seeds` : "";
-    return tile(withUnit(name), cellText(valueOf(tab, row, name), "number"), interval + seeds);
+  const keys = [...presetsOf(tab).main.slice(0, 5), "seconds_per_frame", "parameters"];
+  const tiles = keys.filter((key) => !isGap(valueOf(tab, row, key))).map((key) => {
+    const cell = cellOf(tab, row, key);
+    const more = key === "speed_up" || key === "seconds_per_frame" ? textOf(tab, row, "device") : cell.title;
+    return el("li", {}, el("span", { class: "what" }, columnOf(tab, key).quantity), el("span", { class: "big" }, textOf(tab, row, key)), el("span", { class: "more" }, more));
   });
-  if (row.cost?.speed_up) tiles.push(tile("speed, solver = 1×; self-reported", cellText(row.cost.speed_up, "factor"), `${row.cost.speed_up < 1 ? "slower" : "faster"} than the solver, ${row.cost.device}`));
-  else if (row.cost) tiles.push(tile("time per frame [s], self-reported", written(row.cost.seconds_per_frame), row.cost.device));
-  if (row.parameters) tiles.push(tile("parameters, self-reported", cellText(row.parameters, "count"), row.hardware));
   return el("ul", { class: "tiles" }, tiles);
 }
 
-function drawFlags(row) {
-  const items = [
-    ...row.flags.map(([name, reasons]) => ["bad", "flag", labelOf(name), flagText(name, reasons)]),
-    ...row.warnings.map(([name, reasons]) => ["warn", "warning", labelOf(name), flagText(name, reasons)]),
-  ];
-  if (row.diverged) items.push(["warn", "warning", "diverged", `${row.diverged} rollouts are frozen at their last finite frame.`]);
-  if (row.status !== "active") {
-    const by = row.by ? ` Replaced by ${row.by}.` : "";
-    items.push(["unknown", "status", row.status, `${row.reason}${by}`]);
-  }
-  if (!row.current) items.push(["unknown", "status", `data ${row.version}`, "Scored on a data set version that is no longer current: not ranked."]);
-  const said = items.map(([kind, sort, name, text]) => el("li", {}, el("span", { class: `flag ${kind}` }, sort), el("span", {}, el("strong", {}, name), text ? `: ${text}` : "")));
+/** Return the marks beside the name in the table with what they mean. */
+function drawFlags(tab, row) {
+  const said = [...lineOf(tab, row).querySelectorAll(".flag")].map((chip) => el("li", {}, chip.cloneNode(true), el("span", {}, chip.title)));
   return said.length ? el("ul", { class: "flags" }, said) : null;
 }
 
 function drawErrors(tab, row) {
   const leader = leaderOf(tab);
-  const rows = [["s0", row], ...(leader && leader !== row ? [["s1", leader]] : []), ...floorsOf(tab, row)];
+  const rows = [["s0", row], ...(leader && leader !== row ? [["s1", leader]] : []), ...floorsOf(tab)];
   const options = tab.curves.filter(({ key: name }) => row.curves[name]).map(({ key: name, label }) => [name, label]);
   const holder = el("div");
   const show = (by) => {
@@ -68,8 +55,8 @@ function drawErrors(tab, row) {
 }
 
 function drawScenarios(tab, row) {
-  const options = Object.keys(row.spread).map((name) => [name, columnOf(name).label]);
-  const rows = [["s0", row], ...floorsOf(tab, row)];
+  const options = Object.keys(row.spread).map((name) => [name, columnOf(tab, name).label]);
+  const rows = [["s0", row], ...floorsOf(tab)];
   const holder = el("div");
   const show = (by) => holder.replaceChildren(key(rows.map(([kind, one]) => [kind, short(one.name)]), spot), scenarioChart(tab, by, rows));
   if (options.length) show(options[0][0]);
@@ -83,25 +70,25 @@ function scenarioChart(tab, by, rows) {
   const held = rows.map(([kind, row]) => [kind, short(row.name), (row.spread[by] ?? []).map(number)]);
   const count = tab.scenarios.length;
   const places = { low: -0.5, high: count - 0.5, share: (value) => (value + 0.5) / count, factor: "", ticks: tab.scenarios.map((id, i) => ({ value: i, label: String(id) })) };
-  const plot = new Plot(places, spanning(held.flatMap(([, , values]) => values)), { xLabel: "scenario", yLabel: withUnit(by) });
+  const plot = new Plot(places, spanning(held.flatMap(([, , values]) => values)), { xLabel: "scenario", yLabel: columnOf(tab, by).quantity });
   [...held].reverse().forEach(([kind, name, values]) => values.forEach((value, i) => {
     if (!Number.isFinite(value)) return;
     const mark = spot(kind, plot.column(i), plot.row(value));
     mark.append(svg("title", {}, `${name}, scenario ${tab.scenarios[i]}: ${written(value)}`));
     plot.marks.push(mark);
   }));
-  return plot.draw(`${columnOf(by).label} of every test scenario`, held.map(([, name, values]) => `${name}: ${values.map((v) => written(v)).join(", ")}`).join(". "));
+  return plot.draw(`${columnOf(tab, by).label} of every test scenario`, held.map(([, name, values]) => `${name}: ${values.map((v) => written(v)).join(", ")}`).join(". "));
 }
 
 /** Return a mark: a dot for an entry, hollow ones of two shapes for the floors. */
 function spot(kind, x = 11, y = 5) {
-  if (kind === "floor1") return svg("path", { d: `M${(x - 4).toFixed(1)} ${y.toFixed(1)}l4 -4l4 4l-4 4Z`, class: `spot ${kind}` });
+  if (/^floor.*[13579]$/.test(kind)) return svg("path", { d: `M${(x - 4).toFixed(1)} ${y.toFixed(1)}l4 -4l4 4l-4 4Z`, class: `spot ${kind}` });
   return svg("circle", { cx: x.toFixed(1), cy: y.toFixed(1), r: kind === "s0" ? 5 : 3.8, class: `spot ${kind}` });
 }
 
 function drawEnergy(tab, row) {
   const truth = curveOf(tab.energy);
-  const rows = [["s0", row], ...floorsOf(tab, row)].filter(([, one]) => one.energy);
+  const rows = [["s0", row], ...floorsOf(tab)].filter(([, one]) => one.energy);
   const lines = rows.map(([kind, one]) => ({ kind, name: short(one.name), ...curveOf(one.energy) }));
   const roof = 3 * Math.max(...truth.mean.filter(Number.isFinite));
   const top = [truth, ...lines].flatMap(({ mean }) => [...mean]).map((value) => Math.min(value, roof));
@@ -123,17 +110,55 @@ function grid(head, rows, label, kind = "") {
 function drawFrames(tab, row) {
   const names = Object.keys(row.at);
   if (!names.length) return null;
-  const rows = names.map((name) => [withUnit(name), ...row.at[name].map((value) => written(number(value)))]);
+  const rows = names.map((name) => [columnOf(tab, name).quantity, ...row.at[name].map((value) => written(number(value)))]);
   return el("section", {}, el("h3", {}, "At the frames of interest"), grid(["metric", ...tab.marked.map((frame) => `frame ${frame}`)], rows, "Scores at frames"));
 }
 
 function drawNumbers(tab, row) {
-  const floors = floorsOf(tab, row).map(([, one]) => one);
-  const rows = tab.metrics.filter((name) => row.values[tab.metrics.indexOf(name)]).map((name) => {
-    const [, low, high] = row.values[tab.metrics.indexOf(name)];
-    const interval = low === null || low === undefined ? "" : `${written(number(low))} … ${written(number(high))}`;
-    return [withUnit(name), written(valueOf(tab, row, name)), interval, ...floors.map((one) => written(valueOf(tab, one, name)))];
-  });
-  const table = grid(["metric", "mean", "95 % interval", ...floors.map((one) => one.name)], rows, "Every metric");
+  const keys = presetsOf(tab).all.filter((key) => columnOf(tab, key).form === "number" && !Number.isNaN(valueOf(tab, row, key)));
+  const rows = keys.map((key) => [columnOf(tab, key).quantity, textOf(tab, row, key), cellOf(tab, row, key).title, ...tab.floors.map((one) => textOf(tab, one, key))]);
+  const table = grid(["metric", "mean", "interval, spread", ...tab.floors.map((one) => one.name)], rows, "Every metric");
   return el("details", { class: "numbers" }, el("summary", {}, `Every metric (${rows.length})`), table);
+}
+
+/** Return where an entry comes from, and how to make it again. */
+function drawOrigin(row) {
+  return el("section", { class: "origin" }, [
+    row.command ? [el("h3", {}, "The same predictions again"), commandBox(row.command)] : null,
+    el("h3", {}, "About"),
+    el("dl", {}, row.about.map(([name, text]) => [el("dt", {}, name), el("dd", {}, text)])),
+    el("h3", {}, "Predictions"),
+    grid(["seed", "mean", "size", "SHA-256", "predictions", "score file"], row.predictions.map(predictionLine), "Predictions", "text"),
+  ]);
+}
+
+function predictionLine([seed, mean, size, sha256, url, path, score]) {
+  return [seed, mean, size, el("code", { title: sha256 }, sha256.slice(0, 16)), outward(url, "file") ?? (path ? el("code", {}, path) : MISSING), el("code", {}, score)];
+}
+
+function commandBox(command) {
+  const code = el("code", {}, command);
+  const copy = button("Copy", async () => {
+    copy.textContent = (await copied(command, code)) ? "Copied" : "Press Ctrl+C";
+    setTimeout(() => { copy.textContent = "Copy"; }, 1600);
+  }, { class: "plain copy", "aria-live": "polite" });
+  return el("div", { class: "command" }, el("pre", {}, code), copy);
+}
+
+/** Copy text; where the browser forbids that, select it and say so. */
+async function copied(text, element) {
+  try {
+    await navigator.clipboard.writeText(text);
+    return true;
+  } catch {
+    getSelection().selectAllChildren(element);
+    return document.execCommand("copy");
+  }
+}
+
+/** Return who made an entry and where code, paper and weights are, as the table has it. */
+function drawByline(tab, row) {
+  const line = lineOf(tab, row);
+  const links = line.querySelector(".links")?.cloneNode(true);
+  return el("p", { class: "by" }, line.querySelector(".sub").textContent, links ? [" · ", links] : null);
 }

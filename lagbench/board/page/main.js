@@ -5,7 +5,7 @@ let film = null;
 let opener = null;
 const panel = document.getElementById("panel");
 const act = {
-  sort: (by) => change({ sort: nextSort(by, state.sort) }, `th [data-sort="${by}"]`),
+  sort: (by) => change({ sort: nextSort(tabOf(state), by, state.sort) }, `th [data-sort="${by}"]`),
   cost: (cost) => change({ cost }, '[data-figure="cost"] select'),
   curve: (curve) => change({ curve }, '[data-figure="lines"] select'),
 };
@@ -29,46 +29,41 @@ function draw() {
     link.setAttribute("aria-selected", chosen);
     link.tabIndex = chosen ? 0 : -1;
   }
-  drawTools();
   const tab = tabOf(state);
-  section().querySelector(".table").replaceChildren(drawTable(tab, state, act));
-  section().querySelector(".figures").replaceChildren(...drawOverview(tab, state, act));
-  const { entries } = shownRows(tab, state);
-  const every = tab.rows.filter((row) => !row.floor && (state.inactive || isActive(row))).length;
-  section().querySelector(".count").textContent = `${entries.length === every ? "" : `${entries.length} of `}${every} ${every === 1 ? "entry" : "entries"}`;
-}
-
-/** Fill the tools of the tab once, then keep them up to date. */
-function drawTools() {
-  const tab = tabOf(state);
+  if (!tab) return;
   const tools = section().querySelector(".tools");
-  if (!tools.childElementCount) tools.append(...makeTools(tab));
   const filter = tools.querySelector("input[type=search]");
   if (filter.value !== state.filter) filter.value = state.filter;
   for (const one of tools.querySelectorAll("[data-preset]")) one.setAttribute("aria-pressed", one.dataset.preset === state.preset);
   const inactive = tools.querySelector("input[type=checkbox]");
   if (inactive) inactive.checked = state.inactive;
+  const { every, entries } = arrange(tab, state);
+  section().querySelector(".figures").replaceChildren(...drawFigures(tab, state, entries, act));
+  const of = entries.length === every.length ? "" : `${entries.length} of `;
+  tools.querySelector(".count").textContent = `${of}${every.length} ${every.length === 1 ? "entry" : "entries"}`;
 }
 
-function makeTools(tab) {
-  const filter = el("input", { type: "search", placeholder: "Filter methods, authors, hardware", "aria-label": "Filter", spellcheck: "false" });
+/** Give the tools and headings of a tab their work. */
+function linkTools(tab) {
+  const whole = sectionOf(tab);
+  const filter = whole.querySelector("input[type=search]");
   filter.addEventListener("input", () => change({ filter: filter.value.slice(0, 200) }));
-  const presets = Object.keys(tab.presets).map((name) => button(name, () => choosePreset(name), { "data-preset": name }));
-  const hidden = tab.rows.filter((row) => !row.floor && !isActive(row)).length;
-  const inactive = el("input", { type: "checkbox" });
-  inactive.addEventListener("change", () => change({ inactive: inactive.checked }));
-  return [
-    filter,
-    el("div", { class: "presets", role: "group", "aria-label": "Columns" }, presets),
-    hidden ? el("label", { class: "check", title: "Withdrawn, superseded, or scored on old data" }, inactive, `inactive (${hidden})`) : null,
-    el("span", { class: "count muted", role: "status" }),
-    button("CSV", () => saveCsv(tabOf(state), state), { class: "plain csv", title: "Save the table as it is shown" }),
-  ].filter(Boolean);
+  for (const one of whole.querySelectorAll("[data-preset]")) one.addEventListener("click", () => choosePreset(one.dataset.preset));
+  for (const one of whole.querySelectorAll("[data-sort]")) one.addEventListener("click", () => act.sort(one.dataset.sort));
+  const inactive = whole.querySelector(".tools input[type=checkbox]");
+  inactive?.addEventListener("change", () => change({ inactive: inactive.checked }));
+  whole.querySelector(".csv").addEventListener("click", () => saveCsv(tab, state));
+  for (const name of whole.querySelectorAll("tr[data-entry] .name")) {
+    name.addEventListener("click", (event) => {
+      event.preventDefault();
+      location.hash = addressOf({ ...state, entry: name.closest("tr").dataset.entry });
+    });
+  }
 }
 
 function choosePreset(name) {
   const { key: by } = state.sort;
-  const kept = ["rank", "name", ...tabOf(state).presets[name]].includes(by);
+  const kept = ["rank", "name", ...presetsOf(tabOf(state))[name]].includes(by);
   change({ preset: name, sort: kept ? state.sort : { key: "rank", down: false } }, `[data-preset="${name}"]`);
 }
 
@@ -78,8 +73,8 @@ function openPanel() {
   film?.stop();
   let content;
   [content, film] = drawDetail(tab, state, row);
-  const { floors, entries } = shownRows(tab, state);
-  const listed = [...entries, ...floors];
+  const { entries } = shownRows(tab, state);
+  const listed = entries.includes(row) ? entries : [row];
   const step = (by) => addressOf({ ...state, entry: listed[(listed.indexOf(row) + by + listed.length) % listed.length].id });
   const move = (label, sign, by) => el("a", { href: step(by), class: "plain", "aria-label": label }, sign);
   panel.replaceChildren(
@@ -87,8 +82,8 @@ function openPanel() {
       el("div", {}, [
         el("p", { class: "brand" }, `${tab.split} · ${tab.size}`),
         el("h2", { id: "panel-title", tabindex: -1 }, row.name),
-        drawByline(row),
-        el("p", { class: "muted" }, drawStanding(tab, row)),
+        drawByline(tab, row),
+        el("p", { class: "muted" }, row.standing),
       ]),
       el("nav", { "aria-label": "Entries" }, move("Previous entry", "←", -1), move("Next entry", "→", 1), button("Close", () => panel.close(), { class: "plain" })),
     ]),
@@ -122,9 +117,9 @@ function follow() {
   } else if (panel.open) panel.close();
 }
 
-/** Return the state of a tab just opened: columns and what is hidden stay as they were. */
+/** Return the state of a tab just opened: what is hidden stays as it was. */
 function fresh(tab) {
-  return { tab, preset: state.preset, inactive: state.inactive, sort: { key: "rank", down: false } };
+  return { ...readAddress(`#${tab}`), inactive: state.inactive };
 }
 
 function linkTabs() {
@@ -180,12 +175,13 @@ document.addEventListener("click", (event) => {
 document.addEventListener("keydown", (event) => {
   if (event.key === "/" && !panel.open && !/^(input|select|textarea)$/i.test(event.target.tagName)) {
     event.preventDefault();
-    section().querySelector(".tools input").focus();
+    section()?.querySelector(".tools input")?.focus();
   }
 });
 
 if (BOARD.tabs.length) {
   linkTabs();
+  BOARD.tabs.forEach(linkTools);
   window.addEventListener("hashchange", () => isAddress(location.hash) && follow());
   follow();
 }

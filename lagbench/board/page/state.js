@@ -1,5 +1,7 @@
 // What the reader chose, kept in the address so that it can be shared.
 
+const OVERVIEW = "overview";
+
 function tabOf(state) {
   return BOARD.tabs.find((tab) => tab.id === state.tab);
 }
@@ -7,30 +9,27 @@ function tabOf(state) {
 /** Tell whether an address is one of ours, not that of a place on the page. */
 function isAddress(hash) {
   const text = hash.replace(/^#/, "");
-  return !text || text.includes("tab=") || BOARD.tabs.some((tab) => tab.id === text);
+  return !text || text.includes("tab=") || text === OVERVIEW || BOARD.tabs.some((tab) => tab.id === text);
 }
 
 /** Return the state that an address describes; what it does not know becomes the default. */
 function readAddress(hash) {
   const text = hash.replace(/^#/, "");
-  const bare = BOARD.tabs.find((tab) => tab.id === text);
-  const given = new URLSearchParams(bare ? `tab=${text}` : text);
-  const tab = BOARD.tabs.find((one) => one.id === given.get("tab")) ?? BOARD.tabs[0];
-  const preset = Object.hasOwn(tab.presets, given.get("columns") ?? "") ? given.get("columns") : "main";
+  const given = new URLSearchParams(text.includes("=") ? text : `tab=${text}`);
+  const tab = BOARD.tabs.find((one) => one.id === given.get("tab"));
   const sort = given.get("sort") ?? "rank";
+  const state = { tab: tab?.id ?? OVERVIEW, preset: "main", sort: { key: "rank", down: false }, filter: "", inactive: false, entry: "", cost: "", curve: "" };
+  if (!tab) return state;
+  const presets = presetsOf(tab);
+  if (Object.hasOwn(presets, given.get("columns") ?? "")) state.preset = given.get("columns");
   const order = { key: sort.replace(/^-/, ""), down: sort.startsWith("-") };
-  const known = ["rank", "name", ...tab.presets[preset]].includes(order.key);
-  const entry = tab.rows.find((row) => row.id === given.get("entry"))?.id ?? "";
-  return {
-    tab: tab.id,
-    preset,
-    sort: known ? order : { key: "rank", down: false },
-    filter: (given.get("filter") ?? "").slice(0, 200),
-    inactive: given.get("inactive") === "1",
-    entry,
-    cost: given.get("cost") ?? "",
-    curve: given.get("curve") ?? "",
-  };
+  if (["rank", "name", ...presets[state.preset]].includes(order.key)) state.sort = order;
+  state.filter = (given.get("filter") ?? "").slice(0, 200);
+  state.inactive = given.get("inactive") === "1";
+  state.entry = tab.rows.find((row) => row.id === given.get("entry"))?.id ?? "";
+  state.cost = given.get("cost") ?? "";
+  state.curve = given.get("curve") ?? "";
+  return state;
 }
 
 /** Return the address of a state; defaults are left out. */

@@ -28,17 +28,6 @@ function written(value, digits = 3) {
   return minus(Number(`${mantissa}e${order}`).toFixed(Math.max(0, digits - 1 - order)));
 }
 
-/** Return the text of a cell, whose form is "number", "count", "factor" or "text". */
-function cellText(value, form) {
-  if (form === "text") return value || MISSING;
-  if (form === "factor") return Number.isFinite(value) ? `${written(value)}×` : written(value);
-  if (form !== "count") return written(value);
-  for (const [unit, name] of [[1e9, "G"], [1e6, "M"], [1e3, "k"]]) {
-    if (value >= 0.9995 * unit) return `${written(value / unit)} ${name}`;
-  }
-  return written(value);
-}
-
 function decimals(values, step) {
   let places = Math.max(0, -Math.floor(Math.log10(step) + 1e-9));
   while (places < 9 && Math.abs(Number(step.toFixed(places)) - step) > 1e-9 * step) places += 1;

@@ -1,0 +1,331 @@
+"""NeuralMPM: particles to a grid, a U-Net, the grid to particles, several frames a call.
+
+    g = P2G(1, v(f-H+1) .. v(f)),  a(f+1) .. a(f+M) = U-Net(g, walls, forcing)
+    v(f+k) = (1 - s) v(f+k-1) + G2P(s u(f+k-1) + a(f+k)),  u(f+k) = u(f+k-1) + a(f+k)
+    x(f+k) = x(f+k-1) + v(f+k)
+
+after Rochman Sharabi, Lewin and Louppe (2024), arXiv 2408.15753. u is the velocity on the grid:
+only what particles have beyond it is damped, so that rollouts keep their energy. A node's
+accelerations are those of the matter that is there in frame f, wherever it goes in the bundle: one
+transfer each way serves all of its frames. Training unrolls several calls. The U-Net's last layer
+starts at zero: an untrained model keeps every velocity.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+from torch.nn.functional import gelu
+
+from lagbench.errors import DataError, UsageError
+
+from .baseline import Baseline, Batch, Options
+from .facts import Facts
+from .graph import MATERIALS
+from .particle_grid import ParticleGrid, Stencil
+from .seeding import noisy
+from .symmetry import Symmetry, draw, image
+
+__all__ = ["NeuralMPM", "NeuralMPMOptions", "UNet"]
+
+EMPTY = 1e-3
+"""Below this weight, in units of particles a radius apart, a node's velocity fades to 0."""
+
+REACH = 4
+"""Cells over which the U-Net sees how far a wall is."""
+
+COARSEST = 4
+"""Nodes of the U-Net's finest level to one of its coarsest, along each axis."""
+
+
+class NeuralMPMOptions(Options):
+    """Options of the grid surrogate."""
+
+    cells: int = Field(default=18, ge=4, le=256)  # cells of the network's grid across the box
+    width: int = Field(default=32, ge=4, multiple_of=4)  # channels of the finest level
+    velocities: int = Field(default=5, ge=1)  # last velocities that the U-Net sees
+    bundle: int = Field(default=4, ge=1)  # frames that one call predicts
+    calls: int = Field(default=2, ge=1)  # calls that training unrolls; gradients pass through all
+    smoothing: float = Field(default=0.2, ge=0.0, le=1.0)  # share s of the grid's velocity per frame
+    noise_std: float = Field(default=1e-4, ge=0.0, allow_inf_nan=False)  # on the last velocity [length/frame]
+    context: int = Field(default=0, ge=0)  # numbers read off the given frames and kept, such as a viscosity
+    materials: tuple[int, ...] = (0,)  # materials that have density and velocity of their own
+    wall_velocity: bool = False  # whether the velocity of the walls in the coming frames is a channel
+    symmetry: Symmetry = Symmetry.NONE  # images that training windows are replaced by at random
+
+
+@dataclass(frozen=True, kw_only=True)
+class GridState:
+    """What a call starts from."""
+
+    position: Tensor  # last positions [length], shape [particle, 2]
+    velocity: Tensor  # last velocities, oldest first [length/frame], shape [particle, velocities, 2]
+    sample: Tensor  # window of each particle, int64, shape [particle]
+    layer: Tensor  # layer of the grid: one for each window and material, int64, shape [particle]
+    # velocities of the walls from the last frame on [length/frame], shape [window, frame, wall, 2]
+    walls: Tensor
+    context: Tensor  # what the given frames told, shape [window, context]
+    coming: tuple[Tensor, ...] = ()  # predicted positions that are not yet given out
+
+
+class Block(nn.Module):
+    """Two convolutions beside a shortcut."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__()
+        self.first = nn.Conv2d(inputs, outputs, 3, padding=1)
+        self.norm = nn.GroupNorm(4, outputs)
+        self.second = nn.Conv2d(outputs, outputs, 3, padding=1)
+        self.shortcut = nn.Conv2d(inputs, outputs, 1) if inputs != outputs else nn.Identity()
+
+    def forward(self, field: Tensor) -> Tensor:
+        """Return the field after the block, shape [window, outputs, x node, y node]."""
+        changed: Tensor = self.second(gelu(self.norm(self.first(gelu(field)))))
+        past: Tensor = self.shortcut(field)
+        return changed + past
+
+
+class UNet(nn.Module):
+    """Three levels of resolution with shortcuts between equal ones (Ronneberger et al. 2015)."""
+
+    def __init__(self, inputs: int, outputs: int, width: int) -> None:
+        super().__init__()
+        fine, middle, coarse = width, 2 * width, 4 * width
+        self.begin = nn.Conv2d(inputs, fine, 3, padding=1)
+        self.down_fine, self.down_middle = Block(fine, fine), Block(middle, middle)
+        self.halve_fine = nn.Conv2d(fine, middle, 2, stride=2)
+        self.halve_middle = nn.Conv2d(middle, coarse, 2, stride=2)
+        self.bottom = nn.Sequential(Block(coarse, coarse), Block(coarse, coarse))
+        self.double_coarse = nn.ConvTranspose2d(coarse, middle, 2, stride=2)
+        self.double_middle = nn.ConvTranspose2d(middle, fine, 2, stride=2)
+        self.up_middle, self.up_fine = Block(2 * middle, middle), Block(2 * fine, fine)
+        self.end = nn.Conv2d(fine, outputs, 3, padding=1)
+        for parameter in self.end.parameters():
+            nn.init.zeros_(parameter)
+
+    def forward(self, field: Tensor) -> Tensor:
+        """Return the output in float32, shape [window, outputs, x node, y node]; sides are multiples of 4."""
+        fine = self.down_fine(self.begin(field))
+        middle = self.down_middle(self.halve_fine(fine))
+        coarse = self.double_coarse(self.bottom(self.halve_middle(middle)))
+        middle = self.double_middle(self.up_middle(torch.cat([coarse, middle], dim=1)))
+        fine = self.up_fine(torch.cat([middle, fine], dim=1))
+        # Three digits of bfloat16 are too few for what is added to velocities every frame.
+        with torch.autocast(field.device.type, enabled=False):
+            output: Tensor = self.end(gelu(fine.to(field.dtype)))
+        return output
+
+
+class Context(nn.Module):
+    """A few numbers that the given frames tell about a scenario as a whole."""
+
+    def __init__(self, inputs: int, outputs: int, width: int) -> None:
+        super().__init__()
+        self.fields = nn.Sequential(
+            nn.Conv2d(inputs, width, 3, padding=1),
+            nn.GELU(),
+            nn.Conv2d(width, width, 3, stride=2, padding=1),
+            nn.GELU(),
+            nn.Conv2d(width, width, 3, padding=1),
+            nn.GELU(),
+        )
+        self.numbers = nn.Sequential(nn.Linear(width, width), nn.GELU(), nn.Linear(width, outputs))
+
+    def forward(self, field: Tensor) -> Tensor:
+        """Return the numbers, shape [window, outputs]."""
+        numbers: Tensor = self.numbers(self.fields(field).mean(dim=(2, 3)))
+        return numbers.to(field.dtype)
+
+
+class NeuralMPM(Baseline):
+    """Grid surrogate: density and velocities of every material in, accelerations of the next frames out."""
+
+    Options = NeuralMPMOptions
+    options: NeuralMPMOptions
+    method = "NeuralMPM"
+
+    slot: Tensor
+    geometry: Tensor
+    beside: Tensor
+
+    def __init__(self, options: NeuralMPMOptions, facts: Facts) -> None:
+        super().__init__(options, facts)
+        self._check()
+        self.grid = ParticleGrid(facts.bounds, options.cells, multiple=COARSEST)
+        self.unit = (self.grid.spacing / facts.radius) ** 2
+        # One scale for x and y: a model that is trained on turned windows must not tell them apart.
+        self.speed, self.change = (
+            sum(std**2 / 2 for std in facts.statistics[name]) ** 0.5
+            for name in ("velocity_std", "acceleration_std")
+        )
+        slot = torch.full((MATERIALS,), -1)
+        slot[list(options.materials)] = torch.arange(len(options.materials))
+        self.register_buffer("slot", slot, persistent=False)
+        geometry = self.grid.wall_distance(REACH * self.grid.spacing)
+        self.register_buffer("geometry", geometry, persistent=False)
+        self.register_buffer("beside", self.grid.beside_walls(), persistent=False)
+        kinds, frames = len(options.materials), options.bundle
+        seen = kinds * (1 + 2 * options.velocities) + len(geometry)
+        self.context = Context(seen, options.context, options.width) if options.context else None
+        forcing = 2 * frames * options.wall_velocity
+        self.network = UNet(seen + forcing + options.context, 2 * kinds * frames, options.width)
+
+    def _check(self) -> None:
+        materials = self.options.materials
+        if self.options.wall_velocity and not self.facts.moving_walls:
+            raise UsageError(
+                f"the walls of {self.facts.split} do not move",
+                where="model.wall_velocity",
+                expected=False,
+                got=True,
+                fix="leave the option out",
+            )
+        if (
+            not materials
+            or len(set(materials)) < len(materials)
+            or not set(materials) <= set(range(MATERIALS))
+        ):
+            raise UsageError(
+                "materials are named once each",
+                where="model.materials",
+                expected=f"some of {list(range(MATERIALS))}",
+                got=list(materials),
+            )
+
+    @property
+    def history(self) -> int:
+        """One frame more than the velocities that the U-Net sees."""
+        return self.options.velocities + 1
+
+    @property
+    def future(self) -> int:
+        """Frames of all calls that training unrolls."""
+        return self.options.bundle * self.options.calls
+
+    def forward(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
+        """Return the squared error of velocity over the acceleration's deviation, mean over the frames [1].
+
+        Args:
+            batch: windows of ``history + future`` frames; left unchanged.
+            generator: source of noise and images; without one there is neither.
+        """
+        batch = batch if generator is None else self._disturbed(batch, generator)
+        state = self.start(batch.part(slice(self.history)))
+        target = batch.position[:, self.history - 1 :].diff(dim=1)
+        errors: list[Tensor] = []
+        for _ in range(self.options.calls):
+            state, frames = self.call(state)
+            for _, velocity in frames:
+                error = (velocity - target[:, len(errors)]) / self.change
+                errors.append(error.square().mean())
+        return {"velocity": torch.stack(errors).mean()}
+
+    def _disturbed(self, batch: Batch, generator: torch.Generator) -> Batch:
+        """Return the batch as its random image, with noise."""
+        if self.options.symmetry is not Symmetry.NONE:
+            matrix = draw(self.options.symmetry, batch.windows, generator)
+            batch = image(batch, matrix, self.facts.bounds)
+        if self.options.noise_std > 0.0:
+            position = noisy(batch.position, self.history, self.options.noise_std, generator)
+            batch = replace(batch, position=position)
+        return batch
+
+    def start(self, given: Batch) -> GridState:
+        """Return the state after the given frames; where they are few, the first velocity repeats.
+
+        Raises:
+            UsageError: fewer than two frames.
+            DataError: a particle of a material that the model does not know.
+        """
+        count = self.options.velocities
+        if given.frames < 2:
+            raise UsageError(
+                "too few frames to start from", expected=f"2 or more, {count + 1} for all", got=given.frames
+            )
+        slot = self.slot[given.material]
+        if bool((slot < 0).any()):
+            raise DataError(
+                "a material that the model does not know",
+                where="model.materials",
+                expected=list(self.options.materials),
+                got=sorted(set(given.material.tolist())),
+            )
+        position = given.position[:, -count - 1 :].clamp(self.grid.low, self.grid.high)
+        velocity = position.diff(dim=1)
+        missing = count - velocity.shape[1]
+        velocity = torch.cat([velocity[:, :1].expand(-1, missing, -1), velocity], dim=1)
+        walls = position.new_zeros(given.windows, 1, len(self.beside), 2)
+        if self.options.wall_velocity and given.wall_velocity is not None:
+            walls = given.wall_velocity[:, given.frames - 1 :] * self.facts.frame_interval
+        state = GridState(
+            position=position[:, -1],
+            velocity=velocity,
+            sample=given.sample,
+            layer=given.sample * len(self.options.materials) + slot,
+            walls=walls,
+            context=position.new_zeros(given.windows, 0),
+        )
+        if self.context is None:
+            return state
+        fields, _ = self._fields(state, self.grid.stencil(state.position, state.layer))
+        return replace(state, context=self.context(fields))
+
+    def advance(self, state: GridState) -> tuple[GridState, Tensor]:
+        """Advance by one frame, calling the U-Net once for every bundle of them."""
+        if not state.coming:
+            state, frames = self.call(state)
+            state = replace(state, coming=tuple(position for position, _ in frames))
+        return replace(state, coming=state.coming[1:]), state.coming[0]
+
+    def call(self, state: GridState) -> tuple[GridState, list[tuple[Tensor, Tensor]]]:
+        """Return the state after a bundle of frames, and position and velocity in each of them."""
+        share = self.options.smoothing
+        stencil = self.grid.stencil(state.position, state.layer)
+        fields, on_grid = self._fields(state, stencil)
+        predicted = torch.cat([on_grid, self._accelerations(state, fields)], dim=1)
+        gathered = self.grid.gather(stencil, predicted).view(len(stencil.weight), -1, 2)
+        on_grid, *accelerations = gathered.unbind(dim=1)
+        position, velocity = state.position, state.velocity[:, -1]
+        frames: list[tuple[Tensor, Tensor]] = []
+        for acceleration in accelerations:
+            velocity = (1.0 - share) * velocity + share * on_grid + acceleration
+            velocity = velocity.clamp(self.grid.low - position, self.grid.high - position)
+            # The sum may round to a number beyond the wall.
+            position = (position + velocity).clamp(self.grid.low, self.grid.high)
+            on_grid = on_grid + acceleration
+            frames.append((position, velocity))
+        last = torch.stack([one for _, one in frames], dim=1)
+        velocities = torch.cat([state.velocity, last], dim=1)[:, -self.options.velocities :]
+        walls = state.walls[:, min(len(frames), state.walls.shape[1] - 1) :]
+        return replace(state, position=position, velocity=velocities, walls=walls), frames
+
+    def _fields(self, state: GridState, stencil: Stencil) -> tuple[Tensor, Tensor]:
+        """Return what the U-Net sees of the particles, and the last velocity on the grid [length/frame].
+
+        Velocities are told as the last one and the changes before it, each in its own unit.
+        """
+        windows = len(state.walls)
+        layers = windows * len(self.options.materials)
+        carried = torch.cat([torch.ones_like(state.position[:, :1]), state.velocity.flatten(1)], dim=1)
+        sums = self.grid.spread(stencil, carried, layers)
+        weight = sums[:, :1] / self.unit
+        velocity = sums[:, 1:] / self.unit / weight.clamp(min=EMPTY)
+        velocity = velocity.reshape(layers, -1, 2, *self.grid.shape)
+        changes = velocity.diff(dim=1) / self.change
+        seen = torch.cat([weight, velocity[:, -1] / self.speed, changes.flatten(1, 2)], dim=1)
+        geometry = self.geometry.expand(windows, -1, -1, -1)
+        return torch.cat([seen.reshape(windows, -1, *self.grid.shape), geometry], dim=1), velocity[:, -1]
+
+    def _accelerations(self, state: GridState, fields: Tensor) -> Tensor:
+        """Return the accelerations in the coming frames [length/frame^2], shape [layer, 2 bundle, x, y]."""
+        bundle = self.options.bundle
+        parts = [fields, state.context[:, :, None, None].expand(-1, -1, *self.grid.shape)]
+        if self.options.wall_velocity:
+            frames = torch.arange(1, bundle + 1, device=fields.device).clamp(max=state.walls.shape[1] - 1)
+            forcing = torch.einsum("fmwc,wxy->fmcxy", state.walls[:, frames] / self.speed, self.beside)
+            parts.append(forcing.flatten(1, 2))
+        output: Tensor = self.network(torch.cat(parts, dim=1)) * self.change
+        return output.reshape(-1, 2 * bundle, *self.grid.shape)

@@ -1,0 +1,236 @@
+"""What the scores say of the thesis's claims and of ours: rows of one kind of comparison.
+
+A comparison is the exact sign-flip test over test scenarios, two-sided, in the metric's loss, between the
+means over the seeds that both have (over all seeds where they share none). The p-values of one model against
+several are corrected together (Holm 1979). Scenarios are the sample: with one training per model a difference
+is one between two trainings, which another seed may turn.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from lagbench.metrics import CHOSEN, Comparison, Direction, compare, holm
+from lagbench.metrics.significance import SIGNIFICANCE
+from lagbench.scoring.tables import Table
+
+from .evidence import Evidence, ordered
+from .sheet import number
+from .thesis import FRAME_MODELS, OPERATORS, key_frame, label
+
+__all__ = [
+    "CLAIMS",
+    "Claim",
+    "Compared",
+    "Verdict",
+    "answer",
+    "claim_rows",
+    "compared",
+    "comparison_table",
+    "floors_ahead",
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Claim:
+    """A question about one model and its rivals, asked of every split by the ranking metric."""
+
+    question: str
+    first: str  # model that the question is about; empty for the best floor
+    rivals: tuple[str, ...] = ()  # models to compare it with; empty for all
+    metrics: tuple[str, ...] = ()  # judged beside the ranking one, over the horizon
+    at_key_frame: tuple[str, ...] = ()  # judged at the frame at which the thesis compares models
+
+
+CLAIMS = (
+    Claim(
+        question="Does SuperGAT come first among the operators (Table 5.4: on the cavity it does)?",
+        first="supergat",
+        rivals=tuple(name for name in OPERATORS if name != "supergat"),
+        at_key_frame=("vorticity_mse",),
+    ),
+    Claim(
+        question="Does SuperGAT's link loss help, at the same start and seeds?",
+        first="supergat-link",
+        rivals=("supergat-unlinked",),
+        at_key_frame=("vorticity_pearson",),
+    ),
+    Claim(
+        question="Does the vorticity loss help (Fig. 5.5: it does), at the same budget and seeds?",
+        first="gns",
+        rivals=("gns-novorticity",),
+        metrics=("position_rmse", "energy_error"),
+        at_key_frame=("vorticity_pearson",),
+    ),
+    Claim(
+        question="Do summed messages decide: is SuperGAT better with them than without?",
+        first="supergat",
+        rivals=("supergat-unsummed",),
+    ),
+    Claim(
+        question="Graph or grid: is neuralmpm better than every operator?",
+        first="neuralmpm",
+        rivals=(*OPERATORS, "supergat-link"),
+    ),
+    Claim(
+        question="Does LSTM + MLP come first among the frame models (Table 4.8: it does)?",
+        first="lstm-mlp",
+        rivals=tuple(name for name in FRAME_MODELS if name != "lstm-mlp"),
+    ),
+    Claim(
+        question="Is standing still better than VAR(1) (section 4.8.3: its forecast diverges)?",
+        first="persistence",
+        rivals=("var",),
+        metrics=("mse_end",),
+    ),
+    Claim(question="Is the best floor better than a model that learned?", first=""),
+)
+
+
+class Verdict(enum.StrEnum):
+    """What a comparison lets one say of the first of two, at 5 %."""
+
+    BETTER = "better"
+    WORSE = "worse"
+    OPEN = "open"
+    FEW = "too few scenarios"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Compared:
+    """One row: two models by one metric."""
+
+    where: str  # split and size
+    metric: str
+    frame: int | None  # None for the horizon
+    first: str
+    second: str
+    means: tuple[float, float]
+    test: Comparison
+    won: int  # scenarios in which the first has the smaller loss
+    seeds: tuple[int, int]  # trainings behind each mean
+    p: float  # corrected for the number of rivals; NaN with too few scenarios
+
+    @property
+    def verdict(self) -> Verdict:
+        """What the test lets one say."""
+        if math.isnan(self.p):
+            return Verdict.FEW
+        if self.p >= SIGNIFICANCE:
+            return Verdict.OPEN
+        return Verdict.BETTER if self.test.difference < 0.0 else Verdict.WORSE
+
+
+def compared(
+    evidence: Evidence, first: str, rivals: Sequence[str], metrics: Sequence[str], *, frame: int | None = None
+) -> list[Compared]:
+    """Return a model against its rivals by each metric that both have, over the horizon or at a frame."""
+    found = []
+    for metric in metrics:
+        rows = [
+            row
+            for name in rivals
+            if {first, name} <= evidence.methods.keys()
+            and (row := _pair(evidence, first, name, metric, frame))
+        ]
+        corrected = holm([row.test.p for row in rows])
+        found += [replace(row, p=p) for row, p in zip(rows, corrected, strict=True)]
+    return found
+
+
+def _pair(evidence: Evidence, first: str, second: str, metric: str, frame: int | None) -> Compared | None:
+    one, two = evidence.methods[first], evidence.methods[second]
+    if common := {held.seed for held in one.seeds} & {held.seed for held in two.seeds}:
+        one, two = one.of_seeds(common), two.of_seeds(common)
+    if metric not in one.scores or metric not in two.scores:
+        return None
+    scores = [held.scores[metric] for held in (one, two)]
+    sides = [[seed.scores[metric] for seed in held.seeds] for held in (one, two)]
+    if frame is not None:
+        scores = [replace(score, values=score.at(frame)) for score in scores]
+        sides = [[replace(score, values=score.at(frame)) for score in side] for side in sides]
+    test = compare(*sides)
+    losses = [[score.metric.loss(value) for value in score.values.tolist()] for score in scores]
+    return Compared(
+        where=evidence.where,
+        metric=metric,
+        frame=frame,
+        first=first,
+        second=second,
+        means=(scores[0].mean, scores[1].mean),
+        test=test,
+        won=sum(ours < theirs for ours, theirs in zip(*losses, strict=True)),  # NaN is not smaller
+        seeds=(len(one.seeds), len(two.seeds)),
+        p=test.p,
+    )
+
+
+def claim_rows(claim: Claim, evidence: Evidence) -> list[Compared]:
+    """Return all rows of a claim on one split and size, those by the ranking metric first."""
+    first = claim.first or evidence.best_floor
+    if first is None:
+        return []
+    rivals = claim.rivals or tuple(name for name in evidence.order(evidence.models) if name != first)
+    over = dict.fromkeys((evidence.ranking, *claim.metrics))
+    rows = compared(evidence, first, rivals, tuple(over))
+    return rows + compared(evidence, first, rivals, claim.at_key_frame, frame=key_frame(evidence.size))
+
+
+def answer(rows: Sequence[Compared]) -> str:
+    """Return what the rows by the ranking metric say: yes, no, open, or of how many rivals; "" without."""
+    judged = [row for row in rows if row.metric == rows[0].metric and row.frame is None]
+    verdicts = [row.verdict for row in judged]
+    if not verdicts or Verdict.FEW in verdicts:
+        return Verdict.FEW.value if verdicts else ""
+    better, worse = verdicts.count(Verdict.BETTER), verdicts.count(Verdict.WORSE)
+    if better == len(judged):
+        return "yes"
+    if len(judged) == 1:
+        return "no" if worse else "open"
+    ahead = sum(row.test.difference < 0.0 for row in judged)
+    return f"ahead of {ahead} of {len(judged)}; better than {better}, worse than {worse}"
+
+
+def comparison_table(rows: Sequence[Compared], title: str = "") -> Table:
+    """Return comparisons as a table; the lead is second minus first in loss: positive favours the first."""
+    heads = (
+        *("where", "metric", "first", "second", "means", "seeds"),
+        *("lead (95 %)", "won", "p (Holm)", "the first is"),
+    )
+    return Table(title, heads, tuple(map(_cells, rows)))
+
+
+def _cells(row: Compared) -> tuple[str, ...]:
+    low, high = (-bound for bound in reversed(row.test.interval))
+    bounds = "" if math.isnan(low) else f" ({number(low)} to {number(high)})"
+    return (
+        row.where,
+        row.metric if row.frame is None else f"{row.metric}, frame {row.frame}",
+        label(row.first),
+        label(row.second),
+        f"{number(row.means[0])} / {number(row.means[1])}",
+        f"{row.seeds[0]} / {row.seeds[1]}",
+        f"{number(-row.test.difference)}{bounds}",
+        f"{row.won} of {len(row.test.scenarios)}",
+        number(row.p, 2),
+        row.verdict.value,
+    )
+
+
+def floors_ahead(everything: Sequence[Evidence]) -> Table:
+    """Return the metrics in which a floor is better than every model, in the mean."""
+    rows = []
+    for evidence in everything:
+        for metric in dict.fromkeys((evidence.ranking, *CHOSEN)):
+            scores = {n: m.scores[metric] for n, m in evidence.methods.items() if metric in m.scores}
+            if any(score.metric.direction is Direction.NONE for score in scores.values()):
+                continue
+            order = [name for name in ordered(scores) if not math.isnan(scores[name].mean)]
+            best = next((name for name in order if name in evidence.models), None)
+            if best is not None and order[0] in evidence.floors:
+                means = number(scores[order[0]].mean), number(scores[best].mean)
+                rows.append((evidence.where, metric, order[0], means[0], label(best), means[1]))
+    return Table("", ("where", "metric", "floor", "its mean", "best model", "its mean"), tuple(rows))

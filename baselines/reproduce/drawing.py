@@ -1,0 +1,185 @@
+"""Truth and predictions of a scenario, and charts and rows of panels drawn from them in one style."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagbench.data.scenario import ScenarioFile
+from lagbench.draw.panels import Panel, colour_bar, colour_scale, draw, draw_walls, limit_of
+from lagbench.draw.recording import Recording, Scene, open_recording
+from lagbench.draw.style import INK, figure, pixels_of, png_bytes
+from lagbench.metrics import FramePair, Scenario, Snapshot
+from lagbench.submission import Predictions, open_predictions
+
+from .runs import Plan
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure as Picture
+
+__all__ = ["QUIVER", "TRUTH", "Rollouts", "charts", "opened", "panel_rows", "png", "tidy"]
+
+Floats = NDArray[np.float64]
+
+TRUTH = INK
+LEVELS = 96
+"""Colours of a chart's file."""
+
+QUIVER = "quiver"
+"""A kind of panel of our own: arrows at the nodes, coloured by speed as streamlines are."""
+
+SIDE, GAP, TOP, LEFT, BOTTOM = 1.5, 0.08, 0.34, 0.75, 0.62  # [inch]
+
+
+@dataclass(eq=False)
+class Rollouts:
+    """Truth and predictions of one test scenario, frame by frame, from open files."""
+
+    scenario: Scenario  # what holds in all its frames, as metrics see it
+    recording: Recording  # the same as pictures see it
+    file: ScenarioFile
+    predictions: Mapping[str, Predictions]  # by model, in the order in which they were asked for
+    _truth: dict[int, Snapshot] = field(default_factory=dict)
+
+    def position(self, name: str | None, frame: int) -> Floats:
+        """Return positions of the truth (None) or of a prediction [length], shape [particle, 2].
+
+        Given frames are the truth's.
+        """
+        if name is None or frame < self.scenario.setting.predicted_frames[0]:
+            return np.asarray(self.file.read("position", frame), np.float64)
+        return np.asarray(self.predictions[name].frames(self.recording.scenario, frame, 1)[0], np.float64)
+
+    def snapshot(self, name: str | None, frame: int) -> Snapshot:
+        """Return a frame as metrics see it; the truth's is formed once."""
+        if name is None and frame in self._truth:
+            return self._truth[frame]
+        found = self.scenario.snapshot(self.position(name, frame), self.position(name, frame - 1))
+        if name is None:
+            self._truth[frame] = found
+        return found
+
+    def pair(self, name: str, frame: int) -> FramePair:
+        """Return truth and prediction of a frame."""
+        return FramePair(self.scenario, frame, self.snapshot(None, frame), self.snapshot(name, frame))
+
+    def scene(self, name: str | None, frame: int) -> Scene:
+        """Return a frame as pictures see it."""
+        position = self.position(name, frame)
+        displacement = position - self.position(name, frame - 1)
+        return Scene(
+            recording=self.recording,
+            frame=frame,
+            position=position,
+            velocity=displacement / self.recording.size.frame_interval,
+            displacement=displacement,
+        )
+
+
+@contextmanager
+def opened(plan: Plan, split: str, scenario: int, names: Iterable[str]) -> Iterator[Rollouts]:
+    """Open a test scenario with the predictions of models; those without a run are left out."""
+    paths = {name: plan.predictions(split, name) for name in names}
+    with ExitStack() as stack:
+        truth = stack.enter_context(plan.test_subset(split).opened(scenario))
+        recording = stack.enter_context(open_recording(truth.file.path, registry=plan.described))
+        predictions = {
+            name: stack.enter_context(open_predictions(path)) for name, path in paths.items() if path
+        }
+        yield Rollouts(truth.scenario, recording, truth.file, predictions)
+
+
+@contextmanager
+def charts(count: int, columns: int, *, width: float = 4.2, height: float = 3.0) -> Iterator[list[Axes]]:
+    """Yield axes of so many charts in so many columns; a chart has this width and height [inch]."""
+    rows = -(-count // columns)
+    with figure(columns * width, rows * height) as picture:
+        picture.set_layout_engine("constrained")
+        axes: list[Axes] = picture.subplots(rows, columns, squeeze=False).ravel().tolist()
+        for unused in axes[count:]:
+            unused.set_axis_off()
+        yield axes[:count]
+
+
+def png(axes: Sequence[Axes]) -> bytes:
+    """Return charts as PNG in few colours, without date or software; equal charts, equal bytes."""
+    from PIL import Image
+
+    picture = cast("Picture", axes[0].get_figure(root=True))
+    image = Image.fromarray(pixels_of(picture)).quantize(LEVELS, dither=Image.Dither.NONE)
+    with io.BytesIO() as buffer:
+        image.save(buffer, format="PNG", optimize=True)
+        return buffer.getvalue()
+
+
+def tidy(axes: Axes, title: str, x: str, y: str, *, legend: bool = True) -> None:
+    """Set title, labels, light grid and legend of a chart."""
+    axes.set(title=title, xlabel=x, ylabel=y)
+    axes.grid(alpha=0.25, lw=0.5)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    if legend and axes.get_legend_handles_labels()[1]:
+        axes.legend(frameon=False, fontsize=7.5)
+
+
+def panel_rows(rows: Sequence[tuple[str, Rollouts, str | None]], frames: Sequence[int], panel: str) -> bytes:
+    """Draw rows of (heading, scenario, model or None for the truth), a column per frame, in common colours.
+
+    Of one frame rows stand side by side, headings above. The colour scale is the truth's, which predictions
+    may exceed.
+    """
+    scale = Panel.STREAMLINES if panel == QUIVER else Panel(panel)
+    cells = [(row, frame) for row in rows for frame in frames]
+    across = len(frames) == 1
+    columns, lines = (len(rows), 1) if across else (len(frames), len(rows))
+    left_margin = 0.1 if across else LEFT
+    width = left_margin + columns * (SIDE + GAP) + 0.1
+    height = TOP + lines * (SIDE + GAP) + BOTTOM
+    limit = 1.0
+    if scale is not Panel.MATERIAL:
+        scenarios = {row[1].recording.scenario: row[1] for row in rows}.values()
+        limit = max(limit_of(scale, one.scene(None, frame)) for one in scenarios for frame in frames)
+    with figure(width, height) as picture:
+        for count, ((heading, rollouts, name), frame) in enumerate(cells):
+            line, column = divmod(count, columns)
+            left = (left_margin + column * (SIDE + GAP)) / width
+            bottom = (height - TOP - (line + 1) * (SIDE + GAP) + GAP) / height
+            axes = picture.add_axes((left, bottom, SIDE / width, SIDE / height))
+            if panel == QUIVER:
+                _draw_arrows(axes, rollouts.scene(name, frame), limit)
+            else:
+                draw(axes, scale, rollouts.scene(name, frame), limit=limit, detail=0.35)
+            if across or line == 0:
+                axes.set_title(heading if across else f"frame {frame}", fontsize=8)
+            if not across and column == 0:
+                axes.set_ylabel(heading, fontsize=8, color=INK)
+        if scale is not Panel.MATERIAL:
+            place = (0.35 / width, 0.42 / height, min(2.0, width - 0.6) / width, 0.08 / height)
+            colour_bar(picture.add_axes(place), scale, limit)
+        return png_bytes(picture)
+
+
+def _draw_arrows(axes: Axes, scene: Scene, limit: float) -> None:
+    """Draw the velocity at the nodes; the fastest arrow spans two and a half of them."""
+    draw_walls(axes, scene.recording, scene.frame)
+    fields, scale = scene.fields, colour_scale(Panel.STREAMLINES, limit)
+    x, y = np.meshgrid(fields.grid.axis, fields.grid.axis, indexing="ij")
+    shown = fields.counted
+    velocity = fields.velocity[shown] / scene.recording.size.frame_interval
+    axes.quiver(
+        *(x[shown], y[shown], *velocity.T, np.linalg.norm(velocity, axis=-1)),
+        cmap=scale.cmap,
+        norm=scale.norm,
+        angles="xy",
+        scale_units="xy",
+        scale=limit * fields.grid.cells / 2.5,
+        width=0.006,
+        zorder=2,
+    )

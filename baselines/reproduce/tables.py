@@ -1,0 +1,212 @@
+"""Tables and bars: solver times, rollouts, statistics of train, vorticity of six operators."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagbench.data.manifest import read_manifest
+from lagbench.errors import DataError
+from lagbench.metrics import METRICS
+from lagbench.metrics.distributions import kl, normalised
+from lagbench.scoring.tables import Table
+
+from .drawing import charts, opened, png, tidy
+from .evidence import Evidence
+from .runs import Plan
+from .sheet import Figure, Sheet, number
+from .thesis import (
+    FRAME_MODELS,
+    OPERATORS,
+    STATISTICS,
+    TABLE_4_7,
+    TABLE_4_8,
+    TABLE_5_4,
+    Rollout,
+    colour,
+    key_frame,
+    label,
+    scenario_of,
+)
+
+__all__ = [
+    "cubic_errors",
+    "cubic_vorticity",
+    "rollout_table",
+    "rollouts",
+    "solver_times",
+    "statistics",
+    "vorticity",
+    "vorticity_bars",
+]
+
+Floats = NDArray[np.float64]
+
+
+def solver_times(plan: Plan, figure: Figure) -> Sheet:
+    """Return the command that measures them, and what it last wrote where that is here."""
+    del plan, figure
+    command = "python benchmarks/table_3_1.py --rows 1-4 --device cpu --output docs/figures"
+    found = [path.read_text(encoding="utf-8") for path in sorted(Path("docs/figures").glob("table_3_1_*.md"))]
+    note = f"From a clone of the repository: `{command}` (rows 1-9 with `--device cuda`)."
+    return Sheet(notes=(note, *found))
+
+
+def rollouts(plan: Plan, figure: Figure) -> Sheet:
+    """Return Table 4.7 or 4.8 with ours beside it."""
+    printed = {"fluid": (TABLE_4_7,)} if figure.name == "table_4_7" else TABLE_4_8
+    tables = tuple(rollout_table(plan.evidence(split), rows) for split, rows in printed.items())
+    return Sheet(notes=(figure.said,), tables=tables)
+
+
+def rollout_table(evidence: Evidence, printed: tuple[Rollout, ...]) -> Table:
+    """Return average and end error by scene, ours and the thesis's, as in "0.31 / 0.58"."""
+    names = [*FRAME_MODELS, *(n for n in ("var", "var-stable") if n in evidence.methods)]
+    rows = []
+    for row in printed:
+        ours = scenario_of(evidence.size, row.scenario)
+        cells = [str(row.scenario), row.scene, "-" if ours is None else str(ours)]
+        for theirs, metric in ((row.average, "mse_avg"), (row.end, "mse_end")):
+            known = dict(zip(FRAME_MODELS, theirs, strict=True))
+            for name in names:
+                method = evidence.methods.get(name)
+                value = None if method is None or ours is None else method.over_horizon(metric, ours)
+                cells.append(f"{number(value)} / {number(known.get(name), 4)}")
+        rows.append(tuple(cells))
+    heads = [f"{what}, {label(name)}" for what in ("average", "end") for name in names]
+    return Table(evidence.where, ("thesis's id", "scene", "our id", *heads), tuple(rows))
+
+
+def statistics(plan: Plan, figure: Figure) -> Sheet:
+    """Return the statistics of a split's train per frame, the thesis's beside ours."""
+    split = figure.split
+    tier = plan.tier(split)
+    manifest = read_manifest(plan.root, split, plan.size, tier.major)
+    found = tier.measured.statistics if tier.measured else (manifest.statistics if manifest else {})
+    if not found:
+        raise DataError(
+            "the statistics of train are recorded nowhere", fix=f"lagbench generate --split {split}"
+        )
+    rows = [
+        (quantity, *(number(value, 4) for pair in (printed, found[quantity]) for value in pair))
+        for quantity, printed in STATISTICS[split].items()
+    ]
+    heads = ("per frame", "thesis x", "thesis y", "ours x", "ours y")
+    return Sheet(notes=(figure.said,), tables=(Table(f"{split} {plan.size}, train", heads, tuple(rows)),))
+
+
+def vorticity(plan: Plan, figure: Figure) -> Sheet:
+    """Return Table 5.4 or 5.5: thesis, T0 and mean over scenarios, by both ways to form vorticity."""
+    evidence = plan.evidence(figure.split)
+    frame, first = key_frame(evidence.size), scenario_of(evidence.size, 0)
+    names = [name for name in figure.models if name in evidence.methods]
+    cubic = {i: _by_cubic(plan, figure, i, frame) for i in plan.test_subset(figure.split).scenarios}
+
+    def scored(model: str, measure: str, scenario: int | None) -> float:
+        return evidence.methods[model].at(f"vorticity_{measure}", frame, scenario)
+
+    def interpolated(model: str, measure: str, scenario: int | None) -> float:
+        chosen = list(cubic) if scenario is None else [scenario]
+        found = [cubic[i][model][measure] for i in chosen if model in cubic[i]]
+        return sum(found) / len(found) if found else math.nan
+
+    cells = evidence.size.task.score_grid.cells
+    ways: dict[str, Callable[[str, str, int | None], float]] = {
+        f"Score grid ({cells} cells across, B-spline)": scored,
+        "SciPy griddata, cubic, 40 x 40, as in the thesis": interpolated,
+    }
+    heads = [f"{m.upper()} {who}" for m in figure.metrics for who in ("thesis", "ours T0", "ours mean")]
+    tables = []
+    for title, way in ways.items():
+        rows = []
+        for name in names:
+            row = [label(name)]
+            for measure in figure.metrics:
+                printed = TABLE_5_4.get(name, {}).get(measure)
+                row += [
+                    number(printed, 4),
+                    number(way(name, measure, first)),
+                    number(way(name, measure, None)),
+                ]
+            rows.append(tuple(row))
+        tables.append(Table(title, ("model", *heads), tuple(rows)))
+    note = f"Frame {frame}; T0 is our test scenario {first}. {figure.said}"
+    return Sheet(notes=(note,), tables=tuple(tables))
+
+
+def _by_cubic(plan: Plan, figure: Figure, scenario: int, frame: int) -> Mapping[str, Mapping[str, float]]:
+    """Return the errors of each model at a frame of a scenario, by the thesis's way."""
+    with opened(plan, figure.split, scenario, figure.models) as rollouts:
+        fields = {}
+        for name in (None, *rollouts.predictions):
+            held = rollouts.snapshot(name, frame)
+            fields[name] = cubic_vorticity(held.position, held.velocity, rollouts.recording.size.bounds)
+        return {name: cubic_errors(fields[None], fields[name]) for name in rollouts.predictions}
+
+
+def cubic_vorticity(
+    position: Floats,
+    velocity: Floats,
+    bounds: tuple[tuple[float, float], tuple[float, float]],
+    *,
+    cells: int = 40,
+) -> Floats:
+    """Return the vorticity as the thesis forms it, NaN outside the particles' hull [1/frame], shape [x, y].
+
+        u_ij = griddata(x_p, u_p, x_ij, method="cubic"),   omega = dv/dx - du/dy  (second order)
+
+    over nodes that span the box from wall to wall (Fig. 5.20). Unlike the scorer's transfer it does not
+    average over particles: it follows every particle's velocity [length/frame], so that noise between
+    neighbours shows.
+    """
+    from scipy.interpolate import griddata
+
+    x, y = (np.linspace(low, high, cells) for low, high in bounds)
+    nodes = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
+    held: Floats = griddata(position, velocity, nodes, method="cubic")
+    slope = np.gradient(held[..., 1], x, axis=0) - np.gradient(held[..., 0], y, axis=1)
+    return np.asarray(slope, np.float64)
+
+
+def cubic_errors(truth: Floats, prediction: Floats) -> Mapping[str, float]:
+    """Return MAE, MSE, RMSE, KL (Eq. 5.23) and Pearson (Eq. 5.21) over nodes that both have."""
+    both = np.isfinite(truth) & np.isfinite(prediction)
+    true, predicted = truth[both], prediction[both]
+    mse = float(np.mean((predicted - true) ** 2))
+    still = not (np.ptp(true) and np.ptp(predicted))
+    return {
+        "mae": float(np.mean(np.abs(predicted - true))),
+        "mse": mse,
+        "rmse": mse**0.5,
+        "kl": kl(normalised(true), normalised(predicted)),
+        "pearson": math.nan if still else float(np.corrcoef(true, predicted)[0, 1]),
+    }
+
+
+def vorticity_bars(plan: Plan, figure: Figure) -> Sheet:
+    """Return one measure of six operators at frame 54, ours beside the thesis's."""
+    evidence, (metric,) = plan.evidence(figure.split), figure.metrics
+    frame, first = key_frame(evidence.size), scenario_of(evidence.size, 0)
+    models = {n: evidence.methods[n] for n in figure.models if n in evidence.methods}
+    series: dict[str, dict[str, float]] = {
+        "thesis, T0": {n: row[metric.removeprefix("vorticity_")] for n, row in TABLE_5_4.items()},
+        "ours, T0": {n: m.at(metric, frame, first) for n, m in models.items()},
+        "ours, mean": {n: m.at(metric, frame) for n, m in models.items()},
+    }
+    with charts(3, 3, width=2.9, height=2.6) as drawn:
+        for axes, (title, values) in zip(drawn, series.items(), strict=True):
+            order = [n for n in OPERATORS if n in values]
+            axes.barh([label(n) for n in order], [values[n] for n in order], color=[colour(n) for n in order])
+            axes.invert_yaxis()
+            tidy(axes, title, f"{metric} [{METRICS[metric].unit}]", "", legend=False)
+        picture = png(drawn)
+    rows = tuple((label(n), *(number(values.get(n), 4) for values in series.values())) for n in OPERATORS)
+    return Sheet(
+        notes=(f"Vorticity at frame {frame} on the score grid.",),
+        tables=(Table("", ("model", *series), rows),),
+        pictures={"": picture},
+    )

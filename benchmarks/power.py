@@ -1,0 +1,181 @@
+"""How often do tests over seeds and scenarios tell methods apart, rightly and wrongly?
+
+    python benchmarks/power.py                    # prints the tables
+    python benchmarks/power.py --write            # and writes docs/power.md
+
+From the score files below leaderboard/scores: how much seeds, scenarios and the rest scatter,
+relative to a method's mean; from that model, seeded draws of methods that are equal, or 5, 10
+and 20 % apart. Where no method of a data set has two seeds, cavity's seeds stand in.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import re
+from collections import defaultdict
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagbench.metrics import differ
+from lagbench.metrics.significance import SIGNIFICANCE
+from lagbench.scoring.score_file import read_statistics
+
+Floats = NDArray[np.float64]
+
+ROOT = Path(__file__).parent.parent
+TEST = {"cavity": 20, "curl-noise": 16, "fluid": 16, "multimaterial": 16}
+RANKING = {
+    "cavity": ("vorticity_nrmse", "vorticity_rmse"),
+    "curl-noise": ("vorticity_nrmse", "vorticity_rmse"),
+    "fluid": ("cloud_distance", "sliced_w2"),
+    "multimaterial": ("cloud_distance", "sliced_w2"),
+}
+"""The metric that ranks, and what stands for it in score files that do not have it yet."""
+
+FLOORS = ("persistence", "constant-velocity", "frozen-field", "free-flight", "analog", "coarse-solver")
+DIFFERENCES = (0.05, 0.10, 0.20)
+SEEDS = 3
+DRAWS = 1000
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """Standard deviations relative to a method's mean."""
+
+    seed: float  # of the mean over scenarios, from seed to seed
+    rest: float  # of one scenario, from seed to seed, that mean aside
+    method: float  # of one scenario, from method to method, their means aside
+
+
+def read_methods(split: str) -> tuple[str, dict[str, Floats]]:
+    """Return the metric, and the values of each method of the mini size, shape [seed, scenario]."""
+    held: dict[str, list[dict[str, Floats]]] = defaultdict(list)
+    for path in sorted((ROOT / "leaderboard" / "scores" / split / "mini").glob("*.nc")):
+        scores = read_statistics(path).scores()
+        held[re.sub(r"_\d+$", "", path.stem)].append({name: s.values for name, s in scores.items()})
+    runs = [run for method in held.values() for run in method]
+    metric = next((m for m in RANKING[split] if runs and all(m in run for run in runs)), RANKING[split][0])
+    named = {name: np.array([run[metric] for run in method]) for name, method in held.items() if runs}
+    return metric, {name: values for name, values in named.items() if name not in FLOORS}
+
+
+def measured_scatter(methods: dict[str, Floats]) -> Scatter:
+    """Return the scatter of methods; NaN where no method has two seeds, or none a rival."""
+    seeds, rests = [], []
+    relative = {name: values / values.mean() for name, values in methods.items()}
+    for values in relative.values():
+        if len(values) > 1:
+            off = values - values.mean(axis=0)
+            count = values.shape[1]
+            within = off - off.mean(axis=1, keepdims=True)
+            rest = float(np.sum(within**2)) / ((len(values) - 1) * (count - 1))
+            rests.append(rest)
+            seeds.append(max(0.0, float(np.var(off.mean(axis=1), ddof=1)) - rest / count))
+    best = min((v.mean() for v in methods.values()), default=np.nan)
+    near = [name for name, values in methods.items() if values.mean() < 2.0 * best]
+    pairs = itertools.combinations(near, 2)
+    gaps = [np.var(relative[a].mean(axis=0) - relative[b].mean(axis=0), ddof=1) / 2 for a, b in pairs]
+
+    def root(variances: list[float]) -> float:
+        return float(np.sqrt(np.mean(variances))) if variances else np.nan
+
+    return Scatter(root(seeds), root(rests), root(gaps))
+
+
+def share_told_apart(scatter: Scatter, scenarios: int, difference: float, seeds: int) -> float:
+    """Return the share of draws of two methods so far apart that the test tells apart."""
+    rng = np.random.Generator(np.random.PCG64(0))
+    told = 0
+    for _ in range(DRAWS):
+        sides = []
+        for level in (1.0, 1.0 - difference):
+            own = rng.normal(0.0, scatter.method if difference else 0.0, scenarios)
+            seed = rng.normal(0.0, scatter.seed, (seeds, 1))
+            sides.append(level * (1.0 + own + seed + rng.normal(0.0, scatter.rest, (seeds, scenarios))))
+        told += differ(*sides) < SIGNIFICANCE
+    return told / DRAWS
+
+
+def pairs_of_seeds() -> tuple[int, int]:
+    """Return how many pairs of seeds of one method there are, and how many differ as weights."""
+    p = [
+        differ(a, b)
+        for split in TEST
+        for values in read_methods(split)[1].values()
+        for a, b in itertools.combinations(values, 2)
+    ]
+    return len(p), sum(value < SIGNIFICANCE for value in p)
+
+
+def tables() -> str:
+    """Return the page."""
+    rows, wrong = [], []
+    reference = measured_scatter(read_methods("cavity")[1])
+    for split, scenarios in TEST.items():
+        metric, methods = read_methods(split)
+        scatter = measured_scatter(methods)
+        borrowed = "" if np.isfinite(scatter.seed) else " (cavity's)"
+        if borrowed:
+            scatter = replace(scatter, seed=reference.seed, rest=reference.rest)
+        spread = [f"{100 * value:.1f} %" for value in (scatter.seed, scatter.rest, scatter.method)]
+        power = [f"{share_told_apart(scatter, scenarios, d, SEEDS):.2f}" for d in DIFFERENCES]
+        rows.append(
+            f"| {split} | `{metric}`, {len(methods)} methods | {scenarios} |"
+            f" {spread[0]}{borrowed} | {spread[1]} | {spread[2]} | {' | '.join(power)} |"
+        )
+        false = [100 * share_told_apart(scatter, scenarios, 0.0, seeds) for seeds in (1, 2, 3, 5)]
+        wrong.append(f"| {split} | {' | '.join(f'{share:.1f} %' for share in false)} |")
+    pairs, differing = pairs_of_seeds()
+    return f"""# Power: what the test can tell apart
+
+Written by `python benchmarks/power.py --write` from the score files of the mini sizes below
+leaderboard/scores; the model behind it stands in the script's docstring.
+
+The value of seed s in scenario i is read as mean x (1 + scenario + method-in-scenario + seed + rest).
+Two methods share the scenarios; what is left are the three standard deviations below, relative to a
+method's mean. The last three columns say how often `lagbench.metrics.differ` tells two methods apart
+at 5 %, with {SEEDS} seeds each, if one is better by 5, 10 and 20 % ({DRAWS} draws).
+
+| split | from | test scenarios | seed | rest | method in scenario | 5 % | 10 % | 20 % |
+|---|---|---|---|---|---|---|---|---|
+{chr(10).join(rows)}
+
+A difference that is small beside the scatter of seeds is not found with more scenarios: only with
+more seeds. A board that ranks by hundredths ranks by chance.
+
+Few methods of these score files have two seeds, and those of curl-noise chance to agree: its power is
+an upper bound until three seeds of each method are in.
+
+## Equal methods that are told apart
+
+Both sides are seeds of one method: at most 5 % may differ. With one seed a side the test is the
+sign-flip test over scenarios. It is right about those weights, and wrong about the method as
+often as the first column says: why such a row says "these weights".
+
+| split | 1 seed a side | 2 | 3 | 5 |
+|---|---|---|---|---|
+{chr(10).join(wrong)}
+
+Of the {pairs} pairs of single seeds of one method in these score files {differing} differ as weights.
+"""
+
+
+def main() -> int:
+    """Print the tables; write them with --write."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--write", action="store_true", help="write docs/power.md")
+    page = tables()
+    print(page)
+    if parser.parse_args().write:
+        (ROOT / "docs" / "power.md").write_text(page, encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

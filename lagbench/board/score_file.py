@@ -1,0 +1,305 @@
+"""Read a score file of a stranger: bounded, self-contained, of the shape that the task has.
+
+HDF5 lets a file show the bytes of other files as its own (external links, external storage,
+virtual data sets) and unpack a few bytes to gigabytes. Both are refused by looking at the
+headers, before a value is read. HDF5 is also C code that believes what it reads, so strangers'
+files are first read in a child process under limits: this module is the child's program too.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import stat
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from lagbench.data.grid import Grid, Placement
+from lagbench.data.registry import Size
+from lagbench.errors import UnreadableFileError
+from lagbench.metrics.distributions import BINS
+from lagbench.scoring.card import unreadable_scores
+from lagbench.scoring.scenario import FRAMES, PARTICLES, Preview
+from lagbench.scoring.score_file import FILM_RANGE, StoredScores, read_statistics
+from lagbench.scoring.task import ranking_metric
+from lagbench.submission.hdf5 import opened
+from lagbench.submission.task_checks import frames_to_predict
+
+__all__ = ["MAX_SCORE_BYTES", "Stored", "main", "read_stored", "reported_frames", "unreadable_in_child"]
+
+MAX_SCORE_BYTES = 300_000
+"""Longest score file [bytes]."""
+
+MAX_UNPACKED = 32 << 20
+"""Most that a score file may unpack to [bytes]; the largest of ours takes 3 MB."""
+
+MAX_LINKS = 40
+MAX_STATISTICS = 500
+
+GROUP = "preview"
+FILTERS = (h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE)
+NUMBERS = (h5py.h5t.INTEGER, h5py.h5t.FLOAT)
+LAYOUTS = (h5py.h5d.COMPACT, h5py.h5d.CONTIGUOUS, h5py.h5d.CHUNKED)
+
+MEMORY = 768 << 20
+"""Address space of the child [bytes]."""
+
+CPU_SECONDS = 10
+"""Computing time of the child to start, and for every 50 files [s]."""
+
+FILES_PER_PART = 50
+
+MOST_STOPS = 5
+"""Files that may stop a child before the rest is left unread: each costs a child's whole time."""
+
+WALL_SECONDS = 600.0
+"""Time for every 50 files together [s]; a busy machine may need minutes."""
+
+UNREAD = "not read, because too many others had to be stopped or took all the time allowed"
+
+CHILD = "lagbench.board.score_file"
+"""The child's program; -P keeps the current folder, where strangers' files may lie, off its path."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Stored:
+    """What a score file holds."""
+
+    scores: StoredScores  # identity and statistics
+    preview: Preview  # pictures of the first scenario
+    precision: float  # step of the packed vorticity maps [1/frame]
+
+
+def reported_frames(size: Size) -> tuple[int, ...]:
+    """Return the frames of interest and the last one, absolute."""
+    frames = tuple(frames_to_predict(size))
+    return tuple(sorted({*size.task.frames_of_interest, frames[-1]}.intersection(frames)))
+
+
+def read_stored(path: Path, size: Size | None = None) -> Stored:
+    """Read a score file."""
+    _check_length(path)
+    try:
+        with opened(path) as file:
+            _check_members(file)
+        scores = read_statistics(path)
+        tallies = list(scores.tallies.values())
+        if not tallies or len(tallies[0].names) > MAX_STATISTICS:
+            raise ValueError("no scenarios, or too many statistics")
+        if not all(np.isfinite(tally.total).all() for tally in tallies):
+            raise ValueError("infinite statistics")
+        preview, precision = _read_preview(path)
+        if size is not None:
+            _check_task(scores, preview, size)
+    except UnreadableFileError:
+        raise
+    except Exception as error:  # HDF5 on damaged bytes raises nearly any type
+        raise unreadable_scores(path, error) from error
+    return Stored(scores=scores, preview=preview, precision=precision)
+
+
+def _check_length(path: Path) -> None:
+    try:
+        status = path.lstat()
+    except OSError as error:
+        raise UnreadableFileError(
+            "cannot read the score file",
+            where=str(path),
+            expected="the file that `lagbench submit` wrote beside the entry",
+            got=error.strerror,
+            fix="bring it back, or submit the predictions again; `lagbench leaderboard check` names all such",
+        ) from error
+    regular = stat.S_ISREG(status.st_mode)
+    if not regular or status.st_size > MAX_SCORE_BYTES:
+        raise UnreadableFileError(
+            "not a score file",
+            where=str(path),
+            expected=f"a regular file of at most {MAX_SCORE_BYTES} bytes",
+            got=f"{status.st_size} bytes" if regular else "a link, folder or device",
+            fix="`lagbench submit` writes it",
+        )
+
+
+def _check_members(file: h5py.File) -> None:
+    """Refuse links, foreign storage and filters, and data that unpack to too much."""
+    total = 0
+    for dataset in _datasets(file):
+        plist = dataset.id.get_create_plist()
+        filters = [plist.get_filter(i)[0] for i in range(plist.get_nfilters())]
+        if plist.get_layout() not in LAYOUTS or plist.get_external_count():
+            raise ValueError("a variable that does not lie in this file")
+        if not set(filters).issubset(FILTERS) or len(set(filters)) < len(filters):
+            raise ValueError("a variable that is packed in another way, or twice")
+        if dataset.id.get_type().get_class() not in NUMBERS:  # strings may share one long piece of heap
+            raise ValueError("a variable that holds no plain numbers")
+        total += dataset.id.get_space().get_simple_extent_npoints() * dataset.id.get_type().get_size()
+        if plist.get_layout() == h5py.h5d.CHUNKED:
+            total += int(np.prod(plist.get_chunk(), dtype=object)) * dataset.id.get_type().get_size()
+        if total > MAX_UNPACKED:
+            raise ValueError(f"more than {MAX_UNPACKED} bytes when unpacked")
+
+
+def _datasets(file: h5py.File) -> Iterator[h5py.Dataset]:
+    groups = [file["/"]]
+    while groups:
+        group = groups.pop()
+        if group.id.get_num_objs() > MAX_LINKS:
+            raise ValueError(f"more than {MAX_LINKS} members")
+        for index in range(group.id.get_num_objs()):
+            name = group.id.get_objname_by_idx(index)
+            if group.id.links.get_info(name).type != h5py.h5l.TYPE_HARD:
+                raise ValueError("a link instead of a variable")
+            kind = h5py.h5o.get_info(group.id, name).type
+            if kind == h5py.h5o.TYPE_DATASET:
+                yield group[name]
+            elif kind == h5py.h5o.TYPE_GROUP and group.name == "/" and name == GROUP.encode():
+                groups.append(group[name])
+            else:
+                raise ValueError("a group that score files do not have")
+
+
+def _read_preview(path: Path) -> tuple[Preview, float]:
+    with opened(path) as file:
+        group = file[GROUP]
+        vorticity, precision = _unpacked(group["vorticity"])
+        histogram, _ = _unpacked(group["histogram"])
+        film, _ = _unpacked(group["film"])
+        preview = Preview(
+            scenario=int(np.ravel(group.attrs["scenario"])[0]),
+            map_frames=_integers(group["map_frame"]),
+            vorticity=vorticity,
+            histogram=histogram,
+            histogram_range=np.asarray(group["histogram_range"][...], np.float32),
+            film_frames=_integers(group["film_frame"]),
+            particles=_integers(group["film_particle"]),
+            material=np.asarray(group["material"][...], np.int8),
+            film=film,
+        )
+    _check_shapes(preview)
+    return preview, precision
+
+
+def _unpacked(variable: h5py.Dataset) -> tuple[NDArray[np.float32], float]:
+    """Return packed values, NaN where missing, and the step of the packing."""
+    attributes: dict[str, Any] = dict(variable.attrs)
+    scale, offset = (float(np.ravel(attributes[name])[0]) for name in ("scale_factor", "add_offset"))
+    fill = int(np.ravel(attributes["_FillValue"])[0])
+    steps = variable[...]
+    if steps.dtype != np.uint16 or not np.isfinite([scale, offset]).all() or scale <= 0.0:
+        raise ValueError(f"{variable.name} is not packed as it should be")
+    values = np.where(steps == fill, np.nan, steps * scale + offset)
+    return values.astype(np.float32), scale
+
+
+def _integers(variable: h5py.Dataset) -> tuple[int, ...]:
+    return tuple(int(number) for number in variable[...].astype(np.int64))
+
+
+def _check_shapes(preview: Preview) -> None:
+    maps, frames, particles = len(preview.map_frames), len(preview.film_frames), len(preview.particles)
+    nodes = preview.vorticity.shape[-1]
+    shapes = {
+        "vorticity": (preview.vorticity.shape, (2, maps, nodes, nodes)),
+        "histogram": (preview.histogram.shape, (2, maps, BINS)),
+        "histogram_range": (preview.histogram_range.shape, (maps, 2)),
+        "material": (preview.material.shape, (particles,)),
+        "film": (preview.film.shape, (2, frames, particles, 2)),
+    }
+    for name, (got, expected) in shapes.items():
+        if got != expected:
+            raise ValueError(f"{name} has shape {got}, not {expected}")
+    if frames > FRAMES or particles > PARTICLES or not np.isfinite(preview.film).all():
+        raise ValueError("the film is longer than films are, or has holes")
+    low, high = FILM_RANGE
+    if preview.film.size and (preview.film.min() < low - 1e-3 or preview.film.max() > high + 1e-3):
+        raise ValueError("the film leaves its range")
+
+
+def _check_task(scores: StoredScores, preview: Preview, size: Size) -> None:
+    frames, ids = tuple(frames_to_predict(size)), tuple(sorted(size.subsets["test"]))
+    found = next(iter(scores.tallies.values())).frames
+    if tuple(sorted(scores.tallies)) != ids or found != frames:
+        raise ValueError(f"other scenarios or frames than {size.split} {size.name} has")
+    if scores.ranking != ranking_metric(size) or preview.scenario != ids[0]:
+        raise ValueError("another ranking metric or another pictured scenario")
+    task = size.task
+    grid = Grid(task.score_grid.cells, Placement(task.score_grid.placement))
+    if preview.vorticity.shape[-1] != grid.nodes or preview.map_frames != reported_frames(size):
+        raise ValueError("maps of another grid or of other frames")
+    shown = preview.film_frames
+    if not set(shown).issubset(frames) or shown != tuple(sorted(shown)):
+        raise ValueError("a film of other frames")
+
+
+def unreadable_in_child(paths: Sequence[Path]) -> dict[Path, str]:
+    """Return the files that cannot be read, and why.
+
+    A child that a file stops is started anew for the rest, :data:`MOST_STOPS` times at most and
+    within :data:`WALL_SECONDS` for every :data:`FILES_PER_PART` files, whatever the files do.
+    """
+    found: dict[Path, str] = {}
+    left, stops = list(paths), 0
+    end = time.monotonic() + WALL_SECONDS * _parts(paths)
+    while left:
+        if stops == MOST_STOPS or time.monotonic() >= end:
+            return found | dict.fromkeys(left, UNREAD)
+        answers, how = _asked(left, end - time.monotonic())
+        found |= {path: str(said) for path, said in zip(left, answers, strict=False) if said is not None}
+        if len(answers) < len(left):
+            found[left[len(answers)]] = f"reading it had to be stopped: {how}"
+            stops += 1
+        left = left[len(answers) + 1 :]
+    return found
+
+
+def _parts(paths: Sequence[Path]) -> int:
+    return 1 + len(paths) // FILES_PER_PART
+
+
+def _asked(paths: Sequence[Path], room: float) -> tuple[list[str | None], str]:
+    """Return the child's answers, one line of JSON per file, and how it ended within so many seconds."""
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2"}
+    try:
+        done = subprocess.run(
+            [sys.executable, "-P", "-m", CHILD, str(MEMORY), str(CPU_SECONDS * _parts(paths))],
+            input=json.dumps([str(path) for path in paths]).encode(),
+            capture_output=True,
+            timeout=room,
+            env=environment,
+            check=False,
+        )
+        output, how = done.stdout, f"exit code {done.returncode}"
+    except subprocess.TimeoutExpired as error:
+        output, how = error.stdout or b"", "no end in time"
+    return [json.loads(line) for line in output.splitlines(keepends=True) if line.endswith(b"\n")], how
+
+
+def main() -> int:
+    """Read the files named on stdin under limits: memory [bytes] and computing time [s], the arguments."""
+    memory, seconds = int(sys.argv[1]), int(sys.argv[2])
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
+    resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds + 1))
+    for path in json.load(sys.stdin):
+        try:
+            read_stored(Path(path))
+            answer = None
+        except UnreadableFileError as error:
+            answer = f"{error.what}: {error.got}"
+        sys.stdout.write(json.dumps(answer) + "\n")
+        sys.stdout.flush()
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,259 @@
+"""What the page holds as plain HTML beside the tables: overview, facts, tiles, tools, notes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import groupby
+
+from lagbench.metrics import Direction, Metric
+from lagbench.report.html import Markup, clipped, escaped, join, tag, text, words
+
+from .columns import columns_of, presets_of, value_of, written
+from .model import Board, Row, Tab
+from .table import EXPLAINED, draw_table
+
+__all__ = ["empty", "lede", "navigation", "overview", "section"]
+
+
+def lede(board: Board) -> Markup:
+    """Return the sentence under the title."""
+    entries, checked = 0, 0
+    for tab in board.tabs:
+        entries += len(tab.rows)
+        checked += sum(row.verified is not None for row in tab.rows)
+    shown = f"{_counted(entries, 'entry', 'entries')} on {_counted(len(board.tabs), 'data set', 'data sets')}"
+    return escaped(
+        "Neural surrogates of Lagrangian continuum simulators on data that anyone regenerates bit for bit:"
+        f" {shown}. Every score follows from a score file; of {checked} the maintainers scored the"
+        " predictions again. Costs are self-reported."
+    )
+
+
+def _counted(count: int, one: str, many: str) -> str:
+    return f"{count} {one if count == 1 else many}"
+
+
+def navigation(board: Board) -> Markup:
+    """Return links to the overview and the tabs, grouped by split."""
+    if not board.tabs:
+        return Markup("")
+    groups = [tag("div", _link("overview", "Overview", "Overview of all splits"), class_="group")]
+    for split, tabs in groupby(board.tabs, key=lambda tab: tab.size.split):
+        links = [_link(tab.id, tab.size.name, f"{split} {tab.size.name}") for tab in tabs]
+        groups.append(tag("div", tag("span", split, class_="split"), *links, class_="group"))
+    return tag("nav", *groups, class_="tabs", aria_label="Data sets")
+
+
+def _link(name: str, label: str, said: str) -> Markup:
+    return tag("a", label, href=f"#{name}", data_tab=name, aria_label=said)
+
+
+def empty(board: Board) -> Markup:
+    """Name the data sets without an entry, with the commands that begin one."""
+    if not board.empty:
+        return Markup("")
+    split, size = board.empty[0]
+    names = ", ".join(f"{split} {size}" for split, size in board.empty)
+    commands = (
+        f"lagbench generate --split {split} --size {size}\nlagbench submit predictions.nc --from meta.yaml"
+    )
+    first = "No entry yet" if board.tabs else "There are no entries yet"
+    return tag(
+        "section",
+        tag("p", f"{first}: {names}. Yours can be the first:"),
+        tag("pre", tag("code", commands)),
+        class_="empty",
+    )
+
+
+def overview(board: Board) -> Markup:
+    """Return one row per method over all splits: its skill where that is known, and its rank."""
+    if not board.tabs:
+        return Markup("")
+    rows: dict[str, dict[str, Row]] = {}
+    for tab in board.tabs:
+        for row in tab.rows:
+            if row.rank is not None:
+                rows.setdefault(row.id, {})[tab.id] = row
+    ranked = {tab.id: sum(row.rank is not None for row in tab.rows) for tab in board.tabs}
+
+    def order(method: str) -> tuple[float, float, str]:
+        held = rows[method].values()
+        skills = [row.skill.mean for row in held if row.skill and math.isfinite(row.skill.mean)]
+        standing = [(row.rank or 0) / ranked[tab] for tab, row in rows[method].items()]
+        return (-sum(skills) / len(skills) if skills else math.inf, sum(standing) / len(standing), method)
+
+    heads = [
+        tag("th", tag("a", f"{tab.size.split} {tab.size.name}", href=f"#{tab.id}"), scope="col")
+        for tab in board.tabs
+    ]
+    lines = []
+    for method in sorted(rows, key=order):
+        name = next(iter(rows[method].values())).entry.name
+        cells = [_summary(rows[method].get(tab.id), tab, ranked[tab.id]) for tab in board.tabs]
+        lines.append(tag("tr", tag("th", clipped(name, 60), scope="row", class_="method"), *cells))
+    caption = (
+        "Skill on every data set (0: the best floor, 1: perfect) where it is known, and rank; bold leads."
+    )
+    table = tag(
+        "table",
+        tag("caption", caption, class_="unseen"),
+        tag("thead", tag("tr", tag("th", "method", scope="col", class_="method"), *heads)),
+        tag("tbody", *lines),
+        class_="board across",
+    )
+    return tag(
+        "section",
+        tag("h2", "All data sets"),
+        tag("p", caption, class_="facts"),
+        tag("div", table, class_="scroll", role="region", aria_label="Overview", tabindex=0),
+        id="overview",
+        class_="tab",
+    )
+
+
+def _summary(row: Row | None, tab: Tab, of: int) -> Markup:
+    if row is None:
+        return tag("td", "")
+    rank = f"{row.rank}{' ≈' if row.tied else ''} of {of}"
+    big, small = (text(row.skill.mean), f"rank {rank}") if row.skill else (rank, "")
+    parts = [tag("span", big, class_="n"), tag("span", small, class_="ci") if small else ""]
+    link = tag("a", *parts, href=f"#tab={tab.id}&entry={row.id}")
+    return tag("td", link, class_="best" if row.rank == 1 else None)
+
+
+def section(tab: Tab, metrics: Mapping[str, Metric]) -> Markup:
+    """Return the section of a tab."""
+    presets = presets_of(tab, columns_of(tab, metrics))
+    return tag(
+        "section",
+        tag("h2", f"{tab.title}, {tab.size.name}"),
+        tag("p", _facts(tab, metrics), class_="facts"),
+        tag("ul", *_tiles(tab, metrics), class_="tiles"),
+        _tools(tab, presets),
+        tag(
+            "div",
+            draw_table(tab, metrics),
+            class_="table scroll",
+            role="region",
+            aria_label="Scores",
+            tabindex=0,
+        ),
+        tag("div", *(tag("p", note) for note in _notes(tab)), class_="notes"),
+        tag("div", class_="figures"),
+        id=tab.id,
+        class_="tab",
+    )
+
+
+def _facts(tab: Tab, metrics: Mapping[str, Metric]) -> str:
+    better = "higher" if metrics[tab.ranking].direction is Direction.HIGHER else "lower"
+    sha256 = tab.size.measured.dataset_sha256 if tab.size.measured else tab.rows[0].entry.dataset.sha256
+    return (
+        f"Given {tab.size.task.input_frames} frames of each of {len(tab.scenarios)} test scenarios of"
+        f" {tab.size.particles} particles, predict the next {len(tab.frames)}. Ranked by {words(tab.ranking)}"
+        f" over the horizon, {better} is better. Data set version {tab.size.version}, SHA-256 {sha256[:12]}…"
+    )
+
+
+def _tiles(tab: Tab, metrics: Mapping[str, Metric]) -> Iterator[Markup]:
+    ranked = [row for row in tab.rows if row.rank is not None]
+    columns = columns_of(tab, metrics)
+    ranking, speed_up = columns[tab.ranking], columns["speed_up"]
+    if ranked:
+        leader = ranked[0]
+        tied = sum(row.tied for row in ranked)
+        more = f", and {tied} that cannot be told from it" if tied else ""
+        if leader.skill:
+            yield _tile("skill of the leader", text(leader.skill.mean), f"{_short(leader)}{more}")
+        value = float(value_of(leader, ranking))
+        yield _tile(f"leader by {ranking.quantity}", text(value), f"{_short(leader)}{more}")
+        losses = {
+            floor.name: ranking.loss(float(value_of(floor, ranking))) for floor in tab.floors if floor.counts
+        }
+        known = {name: loss for name, loss in losses.items() if loss > 0.0}
+        if known and metrics[tab.ranking].direction is Direction.LOWER:
+            best = min(known, key=lambda name: known[name])
+            yield _tile("leader beside the best floor", f"{text(value / known[best], 2)}×", best)
+    fast = [row for row in ranked if row.entry.cost and row.entry.cost.speed_up]
+    if fast:
+        row = max(fast, key=lambda one: value_of(one, speed_up))
+        speed = float(value_of(row, speed_up))
+        beside = "slower" if speed < 1.0 else "faster"
+        device = row.entry.cost.device if row.entry.cost else ""
+        yield _tile(
+            "speed of the fastest entry, solver = 1×",
+            written(speed, "factor"),
+            f"{beside} than the solver: {_short(row)}, {device}; self-reported",
+        )
+    rest = len(tab.rows) - len(ranked)
+    yield _tile("entries", str(len(ranked)), f"and {rest} not ranked" if rest else "all ranked")
+
+
+def _short(row: Row) -> str:
+    return clipped(row.entry.name, 40)
+
+
+def _tile(what: str, big: str, more: str) -> Markup:
+    parts = {"what": what, "big": big, "more": more}
+    return tag("li", *(tag("span", part, class_=kind) for kind, part in parts.items()))
+
+
+def _tools(tab: Tab, presets: Mapping[str, Sequence[str]]) -> Markup:
+    hidden = sum(not row.active for row in tab.rows)
+    buttons = [
+        tag("button", name, type="button", data_preset=name, data_keys=" ".join(keys))
+        for name, keys in presets.items()
+    ]
+    inactive = tag(
+        "label",
+        tag("input", type="checkbox"),
+        f"inactive ({hidden})",
+        class_="check",
+        title="Withdrawn, superseded, or scored on old data",
+    )
+    return tag(
+        "div",
+        tag(
+            "input",
+            type="search",
+            placeholder="Filter methods, authors, hardware",
+            aria_label="Filter",
+            spellcheck="false",
+        ),
+        tag("div", *buttons, class_="presets", role="group", aria_label="Columns"),
+        inactive if hidden else "",
+        tag("span", class_="count muted", role="status"),
+        tag("button", "CSV", type="button", class_="plain csv", title="Save the table as it is shown"),
+        class_="tools",
+    )
+
+
+def _notes(tab: Tab) -> Iterator[Markup]:
+    yield escaped(
+        "Click a row for curves, maps, a film, every number and the command that makes it again."
+        " Ranks follow the ranking metric."
+    )
+    told = "There are too few test scenarios to tell entries apart: the intervals speak alone."
+    if tab.decided:
+        told = (
+            "≈ cannot be told from the leader: exact sign-flip test over scenarios, p-values corrected"
+            " for the number of entries by Holm's method."
+        )
+    yield escaped(f"{told} Shaded rows are floors: what costs no learning, never ranked.")
+    yield escaped(
+        "Mean over test scenarios and seeds; below it the 95 % bootstrap interval."
+        " ↓ lower, ↑ higher, ◎ closer to the perfect value is better;"
+        " bold is best, floors included, and the bluer a cell, the nearer to it."
+        " † some frames have no value. – not measured or undefined."
+    )
+    yield escaped(
+        "Times, speed-up, budget, parameters and hardware are self-reported: submitters say them and nobody"
+        " computes them again. A speed-up below 1× means slower than the solver. Scores are verified where"
+        " the maintainers scored the predictions again, else as submitted."
+    )
+    raised = {flag.name for row in tab.rows for flag in (*row.flags, *row.warnings)}
+    for name in sorted(raised & EXPLAINED.keys()):
+        label, meaning = EXPLAINED[name]
+        yield join([tag("strong", label), ": ", meaning])

@@ -1,0 +1,240 @@
+"""The board's table, drawn once: every row and column, those hidden at first too.
+
+Each cell has its value as ``data-value``; the page's script sorts rows, filters them and hides
+cells, and writes no text of its own.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from types import MappingProxyType
+
+from lagbench.metrics import Direction, Metric
+from lagbench.report.html import MISSING, Markup, interval, join, tag, text
+
+from .columns import Column, columns_of, held, presets_of, value_of, written
+from .entry import Flag
+from .model import Floor, Row, Tab
+from .payload import rounded
+
+__all__ = ["EXPLAINED", "draw_table"]
+
+MEAN_DIGITS = 9
+"""Significant digits of means, as in scores.json."""
+
+SHADES = 5
+FEWEST_SHADED = 3
+
+ARROWS = {Direction.LOWER: "↓", Direction.HIGHER: "↑", Direction.TARGET: "◎", Direction.NONE: ""}
+REPORTED = "Self-reported: said by the submitter, computed again by nobody."
+REPORTED_MARK = "self\u2011reported"
+
+EXPLAINED: Mapping[str, tuple[str, str]] = MappingProxyType(
+    {
+        "copy_suspect": (
+            "copy suspected",
+            "The error moves from frame to frame as that of no rollout does.",
+        ),
+        "below_twin_floor": (
+            "closer than a twin",
+            "Closer to the truth than the solver itself after a nudge of 2⁻²⁰.",
+        ),
+        "physics": ("unphysical", "Kinetic energy or filled area are far from the truth's."),
+        "in_domain": (
+            "leaves the box",
+            "Predicted particles lie outside the box; there they carry no weight on the grid.",
+        ),
+        "max_displacement": (
+            "jumps",
+            "Predicted particles move farther in a frame than any of the truth.",
+        ),
+        "discontinuous_start": (
+            "jumps at the start",
+            "The first frame is far from the last given.",
+        ),
+    }
+)
+"""What flags and warnings are called on the page, which shows what is wrong, and what they mean."""
+
+
+def draw_table(tab: Tab, metrics: Mapping[str, Metric]) -> Markup:
+    """Return the table of a tab: entries and floors in the order of the ranking metric."""
+    columns = columns_of(tab, metrics)
+    main = presets_of(tab, columns)["main"]
+    ranking = columns[tab.ranking]
+    shades = {key: _Shades(tab, column) for key, column in columns.items()}
+
+    def order(row: Row | Floor) -> tuple[bool, float]:
+        loss = ranking.loss(float(value_of(row, ranking)))
+        return isinstance(row, Row) and not row.active, math.inf if math.isnan(loss) else loss
+
+    lines = []
+    for number, row in enumerate(sorted(tab.lines, key=order)):
+        cells = [
+            _cell(row, column, shades[key], main=key in main, ranks=key in (tab.ranking, "skill"))
+            for key, column in columns.items()
+        ]
+        lines.append(_line(tab, row, number, cells))
+    head = [
+        _heading("rank", tag("span", "#", class_="metric"), "Rank by the ranking metric", class_="rank"),
+        _heading("name", tag("span", "method", class_="metric"), "Name of the method", class_="method"),
+        *(_column_heading(column, main=key in main) for key, column in columns.items()),
+    ]
+    return tag(
+        "table",
+        tag("caption", f"{tab.size.split} {tab.size.name}: methods and scores", class_="unseen"),
+        tag("thead", tag("tr", *head)),
+        tag("tbody", *lines),
+        class_="board",
+    )
+
+
+def _heading(key: str, label: object, meaning: str, **attributes: object) -> Markup:
+    sorter = tag("button", label, type="button", class_="sorter", data_sort=key, title=meaning)
+    return tag("th", sorter, scope="col", data_key=key, **attributes)
+
+
+def _column_heading(column: Column, *, main: bool) -> Markup:
+    unit = f"{column.unit} {ARROWS[column.direction]}".strip()
+    below = [tag("span", said, class_="unit") for said in (unit, REPORTED_MARK * column.reported) if said]
+    return _heading(
+        column.key,
+        join([tag("span", column.label, class_="metric"), *below]),
+        f"{column.meaning} {REPORTED if column.reported else ''}".strip(),
+        class_="words" if column.form == "text" else None,
+        hidden=not main,
+        data_label=column.label,
+        data_quantity=column.quantity,
+        data_direction=str(column.direction),
+        data_perfect=column.perfect,
+        data_form=column.form,
+    )
+
+
+class _Shades:
+    """Colours of a column: the nearer a cell is to the best of entries and floors, the deeper."""
+
+    def __init__(self, tab: Tab, column: Column) -> None:
+        judged = [row for row in tab.lines if isinstance(row, Floor) or row.active]
+        values = [value_of(row, column) for row in judged if column.form != "text"]
+        losses = [column.loss(float(value)) for value in values]
+        self._column = column
+        self._known = sorted(loss for loss in losses if math.isfinite(loss))
+
+    def classes(self, row: Row | Floor) -> Iterator[str]:
+        """Yield the classes of a row's cell."""
+        value = value_of(row, self._column)
+        inactive = isinstance(row, Row) and not row.active
+        loss = math.nan if isinstance(value, str) else self._column.loss(value)
+        if inactive or not math.isfinite(loss) or len(self._known) < 2:
+            return
+        low, high = self._known[0], self._known[-1]
+        if loss == low:
+            yield "best"
+        if high > low and len(self._known) >= FEWEST_SHADED:
+            bend = math.log if low > 0.0 else float
+            yield f"heat{min(SHADES - 1, int(SHADES * (bend(loss) - bend(low)) / (bend(high) - bend(low))))}"
+
+
+def _cell(row: Row | Floor, column: Column, shades: _Shades, *, main: bool, ranks: bool) -> Markup:
+    value, found = value_of(row, column), held(row, column.key)
+    plain = rounded(value, MEAN_DIGITS) if isinstance(value, float) else value
+    ends = (found.low, found.high) if found else (math.nan, math.nan)
+    bounds = interval(ends)
+    title = [] if not bounds else [f"95 % interval {text(ends[0])} … {text(ends[1])}"]
+    if found is not None and not math.isnan(found.std):
+        title.append(f"± {text(found.std)} over seeds")
+    undefined = found.undefined if found else 0
+    title += [f"{undefined} frames undefined"] if undefined else []
+    if column.key == "checked" and isinstance(row, Row) and row.verified:
+        title = [f"scored again by the maintainers, lagbench {row.verified.lagbench}, {row.verified.date}"]
+    known = isinstance(plain, str) or not math.isnan(plain)
+    kind = ["words"] if column.form == "text" else []
+    return tag(
+        "td",
+        tag("span", written(plain, column.form), class_="n"),
+        tag("sup", "†") if undefined and known else "",
+        bounds if ranks else "",
+        class_=" ".join([*kind, *shades.classes(row)]) or None,
+        title="; ".join(title) or None,
+        data_value=(plain if isinstance(plain, str) else f"{plain:.{MEAN_DIGITS}g}") if known else None,
+        data_low=f"{ends[0]:.6g}" if ranks and bounds else None,
+        data_high=f"{ends[1]:.6g}" if ranks and bounds else None,
+        hidden=not main,
+    )
+
+
+def _line(tab: Tab, row: Row | Floor, number: int, cells: Sequence[Markup]) -> Markup:
+    """Return a row of the table, the floors shaded and never ranked."""
+    if isinstance(row, Floor):
+        parts = [
+            tag("span", row.name, class_="name"),
+            tag("span", "floor", class_="flag"),
+            tag("span", row.definition, class_="sub", title=row.definition) if row.definition else "",
+        ]
+        method = tag("th", *parts, scope="row", class_="method", data_value=row.name.lower())
+        rank = tag("td", "", class_="rank", data_value=number)
+        return tag("tr", rank, method, *cells, class_="floor", data_floor=row.name)
+    entry = row.entry
+    tied = tag("span", "≈", class_="tied", title=_told(row.p)) if row.tied else ""
+    by = " · ".join(filter(None, (", ".join(entry.authors), entry.affiliation)))
+    links = [
+        tag("a", name, href=address, rel="noopener noreferrer nofollow", target="_blank")
+        for name in ("code", "paper", "weights")
+        if (address := getattr(entry, name)) and address.startswith(("http://", "https://"))
+    ]
+    method = tag(
+        "th",
+        tag("a", entry.name, href=f"#tab={tab.id}&entry={row.id}", class_="name"),
+        *_chips(row),
+        tag("span", by, class_="sub", title=by),
+        tag("span", *links, class_="links") if links else "",
+        scope="row",
+        class_="method",
+        data_value=entry.name.lower(),
+    )
+    shown = join([MISSING if row.rank is None else str(row.rank), tied])
+    return tag(
+        "tr",
+        tag("td", shown, class_="rank", data_value=number),
+        method,
+        *cells,
+        class_=None if row.active else "inactive",
+        hidden=not row.active,
+        data_entry=row.id,
+        data_more=f"{entry.training} {entry.hardware}",
+    )
+
+
+def _told(p: float) -> str:
+    return f"cannot be told from the leader at 5 % (p = {text(p, 2)}, corrected)"
+
+
+def _chips(row: Row) -> Iterator[Markup]:
+    """Yield small marks beside a name: status, data set version, flags."""
+    entry = row.entry
+    if str(entry.status) != "active":
+        by = f" Replaced by {entry.superseded_by}." if entry.superseded_by else ""
+        yield _chip("unknown", str(entry.status), f"{entry.reason or f'This entry is {entry.status}.'}{by}")
+    if not row.current:
+        said = "Scored on a data set version that is no longer current: not ranked."
+        yield _chip("unknown", f"data {entry.dataset.version}", said)
+    for kind, flags in (("bad", row.flags), ("warn", row.warnings)):
+        for flag in flags:
+            yield _chip(kind, *_explained(flag))
+    if row.diverged:
+        yield _chip("warn", "diverged", f"{row.diverged} rollouts are frozen at their last finite frame.")
+
+
+def _chip(kind: str, label: str, meaning: str) -> Markup:
+    return tag("span", label, class_=f"flag {kind}", title=meaning)
+
+
+def _explained(flag: Flag) -> tuple[str, str]:
+    """Return label and meaning of a flag or warning; an unknown one is called as the scorer does."""
+    label, meaning = EXPLAINED.get(flag.name, (flag.name.replace("_", " "), ""))
+    if flag.share is not None:
+        label = f"{label}: {text(100.0 * flag.share, 2)} %"
+    said = "; ".join(flag.reasons)
+    return label, " ".join(filter(None, (meaning, f"{said}." if said else "")))

@@ -1,0 +1,216 @@
+"""What a flow keeps: energy, momentum, density, and its place between the walls.
+
+A surrogate that damps loses energy, one that blows up gains it; more energy than the truth is
+no merit, so the ratio aims at 1 and the error counts both ways. Errors of momentum are scaled
+by the truth's sum of magnitudes, which does not vanish where the momenta of a closed flow
+cancel; where the truth comes to rest the scales have a floor. All particles of a scenario have
+one mass; it cancels, and momenta are told over it.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from .frame import Floats, FramePair, Snapshot, dot
+from .metric import (
+    Direction,
+    Metric,
+    enough_nodes,
+    floored_quotient,
+    metric,
+    quotient,
+    total,
+)
+from .metric import root_mean_square as over_frames_rms
+
+__all__ = [
+    "METRICS",
+    "angular_momentum",
+    "kinetic_energy",
+    "momentum",
+    "root_mean_square",
+]
+
+
+def kinetic_energy(snapshot: Snapshot, particle_mass: float) -> float:
+    """Return ``E = sum(m |u|^2) / 2`` (Eq. 5.11) [mass length^2/frame^2]."""
+    return 0.5 * particle_mass * snapshot.speed_square
+
+
+@metric(unit="mass length^2/frame^2", source="Eq. 5.11")
+def energy_true(pair: FramePair) -> float:
+    """Kinetic energy of the truth."""
+    return kinetic_energy(pair.truth, pair.scenario.particle_mass)
+
+
+@metric(unit="mass length^2/frame^2", source="Eq. 5.11, Fig. 5.28")
+def energy_predicted(pair: FramePair) -> float:
+    """Kinetic energy of the prediction."""
+    return kinetic_energy(pair.prediction, pair.scenario.particle_mass)
+
+
+@metric(
+    unit="1",
+    direction=Direction.TARGET,
+    perfect=1.0,
+    source="Eq. 5.11",
+    of=("energy_predicted", "energy_true"),
+)
+def energy_ratio(predicted: Floats, true: Floats) -> Floats:
+    """Predicted over true kinetic energy."""
+    return quotient(predicted, true)
+
+
+@metric(unit="1", source="Fig. 5.19")
+def energy_retention(pair: FramePair) -> float:
+    """Kinetic energy of the prediction over that of the last given frame."""
+    return _retained(pair, pair.prediction)
+
+
+@metric(unit="1", source="Fig. 5.19")
+def energy_retention_true(pair: FramePair) -> float:
+    """Kinetic energy of the truth over that of the last given frame."""
+    return _retained(pair, pair.truth)
+
+
+def _retained(pair: FramePair, snapshot: Snapshot) -> float:
+    mass = pair.scenario.particle_mass
+    given = kinetic_energy(pair.scenario.last_given, mass)
+    return kinetic_energy(snapshot, mass) / given if given > 0.0 else math.nan
+
+
+@metric(
+    unit="1",
+    direction=Direction.LOWER,
+    source="design section 8",
+    of=("energy_predicted", "energy_true"),
+)
+def energy_error(predicted: Floats, true: Floats) -> Floats:
+    """Absolute error of kinetic energy over the truth's, at least 1e-3 of its greatest.
+
+    NaN where the truth rests in all frames. It forgives a flow that is wrong but as fast.
+    """
+    return floored_quotient(np.abs(predicted - true), true)
+
+
+@metric(unit="frame", source="design 2, section 2", over_frames=total, per_frame=False)
+def active_frames(pair: FramePair) -> float:
+    """Predicted frames until the truth's kinetic energy stays below 1 % of its peak."""
+    return float(pair.frame in pair.scenario.active)
+
+
+def momentum(snapshot: Snapshot) -> Floats:
+    """Return ``sum(u)``: momentum over the particle mass [length/frame], shape [2]."""
+    return np.asarray(np.sum(snapshot.velocity, axis=0))
+
+
+def angular_momentum(snapshot: Snapshot, centre: tuple[float, float]) -> float:
+    """Return ``sum(r x u)`` about the centre (Eq. 5.1), over the particle mass [length^2/frame]."""
+    r, u = snapshot.position - centre, snapshot.velocity
+    return dot(r[:, 0], u[:, 1]) - dot(r[:, 1], u[:, 0])
+
+
+def _length(vectors: Floats) -> Floats:
+    """Return the Euclidean length of vectors, shape [particle]."""
+    return np.sqrt(vectors[:, 0] ** 2 + vectors[:, 1] ** 2)
+
+
+@metric(unit="length/frame", source="section 5.2")
+def momentum_gap(pair: FramePair) -> float:
+    """Error of total momentum, unscaled."""
+    dx, dy = momentum(pair.prediction) - momentum(pair.truth)
+    return math.hypot(dx, dy)
+
+
+@metric(unit="length/frame", source="section 5.2")
+def momentum_scale(pair: FramePair) -> float:
+    """The truth's sum of speeds that scales momentum_error."""
+    return float(np.sum(_length(pair.truth.velocity)))
+
+
+@metric(unit="1", direction=Direction.LOWER, source="section 5.2", of=("momentum_gap", "momentum_scale"))
+def momentum_error(gap: Floats, scale: Floats) -> Floats:
+    """Error of total momentum over its scale (at least 1e-3 of its greatest)."""
+    return floored_quotient(gap, scale)
+
+
+@metric(unit="length^2/frame", source="section 5.2, Eq. 5.1")
+def angular_momentum_gap(pair: FramePair) -> float:
+    """Error of angular momentum about the box centre, unscaled."""
+    centre = pair.scenario.setting.centre
+    return abs(angular_momentum(pair.prediction, centre) - angular_momentum(pair.truth, centre))
+
+
+@metric(unit="length^2/frame", source="section 5.2, Eq. 5.1")
+def angular_momentum_scale(pair: FramePair) -> float:
+    """The truth's sum of arm times speed that scales angular_momentum_error."""
+    arms = _length(pair.truth.position - pair.scenario.setting.centre)
+    return dot(arms, _length(pair.truth.velocity))
+
+
+@metric(
+    unit="1",
+    direction=Direction.LOWER,
+    source="section 5.2, Eq. 5.1",
+    of=("angular_momentum_gap", "angular_momentum_scale"),
+)
+def angular_momentum_error(gap: Floats, scale: Floats) -> Floats:
+    """Error of angular momentum over its scale (at least 1e-3 of its greatest)."""
+    return floored_quotient(gap, scale)
+
+
+def root_mean_square(values: Floats) -> float:
+    """Return ``sqrt(mean(v^2))`` over nodes."""
+    return math.sqrt(float(np.mean(values**2)))
+
+
+@metric(unit="1", direction=Direction.LOWER, source="design section 8", over_frames=over_frames_rms)
+def density_rmse(pair: FramePair) -> float:
+    """Root mean squared error of density relative to rest, over all nodes.
+
+    All nodes of the grid, so that material in the wrong place shows both where it is missing
+    and where it should not be. 0 is perfect; values of a box that is filled in part are small.
+    """
+    return root_mean_square(pair.prediction.fields.density - pair.truth.fields.density)
+
+
+@metric(unit="1/frame", source="section 5.9.1", defined=enough_nodes)
+def divergence_rms(pair: FramePair) -> float:
+    """Root mean squared divergence of the prediction."""
+    return root_mean_square(pair.predicted_fields.divergence[pair.nodes])
+
+
+@metric(unit="1/frame", source="section 5.9.1", defined=enough_nodes)
+def divergence_rms_true(pair: FramePair) -> float:
+    """Root mean squared divergence of the truth."""
+    return root_mean_square(pair.truth.fields.divergence[pair.nodes])
+
+
+@metric(unit="%", direction=Direction.LOWER, source="design 2, section 4")
+def outside_share(pair: FramePair) -> float:
+    """Share of predicted particles that are past a wall."""
+    return 100.0 * pair.outside
+
+
+METRICS: tuple[Metric, ...] = (
+    energy_true,
+    energy_predicted,
+    energy_ratio,
+    energy_retention,
+    energy_retention_true,
+    energy_error,
+    active_frames,
+    momentum_gap,
+    momentum_scale,
+    momentum_error,
+    angular_momentum_gap,
+    angular_momentum_scale,
+    angular_momentum_error,
+    density_rmse,
+    divergence_rms,
+    divergence_rms_true,
+    outside_share,
+)
+"""Metrics of this family."""

@@ -1,0 +1,326 @@
+"""Bring scenarios of a store into its working copy, so that they can be read as files.
+
+The store's manifest says what is there; each object is fetched and gets its name once its content
+hash is that of datasets.yaml, or of the manifest where datasets.yaml has none. What is in the
+working copy and is what the manifest says is not fetched again.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import closing, contextmanager
+from contextvars import ContextVar
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from lagbench.data.checksums import file_sha256
+from lagbench.data.layout import MANIFEST_NAME, dataset_folder, url_of
+from lagbench.data.lock import dataset_lock
+from lagbench.data.manifest import FileEntry, Manifest, merge, read_manifest, write_manifest
+from lagbench.data.registry import Size, spell_ids
+from lagbench.errors import DataError
+from lagbench.work.machine import may_differ
+
+from .fetch import Wanted, fetch_scenarios, fetch_text
+from .objects import HTTP, NotDataError, NotInStoreError, Objects, WrongContentError, check_bucket
+
+__all__ = [
+    "address_of",
+    "bring",
+    "fetch_entries",
+    "folder_of",
+    "is_here",
+    "is_right",
+    "join",
+    "merged",
+    "parse_manifest",
+    "quietly",
+    "read_or_empty",
+    "refuse_strangers",
+    "remote_manifest",
+    "unstored",
+    "with_local",
+    "writing",
+]
+
+FRESH = 30.0
+"""How long a store's manifest is not asked for again by this process [s]."""
+
+MANIFEST_LIMIT = 64 << 20
+"""Longest manifest that is read [bytes]."""
+
+_asked: dict[str, tuple[float, Manifest | None]] = {}
+_written: set[Path] = set()
+_quiet: ContextVar[bool] = ContextVar("quiet", default=False)
+
+
+def address_of(size: Size, url: str, name: str) -> str:
+    """Return the address of an object of a data set in a store."""
+    return f"{url}/{folder_of(size)}/{name}"
+
+
+def folder_of(size: Size) -> str:
+    """Return the folder of a data set below the root of a store."""
+    return dataset_folder(Path(), size.split, size.name, size.major).as_posix()
+
+
+def _remedy(size: Size, url: str) -> str:
+    return f"lagbench generate --split {size.split} --size {size.name} --root {url} writes it anew"
+
+
+def merged(size: Size, base: Manifest | None, files: Iterable[FileEntry] = ()) -> Manifest:
+    """Return a manifest of a size with entries put in; an empty one without any."""
+    return merge(
+        base,
+        files,
+        split=size.split,
+        size=size.name,
+        version=size.version,
+        subsets=size.subsets,
+        recorded=size.measured.scenario_sha256 if size.measured else None,
+    )
+
+
+def read_or_empty(size: Size, root: Path) -> Manifest:
+    """Return the manifest of a folder, an empty one where there is none that can be read."""
+    try:
+        found = read_manifest(root, size.split, size.name, size.major)
+    except DataError:  # it is written anew from the files
+        found = None
+    return found or merged(size, None)
+
+
+def parse_manifest(text: bytes, *, where: str, remedy: str) -> Manifest:
+    """Return a store's manifest; what is none is a NotDataError."""
+    try:
+        return Manifest.model_validate_json(text)
+    except ValidationError as error:
+        raise NotDataError(
+            "the store's manifest is none",
+            where=where,
+            expected="a manifest.json as lagbench generate writes it",
+            got=ascii(text[:80].decode("utf-8", "replace")),
+            fix=remedy,
+        ) from error
+
+
+def refuse_strangers(found: Manifest, strangers: Collection[int], *, where: str, remedy: str) -> None:
+    """Refuse a store whose manifest has other content hashes than datasets.yaml."""
+    if strangers:
+        raise WrongContentError(
+            "the store holds another data set",
+            where=f"{where}, scenarios {spell_ids(strangers)}",
+            expected="the content hashes of datasets.yaml",
+            got=f"version {found.version}, data set hash {found.dataset_sha256}",
+            fix=remedy,
+        )
+
+
+def bring(size: Size, root: Path, scenarios: Iterable[int] = (), *, thoroughly: bool = False) -> bool:
+    """Bring a data set's manifest and some scenarios where the root is a store's working copy.
+
+    A scenario that the store does not have is left to the caller, who misses its file.
+
+    Args:
+        size: tier of a split.
+        root: folder of all data sets; nothing is done for one that is no working copy.
+        scenarios: ids.
+        thoroughly: whether to hash files that are there, and not only look at their lengths; and
+            to look whether the store has all that its manifest names.
+
+    Returns:
+        Whether anything came.
+
+    Raises:
+        DataError: the store has no such bucket, or sent what is no data or has other content.
+        WorkFailedError: the store refuses or does not answer, or the disk is full.
+        UsageError: what reads this kind of address is not installed.
+    """
+    url, scenarios = url_of(root), tuple(scenarios)
+    if url is None or root in _written:
+        return False
+    found = remote_manifest(size, url)
+    if found is None or any(found.entry(i) is None for i in scenarios):
+        found = remote_manifest(size, url, fresh=0.0)  # it may have come just now
+    if found is None:
+        return False
+    if thoroughly:
+        _check_objects(size, url, found)
+    named = [e for i in scenarios if (e := found.entry(i))]
+    strangers = [e.scenario for e in named if not is_right(e, size, found)]
+    where = address_of(size, url, MANIFEST_NAME)
+    refuse_strangers(found, strangers, where=where, remedy=_remedy(size, url))
+    old = read_or_empty(size, root)
+    lacking = [e for e in named if not is_here(e, size, root, None if thoroughly else old)]
+    if not lacking and with_local(size, root, found) == old:
+        return False
+    with dataset_lock(root, size.split, size.name, size.major):
+        fetch_entries(size, root, url, [e for e in lacking if not is_here(e, size, root)])
+        write_manifest(root, with_local(size, root, found))
+    return True
+
+
+def remote_manifest(size: Size, url: str, *, fresh: float | None = None) -> Manifest | None:
+    """Return the manifest of a data set in a store; None where there is none.
+
+    An earlier answer of this process counts while it is no older than ``fresh`` [s].
+    """
+    place, remedy = address_of(size, url, MANIFEST_NAME), _remedy(size, url)
+    when, known = _asked.get(place, (-1e9, None))
+    if time.monotonic() - when < (FRESH if fresh is None else fresh):
+        return known
+    try:
+        text = fetch_text(place, limit=MANIFEST_LIMIT, remedy=remedy)
+    except NotInStoreError:
+        check_bucket(url)
+        found = None
+    else:
+        found = parse_manifest(text, where=place, remedy=remedy)
+    _asked[place] = (time.monotonic(), found)
+    return found
+
+
+def unstored(size: Size, root: Path, scenarios: Iterable[int]) -> tuple[int, ...]:
+    """Return scenarios that the manifest of a working copy's store lacks; a plain folder has no store."""
+    url = url_of(root)
+    if url is None:
+        return ()
+    found = remote_manifest(size, url)
+    return tuple(i for i in scenarios if found is None or found.entry(i) is None)
+
+
+def is_right(entry: FileEntry, size: Size, manifest: Manifest) -> bool:
+    """Return whether an entry of a manifest is what datasets.yaml means.
+
+    A file of a machine that promises no equal bits may differ, as it may in a local folder.
+    """
+    if size.measured is None or entry.scenario not in size.scenarios:
+        return entry.scenario in size.scenarios
+    return entry.has_hash(size.measured.scenario_sha256.get(entry.scenario)) or (
+        manifest.identity == "tolerance" and may_differ(entry.device, manifest.environments)
+    )
+
+
+def with_local(size: Size, root: Path, found: Manifest) -> Manifest:
+    """Return the store's manifest with what only the working copy holds."""
+    folder, local = dataset_folder(root, size.split, size.name, size.major), read_or_empty(size, root)
+    ours = [e for e in local.files if found.entry(e.scenario) is None and is_right(e, size, local)]
+    return join(size, found, local, [entry for entry in ours if (folder / entry.path).is_file()])
+
+
+def join(size: Size, base: Manifest, other: Manifest, files: Collection[FileEntry]) -> Manifest:
+    """Return a manifest with entries of another, and its machines and statistics as far as they hold."""
+    if not files:
+        return base
+    machines = [*base.environments, *(e for e in other.environments if e not in base.environments)]
+    joined = merged(size, base.model_copy(update={"environments": tuple(machines)}), files)
+    if joined.statistics or joined.subset_sha256.get("train") != other.subset_sha256.get("train"):
+        return joined
+    return joined.model_copy(update={"statistics": other.statistics})
+
+
+def _check_objects(size: Size, url: str, found: Manifest) -> None:
+    """Refuse a manifest that names what is not there, or of another length."""
+    if url.startswith(HTTP):  # which lists nothing
+        return
+    there = Objects(url, folder_of(size)).sizes()
+    wrong = [entry.scenario for entry in found.files if there.get(entry.path) != entry.bytes]
+    if wrong:
+        raise DataError(
+            "the store's manifest names objects that are not there, or of another length",
+            where=f"{address_of(size, url, MANIFEST_NAME)}, scenarios {spell_ids(wrong)}",
+            fix=_remedy(size, url),
+        )
+
+
+def is_here(entry: FileEntry, size: Size, root: Path, trusted: Manifest | None = None) -> bool:
+    """Return whether the working copy holds what an entry describes; what is trusted is not hashed."""
+    path = dataset_folder(root, size.split, size.name, size.major) / entry.path
+    if not path.is_file() or path.stat().st_size != entry.bytes:
+        return False
+    known = trusted.entry(entry.scenario) if trusted else None
+    return (known is not None and known.file_sha256 == entry.file_sha256) or (
+        file_sha256(path) == entry.file_sha256
+    )
+
+
+def fetch_entries(size: Size, root: Path, url: str, entries: Collection[FileEntry]) -> None:
+    """Fetch objects into the working copy, whose lock is held; each appears whole and right."""
+    if not entries:
+        return
+    folder = dataset_folder(root, size.split, size.name, size.major)
+    wanted = {
+        entry.scenario: Wanted(
+            url=address_of(size, url, entry.path),
+            target=folder / entry.path,
+            limit=entry.bytes,
+            length=entry.bytes,
+            file_sha256=entry.file_sha256,
+            content_sha256=entry.content_sha256,
+            remedy=_remedy(size, url),
+        )
+        for entry in entries
+    }
+    with (
+        _Ticker(url, len(entries), sum(entry.bytes for entry in entries)) as told,
+        closing(fetch_scenarios(wanted, told.count)) as arrivals,
+    ):
+        for _, absent in arrivals:
+            if absent is not None:
+                raise absent
+            told.finished += 1
+
+
+@contextmanager
+def writing(root: Path) -> Iterator[None]:
+    """Bring nothing into a working copy from which this process writes to the store."""
+    _written.add(root)
+    try:
+        yield
+    finally:
+        _written.discard(root)
+        _asked.clear()
+
+
+@contextmanager
+def quietly() -> Iterator[None]:
+    """Say nothing on stderr about what is fetched."""
+    token = _quiet.set(True)
+    try:
+        yield
+    finally:
+        _quiet.reset(token)
+
+
+class _Ticker:
+    """Tells on stderr how much has been fetched, where a person watches."""
+
+    def __init__(self, url: str, objects: int, length: int) -> None:
+        self._url, self._objects, self._length = url, objects, length
+        self.finished = self._arrived = 0
+        self._last = 0.0
+        self._watched = sys.stderr.isatty() and not _quiet.get()
+
+    def __enter__(self) -> _Ticker:
+        self._tell()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._tell(end="\n")
+
+    def count(self, arrived: int) -> None:
+        """Count bytes."""
+        self._arrived += arrived
+        if time.monotonic() - self._last > 0.2:
+            self._tell()
+
+    def _tell(self, end: str = "") -> None:
+        self._last = time.monotonic()
+        if self._watched:
+            files = f"{self.finished} of {self._objects} files"
+            share = f"{self._arrived / 1e6:.1f} of {self._length / 1e6:.1f} MB"
+            sys.stderr.write(f"\rlagbench: fetching from {self._url}: {files}, {share} {end}")
+            sys.stderr.flush()

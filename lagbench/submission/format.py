@@ -1,0 +1,369 @@
+"""What a predictions.nc is: its names, what its headers say, and the checks on its layout.
+
+No data set is needed here. What is wrong is recorded, not raised; only a file that HDF5 cannot
+read at all raises.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import h5py
+
+from lagbench.errors import nearest
+
+from .findings import Findings, quoted
+from .hdf5 import MAX_LINKS, Array, Odd, attribute_of, describe, members_of, reading, storage_problems
+
+__all__ = [
+    "DIMS",
+    "FORMAT",
+    "MAX_NAME",
+    "NEVER",
+    "OPTIONAL",
+    "REQUIRED",
+    "SPACE",
+    "Anatomy",
+    "Header",
+    "check_dims",
+    "check_dtype",
+    "check_format",
+    "check_marks",
+    "dissect",
+    "fits",
+    "header_of",
+    "kind_of",
+]
+
+FORMAT = 1
+"""Number of the file layout; stored as attribute ``lagbench_format``."""
+
+DIMS = ("scenario", "frame", "particle", "space")
+"""Dimensions of ``position``, in this order."""
+
+SPACE = 2
+"""Components of a position."""
+
+NEVER = -1
+"""Value of ``diverged_at`` for a rollout that did not diverge."""
+
+REQUIRED = ("split", "size", "dataset_version", "dataset_sha256", "method")
+"""Text attributes that every file has, beside ``lagbench_format``."""
+
+OPTIONAL: Mapping[str, type[str] | type[int] | type[float]] = {
+    "seconds_per_frame": float,
+    "device": str,
+    "seed": int,
+    "parameters": int,
+    "training": str,
+}
+"""Attributes that a file may have: cost, provenance and size of the model."""
+
+MAX_NAME = 200
+"""Longest required attribute [characters]."""
+
+MAX_COORDINATE = 20_000
+"""Most entries of a coordinate that are read; ids and frame numbers have four digits."""
+
+MAX_COORDINATE_CHUNK = 1 << 26
+"""Largest chunk of a coordinate that is read [bytes]."""
+
+INTEGERS = ("scenario", "frame", "diverged_at")
+PACKING = ("scale_factor", "add_offset")
+
+_START = "start from what `lagbench template` writes, or use lagbench.submission.write"
+_WRITE = "write it with lagbench.submission.write, or with chunks (1, 1, particle, space)"
+_KINDS = {str: "text", int: "an integer", float: "a positive number"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Header:
+    """What a predictions.nc says about itself."""
+
+    split: str
+    size: str
+    dataset_version: str  # semantic version of the split, as in "1.0.0"
+    dataset_sha256: str  # hash of the data set that the model was given, 64 hex digits
+    method: str  # what made the predictions
+    scenarios: tuple[int, ...]  # ids in the order in which they are stored
+    frames: tuple[int, ...]  # absolute numbers of the predicted frames
+    particles: int  # particles in every frame
+    seconds_per_frame: float | None  # cost of one predicted frame [s]
+    device: str | None  # machine that predicted
+    seed: int | None  # seed of the training
+    parameters: int | None  # trainable parameters of the model
+    training: str | None  # what the model was trained on, in words
+    diverged_at: Mapping[int, int]  # scenario id to the absolute frame from which it is frozen
+
+
+@dataclass(frozen=True, kw_only=True)
+class Anatomy:
+    """A file as its headers describe it."""
+
+    links: Mapping[str, str]  # entry of the root group to what it is; the first MAX_LINKS of them
+    link_count: int
+    attributes: Mapping[str, object]  # attribute of the format to its value, None where it is missing
+    arrays: Mapping[str, Array]  # variables of the format that a hard link leads to
+    packing: Mapping[str, object]  # scale_factor and add_offset of ``position``, where it has them
+    integers: Mapping[str, tuple[int, ...]]  # coordinates whose values could be read
+    length: int  # length of the file [bytes]
+
+
+def kind_of(name: str) -> str:
+    """Return in words what an optional attribute must be.
+
+    >>> kind_of("seed"), kind_of("parameters")
+    ('an integer', 'an integer >= 0')
+    """
+    return f"{_KINDS[OPTIONAL[name]]}{' >= 0' if name == 'parameters' else ''}"
+
+
+def fits(name: str, value: object) -> bool:
+    """Tell whether an optional attribute may have a value.
+
+    >>> fits("seed", -5), fits("parameters", -5), fits("parameters", 0)
+    (True, False, True)
+    """
+    if isinstance(value, bool):
+        return False
+    if OPTIONAL[name] is float:
+        return isinstance(value, (int, float)) and 0 < value < math.inf
+    return isinstance(value, OPTIONAL[name]) and not (name == "parameters" and int(value) < 0)
+
+
+def dissect(file: h5py.File, path: Path) -> Anatomy:
+    """Return what a file holds; of values only coordinates are read."""
+    length = path.stat().st_size
+    with reading(path):
+        links, count = members_of(file["/"])
+        names = ("lagbench_format", *REQUIRED, *OPTIONAL)
+        attributes = {name: attribute_of(file["/"], name) for name in names}
+    arrays, integers, packing = {}, {}, {}
+    for name in ("position", *INTEGERS):
+        if links.get(name) == "variable":
+            with reading(path, name):
+                dataset = file[name]
+                array = describe(dataset, name)
+                arrays[name] = array if array.shape else replace(array, shape=None)
+                if name == "position":
+                    found = {key: attribute_of(dataset, key) for key in PACKING}
+                    packing = {key: value for key, value in found.items() if value is not None}
+                elif _is_coordinate(arrays[name], length):
+                    integers[name] = tuple(int(i) for i in dataset[...])
+    return Anatomy(
+        links=links,
+        link_count=count,
+        attributes=attributes,
+        arrays=arrays,
+        packing=packing,
+        integers=integers,
+        length=length,
+    )
+
+
+def _is_coordinate(array: Array, length: int) -> bool:
+    """Tell whether an array's values may be read as a short list of integers."""
+    if array.shape is None or len(array.shape) != 1 or storage_problems(array, length=length):
+        return False
+    small = array.shape[0] <= MAX_COORDINATE and array.chunk_bytes <= MAX_COORDINATE_CHUNK
+    return small and array.kind.lstrip("u").startswith("int")
+
+
+def header_of(anatomy: Anatomy) -> Header:
+    """Return the header of a file whose layout has been checked."""
+    scenarios = anatomy.integers["scenario"]
+    marks = anatomy.integers.get("diverged_at", ())
+    labels: dict[str, Any] = {name: str(anatomy.attributes[name]) for name in REQUIRED}
+    labels |= {name: _optional(anatomy.attributes[name], kind) for name, kind in OPTIONAL.items()}
+    return Header(
+        **labels,
+        scenarios=scenarios,
+        frames=anatomy.integers["frame"],
+        particles=(anatomy.arrays["position"].shape or ())[2],
+        diverged_at={i: mark for i, mark in zip(scenarios, marks, strict=False) if mark >= 0},
+    )
+
+
+def _optional(value: object, kind: type[Any]) -> Any:  # noqa: ANN401
+    if kind is float and isinstance(value, int):
+        return float(value)
+    return value if isinstance(value, kind) else None
+
+
+def check_format(anatomy: Anatomy, out: Findings) -> bool:
+    """Check links, variables, storage and attributes; tell whether the values can be read."""
+    out.made("format")
+    _check_links(anatomy, out)
+    for name in ("position", "scenario", "frame"):
+        _check_variable(name, anatomy, out)
+    for name, array in anatomy.arrays.items():
+        where = f"variable {name!r}"
+        problems = storage_problems(array, length=anatomy.length)
+        for what, expected, got in problems:
+            out.error("format", what, where=where, expected=expected, got=got, fix=_WRITE)
+        if not problems and name != "position" and name not in anatomy.integers:
+            out.error(
+                "format",
+                "a coordinate cannot be read",
+                where=where,
+                expected=f"one dimension of at most {MAX_COORDINATE} integers",
+                got=f"{array.kind}, shape {array.shape}, chunks {array.chunks}",
+                fix=_START,
+            )
+    readable = not out.failed("format")
+    _check_attributes(anatomy, out)
+    return readable
+
+
+def _check_links(anatomy: Anatomy, out: Findings) -> None:
+    for name, kind in anatomy.links.items():
+        if kind.endswith("link"):
+            out.error(
+                "format",
+                f"there is a {kind}, which is not followed",
+                where=quoted(name),
+                expected="variables that lie in this file",
+                got=kind,
+                fix="store the values themselves",
+            )
+    if anatomy.link_count > MAX_LINKS:
+        out.error(
+            "format",
+            "too many variables",
+            where="/",
+            expected=f"at most {MAX_LINKS}",
+            got=anatomy.link_count,
+            fix=_START,
+        )
+
+
+def _check_variable(name: str, anatomy: Anatomy, out: Findings) -> None:
+    kind = anatomy.links.get(name)
+    if kind == "variable" or (kind is not None and kind.endswith("link")):
+        return
+    known = [quoted(other) for other in anatomy.links][:10]
+    fix = _START if kind else nearest(quoted(name), known)
+    got = kind or f"{', '.join(known) or 'nothing'}"
+    out.error("format", f"no variable {name!r}", where="/", expected=f"a variable {name!r}", got=got, fix=fix)
+
+
+def _check_attributes(anatomy: Anatomy, out: Findings) -> None:
+    number = anatomy.attributes["lagbench_format"]
+    if isinstance(number, (str, Odd)) or number != FORMAT:
+        _bad_attribute("lagbench_format", FORMAT, number, out)
+    for name in REQUIRED:
+        value = anatomy.attributes[name]
+        text = value if isinstance(value, str) else ""
+        if not text.strip() or len(text) > MAX_NAME or not text.isprintable():
+            _bad_attribute(name, f"printable text of 1 to {MAX_NAME} characters", value, out)
+    for name in OPTIONAL:
+        value = anatomy.attributes[name]
+        if value is not None and not fits(name, value):
+            _bad_attribute(name, f"{kind_of(name)}, or no such attribute", value, out)
+
+
+def _bad_attribute(name: str, expected: object, value: object, out: Findings) -> None:
+    got = "no such attribute" if value is None else value.reason if isinstance(value, Odd) else quoted(value)
+    out.error(
+        "format",
+        f"the attribute {name!r} {'is missing' if value is None else 'cannot be used'}",
+        where="global attributes",
+        expected=expected,
+        got=got,
+        fix=f"set it: file.{name} = ...",
+    )
+
+
+def check_dims(anatomy: Anatomy, out: Findings) -> bool:
+    """Check names, order and lengths of the dimensions of ``position``."""
+    array = anatomy.arrays.get("position")
+    if array is None or array.shape is None:
+        out.skip("'position' cannot be read", "dims")
+        return False
+    out.made("dims")
+    where = "variable 'position'"
+    if array.dims != DIMS:
+        got = ", ".join(quoted(name) if name else "one without a name" for name in array.dims) or "none"
+        expected, fix = ", ".join(DIMS), _fix_dims(array)
+        out.error("dims", "the dimensions are others", where=where, expected=expected, got=got, fix=fix)
+        return False
+    rows = {name: anatomy.integers.get(name) for name in ("scenario", "frame")}
+    counted = [f"as many as {name!r}" if held is None else len(held) for name, held in rows.items()]
+    lengths = (*counted, array.shape[2], SPACE)
+    if array.shape != lengths:
+        swapped = array.shape[2] == SPACE and array.shape[3] > SPACE
+        fix = "particle and space seem to be swapped: transpose them" if swapped else _START
+        out.error("dims", "the lengths do not fit", where=where, expected=lengths, got=array.shape, fix=fix)
+        return False
+    return True
+
+
+def _fix_dims(array: Array) -> str:
+    if sorted(array.dims) == sorted(DIMS):
+        return "transpose it"
+    if len(array.dims) == len(DIMS) - 1:
+        return "add the leading dimension 'scenario', also for a single scenario"
+    if not any(array.dims):
+        return "attach dimension scales, as netCDF4 and xarray do; plain h5py does not"
+    return _START
+
+
+def check_dtype(anatomy: Anatomy, out: Findings) -> bool:
+    """Check that positions are float32 and not packed as scaled numbers."""
+    array = anatomy.arrays.get("position")
+    if array is None:
+        out.skip("there is no variable 'position'", "dtype")
+        return False
+    out.made("dtype")
+    where = "variable 'position'"
+    if array.kind != "float32":
+        fix = "store positions as float32: positions.astype('float32')"
+        out.error("dtype", "the type is another", where=where, expected="float32", got=array.kind, fix=fix)
+    if anatomy.packing:
+        said = {n: v.reason if isinstance(v, Odd) else quoted(v) for n, v in anatomy.packing.items()}
+        out.error(
+            "dtype",
+            "the values are packed, and are not unpacked here",
+            where=where,
+            expected="no scale_factor and no add_offset",
+            got=", ".join(f"{name} = {text}" for name, text in said.items()),
+            fix="store the positions themselves as float32",
+        )
+    return not out.failed("dtype")
+
+
+def check_marks(anatomy: Anatomy, out: Findings) -> bool:
+    """Check that ``diverged_at``, where it is there, has a predicted frame or -1 per scenario."""
+    array = anatomy.arrays.get("diverged_at")
+    marks, frames = anatomy.integers.get("diverged_at"), anatomy.integers.get("frame")
+    if array is not None and (marks is None or frames is None):
+        out.skip("'diverged_at' or 'frame' cannot be read", "diverged_at")
+        return False
+    out.made("diverged_at")
+    if array is None or marks is None or frames is None:
+        return True
+    where = "variable 'diverged_at'"
+    if array.dims != ("scenario",) or len(marks) != len(anatomy.integers.get("scenario", ())):
+        out.error(
+            "diverged_at",
+            "it is not told per scenario",
+            where=where,
+            expected="one value per scenario, on the dimension 'scenario'",
+            got=f"{len(marks)} on {quoted(array.dims[0]) if any(array.dims) else 'one without a name'}",
+            fix="store it beside 'scenario', or leave it out",
+        )
+    wrong = sorted(set(marks) - {NEVER, *frames})
+    if wrong:
+        out.error(
+            "diverged_at",
+            "a rollout is frozen at no predicted frame",
+            where=where,
+            expected=f"absolute numbers of predicted frames, {NEVER} for a rollout that did not diverge",
+            got=", ".join(map(str, wrong[:5])),
+            fix=f"name the first frozen frame, or {NEVER}",
+        )
+    return not out.failed("diverged_at")

@@ -1,0 +1,221 @@
+"""How predictions begin: mistakes that the first frames give away, and jumps that are none.
+
+A bad model is scored, whatever it predicts; a file is refused only where a mistake is recognised.
+Each mistake is undone and compared: displacements added up, values scaled back, axes swapped
+back, the scenario looked for among the others, the particle among its neighbours.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .findings import Findings
+from .predictions import Predictions
+from .truth import Truth
+
+__all__ = ["JUMP", "Mistake", "Start", "check_start", "mistake", "shifted"]
+
+JUMP = 10.0
+"""A step is suspect beyond this many of the truth's largest per-frame displacement."""
+
+NEARER = 0.25
+"""A mistake is recognised where undoing it brings the prediction this many times nearer."""
+
+SAMPLE = 200
+"""Particles whose neighbours are looked for, evenly spaced over the ids."""
+
+ON = 0.2
+"""A prediction lies on a true particle within this many spacings; at random 13 % do at the most."""
+
+EXACTLY = 0.02
+"""Within this many spacings no shift of a lattice ends by chance."""
+
+Positions = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Start:
+    """The frames around the first predicted one [length], each of shape [particle, space]."""
+
+    given: Positions  # the last given frame
+    true: Positions  # the truth of the first predicted frame
+    first: Positions  # the first predicted frame
+    second: Positions  # the second predicted frame; the first again where there is none
+
+
+class Mistake(NamedTuple):
+    """What was mistaken, and how to mend it."""
+
+    what: str
+    fix: str
+    everywhere: bool = True  # whether a file that has it has it in most scenarios
+
+
+def check_start(predictions: Predictions, truth: Truth, out: Findings) -> None:
+    """Refuse mistakes that are recognised, and flag predictions that do not follow what was given."""
+    header = predictions.header
+    known = sorted(set(header.scenarios) & set(truth.size.subsets["test"]))
+    starts = {scenario: _start(predictions, truth, scenario) for scenario in known}
+    said = {i: mistake(start, truth.size.bounds, _without(starts, i)) for i, start in starts.items()}
+    counts = Counter(found for found in said.values() if found is not None)
+    for scenario, start in starts.items():
+        found = said[scenario]
+        # A bad model may look so in one scenario by chance; what writes a file makes the mistake in all.
+        if found is None or (found.everywhere and 2 * counts[found] < len(starts)):
+            _check_continuity(scenario, start, truth, header.frames[0], out)
+            continue
+        out.error(
+            "start",
+            found.what,
+            where=f"scenario {scenario}, frame {header.frames[0]}",
+            expected="positions that follow the last given frame, particle by particle",
+            got=f"root mean square distance to it {_rms(start.first - start.given):.3g}",
+            fix=found.fix,
+        )
+    _check_shift(starts, header.frames[0], out)
+    out.made("start", "discontinuous_start")
+
+
+def _without(starts: Mapping[int, Start], scenario: int) -> Mapping[int, Start]:
+    return {other: start for other, start in starts.items() if other != scenario}
+
+
+def _start(predictions: Predictions, truth: Truth, scenario: int) -> Start:
+    frames = predictions.header.frames
+    predicted = predictions.frames(scenario, frames[0], min(2, len(frames)))
+    given, true = truth.around_start(scenario)
+    return Start(*(held.astype(np.float64) for held in (given, true, predicted[0], predicted[-1])))
+
+
+def _check_continuity(scenario: int, start: Start, truth: Truth, frame: int, out: Findings) -> None:
+    with np.errstate(all="ignore"):
+        distance = _rms(start.first - start.given)
+    limit = JUMP * truth.largest_displacement(scenario, enough=distance / JUMP)
+    if np.isfinite(distance) and distance > limit:
+        out.warning(
+            "discontinuous_start",
+            "the first predicted frame is far from the last given one",
+            where=f"scenario {scenario}, frame {frame}",
+            expected=f"root mean square distance at most {limit:.3g},"
+            f" {JUMP:g} times the truth's largest displacement in a frame",
+            got=f"{distance:.3g}",
+            fix="predict what follows the last given frame, particle by particle",
+        )
+
+
+def _check_shift(starts: Mapping[int, Start], frame: int, out: Findings) -> None:
+    told = {scenario: said for scenario, start in starts.items() if (said := shifted(start)) is not None}
+    wrong = [scenario for scenario, said in told.items() if said]
+    if wrong:
+        report = out.error if len(wrong) == len(told) else out.warning
+        report(
+            "start",
+            "the frames seem to be shifted by one",
+            where=f"scenario {wrong[0]}, frame {frame}",
+            expected="the frame after the last given one first",
+            got=f"the last given frame, in {len(wrong)} of {len(told)} scenarios whose truth moves",
+            fix="leave the last given frame out: predictions begin one frame later",
+        )
+
+
+def shifted(start: Start) -> bool | None:
+    """Tell whether the first predicted frame is the last given one; None where the truth stands still.
+
+    A prediction that then stays there, as persistence does, is a bad one and no mistake.
+    """
+    moved = _rms(start.true - start.given)
+    if moved < 1e-6:
+        return None
+    stays = _rms(start.first - start.given) <= 0.1 * moved
+    return stays and _rms(start.second - start.first) >= 0.5 * moved
+
+
+def mistake(
+    start: Start, bounds: Sequence[tuple[float, float]], others: Mapping[int, Start]
+) -> Mistake | None:
+    """Return the mistake that was made; None where none is recognised.
+
+    ``others`` are the starts of the other scenarios, by id.
+    """
+    first, given = start.first, start.given
+    low, high = np.array(bounds, np.float64).T
+    apart = _rms(first - given)
+    if not np.isfinite(apart) or np.array_equal(first, given):
+        return None
+    outside = ((first < low) | (first > high)).any(axis=-1).mean() >= 0.5
+    if outside and _rms(first) <= min(NEARER * apart, JUMP * _rms(start.true - given)):
+        return Mistake("these seem to be displacements", "add them up, from the last given frame on")
+    if outside and _is_scaled(first, given):
+        return Mistake("the positions seem to be standardised", "undo that before writing")
+    if _rms(first[:, ::-1] - given) <= NEARER * apart:
+        return Mistake("x and y seem to be swapped", "store x first: positions[..., ::-1]")
+    for i, other in others.items():
+        if _rms(first - other.given) <= min(NEARER * apart, 2 * _rms(other.true - other.given)):
+            what, fix = f"this seems to be the prediction of scenario {i}", "store each under its own id"
+            return Mistake(what, fix, everywhere=False)
+    if _is_permuted(start):
+        what, fix = "the particles seem to stand in another order", "keep the order of the given frames"
+        return Mistake(what, fix, everywhere=False)
+    return None
+
+
+def _is_scaled(first: Positions, given: Positions) -> bool:
+    """Tell whether positions are the given ones in other units, per component, and wider."""
+    spread = first.std(axis=0), given.std(axis=0)
+    if min(map(np.min, spread)) == 0.0:
+        return False
+    scaled = (first - first.mean(axis=0)) / spread[0], (given - given.mean(axis=0)) / spread[1]
+    alike = (scaled[0] * scaled[1]).mean(axis=0)  # correlation
+    return bool((alike >= 0.9).all() and (spread[0] >= 1.5 * spread[1]).all())
+
+
+def _is_permuted(start: Start) -> bool:
+    """Tell whether most particles lie on another particle, next to which they did not move there.
+
+    Clouds that fill a box agree whatever a model does, so it is not their shape that tells a
+    permutation but that predictions lie *on* true or given particles, though not on their own.
+    """
+    count = len(start.given)
+    sample = np.unique(np.linspace(0, count - 1, min(SAMPLE, count)).astype(int))
+    if count < 8:
+        return False
+    beside, spacing = _nearest(start.given[sample], start.given, skip=sample)
+    apart = float(np.median(spacing))
+    move = start.first - start.given
+    if np.median(np.linalg.norm(move[sample], axis=-1)) <= ON * apart:
+        return False
+    # Neighbours that move alike, as a lattice that shifts by its spacing, are no permutation.
+    torn = np.linalg.norm(move[sample] - move[beside], axis=-1) > apart
+    for cloud in (start.given, start.true):
+        found, distance = _nearest(start.first[sample], cloud)
+        own = np.linalg.norm(start.first[sample] - cloud[sample], axis=-1) <= ON * apart
+        other = ((distance <= ON * apart) & torn) | (distance <= EXACTLY * apart)
+        # A cloud that shrank to one point may lie on a particle too, but on one only.
+        if len(np.unique(found[other & ~own])) >= 0.5 * len(sample):
+            return True
+    return False
+
+
+def _nearest(
+    points: Positions, cloud: Positions, skip: NDArray[np.int_] | None = None
+) -> tuple[NDArray[np.int_], Positions]:
+    """Return for every point the nearest particle of a cloud but ``skip``, and its distance."""
+    found, distance = np.empty(len(points), np.int_), np.empty(len(points))
+    for row, point in enumerate(points):
+        squares = np.sum((cloud - point) ** 2, axis=-1)
+        if skip is not None:
+            squares[skip[row]] = np.inf
+        found[row] = np.argmin(squares)
+        distance[row] = np.sqrt(squares[found[row]])
+    return found, distance
+
+
+def _rms(distances: Positions) -> float:
+    """Return the root mean square length of vectors [length]."""
+    return float(np.sqrt(np.mean(np.sum(distances**2, axis=-1))))

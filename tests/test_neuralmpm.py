@@ -1,0 +1,246 @@
+"""NeuralMPM: what holds for any weights, and that it learns."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from graph_cases import batch, facts, jittered, rolled, swirl
+from torch import Tensor, nn
+
+from lagbench.baselines.catalogue import find
+from lagbench.baselines.neuralmpm import NeuralMPM
+from lagbench.baselines.recipe import recipe_for, recipe_names
+from lagbench.baselines.symmetry import image
+from lagbench.data.registry import load
+from lagbench.errors import DataError, UsageError
+
+SMALL: dict[str, object] = {
+    "cells": 10,
+    "width": 8,
+    "velocities": 2,
+    "bundle": 2,
+    "calls": 2,
+    "noise_std": 0.0,
+    "materials": [0, 1, 2, 3],
+}
+
+
+def surrogate(*, awake: float = 0.0, changes: Mapping[str, object] | None = None, **options: object) -> Any:
+    """Return a small model; `awake` is the deviation of its last layer's weights."""
+    torch.manual_seed(0)
+    model = NeuralMPM.build(SMALL | options, facts(**(changes or {})))
+    if awake:
+        nn.init.normal_(model.network.end.weight, std=awake)
+    return model
+
+
+def drift(speed: tuple[float, float], frames: int, seed: int = 0) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """Return a cloud in the middle of the box that moves as one, shape [frame, particle, 2]."""
+    return jittered(seed, low=0.35, high=0.65) + np.arange(frames)[:, None, None] * np.array(speed)
+
+
+def test_untrained_models_keep_every_velocity() -> None:
+    """Without smoothing particles move on straight, and with it a uniform flow keeps its kinetic energy."""
+    rng = np.random.default_rng(0)
+    window = jittered(0, low=0.3, high=0.7) + np.arange(3)[:, None, None] * rng.normal(0.0, 2e-3, (256, 2))
+    found = rolled(surrogate(smoothing=0.0), batch(window), 20).diff(dim=1)
+    torch.testing.assert_close(
+        found, torch.from_numpy(window[1] - window[0])[:, None].expand(-1, 19, -1).float(), rtol=0, atol=1e-6
+    )
+    moved = rolled(surrogate(smoothing=0.2), batch(drift((4e-3, -2e-3), 3)), 40)
+    energy = moved.diff(dim=1).double().square().sum(dim=2).mean(dim=0)
+    np.testing.assert_allclose(energy.numpy(), 2e-5, rtol=2e-3)
+
+
+def test_smoothing_damps_what_the_grid_does_not_see() -> None:
+    """A share s of the sub-grid velocity goes with every frame; momentum stays."""
+    rng = np.random.default_rng(0)
+    window = jittered(0, low=0.3, high=0.7) + np.arange(3)[:, None, None] * rng.normal(0.0, 1e-3, (256, 2))
+    given = batch(window)
+    given.material.zero_()
+    found = rolled(surrogate(smoothing=0.3), given, 4).diff(dim=1).double()
+    spread = found.std(dim=0).mean(dim=1)
+    assert bool((spread[1:] < 0.85 * spread[:-1]).all())
+
+
+def test_particles_stay_inside_the_walls() -> None:
+    """Whatever the network says, positions stay in the box and velocities true to them."""
+    model = surrogate(awake=30.0)
+    given = batch(swirl(0, 3), swirl(1, 3))
+    found = rolled(model, given, 12)
+    low, high = torch.tensor(facts().bounds).T
+    assert bool((found >= low).all())
+    assert bool((found <= high).all())
+    assert bool(((found == low) | (found == high)).any())  # some were stopped
+    _, frames = model.call(model.start(given))
+    torch.testing.assert_close(frames[1][0] - frames[0][0], frames[1][1], rtol=0, atol=2e-7)
+
+
+def test_windows_side_by_side_do_not_see_each_other() -> None:
+    """Two windows in one batch roll out as they do alone, walls and context included."""
+    model = surrogate(awake=0.1, context=3, wall_velocity=True)
+    windows = [batch(swirl(seed, 3), walls=True) for seed in (0, 1)]
+    both = rolled(model, batch(swirl(0, 3), swirl(1, 3), walls=True), 5)
+    torch.testing.assert_close(both, torch.cat([rolled(model, w, 5) for w in windows]), rtol=0, atol=1e-6)
+
+
+def test_training_unrolls_the_rollout() -> None:
+    """The loss over two calls is the mean error of the rollout's velocities, over the deviation."""
+    window = batch(swirl(0, 7))
+    model = surrogate(awake=0.1)
+    with torch.no_grad():
+        found = float(model(window)["velocity"])
+    path = torch.cat([window.position[:, 2:3], rolled(model, window.part(slice(3)), 4)], dim=1)
+    error = path.diff(dim=1) - window.position[:, 2:].diff(dim=1)
+    assert found == pytest.approx(float(error.square().mean()) / ((2e-4**2 + 1e-4**2) / 2), rel=1e-3)
+
+
+class Drag(nn.Module):
+    """Stands for the U-Net: every frame's acceleration is -rate times the velocity on the grid."""
+
+    def __init__(self, rate: float, bundle: int) -> None:
+        super().__init__()
+        self.rate, self.bundle = rate, bundle
+
+    def forward(self, field: Tensor) -> Tensor:
+        """Return the accelerations of one material."""
+        return -self.rate * field[:, 1:3].repeat(1, self.bundle, 1, 1)
+
+
+def test_a_known_network_has_a_known_rollout() -> None:
+    """Drag takes the share r of the velocity before a bundle in each of its frames: a closed form."""
+    model = surrogate(materials=[0], smoothing=0.0)
+    rate = 0.1
+    model.network = Drag(rate * model.speed / model.change, 2)
+    given = batch(drift((4e-3, -2e-3), 3))
+    given.material.zero_()
+    found = rolled(model, given, 4).double().mean(dim=0) - given.position[:, -1].double().mean(dim=0)
+    shares = np.array([1 - rate, 1 - 2 * rate, (1 - 2 * rate) * (1 - rate), (1 - 2 * rate) ** 2])
+    np.testing.assert_allclose(found.numpy(), shares.cumsum()[:, None] * [4e-3, -2e-3], rtol=1e-3)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("signs", [(1.0, 1.0), (-1.0, 1.0), (1.0, -1.0), (-1.0, -1.0)])
+def test_images_roll_out_as_images(signs: tuple[float, float], turned: bool) -> None:
+    """All eight images of the box, with a network that knows no direction: transfers and walls know none."""
+    model = surrogate(materials=[0], smoothing=0.2)
+    model.network = Drag(-0.5 * model.speed / model.change, 2)
+    given = batch(swirl(0, 3, (0.2, 0.2)))
+    given.material.zero_()
+    matrix = torch.diag(torch.tensor(signs))[None]
+    matrix = matrix.flip(2) if turned else matrix
+    there = rolled(model, image(given, matrix, facts().bounds), 5)
+    here = (rolled(model, given, 5) - 0.5) @ matrix[0].T + 0.5
+    torch.testing.assert_close(there, here, rtol=0, atol=1e-5)
+
+
+def test_each_frame_is_driven_by_its_own_walls() -> None:
+    """The first bundle sees the walls of its two frames and none after them; the second sees its own."""
+    model = surrogate(awake=0.1, wall_velocity=True)
+    whole = batch(swirl(0, 9), walls=True)
+
+    def with_walls_at(frame: int) -> Tensor:
+        walls = torch.zeros_like(whole.wall_velocity)
+        walls[:, frame] = 0.05
+        return rolled(model, replace(whole, wall_velocity=walls).part(slice(3)), 4)
+
+    still = with_walls_at(2)  # the last given frame is over
+    first, second, later = (with_walls_at(frame) for frame in (3, 6, 7))
+    assert not torch.equal(first[:, 0], still[:, 0])
+    assert torch.equal(second[:, :2], still[:, :2])
+    assert not torch.equal(second[:, 2], still[:, 2])
+    assert torch.equal(later, still)
+
+
+def test_the_last_known_walls_stay() -> None:
+    """A batch that knows nothing of later frames is rolled out as if its last walls stayed."""
+    model = surrogate(awake=0.1, wall_velocity=True)
+    known = batch(swirl(0, 9), walls=True)
+    short = replace(known.part(slice(3)), wall_velocity=known.wall_velocity[:, :3])
+    assert torch.equal(rolled(model, known.part(slice(3)), 6), rolled(model, short, 6))
+
+
+def test_materials_have_channels_of_their_own() -> None:
+    """Who is jelly and who is snow matters; a material that was not named is refused."""
+    model, given = surrogate(awake=0.1), batch(swirl(0, 3))
+    other = replace(given, material=(given.material + 1) % 4)
+    assert not torch.equal(rolled(model, given, 2), rolled(model, other, 2))
+    with pytest.raises(DataError):
+        surrogate(materials=[0, 2]).start(given)
+
+
+def test_two_frames_are_enough_to_start_from() -> None:
+    """The first velocity repeats before what is given; one frame is refused."""
+    given, model = batch(swirl(0, 5)), surrogate(velocities=4)
+    first = given.position[:, 1] - given.position[:, 0]
+    assert torch.equal(model.start(given.part(slice(2))).velocity, first[:, None].expand(-1, 4, -1))
+    with pytest.raises(UsageError):
+        model.start(given.part(slice(1)))
+
+
+@pytest.mark.parametrize(
+    ("options", "where"),
+    [
+        ({"materials": []}, "model.materials"),
+        ({"materials": [1, 1]}, "model.materials"),
+        ({"materials": [4]}, "model.materials"),
+        ({"wall_velocity": True}, "model.wall_velocity"),
+    ],
+)
+def test_options_that_do_not_fit_are_refused(options: dict[str, object], where: str) -> None:
+    """Materials that do not exist, and walls of a split where none moves."""
+    with pytest.raises(UsageError) as told:
+        surrogate(changes={"moving_walls": False}, **options)
+    assert told.value.where == where
+
+
+def test_learns_a_swirl() -> None:
+    """Particles turn ever slower: soon the rollout errs a third of what constant velocity does."""
+    model = surrogate(materials=[0], width=16, symmetry="square", noise_std=1e-5)
+    flows = [swirl(seed, 24, (0.06, 0.01)) for seed in range(4)]
+    generator, optimiser = torch.Generator().manual_seed(0), torch.optim.Adam(model.parameters(), lr=3e-3)
+    rng = np.random.default_rng(0)
+
+    def error() -> float:
+        whole = batch(swirl(9, 24, (0.06, 0.01)))
+        whole.material.zero_()
+        found = rolled(model, whole.part(slice(3)), 20)
+        return float((found - whole.position[:, 3:23]).square().mean().sqrt())
+
+    before = error()
+    for _ in range(60):
+        starts = rng.integers(24 - model.history - model.future + 1, size=4)
+        given = batch(*(f[s : s + model.history + model.future] for f, s in zip(flows, starts, strict=True)))
+        given.material.zero_()
+        optimiser.zero_grad()
+        model(given, generator)["velocity"].backward()
+        optimiser.step()
+    assert error() < before / 3
+
+
+@pytest.mark.parametrize("size", ["tiny", "mini", "full"])
+@pytest.mark.parametrize("split", ["cavity", "curl-noise", "fluid", "multimaterial"])
+def test_recipes_fit_every_split(split: str, size: str) -> None:
+    """Walls drive the cavity alone, gravity allows the mirror alone, materials are those of the split."""
+    described = load().size(split, size)
+    recipe = recipe_for(find("neuralmpm"), split, size)
+    model = NeuralMPM.build(recipe.model, facts(moving_walls=split == "cavity", bounds=described.bounds))
+    gravity = described.parameters.get("gravity")
+    assert recipe.model["wall_velocity"] is (split == "cavity")
+    assert recipe.model["symmetry"] == ("mirror" if gravity and gravity.value else "square")
+    assert len(recipe.model["materials"]) == (4 if split == "multimaterial" else 1)
+    assert 2 * sum(p.numel() for p in model.parameters()) <= 4e6  # bytes of its weights in bfloat16
+
+
+def test_every_recipe_is_valid() -> None:
+    """Every entry of the file passes the check of its keys and values."""
+    entry = find("neuralmpm")
+    for name in recipe_names(entry):
+        split, _, tier = name.partition("/")
+        size, _, variant = tier.partition("-")
+        assert recipe_for(entry, split, size, variant=variant or None).name == name

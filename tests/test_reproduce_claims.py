@@ -1,0 +1,242 @@
+"""Claims from scores, the thesis's numbers, and the small mathematics of reproduction."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from reproduce_bench import a_method, known
+from scipy.stats import kendalltau
+
+from lagbench.baselines.reproduce import thesis
+from lagbench.baselines.reproduce.claims import (
+    CLAIMS,
+    Claim,
+    Verdict,
+    answer,
+    claim_rows,
+    compared,
+    floors_ahead,
+)
+from lagbench.baselines.reproduce.curves import SMOOTHED, loss_over_steps, smoothed
+from lagbench.baselines.reproduce.evidence import Evidence, Method, Seeded, Sources
+from lagbench.baselines.reproduce.results import agreement
+from lagbench.baselines.reproduce.tables import cubic_errors, cubic_vorticity, rollout_table
+from lagbench.data.registry import load
+from lagbench.metrics import METRICS, Score
+
+FIRST = Claim(question="", first="supergat", rivals=thesis.OPERATORS[1:])
+
+
+def six(**better: list[float]) -> Evidence:
+    """Return six operators at 0.5 in eight scenarios, some replaced."""
+    return known({name: better.get(name, [0.5] * 8) for name in thesis.OPERATORS})
+
+
+def test_a_comparison_can_be_counted_by_hand() -> None:
+    """Better by 0.1 in 8 of 8 scenarios: the exact test gives 2 / 2^8, whichever comes first."""
+    evidence = known({"gns": [0.1] * 8, "gat": [0.2] * 8})
+    (row,) = compared(evidence, "gns", ["gat"], ["position_rmse"])
+    assert (row.means, row.won, row.seeds) == (pytest.approx((0.1, 0.2)), 8, (1, 1))
+    assert row.p == row.test.p == 2 / 2**8
+    assert row.verdict is Verdict.BETTER
+    (turned,) = compared(evidence, "gat", ["gns"], ["position_rmse"])
+    assert (turned.verdict, turned.won, turned.p) == (Verdict.WORSE, 0, row.p)
+
+
+def test_the_larger_correlation_wins() -> None:
+    """Directions come from the metrics table; at a frame the values of that frame are compared."""
+    (row,) = compared(
+        known({"gns": [0.9] * 8, "gat": [0.5] * 8}), "gns", ["gat"], ["vorticity_pearson"], frame=54
+    )
+    assert (row.verdict, row.won, row.frame) == (Verdict.BETTER, 8, 54)
+
+
+def test_nothing_is_claimed_of_what_cannot_be_told() -> None:
+    """Mixed signs leave a question open; fewer than six scenarios give no p-value at all."""
+    (mixed,) = compared(known({"gns": [0.1, 0.3] * 4, "gat": [0.2] * 8}), "gns", ["gat"], ["position_rmse"])
+    assert mixed.verdict is Verdict.OPEN
+    (few,) = compared(known({"gns": [0.1] * 5, "gat": [0.9] * 5}), "gns", ["gat"], ["position_rmse"])
+    assert few.verdict is Verdict.FEW
+    assert math.isnan(few.p)
+
+
+def test_first_place_takes_all_rivals() -> None:
+    """Better than all five after correction (5 x 2 / 2^8 < 5 %): yes; a tie or a loss: counted."""
+    rows = claim_rows(FIRST, six(supergat=[0.1] * 8))
+    assert {row.second for row in rows} == set(FIRST.rivals)
+    assert {row.p for row in rows} == {5 * 2 / 2**8}
+    assert answer(rows) == "yes"
+    tied = claim_rows(FIRST, six(supergat=[0.1] * 8, gns=[0.05, 0.16] * 4))
+    assert {row.second for row in tied if row.verdict is Verdict.OPEN} == {"gns"}
+    assert answer(tied) not in ("yes", "no")
+    assert all(row.verdict is Verdict.WORSE for row in claim_rows(FIRST, six(supergat=[0.9] * 8)))
+
+
+@pytest.mark.parametrize(("without", "expected"), [(0.9, "yes"), (0.1, "no"), (0.5, "open")])
+def test_a_loss_is_judged_by_the_model_without_it(without: float, expected: str) -> None:
+    """The claim on the vorticity loss compares GNS with its ablation, by the ranking metric first."""
+    (claim,) = (claim for claim in CLAIMS if claim.rivals == ("gns-novorticity",))
+    evidence = known({"gns": [0.5] * 8, "gns-novorticity": [without] * 8})
+    rows = claim_rows(claim, evidence)
+    assert answer(rows) == expected
+    assert rows[0].metric == evidence.ranking
+    assert {row.metric for row in rows} == {evidence.ranking, *claim.metrics, *claim.at_key_frame}
+
+
+def test_seeds_that_only_one_has_do_not_count() -> None:
+    """Two models are compared over common seeds; where there are none, over all."""
+    evidence = known({})
+    evidence.methods["gns"] = a_method("gns", [0.5] * 8, [99.0] * 8)
+    evidence.methods["gat"] = a_method("gat", [0.9] * 8)
+    (row,) = compared(evidence, "gns", ["gat"], ["position_rmse"])
+    assert row.means == pytest.approx((0.5, 0.9))
+    evidence.methods["gat"] = Method(
+        name="gat",
+        seeds=tuple(
+            Seeded(seed=7, scores=s.scores, record={}, path=Path()) for s in evidence.methods["gat"].seeds
+        ),
+    )
+    (row,) = compared(evidence, "gns", ["gat"], ["position_rmse"])
+    assert row.seeds == (2, 1)
+
+
+def test_models_stand_beside_the_best_floor() -> None:
+    """The floor of least error is the one that counts; skill is 1 - score / its score."""
+    evidence = known(
+        {"gns": [0.1] * 8, "gat": [0.9] * 8, "persistence": [0.5] * 8, "constant-velocity": [2.0] * 8}
+    )
+    assert evidence.best_floor == "persistence"
+    assert evidence.skill("gns") == pytest.approx(0.8)
+    assert evidence.skill("gat") == pytest.approx(-0.8)
+    assert evidence.skill("persistence") == 0.0
+    rows = claim_rows(Claim(question="", first=""), evidence)
+    assert {row.second: row.verdict for row in rows} == {"gns": Verdict.WORSE, "gat": Verdict.BETTER}
+    del evidence.methods["gns"]
+    ahead = floors_ahead([evidence])
+    assert evidence.ranking in {row[1] for row in ahead.rows}
+    assert {row[2] for row in ahead.rows} <= set(evidence.floors)
+
+
+@pytest.mark.parametrize("claim", CLAIMS, ids=lambda claim: claim.question[:30])
+def test_every_claim_asks_what_can_be_answered(claim: Claim) -> None:
+    """Its metrics are of the table; where nobody has an entry there are no rows, and no answer."""
+    assert {*claim.metrics, *claim.at_key_frame} <= METRICS.keys()
+    for models in ({}, {"gns-short": [0.5] * 8}):
+        rows = claim_rows(claim, known(models))
+        assert (rows, answer(rows)) == ([], "")
+
+
+def test_seeds_become_a_mean_per_scenario() -> None:
+    """The score of two seeds is their mean per scenario; the spread is the sample deviation of means."""
+    method = a_method("gns", [1.0, 3.0], [3.0, 5.0])
+    assert method.scores["position_rmse"].values.tolist() == [2.0, 4.0]
+    assert method.spread("position_rmse") == pytest.approx(math.sqrt(2.0))  # of means 2 and 4
+    assert method.at("position_rmse", 54, 1) == 4.0
+    assert math.isnan(method.at("no_metric", 54))
+    assert math.isnan(a_method("gns", [1.0]).spread("position_rmse"))
+    partly = a_method("gns", [1.0, math.nan], [3.0, 5.0])
+    assert partly.scores["position_rmse"].values.tolist() == [2.0, 5.0]
+
+
+def test_orders_agree_as_scipy_says() -> None:
+    """Kendall's tau of random rankings without ties."""
+    draw = np.random.default_rng(1)
+    for count in (2, 3, 6):
+        one, two = draw.random((2, count))
+        assert agreement(one, two) == pytest.approx(kendalltau(one, two).statistic)
+
+
+def test_printed_parameters_follow_from_the_widths() -> None:
+    """Every printed parameter count of Tables 4.2 to 4.5 is that of dense layers 10,000 -> ... -> 10,000."""
+    for study in thesis.STUDIES:
+        widths = (10_000, *study.widths, 10_000)
+        assert study.parameters == sum(a * b + b for a, b in pairwise(widths)), study
+    assert [study.table for study in thesis.STUDIES].count("4.3") == 6
+    assert len(thesis.STUDIES) == 19
+
+
+def test_printed_errors_agree_with_each_other() -> None:
+    """In Table 5.4 RMSE is the root of MSE, MAE the smaller; Table 4.7 swaps columns of 4.8."""
+    for row in thesis.TABLE_5_4.values():
+        assert row["rmse"] == pytest.approx(math.sqrt(row["mse"]), rel=4e-3)
+        assert row["mae"] < row["rmse"]
+    (printed,) = (row for row in thesis.TABLE_4_8["fluid"] if row.scenario == thesis.TABLE_4_7.scenario)
+    for i in (thesis.FRAME_MODELS.index(name) for name in ("mlp", "lstm-mlp")):
+        assert (printed.average[i], printed.end[i]) == (thesis.TABLE_4_7.end[i], thesis.TABLE_4_7.average[i])
+
+
+def test_scenes_stand_for_their_own_kind() -> None:
+    """At full ids are the thesis's; elsewhere family (id % 4) or pair (id % 6) is; T0 is the first."""
+    registry = load()
+    for (split, rows), families in zip(thesis.TABLE_4_8.items(), (4, 6), strict=True):
+        for row in rows:
+            assert thesis.scenario_of(registry.size(split, "full"), row.scenario) == row.scenario
+            mini = thesis.scenario_of(registry.size(split, "mini"), row.scenario)
+            assert mini is not None
+            assert mini % families == row.scenario % families
+    cavity = registry.size("cavity", "mini")
+    assert thesis.scenario_of(cavity, 0) == min(cavity.subsets["test"])
+    assert thesis.scenario_of(cavity, 1000) is None
+
+
+@pytest.mark.parametrize(("spin", "strain"), [(0.3, 0.0), (-0.2, 0.5)])
+def test_interpolation_finds_the_vorticity_of_a_linear_flow(spin: float, strain: float) -> None:
+    """U = (s x - w y, w x - s y) has vorticity 2 w everywhere inside the hull."""
+    position = np.random.default_rng(1).random((200, 2))
+    x, y = position.T
+    velocity = np.stack([strain * x - spin * y, spin * x - strain * y], axis=-1)
+    found = cubic_vorticity(position, velocity, ((0.3, 0.7), (0.2, 0.6)), cells=8)
+    assert found == pytest.approx(np.full((8, 8), 2 * spin), abs=1e-5)
+
+
+def test_errors_of_interpolated_fields() -> None:
+    """A field against itself is perfect; against twice itself the hand-worked values hold."""
+    truth = np.array([[1.0, -2.0], [3.0, np.nan]])
+    perfect = {"mae": 0.0, "mse": 0.0, "rmse": 0.0, "kl": 0.0, "pearson": pytest.approx(1.0)}
+    assert cubic_errors(truth, truth) == perfect
+    twice = cubic_errors(truth, 2 * truth)
+    # residuals 1, 2, 3; magnitudes in the same proportion, so that KL is 0
+    assert (twice["mae"], twice["mse"]) == pytest.approx((2.0, 14 / 3))
+    assert twice["kl"] == pytest.approx(0.0, abs=1e-9)
+    assert cubic_errors(truth, -truth)["pearson"] == pytest.approx(-1.0)
+    assert math.isnan(cubic_errors(truth, np.zeros((2, 2)))["pearson"])
+
+
+def test_losses_are_read_back_from_tensorboard(tmp_path: Path) -> None:
+    """What was logged comes back in the order of steps; no log gives no curve."""
+    writer = pytest.importorskip("torch.utils.tensorboard").SummaryWriter(str(tmp_path / "tensorboard"))
+    for step in (10, 20, 30):
+        writer.add_scalar("loss/total", 1.0 / step, step)
+    writer.close()
+    steps, loss = loss_over_steps(tmp_path)
+    assert steps.tolist() == [10, 20, 30]
+    assert loss == pytest.approx([0.1, 0.05, 1 / 30])
+    assert loss_over_steps(tmp_path, "vorticity")[0].size == 0
+    assert loss_over_steps(tmp_path / "none")[0].size == 0
+
+
+def test_smoothing_is_a_centred_mean() -> None:
+    """Each value is the mean of as many before it as after, fewer at both ends; lines stay lines."""
+    values = np.random.default_rng(2).random(60)
+    reach = [min(SMOOTHED // 2, i, 59 - i) for i in range(60)]
+    assert smoothed(values) == pytest.approx([values[i - k : i + k + 1].mean() for i, k in enumerate(reach)])
+    assert smoothed(np.arange(60.0)) == pytest.approx(np.arange(60.0))
+
+
+def test_a_table_of_rollouts_puts_ours_beside_theirs() -> None:
+    """Cells are ours / the thesis's, of the scenario that stands for the thesis's."""
+    evidence = Evidence(Sources(board=None), "fluid", "full")
+    ids = tuple(sorted(evidence.size.subsets["test"]))
+    values, none = np.arange(len(ids), dtype=float), np.empty((len(ids), 0))
+    scores = {m: Score(METRICS[m], ids, (), none, values, (0,) * len(ids)) for m in ("mse_avg", "mse_end")}
+    seed = Seeded(seed=0, scores=scores, record={}, path=Path())
+    evidence.methods["mlp"] = Method(name="mlp", seeds=(seed,))
+    table = rollout_table(evidence, thesis.TABLE_4_8["fluid"])
+    circle = dict(zip(table.columns, table.rows[1], strict=True))
+    assert circle["thesis's id"] == circle["our id"] == "26"
+    assert circle["average, MLP"] == f"{ids.index(26)} / 2.127"
+    assert circle["average, LSTM"] == "- / 3.583"

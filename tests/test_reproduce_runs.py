@@ -1,0 +1,215 @@
+"""Runs that are reproduced: those of another recipe or other data, and models without the recipe."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import netCDF4
+import pytest
+
+from lagbench.baselines import catalogue
+from lagbench.baselines.reproduce import __main__ as command
+from lagbench.baselines.reproduce import mlp_studies
+from lagbench.baselines.reproduce.runs import Plan
+from lagbench.baselines.reproduce.thesis import STUDIES
+from lagbench.data.registry import Registry
+from lagbench.errors import UsageError
+from lagbench.make.generate import GenerationResult
+from lagbench.scoring.score_file import read_statistics
+
+pytest.importorskip("torch", reason="the extra 'baselines' is not installed")
+
+Reproduce = Callable[..., int]
+
+SPLIT = "curl-noise"
+
+ONLY = ("--only", "fig_5_22")
+"""A figure that needs one run, of SuperGAT."""
+
+FILES = ("weights.pt", "training.json", "predictions.nc", "scores.nc")
+
+
+@pytest.fixture
+def reproduce(generated: GenerationResult, unmeasured: Registry, tmp_path: Path) -> Reproduce:
+    """Call the command on tiny curl-noise data."""
+
+    def call(*words: str) -> int:
+        places = ["--size", "tiny", "--root", str(generated.root), "--runs", str(tmp_path / "runs")]
+        small = ["--device", "cpu", "--threads", "1", "--set", "model.layers=1"]
+        return command.main([*places, *small, *words], registry=unmeasured)
+
+    return call
+
+
+def stamps(folder: Path) -> dict[str, int]:
+    """Return when the files of a run were written."""
+    return {name: (folder / name).stat().st_mtime_ns for name in FILES}
+
+
+def label(file: Path, **labels: str) -> None:
+    """Change attributes of a netCDF file."""
+    with netCDF4.Dataset(file, "a") as data:
+        data.setncatts(labels)
+
+
+def test_what_is_there_is_what_was_asked_for(
+    reproduce: Reproduce, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A run with another recipe or on other data ends the command; scores of other data are made again."""
+    folder = tmp_path / "runs" / SPLIT / "tiny" / "supergat-0"
+    steps = "--set", "training.steps=1"
+    assert reproduce(*ONLY, *steps) == 0
+    first = stamps(folder)
+    capsys.readouterr()
+
+    assert reproduce(*ONLY, "--set", "training.steps=2") == 2
+    assert str(folder) in capsys.readouterr().err
+
+    label(folder / "scores.nc", dataset_sha256="f" * 64)
+    assert reproduce(*ONLY, *steps) == 0
+    assert str(folder / "scores.nc") in capsys.readouterr().err
+    again = stamps(folder)
+    assert {name for name in FILES if again[name] != first[name]} == {"scores.nc"}
+
+    label(folder / "predictions.nc", dataset_sha256="f" * 64)
+    assert reproduce(*ONLY, *steps, "--dry-run") == 0
+    assert "supergat-0: to predict and score" in capsys.readouterr().out
+    assert reproduce(*ONLY, *steps) == 0
+    again = stamps(folder)
+    assert {name for name in FILES if again[name] != first[name]} == {"predictions.nc", "scores.nc"}
+
+    record = folder / "training.json"
+    record.write_text(json.dumps({**json.loads(record.read_text()), "dataset_sha256": "e" * 64}))
+    assert reproduce(*ONLY, *steps) == 4
+
+
+def test_studies_are_what_was_asked_for(
+    generated: GenerationResult, unmeasured: Registry, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Errors of an MLP with another recipe are not taken for those that were asked for."""
+    monkeypatch.setattr(mlp_studies, "TABLES", {"table_4_2": ("4.2", SPLIT)})
+    monkeypatch.setattr(mlp_studies, "study_rows", lambda _: STUDIES[:1])
+    for steps in (1, 2):
+        plan = Plan(
+            size="tiny",
+            root=generated.root,
+            runs=tmp_path / "runs",
+            output=tmp_path / "out",
+            settings=(f"training.steps={steps}", "model.widths=[4]"),
+            device="cpu",
+            threads=1,
+            registry=unmeasured,
+        )
+        if steps == 1:
+            mlp_studies.make_studies(plan, "table_4_2")
+            assert list((tmp_path / "runs").rglob("errors.json"))
+        else:
+            with pytest.raises(UsageError):
+                mlp_studies.make_studies(plan, "table_4_2")
+
+
+@pytest.fixture
+def short(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Graph networks have a short recipe for tiny, MLPs have none; both are meant for curl-noise."""
+    folder = tmp_path / "recipes"
+    folder.mkdir()
+    for name, recipe in (("gns", "tiny-short"), ("mlp", "tiny")):
+        (folder / f"{name}.yaml").write_text(
+            f"{{format: 1, recipes: {{'*/{recipe}': {{training: {{steps: 1}}}}}}}}"
+        )
+    monkeypatch.setattr(catalogue, "RECIPES", folder)
+    monkeypatch.setattr(command, "EXPECTED", {SPLIT: ("supergat", "mlp")})
+
+
+@pytest.mark.usefixtures("short")
+def test_models_without_the_recipe_are_left_out(
+    reproduce: Reproduce, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With ``--recipe short`` a model that has none is named on stderr, and all others are made."""
+    words = (*ONLY, "--split", SPLIT, "--recipe", "short", "--set", "model.latent=8")
+    home = tmp_path / "runs" / SPLIT / "tiny-short"
+    assert reproduce(*words, "--dry-run") == 0
+    told = capsys.readouterr()
+    assert told.out == "curl-noise tiny supergat-0: to train, curl-noise/tiny-short: 1 steps\n"
+    assert "curl-noise tiny mlp: left out, mlp has no recipe 'short'" in told.err
+    assert not home.exists()
+
+    assert reproduce(*words) == 0
+    told = capsys.readouterr()
+    assert "curl-noise tiny mlp: left out" in told.err
+    assert [folder.name for folder in home.iterdir()] == ["supergat-0"]
+    assert reproduce(*words, "--dry-run") == 0
+    assert capsys.readouterr().out == "curl-noise tiny supergat-0: there\n"
+
+
+def test_a_recipe_that_no_model_has_is_a_mistake(
+    reproduce: Reproduce, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A misspelt recipe ends with exit code 2 and leaves nothing out."""
+    assert reproduce(*ONLY, "--recipe", "shrt", "--dry-run") == 2
+    told = capsys.readouterr().err
+    assert "no recipe 'curl-noise/tiny-shrt'" in told
+    assert "left out" not in told
+
+
+def test_the_way_to_full_is_told_without_data(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """For full, list and dry run name what is made, with the short recipes and with the thesis's own."""
+    places = ("--size", "full", "--root", str(tmp_path), "--runs", str(tmp_path / "runs"))
+    assert command.main([*places, "--recipe", "short", "--list"]) == 0
+    assert "table_5_4" in capsys.readouterr().out
+    assert command.main([*places, "--recipe", "short", "--dry-run"]) == 0
+    told = capsys.readouterr()
+    assert "cavity full gns-0: to train, cavity/full-short: 4,000 steps" in told.out
+    assert "mlp" not in told.out
+    assert "fluid full mlp: left out" in told.err
+    assert "studies of table_4_2: left out" in told.err
+    assert command.main([*places, "--dry-run", "--split", "fluid"]) == 0
+    told = capsys.readouterr()
+    assert "fluid full mlp-0: to train, fluid/full: 600 epochs" in told.out
+    assert "fluid full var-0: to train, fluid/full: closed form" in told.out
+    assert "studies of table_4_2\n" in told.out
+    assert told.err == ""
+    assert not list(tmp_path.iterdir())
+
+
+def test_committed_weights_are_shown_without_training(
+    reproduce: Reproduce, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Their predictions are made on the spot, once, and are those of the run that the weights come from."""
+    made, weights = tmp_path / "runs" / SPLIT / "tiny" / "supergat-0", tmp_path / "weights" / SPLIT / "tiny"
+    assert reproduce(*ONLY, "--set", "training.steps=1") == 0
+    weights.mkdir(parents=True)
+    for source, target in (("weights.pt", "supergat-3.pt"), ("training.json", "supergat-3.json")):
+        (made / source).rename(weights / target)
+    expected = read_statistics(made / "scores.nc").predictions_sha256
+    shutil.rmtree(tmp_path / "runs")
+    capsys.readouterr()
+
+    words = (*ONLY, "--no-training", "--weights", str(tmp_path / "weights"))
+    assert reproduce(*words) == 0
+    assert "seeds 3; 1 x 2 steps" in capsys.readouterr().out
+    folder = made.with_name("supergat-3")
+    assert read_statistics(folder / "scores.nc").predictions_sha256 == expected
+    first = stamps(folder)
+    assert reproduce(*words) == 0
+    assert stamps(folder) == first
+    assert not (folder / "tensorboard").exists()
+    assert list((tmp_path / "runs" / "reproduce" / "tiny").glob("fig_5_22*.png"))
+
+
+def test_nothing_is_made_without_training_and_weights(reproduce: Reproduce, tmp_path: Path) -> None:
+    """Without runs and committed weights a figure says so, and no run appears."""
+    assert reproduce(*ONLY, "--no-training", "--weights", str(tmp_path / "none")) == 0
+    assert [path.name for path in (tmp_path / "runs").iterdir()] == ["reproduce"]
+
+
+def test_unusable_committed_weights_leave_nothing(reproduce: Reproduce, tmp_path: Path) -> None:
+    """Damaged weights end with exit code 3, and no run that a later training would take for its own."""
+    weights = tmp_path / "weights" / SPLIT / "tiny" / "supergat-0.pt"
+    weights.parent.mkdir(parents=True)
+    weights.write_bytes(b"no weights")
+    assert reproduce(*ONLY, "--no-training", "--weights", str(tmp_path / "weights")) == 3
+    assert not list((tmp_path / "runs" / SPLIT).rglob("*.*"))

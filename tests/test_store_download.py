@@ -1,0 +1,369 @@
+"""Downloads from stores that work, break, and lie: right files, or an error by name and nothing else."""
+
+from __future__ import annotations
+
+import shutil
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from exchange_readers import straight_runs
+from lying_server import Mirror, serving
+from object_stores import Store, holding, s3_server
+from typer.testing import CliRunner
+
+import lagbench
+from lagbench.cli.app import app
+from lagbench.errors import LagbenchError, UsageError
+from lagbench.exchange import adopt, download
+from lagbench.exchange.local_split import LocalSplit
+from lagbench.make.generate import GenerationResult
+from lagbench.store import fetch, objects
+
+FIRST = "train/0000.nc"
+
+
+@pytest.fixture(autouse=True)
+def _impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Do not pause between attempts."""
+    monkeypatch.setattr(fetch, "PAUSE", 0.0)
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory: pytest.TempPathFactory) -> LocalSplit:
+    """A data set of four files of about 40 kB."""
+    folder = tmp_path_factory.mktemp("original")
+    np.save(folder / "runs.npy", np.stack(straight_runs(4, frames=12, particles=400)))
+    return adopt(folder / "runs.npy", output=folder / "root" / "own", radius=0.1, frame_interval=0.1)
+
+
+@pytest.fixture(scope="module")
+def s3() -> Iterator[str]:
+    """An S3 server."""
+    with s3_server() as url:
+        yield url
+
+
+@pytest.fixture(params=("http", "file", "s3"))
+def store(
+    request: pytest.FixtureRequest, original: LocalSplit, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Store]:
+    """A store of each kind that holds it."""
+    place = request.getfixturevalue("s3") if request.param == "s3" else request.param
+    with holding(place, tmp_path_factory.mktemp("store"), original.folder.parent) as held:
+        yield held
+
+
+@pytest.fixture
+def server(original: LocalSplit) -> Iterator[Mirror]:
+    """An HTTP server that can be told to lie."""
+    with serving(original.folder.parent) as running:
+        yield running
+
+
+@pytest.fixture
+def here(original: LocalSplit, tmp_path: Path) -> Path:
+    """A root folder that knows the data set by its description alone."""
+    (tmp_path / "own").mkdir()
+    shutil.copy(original.folder / "split.yaml", tmp_path / "own")
+    return tmp_path
+
+
+def left(root: Path) -> set[str]:
+    """Return the names of all files below a root folder but description and locks."""
+    found = {path.name for path in root.rglob("*") if path.is_file()}
+    return {name for name in found if name != "split.yaml" and not name.startswith(".lock")}
+
+
+def test_all_files_come_and_are_right(store: Store, here: Path, original: LocalSplit) -> None:
+    """The data set is complete, has its hash, and equals the original; nothing temporary is left."""
+    result = download("own", root=here, mirror=store.url + "/")
+    assert (result.downloaded, result.kept, result.generated) == ((0, 1, 2, 3), (), ())
+    assert result.complete
+    assert result.dataset_sha256 == original.dataset_sha256
+    assert result.bytes == sum(path.stat().st_size for path in here.rglob("*.nc"))
+    assert left(here) == {"0000.nc", "0001.nc", "0002.nc", "0003.nc", "manifest.json"}
+    assert lagbench.verify("own", root=here, complete=True).warnings == ()
+    with lagbench.open_split("own", root=here) as one, lagbench.open_split(str(original.folder)) as two:
+        np.testing.assert_array_equal(one["position"].values, two["position"].values)
+
+
+def test_what_is_there_is_kept(store: Store, here: Path) -> None:
+    """A second download asks for what is missing or damaged, and for nothing else."""
+    download("own", root=here, mirror=store.url, subset="train")
+    train = here / "own/full/v1/train"
+    (train / "0000.nc").write_bytes((train / "0001.nc").read_bytes())
+    result = download("own", root=here, mirror=store.url, subset="train,valid")
+    assert (result.downloaded, result.kept, result.complete) == ((0, 2), (1,), False)
+    if store.server:
+        assert store.server.count("0001.nc") == 1
+
+
+def test_half_a_file_is_completed(store: Store, here: Path, original: LocalSplit) -> None:
+    """What an interrupted call left under its temporary name is not asked for again."""
+    whole = (original.folder / "full/v1" / FIRST).read_bytes()
+    half = fetch.partial_name(here / "own/full/v1" / FIRST)
+    half.parent.mkdir(parents=True)
+    half.write_bytes(whole[: len(whole) // 3])
+    result = download("own", root=here, mirror=store.url, scenarios="0")
+    assert result.bytes == len(whole) - len(whole) // 3
+    assert (here / "own/full/v1" / FIRST).read_bytes() == whole
+
+
+@pytest.mark.parametrize(
+    ("change", "error"),
+    [
+        ("flipped", objects.WrongContentError),
+        ("shorter", objects.WrongLengthError),
+        ("longer", objects.WrongLengthError),
+        ("a page", objects.NotDataError),
+        ("gone", objects.NotInStoreError),
+    ],
+)
+def test_wrong_objects_are_refused(
+    store: Store, here: Path, original: LocalSplit, change: str, error: type[LagbenchError]
+) -> None:
+    """The error is a DataError that names the address; no file of it is left, other files come."""
+    name = f"own/full/v1/{FIRST}"
+    good = store.read(name)
+    changed = {
+        "flipped": good[:-500] + bytes([good[-500] ^ 1]) + good[-499:],
+        "shorter": good[:-1],
+        "longer": good + b"\0",
+        "a page": b"<html>log in</html>".ljust(len(good)),
+    }
+    if change == "gone":
+        store.remove(name)
+    else:
+        store.put(name, changed[change])
+    with pytest.raises(error) as caught:
+        download("own", root=here, mirror=store.url, connections=1, or_generate=False)
+    assert (type(caught.value), caught.value.exit_code) == (error, 4)
+    assert caught.value.where == f"{store.url}/{name}"
+    assert not [name for name in left(here) if name == "0000.nc" or "partial" in name]
+    store.put(name, good)
+    assert download("own", root=here, mirror=store.url).complete
+
+
+def test_another_data_set_is_told_at_once(store: Store, here: Path) -> None:
+    """A store whose manifest has other content hashes is refused before any file is asked for."""
+    np.save(here / "runs.npy", np.stack(straight_runs(4, frames=12, particles=400, seed=9)))
+    other = adopt(here / "runs.npy", output=here / "other" / "own", radius=0.1, frame_interval=0.1)
+    store.put("own/full/v1/manifest.json", (other.folder / "full/v1/manifest.json").read_bytes())
+    with pytest.raises(objects.WrongContentError) as caught:
+        download("own", root=here, mirror=store.url)
+    assert f"{store.url}/own/full/v1/manifest.json" in str(caught.value.where)
+    assert left(here / "own") == set()
+
+
+def test_what_is_no_manifest_is_told_at_once(store: Store, here: Path) -> None:
+    """As is one that is none."""
+    store.put("own/full/v1/manifest.json", b'{"format": 1}')
+    with pytest.raises(objects.NotDataError) as caught:
+        download("own", root=here, mirror=store.url)
+    assert caught.value.where == f"{store.url}/own/full/v1/manifest.json"
+
+
+@pytest.mark.parametrize("fault", ["drops", "no ranges", "busy once", "wrong range"])
+def test_a_bad_line_costs_time_only(server: Mirror, here: Path, fault: str) -> None:
+    """Broken connections are taken up by range, or from the start where the server knows no ranges."""
+    server.faults = {FIRST: fault}
+    result = download("own", root=here, mirror=server.url)
+    assert result.complete
+    ranges = [wanted for path, wanted in server.asked if path.endswith(FIRST)]
+    if fault == "drops":
+        assert len(ranges) == 3
+        assert ranges[0] is None
+        whole = (here / "own/full/v1" / FIRST).stat().st_size
+        assert ranges[1:] == [f"bytes={whole // 3}-", f"bytes={2 * (whole // 3)}-"]
+
+
+def test_an_interrupted_download_goes_on(server: Mirror, here: Path) -> None:
+    """What came before the connection was lost is not asked for again by the next command."""
+    server.faults = {FIRST: "drops"}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fetch, "MOST_ATTEMPTS", 1)
+        with pytest.raises(objects.ConnectionLostError):
+            download("own", root=here, mirror=server.url, scenarios="0", or_generate=False)
+    server.faults, server.asked = {}, []
+    assert not (here / "own/full/v1" / FIRST).exists()
+    result = download("own", root=here, mirror=server.url, scenarios="0")
+    assert result.downloaded == (0,)
+    third = (here / "own/full/v1" / FIRST).stat().st_size // 3
+    assert server.asked[-1] == (f"/own/full/v1/{FIRST}", f"bytes={third}-")
+
+
+@pytest.mark.parametrize(
+    ("fault", "error"),
+    [
+        ("page", objects.NotDataError),
+        ("hidden page", objects.NotDataError),
+        ("announces more", objects.WrongLengthError),
+        ("announces less", objects.WrongLengthError),
+        ("chopped", objects.WrongLengthError),
+        ("ends early", objects.TruncatedError),
+        ("endless", objects.WrongLengthError),
+        ("flipped", objects.WrongContentError),
+    ],
+)
+def test_each_lie_has_its_error_and_leaves_nothing(
+    server: Mirror, here: Path, fault: str, error: type[LagbenchError]
+) -> None:
+    """No file of that name, no temporary one; the message names the address; other files stay right."""
+    server.faults = {FIRST: fault}
+    with pytest.raises(error) as caught:
+        download("own", root=here, mirror=server.url, connections=1)
+    assert type(caught.value) is error
+    assert caught.value.where == f"{server.url}/own/full/v1/{FIRST}"
+    assert caught.value.exit_code == 4
+    assert not left(here) & {"0000.nc"}
+    assert not [name for name in left(here) if "partial" in name]
+    server.faults = {}
+    assert download("own", root=here, mirror=server.url).complete
+
+
+@pytest.mark.parametrize(
+    ("fault", "error"),
+    [
+        ("announces more", objects.TruncatedError),
+        ("announces less", objects.WrongContentError),
+        ("chopped", objects.WrongContentError),
+        ("endless", objects.WrongLengthError),
+    ],
+)
+def test_lies_are_found_without_a_manifest(
+    server: Mirror, here: Path, fault: str, error: type[LagbenchError]
+) -> None:
+    """Where the store has no manifest, lengths are not known, but content is."""
+    server.faults = {FIRST: fault, "manifest.json": "gone"}
+    with pytest.raises(error):
+        download("own", root=here, mirror=server.url, scenarios="0")
+    assert left(here) == set()
+
+
+@pytest.mark.parametrize("fault", ["page", "hidden page"])
+def test_a_page_as_manifest(server: Mirror, here: Path, fault: str) -> None:
+    """A login page in place of the manifest is told before any file is asked for."""
+    server.faults = {"manifest.json": fault}
+    with pytest.raises(objects.NotDataError) as caught:
+        download("own", root=here, mirror=server.url)
+    assert caught.value.where == f"{server.url}/own/full/v1/manifest.json"
+    assert server.count(".nc") == 0
+
+
+def test_a_line_that_brings_it_no_further(server: Mirror, here: Path) -> None:
+    """Where each attempt starts over and breaks at the same place, five are enough."""
+    server.faults = {FIRST: "drops and starts over"}
+    with pytest.raises((objects.ConnectionLostError, objects.TruncatedError)):
+        download("own", root=here, mirror=server.url, scenarios="0")
+    assert server.count(FIRST) == fetch.ATTEMPTS + 1
+
+
+def test_a_line_that_stays_broken(server: Mirror, here: Path) -> None:
+    """A connection that brings nothing five times is given up, with an error that names the address."""
+    server.faults = {FIRST: "drops always"}
+    with pytest.raises((objects.ConnectionLostError, objects.TruncatedError)) as caught:
+        download("own", root=here, mirror=server.url, scenarios="0")
+    assert caught.value.where == f"{server.url}/own/full/v1/{FIRST}"
+    assert server.count(FIRST) == fetch.ATTEMPTS
+
+
+@pytest.mark.parametrize("name", ["manifest.json", FIRST])
+def test_a_slow_store_is_refused(
+    server: Mirror, here: Path, original: LocalSplit, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    """A hundred bytes a second are below the least rate; the next command goes on from what came."""
+    monkeypatch.setattr(fetch, "PATIENCE", 0.3)
+    server.faults = {name: "slow"}
+    with pytest.raises(objects.TooSlowError) as caught:
+        download("own", root=here, mirror=server.url, scenarios="0", or_generate=False)
+    assert caught.value.exit_code == 5
+    assert caught.value.where == f"{server.url}/own/full/v1/{name}"
+    server.faults = {}
+    result = download("own", root=here, mirror=server.url, scenarios="0")
+    whole = (original.folder / "full/v1" / FIRST).stat().st_size
+    assert result.bytes == whole if name == "manifest.json" else 0 < result.bytes < whole
+
+
+@pytest.mark.parametrize(
+    ("fault", "error"),
+    [
+        ("gone", objects.NotInStoreError),
+        ("busy", objects.StoreUnreachableError),
+        ("forbidden", objects.StoreUnreachableError),
+    ],
+)
+def test_no_generate_stops_where_the_store_does(
+    server: Mirror, here: Path, fault: str, error: type[LagbenchError]
+) -> None:
+    """What the store has not, or does not give, is an error when nothing may be simulated."""
+    server.faults = {FIRST: fault}
+    with pytest.raises(error):
+        download("own", root=here, mirror=server.url, or_generate=False)
+    assert "0000.nc" not in left(here)
+
+
+def test_no_store_at_all(here: Path) -> None:
+    """Without a store there is nothing to download; a local split cannot be simulated either."""
+    for or_generate in (False, True):
+        with pytest.raises(UsageError):
+            download("own", root=here, or_generate=or_generate)
+
+
+def test_nobody_answers(here: Path) -> None:
+    """A port that nobody listens on is an unreachable store."""
+    with socket.socket() as reserved:
+        reserved.bind(("127.0.0.1", 0))
+        address = f"http://127.0.0.1:{reserved.getsockname()[1]}"
+        with pytest.raises(objects.StoreUnreachableError) as caught:
+            download("own", root=here, mirror=address, or_generate=False)
+    assert str(caught.value.where).startswith(address)
+
+
+def test_simulated_splits_come_from_a_store_or_are_simulated(
+    generated: GenerationResult, tmp_path: Path
+) -> None:
+    """Files that a store has not are simulated: the data set is that of datasets.yaml all the same."""
+    told: list[str] = []
+    with serving(generated.root) as running:
+        running.faults = {"0003.nc": "gone"}
+        result = download(
+            "curl-noise", "tiny", mirror=running.url, root=tmp_path, workers=1, announce=told.append
+        )
+    assert result.downloaded == (0, 1, 2, 4)
+    assert result.generated == (3,)
+    assert result.verdict == "equal to datasets.yaml"
+    assert result.dataset_sha256 == generated.dataset_sha256
+    assert len(told) == 1
+    assert f"{running.url}/curl-noise/tiny/v2/test/0003.nc" in told[0]
+    assert lagbench.verify("curl-noise", "tiny", root=tmp_path).warnings == ()
+
+
+def test_no_such_kind_of_address(here: Path) -> None:
+    """An address of no known kind is a usage error."""
+    with pytest.raises(UsageError) as caught:
+        download("own", root=here, mirror="carrier-pigeon://roof")
+    assert str(caught.value.where).startswith("carrier-pigeon://roof")
+
+
+def test_a_redirection_stays_on_the_web(server: Mirror, here: Path) -> None:
+    """A server cannot send us to a file of this machine."""
+    server.faults = {FIRST: "elsewhere"}
+    with pytest.raises(objects.StoreUnreachableError):
+        download("own", root=here, mirror=server.url, or_generate=False)
+    assert "0000.nc" not in left(here)
+
+
+def test_command(server: Mirror, here: Path) -> None:
+    """`lagbench download` says what came from where; a lie is exit code 4."""
+    arguments = ["download", "--split", str(here / "own"), "--from", server.url]
+    done = CliRunner().invoke(app, arguments)
+    assert done.exit_code == 0, done.output
+    assert "4 downloaded, 0 simulated, 0 kept" in done.stdout
+    again = CliRunner().invoke(app, arguments)
+    assert "0 downloaded, 0 simulated, 4 kept" in again.stdout
+    server.faults = {"0003.nc": "page"}
+    (here / "own/full/v1/test/0003.nc").unlink()
+    assert CliRunner().invoke(app, arguments).exit_code == 4

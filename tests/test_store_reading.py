@@ -1,0 +1,266 @@
+"""Reading from a store: only what is needed comes, it is checked, and then all is as in a folder."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import xarray as xr
+from conftest import SIZE, SPLIT
+from object_stores import Store, files, holding, machine, s3_server
+from typer.testing import CliRunner
+
+import lagbench
+from lagbench.baselines.facts import facts_of
+from lagbench.baselines.frame_store import sources_of
+from lagbench.cli.app import app
+from lagbench.data.layout import as_url, resolve_root, url_of
+from lagbench.data.registry import Registry
+from lagbench.errors import DataError
+from lagbench.exchange import export
+from lagbench.make.generate import GenerationResult
+from lagbench.make.overview import overview
+from lagbench.make.verify import verify
+from lagbench.store import copy
+from lagbench.store.fetch import partial_name
+from lagbench.store.objects import WrongContentError, WrongLengthError
+from lagbench.submission import template
+
+FOLDER = f"{SPLIT}/{SIZE}/v2"
+MANIFEST = f"{FOLDER}/manifest.json"
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Be a machine of its own, that asks for the manifest each time."""
+    monkeypatch.setattr(copy, "FRESH", 0.0)
+    return machine(monkeypatch, tmp_path / "cache")
+
+
+@pytest.fixture(scope="module")
+def s3() -> Iterator[str]:
+    """An S3 server."""
+    with s3_server() as url:
+        yield url
+
+
+@pytest.fixture(params=("http", "file", "s3"))
+def store(request: pytest.FixtureRequest, generated: GenerationResult, tmp_path: Path) -> Iterator[Store]:
+    """A store of each kind that holds the tiny data set."""
+    place = request.getfixturevalue("s3") if request.param == "s3" else request.param
+    with holding(place, tmp_path, generated.root) as held:
+        yield held
+
+
+@pytest.fixture
+def folder(generated: GenerationResult, tmp_path: Path) -> Iterator[Store]:
+    """A folder by its URL that holds it, for what the kind of a store does not matter to."""
+    with holding("file", tmp_path, generated.root) as held:
+        yield held
+
+
+@pytest.fixture
+def url(folder: Store) -> str:
+    """The URL of that folder."""
+    return folder.url
+
+
+@pytest.fixture
+def tiny(unmeasured: Registry, monkeypatch: pytest.MonkeyPatch, unmeasured_path: Path) -> Registry:
+    """Our splits without hashes, for functions too that take no registry."""
+    monkeypatch.setenv("LAGBENCH_REGISTRY", str(unmeasured_path))
+    return unmeasured
+
+
+def here(url: str) -> list[str]:
+    """Return the names of the working copy's files."""
+    return sorted(name.removeprefix(f"{FOLDER}/") for name in files(resolve_root(url)))
+
+
+def test_a_subset_comes_and_nothing_else(store: Store, generated: GenerationResult, tiny: Registry) -> None:
+    """The arrays are those of the folder; a second look fetches nothing."""
+    with (
+        lagbench.open_split(SPLIT, size=SIZE, root=store.url) as far,
+        lagbench.open_split(SPLIT, size=SIZE, root=generated.root) as near,
+    ):
+        xr.testing.assert_identical(far.compute(), near.compute())
+    assert here(store.url) == ["manifest.json", "test/0003.nc", "test/0004.nc"]
+    store.remove(f"{FOLDER}/test/0003.nc")
+    lagbench.open_split(SPLIT, size=SIZE, root=store.url).close()
+    assert not store.server or store.server.count("0004.nc") == 1
+
+
+def test_scores_are_those_of_the_folder(
+    url: str, generated: GenerationResult, tiny: Registry, tmp_path: Path
+) -> None:
+    """Template, validation and scores need test alone, also where only the file says which."""
+    written = template(SPLIT, SIZE, output=tmp_path / "p.nc", root=generated.root, registry=tiny).path
+    result = lagbench.validate(written, root=url, require_truth=True, registry=tiny)
+    assert (result.valid, dict(result.skipped)) == (True, {})
+    assert here(url) == ["manifest.json", "test/0003.nc", "test/0004.nc"]
+    far, near = (
+        lagbench.score(written, root=root, write=False, registry=tiny).as_json()
+        for root in (url, generated.root)
+    )
+    assert far == near
+
+
+def test_baselines_read_from_a_store(url: str, generated: GenerationResult, tiny: Registry) -> None:
+    """Facts and training files are those of the folder."""
+    assert facts_of(SPLIT, SIZE, root=url) == facts_of(SPLIT, SIZE, root=generated.root)
+    assert here(url) == ["manifest.json", "train/0000.nc"]
+    found = sources_of(tiny.size(SPLIT, SIZE), ("train", "valid"), resolve_root(url))
+    assert [source.path.read_bytes() for source in found.values()] == [
+        (generated.folder / name).read_bytes() for name in ("train/0000.nc", "train/0001.nc", "valid/0002.nc")
+    ]
+
+
+def test_exports_are_those_of_the_folder(
+    url: str, generated: GenerationResult, tiny: Registry, tmp_path: Path
+) -> None:
+    """All three subsets come, and give the same bytes."""
+    made = [
+        export(SPLIT, SIZE, format="gns-npz", output=tmp_path / name, root=root, registry=tiny)
+        for name, root in (("far", url), ("near", generated.root))
+    ]
+    assert files(made[0].folder) == files(made[1].folder)
+
+
+def test_a_listing_counts_what_the_store_has(url: str, tiny: Registry) -> None:
+    """Of a store the manifest counts, not the working copy; nothing is fetched."""
+    found = overview(tiny.size(SPLIT, SIZE), resolve_root(url))
+    assert (found.state, found.present) == ("yes", {"train": 2, "valid": 1, "test": 2})
+    assert here(url) == []
+    assert overview(tiny.size(SPLIT, SIZE), resolve_root(f"{url}/nothing")).state == "no"
+
+
+def test_what_the_store_lacks_is_missed(store: Store, tiny: Registry) -> None:
+    """As in a folder: a DataError that names the scenarios."""
+    with pytest.raises(DataError) as caught:
+        lagbench.open_split(SPLIT, size=SIZE, subset="train", root=f"{store.url}/nothing")
+    assert "0-1" in str(caught.value)
+
+
+def test_verify_mends_the_copy_and_tells_of_the_store(store: Store, tiny: Registry) -> None:
+    """A damaged file comes again; an object that is gone is named, but over HTTP, which lists nothing."""
+    verify(SPLIT, SIZE, root=store.url, complete=True, registry=tiny).check()
+    path = resolve_root(store.url) / FOLDER / "valid/0002.nc"
+    path.write_bytes(path.read_bytes()[:-9] + bytes(9))
+    verify(SPLIT, SIZE, root=store.url, complete=True, registry=tiny).check()
+    store.remove(f"{FOLDER}/valid/0002.nc")
+    if not store.server:
+        with pytest.raises(DataError) as caught:
+            verify(SPLIT, SIZE, root=store.url, registry=tiny)
+        assert str(caught.value.where).endswith("scenarios 2")
+
+
+def test_an_emptied_store_is_not_whole(store: Store, tiny: Registry) -> None:
+    """Files that are in the working copy alone make no data set of the store whole, be it one or all."""
+    whole = verify(SPLIT, SIZE, root=store.url, complete=True, registry=tiny)
+    assert not whole.problems
+    manifest = json.loads(store.read(MANIFEST))
+    manifest["files"] = [entry for entry in manifest["files"] if entry["scenario"] != 3]
+    store.put(MANIFEST, json.dumps(manifest).encode())
+    lost = verify(SPLIT, SIZE, root=store.url, registry=tiny)
+    assert "scenario 3 is in the working copy alone, not in the store" in lost.problems
+    store.remove(MANIFEST)
+    assert len(verify(SPLIT, SIZE, root=store.url, registry=tiny).problems) == 5
+
+
+@pytest.mark.parametrize("change", ["flipped", "shorter", "other scenario"])
+def test_other_content_is_refused(folder: Store, tiny: Registry, change: str) -> None:
+    """The error names the object, and no file of it is left."""
+    good, other = (folder.read(f"{FOLDER}/test/{name}.nc") for name in ("0003", "0004"))
+    bad = {
+        "flipped": good[:-9] + bytes([good[-9] ^ 1]) + good[-8:],
+        "shorter": good[:-1],
+        "other scenario": other,
+    }
+    folder.put(f"{FOLDER}/test/0003.nc", bad[change])
+    with pytest.raises((WrongContentError, WrongLengthError)) as caught:
+        lagbench.open_split(SPLIT, size=SIZE, root=folder.url)
+    assert caught.value.where == f"{folder.url}/{FOLDER}/test/0003.nc"
+    assert {*here(folder.url)} <= {"test/0004.nc"}
+
+
+def test_another_data_set_is_refused(folder: Store) -> None:
+    """A manifest whose hashes are not those of datasets.yaml brings nothing."""
+    text = json.loads(folder.read(MANIFEST))
+    for entry in text["files"]:
+        entry["content_sha256"] = "0" * 64
+    folder.put(MANIFEST, json.dumps(text).encode())
+    with pytest.raises(WrongContentError):
+        lagbench.open_split(SPLIT, size=SIZE, root=folder.url)
+    assert here(folder.url) == []
+
+
+def test_fetching_goes_on_where_it_stopped(store: Store, tiny: Registry, generated: GenerationResult) -> None:
+    """Half a file under its temporary name is completed from there."""
+    whole = (generated.folder / "test/0003.nc").read_bytes()
+    half = partial_name(resolve_root(store.url) / FOLDER / "test/0003.nc")
+    half.parent.mkdir(parents=True)
+    half.write_bytes(whole[: len(whole) // 2])
+    lagbench.open_split(SPLIT, size=SIZE, root=store.url).close()
+    assert here(store.url) == ["manifest.json", "test/0003.nc", "test/0004.nc"]
+    if store.server:
+        assert (f"/{FOLDER}/test/0003.nc", f"bytes={len(whole) // 2}-") in store.server.asked
+
+
+def test_who_watches_is_told_how_far_it_is(
+    url: str, tiny: Registry, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """On a terminal a line on stderr counts files and bytes; with --quiet it does not."""
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    lagbench.open_split(SPLIT, size=SIZE, root=url).close()
+    assert f"fetching from {url}: 2 of 2 files" in capsys.readouterr().err
+    with copy.quietly():
+        lagbench.open_split(SPLIT, size=SIZE, subset="valid", root=url).close()
+    assert capsys.readouterr() == ("", "")
+
+
+def test_what_only_the_copy_has_stays_known(
+    folder: Store, tiny: Registry, generated: GenerationResult
+) -> None:
+    """Reading loses nothing of a generation that could not put its files yet."""
+    shutil.copytree(generated.root, resolve_root(folder.url), dirs_exist_ok=True)
+    (resolve_root(folder.url) / FOLDER / "test/0003.nc").unlink()
+    full = folder.read(MANIFEST)
+    less = json.loads(full)
+    less["files"] = [entry for entry in less["files"] if entry["subset"] != "train"]
+    folder.put(MANIFEST, json.dumps(less).encode())
+    lagbench.open_split(SPLIT, size=SIZE, root=folder.url).close()
+    assert (resolve_root(folder.url) / MANIFEST).read_bytes() == full
+
+
+def test_urls_and_paths_are_told_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A Path takes a slash away and means the same; LAGBENCH_ROOT may be a URL; a stranger's mark is none."""
+    copy = resolve_root("s3://bucket/some/where/")
+    assert copy == resolve_root(Path("s3://bucket/some/where"))
+    assert copy.name.startswith("s3-bucket-some-where-")
+    assert url_of(copy) == "s3://bucket/some/where"
+    assert resolve_root(copy) == copy
+    monkeypatch.setenv("LAGBENCH_ROOT", "memory://x/y")
+    assert url_of(resolve_root()) == "memory://x/y"
+    shutil.copytree(copy, tmp_path / copy.name)
+    assert url_of(tmp_path / copy.name) is None
+    assert as_url(Path("file:///tmp/x")) == "file:///tmp/x"
+    assert [as_url(path) for path in ("data", "/data", "C:/data", "./s3:", tmp_path)] == [None] * 5
+
+
+def test_the_command_line_takes_a_url(url: str, tiny: Registry, tmp_path: Path) -> None:
+    """List, template, verify and info work on a store as on a folder; the list says where it is."""
+    runner = CliRunner()
+
+    def call(*words: str) -> str:
+        done = runner.invoke(app, [*words, "--root", url], catch_exceptions=False)
+        assert done.exit_code == 0, done.output
+        return done.output
+
+    assert url in call("list").replace("\n", "")
+    assert "2 scenarios" in call("template", SPLIT, "--size", SIZE, "--output", str(tmp_path / "p.nc"))
+    assert "data set hash:" in call("verify", SPLIT, "--size", SIZE)
+    assert "Path" not in call("info", SPLIT, "--size", SIZE)

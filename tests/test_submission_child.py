@@ -1,0 +1,134 @@
+"""The child process: what becomes of a child that waits, crashes, or fails for our own reasons."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from submission_data import Bench, make_bench
+
+from lagbench.errors import WorkFailedError
+from lagbench.submission import CHECKS, validation
+from lagbench.submission.findings import quoted
+from lagbench.submission.validation import in_child
+
+JOBS = """
+import os, signal, sys, time
+
+def echo(value):
+    return value
+
+def behave(how):
+    if how == "sleep":
+        time.sleep(60)
+    elif how == "burn":
+        while True:
+            pass
+    elif how == "fill":
+        bytearray(1 << 40)
+    elif how == "raise":
+        raise ValueError("a bug")
+    elif how:
+        os.kill(os.getpid(), getattr(signal, how))
+    return how
+"""
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
+    """A small data set and a valid submission."""
+    return make_bench(tmp_path_factory.mktemp("bench"))
+
+
+@pytest.fixture
+def jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A module ``jobs`` that children can import."""
+    (tmp_path / "jobs.py").write_text(JOBS)
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{Path(validation.__file__).parents[2]}")
+
+
+@pytest.mark.usefixtures("jobs")
+def test_answers_come_in_the_order_of_requests() -> None:
+    """What JSON can hold goes there and back."""
+    values = [None, 1.5, {"a": ["é", "\u2028", "line\nbreak"]}, True]
+    assert in_child("jobs.echo", values) == (values, None)
+
+
+@pytest.mark.usefixtures("jobs")
+@pytest.mark.parametrize(
+    ("how", "said"),
+    [
+        ("burn", "no end within the computing time"),
+        ("fill", "more than 768 MiB"),
+        ("SIGABRT", "crashed: Aborted"),
+        ("SIGSEGV", "crashed: Segmentation fault"),
+    ],
+)
+def test_what_stops_a_child_leaves_the_answers_before(how: str, said: str) -> None:
+    """Two answers, then it ends; the last request is never reached."""
+    values, stopped = in_child("jobs.behave", ["", "", how, ""], seconds=1.0)
+    assert values == ["", ""]
+    assert said in str(stopped)
+
+
+@pytest.mark.usefixtures("jobs")
+def test_a_child_that_waits_is_stopped() -> None:
+    """By the clock, since it computes nothing; on a busy machine it may not even have begun."""
+    values, stopped = in_child("jobs.behave", ["", "sleep", ""], wall=4.0)
+    assert values in ([], [""])
+    assert stopped == "no end after 4 s"
+
+
+@pytest.mark.usefixtures("jobs")
+def test_a_fault_of_ours_is_told_as_ours() -> None:
+    """A child that raises is exit code 5 and repeats the last line."""
+    with pytest.raises(WorkFailedError) as caught:
+        in_child("jobs.behave", ["raise"])
+    assert "ValueError: a bug" in str(caught.value.got)
+
+
+def test_what_stops_the_child_is_a_finding(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The check is `readable`, the exit code 3, and no other check counts as passed."""
+    monkeypatch.setattr(validation, "MEMORY", 1)
+    monkeypatch.setattr(validation, "in_child", lambda *_, **__: ([], "a reason"))
+    result = bench.validate(bench.valid, isolated=True)
+    assert result.errors[0].got == "a reason"
+    assert (result.errors[0].check, result.exit_code, result.passed) == ("readable", 3, ())
+    assert set(result.skipped) == set(CHECKS) - {"readable"}
+
+
+def test_a_sparse_file_gets_no_more_time(bench: Bench) -> None:
+    """A terabyte that takes no room is not granted a day."""
+    path = bench.copy("sparse.nc")
+    with path.open("r+b") as stream:
+        stream.truncate(1 << 40)
+    assert validation.seconds_for(path) < 1.0
+
+
+def test_waiting_is_granted_far_more_than_computing() -> None:
+    """What computes is stopped by the kernel's count, so the clock need not be near."""
+    assert validation.WALL_SECONDS >= 100.0 * validation.CPU_SECONDS
+
+
+def test_a_stray_module_in_the_current_folder_is_not_run(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Predictions may come with a numpy.py beside them."""
+    (tmp_path / "numpy.py").write_text("raise SystemExit(9)")
+    monkeypatch.chdir(tmp_path)
+    assert bench.validate(bench.valid, isolated=True).exit_code == 0
+
+
+def test_text_of_strangers_is_shown_escaped_and_short() -> None:
+    """Control characters never reach the terminal."""
+    assert quoted("\x1b[2J\u202e") == r"'\x1b[2J\u202e'"
+    assert len(quoted("x" * 10**6)) == 80
+
+
+def test_the_document_names_every_check() -> None:
+    """docs/predictions.md and the code do not drift apart."""
+    text = (Path(__file__).parents[1] / "docs" / "predictions.md").read_text()
+    rows = [line.split("|") for line in text.splitlines() if line.startswith("| `")]
+    assert [
+        row[1].strip(" `") for row in rows if row[2].strip() in {"error", "warning", "error, warning"}
+    ] == list(CHECKS)
