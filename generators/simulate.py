@@ -32,6 +32,7 @@ from .draws import QUANTUM, entropy, seed_text
 from .split import ClosedBoxParameters, FreeSurfaceParameters, InitialState
 
 __all__ = [
+    "OUTCOMES",
     "Facts",
     "Simulated",
     "active_frames",
@@ -47,6 +48,9 @@ __all__ = [
 
 STILL = 0.01
 """Share of its greatest kinetic energy from which on a free surface moves."""
+
+OUTCOMES = ("active_frames",)
+"""Parameters of a file that follow from its simulation; all others are known before it."""
 
 _FILE_NAMES = {"reynolds": "reynolds_number"}
 """Drawn parameters that files call by their CF-like long name."""

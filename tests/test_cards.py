@@ -96,7 +96,7 @@ def test_mlcroissant_reads_the_scenarios(folder: Path) -> None:
     rows = json.loads(done.stdout)
     assert [row["scenario"] for row in rows] == [0, 1, 2, 3, 4]
     assert {row["subset"] for row in rows} == {"train", "valid", "test"}
-    assert all((row["frames"], row["particles"]) == (4, 512) for row in rows)
+    assert all((row["frames"], row["particles"]) == (4, 324) for row in rows)
 
 
 def test_every_file_is_named_with_its_true_sha256(folder: Path) -> None:

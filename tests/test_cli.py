@@ -64,8 +64,8 @@ def test_list_shows_every_size(run: Run, generated: GenerationResult) -> None:
     assert here["present"] == {"train": 2, "valid": 1, "test": 2}
     assert here["picture"].endswith("scenarios.png")
     full = sizes["cavity", "full"]
-    assert full["frames"] == 36_000
-    assert full["bytes"] == 36_000 * 8192 * 16 + 60 * 65536
+    assert full["frames"] == 45_600
+    assert full["bytes"] == 45_600 * 8192 * 16 + 76 * 65536
     assert full["present"] == {"train": 0, "valid": 0, "test": 0}
     assert full["seconds"] > 60.0
 

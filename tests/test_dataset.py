@@ -143,7 +143,7 @@ def test_load_manifest(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"(?s)no manifest.*lagbench generate --split cavity --size tiny"):
         load_manifest("cavity", size="tiny", root=tmp_path)
     manifest = merge(
-        None, [], split="cavity", size="tiny", version="1.0.0", subsets={"test": (3,)}, environment={}
+        None, [], split="cavity", size="tiny", version="2.0.0", subsets={"test": (3,)}, environment={}
     )
     write_manifest(tmp_path, manifest)
     assert load_manifest("cavity", size="tiny", root=tmp_path) == manifest

@@ -54,7 +54,7 @@ def test_everything_is_there_and_hashed(generated: GenerationResult) -> None:
             f"{path.stem} {content_hash(path)}\n" for path in sorted((generated.folder / subset).glob("*.nc"))
         ]
         subsets[subset] = hashlib.sha256("".join(lines).encode()).hexdigest()
-    whole = dumps({"split": SPLIT, "size": SIZE, "major": 1, "subsets": subsets})
+    whole = dumps({"split": SPLIT, "size": SIZE, "major": 2, "subsets": subsets})
     assert generated.dataset_sha256 == hashlib.sha256(whole).hexdigest()
     assert generated.simulated == (0, 1, 2, 3, 4)
     assert (generated.kept, generated.missing, generated.complete) == ((), (), True)

@@ -282,9 +282,7 @@ def test_a_blow_up_says_where(tmp_path: Path, unmeasured_path: Path) -> None:
 def test_a_draw_out_of_range_names_its_scenario(tmp_path: Path, unmeasured_path: Path) -> None:
     """A scale that no float32 grain can hold stops before any worker starts."""
     own = tmp_path / "own.yaml"
-    own.write_text(
-        unmeasured_path.read_text().replace("velocity_scale: {value: 0.0", "velocity_scale: {value: 90.0")
-    )
+    own.write_text(unmeasured_path.read_text().replace("velocity_scale: 0.0052", "velocity_scale: 90.0052"))
     with pytest.raises(WorkFailedError, match="exact float32") as caught:
         generate(SPLIT, SIZE, scenarios="2", root=tmp_path / "data", registry=load(own))
     assert caught.value.where == f"{SPLIT} {SIZE}, scenario 2"

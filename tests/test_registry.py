@@ -27,10 +27,10 @@ def tier(split: str, size: str) -> Size:
 @pytest.mark.parametrize(
     ("split", "particles", "grid", "interval", "substeps", "frames", "counts"),
     [
-        ("fluid", 2500, 128, 1 / 60, 20, 19_200, (28, 4, 8)),
-        ("multimaterial", 2500, 64, 1 / 60, 20, 36_000, (48, 6, 6)),
-        ("cavity", 8192, 40, 0.1, 50, 36_000, (48, 6, 6)),
-        ("curl-noise", 8096, 40, 0.1, 50, 36_000, (48, 6, 6)),
+        ("fluid", 2500, 128, 1 / 60, 20, 22_800, (28, 8, 16)),
+        ("multimaterial", 2500, 64, 1 / 60, 20, 43_200, (48, 8, 16)),
+        ("cavity", 8192, 40, 0.1, 50, 45_600, (48, 8, 20)),
+        ("curl-noise", 8096, 40, 0.1, 50, 43_200, (48, 8, 16)),
     ],
 )
 def test_full_sizes_are_those_of_the_design(
@@ -42,7 +42,7 @@ def test_full_sizes_are_those_of_the_design(
     frames: int,
     counts: tuple[int, ...],
 ) -> None:
-    """The table of section 3, frame counts summed over train, valid and test."""
+    """Particles, grid and substeps of section 3; subsets of version 2; frames over train, valid and test."""
     full = tier(split, "full")
     official = [i for name in ("train", "valid", "test") for i in full.subsets[name]]
     assert (full.particles, full.grid, full.substeps_per_frame) == (particles, grid, substeps)
@@ -53,17 +53,15 @@ def test_full_sizes_are_those_of_the_design(
 
 
 def test_special_ids_of_the_design() -> None:
-    """Test and extra ids, and the frames of fluid 0 and 26, as section 3 names them."""
+    """Subsets are runs of ids; extra and the frames of fluid 0 and 26 are as section 3 names them."""
     fluid, pairs = tier("fluid", "full"), tier("multimaterial", "full")
-    assert fluid.subsets["test"] == (0, 5, 10, 13, 19, 26, 32, 39)
-    assert fluid.subsets["valid"] == (7, 18, 25, 36)
+    assert fluid.subsets["test"] == tuple(range(36, 52))
+    assert fluid.subsets["valid"] == tuple(range(28, 36))
     assert fluid.frame_count(0) == fluid.frame_count(26) == 600
-    assert pairs.subsets["extra"] == tuple(range(60, 75))
+    assert pairs.subsets["extra"] == tuple(range(72, 87))
     assert {pairs.frame_count(i) for i in pairs.subsets["extra"]} == {1200}
-    assert tier("cavity", "full").subsets["test"] == tuple(range(54, 60))
-    noise = tier("curl-noise", "full")
-    assert [i % 10 + 4 for i in noise.subsets["test"]] == [4, 6, 8, 9, 11, 13]
-    assert [i % 10 + 4 for i in noise.subsets["valid"]] == [5, 7, 8, 10, 12, 13]
+    assert tier("cavity", "full").subsets["test"] == tuple(range(56, 76))
+    assert tier("curl-noise", "full").subsets["test"] == tuple(range(56, 72))
 
 
 @pytest.mark.parametrize(("split", "size"), TIERS)
@@ -83,12 +81,17 @@ def test_every_size_is_consistent(split: str, size: str) -> None:
 
 @pytest.mark.parametrize("split", ["fluid", "multimaterial", "cavity", "curl-noise"])
 def test_mini_and_tiny_are_small_relatives(split: str) -> None:
-    """A quarter of the particles, the same frame interval, half the substeps; tiny for tests."""
+    """As many particles per cell, the same frame interval, substeps as cells; tiny for tests."""
     full, mini, tiny = (tier(split, size) for size in ("full", "mini", "tiny"))
-    assert mini.particles == pytest.approx(full.particles / 4, rel=0.01)
+    inside = [(size.bounds[0][1] - size.bounds[0][0]) * size.grid for size in (full, mini)]
+    if split in ("cavity", "curl-noise"):
+        per_cell = [size.particles / cells**2 for size, cells in zip((full, mini), inside, strict=True)]
+        assert per_cell[1] == pytest.approx(per_cell[0], rel=0.06)
+    else:
+        assert mini.particles == full.particles / 4
     assert mini.frame_interval == tiny.frame_interval == full.frame_interval
-    assert mini.substeps_per_frame == full.substeps_per_frame // 2
-    assert 256 <= tiny.particles <= 512
+    assert mini.substeps_per_frame / mini.grid == full.substeps_per_frame / full.grid
+    assert 256 <= tiny.particles <= 640
     assert len(mini.subsets["train"]) == 24
     assert mini.scenarios == tuple(range(len(mini.scenarios)))
 
@@ -146,8 +149,8 @@ def test_unknown_names_offer_the_nearest() -> None:
         load().size("fluid", "ful")
     with pytest.raises(UsageError, match="did you mean 'liquid_modulus'"):
         tier("fluid", "full").value("liqid_modulus")
-    with pytest.raises(UsageError, match="extra 60-74"):
-        tier("multimaterial", "full").subset_of(75)
+    with pytest.raises(UsageError, match="extra 72-86"):
+        tier("multimaterial", "full").subset_of(87)
 
 
 def test_a_registry_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
