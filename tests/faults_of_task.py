@@ -17,7 +17,7 @@ attribute("path_as_split", "split", "../../etc", check="split")
 attribute("wrong_split", "split", "curl-noise", check="particles", says="506")
 attribute("stale_hash", "dataset_sha256", "ab" * 32, check="dataset", says="another data set")
 attribute("shortened_hash", "dataset_sha256", "abcdef", check="dataset")
-attribute("another_major_version", "dataset_version", "2.0.0", check="dataset", says="version")
+attribute("another_major_version", "dataset_version", "3.0.0", check="dataset", says="version")
 attribute("version_in_words", "dataset_version", "latest", check="dataset", says="version")
 
 # --- dimensions ----------------------------------------------------------------------------

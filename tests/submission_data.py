@@ -20,7 +20,7 @@ TESTS = (3, 4, 5)
 
 GIVEN, HORIZON, PARTICLES = 3, 8, 48
 FRAMES = GIVEN + HORIZON
-VERSION = "1.2.0"
+VERSION = "2.2.0"
 
 
 @dataclass(frozen=True)

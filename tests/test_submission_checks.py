@@ -53,14 +53,14 @@ def test_particles_outside_the_box_are_flagged(bench: Bench) -> None:
     flag = next(f for f in result.findings if f.check == "in_domain")
     assert (flag.severity, result.exit_code) == (Severity.WARNING, 0)
     assert flag.where == "first in scenario 4, frame 7, particle 9"
-    # 1 / (3 * 8 * 48) = 0.087 %; the wall is at 0.95
+    # 1 / (3 * 8 * 48) = 0.087 %; the wall is at 0.9375
     assert "0.09%" in flag.what
-    assert "0.55" in flag.got
+    assert "0.562" in flag.got
 
 
 def test_a_cell_beyond_the_wall_is_no_warning(bench: Bench) -> None:
-    """The wall is at 0.95 and a solver cell is 0.1 wide: 1.04 passes, 1.06 does not."""
-    for place, flagged in ((1.04, False), (1.06, True)):
+    """The wall is at 0.9375 and a solver cell is 0.125 wide: 1.06 passes, 1.07 does not."""
+    for place, flagged in ((1.06, False), (1.07, True)):
         everywhere = np.full((3, 8, PARTICLES, 2), place, np.float32)
         result = changed(bench, lambda _, values=everywhere: values)  # type: ignore[misc]
         assert ("in_domain" in {f.check for f in result.warnings}) == flagged

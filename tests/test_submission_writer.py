@@ -83,7 +83,7 @@ def test_a_template_needs_the_test_scenarios(bench: Bench, tmp_path: Path) -> No
 
 def test_without_a_recorded_hash_one_must_be_given(unmeasured: Registry, tmp_path: Path) -> None:
     """A split that nobody measured has no hash; a given one is stored."""
-    zeros = np.full((2, 20, 512, 2), 0.5)
+    zeros = np.full((2, 20, 324, 2), 0.5)
     path = tmp_path / "p.nc"
     more: dict[str, Any] = {"split": "cavity", "size": "tiny", "method": "m", "registry": unmeasured}
     with pytest.raises(DataError, match="hash of the data set is not known"):
