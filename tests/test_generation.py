@@ -62,13 +62,13 @@ def test_everything_is_there_and_hashed(generated: GenerationResult) -> None:
 
 
 def test_nothing_else_is_left(generated: GenerationResult) -> None:
-    """Beside the scenarios stand manifest, cards, pictures and the lock; no temporary file."""
+    """Beside the scenarios stand manifest, cards, pictures, the lock and the notes; no temporary file."""
     names = {
         str(path.relative_to(generated.folder)) for path in generated.folder.rglob("*") if path.is_file()
     }
     scenarios = {"train/0000.nc", "train/0001.nc", "valid/0002.nc", "test/0003.nc", "test/0004.nc"}
     cards = {"manifest.json", "README.md", "croissant.json", "pictures/frame.png", "pictures/scenarios.png"}
-    assert names == scenarios | cards | {".lock"}
+    assert names == scenarios | cards | {".lock", ".verified.json"}
 
 
 def test_a_file_holds_what_its_scenario_says(generated: GenerationResult, unmeasured: Registry) -> None:

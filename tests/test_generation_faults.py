@@ -165,13 +165,13 @@ CALL = "from lagbench.cli import main; main()"
 INTERRUPTED = f"""
 import os, signal
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
-from lagbench import campaign
-write = campaign.write_manifest
+from lagbench.make import generate
+write = generate.write_manifest
 def write_first(*arguments):
-    campaign.write_manifest = write
+    generate.write_manifest = write
     write(*arguments)
     os.killpg(0, signal.SIGINT)
-campaign.write_manifest = write_first
+generate.write_manifest = write_first
 {CALL}
 """
 

@@ -42,10 +42,10 @@ def bench(generated: GenerationResult, unmeasured: Registry) -> ScoreBench:
 LOSER = """
 import sys
 from lagbench.errors import WorkFailedError
-from lagbench.work.run import spread
+from lagbench.work.run import run_all
 from spread_jobs import take_worker_along
 try:
-    spread(take_worker_along, {"job 0": 0}, scheduler=sys.argv[1])
+    run_all(take_worker_along, {"job 0": 0}, scheduler=sys.argv[1])
 except WorkFailedError as error:
     print(error.what)
 """

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from lagbench.data.yamlfile import MAX_BYTES, read_yaml
+from lagbench.data.yamlfile import MAX_BYTES, read_yaml, spell_yaml
 from lagbench.errors import UnreadableFileError
 
 BOMB = "a: &a [x, x, x]\nb: &b [*a, *a, *a]\nc: [*b, *b, *b]\n"
@@ -82,3 +82,13 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
     """The path stands in the message."""
     with pytest.raises(UnreadableFileError, match=r"absent\.yaml"):
         read_yaml(tmp_path / "absent.yaml")
+
+
+@pytest.mark.parametrize(
+    "text", ["12e45678", "1e3", "0x10", "0o17", ".5", "59:59:1.5", "true", "-", "a: b", "é"]
+)
+def test_text_stays_text(text: str, tmp_path: Path) -> None:
+    """Hashes that look like numbers among them: what is written is read as the same value."""
+    path = tmp_path / "held.yaml"
+    path.write_text(spell_yaml({"held": [text, 1.5, 7]}), encoding="utf-8")
+    assert read_yaml(path) == {"held": [text, 1.5, 7]}

@@ -9,11 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
-import yaml
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from lagbench.data.yamlfile import NUMBERS, read_yaml
+from lagbench.data.yamlfile import read_yaml, spell_yaml
 from lagbench.errors import ChecksFailedError, UnreadableFileError, UsageError, nearest
 from lagbench.submission.findings import quoted
 
@@ -139,10 +138,7 @@ def spell(value: Any) -> bytes:  # noqa: ANN401
     if isinstance(value, Entry):
         held = value.model_dump(mode="python", exclude_defaults=True)
         value = {key: held[key] for key in Entry.ORDER if key in held}
-    text = yaml.dump(
-        _plain(value), Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=110, default_flow_style=None
-    )
-    return text.encode()
+    return spell_yaml(_plain(value), default_flow_style=None).encode()
 
 
 def _plain(value: Any) -> Any:  # noqa: ANN401
@@ -151,17 +147,6 @@ def _plain(value: Any) -> Any:  # noqa: ANN401
     if isinstance(value, (list, tuple)):
         return [_plain(held) for held in value]
     return str(value) if isinstance(value, enum.Enum) else value
-
-
-class _Dumper(yaml.SafeDumper):
-    """Knows the numbers that our reader knows, and writes no aliases, which it refuses."""
-
-    def ignore_aliases(self, data: object) -> bool:
-        return True
-
-
-for _tag, _pattern in NUMBERS.items():
-    _Dumper.add_implicit_resolver(_tag, _pattern, list("-+.0123456789"))
 
 
 def _mistake(kind: type[BaseModel], item: ErrorDetails) -> Mistake:

@@ -19,8 +19,8 @@ from lagbench.errors import UnreadableFileError
 __all__ = [
     "MAX_BYTES",
     "MAX_DEPTH",
-    "NUMBERS",
     "read_yaml",
+    "spell_yaml",
 ]
 
 
@@ -116,3 +116,28 @@ def read_yaml(path: Path) -> Any:  # noqa: ANN401
             got=" ".join(str(error).split()),
             fix="use plain mappings, lists, numbers and strings, in UTF-8",
         ) from error
+
+
+class _Dumper(yaml.SafeDumper):
+    """Quotes what our reader takes for a number, and writes no aliases, which it refuses."""
+
+    def ignore_aliases(self, data: object) -> bool:
+        return True
+
+
+for _tag, _pattern in NUMBERS.items():
+    _Dumper.add_implicit_resolver(_tag, _pattern, list("-+.0123456789"))
+
+
+def spell_yaml(value: object, *, default_flow_style: bool | None = False) -> str:
+    """Return plain values as the text of a YAML file, which :func:`read_yaml` reads as the same values."""
+    return str(
+        yaml.dump(
+            value,
+            Dumper=_Dumper,
+            sort_keys=False,
+            allow_unicode=True,
+            width=110,
+            default_flow_style=default_flow_style,
+        )
+    )

@@ -14,7 +14,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from lagbench.atomic import temporary_name
@@ -25,6 +24,7 @@ from lagbench.data.manifest import FileEntry, Manifest, describe_file, merge, wr
 from lagbench.data.registry import MAX_ID, NO_GENERATOR, load, spell_ids
 from lagbench.data.statistics import file_statistics
 from lagbench.data.writer import ScenarioWriter
+from lagbench.data.yamlfile import spell_yaml
 from lagbench.errors import DataError, UsageError, WorkFailedError
 from lagbench.work.machine import environment_of
 from lagbench.work.progress import Meter, Progress
@@ -252,7 +252,7 @@ class _Building:
             "splits": {about.name: self._split(ids)},
             "measured": {about.name: {SIZE: measured}},
         }
-        text = yaml.safe_dump(described, sort_keys=False, allow_unicode=True, width=110)
+        text = spell_yaml(described)
         (self.root / about.name / DESCRIPTION).write_text(HEAD.format(command) + text, encoding="utf-8")
         return manifest
 
