@@ -54,7 +54,7 @@ def test_a_strangers_path(run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: P
     assert run("submit", "predictions.nc", "--from", TOY / "meta.yaml").exit_code == 2
     submitted = run("submit", "predictions.nc", "--from", TOY / "meta.yaml", "--new-board")
     assert submitted.exit_code == 0, submitted.output
-    assert "toy-model on curl-noise tiny: vorticity_rmse" in submitted.stdout
+    assert "toy-model on curl-noise tiny: vorticity_nrmse" in submitted.stdout
     entry = tmp_path / "leaderboard/submissions" / SPLIT / SIZE / "toy-model.yaml"
     assert yaml.safe_load(entry.read_text())["parameters"] == 1
     assert run("leaderboard", "check").exit_code == 0
@@ -81,7 +81,7 @@ def test_machines_are_answered_in_json(run: Run, monkeypatch: pytest.MonkeyPatch
     submitted = run(*words)
     assert submitted.stdout.count("--board trial") == 2
     again = run(*words, "--replace", "--json")
-    assert json.loads(again.stdout)["ranking"] == "vorticity_rmse"
+    assert json.loads(again.stdout)["ranking"] == "vorticity_nrmse"
     board = ("--board", "trial")
     built = json.loads(run("leaderboard", "build", *board, "--json").stdout)
     assert (built["rows"], built["tabs"]) == (1, 1)

@@ -114,12 +114,13 @@ def submit(
     """
     folder, paths = Folder(board), [Path(path) for path in predictions]
     _check_needed(meta, folder, new_board=new_board)
-    headers, outside, described = [], [], registry or load()
+    headers, outside, results, described = [], [], [], registry or load()
     for path in paths:
         result = validate(path, root=root, require_truth=True, registry=registry)
         if examined is not None:
             examined(result)
         result.check()
+        results.append(result)
         with open_predictions(path) as opened:
             headers.append(opened.header)
             size = described.size(opened.header.split, opened.header.size)
@@ -132,10 +133,17 @@ def submit(
         fix = "replace it with --replace, or name this one otherwise: --method NAME"
         raise UsageError("there is such an entry already", where=where, fix=fix)
     about, urls = _about(headers, meta), _urls(headers, meta)
-    # validated above: once `score` takes the result, no file is looked at twice
     cards = [
-        score(path, root=root, workers=workers, registry=registry, progress=progress, write=False)
-        for path in paths
+        score(
+            path,
+            root=root,
+            workers=workers,
+            registry=registry,
+            progress=progress,
+            write=False,
+            validated=result,
+        )
+        for path, result in zip(paths, results, strict=True)
     ]
     made = [
         Prediction(
