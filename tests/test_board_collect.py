@@ -69,7 +69,8 @@ def test_values_are_those_of_the_scorer(board: Board, card: ScoreCard) -> None:
         assert held.undefined == sum(score.undefined)
         assert math.isnan(held.std)
         for frame, value in held.at.items():
-            assert digits(value) == digits(float(np.mean(score.at(frame)[~np.isnan(score.at(frame))])))
+            defined = score.at(frame)[~np.isnan(score.at(frame))]
+            assert digits(value) == digits(float(np.mean(defined)) if defined.size else math.nan)
 
 
 def test_floors_stand_as_the_scorer_sees_them(board: Board, card: ScoreCard) -> None:
@@ -278,14 +279,14 @@ def test_an_entry_in_another_place_is_refused(own: BoardBench) -> None:
 def test_tables_and_json(board: Board) -> None:
     """The terminal shows ranks, spread, cost, floors and flags; JSON has the same numbers."""
     (table,) = tables(board, chosen_tabs(board, "cavity", None), ["position_rmse"])
-    assert table.columns[:4] == ("rank", "method", "vorticity_nrmse", "position_rmse")
+    assert table.columns[:5] == ("rank", "method", "skill", "vorticity_nrmse", "position_rmse")
     rows = {row[1]: row for row in table.rows}
     measured = sorted(floor.name for floor in board.tabs[0].floors)
     for name in measured:
         assert (rows[name][0], rows[name][-1]) == ("-", "floor")
     assert rows["damped"][0] == str(row_of(board, "damped").rank)
-    assert " ± " in rows["damped"][2]
-    assert rows["damped"][4:6] == ("0.5", "4")
+    assert " ± " in rows["damped"][3]
+    assert rows["damped"][5:7] == ("0.5", "4")
     (plain,) = as_plain(board.tabs)["tabs"]
     means = {row["id"]: row["metrics"]["position_rmse"]["mean"] for row in plain["rows"]}
     assert means["damped"] == digits(row_of(board, "damped").values["position_rmse"].mean)

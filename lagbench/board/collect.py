@@ -201,7 +201,7 @@ def _row(
         entry=held.entry,
         current=held.current,
         rank=standing.rank if standing else None,
-        tied=standing.tied if standing else False,
+        tied=standing is not None and standing.tied and not math.isnan(standing.p),
         p=standing.p if standing else math.nan,
         verified=verified,
         skill=_skill(held.scores[ranking].score, floors) if held.current else None,
