@@ -198,7 +198,7 @@ def made_up(size: Size, method: str, seed: int, quality: float) -> ScoreCard:
             attribute_std=(1.0, 1.0, 1.0, 1.0),
             radius=task.radius,
             materials=(),
-            centre=(0.5, 0.5),
+            bounds=size.bounds,
         ),
         ranking=ranking,
         tallies=tallies,
