@@ -43,7 +43,7 @@ from lagbench.cli.output import spell_bytes
 from lagbench.data.checksums import file_sha256
 from lagbench.data.grid import Grid, Placement
 from lagbench.data.registry import Size, load
-from lagbench.metrics import METRICS, Direction, Setting, Tally
+from lagbench.metrics import METRICS, Direction, Setting, Tally, aggregate
 from lagbench.metrics.distributions import BINS
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.scenario import FRAMES, PARTICLES, SUBMISSION, Preview, as_stored
@@ -162,7 +162,14 @@ def made_up(size: Size, method: str, seed: int, quality: float) -> ScoreCard:
     """Return a score card of nobody's predictions: errors that grow, pictures of noise."""
     rng, rows = np.random.Generator(np.random.PCG64(seed)), {SUBMISSION: quality}
     rows |= {name: 3.0 + i for i, name in enumerate(floor_names())}
-    task, frames = size.task, tuple(frames_to_predict(size))
+    task, frames, ranking = size.task, tuple(frames_to_predict(size)), ranking_metric(size)
+    tallies = {
+        row: {
+            i: _tally(frames, value, np.random.Generator(np.random.PCG64([i, int(1e6 * value)])))
+            for i in size.subsets["test"]
+        }
+        for row, value in rows.items()
+    }
     header = Header(
         split=size.split,
         size=size.name,
@@ -191,17 +198,11 @@ def made_up(size: Size, method: str, seed: int, quality: float) -> ScoreCard:
             attribute_std=(1.0, 1.0, 1.0, 1.0),
             radius=task.radius,
             materials=(),
-            centre=(0.5, 0.5),
+            bounds=size.bounds,
         ),
-        ranking=ranking_metric(size),
-        tallies={
-            row: {
-                i: _tally(frames, value, np.random.Generator(np.random.PCG64([i, int(1e6 * value)])))
-                for i in size.subsets["test"]
-            }
-            for row, value in rows.items()
-        },
-        scores={},
+        ranking=ranking,
+        tallies=tallies,
+        scores={row: aggregate([METRICS[ranking]], held) for row, held in tallies.items()},
         flags=(),
         warnings=(),
         preview=_preview(size, grid.nodes, rng),
