@@ -58,7 +58,7 @@ def test_the_entry_says_all_that_is_known(own: BoardBench, predictions: Path) ->
     card = own.data.card(predictions)
     assert result.mean == pytest.approx(card.submission[card.ranking].mean, rel=1e-8)
     assert [path.name for path in result.files] == ["my-model.yaml", "my-model.nc"]
-    assert all(path.stat().st_size <= 300_000 for path in result.files)
+    assert all(path.stat().st_size <= 1_000_000 for path in result.files)
     assert not check_board(own.folder, registry=own.registry, page=False, isolated=False).findings
     before = own.state()
     own.submit(
@@ -171,7 +171,7 @@ def test_an_interruption_is_found(
 def test_a_score_file_that_is_too_long_is_not_published(
     own: BoardBench, predictions: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """More than 300 kB: the work failed, and nothing is left behind."""
+    """More than 1 MB: the work failed, and nothing is left behind."""
     monkeypatch.setattr(submitting, "MAX_SCORE_BYTES", 1000)
     before = tree(own.folder)
     with pytest.raises(WorkFailedError, match="too long"):

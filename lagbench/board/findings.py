@@ -103,7 +103,7 @@ CHECKS: Mapping[str, Check] = MappingProxyType(
             "add it to the pull request, or submit again",
         ),
         "oversize": Check(
-            "a score file of more than 300 kB",
+            "a score file of more than 1 MB",
             "a score file is too long",
             f"at most {MAX_SCORE_BYTES} bytes",
             RESCORE,

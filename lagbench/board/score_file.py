@@ -37,7 +37,7 @@ from lagbench.submission.task_checks import frames_to_predict
 
 __all__ = ["MAX_SCORE_BYTES", "Stored", "main", "read_stored", "reported_frames", "unreadable_in_child"]
 
-MAX_SCORE_BYTES = 300_000
+MAX_SCORE_BYTES = 1_000_000
 """Longest score file [bytes]."""
 
 MAX_UNPACKED = 32 << 20
