@@ -187,7 +187,7 @@ def test_round_trip_and_atomic_write(tmp_path: Path) -> None:
     """What is written is read back, as plain JSON, with no temporary file left."""
     manifest = merged(None, range(5), statistics=STATISTICS)
     path = write_manifest(tmp_path, manifest)
-    assert path == tmp_path / "cavity" / "tiny" / "v2" / "manifest.json"
+    assert path == tmp_path / "cavity" / "tiny" / "v1" / "manifest.json"
     assert read_manifest(tmp_path, "cavity", "tiny", 1) == manifest
     assert list(path.parent.iterdir()) == [path]
     assert json.loads(path.read_text())["files"][3]["facts"] == {"energy_last_over_max": 0.25}
