@@ -190,7 +190,8 @@ def test_floors_are_added_by_themselves(own: BoardBench, predictions: Path) -> N
     (folder / first).unlink()
     (folder / max(before)).write_bytes(b"something else")
     result = own.submit(predictions)
-    assert set(result.files) >= {folder / name for name in before}
+    assert set(result.files) >= {folder / first, folder / max(before)}
+    assert {path.name for path in folder.iterdir()} == set(before)
     for path in folder.iterdir():
         scores = read_stored(path).scores
         assert scores.identity["method"] == path.stem

@@ -173,8 +173,7 @@ def test_the_whole_demo_from_nothing(run: Run, tmp_path: Path) -> None:
     model = made["model"]
     assert model["training"]["split"] == "cavity"
     assert model["solver"]["seconds_per_frame"] > 0
-    error = {row: scores["vorticity_rmse"]["mean"] for row, scores in model["card"]["rows"].items()}
-    assert error["submission"] < 0.3 * error["persistence"]
+    assert model["card"]["skill"]["value"] > 0.05  # better than anything that costs no learning
     assert error["submission"] < 1.2 * error["constant-velocity"]
     assert (model["page"]["rows"], model["page"]["tabs"]) == (3, 1)
     assert Path(model["page"]["page"]).stat().st_size == model["page"]["bytes"]
