@@ -125,11 +125,11 @@ def test_style_sheet_is_packaged() -> None:
 def test_the_stable_tile_says_how_many_frames_do_not_count() -> None:
     """Two scenarios of 3 frames, 2 of them without a correlation: both numbers stand on the tile."""
     names, frames, nan = ("vorticity_pearson",), (2, 3, 4), math.nan
-    rows = {0: (0.9, nan, nan), 1: (0.9, 0.9, 0.7)}
+    rows = {0: (0.96, nan, nan), 1: (0.96, 0.96, 0.9)}
     tallies = {
         i: Tally.of(names, frames, {f: {names[0]: v} for f, v in zip(frames, row, strict=True)})
         for i, row in rows.items()
     }
     stable = aggregate([METRICS["stable_frames"]], tallies)["stable_frames"]
     assert stable.values.tolist() == [1.0, 2.0]
-    assert _stable_of(stable) == "of 3, correlation above 0.8; 2 of 6 frames undefined"
+    assert _stable_of(stable) == "of 3, correlation above 0.95; 2 of 6 frames undefined"

@@ -198,7 +198,8 @@ def test_rollouts_show_truth_and_prediction(plan: Plan, cavity: ScoreBench) -> N
         assert float(np.abs(pair.vorticity_residual).max()) == 0.0
         scene = rollouts.scene("supergat", 6)
         assert np.allclose(scene.displacement, truth[6] - truth[5], atol=0)
-        again = fields(truth[15], truth[15] - truth[14], pair.truth.grid, full=pair.truth.full)
+        told = pair.truth.scenario
+        again = fields(truth[15], truth[15] - truth[14], told.setting.grid, full=told.full)
         assert np.array_equal(again.vorticity, pair.truth.fields.vorticity, equal_nan=True)
 
 

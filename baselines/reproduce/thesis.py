@@ -249,15 +249,13 @@ _KEY_FRAMES = {"cavity": 54, "curl-noise": 40}
 def scenario_of(size: Size, case: int) -> int | None:
     """Return the test scenario that stands for one of the thesis; None where there is none alike.
 
-    In a full box cases are T0, T1, ...: ours in ascending order. On the free surface they are ids, which size
-    ``full`` shares; elsewhere the first test scenario of the same family or pair stands in.
+    In a full box cases are T0, T1, ...: ours in ascending order. On the free surface they are ids, for which
+    our first test scenario of the same family or pair stands.
     """
     test = sorted(size.subsets["test"])
     families = _FAMILIES.get(size.split)
     if families is None:
         return test[case] if case < len(test) else None
-    if case in test and size.name == "full":
-        return case
     return next((i for i in test if i % families == case % families), None)
 
 
