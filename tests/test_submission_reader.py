@@ -126,7 +126,7 @@ def test_the_content_hash_is_that_of_the_document(bench: Bench) -> None:
         got, head = predictions.content_sha256(), predictions.header
     whole = {
         "dataset_sha256": head.dataset_sha256,
-        "dataset_version": "1.2.0",
+        "dataset_version": "2.2.0",
         "frames": ALL,
         "method": "truth",
         "scenarios": list(TESTS),
