@@ -123,7 +123,7 @@ def score(
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
-    """Score a predictions.nc beside two floors; write scores.json and scores.nc."""
+    """Score a predictions.nc beside its floors; write scores.json and scores.nc."""
     from lagbench.scoring.score import score as run
 
     if len(predictions) > 1 and report is None:
