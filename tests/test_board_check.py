@@ -237,7 +237,7 @@ FILES: dict[str, Damage] = {
     ),
     "missing entry": (lambda b: b.entry("noisy").unlink(), {"stray"}),
     "oversize score file": (
-        lambda b: (b.folder / SCORES / "noisy.nc").write_bytes(bytes(300_001)),
+        lambda b: (b.folder / SCORES / "noisy.nc").write_bytes(bytes(1_000_001)),
         {"oversize"},
     ),
     "score file that is a link": (
