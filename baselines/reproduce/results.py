@@ -282,8 +282,6 @@ def _missing(found: Sequence[Evidence]) -> Iterator[str]:
             what = "all models" if len(missing) == len(EXPECTED[split]) else ", ".join(missing)
             command = f"python -m lagbench.baselines.reproduce --size {size} --split {split}"
             yield f"- {evidence.where}: {what}: `{command}`, then `lagbench submit`."
-        if not evidence.floors:
-            yield f"- {evidence.where}: floors: `lagbench submit --floor NAME --split {split} --size {size}`."
         if evidence.stale:
             yield f"- {evidence.where}: {len(evidence.stale)} score files of other data, left out."
 
