@@ -5,20 +5,18 @@ from __future__ import annotations
 import math
 import signal
 import threading
+from dataclasses import replace
 from types import FrameType
 from typing import Any
 
 import torch
 from pytorch_lightning import Callback, LightningModule, Trainer
 
-from lagbench.work.progress import Meter
-
-from .baseline import Batch
-from .checkpoint import Checkpoint, rounded_weights, save
-from .job import STOPPED_EARLY, RunFolder, TrainingRecord
+from .checkpoint import load, rounded_weights, save
+from .job import STOPPED_EARLY, TrainingJob, TrainingRecord
 from .machine import return_memory
 from .module import TOTAL, TrainingModule
-from .rollout import validate
+from .validation import Validation
 
 __all__ = [
     "TrainingCallback",
@@ -33,20 +31,18 @@ class TrainingCallback(Callback):
 
     def __init__(
         self,
-        folder: RunFolder,
+        job: TrainingJob,
         ledger: TrainingRecord,
         *,
-        about: Checkpoint,
-        record: dict[str, Any],
-        validation: Batch | None,
-        meter: Meter,
+        validation: Validation | None,
+        steps: int,
+        windows: int,
     ) -> None:
-        self.folder = folder  # where files go
-        self.ledger = ledger  # what the training has done so far
-        self.about = about  # fields of the checkpoint that do not change
-        self.record = record  # entries of training.json that do not change
-        self.validation = validation  # windows of 'valid' with their truth; None validates never
-        self.meter = meter  # counts steps
+        self.job = job  # the training that was asked for
+        self.ledger = ledger  # what it has done so far
+        self.validation = validation  # None validates never
+        self.steps = steps  # of the whole training
+        self.windows = windows  # of the training subsets
         self._interrupted = False
         self._handlers: dict[int, Any] = {}
 
@@ -55,24 +51,23 @@ class TrainingCallback(Callback):
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
                 self._handlers[number] = signal.signal(number, self._interrupt)
-        steps = _of(module).steps
-        self.meter.begin("training", total=steps, scenarios=steps, done=_of(module).step)
+        steps = self.steps
+        self.job.meter.begin("training", total=steps, scenarios=steps, done=_of(module).step)
 
     def on_train_batch_end(
         self, trainer: Trainer, module: LightningModule, outputs: object, batch: object, batch_idx: int
     ) -> None:
         """Do what is due after a step."""
         trained = _of(module)
-        step, steps, recipe = trained.step, trained.steps, trained.recipe
-        self.ledger.step = step
+        step, steps, recipe = trained.step, self.steps, trained.recipe
+        self.ledger.stepped(step, batch=recipe.batch * trainer.world_size, windows=self.windows)
         last = step >= steps
         if last or step % recipe.log_every == 0 or step == 1:
             self._log(trainer, trained)
             return_memory()
-        self.meter.count(1, scenarios=1)
-        every = max(1, steps // 10) if recipe.validate_every is None else recipe.validate_every
-        if self.validation is not None and every and (last or step % every == 0):
-            self._validate(trainer, trained)
+        self.job.meter.count(1, scenarios=1)
+        if self.validation is not None and self._is_due(trained, self.validation):
+            self._validate(trainer, trained, self.validation)
         stop = trainer.strategy.reduce_boolean_decision(self._interrupted, all=False)
         if stop or trainer.should_stop or last:
             over = last or self.ledger.state == STOPPED_EARLY
@@ -90,8 +85,7 @@ class TrainingCallback(Callback):
         self._release()
         if trainer.is_global_zero and isinstance(exception, Exception):
             self.ledger.state = "failed"
-            self.ledger.read_clocks(trainer.world_size)
-            self.folder.write_record({**self.record, **self.ledger.as_json()})
+            self._write_record(trainer, _of(module))
 
     def _release(self) -> None:
         for number, handler in self._handlers.items():
@@ -108,22 +102,30 @@ class TrainingCallback(Callback):
         self.ledger.loss = {name: float(value) for name, value in module.terms.items()}
         if not math.isfinite(self.ledger.loss[TOTAL]) and trainer.world_size == 1:
             raise module.not_finite()
-        self.meter.stage = f"loss {self.ledger.loss[TOTAL]:.3g}"
+        self.job.meter.stage = f"loss {self.ledger.loss[TOTAL]:.3g}"
         if trainer.logger is not None:
             values = {f"loss/{name}": value for name, value in self.ledger.loss.items()}
             trainer.logger.log_metrics({**values, "learning_rate": module.learning_rate}, step=module.step)
 
-    def _validate(self, trainer: Trainer, module: TrainingModule) -> None:
+    def _is_due(self, module: TrainingModule, validation: Validation) -> bool:
+        """Return whether the step is followed by a validation."""
+        recipe, model = module.recipe, module.model
+        trained, rolled = recipe.batch * model.future, sum(validation.frames.values())
+        count = recipe.validations(self.steps, trained=trained, rolled=rolled)
+        return recipe.is_validated(module.step, steps=self.steps, validations=count)
+
+    def _validate(self, trainer: Trainer, module: TrainingModule, validation: Validation) -> None:
         """Validate in the first process; all act on what it finds."""
-        rmse = 0.0
-        if trainer.is_global_zero and self.validation is not None:
-            rmse = validate(module.model, self.validation)
-        rmse = float(trainer.strategy.broadcast(rmse))
-        better = self.ledger.validated(rmse)
+        value = 0.0
+        with self.ledger.validating(trainer.world_size, device=self.job.device):
+            if trainer.is_global_zero:
+                value = validation(module.model)
+            value = float(trainer.strategy.broadcast(value))
+        better = self.ledger.validated(validation.metric, value)
         if trainer.logger is not None:
-            trainer.logger.log_metrics({"validation/position_rmse": rmse}, step=module.step)
+            trainer.logger.log_metrics({f"validation/{validation.metric}": value}, step=module.step)
         if better and trainer.is_global_zero:
-            self._write_weights(module)
+            save(self.job.folder.weights, self.job.checkpoint(self.ledger, rounded_weights(module.model)))
         patience = module.recipe.patience
         if patience is not None and self.ledger.since_best() >= patience and module.step < module.steps:
             self.ledger.state = STOPPED_EARLY
@@ -138,29 +140,21 @@ class TrainingCallback(Callback):
         state = module.model.state_dict()
         if not all(bool(torch.isfinite(value).all()) for value in state.values()):
             raise module.not_finite()
-        self.ledger.read_clocks(trainer.world_size)
-        training = {**self.about.training, **self.ledger.as_json()}
+        self._write_record(trainer, module)
+        folder = self.job.folder
         optimizer = trainer.optimizers[0].state_dict()
-        save(self.folder.checkpoint, self._checkpoint(state, training, optimizer))
-        if self.validation is None or not self.folder.weights.exists():
-            self._write_weights(module)
-        self.folder.write_record({**self.record, **self.ledger.as_json()})
+        save(folder.checkpoint, self.job.checkpoint(self.ledger, state, optimizer))
+        if self.ledger.best_step is None or not folder.weights.exists():
+            save(folder.weights, self.job.checkpoint(self.ledger, rounded_weights(module.model)))
+        else:  # the weights stay those of the best step, their budget is that of the training
+            best = load(folder.weights)
+            budget = self.job.budget(self.ledger).model_dump(mode="json")
+            save(folder.weights, replace(best, training={**best.training, "budget": budget}))
 
-    def _write_weights(self, module: TrainingModule) -> None:
-        training = {**self.about.training, **self.ledger.as_json()}
-        save(self.folder.weights, self._checkpoint(rounded_weights(module.model), training, None))
-
-    def _checkpoint(
-        self, weights: dict[str, torch.Tensor], training: dict[str, Any], optimizer: dict[str, Any] | None
-    ) -> Checkpoint:
-        return Checkpoint(
-            baseline=self.about.baseline,
-            options=self.about.options,
-            facts=self.about.facts,
-            weights=weights,
-            training=training,
-            optimizer=optimizer,
-        )
+    def _write_record(self, trainer: Trainer, module: TrainingModule) -> None:
+        self.ledger.read_clocks(trainer.world_size, device=self.job.device)
+        more = {"steps": self.steps, "windows": self.windows}
+        self.job.folder.write_record(self.job.record(module.model, self.ledger, **more))
 
 
 def _of(module: LightningModule) -> TrainingModule:

@@ -8,19 +8,23 @@ The ledger of a training: what it did, what it cost, on what machine.
 from __future__ import annotations
 
 import json
+import math
 import platform
 import resource
 import time
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Self
 
+from torch import Tensor
+
 from lagbench.atomic import write_atomically
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
+from lagbench.submission.budget import MOST_VALIDATIONS, Budget, track_of
 from lagbench.work.progress import Meter
 
 from .baseline import Baseline
@@ -58,11 +62,16 @@ class TrainingRecord:
     step: int = 0  # optimiser steps made
     # raw loss terms of the last step looked at, and their weighted sum 'total'
     loss: dict[str, float] = field(default_factory=dict)
-    # step and position RMSE of every validation [length]
+    windows_seen: int = 0  # training windows of all steps
+    epochs: float = 0.0  # the same over the windows of the training subsets
+    metric: str | None = None  # what is validated by; None before the first validation
+    # step and value of every validation, under the metric's name
     validation: list[dict[str, float]] = field(default_factory=list)
     best_step: int | None = None  # step of the best validation; None before the first
-    best_rmse: float | None = None  # its RMSE [length]
+    best_value: float | None = None  # its value
     cpu_seconds: float = 0.0  # processor time of all processes, in all runs [s]
+    validation_cpu_seconds: float = 0.0  # of it that of validations [s]
+    gpu_seconds: float = 0.0  # time of all runs times the GPUs that were held [s]
     wall_seconds: float = 0.0  # time of all runs [s]
 
     def __post_init__(self) -> None:
@@ -79,19 +88,35 @@ class TrainingRecord:
         """Return plain values."""
         return {name: getattr(self, name) for name in self.__dataclass_fields__}
 
-    def read_clocks(self, processes: int = 1) -> None:
+    def read_clocks(self, processes: int = 1, *, device: str = "cpu") -> None:
         """Add the time since the last reading, of as many processes as train alike."""
         cpu, wall = _processor_seconds(), time.monotonic()
         self.cpu_seconds += (cpu - self._cpu) * processes
+        self.gpu_seconds += (wall - self._wall) * processes * (device != "cpu")
         self.wall_seconds += wall - self._wall
         self._cpu, self._wall = cpu, wall
 
-    def validated(self, rmse: float) -> bool:
+    def stepped(self, step: int, *, batch: int, windows: int) -> None:
+        """Enter a step of so many windows out of a training set of so many."""
+        self.step, self.windows_seen = step, step * batch
+        self.epochs = self.windows_seen / windows
+
+    @contextmanager
+    def validating(self, processes: int = 1, *, device: str = "cpu") -> Iterator[None]:
+        """Take the processor time of a validation, for which as many processes wait."""
+        self.read_clocks(processes, device=device)
+        before = self.cpu_seconds
+        yield
+        self.read_clocks(processes, device=device)
+        self.validation_cpu_seconds += self.cpu_seconds - before
+
+    def validated(self, metric: str, value: float) -> bool:
         """Enter a validation at the present step; return whether it is the best so far."""
-        self.validation.append({"step": self.step, "rmse": rmse})
-        if self.best_rmse is not None and not rmse < self.best_rmse:
+        self.metric = metric
+        self.validation.append({"step": self.step, metric: value})
+        if math.isnan(value) or (self.best_value is not None and not value < self.best_value):
             return False
-        self.best_step, self.best_rmse = self.step, rmse
+        self.best_step, self.best_value = self.step, value
         return True
 
     def since_best(self) -> int:
@@ -247,22 +272,56 @@ class TrainingJob:
         """Return the ledger that goes on where an earlier run ended, in the state that it ended in."""
         return TrainingRecord() if self.earlier is None else TrainingRecord.from_json(self.earlier.training)
 
-    def checkpoint(self, **changes: Any) -> Checkpoint:  # noqa: ANN401 (its fields)
-        """Return a checkpoint with the fields that do not change."""
+    def budget(self, ledger: TrainingRecord) -> Budget:
+        """Return what the training took so far, as predictions and entries say it.
+
+        Of many validations every n-th is told, the last one among them.
+        """
+        machine = hardware(self.device)
+        device = str(machine["device" if self.device != "cpu" else "processor"])
+        known = [(int(one["step"]), one[str(ledger.metric)]) for one in ledger.validation]
+        told = [one for one in known if math.isfinite(one[1])]
+        stride = -(-len(told) // MOST_VALIDATIONS) or 1
+        return Budget(
+            windows=ledger.windows_seen or None,
+            epochs=_rounded(ledger.epochs),
+            steps=ledger.step,
+            cpu_hours=_rounded((ledger.cpu_seconds - ledger.validation_cpu_seconds) / 3600.0),
+            validation_hours=_rounded(ledger.validation_cpu_seconds / 3600.0),
+            gpu_hours=_rounded(ledger.gpu_seconds / 3600.0),
+            device=device.encode("ascii", "replace").decode()[:100],
+            threads=machine["threads"],
+            metric=ledger.metric,
+            best=ledger.best_value,
+            best_step=ledger.best_step,
+            validations=tuple(told[::-1][::stride][::-1]),
+        )
+
+    def checkpoint(
+        self,
+        ledger: TrainingRecord,
+        weights: Mapping[str, Tensor],
+        optimizer: Mapping[str, Any] | None = None,
+    ) -> Checkpoint:
+        """Return a checkpoint of the present step."""
         fixed = {"recipe": self.recipe.as_json(), "processes": self.processes}
-        training = {**fixed, **changes.pop("training", {})}
         return Checkpoint(
             baseline=self.recipe.baseline,
             options=self.recipe.model,
             facts=self.facts,
-            weights=changes.pop("weights", {}),
-            training=training,
-            **changes,
+            weights=weights,
+            training={**fixed, **ledger.as_json(), "budget": self.budget(ledger).model_dump(mode="json")},
+            optimizer=optimizer,
         )
 
-    def record(self, model: Baseline, **changes: Any) -> dict[str, Any]:  # noqa: ANN401 (plain values)
+    def record(
+        self,
+        model: Baseline,
+        ledger: TrainingRecord,
+        **more: Any,  # noqa: ANN401 (plain values)
+    ) -> dict[str, Any]:
         """Return what training.json says."""
-        facts = self.facts
+        facts, budget = self.facts, self.budget(ledger)
         return {
             "format": FORMAT,
             "baseline": self.recipe.baseline,
@@ -276,8 +335,15 @@ class TrainingJob:
             "processes": self.processes,
             "hardware": hardware(self.device),
             "versions": versions(),
-            **changes,
+            "budget": budget.model_dump(mode="json"),
+            "track": track_of(facts.size, budget),
+            **more,
+            **ledger.as_json(),
         }
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.6g}")
 
 
 def parameter_count(model: Baseline) -> int:

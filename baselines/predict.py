@@ -10,6 +10,7 @@ import json
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from lagbench.data.layout import resolve_root
 from lagbench.data.local import rooted
 from lagbench.data.registry import Registry
 from lagbench.submission import PredictionsWriter
+from lagbench.submission.budget import budget_in
 from lagbench.work.progress import Meter, Progress
 
 from .baseline import Baseline, Batch
@@ -34,7 +36,6 @@ from .windows import scenario_batch, scenario_paths
 __all__ = [
     "PredictionResult",
     "predict",
-    "record_cost",
 ]
 
 
@@ -58,6 +59,7 @@ class PredictionResult:
     # 'processor' on one CPU thread, where other work on the machine then does not count; 'wall' on
     # a GPU and on several threads
     clock: str
+    solver_seconds_per_frame: float | None  # of our solver on one core of this machine [s]
     device: str  # processor and threads, or GPU
     parameters: int  # trained numbers of the model
     diverged: Mapping[int, int]  # scenario id to the absolute frame from which its rollout is frozen
@@ -72,6 +74,7 @@ def predict(
     threads: int | None = None,
     batch: int | None = None,
     method: str | None = None,
+    solver: Callable[[str, str], float | None] | None = None,
     progress: Callable[[Progress], None] | None = None,
     registry: Registry | None = None,
 ) -> PredictionResult:
@@ -85,6 +88,8 @@ def predict(
         threads: threads on the CPU; one per core by default.
         batch: scenarios side by side; 1 on a CPU and all on a GPU by default.
         method: what to call it; the model's own name by default.
+        solver: called with split and size after the rollouts: time of our solver for a frame on one core
+            of this machine [s], None where it cannot be told.
         progress: called as the work advances.
         registry: where splits are described; ours when None.
 
@@ -117,7 +122,7 @@ def predict(
             parameters=count,
             **_provenance(found),
         )
-        _write(writer, work, Meter(progress))
+        timed = _write(writer, work, Meter(progress), solver and partial(solver, facts.split, facts.size))
     result = PredictionResult(
         path=Path(output),
         split=facts.split,
@@ -129,28 +134,14 @@ def predict(
         seconds_per_frame=work.seconds_per_frame,
         seconds_without_search=work.seconds_per_frame - work.search_per_frame,
         clock=work.clock,
+        solver_seconds_per_frame=timed,
         device=hardware_label,
         parameters=count,
         diverged=work.diverged,
     )
-    record_cost(result)
+    plain = json.dumps({**asdict(result), "path": result.path.name}, indent=2, sort_keys=True)
+    write_atomically(result.path.with_suffix(".json"), plain.encode() + b"\n", option="--output")
     return result
-
-
-def record_cost(result: PredictionResult, *, solver: float | None = None) -> Path:
-    """Write what a prediction cost to ``<name>.json`` beside it; return that path.
-
-    Args:
-        result: the prediction.
-        solver: time of our solver for a frame on one core of the same machine [s].
-
-    Raises:
-        WorkFailedError: the disk is full or not writable.
-    """
-    plain = {**asdict(result), "path": result.path.name, "solver_seconds_per_frame": solver}
-    path = result.path.with_suffix(".json")
-    write_atomically(path, json.dumps(plain, indent=2, sort_keys=True).encode() + b"\n", option="--output")
-    return path
 
 
 def _test_files(facts: Facts, root: Path, registry: Registry) -> list[Path]:
@@ -158,13 +149,20 @@ def _test_files(facts: Facts, root: Path, registry: Registry) -> list[Path]:
     return list(paths.values())
 
 
-def _write(writer: PredictionsWriter, work: _Rollouts, meter: Meter) -> None:
+def _write(
+    writer: PredictionsWriter, work: _Rollouts, meter: Meter, solver: Callable[[], float | None] | None
+) -> float | None:
+    """Write the rollouts and what they cost; return what the solver takes."""
     meter.begin("predicting", total=len(work), scenarios=len(work))
     with writer:
         for rollout in work:
             writer.add(rollout.scenario, rollout.position.numpy(), diverged_at=rollout.diverged_at)
             meter.count(1, scenarios=1)
         writer.label(seconds_per_frame=work.seconds_per_frame)
+        timed = solver() if solver else None
+        if timed is not None:
+            writer.label(solver_seconds_per_frame=timed)
+    return timed
 
 
 class _Rollouts:
@@ -241,10 +239,12 @@ def _device_label(machine: str) -> str:
 
 
 def _provenance(checkpoint: Checkpoint) -> dict[str, Any]:
-    """Return seed and training in words, for the file's attributes."""
+    """Return seed, training in words and its budget, for the file's attributes."""
     facts, done = checkpoint.facts, checkpoint.training
     recipe = done.get("recipe", {})
     options = recipe.get("training", {})
     subsets = "+".join(options.get("windows", ("train",)))
     words = f"{facts.split} {facts.size} {subsets}, recipe {recipe.get('name')}, step {done.get('step', 0)}"
-    return {"training": words, "seed": int(options.get("seed", 0))}
+    found: dict[str, Any] = {"training": words, "seed": int(options.get("seed", 0))}
+    budget = budget_in(json.dumps(done.get("budget")))
+    return found if budget is None else {**found, "budget": budget.model_dump_json(exclude_defaults=True)}

@@ -1,8 +1,6 @@
 """Rollouts: a model fed with its own predictions, frozen where it ceases to be finite or leaves for far.
 
 One function serves validation during training and the predictions that are scored.
-
-Rollouts of a few scenarios of ``valid`` while a model is trained; ``test`` is never read.
 """
 
 from __future__ import annotations
@@ -17,16 +15,12 @@ from torch import Tensor, nn
 from lagbench.submission.checks import MAX_DISTANCE
 
 from .baseline import Baseline, Batch
-from .job import TrainingJob
-from .windows import scenario_batch
 
 __all__ = [
     "Rollout",
     "roll_out",
     "single",
     "as_published",
-    "validate",
-    "validation_windows",
 ]
 
 
@@ -110,35 +104,6 @@ def _advance(model: Baseline, given: Batch, frames: int) -> tuple[Tensor, int]:
         if not ((predicted[frame] - 0.5).abs() <= MAX_DISTANCE).all():
             return predicted, frame
     return predicted, frames
-
-
-def validation_windows(job: TrainingJob) -> Batch | None:
-    """Return the windows of ``valid`` that are rolled out; None where the recipe wants none."""
-    options, facts = job.recipe.training, job.facts
-    if options.validate_every == 0:
-        return None
-    paths = job.files("valid")
-    chosen = [paths[scenario] for scenario in sorted(paths)[: options.validation_scenarios]]
-    frames = facts.input_frames + min(options.validation_frames, facts.horizon)
-    return scenario_batch(chosen, slice(0, frames))
-
-
-def validate(model: Baseline, truth: Batch) -> float:
-    """Return the position RMSE of rollouts, the mean over windows [length].
-
-    The model is rolled out with its weights rounded to bfloat16, as predictions use them. A
-    rollout that diverges counts with its frozen frames.
-    """
-    given = model.facts.input_frames
-    rmse = []
-    with as_published(model):
-        device = next((p.device for p in model.parameters()), torch.device("cpu"))
-        for window in range(truth.windows):
-            part = single(truth, window)
-            found = roll_out(model, part.part(slice(0, given)).to(device), part.frames - given)[0]
-            error = found.position - part.position[:, given:].transpose(0, 1)
-            rmse.append(float(error.double().square().mean().sqrt()))
-    return sum(rmse) / len(rmse)
 
 
 @contextmanager

@@ -30,6 +30,7 @@ from lagbench.atomic import check_writable
 from lagbench.data.local import locate
 from lagbench.data.registry import Registry
 from lagbench.errors import DataError, UsageError
+from lagbench.submission.budget import Track, track_of
 from lagbench.work.progress import Meter, Progress
 
 from .baseline import Baseline
@@ -48,9 +49,9 @@ from .machine import (
 )
 from .module import TrainingModule
 from .recipe import recipe_for
-from .rollout import validate, validation_windows
 from .seeding import generators_kept, reseed, seed_of
 from .symmetry import check_symmetry
+from .validation import validation_of
 from .windows import Window, WindowDataset, WindowSampler, collate, scenario_batch
 
 __all__ = [
@@ -83,9 +84,17 @@ class TrainingResult:
     steps: int  # steps of the whole training
     parameters: int  # trainable parameters
     loss: dict[str, float]  # raw loss terms of the last step, and their weighted sum 'total'
-    best_rmse: float | None  # position RMSE of the best validation [length]; None without one
+    windows_seen: int  # training windows of all steps
+    epochs: float  # the same over the windows of the training subsets
+    metric: str | None  # what was validated by, lower is better; None without a validation
+    best_value: float | None  # its least value
     best_step: int | None
+    device: str  # processor or GPU
+    threads: int  # of a process on the CPU
+    track: Track | None  # equal compute, converged or none
     cpu_seconds: float  # processor time in all runs [s]
+    validation_cpu_seconds: float  # of it that of validations [s]
+    gpu_seconds: float  # time times the GPUs that were held [s]
     wall_seconds: float  # time of all runs [s]
 
 
@@ -166,7 +175,7 @@ def train(
         reseed(seed_of(plan.training.seed))
         model = entry.model.build(plan.model, facts)
         ledger, steps = _run(job, model)
-    return _result(job, ledger, model, steps)
+        return _result(job, ledger, model, steps)
 
 
 def _run(job: TrainingJob, model: Baseline) -> tuple[TrainingRecord, int]:
@@ -200,6 +209,7 @@ def _check_same(earlier: Checkpoint | None, facts: Facts, processes: int, folder
 
 
 def _result(job: TrainingJob, ledger: TrainingRecord, model: Baseline, steps: int) -> TrainingResult:
+    budget = job.budget(ledger)
     return TrainingResult(
         baseline=job.recipe.baseline,
         split=job.facts.split,
@@ -213,9 +223,17 @@ def _result(job: TrainingJob, ledger: TrainingRecord, model: Baseline, steps: in
         steps=steps,
         parameters=parameter_count(model),
         loss=ledger.loss,
-        best_rmse=ledger.best_rmse,
+        windows_seen=ledger.windows_seen,
+        epochs=ledger.epochs,
+        metric=ledger.metric,
+        best_value=ledger.best_value,
         best_step=ledger.best_step,
+        device=budget.device or "",
+        threads=budget.threads or 0,
+        track=track_of(job.facts.size, budget),
         cpu_seconds=ledger.cpu_seconds,
+        validation_cpu_seconds=ledger.validation_cpu_seconds,
+        gpu_seconds=ledger.gpu_seconds,
         wall_seconds=ledger.wall_seconds,
     )
 
@@ -263,14 +281,7 @@ def descend(job: TrainingJob, model: Baseline) -> tuple[TrainingRecord, int]:
         ledger.state = "finished" if ledger.step >= steps else "running"
     if ledger.state != "running":
         return ledger, steps
-    keeper = TrainingCallback(
-        job.folder,
-        ledger,
-        about=job.checkpoint(),
-        record=job.record(model, steps=steps, windows=len(data)),
-        validation=validation_windows(job),
-        meter=job.meter,
-    )
+    keeper = TrainingCallback(job, ledger, validation=validation_of(job), steps=steps, windows=len(data))
     with quiet():
         _fit(_trainer(job, keeper), module)
     if ledger.state == "interrupted":
@@ -384,15 +395,18 @@ def fit(job: TrainingJob, model: Baseline) -> tuple[TrainingRecord, int]:
         return ledger, STEPS
     figures = model.fit(_scenarios(job))  # type: ignore[operator]
     ledger.step, ledger.loss = STEPS, {name: float(value) for name, value in figures.items()}
-    truth = validation_windows(job)
-    if truth is not None:
-        ledger.validated(validate(model, truth))
+    ledger.epochs = 1.0
+    validation = validation_of(job)
+    if validation is not None:
+        with ledger.validating(device=job.device):
+            value = validation(model)
+        ledger.validated(validation.metric, value)
     ledger.state = "finished"
-    ledger.read_clocks()
+    ledger.read_clocks(device=job.device)
     state = {name: value.detach() for name, value in model.state_dict().items()}
-    save(job.folder.weights, job.checkpoint(weights=rounded_weights(model), training=ledger.as_json()))
-    save(job.folder.checkpoint, job.checkpoint(weights=state, training=ledger.as_json()))
-    job.folder.write_record({**job.record(model, steps=STEPS), **ledger.as_json()})
+    save(job.folder.weights, job.checkpoint(ledger, rounded_weights(model)))
+    save(job.folder.checkpoint, job.checkpoint(ledger, state))
+    job.folder.write_record(job.record(model, ledger, steps=STEPS))
     return ledger, STEPS
 
 

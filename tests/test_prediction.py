@@ -20,8 +20,7 @@ from lagbench.baselines.baseline import Batch
 from lagbench.baselines.checkpoint import Checkpoint, save
 from lagbench.baselines.facts import facts_of
 from lagbench.baselines.predict import PredictionResult, predict
-from lagbench.baselines.rollout import as_published, roll_out, single, validate
-from lagbench.baselines.windows import scenario_batch
+from lagbench.baselines.rollout import as_published, roll_out, single
 from lagbench.data.registry import Registry
 from lagbench.errors import DataError, UnreadableFileError, UsageError, WorkFailedError
 from lagbench.make.generate import GenerationResult
@@ -202,22 +201,6 @@ def test_rollouts_keep_the_mode() -> None:
     model = Drift.build({}, FACTS).train()
     roll_out(model, windows([0.9]), 1)
     assert model.training
-
-
-def test_validation_error(run: Predict, generated: GenerationResult) -> None:
-    """The RMSE is the mean over scenarios of the root of the mean squared error, with bf16 weights."""
-    folder = generated.root / "curl-noise/tiny/v2/train"
-    model = Drift.build({"start": 1 / 3}, FACTS)
-    found = validate(model, scenario_batch(sorted(folder.glob("*.nc")), slice(0, 10)))
-    a = float(torch.tensor(1 / 3).bfloat16())
-    expected = []
-    for file in sorted(folder.glob("*.nc")):
-        with netCDF4.Dataset(file) as data:
-            x = np.asarray(data["position"][:10], np.float64)
-        shares = np.cumsum(a ** np.arange(1, 5))
-        predicted = x[5] + shares[:, None, None] * (x[5] - x[4])
-        expected.append(np.sqrt(np.mean((predicted - x[6:]) ** 2)))
-    assert found == pytest.approx(np.mean(expected), rel=1e-4)
 
 
 def test_rounding_for_a_while() -> None:

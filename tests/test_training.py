@@ -138,7 +138,7 @@ def test_resumed_equals_uninterrupted(run: Run, baseline: str, tmp_path: Path) -
     assert (parts.state, parts.step) == ("finished", 7)
     assert same(whole.checkpoint, parts.checkpoint)
     assert same(whole.weights, parts.weights)
-    assert (whole.best_rmse, whole.best_step) == (parts.best_rmse, parts.best_step)
+    assert (whole.best_value, whole.best_step) == (parts.best_value, parts.best_step)
 
 
 def test_a_finished_training_is_not_repeated(run: Run) -> None:
@@ -198,9 +198,9 @@ def test_early_stop(run: Run) -> None:
         "drift", "run", "model.start=1.0", "steps=50", "validate_every=1", "patience=3", "learning_rate=0.5"
     )
     record = json.loads((result.folder / "training.json").read_text())
-    rmse = [entry["rmse"] for entry in record["validation"]]
+    values = [entry["vorticity_nrmse"] for entry in record["validation"]]
     assert result.state == "stopped early"
-    assert result.step == int(np.argmin(rmse)) + 1 + 3 < 50
+    assert result.step == int(np.argmin(values)) + 1 + 3 < 50
     assert load(result.weights).training["step"] == result.best_step
 
 
@@ -219,7 +219,7 @@ def test_the_test_subset_is_never_read(run: Run, generated: GenerationResult, tm
     root = tmp_path / "root"
     shutil.copytree(generated.root, root)
     shutil.rmtree(root / "curl-noise/tiny/v2/test")
-    assert run("drift", "run", "steps=2", root=root).best_rmse is not None
+    assert run("drift", "run", "steps=2", root=root).best_value is not None
 
 
 def test_learning_rate_follows_the_processes() -> None:

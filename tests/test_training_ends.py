@@ -63,7 +63,7 @@ def test_a_training_that_stopped_early_is_over(run: Run) -> None:
     again = run("drift", *settings)
     assert (again.state, again.step) == (first.state, first.step) == ("stopped early", first.step)
     assert first.step < 50
-    assert (again.best_step, again.best_rmse) == (first.best_step, first.best_rmse)
+    assert (again.best_step, again.best_value) == (first.best_step, first.best_value)
     assert [file.read_bytes() for file in files] == before
 
 

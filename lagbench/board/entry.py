@@ -12,10 +12,10 @@ import datetime
 import enum
 import ipaddress
 import unicodedata
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 from urllib.parse import urlsplit
 
 from pydantic import (
@@ -27,6 +27,9 @@ from pydantic import (
     StringConstraints,
     model_validator,
 )
+
+from lagbench.submission.budget import Budget as SeedBudget
+from lagbench.submission.budget import Track, track_of
 
 from .folder import Place, entry_path, score_paths
 
@@ -151,7 +154,6 @@ Hash = Annotated[str, StringConstraints(pattern=SHA256)]
 Version = Annotated[str, StringConstraints(pattern=RELEASE)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Seconds = Annotated[float, Field(ge=1e-7, lt=1e9, allow_inf_nan=False)]
-Amount = Annotated[float, Field(ge=0, lt=1e12, allow_inf_nan=False)]
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Date = Annotated[datetime.date, BeforeValidator(_date)]
 
@@ -185,6 +187,7 @@ class Prediction(Strict):
     url: Link | None = None
     path: InnerPath | None = Field(default=None, description="inside the leaderboard's folder")
     bytes: int | None = Field(default=None, gt=0, lt=MOST_BYTES, description="length of the file")
+    budget: SeedBudget | None = Field(default=None, description="what its training took, as the file says")
 
 
 class Cost(Strict):
@@ -201,14 +204,30 @@ class Cost(Strict):
         return None if solver is None else solver / self.seconds_per_frame
 
 
-class Budget(Strict):
-    """What the training of one seed took."""
+class Budget(SeedBudget):
+    """What the training of one seed took: of several the mean, and the track that all of them belong to."""
 
-    track: Literal["equal compute", "converged"] | None = None
-    windows: int | None = Field(default=None, ge=0, lt=10**15, description="training windows seen")
-    epochs: Amount | None = None
-    cpu_hours: Amount | None = None
-    gpu_hours: Amount | None = None
+    track: Track | None = Field(
+        default=None, description="follows from the budgets of all predictions, never stated"
+    )
+
+    @classmethod
+    def of(cls, size: str, seeds: Sequence[SeedBudget | None]) -> Self | None:
+        """Return the mean over seeds, with the track that all belong to; None unless each has a budget."""
+        known = [seed for seed in seeds if seed is not None]
+        if len(known) < len(seeds):
+            return None
+        held: dict[str, Any] = {}
+        for name in ("windows", "epochs", "steps", "cpu_hours", "validation_hours", "gpu_hours"):
+            values = [value for seed in known if (value := getattr(seed, name)) is not None]
+            if len(values) == len(known):
+                mean = sum(values) / len(values)
+                held[name] = round(mean) if name in ("windows", "steps") else float(f"{mean:.6g}")
+        for name in ("device", "threads", "metric"):
+            if len({getattr(seed, name) for seed in known}) == 1:
+                held[name] = getattr(known[0], name)
+        tracks = {track_of(size, seed) for seed in known}
+        return cls(**held, track=tracks.pop() if len(tracks) == 1 else None)
 
 
 class Flag(Strict):

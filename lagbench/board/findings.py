@@ -126,6 +126,12 @@ CHECKS: Mapping[str, Check] = MappingProxyType(
             "what the score files give",
             RESCORE,
         ),
+        "budget": Check(
+            "a budget, or its track, that those of the predictions do not give",
+            "the budget is not what those of the predictions give",
+            "no track, since the predictions have no budgets",
+            RESCORE,
+        ),
         "twin": Check(
             "the same predictions under two names or seeds",
             "the same predictions stand here twice",

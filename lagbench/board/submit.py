@@ -35,6 +35,7 @@ from .entry import (
     LONGEST_TEXT,
     MOST_SEEDS,
     About,
+    Budget,
     Cost,
     DataSet,
     Entry,
@@ -152,8 +153,9 @@ def submit(
             url=url,
             path=_inner_path(path, folder),
             bytes=path.stat().st_size,
+            budget=header.budget,
         )
-        for card, path, seed, url in zip(cards, paths, seeds, urls, strict=True)
+        for card, path, seed, url, header in zip(cards, paths, seeds, urls, headers, strict=True)
     ]
     try:
         return _publish(place, about, cards, made, folder, outside)
@@ -239,20 +241,32 @@ def _about(headers: Sequence[Header], meta: Meta) -> About:
     if meta.parameters is None:
         held["parameters"] = first.parameters
     held["cost"] = meta.cost or _cost(headers, meta)
+    if meta.budget is not None and meta.budget.track is not None:
+        raise UsageError(
+            "a track is not stated",
+            where="budget.track",
+            fix="leave it out: it follows from the budget that `lagbench predict` writes into predictions.nc",
+        )
+    held["budget"] = Budget.of(first.size, [header.budget for header in headers]) or meta.budget
     return About(**held)
 
 
 def _cost(headers: Sequence[Header], meta: Meta) -> Cost | None:
-    """Return the mean cost over the files; None unless all tell it and one machine."""
+    """Return the mean cost over the files, and the solver's; None unless all tell it and one machine."""
     times = [header.seconds_per_frame for header in headers if header.seconds_per_frame is not None]
     device = headers[0].device
     if len(times) < len(headers) or not device or any(header.device != device for header in headers):
         return None
+    solver = [held for one in headers if (held := one.solver_seconds_per_frame) is not None]
     return Cost(
-        seconds_per_frame=float(f"{sum(times) / len(times):.6g}"),
+        seconds_per_frame=_mean(times),
         device=device[:100],
-        solver_seconds_per_frame=meta.solver_seconds_per_frame,
+        solver_seconds_per_frame=meta.solver_seconds_per_frame or (_mean(solver) if solver else None),
     )
+
+
+def _mean(values: Sequence[float]) -> float:
+    return float(f"{sum(values) / len(values):.6g}")
 
 
 def _inner_path(path: Path, folder: Folder) -> str | None:

@@ -140,13 +140,23 @@ def _where(split: str, root: Path | None) -> str:
 
 def _trained(result: TrainingResult, where: str) -> list[str]:
     time = f"{spell_seconds(result.wall_seconds)}, {spell_seconds(result.cpu_seconds)} of processor time"
+    if result.gpu_seconds:
+        time += f", {spell_seconds(result.gpu_seconds)} of GPU time"
     lines = [
         f"{result.baseline} on {result.recipe}: {result.state}, step {result.step} of {result.steps}, {time}",
         f"  parameters {result.parameters}",
         "  loss       " + ", ".join(f"{name} {value:.4g}" for name, value in result.loss.items()),
     ]
-    if result.best_rmse is not None:
-        lines.append(f"  best       position RMSE {result.best_rmse:.4g} on valid, step {result.best_step}")
+    if result.best_value is not None:
+        lines.append(
+            f"  best       {result.metric} {result.best_value:.4g} on valid, step {result.best_step}"
+        )
+    share = result.validation_cpu_seconds / (result.cpu_seconds or 1.0)
+    seen = f"{result.windows_seen:,} windows, " if result.windows_seen else ""
+    lines.append(
+        f"  budget     {seen}{result.epochs:.3g} epochs; {share:.0%} of the processor time for validations;"
+        f" {result.device}, {result.threads} thread(s); track: {result.track or 'none'}"
+    )
     lines.append(f"  weights    {result.weights}")
     return [*lines, f"next: lagbench predict {result.weights}{where} -o predictions.nc"]
 
@@ -178,7 +188,13 @@ def predict(
     for module in ("torch", "torch_geometric"):
         check_installed(module, extra=EXTRA)
     from lagbench.baselines.predict import predict as run
-    from lagbench.baselines.predict import record_cost
+
+    timed: SolverBench | None = None
+
+    def time_solver(split: str, size: str) -> float | None:
+        nonlocal timed
+        timed = _solver_time(split, size, quiet=quiet)
+        return None if timed is None else timed.seconds_per_frame
 
     with progress_bar(quiet=quiet) as draw:
         result = run(
@@ -189,18 +205,16 @@ def predict(
             threads=threads,
             batch=batch,
             method=method,
+            solver=time_solver if solver else None,
             progress=draw,
         )
-    timed = _solver_time(result, quiet=quiet) if solver else None
-    if timed is not None:
-        record_cost(result, solver=timed.seconds_per_frame)
     if as_json:
         print_json({**vars(result), "solver": timed})
     else:
         say("\n".join(_predicted(result, timed, f" --root {root}" if root else "")), quiet=quiet)
 
 
-def _solver_time(result: PredictionResult, *, quiet: bool) -> SolverBench | None:
+def _solver_time(split: str, size: str, *, quiet: bool) -> SolverBench | None:
     """Return what the solver takes here; None, with the reason on stderr, where it cannot run.
 
     Local splits have no solver of ours.
@@ -209,10 +223,10 @@ def _solver_time(result: PredictionResult, *, quiet: bool) -> SolverBench | None
 
     from .machine import bench_apart
 
-    if result.split not in load().splits:
+    if split not in load().splits:
         return None
     try:
-        return bench_apart(result.split, result.size)
+        return bench_apart(split, size)
     except LagbenchError as error:
         if not quiet:
             typer.echo(f"warning: no speed-up over the solver: {error}", err=True)

@@ -41,7 +41,7 @@ BLOCK_BYTES = 1 << 20
 
 @dataclass(frozen=True)
 class OpenScenario:
-    """A test scenario whose file is open."""
+    """A scenario whose file is open."""
 
     scenario: Scenario  # what holds in all its frames
     file: ScenarioFile
@@ -59,7 +59,7 @@ class OpenScenario:
 
 @dataclass(frozen=True, kw_only=True)
 class ScoredTask:
-    """The test subset of one split and size."""
+    """The test subset of one split and size; while a model is trained, the valid subset."""
 
     truth: Truth  # its files
     setting: Setting  # the split and size, as metrics see it
@@ -74,8 +74,8 @@ class ScoredTask:
 
     @property
     def scenarios(self) -> tuple[int, ...]:
-        """Ids of the test scenarios, ascending."""
-        return tuple(sorted(self.size.subsets["test"]))
+        """Ids of the scenarios, ascending."""
+        return tuple(sorted(self.size.subsets[self.truth.subset]))
 
     @contextmanager
     def opened(self, scenario: int) -> Iterator[OpenScenario]:
@@ -105,20 +105,20 @@ def ranking_metric(size: Size) -> str:
     return RANKING[Placement(size.task.score_grid.placement)]
 
 
-def load_scored_task(size: Size, root: Path) -> ScoredTask:
-    """Check that the test subset is there and gather what the metrics need to know."""
-    bring(size, root, size.subsets["test"])
-    truth = Truth(size, root)
+def load_scored_task(size: Size, root: Path, *, subset: str = "test") -> ScoredTask:
+    """Check that a subset is there and gather what the metrics need to know."""
+    bring(size, root, size.subsets[subset])
+    truth = Truth(size, root, subset)
     truth.require()
     truth.check()
-    test = sorted(size.subsets["test"])
-    present = set().union(*(_materials(truth, scenario) for scenario in test))
+    scenarios = sorted(size.subsets[subset])
+    present = set().union(*(_materials(truth, scenario) for scenario in scenarios))
     manifest = None if size.measured else read_manifest(root, size.split, size.name, size.major)
     task = size.task
     return ScoredTask(
         truth=truth,
         density=float(size.value("density")),
-        twin_floor=size.measured.twin_floor if size.measured else _floor(manifest, test),
+        twin_floor=size.measured.twin_floor if size.measured else _floor(manifest, scenarios),
         setting=Setting(
             grid=Grid(task.score_grid.cells, Placement(task.score_grid.placement)),
             input_frames=task.input_frames,
@@ -147,7 +147,8 @@ def _materials(truth: Truth, scenario: int) -> set[str]:
         frames, material = file.header.frames, file.read("material")
     if frames < needed:
         where = str(truth.path(scenario))
-        raise DataError("a test scenario is too short", where=where, expected=f"{needed} frames", got=frames)
+        what = f"a {truth.subset} scenario is too short"
+        raise DataError(what, where=where, expected=f"{needed} frames", got=frames)
     return {MATERIALS[value] for value in np.unique(material).tolist()}
 
 

@@ -16,6 +16,7 @@ import h5py
 
 from lagbench.errors import nearest
 
+from .budget import Budget, budget_in
 from .findings import Findings, quoted
 from .hdf5 import MAX_LINKS, Array, Odd, attribute_of, describe, members_of, reading, storage_problems
 
@@ -60,6 +61,8 @@ OPTIONAL: Mapping[str, type[str] | type[int] | type[float]] = {
     "seed": int,
     "parameters": int,
     "training": str,
+    "solver_seconds_per_frame": float,
+    "budget": str,
 }
 """Attributes that a file may have: cost, provenance and size of the model."""
 
@@ -98,6 +101,8 @@ class Header:
     parameters: int | None  # trainable parameters of the model
     training: str | None  # what the model was trained on, in words
     diverged_at: Mapping[int, int]  # scenario id to the absolute frame from which it is frozen
+    solver_seconds_per_frame: float | None = None  # of our solver on one core of the same machine [s]
+    budget: Budget | None = None  # what the training took
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,6 +124,8 @@ def kind_of(name: str) -> str:
     >>> kind_of("seed"), kind_of("parameters")
     ('an integer', 'an integer >= 0')
     """
+    if name == "budget":
+        return "JSON of a training's budget"
     return f"{_KINDS[OPTIONAL[name]]}{' >= 0' if name == 'parameters' else ''}"
 
 
@@ -132,6 +139,8 @@ def fits(name: str, value: object) -> bool:
         return False
     if OPTIONAL[name] is float:
         return isinstance(value, (int, float)) and 0 < value < math.inf
+    if name == "budget":
+        return isinstance(value, str) and budget_in(value) is not None
     return isinstance(value, OPTIONAL[name]) and not (name == "parameters" and int(value) < 0)
 
 
@@ -179,6 +188,7 @@ def header_of(anatomy: Anatomy) -> Header:
     marks = anatomy.integers.get("diverged_at", ())
     labels: dict[str, Any] = {name: str(anatomy.attributes[name]) for name in REQUIRED}
     labels |= {name: _optional(anatomy.attributes[name], kind) for name, kind in OPTIONAL.items()}
+    labels["budget"] = budget_in(labels["budget"] or "")
     return Header(
         **labels,
         scenarios=scenarios,

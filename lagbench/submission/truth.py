@@ -1,4 +1,4 @@
-"""The test scenarios that predictions are held against: hashed before use, read a few frames at a time."""
+"""The scenarios that predictions are held against: hashed before use, read a few frames at a time."""
 
 from __future__ import annotations
 
@@ -21,11 +21,12 @@ BLOCK = 16
 
 
 class Truth:
-    """The test subset of a data set under a root folder."""
+    """The test subset of a data set under a root folder; while a model is trained, its valid subset."""
 
-    def __init__(self, size: Size, root: Path) -> None:
+    def __init__(self, size: Size, root: Path, subset: str = "test") -> None:
         self.size = size
         self.root = root
+        self.subset = subset
 
     @property
     def folder(self) -> Path:
@@ -33,22 +34,22 @@ class Truth:
         return dataset_folder(self.root, self.size.split, self.size.name, self.size.major)
 
     def require(self) -> None:
-        """Check that every test scenario is there."""
-        ids = self.size.subsets["test"]
+        """Check that every scenario is there."""
+        ids = self.size.subsets[self.subset]
         missing = [i for i in ids if not self.path(i).is_file()]
         if missing:
             raise DataError(
-                f"{len(missing)} of {len(ids)} test scenarios are not generated",
+                f"{len(missing)} of {len(ids)} {self.subset} scenarios are not generated",
                 where=str(self.path(ids[0]).parent),
                 expected=f"scenarios {spell_ids(ids)}",
                 got=f"missing: {spell_ids(missing)}",
-                fix=remedy(self.size, "--subset test", root=self.root),
+                fix=self._remedy(),
             )
 
     def check(self) -> None:
-        """Hash the values of every test scenario, or find that this machine has done so."""
+        """Hash the values of every scenario, or find that this machine has done so."""
         known, new = noted_content(self.folder), {}
-        for scenario in sorted(self.size.subsets["test"]):
+        for scenario in sorted(self.size.subsets[self.subset]):
             path, expected = self.path(scenario), self._expected(scenario)
             try:
                 content = known(path)
@@ -58,7 +59,7 @@ class Truth:
                 raise self._damaged(path, error) from error
             if not content.startswith(expected):
                 raise DataError(
-                    "a test scenario has another content hash",
+                    f"a {self.subset} scenario has another content hash",
                     where=str(path),
                     expected=expected,
                     got=content,
@@ -69,14 +70,17 @@ class Truth:
     def _damaged(self, path: Path, error: DataError | OSError) -> DataError:
         if isinstance(error, OSError):
             return DataError(
-                "cannot read a test scenario", where=str(path), got=error.strerror, fix=self._fix()
+                f"cannot read a {self.subset} scenario", where=str(path), got=error.strerror, fix=self._fix()
             )
         where = error.where or str(path)
         return DataError(error.what, where=where, expected=error.expected, got=error.got, fix=self._fix())
 
     def _fix(self) -> str:
-        mend = remedy(self.size, "--subset test", root=self.root)
-        return f"{mend}; lagbench verify --split {self.size.split} --size {self.size.name} says what is wrong"
+        verify = f"lagbench verify --split {self.size.split} --size {self.size.name}"
+        return f"{self._remedy()}; {verify} says what is wrong"
+
+    def _remedy(self) -> str:
+        return remedy(self.size, f"--subset {self.subset}", root=self.root)
 
     def _expected(self, scenario: int) -> str:
         """Return what is known of a content hash: its first digits, all, or nothing."""
@@ -90,11 +94,11 @@ class Truth:
         return entry.content_sha256 if entry else ""
 
     def path(self, scenario: int) -> Path:
-        """Return where a test scenario lies."""
+        """Return where a scenario lies."""
         return scenario_path(self.root, self._key(scenario))
 
     def open(self, scenario: int) -> ScenarioFile:
-        """Open a test scenario; check that it is the one that the registry means."""
+        """Open a scenario; check that it is the one that the registry means."""
         path, key = self.path(scenario), self._key(scenario)
         file = read_scenario(path)
         header = file.header
@@ -105,11 +109,11 @@ class Truth:
             return file
         file.close()
         raise DataError(
-            "a test scenario is not that of the registry",
+            f"a {self.subset} scenario is not that of the registry",
             where=str(path),
             expected=f"{expected}, content hash {short or 'any'}",
             got=f"{found}, content hash {header.content_sha256[:16]}",
-            fix=remedy(self.size, "--subset test"),
+            fix=self._remedy(),
         )
 
     def given(self, scenario: int) -> NDArray[np.float32]:
@@ -127,7 +131,7 @@ class Truth:
             if len(frames) == stop - start and frames.shape[1] == self.size.particles:
                 return frames
             raise DataError(
-                "a test scenario has other frames or particles than the registry says",
+                f"a {self.subset} scenario has other frames or particles than the registry says",
                 where=str(self.path(scenario)),
                 expected=f"at least {stop} frames of {self.size.particles} particles",
                 got=frames.shape,
@@ -151,7 +155,7 @@ class Truth:
     def _key(self, scenario: int) -> ScenarioKey:
         size = self.size
         return ScenarioKey(
-            split=size.split, size=size.name, version=size.version, scenario=scenario, subset="test"
+            split=size.split, size=size.name, version=size.version, scenario=scenario, subset=self.subset
         )
 
     def _hash(self, scenario: int) -> str:

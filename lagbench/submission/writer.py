@@ -86,7 +86,7 @@ class PredictionsWriter:
 
         Args:
             **labels: seconds_per_frame [s], device, seed, parameters (trainable, a number >= 0),
-                training (in words).
+                training (in words), solver_seconds_per_frame [s], budget (JSON, docs/predictions.md).
 
         Raises:
             UsageError: there is no such label, or it cannot have that value.
@@ -310,7 +310,7 @@ def write(
         dataset_sha256: hash of the data set that the model was given; else the recorded one.
         root: folder of all data sets; asked only where no hash is recorded.
         registry: where splits are described; ours when None.
-        **labels: seconds_per_frame, device, seed, parameters, training.
+        **labels: see :meth:`PredictionsWriter.label`.
 
     Returns:
         The path.
