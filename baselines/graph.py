@@ -33,7 +33,6 @@ __all__ = [
     "radius_graph",
     "EDGE_FEATURES",
     "MATERIALS",
-    "VELOCITIES",
     "NodeFeatures",
     "Scale",
     "edge_features",
@@ -193,9 +192,6 @@ def _pairs_torch(x: Tensor, key: Tensor, stride: Tensor | int, radius: float) ->
     return i[near], j[near]
 
 
-VELOCITIES = 5
-"""Per-frame velocities that a particle shows, the last ones; they need one more position."""
-
 MATERIALS = 4
 """Liquid, jelly, snow, rope."""
 
@@ -267,7 +263,7 @@ def edge_features(position: Tensor, edge_index: Tensor, radius: float) -> Tensor
 
 
 class NodeFeatures(nn.Module):
-    """Features of a particle: 10 of motion, 4 of walls, 16 of material, 8 of moving walls if asked.
+    """Features of a particle: 2 of each velocity, 4 of walls, 16 of material, 8 of moving walls if asked.
 
     Moving walls: the per-frame velocity of each wall over the velocity scale, times
     ``1 - distance / radius`` (0 beyond the radius), so that it acts where the wall is near.
@@ -276,11 +272,21 @@ class NodeFeatures(nn.Module):
         facts: public figures of the data set.
         velocity: standardisation of per-frame velocities.
         radius: connectivity radius [length].
+        velocities: last per-frame velocities that a particle shows.
         moving_walls: whether the velocities of the walls are features too.
     """
 
-    def __init__(self, facts: Facts, velocity: Scale, radius: float, *, moving_walls: bool = False) -> None:
+    def __init__(
+        self,
+        facts: Facts,
+        velocity: Scale,
+        radius: float,
+        *,
+        velocities: int = 5,
+        moving_walls: bool = False,
+    ) -> None:
         super().__init__()
+        self.velocities = velocities
         self.velocity = velocity
         self.bounds = facts.bounds
         self.radius = radius
@@ -289,8 +295,8 @@ class NodeFeatures(nn.Module):
 
     @property
     def count(self) -> int:
-        """Features of one particle: 30, or 38 with moving walls."""
-        return 2 * VELOCITIES + _WALLS + EMBEDDING + 2 * _WALLS * self.moving_walls
+        """Features of one particle: with five velocities 30, or 38 with moving walls."""
+        return 2 * self.velocities + _WALLS + EMBEDDING + 2 * _WALLS * self.moving_walls
 
     def forward(
         self, position: Tensor, velocity: Tensor, material: Tensor, wall_velocity: Tensor | None = None
@@ -299,7 +305,7 @@ class NodeFeatures(nn.Module):
 
         Args:
             position: last positions [length], shape [particle, 2].
-            velocity: last velocities, oldest first [length/frame], shape [particle, 5, 2].
+            velocity: last velocities, oldest first [length/frame], shape [particle, velocities, 2].
             material: material of each particle, int64, shape [particle].
             wall_velocity: velocity of the walls as each particle sees them [length/frame], shape
                 [particle, 4, 2]; None counts as walls at rest.
