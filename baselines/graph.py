@@ -265,12 +265,16 @@ def edge_features(position: Tensor, edge_index: Tensor, radius: float) -> Tensor
 class NodeFeatures(nn.Module):
     """Features of a particle: 2 of each velocity, 4 of walls, 16 of material, 8 of moving walls if asked.
 
+    The last velocities are shown as the last one and the changes that led to it, each over its own
+    deviation: in velocities alone the changes, of which the next is to be predicted, are hundredths.
+
     Moving walls: the per-frame velocity of each wall over the velocity scale, times
     ``1 - distance / radius`` (0 beyond the radius), so that it acts where the wall is near.
 
     Args:
         facts: public figures of the data set.
         velocity: standardisation of per-frame velocities.
+        acceleration: standardisation of their changes.
         radius: connectivity radius [length].
         velocities: last per-frame velocities that a particle shows.
         moving_walls: whether the velocities of the walls are features too.
@@ -280,6 +284,7 @@ class NodeFeatures(nn.Module):
         self,
         facts: Facts,
         velocity: Scale,
+        acceleration: Scale,
         radius: float,
         *,
         velocities: int = 5,
@@ -288,6 +293,7 @@ class NodeFeatures(nn.Module):
         super().__init__()
         self.velocities = velocities
         self.velocity = velocity
+        self.acceleration = acceleration
         self.bounds = facts.bounds
         self.radius = radius
         self.moving_walls = moving_walls
@@ -311,7 +317,9 @@ class NodeFeatures(nn.Module):
                 [particle, 4, 2]; None counts as walls at rest.
         """
         distance = wall_distance(position, self.bounds, self.radius)
-        parts = [self.velocity(velocity).flatten(1), distance, self.embedding(material).to(position.dtype)]
+        changes = self.acceleration(velocity.diff(dim=1)).flatten(1)
+        kind = self.embedding(material).to(position.dtype)
+        parts = [self.velocity(velocity[:, -1]), changes, distance, kind]
         if self.moving_walls:
             parts.append(self._near_walls(distance, wall_velocity).flatten(1))
         return torch.cat(parts, dim=1)

@@ -108,6 +108,7 @@ class GraphNetwork(Baseline):
         self.features = NodeFeatures(
             facts,
             self.velocity,
+            self.acceleration,
             self.radius,
             velocities=options.velocities,
             moving_walls=options.wall_velocity,

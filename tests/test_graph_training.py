@@ -70,7 +70,7 @@ def test_rollout_losses_of_a_falling_particle_by_hand() -> None:
 def test_rollout_losses_pass_gradients_through_all_steps() -> None:
     """The last step alone, with the first two detached, has another gradient."""
     window = batch(swirl(0, 9))
-    model = network(awake=True, rollout_loss_steps=3)
+    model = network(awake=True, rollout_loss_steps=3, loss={"velocity": 1.0})
     (through,) = torch.autograd.grad(model(window)["velocity"], model.network.decoder[-1].bias)
     state, total = model.start(window.part(slice(6))), 0.0
     for frame in (6, 7, 8):
