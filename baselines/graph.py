@@ -226,13 +226,13 @@ class Scale(nn.Module):
         return standardised * self.std + self.mean
 
 
-def wall_distance(position: Tensor, bounds: tuple[Pair, Pair], radius: float) -> Tensor:
-    """Return the distances to the four walls over the radius, clipped to [-1, 1].
+def wall_distance(position: Tensor, bounds: tuple[Pair, Pair], reach: float) -> Tensor:
+    """Return the distances to the four walls over the reach, clipped to [-1, 1].
 
     Args:
         position: particle positions [length], shape [particle, 2].
         bounds: box (low, high) along x and y [length].
-        radius: connectivity radius [length]; a wall farther away than it looks like one at it.
+        reach: how far a wall is seen [length]; one farther away looks like one at it.
 
     Returns:
         Left, right, bottom, top; negative outside the box; shape [particle, 4].
@@ -240,7 +240,7 @@ def wall_distance(position: Tensor, bounds: tuple[Pair, Pair], radius: float) ->
     (left, right), (bottom, top) = bounds
     x, y = position.unbind(dim=-1)
     distance = torch.stack([x - left, right - x, y - bottom, top - y], dim=-1)
-    return (distance / radius).clamp(-1.0, 1.0)
+    return (distance / reach).clamp(-1.0, 1.0)
 
 
 def edge_features(position: Tensor, edge_index: Tensor, radius: float) -> Tensor:
@@ -269,13 +269,13 @@ class NodeFeatures(nn.Module):
     deviation: in velocities alone the changes, of which the next is to be predicted, are hundredths.
 
     Moving walls: the per-frame velocity of each wall over the velocity scale, times
-    ``1 - distance / radius`` (0 beyond the radius), so that it acts where the wall is near.
+    ``1 - distance / reach`` (0 beyond the reach), so that it acts where the wall is near.
 
     Args:
         facts: public figures of the data set.
         velocity: standardisation of per-frame velocities.
         acceleration: standardisation of their changes.
-        radius: connectivity radius [length].
+        reach: how far a wall is seen [length].
         velocities: last per-frame velocities that a particle shows.
         moving_walls: whether the velocities of the walls are features too.
     """
@@ -285,7 +285,7 @@ class NodeFeatures(nn.Module):
         facts: Facts,
         velocity: Scale,
         acceleration: Scale,
-        radius: float,
+        reach: float,
         *,
         velocities: int = 5,
         moving_walls: bool = False,
@@ -295,7 +295,7 @@ class NodeFeatures(nn.Module):
         self.velocity = velocity
         self.acceleration = acceleration
         self.bounds = facts.bounds
-        self.radius = radius
+        self.reach = reach
         self.moving_walls = moving_walls
         self.embedding = nn.Embedding(MATERIALS, EMBEDDING)
 
@@ -316,7 +316,7 @@ class NodeFeatures(nn.Module):
             wall_velocity: velocity of the walls as each particle sees them [length/frame], shape
                 [particle, 4, 2]; None counts as walls at rest.
         """
-        distance = wall_distance(position, self.bounds, self.radius)
+        distance = wall_distance(position, self.bounds, self.reach)
         changes = self.acceleration(velocity.diff(dim=1)).flatten(1)
         kind = self.embedding(material).to(position.dtype)
         parts = [self.velocity(velocity[:, -1]), changes, distance, kind]
@@ -325,7 +325,7 @@ class NodeFeatures(nn.Module):
         return torch.cat(parts, dim=1)
 
     def _near_walls(self, distance: Tensor, wall_velocity: Tensor | None) -> Tensor:
-        """Return the walls' velocities, faded out over the radius [1], shape [particle, 4, 2]."""
+        """Return the walls' velocities, faded out over the reach [1], shape [particle, 4, 2]."""
         if wall_velocity is None:
             return distance.new_zeros(len(distance), _WALLS, 2)
         nearness = 1.0 - distance.clamp(min=0.0)

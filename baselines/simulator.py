@@ -76,6 +76,8 @@ class GraphNetworkOptions(Options):
     # own steps that the loss is averaged over; gradients pass through all
     rollout_loss_steps: int = Field(default=1, ge=1)
     wall_velocity: bool = False  # whether the velocities of moving walls in the next frame are features
+    # how far a particle sees a wall [radius]; the solver's grid carries a wall's effect beyond one radius
+    wall_reach: float = Field(default=3.0, gt=0.0, allow_inf_nan=False)
     symmetry: Symmetry = Symmetry.NONE  # images that training windows are replaced by at random
     # connectivity radius [length]; the data set's when None
     radius: float | None = Field(default=None, gt=0.0, allow_inf_nan=False)
@@ -109,7 +111,7 @@ class GraphNetwork(Baseline):
             facts,
             self.velocity,
             self.acceleration,
-            self.radius,
+            options.wall_reach * self.radius,
             velocities=options.velocities,
             moving_walls=options.wall_velocity,
         )

@@ -77,7 +77,7 @@ def test_coinciding_particles_have_a_finite_gradient() -> None:
 
 
 def test_a_particle_shows_thirty_numbers() -> None:
-    """The last of five velocities and their changes, over deviations, four walls, the material's embedding."""
+    """The last of five velocities and their changes, over deviations, four walls, an embedding."""
     features = node_features()
     # deviations (0.004, 0.003) and (0.0002, 0.0001): changes of 1, 2, 3, 4 deviations end at 0.002 and 0.001
     velocity = torch.tensor([0.0, 1.0, 3.0, 6.0, 10.0])[None, :, None] * torch.tensor([0.0002, 0.0001])

@@ -51,7 +51,7 @@ def test_every_recipe_is_right(name: str) -> None:
 
 
 def test_operators_share_their_recipes() -> None:
-    """The six operators have one recipe on every split: they differ in the steps alone, by what those cost."""
+    """The six operators have one recipe on every split; they differ in the steps alone, by their cost."""
     operators = ("gns", "supergat", "gat", "gatv2", "pointnet", "transformer")
     for split in ("cavity", "curl-noise", "fluid", "multimaterial"):
         for size in ("tiny", "mini", "full"):

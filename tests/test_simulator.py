@@ -235,7 +235,7 @@ def test_forcing_of_the_next_frame_moves_particles_near_walls() -> None:
     """Another wall velocity in the coming frame changes the step near walls, in an older frame nothing."""
     window = batch(np.repeat(jittered(0)[None], 7, axis=0), walls=True)
     assert window.wall_velocity is not None
-    model = network(awake=True, layers=1, wall_velocity=True)
+    model = network(awake=True, layers=1, wall_velocity=True, wall_reach=1.0)
     found = []
     for frame in (None, 5, 6):
         walls = window.wall_velocity.clone()

@@ -198,9 +198,7 @@ _MODELS = (
     Model("gns", "GNS", "#b0569a"),
     Model("gatv2", "GATv2", "#0072b2"),
     Model("transformer", "graph transformer", "#e69f00"),
-    Model(
-        "supergat-unlinked", "SuperGAT without link loss", "#d9a46a", "supergat", ("model.link_weight=0",)
-    ),
+    Model("supergat-unlinked", "SuperGAT without link loss", "#d9a46a", "supergat", ("model.link_weight=0",)),
     Model(
         "supergat-unsummed",
         "SuperGAT without summed messages",
