@@ -33,7 +33,6 @@ __all__ = [
     "radius_graph",
     "EDGE_FEATURES",
     "MATERIALS",
-    "VELOCITIES",
     "NodeFeatures",
     "Scale",
     "edge_features",
@@ -193,9 +192,6 @@ def _pairs_torch(x: Tensor, key: Tensor, stride: Tensor | int, radius: float) ->
     return i[near], j[near]
 
 
-VELOCITIES = 5
-"""Per-frame velocities that a particle shows, the last ones; they need one more position."""
-
 MATERIALS = 4
 """Liquid, jelly, snow, rope."""
 
@@ -230,13 +226,13 @@ class Scale(nn.Module):
         return standardised * self.std + self.mean
 
 
-def wall_distance(position: Tensor, bounds: tuple[Pair, Pair], radius: float) -> Tensor:
-    """Return the distances to the four walls over the radius, clipped to [-1, 1].
+def wall_distance(position: Tensor, bounds: tuple[Pair, Pair], reach: float) -> Tensor:
+    """Return the distances to the four walls over the reach, clipped to [-1, 1].
 
     Args:
         position: particle positions [length], shape [particle, 2].
         bounds: box (low, high) along x and y [length].
-        radius: connectivity radius [length]; a wall farther away than it looks like one at it.
+        reach: how far a wall is seen [length]; one farther away looks like one at it.
 
     Returns:
         Left, right, bottom, top; negative outside the box; shape [particle, 4].
@@ -244,7 +240,7 @@ def wall_distance(position: Tensor, bounds: tuple[Pair, Pair], radius: float) ->
     (left, right), (bottom, top) = bounds
     x, y = position.unbind(dim=-1)
     distance = torch.stack([x - left, right - x, y - bottom, top - y], dim=-1)
-    return (distance / radius).clamp(-1.0, 1.0)
+    return (distance / reach).clamp(-1.0, 1.0)
 
 
 def edge_features(position: Tensor, edge_index: Tensor, radius: float) -> Tensor:
@@ -267,30 +263,46 @@ def edge_features(position: Tensor, edge_index: Tensor, radius: float) -> Tensor
 
 
 class NodeFeatures(nn.Module):
-    """Features of a particle: 10 of motion, 4 of walls, 16 of material, 8 of moving walls if asked.
+    """Features of a particle: 2 of each velocity, 4 of walls, 16 of material, 8 of moving walls if asked.
+
+    The last velocities are shown as the last one and the changes that led to it, each over its own
+    deviation: in velocities alone the changes, of which the next is to be predicted, are hundredths.
 
     Moving walls: the per-frame velocity of each wall over the velocity scale, times
-    ``1 - distance / radius`` (0 beyond the radius), so that it acts where the wall is near.
+    ``1 - distance / reach`` (0 beyond the reach), so that it acts where the wall is near.
 
     Args:
         facts: public figures of the data set.
         velocity: standardisation of per-frame velocities.
-        radius: connectivity radius [length].
+        acceleration: standardisation of their changes.
+        reach: how far a wall is seen [length].
+        velocities: last per-frame velocities that a particle shows.
         moving_walls: whether the velocities of the walls are features too.
     """
 
-    def __init__(self, facts: Facts, velocity: Scale, radius: float, *, moving_walls: bool = False) -> None:
+    def __init__(
+        self,
+        facts: Facts,
+        velocity: Scale,
+        acceleration: Scale,
+        reach: float,
+        *,
+        velocities: int = 5,
+        moving_walls: bool = False,
+    ) -> None:
         super().__init__()
+        self.velocities = velocities
         self.velocity = velocity
+        self.acceleration = acceleration
         self.bounds = facts.bounds
-        self.radius = radius
+        self.reach = reach
         self.moving_walls = moving_walls
         self.embedding = nn.Embedding(MATERIALS, EMBEDDING)
 
     @property
     def count(self) -> int:
-        """Features of one particle: 30, or 38 with moving walls."""
-        return 2 * VELOCITIES + _WALLS + EMBEDDING + 2 * _WALLS * self.moving_walls
+        """Features of one particle: with five velocities 30, or 38 with moving walls."""
+        return 2 * self.velocities + _WALLS + EMBEDDING + 2 * _WALLS * self.moving_walls
 
     def forward(
         self, position: Tensor, velocity: Tensor, material: Tensor, wall_velocity: Tensor | None = None
@@ -299,19 +311,21 @@ class NodeFeatures(nn.Module):
 
         Args:
             position: last positions [length], shape [particle, 2].
-            velocity: last velocities, oldest first [length/frame], shape [particle, 5, 2].
+            velocity: last velocities, oldest first [length/frame], shape [particle, velocities, 2].
             material: material of each particle, int64, shape [particle].
             wall_velocity: velocity of the walls as each particle sees them [length/frame], shape
                 [particle, 4, 2]; None counts as walls at rest.
         """
-        distance = wall_distance(position, self.bounds, self.radius)
-        parts = [self.velocity(velocity).flatten(1), distance, self.embedding(material).to(position.dtype)]
+        distance = wall_distance(position, self.bounds, self.reach)
+        changes = self.acceleration(velocity.diff(dim=1)).flatten(1)
+        kind = self.embedding(material).to(position.dtype)
+        parts = [self.velocity(velocity[:, -1]), changes, distance, kind]
         if self.moving_walls:
             parts.append(self._near_walls(distance, wall_velocity).flatten(1))
         return torch.cat(parts, dim=1)
 
     def _near_walls(self, distance: Tensor, wall_velocity: Tensor | None) -> Tensor:
-        """Return the walls' velocities, faded out over the radius [1], shape [particle, 4, 2]."""
+        """Return the walls' velocities, faded out over the reach [1], shape [particle, 4, 2]."""
         if wall_velocity is None:
             return distance.new_zeros(len(distance), _WALLS, 2)
         nearness = 1.0 - distance.clamp(min=0.0)

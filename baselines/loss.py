@@ -50,7 +50,7 @@ class State:
     """What a step starts from."""
 
     position: Tensor  # last positions [length], shape [particle, 2]
-    velocity: Tensor  # last velocities, oldest first [length/frame], shape [particle, 5, 2]
+    velocity: Tensor  # last velocities, oldest first [length/frame], shape [particle, velocities, 2]
     material: Tensor  # material of each particle, int64, shape [particle]
     sample: Tensor  # window of each particle, ascending, int64, shape [particle]
     # velocity of the walls in the coming frames, the next one first [length/frame], shape

@@ -5,29 +5,35 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from lagbench.baselines.operators.operator import Losses, Operator
+from lagbench.baselines.operators.operator import Losses, Operator, summed
 
-from .layers import EdgeMLP, LayerNorm, mlp
+from .layers import EdgeMLP, mlp
 
 __all__ = ["EncodeProcessDecode", "ProcessorLayer"]
 
 
 class ProcessorLayer(nn.Module):
-    r"""One round of message passing; everything but the node update is fixed.
+    r"""One round of message passing; everything but the aggregation is fixed.
 
     .. math::
 
         m_{ij} &= \mathrm{MLP}(e_{ij}, x_i, x_j) \\
         e_{ij} &\leftarrow e_{ij} + m_{ij} \\
-        x_i &\leftarrow x_i + \mathrm{LayerNorm}(\mathrm{Operator}
-            ([x_i \Vert \textstyle\sum_j m_{ij}], m_{ij}))
+        s_i &= [x_i \Vert \textstyle\sum_j m_{ij}] \\
+        a_i &= \mathrm{Operator}(s, m)_i \\
+        x_i &\leftarrow x_i + \mathrm{LayerNorm}(\mathrm{MLP}([x_i \Vert a_i]))
+
+    MLPs have two hidden layers. Where messages are not summed, :math:`s_i = x_i`.
     """
 
-    def __init__(self, operator: type[Operator], *, latent: int, hidden: int) -> None:
+    def __init__(
+        self, operator: type[Operator], *, latent: int, hidden: int, sum_messages: bool = True
+    ) -> None:
         super().__init__()
+        self.sum_messages = sum_messages
         self.message = EdgeMLP(latent, hidden)
-        self.operator = operator(latent, hidden)
-        self.norm = LayerNorm(latent)
+        self.operator = operator((1 + sum_messages) * latent, latent, hidden)
+        self.update = mlp([2 * latent, hidden, hidden, latent])
 
     def forward(
         self, node: Tensor, edge_index: Tensor, edge: Tensor, generator: torch.Generator | None = None
@@ -41,11 +47,12 @@ class ProcessorLayer(nn.Module):
             generator: source of whatever the operator draws.
         """
         message = self.message(edge, node, edge_index)
-        incoming = torch.zeros_like(node, dtype=message.dtype).index_add_(0, edge_index[1], message)
-        update, losses = self.operator(
-            torch.cat([node, incoming], dim=-1), edge_index, message, generator=generator
-        )
-        return node + self.norm(update), edge + message, losses
+        given = node
+        if self.sum_messages:
+            given = torch.cat([node, summed(edge_index, message, len(node))], dim=-1)
+        gathered, losses = self.operator(given, edge_index, message, generator=generator)
+        update = self.update(torch.cat([node, gathered], dim=-1))
+        return node + update, edge + message, losses
 
 
 class EncodeProcessDecode(nn.Module):
@@ -65,13 +72,15 @@ class EncodeProcessDecode(nn.Module):
         latent: int = 128,
         layers: int = 10,
         hidden: int | None = None,
+        sum_messages: bool = True,
     ) -> None:
         super().__init__()
         hidden = latent if hidden is None else hidden
         self.node_encoder = mlp([node_features, hidden, hidden, latent])
         self.edge_encoder = mlp([edge_features, hidden, hidden, latent])
         self.processor = nn.ModuleList(
-            ProcessorLayer(operator, latent=latent, hidden=hidden) for _ in range(layers)
+            ProcessorLayer(operator, latent=latent, hidden=hidden, sum_messages=sum_messages)
+            for _ in range(layers)
         )
         self.decoder = mlp([latent, hidden, hidden, outputs], norm=False)
 

@@ -190,12 +190,18 @@ class _Part(BaseModel):
     training: Layer = Field(default_factory=dict)
 
 
+class _Shared(_Part):
+    """A recipe of several baselines, with what differs for some of them by name."""
+
+    baselines: dict[str, _Part] = Field(default_factory=dict)
+
+
 class _File(_Part):
     """A whole file of recipes."""
 
     format: Literal[1]
     family: str = ""
-    recipes: dict[str, _Part] = Field(default_factory=dict)
+    recipes: dict[str, _Shared] = Field(default_factory=dict)
 
 
 def recipe_names(entry: Entry) -> tuple[str, ...]:
@@ -218,6 +224,8 @@ def recipe_for(
     file = _read(path) if path else _File(format=1)
     name, part = _choose(entry, file, split, size if own_file or not variant else f"{size}-{variant}")
     model, training = _merge(file.model, part.model), _merge(file.training, part.training)
+    own = part.baselines.get(entry.name, _Part())
+    model, training = _merge(model, own.model), _merge(training, own.training)
     for setting in settings:
         group, changes = _setting(setting)
         if group == "model":
@@ -243,13 +251,13 @@ def _read(path: Path) -> _File:
         raise _complaint(error, _File, "", str(path), UnreadableFileError) from None
 
 
-def _choose(entry: Entry, file: _File, split: str, size: str) -> tuple[str, _Part]:
+def _choose(entry: Entry, file: _File, split: str, size: str) -> tuple[str, _Shared]:
     """Return the recipe for a split and size, ``*`` standing for any split."""
     for name in (f"{split}/{size}", f"{ANY}/{size}"):
         if name in file.recipes:
             return f"{split}/{size}", file.recipes[name]
     if not file.recipes:
-        return f"{split}/{size}", _Part()
+        return f"{split}/{size}", _Shared()
     raise UsageError(
         f"{entry.name} has no recipe {f'{split}/{size}'!r}",
         where="--split, --size, --recipe",
@@ -326,5 +334,5 @@ def _fields(options: type[BaseModel], path: tuple[int | str, ...]) -> list[str]:
         if isinstance(inner, type) and issubclass(inner, BaseModel):
             options = inner
         elif step == "recipes" or options is _File:
-            options = _Part
+            options = _Shared
     return list(options.model_fields)

@@ -25,15 +25,13 @@ from lagbench.errors import UsageError
 
 from .baseline import Baseline, Batch, Options
 from .facts import Facts
-from .graph import EDGE_FEATURES, VELOCITIES, NodeFeatures, Scale, edge_features, radius_graph
+from .graph import EDGE_FEATURES, NodeFeatures, Scale, edge_features, radius_graph
 from .loss import LossNorm, Motion, Scales, State, integrate, loss_terms
 from .network import EncodeProcessDecode
 from .seeding import noisy
 from .symmetry import Symmetry, draw, image
 
 __all__ = ["GraphNetwork", "GraphNetworkOptions", "LossWeights", "Target"]
-
-HISTORY = VELOCITIES + 1
 
 
 class Target(enum.StrEnum):
@@ -44,14 +42,19 @@ class Target(enum.StrEnum):
 
 
 class LossWeights(Options):
-    """Weights of Eq. 5.35; a term of weight 0 is logged and not learnt from."""
+    """Weights of Eq. 5.35; a term of weight 0 is logged and not learnt from.
 
-    acceleration: float = Field(default=1.0, ge=0.0, allow_inf_nan=False)
-    velocity: float = Field(default=1.0, ge=0.0, allow_inf_nan=False)
-    position: float = Field(default=1.0, ge=0.0, allow_inf_nan=False)
-    density: float = Field(default=1.0, ge=0.0, allow_inf_nan=False)
-    divergence: float = Field(default=1.0, ge=0.0, allow_inf_nan=False)
-    vorticity: float = Field(default=1.0, ge=0.0, allow_inf_nan=False)
+    By default those that count start between 0.01 and 1. Over one step, errors of velocity and
+    position are that of acceleration in other units, and density errors start at 1e-5: they have
+    weight 0. The thesis weighs all terms by 1.
+    """
+
+    acceleration: float = Field(default=0.5, ge=0.0, allow_inf_nan=False)
+    velocity: float = Field(default=0.0, ge=0.0, allow_inf_nan=False)
+    position: float = Field(default=0.0, ge=0.0, allow_inf_nan=False)
+    density: float = Field(default=0.0, ge=0.0, allow_inf_nan=False)
+    divergence: float = Field(default=0.1, ge=0.0, allow_inf_nan=False)
+    vorticity: float = Field(default=0.1, ge=0.0, allow_inf_nan=False)
 
 
 class GraphNetworkOptions(Options):
@@ -59,6 +62,9 @@ class GraphNetworkOptions(Options):
 
     latent: int = Field(default=128, ge=1)  # width of nodes, edges and hidden layers
     layers: int = Field(default=10, ge=1)  # processor layers
+    # whether the sums of a node's messages are inputs of its operator; not for GNS, which is the sum itself
+    sum_messages: bool = True
+    velocities: int = Field(default=5, ge=1)  # last velocities that a particle shows
     target: Target = Target.ACCELERATION  # what the network predicts
     # deviation of the noise on the last given velocity, per component [length/frame]; near the error of one
     # predicted step is good, far above it training learns to remove noise and little else
@@ -70,12 +76,13 @@ class GraphNetworkOptions(Options):
     # own steps that the loss is averaged over; gradients pass through all
     rollout_loss_steps: int = Field(default=1, ge=1)
     wall_velocity: bool = False  # whether the velocities of moving walls in the next frame are features
+    # how far a particle sees a wall [radius]; the solver's grid carries a wall's effect beyond one radius
+    wall_reach: float = Field(default=3.0, gt=0.0, allow_inf_nan=False)
     symmetry: Symmetry = Symmetry.NONE  # images that training windows are replaced by at random
     # connectivity radius [length]; the data set's when None
     radius: float | None = Field(default=None, gt=0.0, allow_inf_nan=False)
-    # keep particles of a rollout in the box, and their velocities true to that; else they may leave it.
-    # Training never clamps.
-    clamp: bool = False
+    # keep particles in the box, and their velocities true to that, in training and in rollouts
+    clamp: bool = True
 
 
 class GraphNetwork(Baseline):
@@ -100,13 +107,21 @@ class GraphNetwork(Baseline):
         self.acceleration = Scale(
             statistics["acceleration_mean"], statistics["acceleration_std"], noise=noise
         )
-        self.features = NodeFeatures(facts, self.velocity, self.radius, moving_walls=options.wall_velocity)
+        self.features = NodeFeatures(
+            facts,
+            self.velocity,
+            self.acceleration,
+            options.wall_reach * self.radius,
+            velocities=options.velocities,
+            moving_walls=options.wall_velocity,
+        )
         self.network = EncodeProcessDecode(
             self.operator,
             node_features=self.features.count,
             edge_features=EDGE_FEATURES,
             latent=options.latent,
             layers=options.layers,
+            sum_messages=options.sum_messages,
         )
         for parameter in self.network.decoder[-1].parameters():
             nn.init.zeros_(parameter)
@@ -132,8 +147,8 @@ class GraphNetwork(Baseline):
 
     @property
     def history(self) -> int:
-        """Frames given: six, of which five velocities."""
-        return HISTORY
+        """One frame more than the velocities that a particle shows."""
+        return self.options.velocities + 1
 
     @property
     def future(self) -> int:
@@ -151,9 +166,9 @@ class GraphNetwork(Baseline):
     def forward(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """Return the six terms of Eq. 5.35 and the operator's own, raw, means over the steps."""
         batch = batch if generator is None else self._disturbed(batch, generator)
-        state = self.start(batch.part(slice(HISTORY)))
+        state = self.start(batch.part(slice(self.history)))
         steps = []
-        for frame in range(HISTORY, HISTORY + self.future):
+        for frame in range(self.history, self.history + self.future):
             following, own = self.step(state, generator)
             target = batch.position[:, frame]
             velocity = target - batch.position[:, frame - 1]
@@ -167,8 +182,8 @@ class GraphNetwork(Baseline):
             matrix = draw(self.options.symmetry, batch.windows, generator)
             batch = image(batch, matrix, self.facts.bounds)
         if self.options.noise_std > 0.0:
-            position = noisy(batch.position, HISTORY, self.options.noise_std, generator)
-            batch = replace(batch, position=position)
+            position = noisy(batch.position, self.history, self.options.noise_std, generator)
+            batch = replace(batch, position=self._inside(position))
         return batch
 
     def _loss(self, state: State, following: State, position: Tensor, velocity: Tensor) -> dict[str, Tensor]:
@@ -188,15 +203,17 @@ class GraphNetwork(Baseline):
     def start(self, given: Batch) -> State:
         """Return the state after the given frames.
 
-        Where they are fewer than six, the first velocity repeats.
+        Where they are few, the first velocity repeats.
         """
         if given.frames < 2:
             raise UsageError(
-                "too few frames to start from", expected="2 or more, 6 for all", got=given.frames
+                "too few frames to start from",
+                expected=f"2 or more, {self.history} for all",
+                got=given.frames,
             )
-        position = given.position[:, -HISTORY:]
+        position = given.position[:, -self.history :]
         velocity = position.diff(dim=1)
-        missing = VELOCITIES - velocity.shape[1]
+        missing = self.options.velocities - velocity.shape[1]
         velocity = torch.cat([velocity[:, :1].expand(-1, missing, -1), velocity], dim=1)
         walls = None
         if self.options.wall_velocity and given.wall_velocity is not None:
@@ -213,18 +230,19 @@ class GraphNetwork(Baseline):
     def advance(self, state: State) -> tuple[State, Tensor]:
         """Advance by one frame: the next state and positions [length], shape [particle, 2]."""
         following, _ = self.step(state)
-        if self.options.clamp:
-            following = self._clamped(state, following)
         return following, following.position
 
     def step(self, state: State, generator: torch.Generator | None = None) -> tuple[State, Losses]:
         """Return the state one frame on and the operator's own losses."""
         output, own = self.predict(state, self.edges(state), generator)
-        last = state.velocity[:, -1]
         if self.options.target is Target.VELOCITY:
             velocity = self.velocity.inverse(output)
-            return state.moved(state.position + velocity, velocity), own
-        return state.moved(*integrate(state.position, last, self.acceleration.inverse(output))), own
+            position = state.position + velocity
+        else:
+            acceleration = self.acceleration.inverse(output)
+            position, velocity = integrate(state.position, state.velocity[:, -1], acceleration)
+        inside = self._inside(position)
+        return state.moved(inside, velocity + (inside - position).detach()), own
 
     def edges(self, state: State) -> Tensor:
         """Search the neighbours: senders and receivers, int64, shape [2, edge]."""
@@ -240,11 +258,12 @@ class GraphNetwork(Baseline):
         output: tuple[Tensor, Losses] = self.network(node, edge_index, edge, generator)
         return output
 
-    def _clamped(self, state: State, following: State) -> State:
-        """Return the next state with every particle in the box."""
-        low, high = following.position.new_tensor(self.facts.bounds).T
-        position = following.position.clamp(low, high)
-        return state.moved(position, position - state.position)
+    def _inside(self, position: Tensor) -> Tensor:
+        """Return positions in the box, with the gradient of those given: a wall would stop it."""
+        if not self.options.clamp:
+            return position
+        low, high = position.new_tensor(self.facts.bounds).T
+        return position.detach().clamp(low, high) + (position - position.detach())
 
 
 _CLASSES: dict[tuple[type[GraphNetwork], type[Operator]], type[GraphNetwork]] = {}

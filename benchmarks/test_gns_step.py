@@ -28,7 +28,7 @@ SIDES = {
     "float32, and plain first layer": CONVENTIONAL,
     "bfloat16, plain first layer": ("--precision", "bfloat16", "--edge-layer", "plain"),
 }
-OPERATORS = ("gns", "supergat", "supergat-link", "gat", "gatv2", "pointnet", "transformer")
+OPERATORS = ("gns", "supergat", "gat", "gatv2", "pointnet", "transformer")
 MINI = ("--particles", "2048", "--windows", "2", "--latent", "64", "--layers", "5", "--steps", "8")
 
 Found = dict[str, Any]

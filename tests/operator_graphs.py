@@ -11,7 +11,7 @@ from lagbench.baselines.operators.gat import GAT, GATv2
 from lagbench.baselines.operators.gns import GNS
 from lagbench.baselines.operators.operator import Operator
 from lagbench.baselines.operators.pointnet import PointNet
-from lagbench.baselines.operators.supergat import SuperGAT, SuperGATDot, SuperGATLink
+from lagbench.baselines.operators.supergat import SuperGAT, SuperGATDot
 from lagbench.baselines.operators.transformer import Transformer
 
 __all__ = ["OPERATORS", "Graph", "graph"]
@@ -20,7 +20,6 @@ OPERATORS: tuple[type[Operator], ...] = (
     GNS,
     SuperGAT,
     SuperGATDot,
-    SuperGATLink,
     GAT,
     GATv2,
     PointNet,

@@ -21,12 +21,13 @@ def generator(seed: int = 0) -> torch.Generator:
 
 
 def node_features(**options: bool) -> NodeFeatures:
-    """Return the features of the test's box, the velocity scale without noise."""
+    """Return the features of the test's box, the scales without noise."""
     statistics = facts().statistics
     torch.manual_seed(0)
-    return NodeFeatures(
-        facts(), Scale(statistics["velocity_mean"], statistics["velocity_std"]), RADIUS, **options
+    velocity, acceleration = (
+        Scale(statistics[f"{name}_mean"], statistics[f"{name}_std"]) for name in ("velocity", "acceleration")
     )
+    return NodeFeatures(facts(), velocity, acceleration, RADIUS, **options)
 
 
 def test_noise_widens_the_deviation_of_the_data() -> None:
@@ -76,13 +77,15 @@ def test_coinciding_particles_have_a_finite_gradient() -> None:
 
 
 def test_a_particle_shows_thirty_numbers() -> None:
-    """Five velocities over their deviation, oldest first, four walls, the material's embedding."""
+    """The last of five velocities and their changes, over deviations, four walls, an embedding."""
     features = node_features()
-    velocity = torch.arange(10.0).reshape(1, 5, 2) * torch.tensor([0.004, 0.003])
+    # deviations (0.004, 0.003) and (0.0002, 0.0001): changes of 1, 2, 3, 4 deviations end at 0.002 and 0.001
+    velocity = torch.tensor([0.0, 1.0, 3.0, 6.0, 10.0])[None, :, None] * torch.tensor([0.0002, 0.0001])
     shown = features(torch.tensor([[0.5, 0.5]]), velocity, torch.tensor([2]))
     assert shown.shape == (1, 30)
     assert features.count == 30
-    torch.testing.assert_close(shown[0, :10], torch.arange(10.0))
+    expected = torch.tensor([0.5, 1 / 3, 1.0, 1.0, 2.0, 2.0, 3.0, 3.0, 4.0, 4.0])
+    torch.testing.assert_close(shown[0, :10], expected)
     assert shown[0, 10:14].tolist() == [1.0] * 4
     assert torch.equal(shown[0, 14:], features.embedding.weight[2])
 

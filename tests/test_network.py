@@ -131,10 +131,9 @@ def test_layer_by_hand() -> None:
     node, edge = inputs.node.double(), inputs.edge.double()
     nodes, edges, _ = layer(node, inputs.edge_index, edge)
     message = plain(layer.message, edge, node, inputs.edge_index)
-    assert isinstance(layer.operator, GNS)
     for i in range(6):
         total = sum((message[k] for k in range(12) if inputs.edge_index[1, k] == i), torch.zeros(8))
-        expected = node[i] + layer.norm(layer.operator.update(torch.cat([node[i], total])))
+        expected = node[i] + layer.update(torch.cat([node[i], total]))
         torch.testing.assert_close(nodes[i], expected, rtol=1e-10, atol=1e-10)
     torch.testing.assert_close(edges, edge + message, rtol=1e-10, atol=1e-10)
 
@@ -222,9 +221,9 @@ class Total(Operator):
     method = "GNS + sum"
     weights = {"size": 0.5}  # noqa: RUF012
 
-    def __init__(self, latent: int, hidden: int) -> None:
-        super().__init__(latent, hidden)
-        self.linear = nn.Linear(2 * latent, latent)
+    def __init__(self, inputs: int, latent: int, hidden: int) -> None:
+        super().__init__(inputs, latent, hidden)
+        self.linear = nn.Linear(inputs, latent)
 
     def forward(
         self,
@@ -234,7 +233,7 @@ class Total(Operator):
         *,
         generator: torch.Generator | None = None,
     ) -> tuple[Tensor, Losses]:
-        """Return the update of each node and a loss of its own."""
+        """Return what each node gathers and a loss of its own."""
         heard = node.index_add(0, edge_index[1], node[edge_index[0]])
         return self.linear(heard), {"size": heard.square().mean()}
 

@@ -17,7 +17,7 @@ from lagbench.baselines.operators.gat import GAT, GATv2
 from lagbench.baselines.operators.gns import GNS
 from lagbench.baselines.operators.operator import Operator
 from lagbench.baselines.operators.pointnet import PointNet
-from lagbench.baselines.operators.supergat import SuperGAT, SuperGATDot, SuperGATLink, unlinked_pairs
+from lagbench.baselines.operators.supergat import START, SuperGAT, SuperGATDot, unlinked_pairs
 from lagbench.baselines.operators.transformer import Transformer
 
 Array = NDArray[np.float64]
@@ -33,14 +33,14 @@ def small(seed: int = 0) -> Graph:
 def built(operator: type[Operator], *, scale: float = 1.0) -> Operator:
     """Return an operator in float64 whose every weight, biases too, is random."""
     torch.manual_seed(1)
-    layer = operator(LATENT, HIDDEN).double()
+    layer = operator(2 * LATENT, LATENT, HIDDEN).double()
     for parameter in layer.parameters():
         torch.nn.init.normal_(parameter, std=scale)
     return layer
 
 
 def updated(layer: Operator, inputs: Graph) -> Array:
-    """Return the layer's update of each node."""
+    """Return what each node gathers."""
     node, edge_index, edge = inputs
     return layer(node.double(), edge_index, edge.double())[0].detach().numpy()
 
@@ -88,20 +88,26 @@ def gatv2(w: dict[str, Array], x: Array, i: int, near: list[tuple[int, Array]]) 
     return np.sum([a_j * left[j] for a_j, (j, _) in zip(a, near, strict=True)], axis=0) + w["conv.bias"]
 
 
+SCALE = START * np.sqrt(LATENT)
+"""What SuperGAT's inputs are divided by and its values multiplied by."""
+
+
 def supergat_mx(w: dict[str, Array], x: Array, i: int, near: list[tuple[int, Array]]) -> Array:
-    """Return Eqs. 5.26 and 5.27 of the thesis, MX; edges have no part in it."""
-    z = x @ w["conv.lin.weight"].T
+    """Return Eqs. 5.26 and 5.27 of the thesis, MX, of scaled inputs; edges have no part in it."""
+    z = x / SCALE @ w["conv.lin.weight"].T
     left, right = w["conv.att_l"].ravel(), w["conv.att_r"].ravel()
     gate = [1 / (1 + np.exp(-z[i] @ z[j])) for j, _ in near]
     e = [float(leaky((z[j] @ left + z[i] @ right) * g)) for g, (j, _) in zip(gate, near, strict=True)]
-    return np.sum([a * z[j] for a, (j, _) in zip(softmax(e), near, strict=True)], axis=0) + w["conv.bias"]
+    heard = np.sum([a * z[j] for a, (j, _) in zip(softmax(e), near, strict=True)], axis=0)
+    return SCALE * (heard + w["conv.bias"])
 
 
 def supergat_sd(w: dict[str, Array], x: Array, i: int, near: list[tuple[int, Array]]) -> Array:
-    """Return Eqs. 5.26 and 5.27 of the thesis, SD."""
-    z = x @ w["conv.lin.weight"].T
+    """Return Eqs. 5.26 and 5.27 of the thesis, SD, of scaled inputs."""
+    z = x / SCALE @ w["conv.lin.weight"].T
     a = softmax([float(leaky(z[i] @ z[j] / np.sqrt(LATENT))) for j, _ in near])
-    return np.sum([a_j * z[j] for a_j, (j, _) in zip(a, near, strict=True)], axis=0) + w["conv.bias"]
+    heard = np.sum([a_j * z[j] for a_j, (j, _) in zip(a, near, strict=True)], axis=0)
+    return SCALE * (heard + w["conv.bias"])
 
 
 def transformer(w: dict[str, Array], x: Array, i: int, near: list[tuple[int, Array]]) -> Array:
@@ -119,10 +125,8 @@ def transformer(w: dict[str, Array], x: Array, i: int, near: list[tuple[int, Arr
 
 
 def gns(w: dict[str, Array], x: Array, i: int, near: list[tuple[int, Array]]) -> Array:
-    """Return an MLP of two hidden layers of the node's input, in which the messages are summed."""
-    h = np.maximum(w["update.0.weight"] @ x[i] + w["update.0.bias"], 0)
-    h = np.maximum(w["update.2.weight"] @ h + w["update.2.bias"], 0)
-    return w["update.4.weight"] @ h + w["update.4.bias"]
+    """Return the sum of Sanchez-Gonzalez et al. (2020)."""
+    return np.sum([np.zeros(LATENT), *(e for _, e in near)], axis=0)
 
 
 Equation = Callable[[dict[str, Array], Array, int, list[tuple[int, Array]]], Array]
@@ -138,7 +142,7 @@ EQUATIONS: list[tuple[type[Operator], Equation, bool]] = [
 
 @pytest.mark.parametrize(("operator", "equation", "loop"), EQUATIONS)
 def test_equation(operator: type[Operator], equation: Equation, loop: bool) -> None:
-    """An update is its published equation, summed over neighbours one by one."""
+    """What a node gathers is the published equation, summed over neighbours one by one."""
     inputs, layer = small(), built(operator, scale=0.4)
     x, w = inputs.node.double().numpy(), weights(layer)
     expected = [equation(w, x, i, neighbours(inputs, i, loop=loop)) for i in range(len(x))]
@@ -157,7 +161,7 @@ def test_pointnet_is_that_of_pyg() -> None:
         local[0].bias[:] = layer.of_node.bias
     with torch.random.fork_rng():
         theirs = PointNetConv()  # Its constructor would reset the weights.
-    theirs.local_nn, theirs.global_nn = local, copy.deepcopy(layer.whole)
+    theirs.local_nn = local
     x = inputs.node.double()
     ours = layer(x, inputs.edge_index, position[sender] - position[receiver])[0]
     torch.testing.assert_close(ours, theirs(x, position, inputs.edge_index), rtol=1e-12, atol=1e-12)
@@ -179,9 +183,11 @@ def test_without_edges(operator: type[Operator]) -> None:
     """Particles without neighbours have finite updates and gradients."""
     layer = built(operator)
     alone = Graph(torch.randn(3, 2 * LATENT), torch.empty(2, 0, dtype=torch.int64), torch.empty(0, LATENT))
+    alone.edge.requires_grad_()  # a plain sum has no weights
     update, losses = layer(alone.node.double(), alone.edge_index, alone.edge.double())
-    (update.sum() + sum(losses.values())).backward()
+    total = update.sum() + sum(losses.values())
     assert update.isfinite().all()
+    total.backward()
     assert all(p.grad is None or p.grad.isfinite().all() for p in layer.parameters())
 
 
@@ -189,7 +195,8 @@ def test_without_edges(operator: type[Operator]) -> None:
 def test_bfloat16(operator: type[Operator]) -> None:
     """Under autocast an operator is itself to three digits, and learns."""
     torch.manual_seed(0)
-    inputs, layer = small(), operator(LATENT, HIDDEN)
+    inputs, layer = small(), operator(2 * LATENT, LATENT, HIDDEN)
+    inputs.edge.requires_grad_()  # a plain sum has no weights
     exact, _ = layer(*inputs)
     with torch.autocast("cpu", torch.bfloat16):
         update, losses = layer(*inputs)
@@ -213,18 +220,17 @@ def test_unlinked_pairs() -> None:
 
 def test_link_loss() -> None:
     """The link loss is the cross entropy of edges, loops and unlinked pairs (Eq. 5.28), by hand."""
-    inputs, layer = small(), built(SuperGATLink, scale=0.4)
+    inputs, layer = small(), built(SuperGAT, scale=0.4)
     _, losses = layer(
         inputs.node.double(), inputs.edge_index, inputs.edge, generator=torch.Generator().manual_seed(2)
     )
     pairs = unlinked_pairs(inputs.edge_index, 9, 12, torch.Generator().manual_seed(2)).numpy()
-    z = inputs.node.double().numpy() @ weights(layer)["conv.lin.weight"].T
+    z = inputs.node.double().numpy() / SCALE @ weights(layer)["conv.lin.weight"].T
     links = np.concatenate([inputs.edge_index.numpy(), np.tile(np.arange(9), (2, 1))], axis=1)
     likely = 1 / (1 + np.exp(-np.sum(z[links[0]] * z[links[1]], axis=1)))
     unlikely = 1 / (1 + np.exp(-np.sum(z[pairs[0]] * z[pairs[1]], axis=1)))
     expected = -np.mean(np.concatenate([np.log(likely), np.log(1 - unlikely)]))
     assert losses["link"].item() == pytest.approx(expected, rel=1e-9)
-    assert not SuperGAT(LATENT, HIDDEN)(*inputs)[1]
     assert not layer.eval()(inputs.node.double(), inputs.edge_index, inputs.edge)[1]
 
 
@@ -233,13 +239,14 @@ def test_link_loss_starts_low() -> None:
     torch.manual_seed(0)
     inputs = graph(300, 2400, node=256, edge=128)
     inputs.node[:, 128:] *= 8.0  # sums of about 8 normalised messages
-    assert 0.3 < SuperGATLink(128, 128)(*inputs)[1]["link"].item() < 3.0
+    assert 0.3 < SuperGAT(256, 128, 128)(*inputs)[1]["link"].item() < 3.0
 
 
 def test_link_loss_decreases() -> None:
     """Trained on one graph, SuperGAT learns which particles are neighbours."""
     torch.manual_seed(0)
-    inputs, layer = graph(40, 200, node=32, edge=16), SuperGATLink(16, 16)
+    inputs, layer = graph(40, 200, node=32, edge=16), SuperGAT(32, 16, 16)
+    inputs.node.mul_(8.0)  # sums of about 8 normalised messages
     source = torch.Generator().manual_seed(0)
     optimizer = torch.optim.Adam(layer.parameters(), lr=1e-2)
     course = []
@@ -254,7 +261,7 @@ def test_link_loss_decreases() -> None:
 
 def test_draws_leave_global_sources_alone() -> None:
     """Training SuperGAT draws from the given generator only, the same for the same seed."""
-    inputs, layer = small(), built(SuperGATLink, scale=0.4)
+    inputs, layer = small(), built(SuperGAT, scale=0.4)
     before = random.getstate(), torch.get_rng_state(), np.random.get_state()[1].tolist()  # noqa: NPY002
     losses = [
         layer(*map(_double, inputs), generator=torch.Generator().manual_seed(seed))[1]["link"].item()
@@ -273,7 +280,7 @@ def _double(tensor: torch.Tensor) -> torch.Tensor:
 
 def test_nothing_stays_on_the_layer() -> None:
     """A trained layer can be copied: no graph of gradients hangs on it."""
-    layer = built(SuperGATLink)
+    layer = built(SuperGAT)
     layer(*map(_double, small()))
     copied = copy.deepcopy(layer)
     assert all(torch.equal(a, b) for a, b in zip(layer.parameters(), copied.parameters(), strict=True))

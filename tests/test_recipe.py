@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -22,6 +23,7 @@ recipes:
   cavity/tiny: {training: {steps: 7}}
   cavity/tiny-long: {model: {start: 2.0}, training: {steps: 70, schedule: {every: 10}}}
   "*/mini": {training: {learning_rate: 1.0e-2}}
+  fluid/full: {model: {start: 1.0}, training: {steps: 8}, baselines: {other: {training: {steps: 9}}}}
 """
 
 
@@ -49,11 +51,14 @@ def test_every_recipe_is_right(name: str) -> None:
 
 
 def test_operators_share_their_recipes() -> None:
-    """The six operators have one recipe: the same model options, steps, batch and rate."""
+    """The six operators have one recipe on every split; they differ in the steps alone, by their cost."""
     operators = ("gns", "supergat", "gat", "gatv2", "pointnet", "transformer")
-    for size in ("tiny", "mini", "full"):
-        found = [recipe_for(find(name), "cavity", size) for name in operators]
-        assert all(one.model == found[0].model and one.training == found[0].training for one in found)
+    for split in ("cavity", "curl-noise", "fluid", "multimaterial"):
+        for size in ("tiny", "mini", "full"):
+            found = [recipe_for(find(name), split, size) for name in operators]
+            budgets = [one.training.model_copy(update={"steps": 1}) for one in found]
+            assert all(one.model == found[0].model for one in found)
+            assert all(one == budgets[0] for one in budgets)
 
 
 def test_layers(entry: Entry) -> None:
@@ -79,6 +84,13 @@ def test_any_split(entry: Entry) -> None:
     """A star stands for every split; the recipe is named after the split that was asked for."""
     recipe = recipe_for(entry, "fluid", "mini")
     assert (recipe.name, recipe.training.learning_rate) == ("fluid/mini", 0.01)
+
+
+def test_a_baseline_among_others(entry: Entry) -> None:
+    """Of baselines that share a recipe, one has what is said of it by name beside what all have."""
+    for name, steps in (("drift", 8), ("other", 9)):
+        recipe = recipe_for(replace(entry, name=name), "fluid", "full")
+        assert (recipe.model["start"], recipe.training.steps, recipe.training.batch) == (1.0, steps, 4)
 
 
 def test_own_file(entry: Entry, tmp_path: Path) -> None:
@@ -119,7 +131,7 @@ def test_no_such_recipe(entry: Entry) -> None:
     with pytest.raises(UsageError, match="did you mean 'cavity/tiny-long'"):
         recipe_for(entry, "cavity", "tiny", variant="lon")
     with pytest.raises(UsageError, match="cavity/tiny"):
-        recipe_for(entry, "fluid", "full")
+        recipe_for(entry, "curl-noise", "full")
 
 
 @pytest.mark.parametrize(
@@ -128,6 +140,7 @@ def test_no_such_recipe(entry: Entry) -> None:
         ("{format: 2, recipes: {}}", "format"),
         ("{format: 1, receipts: {}}", "did you mean 'recipes'"),
         ("{format: 1, recipes: {a/b: {modell: {}}}}", "did you mean 'model'"),
+        ("{format: 1, recipes: {a/b: {baselines: {gns: {trainin: {}}}}}}", "did you mean 'training'"),
         ("[1, 2]", "dictionary"),
         ("{format: 1, a: &x 1, b: *x}", "aliases"),
     ],

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from graph_cases import batch, facts, jittered, network, oracle, rolled, swirl
+from graph_cases import RADIUS, SMALL, batch, facts, jittered, network, oracle, rolled, swirl
 from pydantic import ValidationError
 
 from lagbench.baselines.loss import State, integrate
@@ -176,10 +176,10 @@ def test_walls_that_rest_are_no_features() -> None:
         network(wall_velocity=True, changes={"moving_walls": False})
 
 
-def test_particles_leave_the_box_unless_told_otherwise() -> None:
-    """A particle that flies out keeps flying; with clamp it stops at the wall and its velocity says so."""
+def test_particles_stay_in_the_box_unless_told_otherwise() -> None:
+    """A particle that flies out stops at the wall and its velocity says so; without clamp it flies on."""
     flight = np.array([[[0.93 - 0.004 * (5 - f), 0.5 + 0.001 * f]] for f in range(6)])
-    free, kept = network(), network(clamp=True)
+    free, kept = network(clamp=False), network()
     assert float(rolled(free, batch(flight), 3)[0, -1, 0]) == pytest.approx(0.942, abs=1e-6)
     state = kept.start(batch(flight))
     places = []
@@ -190,6 +190,75 @@ def test_particles_leave_the_box_unless_told_otherwise() -> None:
     assert places == pytest.approx([0.934, 0.9375, 0.9375], abs=1e-6)
     assert float(state.velocity[0, -1, 0]) == pytest.approx(0.0, abs=1e-7)
     assert float(state.velocity[0, -1, 1]) == pytest.approx(0.001, abs=1e-6)
+
+
+@pytest.mark.parametrize("target", ["acceleration", "velocity"])
+def test_no_rollout_leaves_the_box(target: str) -> None:
+    """Whatever a network says: of 256 particles over 30 frames none is outside."""
+    model = network(awake=True, target=target)
+    torch.nn.init.normal_(model.network.decoder[-1].bias, std=50.0)
+    found = rolled(model, batch(swirl(0, 6)), 30)
+    low, high = torch.tensor(facts().bounds).T
+    assert bool(((found >= low) & (found <= high)).all())
+    assert bool(((found == low) | (found == high)).any())  # some did try
+
+
+def test_noise_stays_in_the_box() -> None:
+    """Particles that rest at a wall are disturbed to its inner side only."""
+    resting = np.repeat([[[0.9375, 0.3 + 0.05 * i] for i in range(8)]], 7, axis=0)
+    starts: list[torch.Tensor] = []
+
+    class Watched(GraphNetwork):
+        operator, method = GNS, "watched"
+
+        def predict(self, state: State, *_: object) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+            starts.append(state.position[:, 0])
+            return torch.zeros_like(state.position), {}
+
+    model = Watched.build(SMALL | {"noise_std": 1e-3}, facts())
+    model(batch(resting), torch.Generator().manual_seed(0))
+    assert float(starts[0].max()) == 0.9375
+    assert float(starts[0].min()) < 0.9375
+
+
+def test_a_wall_passes_gradients_on() -> None:
+    """A prediction that a wall stops learns to stop before it, where the truth does."""
+    arriving = np.array([[[0.9275 + 0.002 * f, 0.5]] for f in range(6)] + [[[0.936, 0.5]]])
+    model = network()
+    (slope,) = torch.autograd.grad(model(batch(arriving))["acceleration"], model.network.decoder[-1].bias)
+    assert float(rolled(model, batch(arriving[:6]), 1)[0, 0, 0]) == 0.9375
+    # The stopped position is 0.0015 off: 2 e / std^2, times the std that outputs are multiplied by.
+    assert float(slope[0]) == pytest.approx(2 * 0.0015 / 0.0002, rel=1e-3)
+
+
+def test_forcing_of_the_next_frame_moves_particles_near_walls() -> None:
+    """Another wall velocity in the coming frame changes the step near walls, in an older frame nothing."""
+    window = batch(np.repeat(jittered(0)[None], 7, axis=0), walls=True)
+    assert window.wall_velocity is not None
+    model = network(awake=True, layers=1, wall_velocity=True, wall_reach=1.0)
+    found = []
+    for frame in (None, 5, 6):
+        walls = window.wall_velocity.clone()
+        if frame is not None:
+            walls[:, frame] *= -3.0
+        with torch.no_grad():
+            state, _ = model.step(model.start(replace(window, wall_velocity=walls).part(slice(6))))
+        found.append(state.position)
+    assert torch.equal(found[0], found[1])
+    changed = (found[0] - found[2]).abs().amax(dim=1) > 0
+    low, high = torch.tensor(facts().bounds).T
+    place = window.position[:, 5]
+    near = torch.minimum(place - low, high - place).amin(dim=1)
+    assert bool(changed[near < 0.9 * RADIUS].all())
+    assert not bool(changed[near > 2.0 * RADIUS].any())  # one layer: a neighbour's wall at most
+
+
+def test_velocities_shown_are_the_last_ones() -> None:
+    """A model of one velocity sees two frames and starts from two, in training and in rollouts."""
+    model = network(awake=True, velocities=1)
+    assert (model.history, model.features.count) == (2, 22)
+    given = batch(swirl(0, 6))
+    assert torch.equal(rolled(model, given, 2), rolled(model, given.part(slice(4, 6)), 2))
 
 
 def test_options_are_checked() -> None:

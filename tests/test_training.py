@@ -123,7 +123,7 @@ def test_the_record(run: Run) -> None:
     assert list((result.folder / "tensorboard").iterdir())
 
 
-@pytest.mark.parametrize("baseline", ["supergat-link", "neuralmpm", "drift"])
+@pytest.mark.parametrize("baseline", ["supergat", "neuralmpm", "drift"])
 def test_resumed_equals_uninterrupted(run: Run, baseline: str, tmp_path: Path) -> None:
     """Interrupted twice and resumed, a training ends with the bits of an uninterrupted one."""
     settings = ("steps=7", "validate_every=3", "schedule=cosine")

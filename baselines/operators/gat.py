@@ -22,18 +22,18 @@ class GAT(Operator):
 
     .. math::
 
-        x_i' &= \sum_{j \in N(i) \cup \{i\}} \alpha_{ij} \Theta x_j \\
+        a_i &= \sum_{j \in N(i) \cup \{i\}} \alpha_{ij} \Theta s_j \\
         \alpha_{ij} &= \mathrm{softmax}_j\,\mathrm{LeakyReLU}(
-            a_r^T \Theta x_i + a_s^T \Theta x_j + a_e^T \Theta_e m_{ij})
+            b_r^T \Theta s_i + b_s^T \Theta s_j + b_e^T \Theta_e m_{ij})
 
     The edge of a particle with itself is the mean of those that it receives.
     """
 
     method = "GNS + GATConv"
 
-    def __init__(self, latent: int, hidden: int) -> None:
-        super().__init__(latent, hidden)
-        self.conv = GATConv(2 * latent, latent, edge_dim=latent)
+    def __init__(self, inputs: int, latent: int, hidden: int) -> None:
+        super().__init__(inputs, latent, hidden)
+        self.conv = GATConv(inputs, latent, edge_dim=latent)
 
     def forward(
         self,
@@ -43,7 +43,7 @@ class GAT(Operator):
         *,
         generator: torch.Generator | None = None,
     ) -> tuple[Tensor, Losses]:
-        """Return the update of each node."""
+        """Return what each node gathers."""
         return self.conv(node, edge_index, edge), {}
 
 
@@ -52,18 +52,18 @@ class GATv2(Operator):
 
     .. math::
 
-        x_i' &= \sum_{j \in N(i) \cup \{i\}} \alpha_{ij} \Theta_s x_j \\
-        \alpha_{ij} &= \mathrm{softmax}_j\,a^T \mathrm{LeakyReLU}(
-            \Theta_r x_i + \Theta_s x_j + \Theta_e m_{ij})
+        a_i &= \sum_{j \in N(i) \cup \{i\}} \alpha_{ij} \Theta_s s_j \\
+        \alpha_{ij} &= \mathrm{softmax}_j\,b^T \mathrm{LeakyReLU}(
+            \Theta_r s_i + \Theta_s s_j + \Theta_e m_{ij})
 
     The edge of a particle with itself is the mean of those that it receives.
     """
 
     method = "GNS + GATv2Conv"
 
-    def __init__(self, latent: int, hidden: int) -> None:
-        super().__init__(latent, hidden)
-        self.conv = GATv2Conv(2 * latent, latent, edge_dim=latent)
+    def __init__(self, inputs: int, latent: int, hidden: int) -> None:
+        super().__init__(inputs, latent, hidden)
+        self.conv = GATv2Conv(inputs, latent, edge_dim=latent)
 
     def forward(
         self,
@@ -73,5 +73,5 @@ class GATv2(Operator):
         *,
         generator: torch.Generator | None = None,
     ) -> tuple[Tensor, Losses]:
-        """Return the update of each node."""
+        """Return what each node gathers."""
         return self.conv(node, edge_index, edge), {}

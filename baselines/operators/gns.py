@@ -1,13 +1,11 @@
-"""GNS: an MLP of a node and the sum of its messages."""
+"""GNS: the sum of a node's messages."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from lagbench.baselines.layers import mlp
-
-from .operator import Losses, Operator
+from .operator import Losses, Operator, summed
 
 __all__ = ["GNS"]
 
@@ -15,14 +13,13 @@ __all__ = ["GNS"]
 class GNS(Operator):
     r"""The interaction network of Sanchez-Gonzalez et al. (2020).
 
-    .. math:: x_i' = \mathrm{MLP}([x_i \Vert \textstyle\sum_j m_{ij}])
+    .. math:: a_i = \sum_j m_{ij}
+
+    With the network's node MLP: :math:`x_i' = \mathrm{MLP}([x_i \Vert \textstyle\sum_j m_{ij}])`. It gathers
+    the same with the option ``sum_messages: false``, which changes other operators' node inputs.
     """
 
     method = "GNS"
-
-    def __init__(self, latent: int, hidden: int) -> None:
-        super().__init__(latent, hidden)
-        self.update = mlp([2 * latent, hidden, hidden, latent], norm=False)
 
     def forward(
         self,
@@ -32,5 +29,5 @@ class GNS(Operator):
         *,
         generator: torch.Generator | None = None,
     ) -> tuple[Tensor, Losses]:
-        """Return the update of each node."""
-        return self.update(node), {}
+        """Return what each node gathers."""
+        return summed(edge_index, edge, len(node)), {}

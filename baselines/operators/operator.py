@@ -1,4 +1,4 @@
-"""The contract of an operator: the node update of one processor layer."""
+"""The contract of an operator: how a particle gathers what its neighbours tell it."""
 
 from __future__ import annotations
 
@@ -9,29 +9,31 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-__all__ = ["Losses", "Operator"]
+__all__ = ["Losses", "Operator", "summed"]
 
 Losses = Mapping[str, Tensor]
 """Losses of an operator's own by name, each a scalar."""
 
 
 class Operator(nn.Module):
-    """A node update; LayerNorm and residual follow it in the network.
+    """An aggregation; node MLP, LayerNorm and residual follow it in the network.
 
     Class attributes:
         method: what the board calls a graph network with this operator.
         weights: weight of each of its own losses in training.
 
     Args:
-        latent: width of a node and of an edge.
+        inputs: width of a node's input.
+        latent: width of an edge and of what is gathered.
         hidden: width of hidden layers, if it has any.
     """
 
     method: ClassVar[str]
     weights: ClassVar[Mapping[str, float]] = {}
 
-    def __init__(self, latent: int, hidden: int) -> None:
+    def __init__(self, inputs: int, latent: int, hidden: int) -> None:
         super().__init__()
+        self.inputs = inputs
         self.latent = latent
         self.hidden = hidden
 
@@ -44,15 +46,20 @@ class Operator(nn.Module):
         *,
         generator: torch.Generator | None = None,
     ) -> tuple[Tensor, Losses]:
-        """Return the update of each node, and losses of its own if any.
+        """Return what each node gathers, and losses of its own if any.
 
         Args:
-            node: latent of each particle beside the sum of the updates of the edges that it
-                receives, shape [particle, 2 latent].
+            node: latent of each particle, by default beside the sum of the updates of the edges
+                that it receives, shape [particle, inputs].
             edge_index: senders and receivers, shape [2, edge].
             edge: update of each edge, shape [edge, latent].
             generator: source of random numbers; None asks for the same draw every time.
 
         Returns:
-            Update, shape [particle, latent]; losses by name.
+            What is gathered, shape [particle, latent]; losses by name.
         """
+
+
+def summed(edge_index: Tensor, edge: Tensor, nodes: int) -> Tensor:
+    """Return the sum of the edges that each node receives, shape [node, latent]."""
+    return edge.new_zeros(nodes, edge.shape[1]).index_add_(0, edge_index[1], edge)

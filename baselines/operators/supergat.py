@@ -10,14 +10,14 @@ from torch_geometric.nn import SuperGATConv
 
 from .operator import Losses, Operator
 
-__all__ = ["SuperGAT", "SuperGATDot", "SuperGATLink", "unlinked_pairs"]
+__all__ = ["SuperGAT", "SuperGATDot", "unlinked_pairs"]
 
 
 START = 4.0
-"""Where links are learnt, Theta starts smaller than Glorot's by this times the root of its width.
+"""Links and attention see inputs over this times the root of the latent width, values are multiplied by it.
 
-Logits of links then start near 1, not near 2000, where the sigmoid is flat and the link loss
-drowns the others; the scale of values is the LayerNorm's, which follows.
+Logits of links then start near 1, not near 1000, where the sigmoid is flat, the link loss drowns the
+others and one neighbour has all the attention.
 """
 
 
@@ -44,26 +44,29 @@ def unlinked_pairs(
 
 
 class SuperGAT(Operator):
-    r"""Self-supervised graph attention of Kim and Oh (2021): PyG's SuperGATConv, MX.
+    r"""Self-supervised graph attention of Kim and Oh (2021): PyG's SuperGATConv, MX, with its link loss.
 
     .. math::
 
-        x_i' &= \sum_{j \in N(i) \cup \{i\}} \alpha_{ij} \Theta x_j \\
+        a_i &= k \sum_{j \in N(i) \cup \{i\}} \alpha_{ij} \Theta z_j, \quad z = s / k \\
         \alpha_{ij} &= \mathrm{softmax}_j\,\mathrm{LeakyReLU}(
-            a^T [\Theta x_i \Vert \Theta x_j] \cdot \sigma((\Theta x_i)^T \Theta x_j))
+            b^T [\Theta z_i \Vert \Theta z_j] \cdot \sigma((\Theta z_i)^T \Theta z_j))
 
-    Source: Eqs. 5.26 and 5.27. Its link prediction (Eq. 5.28) is not trained: Eq. 5.35 has no
-    such term. :class:`SuperGATLink` trains it.
+    Source: Eqs. 5.26 to 5.28. The cross entropy of Eq. 5.28 over edges, loops and drawn unlinked
+    pairs is a term of the loss, weight 1; with the option ``link_weight`` 0 it is not learnt from.
+    k is 1 in the thesis; here it makes the start sound (:data:`START`).
     """
 
     method = "GNS + SuperGATConv"
+    weights: ClassVar[dict[str, float]] = {"link": 1.0}
     attention: ClassVar[str] = "MX"
     negatives: ClassVar[float] = 0.5
     """Unlinked pairs drawn for each edge."""
 
-    def __init__(self, latent: int, hidden: int) -> None:
-        super().__init__(latent, hidden)
-        self.conv = SuperGATConv(2 * latent, latent, attention_type=self.attention)
+    def __init__(self, inputs: int, latent: int, hidden: int) -> None:
+        super().__init__(inputs, latent, hidden)
+        self.scale = START * latent**0.5
+        self.conv = SuperGATConv(inputs, latent, attention_type=self.attention)
 
     def forward(
         self,
@@ -73,39 +76,25 @@ class SuperGAT(Operator):
         *,
         generator: torch.Generator | None = None,
     ) -> tuple[Tensor, Losses]:
-        """Return the update of each node, and the link loss while it is trained."""
-        if not (self.training and "link" in self.weights):
-            self.conv.training = False  # PyG would draw pairs from Python's global source.
-            return self.conv(node, edge_index), {}
-        self.conv.training = True
+        """Return what each node gathers, and the link loss in training."""
+        node = node / self.scale
+        self.conv.training = self.training
+        if not self.training:
+            return self.scale * self.conv(node, edge_index), {}
         count = int(self.negatives * edge_index.shape[1])
+        # Given pairs: PyG would draw its own from Python's global source.
         pairs = unlinked_pairs(edge_index, len(node), count, generator)
-        update = self.conv(node, edge_index, pairs)
+        gathered = self.scale * self.conv(node, edge_index, pairs)
         loss = self.conv.get_attention_loss()
         self.conv.att_x = self.conv.att_y = None  # They would hold the whole graph of gradients.
-        return update, {"link": loss}
+        return gathered, {"link": loss}
 
 
 class SuperGATDot(SuperGAT):
     r"""SuperGAT whose attention is the scaled dot product, SD.
 
-    .. math:: \alpha_{ij} = \mathrm{softmax}_j\,\mathrm{LeakyReLU}((\Theta x_i)^T \Theta x_j / \sqrt{d})
+    .. math:: \alpha_{ij} = \mathrm{softmax}_j\,\mathrm{LeakyReLU}((\Theta z_i)^T \Theta z_j / \sqrt{d})
     """
 
     method = "GNS + SuperGATConv (SD)"
     attention = "SD"
-
-
-class SuperGATLink(SuperGAT):
-    """SuperGAT with its link prediction in the loss, weight 1, and a smaller start.
-
-    With ``link_weight`` 0 only the start differs from :class:`SuperGAT`.
-    """
-
-    method = "GNS + SuperGATConv + link loss"
-    weights: ClassVar[dict[str, float]] = {"link": 1.0}
-
-    def __init__(self, latent: int, hidden: int) -> None:
-        super().__init__(latent, hidden)
-        with torch.no_grad():
-            self.conv.lin.weight /= START * latent**0.5

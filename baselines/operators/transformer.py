@@ -16,16 +16,16 @@ class Transformer(Operator):
 
     .. math::
 
-        x_i' &= W_1 x_i + \sum_{j \in N(i)} \alpha_{ij} (W_2 x_j + W_5 m_{ij}) \\
+        a_i &= W_1 s_i + \sum_{j \in N(i)} \alpha_{ij} (W_2 s_j + W_5 m_{ij}) \\
         \alpha_{ij} &= \mathrm{softmax}_j
-            \frac{(W_3 x_i)^T (W_4 x_j + W_5 m_{ij})}{\sqrt{d}}
+            \frac{(W_3 s_i)^T (W_4 s_j + W_5 m_{ij})}{\sqrt{d}}
     """
 
     method = "GNS + TransformerConv"
 
-    def __init__(self, latent: int, hidden: int) -> None:
-        super().__init__(latent, hidden)
-        self.conv = TransformerConv(2 * latent, latent, edge_dim=latent)
+    def __init__(self, inputs: int, latent: int, hidden: int) -> None:
+        super().__init__(inputs, latent, hidden)
+        self.conv = TransformerConv(inputs, latent, edge_dim=latent)
 
     def forward(
         self,
@@ -35,5 +35,5 @@ class Transformer(Operator):
         *,
         generator: torch.Generator | None = None,
     ) -> tuple[Tensor, Losses]:
-        """Return the update of each node."""
+        """Return what each node gathers."""
         return self.conv(node, edge_index, edge), {}

@@ -38,7 +38,7 @@ _VORTICITY = Figure(
     name="",
     title="Vorticity errors at frame 54",
     draw=tables.vorticity,
-    needs={"cavity": (*OPERATORS, "supergat-link")},
+    needs={"cavity": OPERATORS},
     said="It is another flow than the thesis's. Vorticity is per frame; its units are taken to be the same.",
 )
 _BARS = replace(_VORTICITY, draw=tables.vorticity_bars, needs={"cavity": OPERATORS}, said="")

@@ -54,7 +54,7 @@ CLAIMS = (
     ),
     Claim(
         question="Does SuperGAT's link loss help, at the same start and seeds?",
-        first="supergat-link",
+        first="supergat",
         rivals=("supergat-unlinked",),
         at_key_frame=("vorticity_pearson",),
     ),
@@ -71,9 +71,36 @@ CLAIMS = (
         rivals=("supergat-unsummed",),
     ),
     Claim(
+        question="Is MX attention better than SD (Eq. 5.27 has both)?",
+        first="supergat",
+        rivals=("supergat-sd",),
+    ),
+    Claim(
+        question="Is acceleration a better target than velocity (section 5.9.3)?",
+        first="gns",
+        rivals=("gns-velocity",),
+        at_key_frame=("vorticity_pearson",),
+    ),
+    Claim(
+        question="Is L2 better than L1 as the norm of the loss (the thesis chooses L2)?",
+        first="gns",
+        rivals=("gns-l1",),
+    ),
+    Claim(
+        question="Does a weight of the vorticity loss ten times as large help?",
+        first="gns-tenfold",
+        rivals=("gns",),
+        at_key_frame=("vorticity_pearson",),
+    ),
+    Claim(
+        question="Does a loss over three own steps help (section 6.2), at the same processor time?",
+        first="gns-unrolled",
+        rivals=("gns",),
+    ),
+    Claim(
         question="Graph or grid: is neuralmpm better than every operator?",
         first="neuralmpm",
-        rivals=(*OPERATORS, "supergat-link"),
+        rivals=OPERATORS,
     ),
     Claim(
         question="Does LSTM + MLP come first among the frame models (Table 4.8: it does)?",

@@ -134,7 +134,7 @@ of the cavity at frame 54. MAE and RMSE [1/frame], divergence of the magnitudes 
 correlation."""
 
 OPERATORS = tuple(TABLE_5_4)
-"""The six operators, as in the thesis without a link loss."""
+"""The six operators."""
 
 STATISTICS: Mapping[str, Mapping[str, tuple[float, float]]] = MappingProxyType(
     {
@@ -198,15 +198,23 @@ _MODELS = (
     Model("gns", "GNS", "#b0569a"),
     Model("gatv2", "GATv2", "#0072b2"),
     Model("transformer", "graph transformer", "#e69f00"),
-    Model("supergat-link", "SuperGAT with link loss", "#8c3b00"),
+    Model("supergat-unlinked", "SuperGAT without link loss", "#d9a46a", "supergat", ("model.link_weight=0",)),
     Model(
-        "supergat-unlinked",
-        "SuperGAT with link loss of weight 0",
-        "#d9a46a",
-        "supergat-link",
-        ("model.link_weight=0",),
+        "supergat-unsummed",
+        "SuperGAT without summed messages",
+        "#8c3b00",
+        "supergat",
+        ("model.sum_messages=false",),
     ),
+    Model("supergat-sd", "SuperGAT, scaled dot product"),
     Model("gns-novorticity", "GNS without vorticity loss", "#e3b4d6", "gns", ("model.loss.vorticity=0",)),
+    Model(
+        "gns-tenfold", "GNS, ten times the vorticity loss", varied="gns", settings=("model.loss.vorticity=1",)
+    ),
+    Model("gns-velocity", "GNS of velocities", varied="gns", settings=("model.target=velocity",)),
+    Model("gns-l1", "GNS, L1 loss", varied="gns", settings=("model.loss_norm=l1",)),
+    Model("gns-unrolled", "GNS, loss over three steps", varied="gns", recipe="unrolled"),
+    Model("neuralmpm", "NeuralMPM", "#000000"),
     Model("mlp", "MLP", "#0072b2"),
     Model("lstm", "LSTM", "#009e73"),
     Model("lstm-mlp", "LSTM + MLP", "#d55e00"),
@@ -220,13 +228,22 @@ _MODELS = (
 ROSTER: Mapping[str, Model] = MappingProxyType({model.name: model for model in _MODELS})
 """Models by name."""
 
-_GRAPHS = (*OPERATORS, "supergat-link", "supergat-unlinked", "gns-novorticity", "mlp", "lstm-mlp")
-_FRAMES = (*FRAME_MODELS, "var", "var-stable")
+_EVERYWHERE = ("neuralmpm", *OPERATORS, *FRAME_MODELS, "var", "var-stable")
+_ABLATIONS = ("supergat-unlinked", "supergat-unsummed", "gns-novorticity")
+_STUDIES = ("gns-velocity", "gns-l1", "gns-tenfold", "gns-unrolled", "supergat-sd")
 
 EXPECTED: Mapping[str, tuple[str, ...]] = MappingProxyType(
-    {"cavity": _GRAPHS, "curl-noise": _GRAPHS, "fluid": _FRAMES, "multimaterial": _FRAMES}
+    {
+        "cavity": (*_EVERYWHERE, *_ABLATIONS),
+        "curl-noise": (*_EVERYWHERE, *_ABLATIONS, *_STUDIES),
+        "fluid": _EVERYWHERE,
+        "multimaterial": _EVERYWHERE,
+    }
 )
-"""Names by split, in the order in which they are trained; other variants are shown where they are."""
+"""Names by split, in the order in which they are trained; other variants are shown where they are.
+
+The studies of sections 5.6.2, 5.9.3 and 6.2 are rows of curl-noise, the split of section 5.9.3.
+"""
 
 
 def label(name: str | None) -> str:

@@ -1,4 +1,4 @@
-"""GraphSAGE as a node update: a graph network of one's own."""
+"""GraphSAGE as an aggregation: a graph network of one's own."""
 
 from torch import Generator, Tensor
 from torch_geometric.nn import SAGEConv
@@ -11,12 +11,12 @@ class Sage(Operator):
 
     method = "GNS + SAGEConv"
 
-    def __init__(self, latent: int, hidden: int) -> None:
-        super().__init__(latent, hidden)
-        self.conv = SAGEConv(2 * latent, latent)
+    def __init__(self, inputs: int, latent: int, hidden: int) -> None:
+        super().__init__(inputs, latent, hidden)
+        self.conv = SAGEConv(inputs, latent)
 
     def forward(
         self, node: Tensor, edge_index: Tensor, edge: Tensor, *, generator: Generator | None = None
     ) -> tuple[Tensor, Losses]:
-        """Return the update of each node, and no loss of its own."""
+        """Return what each node gathers, and no loss of its own."""
         return self.conv(node, edge_index), {}
