@@ -65,12 +65,12 @@ def test_the_board_comes_first(plan: Plan, tmp_path: Path) -> None:
     board, weights = tmp_path / "board", tmp_path / "weights"
     entry = board / "submissions" / SPLIT / SIZE / "gns.yaml"
     scores = board / "scores" / SPLIT / SIZE / "gns.nc"
-    for path in (entry, scores, weights / SPLIT / SIZE / "gns-0.json"):
+    for path in (entry, scores, weights / SPLIT / SIZE / "gns_0.json"):
         path.parent.mkdir(parents=True, exist_ok=True)
     shutil.copy(plan.home(SPLIT) / "gat-0" / "scores.nc", scores)
     cost = "{seconds_per_frame: 0.1, device: here, solver_seconds_per_frame: 0.05}"
     entry.write_text(f"predictions: [{{seed: 0}}]\nparameters: 7\ncost: {cost}\n")
-    (weights / SPLIT / SIZE / "gns-0.json").write_text(json.dumps({"cpu_seconds": 3600.0}))
+    (weights / SPLIT / SIZE / "gns_0.json").write_text(json.dumps({"cpu_seconds": 3600.0}))
     sources = Sources(board=board, weights=weights, runs=plan.runs, registry=plan.described)
     held = Evidence(sources, SPLIT, SIZE).methods
     assert held["gns"].seeds[0].path == scores
@@ -133,7 +133,7 @@ def test_the_page_tells_what_there_is(sources: Sources) -> None:
 def test_what_is_missing_is_listed_with_its_command(plan: Plan, tmp_path: Path) -> None:
     """Where entries are missing stands the command; a training whose predictions were refused is no gap."""
     (tmp_path / SPLIT / SIZE).mkdir(parents=True)
-    (tmp_path / SPLIT / SIZE / "mlp-0.json").write_text("{}")
+    (tmp_path / SPLIT / SIZE / "mlp_0.json").write_text("{}")
     sources = Sources(board=None, weights=tmp_path, runs=plan.runs, registry=plan.described)
     missing = results.render(sources, (SIZE,)).split("## Missing")[1].splitlines()
     refused, absent = (

@@ -182,7 +182,7 @@ def test_committed_weights_are_shown_without_training(
     made, weights = tmp_path / "runs" / SPLIT / "tiny" / "supergat-0", tmp_path / "weights" / SPLIT / "tiny"
     assert reproduce(*ONLY, "--set", "training.steps=1") == 0
     weights.mkdir(parents=True)
-    for source, target in (("weights.pt", "supergat-3.pt"), ("training.json", "supergat-3.json")):
+    for source, target in (("weights.pt", "supergat_3.pt"), ("training.json", "supergat_3.json")):
         (made / source).rename(weights / target)
     expected = read_statistics(made / "scores.nc").predictions_sha256
     shutil.rmtree(tmp_path / "runs")
@@ -208,7 +208,7 @@ def test_nothing_is_made_without_training_and_weights(reproduce: Reproduce, tmp_
 
 def test_unusable_committed_weights_leave_nothing(reproduce: Reproduce, tmp_path: Path) -> None:
     """Damaged weights end with exit code 3, and no run that a later training would take for its own."""
-    weights = tmp_path / "weights" / SPLIT / "tiny" / "supergat-0.pt"
+    weights = tmp_path / "weights" / SPLIT / "tiny" / "supergat_0.pt"
     weights.parent.mkdir(parents=True)
     weights.write_bytes(b"no weights")
     assert reproduce(*ONLY, "--no-training", "--weights", str(tmp_path / "weights")) == 3

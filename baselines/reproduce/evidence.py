@@ -1,7 +1,7 @@
 """What is known of each model: scores, costs, training; from the leaderboard and from runs.
 
 The committed files suffice: entries and score files of ``leaderboard/``, and what each training recorded,
-``<weights>/<split>/<size>/<name>-<seed>.json``. Folders of runs, ``runs/<split>/<size>/<name>-<seed>/``, add
+``<weights>/<split>/<size>/<name>_<seed>.json``. Folders of runs, ``runs/<split>/<size>/<name>-<seed>/``, add
 what is not committed yet. A *name* is that of a baseline, or of a baseline and a variant, as in
 ``gns-novorticity``.
 """
@@ -32,8 +32,8 @@ from lagbench.scoring.task import ranking_metric
 __all__ = ["BOARD", "WEIGHTS", "Cost", "Evidence", "Method", "Seeded", "Sources", "ordered", "read_json"]
 
 BOARD = Path("leaderboard")
-WEIGHTS = Path("baselines/weights")
-"""Where committed weights and the records of their trainings lie; the one place that names it."""
+WEIGHTS = BOARD / "weights"
+"""Where committed weights and the records of their trainings lie, as `lagbench submit --weights` put them."""
 
 RUN = re.compile(r"([a-z0-9]+(?:-[a-z0-9]+)*?)-(\d+)")
 RECORD_NAME = "training.json"
@@ -160,7 +160,7 @@ class Sources:
 
     def record(self, split: str, size: str, name: str, seed: int | None) -> Mapping[str, Any]:
         """Return what a committed training recorded; nothing where it is not there."""
-        return read_json(self.weights / split / size / f"{name}-{seed or 0}.json")
+        return read_json(self.weights / split / size / f"{name}_{seed or 0}.json")
 
     def run_folders(self, split: str, size: str) -> Iterator[tuple[str, int, Path]]:
         """Yield name, seed and folder of the runs of a size.
@@ -266,7 +266,7 @@ class Evidence:
 
     def trained(self, name: str) -> bool:
         """Return whether there is a committed record of a training, with scores or without."""
-        return any(self._weights.glob(f"{name}-[0-9]*.json"))
+        return any(self._weights.glob(f"{name}_[0-9]*.json"))
 
 
 def _score_files(path: Path, entry: Any) -> Iterator[tuple[int | None, Path]]:  # noqa: ANN401

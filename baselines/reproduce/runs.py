@@ -99,7 +99,7 @@ class Plan:
     def committed(self, split: str, name: str) -> tuple[int, Path] | None:
         """Return the least seed of a model's committed weights, and their file; None where there are none."""
         known = f"{name}-{self.recipe}" if self.recipe else name
-        files = (self.weights / split / self.size).glob(f"{known}-*.pt")
+        files = (self.weights / split / self.size).glob(f"{known}_*.pt")
         seeds = {int(end): path for path in files if (end := path.stem[len(known) + 1 :]).isdecimal()}
         return min(seeds.items(), default=None)
 

@@ -18,7 +18,7 @@ from lagbench.submission import Finding
 
 from .entry_file import MAX_ENTRY_BYTES
 from .findings import finding
-from .folder import FLOORS, SCORES, SUBMISSIONS, VERIFIED, Folder
+from .folder import FLOORS, SCORES, SUBMISSIONS, VERIFIED, WEIGHTS, Folder
 
 __all__ = ["check_base"]
 
@@ -40,7 +40,7 @@ def check_base(folder: Folder, base: str, own: Collection[str]) -> Iterator[Find
         if path == Path(VERIFIED) or path.parts[0] == FLOORS:
             if path.as_posix() in before or path == Path(VERIFIED):
                 yield finding("base", path, _verb(how), expected="what the maintainers keep, unchanged")
-        elif path.parts[0] in (SUBMISSIONS, SCORES) and len(path.parts) == 4:
+        elif path.parts[0] in (SUBMISSIONS, SCORES, WEIGHTS) and len(path.parts) == 4:
             method = path.stem.partition("_")[0]
             entry = Path(SUBMISSIONS, *path.parts[1:3], f"{method}.yaml")
             if entry.as_posix() not in before or method in own:

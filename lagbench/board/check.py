@@ -33,6 +33,7 @@ from .ranking import combine, is_current, summarise
 from .rescore import TOLERANCE, Confirmation, Rescoring
 from .score_file import MAX_SCORE_BYTES, Stored, read_stored, unreadable_in_child
 from .verified import read_verified, record, verification_of
+from .weights import check_weights
 
 __all__ = ["CheckResult", "check_board"]
 
@@ -300,6 +301,7 @@ class _Look:
         named = [Path(made.path) for entry, _ in self.known for made in entry.predictions if made.path]
         for path, reason in self.folder.odd(named):
             self.add("folder", ascii(path.as_posix())[1:-1], reason)
+        self.found += check_weights(self.folder, [entry for entry, _ in self.known])
         self._lives()
         self._twins()
         self._names()

@@ -31,7 +31,7 @@ from pydantic import (
 from lagbench.submission.budget import Budget as SeedBudget
 from lagbench.submission.budget import Track, track_of
 
-from .folder import Place, entry_path, score_paths
+from .folder import Place, entry_path, score_paths, weights_path
 
 __all__ = [
     "ID",
@@ -55,6 +55,7 @@ __all__ = [
     "Status",
     "Strict",
     "Summary",
+    "Weights",
 ]
 
 ID = r"^[a-z0-9]+(-[a-z0-9]+)*$"
@@ -179,6 +180,13 @@ class DataSet(Strict):
     sha256: Hash
 
 
+class Weights(Strict):
+    """The weights that made predictions, kept in the leaderboard's folder."""
+
+    path: InnerPath = Field(description="inside the leaderboard's folder")
+    sha256: Hash = Field(description="of the file")
+
+
 class Prediction(Strict):
     """One predictions.nc: where it is kept, if anywhere, and what it holds."""
 
@@ -188,6 +196,7 @@ class Prediction(Strict):
     path: InnerPath | None = Field(default=None, description="inside the leaderboard's folder")
     bytes: int | None = Field(default=None, gt=0, lt=MOST_BYTES, description="length of the file")
     budget: SeedBudget | None = Field(default=None, description="what its training took, as the file says")
+    weights: Weights | None = None
 
 
 class Cost(Strict):
@@ -346,3 +355,9 @@ class Entry(About):
     def score_paths(self) -> tuple[Path, ...]:
         """Where its score files lie, relative to the folder, in the order of the predictions."""
         return score_paths(self.place, [made.seed for made in self.predictions])
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Score files, then weights with what their trainings recorded: all that lies beside the entry."""
+        weights = [weights_path(self.place, made.seed) for made in self.predictions if made.weights]
+        return (*self.score_paths, *(path.with_suffix(end) for path in weights for end in (".pt", ".json")))

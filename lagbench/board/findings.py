@@ -132,6 +132,12 @@ CHECKS: Mapping[str, Check] = MappingProxyType(
             "no track, since the predictions have no budgets",
             RESCORE,
         ),
+        "weights": Check(
+            "weights that are missing, edited, out of place or without an entry; more than 40 MB of them",
+            "the weights are not those of the entry",
+            "the file that `lagbench submit --weights` wrote",
+            "submit with the weights again: lagbench submit --weights; or remove what no entry names",
+        ),
         "twin": Check(
             "the same predictions under two names or seeds",
             "the same predictions stand here twice",

@@ -3,6 +3,7 @@
     submissions/<split>/<size>/<method>.yaml      entries
     scores/<split>/<size>/<method>[_<seed>].nc    their score files
     floors/<split>/<size>/<name>.nc               scores of the floors
+    weights/<split>/<size>/<method>_<seed>.pt     weights, with the .json that their trainings recorded
     verified.yaml, schema.json, index.html, README.md
 
 Symbolic links are never followed: one could lead out of the folder.
@@ -25,19 +26,21 @@ __all__ = [
     "SCORES",
     "SUBMISSIONS",
     "VERIFIED",
+    "WEIGHTS",
     "Folder",
     "Place",
     "entry_path",
     "score_paths",
+    "weights_path",
 ]
 
 Place = tuple[str, str, str]
 """Split, size and method."""
 
-SUBMISSIONS, SCORES, FLOORS = "submissions", "scores", "floors"
+SUBMISSIONS, SCORES, FLOORS, WEIGHTS = "submissions", "scores", "floors", "weights"
 PAGE, SCHEMA, VERIFIED, README = "index.html", "schema.json", "verified.yaml", "README.md"
 
-ENDINGS = {SUBMISSIONS: ".yaml", SCORES: ".nc", FLOORS: ".nc"}
+ENDINGS = {SUBMISSIONS: (".yaml",), SCORES: (".nc",), FLOORS: (".nc",), WEIGHTS: (".pt", ".json")}
 KEPT = ".gitkeep"
 PART = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 """What a folder or file may be called: nothing that a terminal or a CI log would obey."""
@@ -70,6 +73,16 @@ def score_paths(place: Place, seeds: Sequence[int | None]) -> tuple[Path, ...]:
     return tuple(Path(SCORES, split, size, f"{name}.nc") for name in names)
 
 
+def weights_path(place: Place, seed: int | None) -> Path:
+    """Return where the weights of a seed lie, relative to the folder.
+
+    >>> weights_path(("cavity", "mini", "gns"), 3).as_posix()
+    'weights/cavity/mini/gns_3.pt'
+    """
+    split, size, method = place
+    return Path(WEIGHTS, split, size, f"{method}_{seed or 0}.pt")
+
+
 class Folder:
     """The files of a leaderboard."""
 
@@ -100,10 +113,14 @@ class Folder:
         """Return the scores of floors, of one split and size or all, in the order of their names."""
         return tuple(path for path in self._sound(FLOORS) if path.parts[1:3] == (split, size) or not split)
 
+    def weight_files(self) -> tuple[Path, ...]:
+        """Return weights and records of their trainings, in the order of their names."""
+        return self._sound(WEIGHTS)
+
     def claims(self) -> set[Place]:
         """Return split, size and method of all that lies where an entry would, whatever it is."""
         ends = ENDINGS[SUBMISSIONS]
-        files = [p for p in self._files(SUBMISSIONS) if len(p.parts) == DEPTH and p.suffix == ends]
+        files = [p for p in self._files(SUBMISSIONS) if len(p.parts) == DEPTH and p.suffix in ends]
         return {(path.parts[1], path.parts[2], path.stem) for path in files}
 
     def odd(self, expected: Collection[Path]) -> Iterator[tuple[Path, str]]:
@@ -123,11 +140,11 @@ class Folder:
             return f"{link} is a symbolic link"
         if not stat.S_ISREG((self.path / path).lstat().st_mode):
             return "no regular file"
-        ending = ENDINGS[path.parts[0]]
+        endings = ENDINGS[path.parts[0]]
         if not all(PART.fullmatch(part) for part in path.parts):
             return "a name with other characters than letters, digits, '-', '_' and '.'"
-        if path.suffix != ending or len(path.parts) != DEPTH:
-            return f"not {path.parts[0]}/<split>/<size>/<name>{ending}"
+        if path.suffix not in endings or len(path.parts) != DEPTH:
+            return f"not {path.parts[0]}/<split>/<size>/<name>{' or '.join(endings)}"
         return None
 
     def link_in(self, path: Path) -> Path | None:

@@ -50,6 +50,7 @@ from .floors import floor_names, write_floors
 from .folder import SUBMISSIONS, Folder, Place, entry_path, score_paths
 from .ranking import combine, summarise
 from .score_file import MAX_SCORE_BYTES, read_stored
+from .weights import copy_weights, named_weights, require_weights
 
 __all__ = ["BOARD", "SubmitResult", "scored_file", "submit"]
 
@@ -82,6 +83,7 @@ def submit(
     predictions: Sequence[str | Path],
     meta: Meta,
     *,
+    weights: Sequence[str | Path] = (),
     board: str | Path = BOARD,
     root: str | Path | None = None,
     replace: bool = False,
@@ -96,6 +98,7 @@ def submit(
     Args:
         predictions: one predictions.nc per seed.
         meta: what is said of the method.
+        weights: weights that made the predictions, to keep beside the entry: one per seed, or none.
         board: the leaderboard's folder.
         root: folder of all data sets.
         replace: whether an entry of that name may be replaced.
@@ -108,7 +111,7 @@ def submit(
     Raises:
         UsageError: a key is missing, the entry is there already, the files do not belong
             together, the method has the name of a floor, or there is no leaderboard.
-        UnreadableFileError: predictions cannot be read.
+        UnreadableFileError: predictions or weights cannot be read.
         ChecksFailedError: they are not valid.
         DataError: the test subset is missing, or they were made from another data set.
         WorkFailedError: the disk is full or not writable, or a score file became too long.
@@ -133,7 +136,7 @@ def submit(
         where = str(folder.path / entry_path(place))
         fix = "replace it with --replace, or name this one otherwise: --method NAME"
         raise UsageError("there is such an entry already", where=where, fix=fix)
-    about, urls = _about(headers, meta), _urls(headers, meta)
+    about, urls, sources = _about(headers, meta), _urls(headers, meta), require_weights(weights, headers)
     cards = [
         score(
             path,
@@ -158,7 +161,7 @@ def submit(
         for card, path, seed, url, header in zip(cards, paths, seeds, urls, headers, strict=True)
     ]
     try:
-        return _publish(place, about, cards, made, folder, outside)
+        return _publish(place, about, cards, made, folder, outside, sources)
     except OSError as error:
         raise WorkFailedError(
             "cannot write there",
@@ -293,10 +296,11 @@ def _publish(
     made: Sequence[Prediction],
     folder: Folder,
     outside: Sequence[float | None],
+    sources: Sequence[Path],
 ) -> SubmitResult:
     """Write score files, then the entry that names them; remove those that only the old entry had."""
     names, yaml_path = score_paths(place, [one.seed for one in made]), entry_path(place)
-    before = read_entry(folder.path / yaml_path).score_paths if (folder.path / yaml_path).exists() else ()
+    before = read_entry(folder.path / yaml_path).files if (folder.path / yaml_path).exists() else ()
     (folder.path / SUBMISSIONS).mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=STAGE, dir=folder.path) as stage:
         staged = [Path(stage) / name.name for name in names]
@@ -304,14 +308,17 @@ def _publish(
             write_statistics(card, target)
             _check_length(target, card)
         files = tuple(map(scored_file, cards, staged, outside))
+        kept = named_weights(place, [one.seed for one in made], sources)
+        made = [one.model_copy(update={"weights": held}) for one, held in zip(made, kept, strict=True)]
         entry = _entry(place, about, cards, made, files, staged)
         for source, name in zip(staged, names, strict=True):
             (folder.path / name).parent.mkdir(parents=True, exist_ok=True)
             os.replace(source, folder.path / name)
+    copy_weights(folder, kept, sources)
     floors = write_floors(cards[0], folder)
     (folder.path / yaml_path).parent.mkdir(parents=True, exist_ok=True)
     write_atomically(folder.path / yaml_path, spell(entry), option="--board")
-    for name in set(before) - set(names):
+    for name in set(before) - set(entry.files):
         (folder.path / name).unlink(missing_ok=True)
     summary = entry.score.metrics[entry.score.ranking_metric]
     split, size, method = place
@@ -324,7 +331,7 @@ def _publish(
         std=summary.std,
         flags=tuple(dict.fromkeys(flag.name for file in entry.score.files for flag in file.flags)),
         board=folder.path,
-        files=(*(folder.path / name for name in (yaml_path, *names)), *floors),
+        files=(*filter(Path.is_file, (folder.path / name for name in (yaml_path, *entry.files))), *floors),
     )
 
 

@@ -44,6 +44,10 @@ def submit(
         list[str] | None,
         typer.Option("--url", metavar="URL", help="Where FILE can be had; one per FILE."),
     ] = None,
+    weights: Annotated[
+        list[Path] | None,
+        typer.Option("--weights", metavar="FILE", help="weights.pt to keep beside the entry; one per FILE."),
+    ] = None,
     replace: Annotated[bool, typer.Option("--replace", help="Replace the entry of that name.")] = False,
     new_board: Annotated[
         bool, typer.Option("--new-board", help="Begin a leaderboard in --board, where there is none.")
@@ -64,6 +68,7 @@ def submit(
         result = run(
             predictions,
             meta,
+            weights=weights or (),
             board=board,
             root=root,
             replace=replace,

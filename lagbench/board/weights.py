@@ -1,0 +1,110 @@
+"""Weights beside their entries: ``lagbench submit --weights`` copies them, ``leaderboard check`` hashes them.
+
+weights/<split>/<size>/<method>_<seed>.pt     parameters, as `lagbench predict` reads them
+weights/<split>/<size>/<method>_<seed>.json   what the training recorded, where it did
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from lagbench.atomic import write_atomically
+from lagbench.data.checksums import file_sha256
+from lagbench.errors import UsageError, check_installed
+from lagbench.submission import Finding, Header
+
+from .entry import Entry, Weights
+from .findings import finding
+from .folder import Folder, Place, weights_path
+
+__all__ = ["MOST_BYTES", "check_weights", "copy_weights", "named_weights", "require_weights"]
+
+MOST_BYTES = 40_000_000
+"""All weights of a leaderboard together [bytes]: git keeps every version of them for good."""
+
+RECORD = "training.json"
+
+
+def require_weights(weights: Sequence[str | Path], headers: Sequence[Header]) -> tuple[Path, ...]:
+    """Refuse weights that cannot have made the predictions, one file for each; return their paths."""
+    if not weights:
+        return ()
+    if len(weights) != len(headers):
+        raise UsageError(
+            "weights and predictions differ in number",
+            where="--weights",
+            expected=len(headers),
+            got=len(weights),
+            fix="give one file per predictions.nc, in their order, or none",
+        )
+    check_installed("torch", extra="baselines")
+    from lagbench.baselines.checkpoint import load
+
+    paths = tuple(map(Path, weights))
+    for path, header in zip(paths, headers, strict=True):
+        held = load(path)
+        seed = held.training.get("recipe", {}).get("training", {}).get("seed", 0)
+        facts = held.facts
+        got = (facts.split, facts.size, facts.dataset_sha256, seed)
+        expected = (header.split, header.size, header.dataset_sha256, header.seed or 0)
+        if got != expected:
+            raise UsageError(
+                "the weights did not make the predictions",
+                where=str(path),
+                expected=f"{expected[0]} {expected[1]}, data set {expected[2][:16]}, seed {expected[3]}",
+                got=f"{got[0]} {got[1]}, data set {got[2][:16]}, seed {got[3]}",
+                fix="give --weights in the order of the predictions",
+            )
+    return paths
+
+
+def named_weights(
+    place: Place, seeds: Sequence[int | None], paths: Sequence[Path]
+) -> tuple[Weights | None, ...]:
+    """Return what an entry says of its weights, seed by seed; None of each where there are none."""
+    if not paths:
+        return (None,) * len(seeds)
+    return tuple(
+        Weights(path=weights_path(place, seed).as_posix(), sha256=file_sha256(path))
+        for seed, path in zip(seeds, paths, strict=True)
+    )
+
+
+def copy_weights(folder: Folder, named: Sequence[Weights | None], paths: Sequence[Path]) -> None:
+    """Copy weights, and what their trainings recorded, to their places."""
+    for said, path in zip(filter(None, named), paths, strict=True):
+        target, record = folder.path / said.path, path.with_name(RECORD)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(target, path.read_bytes(), option="--board")
+        if record.is_file():
+            write_atomically(target.with_suffix(".json"), record.read_bytes(), option="--board")
+
+
+def check_weights(folder: Folder, entries: Sequence[Entry]) -> Iterator[Finding]:
+    """Yield weights that are missing, edited, out of place, without an entry, or too many."""
+    known: set[Path] = set()
+    for entry in entries:
+        for number, made in enumerate(entry.predictions):
+            if made.weights is None:
+                continue
+            where = f"{entry.yaml_path}, predictions.{number}.weights"
+            path = weights_path(entry.place, made.seed)
+            known |= {path, path.with_suffix(".json")}
+            file = folder.path / path
+            if made.weights.path != path.as_posix():
+                yield finding("weights", where, ascii(made.weights.path)[1:-1], expected=path)
+            elif not file.is_file() or folder.link_in(path) is not None:
+                yield finding("weights", where, "no such file", expected=path)
+            elif (found := file_sha256(file)) != made.weights.sha256:
+                said = made.weights.sha256[:16]
+                yield finding("weights", path, f"SHA-256 {found[:16]}", expected=f"{said} as the entry says")
+    held = folder.weight_files()
+    for path in held:
+        if path not in known:
+            yield finding("weights", path, "none", what="weights that no entry has", expected="an entry")
+    total = sum((folder.path / path).stat().st_size for path in held)
+    if total > MOST_BYTES:
+        fix = "keep larger ones as files of a release, and name them by `weights: https://...` in the entry"
+        most = f"at most {MOST_BYTES} bytes in all"
+        yield finding("weights", "weights", f"{total} bytes", what="too many", expected=most, fix=fix)

@@ -1,0 +1,185 @@
+"""Weights beside their entries: copied by submit, hashed by check, used by predict."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from board_worlds import BoardBench, copied, in_process
+from simple_models import Drift, install
+
+from lagbench.baselines.checkpoint import Checkpoint, save
+from lagbench.baselines.facts import facts_of
+from lagbench.baselines.predict import predict
+from lagbench.board import weights as kept
+from lagbench.board.check import check_board
+from lagbench.board.entry import Meta
+from lagbench.board.entry_file import read_entry
+from lagbench.board.submit import submit
+from lagbench.data.checksums import file_sha256
+from lagbench.errors import UnreadableFileError, UsageError
+from lagbench.submission.budget import Budget
+
+BUDGET = Budget(windows=48, epochs=0.5, steps=6, cpu_hours=0.1, gpu_hours=0.0)
+
+
+@pytest.fixture
+def own(
+    tmp_path_factory: pytest.TempPathFactory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> BoardBench:
+    """A copy of the leaderboard, and a baseline that needs no training."""
+    install(monkeypatch, drift=Drift)
+    return copied(tmp_path_factory, tmp_path)
+
+
+def trained(own: BoardBench, seed: int) -> Path:
+    """Write the weights of a run, with its record beside them and its predictions."""
+    size = own.data.size
+    facts = facts_of(size.split, size.name, root=own.data.root, registry=own.registry)
+    model = Drift.build({"start": 0.9 + 0.01 * seed}, facts)
+    recipe = {"name": "cavity/tiny", "training": {"seed": seed}}
+    folder = own.folder.parent / f"drift-{seed}"
+    save(
+        folder / "weights.pt",
+        Checkpoint(
+            baseline="drift",
+            options=model.options.model_dump(),
+            facts=facts,
+            weights=model.state_dict(),
+            training={"step": 6, "recipe": recipe, "budget": BUDGET.model_dump(mode="json")},
+        ),
+    )
+    (folder / "training.json").write_text(json.dumps({"step": 6}))
+    torch.set_num_threads(1)
+    output = folder / "predictions.nc"
+    predict(
+        folder / "weights.pt", output, root=own.data.root, registry=own.registry, threads=1, method="drift"
+    )
+    return folder
+
+
+def submitted(
+    own: BoardBench, *folders: Path, weights: tuple[Path, ...] | None = None, **options: Any
+) -> None:
+    """Submit the predictions of runs, with their weights unless others are given."""
+    files = [folder / "predictions.nc" for folder in folders]
+    given = tuple(folder / "weights.pt" for folder in folders) if weights is None else weights
+    with in_process():
+        meta = Meta(authors=("A. Author",), command="make")
+        submit(files, meta, weights=given, **own.where, **options)
+
+
+def found(own: BoardBench) -> set[str]:
+    """Return the names of the checks that find something."""
+    return {one.check for one in check_board(own.folder, registry=own.registry, page=False).findings}
+
+
+def test_weights_lie_beside_their_entry(own: BoardBench) -> None:
+    """Both seeds' weights and records are copied, named by hash; they predict what was submitted."""
+    runs = [trained(own, 0), trained(own, 3)]
+    submitted(own, *runs)
+    entry = read_entry(own.entry("drift"))
+    for run, made, seed in zip(runs, entry.predictions, (0, 3), strict=True):
+        assert made.weights is not None
+        assert made.weights.path == f"weights/cavity/tiny/drift_{seed}.pt"
+        file = own.folder / made.weights.path
+        assert file.read_bytes() == (run / "weights.pt").read_bytes()
+        assert file_sha256(file) == made.weights.sha256
+        assert json.loads(file.with_suffix(".json").read_text()) == {"step": 6}
+        assert made.budget == BUDGET
+        again = own.folder.parent / "again.nc"
+        predict(file, again, root=own.data.root, registry=own.registry, threads=1, method="drift")
+        assert own.data.card(again).predictions_sha256 == made.sha256
+    assert entry.budget is not None
+    assert (entry.budget.windows, entry.budget.cpu_hours, entry.budget.track) == (48, 0.1, None)  # tiny
+    assert found(own) == set()
+
+
+def test_a_later_entry_takes_its_files_along(own: BoardBench) -> None:
+    """Replaced without weights, an entry leaves none behind."""
+    run = trained(own, 0)
+    submitted(own, run)
+    submitted(own, run, weights=(), replace=True)
+    assert not list((own.folder / "weights").rglob("*.*"))
+    assert found(own) == set()
+
+
+def test_other_weights_are_refused(own: BoardBench) -> None:
+    """Weights of another seed, too few of them and files that are none are told; nothing is written."""
+    runs = [trained(own, 0), trained(own, 3)]
+    before = own.state()
+    first, second = (run / "weights.pt" for run in runs)
+    with pytest.raises(UsageError) as caught:
+        submitted(own, *runs, weights=(second, first))
+    assert caught.value.where == str(second)
+    with pytest.raises(UsageError) as caught:
+        submitted(own, *runs, weights=(first,))
+    assert caught.value.where == "--weights"
+    with pytest.raises(UnreadableFileError):
+        submitted(own, *runs, weights=(first, runs[0] / "training.json"))
+    assert own.state() == before
+
+
+def edit(own: BoardBench) -> None:
+    """Change a byte of the weights."""
+    path = own.folder / "weights/cavity/tiny/drift_0.pt"
+    path.write_bytes(path.read_bytes()[:-1] + b"x")
+
+
+def lose(own: BoardBench) -> None:
+    """Remove the weights."""
+    (own.folder / "weights/cavity/tiny/drift_0.pt").unlink()
+
+
+def misplace(own: BoardBench) -> None:
+    """Name the weights of another method."""
+    own.edit(
+        "drift", lambda held: held["predictions"][0]["weights"].update(path="weights/cavity/tiny/a_0.pt")
+    )
+
+
+def stray(own: BoardBench) -> None:
+    """Add weights that no entry names."""
+    (own.folder / "weights/cavity/tiny/other_0.pt").write_bytes(b"1")
+
+
+def claim(own: BoardBench) -> None:
+    """Claim a track."""
+    own.edit("drift", lambda held: held["budget"].update(track="converged"))
+
+
+def claim_without(own: BoardBench) -> None:
+    """Claim a track for predictions that tell no budget."""
+    own.edit("noisy", lambda held: held.update(budget={"track": "equal compute"}))
+
+
+@pytest.mark.parametrize(
+    ("change", "check"),
+    [
+        *((change, "weights") for change in (edit, lose, misplace, stray)),
+        *((change, "budget") for change in (claim, claim_without)),
+    ],
+)
+def test_what_the_check_finds(own: BoardBench, change: Callable[[BoardBench], None], check: str) -> None:
+    """Weights that are edited, lost, elsewhere or nobody's, and tracks that the record does not give."""
+    submitted(own, trained(own, 0))
+    change(own)
+    assert found(own) == {check}
+
+
+def test_more_than_git_should_keep(own: BoardBench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All weights together have a bound."""
+    submitted(own, trained(own, 0))
+    monkeypatch.setattr(kept, "MOST_BYTES", 1000)
+    assert found(own) == {"weights"}
+
+
+def test_a_track_is_not_stated(own: BoardBench) -> None:
+    """Who describes a method cannot say its track."""
+    with pytest.raises(UsageError) as caught:
+        own.submit(trained(own, 0) / "predictions.nc", budget={"track": "converged"})
+    assert caught.value.where == "budget.track"
