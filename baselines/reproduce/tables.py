@@ -38,8 +38,8 @@ __all__ = [
     "cubic_vorticity",
     "rollout_table",
     "rollouts",
-    "solver_times",
     "statistics",
+    "times",
     "vorticity",
     "vorticity_bars",
 ]
@@ -47,12 +47,21 @@ __all__ = [
 Floats = NDArray[np.float64]
 
 
-def solver_times(plan: Plan, figure: Figure) -> Sheet:
-    """Return the command that measures them, and what it last wrote where that is here."""
-    del plan, figure
-    command = "python benchmarks/table_3_1.py --rows 1-4 --device cpu --output docs/figures"
-    found = [path.read_text(encoding="utf-8") for path in sorted(Path("docs/figures").glob("table_3_1_*.md"))]
-    note = f"From a clone of the repository: `{command}` (rows 1-9 with `--device cuda`)."
+MEASURED = {
+    "table_3_1": ("table_3_1.py --rows 1-4 --device cpu", "table_3_1_*.md"),
+    "section_3_2_2": ("inference_cost.py --rows 1-4", "inference_cost.md"),
+}
+"""Script in benchmarks/ and the files that it writes."""
+
+
+def times(plan: Plan, figure: Figure) -> Sheet:
+    """Return the command that measures times, and what it last wrote where that is here."""
+    del plan
+    script, written = MEASURED[figure.name]
+    found = [path.read_text(encoding="utf-8") for path in sorted(Path("docs/figures").glob(written))]
+    note = (
+        f"From a clone of the repository: `python benchmarks/{script} --output docs/figures`. {figure.said}"
+    )
     return Sheet(notes=(note, *found))
 
 

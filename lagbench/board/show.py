@@ -137,6 +137,8 @@ def _remarks(row: Row) -> Iterator[str]:
         yield str(row.entry.status)
     if not row.current:
         yield f"data set {row.entry.dataset.version}"
+    if row.entry.budget and row.entry.budget.track:
+        yield row.entry.budget.track
     if len(row.entry.predictions) > 1:
         yield f"{len(row.entry.predictions)} seeds"
     if row.diverged:
