@@ -120,9 +120,7 @@ def main() -> int:
     if len(rows) > 1:
         slopes = [float(np.polyfit(np.log(counts), np.log(found[name]), 1)[0]) for name in MODELS]
         lines.append(["", "exponent", *(f"{slope:.2f}" for slope in slopes)])
-    said = (
-        f"Milliseconds of processor time for a frame, untrained models, recipes of {SPLIT} {SIZE}, one core."
-    )
+    said = f"Processor time of a frame [ms] on one core; untrained models, recipes of {SPLIT} {SIZE}."
     text = f"{said}\n\n{table(['q', 'particles', *MODELS], lines)}\n"
     print(text)
     if asked.output:
