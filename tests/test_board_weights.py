@@ -173,6 +173,22 @@ def test_more_than_git_should_keep(own: BoardBench, monkeypatch: pytest.MonkeyPa
     assert found(own) == {"weights"}
 
 
+def test_a_budget_is_that_of_the_file(own: BoardBench) -> None:
+    """Scored again, predictions that tell another budget are found, though the entry is sound by itself."""
+    run = trained(own, 0)
+    submitted(own, run)
+
+    def shorten(held: dict[str, Any]) -> None:
+        held["predictions"][0]["budget"]["cpu_hours"] = held["budget"]["cpu_hours"] = 0.05
+
+    own.edit("drift", shorten)
+    assert found(own) == set()
+    where = {"registry": own.registry, "root": own.data.root, "page": False}
+    with in_process():
+        again = check_board(own.folder, predictions=[run / "predictions.nc"], **where)
+    assert {one.check for one in again.findings} == {"rescored"}
+
+
 def test_a_track_is_not_stated(own: BoardBench) -> None:
     """Who describes a method cannot say its track."""
     with pytest.raises(UsageError) as caught:

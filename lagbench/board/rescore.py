@@ -133,6 +133,10 @@ class Rescoring:
             if one != other:
                 differing.append(name)
                 yield finding("rescored", where, one, expected=f"{name} {other}")
+        made = entry.predictions[entry.score_paths.index(inner)]
+        if made.budget != card.header.budget:
+            differing.append("budget")
+            yield finding("rescored", where, card.header.budget, expected=f"budget {made.budget}")
         if not differing:
             found = Confirmation(
                 predictions=Path(path), entry=entry.yaml_path, score_file=inner, difference=difference
