@@ -192,9 +192,9 @@ def test_holm_passes_over_what_is_not_claimed() -> None:
     assert math.isnan(second)
 
 
-@pytest.mark.parametrize("values", [[], [1.0], [math.nan, 2.0]])
-def test_one_scenario_has_no_interval(values: list[float]) -> None:
-    """Nothing can be said of spread from fewer than two scenarios."""
+@pytest.mark.parametrize("values", [[], [1.0], [1.0, 2.0, 4.0], [math.nan, 2.0, 1.0, 1.0]])
+def test_few_scenarios_have_no_interval(values: list[float]) -> None:
+    """Of spread nothing is said from fewer than four scenarios with a value."""
     assert all(math.isnan(bound) for bound in bootstrap_interval(values))
 
 

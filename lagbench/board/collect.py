@@ -204,7 +204,7 @@ def _row(
         tied=standing is not None and standing.tied and not math.isnan(standing.p),
         p=standing.p if standing else math.nan,
         verified=verified,
-        skill=_skill(held.scores[ranking].score, floors) if held.current else None,
+        skill=_skill(held.scores[ranking], floors) if held.current else None,
         values={
             name: _value(found.score, found.interval, found.std, size) for name, found in held.scores.items()
         },
@@ -216,14 +216,15 @@ def _row(
     )
 
 
-def _skill(score: Score, floors: Sequence[FloorScores]) -> Value | None:
-    """Return how much better a row is than the best floor, from the mean over its seeds."""
-    name = score.metric.name
-    found = skill(score, {floor.name: floor.scores[name] for floor in floors if name in floor.scores})
+def _skill(scores: Combined, floors: Sequence[FloorScores]) -> Value | None:
+    """Return how much better a row is than the best floor, over its seeds."""
+    name = scores.score.metric.name
+    known = {floor.name: floor.scores[name] for floor in floors if name in floor.scores}
+    found = skill(scores.seeds, known)
     if found is None:
         return None
     low, high = found.interval
-    return Value(mean=found.value, std=math.nan, low=low, high=high, per_scenario=(), at={}, undefined=0)
+    return Value(mean=found.value, std=found.std, low=low, high=high, per_scenario=(), at={}, undefined=0)
 
 
 def _floor(held: FloorScores, size: Size, ranking: str) -> Floor:

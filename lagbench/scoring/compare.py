@@ -18,7 +18,7 @@ import numpy as np
 
 from lagbench.data.registry import Registry
 from lagbench.errors import DataError, UnreadableFileError, UsageError, nearest
-from lagbench.metrics import Comparison, Direction, Score, mean
+from lagbench.metrics import Comparison, Direction, Score, mean, mean_over_seeds
 from lagbench.metrics import compare as compare_scores
 from lagbench.metrics.significance import FEWEST_SCENARIOS
 from lagbench.submission.format import MAX_NAME
@@ -285,7 +285,7 @@ def _known(name: str, judged: Collection[str]) -> str:
 
 
 def _compared(first: tuple[Score, ...], second: tuple[Score, ...]) -> MetricComparison:
-    one, two = (mean(np.array([score.mean for score in side])) for side in (first, second))
+    one, two = (mean(mean_over_seeds([score.values for score in side])) for side in (first, second))
     return MetricComparison(
         unit=first[0].metric.unit, first=one, second=two, test=compare_scores(first, second)
     )

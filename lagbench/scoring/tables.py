@@ -17,7 +17,6 @@ __all__ = [
     "card_tables",
     "comparison_table",
     "flag_lines",
-    "skill_line",
 ]
 
 
@@ -92,16 +91,6 @@ def _skill_row(card: ScoreCard, floors: int) -> tuple[str, ...]:
     low, high = found.interval
     interval = "" if math.isnan(low) else f"{low:.3g} to {high:.3g}"
     return ("skill", _number(found.value), interval, *("" for _ in range(floors)), "higher", "", "1")
-
-
-def skill_line(card: ScoreCard) -> str:
-    """Return the skill in one line."""
-    found = card.skill
-    if found is None:
-        return "skill: undefined, no floor that counts has a score"
-    low, high = found.interval
-    interval = "" if math.isnan(low) else f" ({low:.3g} to {high:.3g})"
-    return f"skill {found.value:.3g}{interval}: 1 - {found.metric} / {found.metric} of {found.floor}"
 
 
 def _at_frames(card: ScoreCard, names: Collection[str], title: str) -> Table:
