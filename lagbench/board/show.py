@@ -15,9 +15,6 @@ from .model import Board, Floor, Row, Tab, Value
 
 __all__ = ["as_plain", "chosen_tabs", "tables"]
 
-SHOWN = 5
-"""Metrics in a table unless some are named."""
-
 
 def chosen_tabs(board: Board, split: str | None, size: str | None) -> tuple[Tab, ...]:
     """Return the tabs of a split, of a size, or all.
@@ -36,13 +33,16 @@ def chosen_tabs(board: Board, split: str | None, size: str | None) -> tuple[Tab,
     raise UsageError("no entries there", where=f"leaderboard {wanted}".strip(), fix=fix)
 
 
-def tables(board: Board, tabs: Collection[Tab], metrics: Collection[str] = ()) -> Iterator[Table]:
+def tables(
+    board: Board, tabs: Collection[Tab], metrics: Collection[str] = (), *, wide: bool = False
+) -> Iterator[Table]:
     """Yield a table per tab: ranked rows, then floors, then what is not ranked.
 
     Args:
         board: the board.
         tabs: its tabs to show.
-        metrics: names of metrics to show beside the ranking one; the tab's first ones by default.
+        metrics: names of metrics to show beside skill and the ranking one.
+        wide: whether to show the tab's first metrics too.
 
     Raises:
         UsageError: a metric that the board does not have.
@@ -52,7 +52,7 @@ def tables(board: Board, tabs: Collection[Tab], metrics: Collection[str] = ()) -
             raise UsageError(f"no metric {name!r} here", where="--metric", fix=nearest(name, board.metrics))
     for tab in tabs:
         skill = ("skill",) if any(row.skill for row in tab.rows) else ()
-        names = list(dict.fromkeys((*skill, tab.ranking, *(metrics or tab.columns[:SHOWN]))))
+        names = list(dict.fromkeys((*skill, tab.ranking, *metrics, *(tab.columns if wide else ()))))
         claim = "" if tab.decided else ", too few scenarios to tell entries apart"
         cost = "; cost self-reported" if any(row.entry.cost for row in tab.rows) else ""
         title = f"{tab.size.split} {tab.size.name} {tab.size.version}, by {tab.ranking}{claim}{cost}"
@@ -63,6 +63,7 @@ def tables(board: Board, tabs: Collection[Tab], metrics: Collection[str] = ()) -
             title,
             ("rank", "method", *names, "s/frame", "speed-up", "remarks"),
             tuple(_cells(row, names) for row in shown),
+            keys=2,
         )
 
 

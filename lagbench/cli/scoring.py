@@ -28,6 +28,7 @@ from .output import print_json, print_table, progress_bar, say, spell_bytes
 if TYPE_CHECKING:
     from lagbench.scoring.card import ScoreCard
     from lagbench.scoring.compare import ComparisonResult
+    from lagbench.scoring.tables import Table
     from lagbench.submission import ValidationResult
 
 __all__ = ["compare", "score", "template", "validate"]
@@ -41,6 +42,7 @@ OwnSplitOption = Annotated[
     typer.Option("--split", metavar="NAME", help="Split that they must be for; a local one by its folder."),
 ]
 EveryFlag = Annotated[bool, typer.Option("--all", help="Show every metric.")]
+FloorsFlag = Annotated[bool, typer.Option("--all-floors", help="Show every floor, not only the best.")]
 
 
 def template(
@@ -120,6 +122,7 @@ def score(
         str, typer.Option("--extras", metavar="NAMES", help="Extras with metrics, as in transport.")
     ] = "",
     every: EveryFlag = False,
+    floors: FloorsFlag = False,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
@@ -149,7 +152,7 @@ def score(
             )
         cards.append(card)
         if not as_json and not quiet:
-            _scored(card, every=every)
+            _scored(card, every=every, floors=floors)
     if as_json:
         print_json(cards[0].as_json() if len(cards) == 1 else [card.as_json() for card in cards])
     if report is not None:
@@ -238,14 +241,19 @@ def _complain(result: ValidationResult) -> None:
         typer.echo("\n".join(str(finding) for finding in result.errors), err=True)
 
 
-def _scored(card: ScoreCard, *, every: bool) -> None:
+def _scored(card: ScoreCard, *, every: bool, floors: bool) -> None:
     from lagbench.scoring.tables import card_tables, flag_lines
 
-    for table in card_tables(card, every=every):
-        print_table(table.title, table.columns, table.rows)
+    for table in card_tables(card, every=every, floors=floors):
+        _print(table)
     for line in flag_lines(card):
         say(line)
     say("written: " + ", ".join(str(path) for path in card.files))
+
+
+def _print(table: Table) -> None:
+    for block in table.blocks():
+        print_table(block.title, block.columns, block.rows)
 
 
 def compare(
@@ -274,8 +282,8 @@ def compare(
 
 
 def _compared(result: ComparisonResult, *, every: bool) -> None:
-    from lagbench.scoring.tables import comparison_table
+    from lagbench.scoring.tables import comparison_tables
 
-    table = comparison_table(result, every=every)
-    print_table(table.title, table.columns, table.rows)
+    for table in comparison_tables(result, every=every):
+        _print(table)
     say(result.verdict)
