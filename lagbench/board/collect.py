@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from lagbench.data.registry import Registry, Size, load
 from lagbench.errors import ChecksFailedError, UnreadableFileError
+from lagbench.floors import FLOORS, FloorScores, solver_seconds
 from lagbench.metrics import METRICS, Score
 from lagbench.metrics.metric import mean
 from lagbench.metrics.significance import FEWEST_SCENARIOS, Standing, mean_loss, standings
@@ -23,9 +24,9 @@ from lagbench.scoring.scenario import Preview
 from lagbench.scoring.skill import skill
 from lagbench.submission.task_checks import frames_to_predict
 
-from .entry import Entry, Status
+from .entry import Cost, Entry, Status
 from .entry_file import read_entry
-from .floors import FloorScores, read_floors
+from .floors import read_floors
 from .folder import Folder
 from .model import Board, Curve, Floor, Histogram, Pictures, Row, Tab, Value
 from .payload import spaced
@@ -181,6 +182,7 @@ def _tab(
         truth=_pictures(witness.stored[0].preview, TRUTH),
         rows=tuple(rows),
         floors=tuple(_floor(held, size, ranking) for held in floors),
+        solver_seconds=solver_seconds(size),
     )
 
 
@@ -228,14 +230,23 @@ def _skill(scores: Combined, floors: Sequence[FloorScores]) -> Value | None:
 
 
 def _floor(held: FloorScores, size: Size, ranking: str) -> Floor:
-    energy = held.scores.get(ENERGIES[1])
+    energy, about = held.scores.get(ENERGIES[1]), FLOORS[held.name]
     return Floor(
         name=held.name,
-        definition=held.definition,
+        definition=about.definition,
         values={name: _value(score, score.interval, math.nan, size) for name, score in held.scores.items()},
         curves=_curves(held.scores, ranking),
         energy=curve(energy) if energy is not None and np.isfinite(energy.per_frame).mean() > 0.5 else None,
-        counts=held.counts,
+        counts=about.counts,
+        cost=None if math.isnan(held.seconds_per_frame) else _cost(held.seconds_per_frame, size),
+    )
+
+
+def _cost(seconds: float, size: Size) -> Cost:
+    return Cost.model_construct(
+        seconds_per_frame=seconds,
+        device="one core, where the floors were measured",
+        solver_seconds_per_frame=solver_seconds(size),
     )
 
 

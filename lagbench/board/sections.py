@@ -10,6 +10,7 @@ from lagbench.metrics import Direction, Metric
 from lagbench.report.html import Markup, clipped, escaped, join, tag, text, words
 
 from .columns import columns_of, presets_of, value_of, written
+from .cost import cost_figure
 from .model import Board, Row, Tab
 from .table import EXPLAINED, draw_table
 
@@ -141,7 +142,7 @@ def section(tab: Tab, metrics: Mapping[str, Metric]) -> Markup:
             tabindex=0,
         ),
         tag("div", *(tag("p", note) for note in _notes(tab)), class_="notes"),
-        tag("div", class_="figures"),
+        tag("div", cost_figure(tab), class_="figures"),
         id=tab.id,
         class_="tab",
     )

@@ -11,6 +11,7 @@ from lagbench.scoring.card import digits
 from lagbench.scoring.tables import Table
 
 from .columns import held
+from .entry import Cost
 from .model import Board, Floor, Row, Tab, Value
 
 __all__ = ["as_plain", "chosen_tabs", "tables"]
@@ -112,16 +113,16 @@ def _plain_value(value: Value) -> dict[str, float | None]:
 def _cells(row: Row | Floor, names: list[str]) -> tuple[str, ...]:
     values = tuple(_spelt(held(row, name)) for name in names)
     if isinstance(row, Floor):
-        return ("-", row.name, *values, "", "", "floor")
-    cost = row.entry.cost
-    return (
-        "-" if row.rank is None else f"{row.rank}{'≈' if row.tied else ''}",
-        row.id,
-        *values,
-        "" if cost is None else f"{cost.seconds_per_frame:.3g}",
-        "" if cost is None or cost.speed_up is None else f"{cost.speed_up:.3g}",
-        ", ".join(_remarks(row)),
-    )
+        return ("-", row.name, *values, *_spent(row.cost), "floor")
+    rank = "-" if row.rank is None else f"{row.rank}{'≈' if row.tied else ''}"
+    return (rank, row.id, *values, *_spent(row.entry.cost), ", ".join(_remarks(row)))
+
+
+def _spent(cost: Cost | None) -> tuple[str, str]:
+    """Return the time of a frame and the speed-up over the solver."""
+    if cost is None:
+        return "", ""
+    return f"{cost.seconds_per_frame:.3g}", "" if cost.speed_up is None else f"{cost.speed_up:.3g}"
 
 
 def _spelt(value: Value | None) -> str:

@@ -7,7 +7,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .options import JsonFlag, QuietFlag, RootOption, SplitArgument, SplitOption, WorkersOption, chosen
+from .options import (
+    JsonFlag,
+    QuietFlag,
+    RootOption,
+    SizeOption,
+    SplitArgument,
+    SplitOption,
+    WorkersOption,
+    chosen,
+)
 from .output import print_json, print_table, progress_bar, say, spell_bytes
 
 if TYPE_CHECKING:
@@ -199,6 +208,28 @@ def _checked(result: CheckResult, *, quiet: bool) -> None:
     state = f"{len(result.findings)} findings" if result.findings else "nothing wrong"
     looked = ", page compared" if result.page_checked else ""
     say(f"{result.folder}: {result.entries} entries, {state}{looked}", quiet=quiet)
+
+
+@leaderboard.command("picture", epilog="Example: lagbench leaderboard picture cavity --size mini -o cost.svg")
+def picture(
+    name: SplitArgument = None,
+    split: SplitOption = None,
+    size: SizeOption = "full",
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="SVG file to write.")] = Path(
+        "cost.svg"
+    ),
+    board: BoardOption = BOARD,
+    quiet: QuietFlag = False,
+) -> None:
+    """Draw accuracy against cost of a data set as an SVG file."""
+    from lagbench.atomic import write_atomically
+    from lagbench.board.collect import collect
+    from lagbench.board.cost import picture as draw
+    from lagbench.data.registry import load
+
+    drawn = draw(collect(board), load().size(chosen(name, split), size))
+    write_atomically(output, drawn.encode(), option="--output")
+    say(str(output), quiet=quiet)
 
 
 @leaderboard.command("show", epilog="Example: lagbench leaderboard show cavity --size mini")
