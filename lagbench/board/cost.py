@@ -34,7 +34,7 @@ STYLE = """
 .level{stroke:#98a2b3;stroke-dasharray:5 4}.front{fill:none;stroke:#2458d3;stroke-dasharray:4 4}
 .end{text-anchor:end}.middle{text-anchor:middle}.dot circle{fill:#fff;stroke:#2458d3;stroke-width:1.8}
 .dot.best circle{fill:#2458d3}.dot.floor circle{stroke:#667085}.dot.coarse circle{fill:#667085;stroke:#667085}
-.dot .reach,.dot.best .reach,.dot.coarse .reach{fill:none;stroke:none}
+.dot .reach,.dot.best .reach,.dot.coarse .reach,.dot.floor .reach{fill:none;stroke:none}
 .name{paint-order:stroke;stroke:#fff;stroke-width:4px}
 """
 """Colours of a picture on its own; on the page the style sheets have them."""

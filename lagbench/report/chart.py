@@ -117,12 +117,19 @@ def close_logarithmic(low: float, high: float) -> Scale:
     """Return a logarithmic axis that ends at the next 1, 2 or 5; of many ticks the powers of ten are kept."""
     decades = range(math.floor(math.log10(low)) - 1, math.ceil(math.log10(high)) + 1)
     marks = [(factor * 10.0**k, factor, k) for k in decades for factor in (1, 2, 5)]
-    first = max(i for i, (value, *_) in enumerate(marks) if value <= 0.98 * low)
-    last = min(i for i, (value, *_) in enumerate(marks) if value >= 1.02 * high)
+    first = max(i for i, (value, *_) in enumerate(marks) if value <= 0.8 * low)
+    last = min(i for i, (value, *_) in enumerate(marks) if value >= 1.25 * high)
     kept = marks[first : last + 1]
     shown = [mark for mark in kept if mark[1] == 1] if len(kept) > 8 else kept
-    ticks = tuple(Tick(v, power(k) if factor == 1 else f"{factor}×{power(k)}") for v, factor, k in shown)
+    ticks = tuple(Tick(value, _spelt(value, factor, k)) for value, factor, k in shown)
     return Scale(kept[0][0], kept[-1][0], True, 0, ticks)
+
+
+def _spelt(value: float, factor: int, exponent: int) -> str:
+    """Return a round number, in powers of ten where it would be long."""
+    if -3 <= exponent <= 3:
+        return f"{value:g}"
+    return power(exponent) if factor == 1 else f"{factor}×{power(exponent)}"
 
 
 def spanning(series: Sequence[ArrayLike], *, zero: bool = True, log: bool | None = None) -> Scale:
