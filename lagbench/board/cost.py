@@ -138,10 +138,12 @@ def cost_figure(tab: Tab) -> Markup:
     marks, without = marks_of(tab), sum(row.active and row.entry.cost is None for row in tab.rows)
     said = (
         "Further left is cheaper, further down more accurate; the line joins those that no other beats in"
-        " both. Filled grey is the solver on a coarser grid, the dashed line what the solver itself takes."
+        " both. The upright line is what the solver itself takes."
         " Costs of entries are self-reported, brought to the machine of the solver by their"
         " speed-up."
     )
+    if any(mark.kind == "coarse" for mark in marks):
+        said += " Filled grey is the solver on a coarser grid."
     if without:
         said += f" {without} {'entry says' if without == 1 else 'entries say'} nothing about cost."
     title = "Accuracy against cost"

@@ -94,7 +94,7 @@ def measured_again(
 class FloorJob:
     """What a worker needs to measure the floors on one scenario."""
 
-    exam: ScoredTask  # the test subset
+    task: ScoredTask  # the test subset
     scenario: int  # id of the scenario
     floors: tuple[str, ...]  # names of the floors
     metrics: tuple[str, ...]  # names of the metrics
@@ -113,11 +113,11 @@ class FloorTallies:
 def measure_scenario(job: FloorJob, report: Report) -> FloorTallies:
     """Measure the floors on one scenario, or read what was measured before."""
     if job.keep is not None and job.keep.is_file():
-        report(job.exam.setting.horizon)
+        report(job.task.setting.horizon)
         return _kept(job, job.keep)
     seconds: dict[str, list[float]] = {name: [] for name in job.floors}
-    with job.exam.opened(job.scenario) as truth:
-        given = given_in(truth.file, job.exam.size, job.exam.truth.root)
+    with job.task.opened(job.scenario) as truth:
+        given = given_in(truth.file, job.task.size, job.task.truth.root)
         rows = {
             name: snapshots(truth.scenario, _timed(FLOORS[name].predict(given), taken))
             for name, taken in seconds.items()
@@ -201,20 +201,20 @@ def measure(
         DataError: the data are missing or damaged.
         UsageError: a floor needs an extra that is not installed.
     """
-    exam = load_scored_task(size, root)
+    task = load_scored_task(size, root)
     names = tuple(floor.name for floor in floors_of(size) if floors is None or floor.name in floors)
     jobs = {
         f"floors on scenario {i}": FloorJob(
-            exam=exam,
+            task=task,
             scenario=i,
             floors=names,
             metrics=tuple(metric.name for metric in select()),
             keep=kept_in(size, root) / f"{i:04d}.npz" if resume else None,
         )
-        for i in exam.scenarios
+        for i in task.scenarios
     }
     meter = Meter(progress)
-    meter.begin("measuring floors", total=len(jobs) * exam.setting.horizon, scenarios=len(jobs))
+    meter.begin("measuring floors", total=len(jobs) * task.setting.horizon, scenarios=len(jobs))
     found = run_all(measure_scenario, jobs, workers=workers, report=meter.count)
     return {name: _together(name, found) for name in names}
 

@@ -90,11 +90,11 @@ def score(
         check_writable(folder, option="--output")
     with open_predictions(path) as opened:
         header, content = opened.header, result.sha256 or opened.content_sha256()
-    exam = load_scored_task(described.size(header.split, header.size), holder)
-    known = shipped(exam.size) or {}
-    floors = () if known else measurable(exam.size, holder)
+    task = load_scored_task(described.size(header.split, header.size), holder)
+    known = shipped(task.size) or {}
+    floors = () if known else measurable(task.size, holder)
     outcomes = _outcomes(
-        exam, path, tuple(m.name for m in metrics), floors, workers, scheduler, Meter(progress)
+        task, path, tuple(m.name for m in metrics), floors, workers, scheduler, Meter(progress)
     )
     tallies = {
         row: {outcome.scenario: outcome.tallies[row] for outcome in outcomes} for row in outcomes[0].tallies
@@ -105,11 +105,11 @@ def score(
     card = ScoreCard(
         header=header,
         predictions_sha256=content,
-        setting=exam.setting,
-        ranking=ranking_metric(exam.size),
+        setting=task.setting,
+        ranking=ranking_metric(task.size),
         tallies=tallies,
         scores=scores,
-        flags=_flags(exam, outcomes, scores),
+        flags=_flags(task, outcomes, scores),
         warnings=result.warnings,
         preview=preview,
     )
@@ -133,7 +133,7 @@ def _chosen(extras: Collection[str]) -> tuple[Metric, ...]:
 
 
 def _outcomes(
-    exam: ScoredTask,
+    task: ScoredTask,
     path: Path,
     metrics: tuple[str, ...],
     floors: tuple[str, ...],
@@ -142,26 +142,26 @@ def _outcomes(
     meter: Meter,
 ) -> list[ScenarioScores]:
     """Return what was measured of every scenario, by ascending id."""
-    ids, horizon = exam.scenarios, exam.setting.horizon
+    ids, horizon = task.scenarios, task.setting.horizon
     jobs = {
         f"scenario {i}": ScenarioJob(
-            exam=exam, scenario=i, predictions=path, metrics=metrics, floors=floors, pictured=i == ids[0]
+            task=task, scenario=i, predictions=path, metrics=metrics, floors=floors, pictured=i == ids[0]
         )
         for i in ids
     }
     if workers is None:
-        worth = len(ids) * horizon * exam.size.particles >= WORTH_WORKERS
+        worth = len(ids) * horizon * task.size.particles >= WORTH_WORKERS
         workers = available_cores() if worth else 1
     meter.begin("scoring", total=len(ids) * horizon, scenarios=len(ids))
     return run_all(score_scenario, jobs, workers=workers, scheduler=scheduler, report=meter.count)
 
 
 def _flags(
-    exam: ScoredTask, outcomes: Sequence[ScenarioScores], scores: Mapping[str, Mapping[str, Score]]
+    task: ScoredTask, outcomes: Sequence[ScenarioScores], scores: Mapping[str, Mapping[str, Score]]
 ) -> tuple[Flag, ...]:
     traces = [outcome.trace for outcome in outcomes]
     error, still = (
         np.asarray(np.mean(scores[row]["position_rmse"].per_frame, axis=0))
         for row in (SUBMISSION, persistence.FLOOR.name)
     )
-    return copy_suspect(traces), below_twin_floor(error, still, exam.twin_floor), physics(traces)
+    return copy_suspect(traces), below_twin_floor(error, still, task.twin_floor), physics(traces)
