@@ -1,7 +1,7 @@
 """Print what honest and dishonest predictions of our own splits show to the flags.
 
-Honest ones see the given frames only: persistence, constant velocity, decaying velocity, the last grid velocity
-field held fixed (as it is, and with a jitter of a tenth of a frame's motion), another
+Honest ones see the given frames only: persistence, constant velocity, decaying velocity, the last grid
+velocity field held fixed (as it is, and with a jitter of a tenth of a frame's motion), another
 scenario's motion, and two emulations of an accurate model: the truth plus integrated velocity
 errors of 2 %, smooth or white. Dishonest ones are made from the true answer: noise on top,
 one-step predictions from true frames, shifts in time, resets every few frames, interpolation

@@ -239,8 +239,8 @@ def _notes(tab: Tab) -> Iterator[Markup]:
     told = "There are too few test scenarios to tell entries apart: the intervals speak alone."
     if tab.decided:
         told = (
-            "≈ cannot be told from the leader at 5 %: two-way bootstrap over scenarios and seeds, with one seed"
-            " each the exact sign-flip test over scenarios; p-values corrected by Holm's method."
+            "≈ cannot be told from the leader at 5 %: two-way bootstrap over scenarios and seeds, with one"
+            " seed each the exact sign-flip test over scenarios; p-values corrected by Holm's method."
         )
     yield escaped(f"{told} Shaded rows are floors: what costs no learning, never ranked.")
     yield escaped(

@@ -14,10 +14,10 @@ from lagbench.errors import UsageError
 
 from .options import (
     JsonFlag,
+    PresentSizeOption,
     QuietFlag,
     RootOption,
     SchedulerOption,
-    SizeOption,
     SplitArgument,
     SplitOption,
     WorkersOption,
@@ -48,10 +48,11 @@ FloorsFlag = Annotated[bool, typer.Option("--all-floors", help="Show every floor
 def template(
     name: SplitArgument = None,
     split: SplitOption = None,
-    size: SizeOption = "full",
+    size: PresentSizeOption = None,
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="File to write.")] = Path(
         "predictions.nc"
     ),
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file of that name.")] = False,
     root: RootOption = None,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
@@ -59,7 +60,7 @@ def template(
     """Write a valid predictions.nc to fill: the persistence prediction."""
     from lagbench.submission import template as run
 
-    result = run(chosen(name, split), size, output=output, root=root)
+    result = run(chosen(name, split), size, output=output, overwrite=overwrite, root=root)
     if as_json:
         print_json(result)
         return
@@ -91,8 +92,9 @@ def validate(
 def _checked(result: ValidationResult) -> None:
     for finding in result.findings:
         say(str(finding))
-    for check, reason in result.skipped.items():
-        say(f"not made [{check}]: {reason}")
+    for reason in dict.fromkeys(result.skipped.values()):
+        checks = ", ".join(check for check, why in result.skipped.items() if why == reason)
+        say(f"not made, since {reason}: {checks}")
     counts = (
         f"{len(result.errors)} errors, {len(result.warnings)} warnings, {len(result.passed)} checks passed"
     )
@@ -109,7 +111,8 @@ def score(
             "--output",
             "-o",
             metavar="FOLDER",
-            help="Where scores go; beside FILE by default. With several, in folders named like them.",
+            help="Where scores go; beside predictions.nc by default, of other and of several files in folders"
+            " named like them.",
         ),
     ] = None,
     report: Annotated[
@@ -161,10 +164,10 @@ def score(
         say(f"report: {write_report(report, cards, predictions, root=root)}", quiet=quiet or as_json)
 
 
-def _targets(predictions: Sequence[Path], output: Path | None) -> list[Path]:
+def _targets(predictions: Sequence[Path], output: Path | None) -> Sequence[Path | None]:
     """Return the folder for the scores of each file; refuse two files with one folder."""
     if len(predictions) == 1:
-        return [output or predictions[0].parent]
+        return [output]
     targets = [(output or path.parent) / path.stem for path in predictions]
     held: dict[Path, Path] = {}
     for path, target in zip(predictions, targets, strict=True):

@@ -49,6 +49,12 @@ DIMS = ("scenario", "frame", "particle", "space")
 SPACE = 2
 """Components of a position."""
 
+OTHERS: Mapping[str, str] = {
+    "measured": "scores.nc, which `lagbench score` writes of predictions",
+    "particle_mass": "a scenario file, which `lagbench generate` writes",
+}
+"""Files of ours that are taken for predictions, by a variable that only they have."""
+
 NEVER = -1
 """Value of ``diverged_at`` for a rollout that did not diverge."""
 
@@ -207,6 +213,12 @@ def _optional(value: object, kind: type[Any]) -> Any:  # noqa: ANN401
 def check_format(anatomy: Anatomy, out: Findings) -> bool:
     """Check links, variables, storage and attributes; tell whether the values can be read."""
     out.made("format")
+    known = next((what for name, what in OTHERS.items() if name in anatomy.arrays), None)
+    if known is not None:
+        out.error(
+            "format", "a file of another kind", where="/", expected="predictions", got=known, fix=_START
+        )
+        return False
     _check_links(anatomy, out)
     for name in ("position", "scenario", "frame"):
         _check_variable(name, anatomy, out)
