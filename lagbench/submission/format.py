@@ -14,7 +14,7 @@ from typing import Any
 
 import h5py
 
-from lagbench.errors import nearest
+from lagbench.errors import UnreadableFileError, nearest
 
 from .budget import Budget, budget_in
 from .findings import Findings, quoted
@@ -38,6 +38,7 @@ __all__ = [
     "fits",
     "header_of",
     "kind_of",
+    "refuse_other_kinds",
 ]
 
 FORMAT = 1
@@ -210,15 +211,20 @@ def _optional(value: object, kind: type[Any]) -> Any:  # noqa: ANN401
     return value if isinstance(value, kind) else None
 
 
+def refuse_other_kinds(anatomy: Anatomy, path: Path) -> None:
+    """Refuse a file of ours that holds no predictions: all that could be said of it would mislead."""
+    if {"position", "scenario"} <= anatomy.links.keys():
+        return
+    for name, what in OTHERS.items():
+        if name in anatomy.links:
+            raise UnreadableFileError(
+                "a file of another kind", where=str(path), expected="predictions", got=what, fix=_START
+            )
+
+
 def check_format(anatomy: Anatomy, out: Findings) -> bool:
     """Check links, variables, storage and attributes; tell whether the values can be read."""
     out.made("format")
-    known = next((what for name, what in OTHERS.items() if name in anatomy.arrays), None)
-    if known is not None:
-        out.error(
-            "format", "a file of another kind", where="/", expected="predictions", got=known, fix=_START
-        )
-        return False
     _check_links(anatomy, out)
     for name in ("position", "scenario", "frame"):
         _check_variable(name, anatomy, out)

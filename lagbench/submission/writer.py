@@ -181,7 +181,11 @@ class PredictionsWriter:
         with np.errstate(over="ignore"):
             array = np.asarray(values).astype(np.float32)
         if array.shape != self.shape:
-            raise UsageError("the shape is another", where=where, expected=self.shape, got=array.shape)
+            turned = sorted(array.shape) == sorted(self.shape)
+            fix = "transpose it: frame, particle, space" if turned else None
+            raise UsageError(
+                "the shape is another", where=where, expected=self.shape, got=array.shape, fix=fix
+            )
         wrong = np.argwhere(~np.isfinite(array))
         if len(wrong):
             frame, particle, axis = (int(i) for i in wrong[0])
