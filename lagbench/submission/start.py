@@ -91,8 +91,8 @@ def _start(predictions: Predictions, truth: Truth, scenario: int) -> Start:
     frames = predictions.header.frames
     predicted = predictions.frames(scenario, frames[0], min(2, len(frames)))
     given, true = truth.around_start(scenario)
-    held = (given, true, predicted[0], predicted[-1])
-    return Start(*(frame.astype(np.float64) for frame in held), len(frames))
+    first, second = predicted[0].astype(np.float64), predicted[-1].astype(np.float64)
+    return Start(given.astype(np.float64), true.astype(np.float64), first, second, len(frames))
 
 
 def _check_continuity(scenario: int, start: Start, truth: Truth, frame: int, out: Findings) -> None:
