@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +18,17 @@ from lagbench.floors import FLOORS, floors_of, shipped
 from lagbench.floors.shipped import shipped_path, write_shipped
 from lagbench.make.generate import GenerationResult
 from lagbench.metrics import METRICS, Score
+from lagbench.scoring import floors as floors_of_scoring
 from lagbench.scoring import score as scoring
 from lagbench.scoring.card import ScoreCard
-from lagbench.scoring.floors import differences, kept_in, measurable, measure
+from lagbench.scoring.floors import (
+    differences,
+    kept_in,
+    measurable,
+    measure,
+    measured_again,
+    measured_sizes,
+)
 from lagbench.scoring.scenario import SUBMISSION
 from lagbench.scoring.score_file import read_statistics
 from lagbench.scoring.skill import best_floor, skill
@@ -169,6 +178,19 @@ def test_a_forged_shipped_score_is_found(bench: ScoreBench, tmp_path: Path) -> N
     unlike = differences(held, found)
     assert unlike["persistence"] == ("position_rmse",)
     assert set(unlike["constant-velocity"]) == set(found["constant-velocity"].scores)
+
+
+def test_shipped_floors_are_measured_again(bench: ScoreBench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is shipped agrees with a second measurement; one value changed by 1 % is named with its floor."""
+    assert [size.name for size in measured_sizes(bench.root, registry=bench.registry)] == [bench.size.name]
+    held = measure(bench.size, bench.root)
+    monkeypatch.setattr(floors_of_scoring, "shipped", lambda size: held)
+    assert measured_again(bench.size, bench.root) == (tuple(held), {})
+    still = held["persistence"]
+    score = still.scores["position_rmse"]
+    forged = {**still.scores, "position_rmse": replace(score, values=1.01 * score.values)}
+    held["persistence"] = replace(still, scores=forged)
+    assert measured_again(bench.size, bench.root)[1] == {"persistence": ("position_rmse",)}
 
 
 def test_an_interrupted_measurement_goes_on(bench: ScoreBench, copied: Callable[[], Path]) -> None:
