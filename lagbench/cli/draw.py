@@ -113,7 +113,7 @@ def plot(
 ) -> None:
     """Draw one frame of a scenario: particles, vorticity, streamlines."""
     from lagbench.data.local import locate
-    from lagbench.draw.plot import contact_sheet, plot_frame
+    from lagbench.draw.plot import check_kind, contact_sheet, plot_frame
 
     if sheet:
         chosen_split = chosen(name, split)
@@ -122,6 +122,7 @@ def plot(
         drawn = contact_sheet(chosen_split, tier.name, page, root=root, dpi=dpi)
         _done(drawn, as_json=as_json, quiet=quiet)
         return
+    check_kind(kind)
     source = _source(name, split, size, scenario, root)
     target = _target(output or _default_name(source, f"-frame{frame}.png"))
     with _told_as_given(name):
@@ -150,7 +151,10 @@ def animate(
 ) -> None:
     """Turn a scenario into an MP4 or GIF film; two scenarios stand side by side."""
     from lagbench.draw.animate import animate as run
+    from lagbench.draw.animate import check_ending
 
+    if output is not None:
+        check_ending(output)
     source = _source(name, split, size, scenario, root)
     other = Path(second) if second else None
     if beside is not None:

@@ -37,6 +37,7 @@ __all__ = [
     "KINDS",
     "Panel",
     "describe",
+    "check_kind",
     "plot_frame",
 ]
 
@@ -233,6 +234,12 @@ SEPARATOR = "  ·  "
 DIRECTIONS = {(1, 0): "right", (-1, 0): "left", (0, 1): "up", (0, -1): "down"}
 
 
+def check_kind(kind: str) -> None:
+    """Refuse a kind of picture that :func:`plot_frame` cannot draw."""
+    if kind not in KINDS:
+        raise UsageError(f"no kind of picture {kind!r}", where="--kind", fix=nearest(kind, KINDS))
+
+
 def plot_frame(
     source: str | Path | xr.Dataset,
     frame: int,
@@ -256,8 +263,7 @@ def plot_frame(
         UsageError: unknown kind, no such frame, a name with another ending, no matplotlib.
         DataError: the scenario file is missing or damaged.
     """
-    if kind not in KINDS:
-        raise UsageError(f"no kind of picture {kind!r}", where="--kind", fix=nearest(kind, KINDS))
+    check_kind(kind)
     with open_recording(source, registry=registry) as recording:
         scene = recording.scene(frame)
     panels = _panels(recording) if kind == ALL else [Panel(kind)]
