@@ -1,7 +1,7 @@
 """Print what honest and dishonest predictions of our own splits show to the flags.
 
-Honest ones see the given frames only: both floors, decaying velocity, the last grid velocity
-field held fixed (as it is, and with a jitter of a tenth of a frame's motion), another
+Honest ones see the given frames only: persistence, constant velocity, decaying velocity, the last grid
+velocity field held fixed (as it is, and with a jitter of a tenth of a frame's motion), another
 scenario's motion, and two emulations of an accurate model: the truth plus integrated velocity
 errors of 2 %, smooth or white. Dishonest ones are made from the true answer: noise on top,
 one-step predictions from true frames, shifts in time, resets every few frames, interpolation
@@ -151,14 +151,14 @@ def trace_of(case: Case, predicted: Floats) -> Trace:
     return tracer.result()
 
 
-def cases(exam: ScoredTask) -> dict[int, Case]:
+def cases(task: ScoredTask) -> dict[int, Case]:
     """Return the test scenarios of a split by id."""
     held = []
-    for number in exam.scenarios:
-        with exam.opened(number) as opened:
+    for number in task.scenarios:
+        with task.opened(number) as opened:
             held.append((opened.scenario, opened.file.read("position").astype(np.float64)))
     found = [Case(scenario, positions, held[i - 1][1]) for i, (scenario, positions) in enumerate(held)]
-    return dict(zip(exam.scenarios, found, strict=True))
+    return dict(zip(task.scenarios, found, strict=True))
 
 
 def trained(paths: Sequence[Path], split: str, size: str) -> Iterator[tuple[str, Predictions]]:
@@ -181,8 +181,8 @@ def main() -> int:
     print(f"{'prediction':32s} {'split':14s}{names}  copy_suspect")
     seen: dict[str, list[list[float]]] = {"honest": [], "made from the truth": [], "trained": []}
     for split in options.splits.split(","):
-        exam = load_scored_task(load().size(split, options.size), resolve_root(options.root))
-        by_id = cases(exam)
+        task = load_scored_task(load().size(split, options.size), resolve_root(options.root))
+        by_id = cases(task)
         held = list(by_id.values())
         for kind, table in (("honest", HONEST), ("made from the truth", DISHONEST)):
             print(f"-- {split} {options.size}, {kind}")

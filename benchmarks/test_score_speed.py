@@ -70,10 +70,10 @@ def test_score_beside_a_naive_scorer(data: ScoreData) -> None:
     """All metrics take a tenth of the time of five naive ones, or less."""
     folder = data.predictions.parent
     one, two = run_ours(folder, 1), run_ours(folder, 2)
-    exam = load_scored_task(data.registry.size("cavity", "full"), data.root)
+    task = load_scored_task(data.registry.size("cavity", "full"), data.root)
     start, used = time.perf_counter(), time.process_time()
-    for row, scenario in enumerate(exam.scenarios[:2]):
-        naive_scores(exam.truth.path(scenario), data.predictions, row, 6, NAIVE_FRAMES)
+    for row, scenario in enumerate(task.scenarios[:2]):
+        naive_scores(task.truth.path(scenario), data.predictions, row, 6, NAIVE_FRAMES)
     scale = SCENARIOS * 90 / (2 * NAIVE_FRAMES)
     naive = {"wall": scale * (time.perf_counter() - start), "cpu": scale * (time.process_time() - used)}
     for name, found in (("one worker", one), ("two workers", two)):

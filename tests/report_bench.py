@@ -36,7 +36,7 @@ class ReportBench:
     size: Size
 
     @property
-    def exam(self) -> ScoredTask:
+    def task(self) -> ScoredTask:
         """Its test subset."""
         return load_scored_task(self.size, self.root)
 

@@ -31,13 +31,13 @@ class ScoreBench:
     size: Size
 
     @property
-    def exam(self) -> ScoredTask:
+    def task(self) -> ScoredTask:
         """Its test subset."""
         return load_scored_task(self.size, self.root)
 
     def truth(self, scenario: int) -> Floats:
         """All positions of a test scenario, shape [frame, particle, 2]."""
-        with self.exam.opened(scenario) as opened:
+        with self.task.opened(scenario) as opened:
             return np.asarray(opened.file.read("position"))
 
     def submit(self, path: Path, predict: Predict, **labels: Any) -> Path:

@@ -14,6 +14,7 @@ from board_browsing import active, close, names, press, restored, run, still, un
 from board_worlds import make_board, with_entry
 from browser import CHROMIUM, Browser, Page, browser
 
+from lagbench.board.cost import marks_of
 from lagbench.board.entry import Flag
 from lagbench.board.model import Board
 from lagbench.board.page import render
@@ -161,9 +162,10 @@ def test_scatter_leads_to_entries(page: Page, board: Board) -> None:
     rows = [row for row in active(board.tabs[0].rows) if row.entry.cost is not None]
     assert len(dots) == len(rows)
     points = {
-        row.id: (-float(row.entry.cost.speed_up or 0.0), row.values["vorticity_rmse"].mean)
+        row.id: (mark.seconds, mark.error)
         for row in rows
-        if row.entry.cost
+        for mark in marks_of(board.tabs[0])
+        if mark.name == row.entry.name
     }
     best = {
         i

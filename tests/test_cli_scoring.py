@@ -55,7 +55,7 @@ def test_from_template_to_tables(run: Run, predictions: Path) -> None:
         "persistence",
         "velocity",
         "vorticity_rmse",
-        "40 of 40",
+        "vorticity_pearson 40",
         "1/frame",
         "flag copy_suspect",
         "scores.nc",
@@ -72,6 +72,68 @@ def test_json_is_the_file(run: Run, predictions: Path) -> None:
     assert {path.name for path in folder.iterdir()} == {"scores.json", "scores.nc"}
     assert not (predictions.parent / "scores.json").exists()
     assert run("score", predictions, "--quiet").stdout == ""
+
+
+def test_a_template_keeps_what_is_there(run: Run, predictions: Path) -> None:
+    """Predictions are not replaced unless one says so."""
+    predictions.write_bytes(b"the work of a week")
+    words = ("template", "--split", SPLIT, "--size", SIZE, "-o", predictions)
+    assert run(*words).exit_code == 2
+    assert predictions.read_bytes() == b"the work of a week"
+    assert run(*words, "--overwrite").exit_code == 0
+    assert run("validate", predictions).exit_code == 0
+
+
+def test_the_only_size_there_is_the_default(run: Run, tmp_path: Path) -> None:
+    """One size lies here; where there is none, the message has sizes and the command."""
+    target = tmp_path / "t.nc"
+    assert run("template", SPLIT, "-o", target).exit_code == 0
+    assert target.is_file()
+    nothing = run("template", SPLIT, "-o", tmp_path / "u.nc", "--root", tmp_path / "empty")
+    assert nothing.exit_code == 2
+    assert f"lagbench generate --split {SPLIT} --size" in nothing.stderr
+
+
+def test_scores_are_called_as_their_predictions(run: Run, predictions: Path) -> None:
+    """Scores of gns.nc lie in gns/; those of another method are never written over."""
+    other = predictions.with_name("gns.nc")
+    shutil.copy(predictions, other)
+    with h5py.File(other, "a") as file:
+        file.attrs["method"] = "gns"
+    assert run("score", predictions).exit_code == 0
+    assert run("score", predictions).exit_code == 0
+    kept = predictions.with_name("scores.json").read_bytes()
+    assert run("score", other).exit_code == 0
+    assert (predictions.parent / "gns" / "scores.nc").is_file()
+    refused = run("score", other, "--output", predictions.parent)
+    assert refused.exit_code == 2
+    assert "persistence" in refused.stderr
+    assert predictions.with_name("scores.json").read_bytes() == kept
+
+
+def test_files_of_ours_that_are_no_predictions_are_named(
+    run: Run, predictions: Path, generated: GenerationResult
+) -> None:
+    """One finding says what scores.nc and a scenario file are, and nothing else is said of them."""
+    run("score", predictions)
+    scenario = next(generated.folder.glob("test/*.nc"))
+    for path in (predictions.with_name("scores.nc"), scenario):
+        result = submission.validate(path)
+        assert [finding.check for finding in result.findings] == ["readable"]
+        assert result.exit_code == 3
+        assert run("validate", path).exit_code == 3
+
+
+def test_tables_fit_eighty_columns(run: Run, predictions: Path) -> None:
+    """No line of any table is wider, with every metric and every floor too."""
+    run("score", predictions)
+    for words in (
+        ("score", predictions, "--all", "--all-floors"),
+        ("compare", predictions.parent, "analog", "--all"),
+    ):
+        lines = run(*words).stdout.split("\n")
+        wide = [line for line in lines if len(line.rstrip()) > 80 and ":" not in line]
+        assert wide == []
 
 
 def test_all_shows_every_metric(run: Run, predictions: Path) -> None:
@@ -136,7 +198,7 @@ def test_names_are_no_markup(run: Run, predictions: Path, method: str) -> None:
     assert compared.exit_code == 0, compared.stderr
     title, head = (line for line in compared.stdout.splitlines() if method in line)
     assert title.startswith(f"{method} against persistence")
-    assert "loss difference" in head
+    assert head.split()[0] == "metric"
 
 
 def test_several_files_keep_their_scores(run: Run, predictions: Path) -> None:

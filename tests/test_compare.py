@@ -17,7 +17,7 @@ from lagbench.errors import DataError, UnreadableFileError, UsageError
 from lagbench.make.generate import GenerationResult
 from lagbench.metrics import differ
 from lagbench.scoring.compare import ComparisonResult, compare
-from lagbench.scoring.tables import card_tables, comparison_table, flag_lines
+from lagbench.scoring.tables import Table, card_tables, comparison_tables, flag_lines
 
 
 @pytest.fixture(scope="module")
@@ -187,7 +187,7 @@ def test_equal_names_are_told_apart(tmp_path: Path) -> None:
     result = compare(a, b)
     assert (result.first, result.second) == ("toy (1)", "toy (2)")
     assert "toy (1) is better" in result.verdict
-    assert comparison_table(result).columns[1:3] == ("toy (1)", "toy (2)")
+    assert list(comparison_tables(result))[1].columns[1:] == ("toy (1)", "toy (2)")
     rows = json.loads(a.read_text())["rows"]
     borrowed = published(tmp_path, [1] * 6, method="floor", rows={**rows, "floor": rows["submission"]})
     result = compare(borrowed, "floor")
@@ -257,43 +257,58 @@ def test_tables_show_floors_undefined_and_units(bench: ScoreBench, tmp_path: Pat
     """The tables hold floors beside the submission, intervals, undefined frames, frames of interest."""
     card = bench.evaluate(bench.submit(tmp_path / "predictions.nc", half_right))
     horizon, at_frames, per_scenario = card_tables(card)
-    assert horizon.columns[3:5] == ("persistence", "constant-\nvelocity")
-    rows = {row[0]: row for row in horizon.rows}
+    rows = {row[0].split()[0]: row for row in horizon.rows}
     assert list(rows)[:2] == ["skill", card.ranking]
-    assert rows["vorticity_pearson"][horizon.columns.index("undefined")] == "20 of 40"
-    assert rows["vorticity_rmse"][-1] == "1/frame"
-    assert " to " in rows["vorticity_rmse"][2]
+    assert card.skill is not None
+    assert [column.replace("\n", "") for column in horizon.columns[2:]] == [card.skill.floor]
+    assert rows["vorticity_pearson"][1].endswith("†")
+    assert rows["vorticity_rmse"][0].endswith("[1/frame]")
     assert at_frames.columns == ("metric", "15", "25")
-    assert per_scenario.columns == ("row", "3", "4")
-    every, *_ = card_tables(card, every=True)
-    assert [row[0] for row in every.rows] == ["skill", *card.submission]
-    assert len({len(row) for row in horizon.rows} | {len(horizon.columns)}) == 1
+    assert [row[0] for row in per_scenario.rows] == ["3", "4"]
+    every, *_ = card_tables(card, every=True, floors=True)
+    assert [row[0].split()[0] for row in every.rows] == ["skill", *card.submission]
+    assert len(every.columns) == len(card.scores) + 1
     lines = list(flag_lines(card))
     assert any(line.startswith("flag copy_suspect: raised") for line in lines)
     assert any("2 scenarios: no p-value" in line for line in lines)
+    assert any("vorticity_pearson 20" in line for line in lines)
+
+
+def test_wide_tables_come_in_blocks() -> None:
+    """Every block fits and repeats what a row is; side by side they hold every cell once."""
+    columns = ("row", *(f"column-{i}" for i in range(20)))
+    rows = tuple((f"row {j}", *(f"{i}.{j} [0.25, 0.75]" for i in range(20))) for j in range(3))
+    blocks = list(Table("wide", columns, rows).blocks(80))
+    assert len(blocks) > 1
+    for block in blocks:
+        widths = [max(map(len, column)) for column in zip(block.columns, *block.rows, strict=True)]
+        assert sum(widths) + 3 * len(widths) <= 80
+        assert [row[0] for row in block.rows] == ["row 0", "row 1", "row 2"]
+    assert sum((block.columns[1:] for block in blocks), ()) == columns[1:]
+    assert sum((block.rows[1][1:] for block in blocks), ()) == rows[1][1:]
 
 
 def test_comparison_table(scored: dict[str, Path]) -> None:
     """The short table leads with the ranking metric; all metrics come when asked for."""
     result = compare(scored["still"], scored["straight"])
-    short, whole = comparison_table(result), comparison_table(result, every=True)
-    assert short.rows[0][0] == "vorticity_nrmse"
+    (short, means), (whole, _) = comparison_tables(result), comparison_tables(result, every=True)
+    assert short.rows[0][0].split()[0] == "vorticity_nrmse"
+    assert len(means.rows) == len(short.rows)
     assert len(short.rows) < len(whole.rows) == len(result.metrics)
 
 
 @pytest.mark.parametrize(("predict", "row", "word"), [(straight, 0, "better"), (still, 1, "worse")])
-def test_how_much_better_lies_in_its_interval(
+def test_how_much_better_is_said(
     bench: ScoreBench, tmp_path: Path, predict: Any, row: int, word: str
 ) -> None:
-    """The printed interval is that of the printed number, which it holds; the number has its sign."""
+    """The printed number is the size of the difference, and the word its sign."""
     card = bench.evaluate(bench.submit(tmp_path / "predictions.nc", predict))
-    line = list(flag_lines(card))[row]
-    number = r"(-?[\d.e-]+)"
-    found = re.search(rf"{word} by {number} \({number} to {number}", line)
+    line = [line for line in flag_lines(card) if line.startswith("against ")][row]
+    found = re.search(rf"{word} by ([\d.e-]+) \(2 scenarios: no p-value\)", line)
     assert found, line
-    by, low, high = map(float, found.groups())
-    assert by > 0.0
-    assert low <= by <= high
+    against = card.against(list(card.scores)[1 + row])
+    assert float(found[1]) == pytest.approx(abs(against.difference), rel=1e-3)
+    assert (against.difference < 0.0) == (word == "better")
 
 
 def test_pipes_and_devices_are_refused_at_once(tmp_path: Path) -> None:

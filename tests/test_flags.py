@@ -171,7 +171,7 @@ def test_copies_on_generated_data(bench: ScoreBench, predict: Predict, raised: b
     n, h = bench.size.task.input_frames, bench.size.task.horizon
     traces = []
     for number in bench.size.subsets["test"]:
-        with bench.exam.opened(number) as opened:
+        with bench.task.opened(number) as opened:
             scenario, tracer = opened.scenario, Tracer(opened.scenario)
             truth = opened.file.read("position")
             guess = snapshots(scenario, predict(truth, n, h))

@@ -24,6 +24,7 @@ from lagbench.metrics import (
     sign_flip_p,
     standings,
 )
+from lagbench.metrics.significance import mean_loss
 
 DIFFERENCES = st.lists(st.integers(-5, 5).map(float), min_size=1, max_size=9)
 
@@ -192,9 +193,9 @@ def test_holm_passes_over_what_is_not_claimed() -> None:
     assert math.isnan(second)
 
 
-@pytest.mark.parametrize("values", [[], [1.0], [math.nan, 2.0]])
-def test_one_scenario_has_no_interval(values: list[float]) -> None:
-    """Nothing can be said of spread from fewer than two scenarios."""
+@pytest.mark.parametrize("values", [[], [1.0], [1.0, 2.0, 4.0], [math.nan, 2.0, 1.0, 1.0]])
+def test_few_scenarios_have_no_interval(values: list[float]) -> None:
+    """Of spread nothing is said from fewer than four scenarios with a value."""
     assert all(math.isnan(bound) for bound in bootstrap_interval(values))
 
 
@@ -276,3 +277,14 @@ def test_observables_and_different_metrics_are_not_compared() -> None:
         compare(score_of(1.0, metric="energy_true"), score_of(1.0, metric="energy_true"))
     with pytest.raises(UsageError, match="different metrics"):
         compare(score_of(1.0), score_of(1.0, metric="vorticity_mae"))
+
+
+def test_ranks_follow_the_means_that_are_shown() -> None:
+    """A seed lacks the scenario in which the other has 4: the mean over seeds, then scenarios, is 2.5.
+
+    The mean over all values would be 2 and lead.
+    """
+    gappy = [score_of(1.0, math.nan), score_of(1.0, 4.0)]
+    assert mean_loss(gappy) == 2.5
+    placed = standings({"gappy": gappy, "even": [score_of(2.2, 2.2)]})
+    assert list(placed) == ["even", "gappy"]

@@ -161,9 +161,32 @@ def test_unknown_kinds_are_refused(swirl: Path, tmp_path: Path, kind: str) -> No
     assert "vorticity" in str(caught.value)
 
 
-def test_only_png_names_are_taken(swirl: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("name", "head"), [("x.pdf", b"%PDF"), ("x.svg", b"<?xml")])
+def test_vector_pictures_have_the_same_bytes_twice(
+    swirl: Path, tmp_path: Path, name: str, head: bytes
+) -> None:
+    """PDF and SVG hold no date."""
+    first, second = (plot_frame(swirl, 0, tmp_path / i / name).read_bytes() for i in _folders(tmp_path))
+    assert first.startswith(head)
+    assert first == second
+
+
+def _folders(parent: Path) -> list[str]:
+    for name in ("a", "b"):
+        (parent / name).mkdir()
+    return ["a", "b"]
+
+
+def test_dpi_scales_a_picture(swirl: Path, tmp_path: Path) -> None:
+    """Twice the pixels per inch are twice the pixels a side."""
+    one, two = (plot_frame(swirl, 0, tmp_path / f"{dpi}.png", dpi=dpi) for dpi in (64, 128))
+    with Image.open(one) as small, Image.open(two) as large:
+        assert large.size == pytest.approx((2 * small.width, 2 * small.height), abs=1)
+
+
+def test_only_known_endings_are_taken(swirl: Path, tmp_path: Path) -> None:
     """Another ending is refused before anything is written."""
-    with pytest.raises(UsageError, match="PNG"):
+    with pytest.raises(UsageError):
         plot_frame(swirl, 0, tmp_path / "x.jpg")
     assert not list(tmp_path.iterdir())
 

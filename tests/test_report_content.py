@@ -42,8 +42,8 @@ def subject_on(split: str, size_name: str) -> Subject:
         attribute_std=(1.0, 1.0, 1.0, 1.0),
         radius=task.radius,
     )
-    exam = ScoredTask(truth=Truth(size, Path()), setting=setting, density=1.0)
-    return Subject(exam=exam, title=split, entries=())
+    scored = ScoredTask(truth=Truth(size, Path()), setting=setting, density=1.0)
+    return Subject(task=scored, title=split, entries=())
 
 
 @pytest.mark.parametrize(
@@ -65,7 +65,7 @@ def test_histograms_are_at_the_frames_of_the_thesis() -> None:
 def test_pictures_over_time_are_six(split: str, size: str) -> None:
     """Six ascending predicted frames, the first and the last among them."""
     subject = subject_on(split, size)
-    predicted = subject.exam.setting.predicted_frames
+    predicted = subject.task.setting.predicted_frames
     assert len(subject.times) == 6
     assert list(subject.times) == sorted(subject.times)
     assert (subject.times[0], subject.times[-1]) == (predicted[0], predicted[-1])
@@ -100,7 +100,7 @@ def test_maps_show_their_frames(tmp_path: Path) -> None:
     assert len(panels) == 6
     limit = limit_of([vorticity(frame) for frame in panels])
     for frame, shown in panels.items():
-        meant = np.clip(inside(bench.exam, vorticity(frame)) / limit, -1.0, 1.0)
+        meant = np.clip(inside(bench.task, vorticity(frame)) / limit, -1.0, 1.0)
         np.testing.assert_array_equal(np.isnan(shown), np.isnan(meant))
         np.testing.assert_allclose(np.nan_to_num(shown), np.nan_to_num(meant), atol=0.0101)
 

@@ -249,7 +249,7 @@ def test_without_statistics_of_train(bench: ScoreBench, tmp_path: Path) -> None:
     """With the manifest gone and nothing recorded, the error says what is missing and how to get it."""
     root = tmp_path / "root"
     for scenario in bench.size.subsets["test"]:
-        source = bench.exam.truth.path(scenario)
+        source = bench.task.truth.path(scenario)
         target = root / source.relative_to(bench.root)
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_bytes(source.read_bytes())

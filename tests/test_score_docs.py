@@ -42,4 +42,4 @@ def test_every_option_of_score_is_described() -> None:
     cells = "".join(line.split("|")[1] for line in table.splitlines() if line.startswith("| `"))
     score = get_command(app).commands["score"]  # type: ignore[attr-defined]
     options = {name for p in score.params for name in p.opts if name.startswith("-")}
-    assert set(re.findall(r"(?<![\w-])--?[a-z]+", cells)) == options - {"--help"}
+    assert set(re.findall(r"(?<![\w-])--?[a-z]+(?:-[a-z]+)*", cells)) == options - {"--help"}

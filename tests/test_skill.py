@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.stats
 from score_bench import ScoreBench, bench_of, right, still, straight
 
 from lagbench.data.registry import Measured, Registry, Size
@@ -16,13 +18,21 @@ from lagbench.floors import FLOORS, floors_of, shipped
 from lagbench.floors.shipped import shipped_path, write_shipped
 from lagbench.make.generate import GenerationResult
 from lagbench.metrics import METRICS, Score
+from lagbench.scoring import floors as floors_of_scoring
 from lagbench.scoring import score as scoring
 from lagbench.scoring.card import ScoreCard
-from lagbench.scoring.floors import differences, kept_in, measurable, measure
+from lagbench.scoring.floors import (
+    differences,
+    kept_in,
+    measurable,
+    measure,
+    measured_again,
+    measured_sizes,
+)
 from lagbench.scoring.scenario import SUBMISSION
 from lagbench.scoring.score_file import read_statistics
-from lagbench.scoring.skill import best_floor, ratio_interval, skill
-from lagbench.scoring.tables import card_tables, skill_line
+from lagbench.scoring.skill import best_floor, skill
+from lagbench.scoring.tables import card_tables
 
 
 def scored(values: list[float], metric: str = "vorticity_rmse", first: int = 0) -> Score:
@@ -35,13 +45,13 @@ def scored(values: list[float], metric: str = "vorticity_rmse", first: int = 0) 
 def test_skill_is_one_minus_the_ratio_of_means() -> None:
     """Means 1 and 4: skill 3/4 beside the better floor; a perfect score has 1, twice the floor's -1."""
     floors = {"persistence": scored([6.0, 6.0]), "frozen-field": scored([3.0, 5.0])}
-    found = skill(scored([0.5, 1.5]), floors)
+    found = skill([scored([0.5, 1.5])], floors)
     assert found is not None
     assert (found.floor, found.value) == ("frozen-field", 0.75)
-    perfect, worse = skill(scored([0.0, 0.0]), floors), skill(scored([6.0, 10.0]), floors)
+    perfect, worse = skill([scored([0.0, 0.0])], floors), skill([scored([6.0, 10.0])], floors)
     assert perfect is not None
     assert worse is not None
-    assert (perfect.value, perfect.interval, worse.value) == (1.0, (1.0, 1.0), -1.0)
+    assert (perfect.value, worse.value) == (1.0, -1.0)
 
 
 def test_the_coarse_solver_is_no_best_floor() -> None:
@@ -53,31 +63,64 @@ def test_the_coarse_solver_is_no_best_floor() -> None:
 def test_skill_is_undefined_without_a_floor() -> None:
     """No floor, an undefined one, a perfect one, other scenarios, or a metric of which more is better."""
     ours = scored([1.0, 1.0])
-    assert skill(ours, {}) is None
-    assert skill(ours, {"analog": scored([math.nan, math.nan])}) is None
-    assert skill(ours, {"analog": scored([0.0, 0.0])}) is None
-    assert skill(ours, {"analog": scored([1.0, 1.0], first=7)}) is None
+    assert skill([ours], {}) is None
+    assert skill([ours], {"analog": scored([math.nan, math.nan])}) is None
+    assert skill([ours], {"analog": scored([0.0, 0.0])}) is None
+    assert skill([ours], {"analog": scored([1.0, 1.0], first=7)}) is None
     pearson = scored([0.5, 0.5], "vorticity_pearson")
-    assert skill(pearson, {"analog": pearson}) is None
+    assert skill([pearson], {"analog": pearson}) is None
 
 
 def test_skill_takes_the_scenarios_that_both_have() -> None:
     """An undefined scenario is left out on both sides: 1 of 4, not (1 + 9) of anything."""
-    found = skill(scored([1.0, 9.0]), {"analog": scored([4.0, math.nan])})
+    found = skill([scored([1.0, 9.0])], {"analog": scored([4.0, math.nan])})
     assert found is not None
     assert found.value == 0.75
     assert all(math.isnan(bound) for bound in found.interval)
 
 
 def test_the_interval_of_a_ratio() -> None:
-    """A ratio that is 1/2 in every scenario is certain; else the interval holds the ratio of means."""
-    base = np.array([1.0, 2.0, 5.0, 3.0])
-    assert ratio_interval(base / 2.0, base) == (0.5, 0.5)
-    low, high = ratio_interval([1.0, 1.0, 4.0, 1.0], base)
-    assert low < 7.0 / 11.0 < high
-    # scenarios are drawn together: no resample is beyond the extreme ratios of single scenarios
-    assert low >= 1.0 / 3.0
-    assert high <= 1.0
+    """A ratio that is 1/2 in every scenario is certain; three scenarios have no interval."""
+    base = [1.0, 2.0, 5.0, 3.0]
+    certain = skill([scored([0.5, 1.0, 2.5, 1.5])], {"analog": scored(base)})
+    assert certain is not None
+    assert (certain.value, certain.interval) == (0.5, (0.5, 0.5))
+    few = skill([scored([1.0, 1.0, 4.0])], {"analog": scored(base[:3])})
+    assert few is not None
+    assert all(math.isnan(bound) for bound in few.interval)
+
+
+def test_the_interval_is_that_of_resampled_ratios() -> None:
+    """Scenarios drawn together, 20 of them: SciPy's percentiles of the ratio, Student's widening aside."""
+    rng = np.random.default_rng(3)
+    base = rng.gamma(9.0, size=20)
+    ours = 0.3 * base * rng.gamma(25.0, 0.04, size=20)
+    found = skill([scored(ours.tolist())], {"analog": scored(base.tolist())})
+    assert found is not None
+    theirs = scipy.stats.bootstrap(
+        (ours, base),
+        lambda a, b, axis: 1.0 - a.mean(axis=axis) / b.mean(axis=axis),
+        paired=True,
+        method="percentile",
+        rng=np.random.default_rng(1),
+    ).confidence_interval
+    stretch = math.sqrt(20 / 19) * scipy.stats.t.ppf(0.975, 19) / scipy.stats.norm.ppf(0.975)
+    expected = [found.value + stretch * (bound - found.value) for bound in theirs]
+    assert found.interval == pytest.approx(expected, abs=0.1 * (expected[1] - expected[0]))
+
+
+def test_seeds_widen_the_interval_of_skill() -> None:
+    """Where scenarios agree and seeds do not, the interval is that of the seeds: Student's, two degrees."""
+    base, share = np.full(12, 4.0), np.array([0.4, 0.5, 0.9])
+    seeds = [scored((part * base).tolist()) for part in share]
+    found = skill(seeds, {"analog": scored(base.tolist())})
+    assert found is not None
+    assert (found.value, found.std) == pytest.approx((0.4, np.std(share, ddof=1)))
+    reach = np.std(share, ddof=1) / math.sqrt(3) * scipy.stats.t.ppf(0.975, 2)
+    assert found.interval[1] - found.interval[0] == pytest.approx(2 * reach, rel=0.15)
+    alone = skill(seeds[:1], {"analog": scored(base.tolist())})
+    assert alone is not None
+    assert alone.interval == pytest.approx((0.6, 0.6))
 
 
 @pytest.fixture(scope="module")
@@ -137,6 +180,19 @@ def test_a_forged_shipped_score_is_found(bench: ScoreBench, tmp_path: Path) -> N
     assert set(unlike["constant-velocity"]) == set(found["constant-velocity"].scores)
 
 
+def test_shipped_floors_are_measured_again(bench: ScoreBench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is shipped agrees with a second measurement; one value changed by 1 % is named with its floor."""
+    assert [size.name for size in measured_sizes(bench.root, registry=bench.registry)] == [bench.size.name]
+    held = measure(bench.size, bench.root)
+    monkeypatch.setattr(floors_of_scoring, "shipped", lambda size: held)
+    assert measured_again(bench.size, bench.root) == (tuple(held), {})
+    still = held["persistence"]
+    score = still.scores["position_rmse"]
+    forged = {**still.scores, "position_rmse": replace(score, values=1.01 * score.values)}
+    held["persistence"] = replace(still, scores=forged)
+    assert measured_again(bench.size, bench.root)[1] == {"persistence": ("position_rmse",)}
+
+
 def test_an_interrupted_measurement_goes_on(bench: ScoreBench, copied: Callable[[], Path]) -> None:
     """What is kept is taken as it is: a file altered on purpose shows in the second run."""
     size, root = recorded(bench.size), copied()
@@ -168,7 +224,7 @@ def test_scoring_takes_what_is_shipped(
 
 
 def test_skill_stands_in_the_card(bench: ScoreBench, tmp_path: Path) -> None:
-    """The truth has skill 1; persistence has none above 0; line, first row and JSON say the same."""
+    """The truth has skill 1; persistence has none above 0; first row and JSON say the same."""
     perfect = bench.evaluate(bench.submit(tmp_path / "right.nc", right))
     standing: ScoreCard = bench.score(bench.submit(tmp_path / "still.nc", still))
     assert perfect.skill is not None
@@ -180,6 +236,6 @@ def test_skill_stands_in_the_card(bench: ScoreBench, tmp_path: Path) -> None:
     assert FLOORS[said["floor"]].counts
     assert said["value"] == pytest.approx(standing.skill.value)
     again = read_statistics(standing.files[1]).skill()
-    assert again == standing.skill
+    assert again is not None
+    assert (again.floor, again.value) == (standing.skill.floor, standing.skill.value)
     assert next(iter(card_tables(standing))).rows[0][0] == "skill"
-    assert standing.skill.floor in skill_line(standing)

@@ -14,6 +14,7 @@ from lagbench.data.registry import Size, load
 from lagbench.data.scenario import read_scenario
 from lagbench.make.generate import generate
 from lagbench.submission import PredictionsWriter, ValidationResult, template, validate
+from lagbench.submission.start import Start, mistake
 from lagbench.submission.truth import Truth
 
 Floats = NDArray[np.floating]
@@ -219,3 +220,16 @@ def test_one_early_scenario_is_a_warning(world: World, tmp_path: Path) -> None:
     result = world.validate(tmp_path / "p.nc", predict)
     assert result.valid
     assert [finding.check for finding in result.warnings] == ["start"]
+
+
+def test_frames_and_particles_mixed_up_are_named() -> None:
+    """An array [particle, frame, space] that was reshaped instead of transposed; turned round it is none."""
+    rng = np.random.default_rng(4)
+    given = rng.random((60, 2))
+    path = given[:, None] + 0.002 * np.cumsum(rng.standard_normal((60, 10, 2)), axis=1)
+    wrong, right = path.reshape(10, 60, 2), path.transpose(1, 0, 2)
+    bounds = ((0.0, 1.0), (0.0, 1.0))
+    found = mistake(Start(given, right[0], wrong[0], wrong[1], 10), bounds, {})
+    assert found is not None
+    assert "mixed up" in found.what
+    assert mistake(Start(given, right[0], right[0], right[1], 10), bounds, {}) is None

@@ -17,8 +17,11 @@ from pathlib import Path
 from typing import Any
 
 from lagbench.data.checksums import file_sha256
+from lagbench.data.layout import resolve_root
 from lagbench.data.registry import Registry, Size, load
 from lagbench.errors import LagbenchError, UnreadableFileError, UsageError
+from lagbench.floors.shipped import shipped_path
+from lagbench.scoring.floors import measured_again
 from lagbench.submission import Finding
 from lagbench.work.progress import Progress
 
@@ -48,6 +51,8 @@ class CheckResult:
     page_checked: bool  # whether the page was compared; it is not while anything else is wrong
     confirmed: tuple[Confirmation, ...] = ()  # predictions that gave the same when scored again
     recorded: tuple[str, ...] = ()  # entries that were added to verified.yaml
+    # floors that were measured again, by data set, as in "cavity mini"
+    floors: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     @property
     def exit_code(self) -> int:
@@ -65,6 +70,7 @@ def check_board(
     isolated: bool = True,
     predictions: Sequence[str | Path] = (),
     recording: bool = False,
+    floors: Collection[Size] = (),
     root: str | Path | None = None,
     today: datetime.date | None = None,
     progress: Callable[[Progress], None] | None = None,
@@ -80,7 +86,8 @@ def check_board(
         isolated: whether to read score files in a child process first.
         predictions: predictions of entries to score again.
         recording: whether to note entries thus confirmed in verified.yaml.
-        root: folder of all data sets, for that.
+        floors: sizes whose shipped floors are measured again.
+        root: folder of all data sets, for both.
         today: the last day that entries may be of; by default tomorrow, as somewhere it is.
         progress: told how far that scoring is.
 
@@ -111,6 +118,7 @@ def check_board(
     )
     for one in predictions:
         look.found += again.of_file(one)
+    measured = {f"{size.split} {size.name}": look.measured(size, root, progress) for size in floors}
     recorded = again.entries_confirmed() if recording and not look.found else []
     record(folder, recorded, datetime.datetime.now(datetime.UTC).date())
     looked = page and not look.found
@@ -126,6 +134,7 @@ def check_board(
         page_checked=looked,
         confirmed=tuple(again.confirmed),
         recorded=tuple(entry.yaml_path.as_posix() for entry in recorded),
+        floors=measured,
     )
 
 
@@ -295,6 +304,17 @@ class _Look:
                 self.add("floor", path, identity["dataset_sha256"], what="scores on another data set")
         except LagbenchError as error:
             self.found.append(finding_of("floor", error, path))
+
+    def measured(
+        self, size: Size, root: str | Path | None, progress: Callable[[Progress], None] | None
+    ) -> tuple[str, ...]:
+        """Measure the shipped floors of a data set again; return which were."""
+        names, unlike = measured_again(size, resolve_root(root), progress=progress)
+        for name, metrics in unlike.items():
+            more = f" and {len(metrics) - 3} more metrics" if len(metrics) > 3 else ""
+            where = f"{shipped_path(size).name}, {name}"
+            self.add("measured", where, f"other {', '.join(metrics[:3])}{more}")
+        return names
 
     def together(self) -> None:
         """Check what entries are to each other, and what else lies in the folder."""

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from lagbench.data.registry import Registry, Size, load
 from lagbench.errors import ChecksFailedError, UnreadableFileError
+from lagbench.floors import FLOORS, FloorScores, solver_seconds
 from lagbench.metrics import METRICS, Score
 from lagbench.metrics.metric import mean
 from lagbench.metrics.significance import FEWEST_SCENARIOS, Standing, mean_loss, standings
@@ -23,9 +24,9 @@ from lagbench.scoring.scenario import Preview
 from lagbench.scoring.skill import skill
 from lagbench.submission.task_checks import frames_to_predict
 
-from .entry import Entry, Status
+from .entry import Cost, Entry, Status
 from .entry_file import read_entry
-from .floors import FloorScores, read_floors
+from .floors import read_floors
 from .folder import Folder
 from .model import Board, Curve, Floor, Histogram, Pictures, Row, Tab, Value
 from .payload import spaced
@@ -47,6 +48,9 @@ CURVES = (
     *("density_rmse", "divergence_rms"),
 )
 """Metrics that details have curves of, beside the ranking one."""
+
+TRIAL = "tiny"
+"""The size for trying out: nobody is asked to submit to it."""
 
 ENERGIES = ("energy_true", "energy_predicted")
 
@@ -111,7 +115,7 @@ def collect(
             if (split, name) in found:
                 floors = read_floors(place, size)
                 tabs.append(_tab(size, about.title, found[split, name], floors, verified))
-            elif len(size.subsets["test"]) >= FEWEST_SCENARIOS:
+            elif name != TRIAL and len(size.subsets["test"]) >= FEWEST_SCENARIOS:
                 empty.append((split, name))
     seen = {name for tab in tabs for row in tab.lines for name in row.values}
     metrics = {name: metric for name, metric in METRICS.items() if name in seen}
@@ -181,6 +185,7 @@ def _tab(
         truth=_pictures(witness.stored[0].preview, TRUTH),
         rows=tuple(rows),
         floors=tuple(_floor(held, size, ranking) for held in floors),
+        solver_seconds=solver_seconds(size),
     )
 
 
@@ -204,7 +209,7 @@ def _row(
         tied=standing is not None and standing.tied and not math.isnan(standing.p),
         p=standing.p if standing else math.nan,
         verified=verified,
-        skill=_skill(held.scores[ranking].score, floors) if held.current else None,
+        skill=_skill(held.scores[ranking], floors) if held.current else None,
         values={
             name: _value(found.score, found.interval, found.std, size) for name, found in held.scores.items()
         },
@@ -216,25 +221,35 @@ def _row(
     )
 
 
-def _skill(score: Score, floors: Sequence[FloorScores]) -> Value | None:
-    """Return how much better a row is than the best floor, from the mean over its seeds."""
-    name = score.metric.name
-    found = skill(score, {floor.name: floor.scores[name] for floor in floors if name in floor.scores})
+def _skill(scores: Combined, floors: Sequence[FloorScores]) -> Value | None:
+    """Return how much better a row is than the best floor, over its seeds."""
+    name = scores.score.metric.name
+    known = {floor.name: floor.scores[name] for floor in floors if name in floor.scores}
+    found = skill(scores.seeds, known)
     if found is None:
         return None
     low, high = found.interval
-    return Value(mean=found.value, std=math.nan, low=low, high=high, per_scenario=(), at={}, undefined=0)
+    return Value(mean=found.value, std=found.std, low=low, high=high, per_scenario=(), at={}, undefined=0)
 
 
 def _floor(held: FloorScores, size: Size, ranking: str) -> Floor:
-    energy = held.scores.get(ENERGIES[1])
+    energy, about = held.scores.get(ENERGIES[1]), FLOORS[held.name]
     return Floor(
         name=held.name,
-        definition=held.definition,
+        definition=about.definition,
         values={name: _value(score, score.interval, math.nan, size) for name, score in held.scores.items()},
         curves=_curves(held.scores, ranking),
         energy=curve(energy) if energy is not None and np.isfinite(energy.per_frame).mean() > 0.5 else None,
-        counts=held.counts,
+        counts=about.counts,
+        cost=None if math.isnan(held.seconds_per_frame) else _cost(held.seconds_per_frame, size),
+    )
+
+
+def _cost(seconds: float, size: Size) -> Cost:
+    return Cost.model_construct(
+        seconds_per_frame=seconds,
+        device="one core, where the floors were measured",
+        solver_seconds_per_frame=solver_seconds(size),
     )
 
 

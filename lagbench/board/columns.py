@@ -57,7 +57,7 @@ class Column:
     form: str = "number"  # how cells are written: number, count, factor or text
     reported: bool = False  # said by the submitter, computed again by nobody
     meaning: str
-    of: Callable[[Row], object] | None = None  # what an entry has there, where no metric stands behind
+    of: Callable[[Row | Floor], object] | None = None  # what a row has there, where no metric stands behind
 
     @property
     def quantity(self) -> str:
@@ -80,8 +80,12 @@ SKILL = Column(
 )
 
 
-def _of(part: str, key: str) -> Callable[[Row], object]:
-    return lambda row: getattr(getattr(row.entry, part) if part else row.entry, key, None)
+def _of(part: str, key: str) -> Callable[[Row | Floor], object]:
+    def of(row: Row | Floor) -> object:
+        said = row.entry if isinstance(row, Row) else row
+        return getattr(getattr(said, part, None) if part else said, key, None)
+
+    return of
 
 
 def _reported(part: str, held: Mapping[str, tuple[str, str, str, Direction, str]]) -> Iterator[Column]:
@@ -130,7 +134,7 @@ OF_ENTRY = (
         form="text",
         reported=True,
         meaning="Computing time of one training.",
-        of=lambda row: _budget(row.entry.budget),
+        of=lambda row: _budget(row.entry.budget) if isinstance(row, Row) else "",
     ),
     *_reported("budget", TRAINING),
     Column(
@@ -138,14 +142,14 @@ OF_ENTRY = (
         label="seeds",
         form="count",
         meaning="Trainings behind the row; with one it speaks of these weights only.",
-        of=lambda row: len(row.entry.predictions),
+        of=lambda row: len(row.entry.predictions) if isinstance(row, Row) else None,
     ),
     Column(
         key="checked",
         label="scores",
         form="text",
         meaning="Verified: the maintainers scored these predictions again. As submitted: they did not.",
-        of=lambda row: "verified" if row.verified else "as submitted",
+        of=lambda row: ("verified" if row.verified else "as submitted") if isinstance(row, Row) else "",
     ),
     Column(key="date", label="date", form="text", meaning="Of the submission.", of=_of("", "date")),
 )
@@ -197,7 +201,7 @@ def value_of(row: Row | Floor, column: Column) -> float | str:
     """Return what a row has in a column; NaN, or an empty text, where it has nothing."""
     if (value := held(row, column.key)) is not None:
         return value.mean
-    found = column.of(row) if column.of and isinstance(row, Row) else None
+    found = column.of(row) if column.of else None
     if column.form == "text":
         return str(found or "")
     return math.nan if found is None else float(str(found))

@@ -174,6 +174,12 @@ CHECKS: Mapping[str, Check] = MappingProxyType(
             "what the scorer gives",
             RESCORE,
         ),
+        "measured": Check(
+            "a shipped score of a floor that is not what the data give, measured again",
+            "the shipped scores of a floor are not those of the data",
+            "the scores that the package ships",
+            "lagbench verify; if the data are the recorded ones, python -m lagbench.scoring.record",
+        ),
         "page": Check(
             "a page or schema.json that is not what the submissions give",
             "the page is not what the submissions give",

@@ -8,8 +8,9 @@ pictures show the truth alone.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +18,7 @@ import numpy as np
 from lagbench.data.registry import Size
 from lagbench.errors import UnreadableFileError
 from lagbench.floors import FLOORS as KNOWN
-from lagbench.floors import shipped
-from lagbench.metrics import Score
+from lagbench.floors import FloorScores, shipped
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.scenario import SUBMISSION
 from lagbench.scoring.score_file import write_statistics
@@ -28,17 +28,7 @@ from .folder import FLOORS, Folder
 from .ranking import combine, is_current
 from .score_file import read_stored
 
-__all__ = ["FloorScores", "dataset_of", "floor_names", "read_floors", "write_floors"]
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class FloorScores:
-    """A floor on one split and size."""
-
-    name: str
-    scores: Mapping[str, Score]  # by metric
-    definition: str = ""  # one sentence
-    counts: bool = True  # whether it may be the best floor
+__all__ = ["dataset_of", "floor_names", "read_floors", "write_floors"]
 
 
 def floor_names() -> tuple[str, ...]:
@@ -49,7 +39,7 @@ def floor_names() -> tuple[str, ...]:
 def read_floors(folder: Folder, size: Size) -> tuple[FloorScores, ...]:
     """Return the floors of a split and size, those of another data set left out."""
     if known := shipped(size):
-        return tuple(_described(name, held.scores) for name, held in known.items())
+        return tuple(known.values())
     found = []
     for path in folder.floor_files(size.split, size.name):
         scores = read_stored(folder.path / path).scores
@@ -57,13 +47,10 @@ def read_floors(folder: Folder, size: Size) -> tuple[FloorScores, ...]:
             continue
         read_stored(folder.path / path, size)
         held = {name: made.score for name, made in combine([scores]).items()}
-        found.append(_described(path.stem, held))
+        found.append(
+            FloorScores(name=path.stem, scores=held, seconds_per_frame=math.nan, correlation=np.empty(0))
+        )
     return tuple(found)
-
-
-def _described(name: str, scores: Mapping[str, Score]) -> FloorScores:
-    floor = KNOWN[name]
-    return FloorScores(name=name, scores=scores, definition=floor.definition, counts=floor.counts)
 
 
 def dataset_of(identity: Mapping[str, str]) -> DataSet:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from lagbench.data.registry import Size
 from lagbench.metrics import Metric
 
-from .entry import Entry, Flag, Status
+from .entry import Cost, Entry, Flag, Status
 from .verified import Verification
 
 __all__ = ["Board", "Curve", "Floor", "Histogram", "Pictures", "Row", "Tab", "Value"]
@@ -78,6 +78,7 @@ class Floor:
     curves: Mapping[str, Curve]
     energy: Curve | None
     counts: bool = True  # whether it may be the best floor
+    cost: Cost | None = None  # what a frame costs it and the solver, on the machine that measured
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -156,6 +157,7 @@ class Tab:
     truth: Pictures  # those of the rows have the same scenario and frames
     rows: tuple[Row, ...]  # ranked ones by rank, then the others
     floors: tuple[Floor, ...]
+    solver_seconds: float | None = None  # processor time of a frame of the solver itself [s]
 
     @property
     def id(self) -> str:

@@ -7,16 +7,14 @@ value there; intervals and tests resample scenarios and seeds together.
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lagbench.data.layout import major_of
 from lagbench.data.registry import Size
-from lagbench.metrics import METRICS, Score, aggregate, bootstrap_interval
+from lagbench.metrics import METRICS, Score, aggregate, bootstrap_interval, mean_over_seeds
 from lagbench.scoring.card import digits
 from lagbench.scoring.score_file import StoredScores
 
@@ -60,20 +58,13 @@ def _combined(scores: Sequence[Score]) -> Combined:
         metric=first.metric,
         scenarios=first.scenarios,
         frames=first.frames,
-        per_frame=_mean_defined([held.per_frame for held in scores]),
-        values=_mean_defined([held.values for held in scores]),
+        per_frame=mean_over_seeds([held.per_frame for held in scores]),
+        values=mean_over_seeds([held.values for held in scores]),
         undefined=tuple(sum(counts) for counts in zip(*(held.undefined for held in scores), strict=True)),
     )
     defined = [value for value in means if not math.isnan(value)]
     std = float(np.std(defined, ddof=1)) if len(defined) > 1 else math.nan
     return Combined(score=score, std=std, means=means, seeds=tuple(scores))
-
-
-def _mean_defined(arrays: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Return the mean over the arrays that have a value, NaN where none has, shape of one."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # a mean of nothing is NaN, as it should be
-        return np.asarray(np.nanmean(np.stack(arrays), axis=0), np.float64)
 
 
 def summarise(scores: Mapping[str, Combined]) -> dict[str, Summary]:

@@ -11,11 +11,10 @@ from __future__ import annotations
 import json
 import os
 import resource
-import stat
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,7 +31,7 @@ from lagbench.scoring.card import unreadable_scores
 from lagbench.scoring.scenario import FRAMES, PARTICLES, Preview
 from lagbench.scoring.score_file import FILM_RANGE, StoredScores, read_statistics
 from lagbench.scoring.task import ranking_metric
-from lagbench.submission.hdf5 import opened
+from lagbench.submission.hdf5 import Structure, check_regular, check_structure, opened
 from lagbench.submission.task_checks import frames_to_predict
 
 __all__ = ["MAX_SCORE_BYTES", "Stored", "main", "read_stored", "reported_frames", "unreadable_in_child"]
@@ -43,13 +42,11 @@ MAX_SCORE_BYTES = 1_000_000
 MAX_UNPACKED = 32 << 20
 """Most that a score file may unpack to [bytes]; the largest of ours takes 3 MB."""
 
-MAX_LINKS = 40
 MAX_STATISTICS = 500
 
 GROUP = "preview"
-FILTERS = (h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE)
-NUMBERS = (h5py.h5t.INTEGER, h5py.h5t.FLOAT)
-LAYOUTS = (h5py.h5d.COMPACT, h5py.h5d.CONTIGUOUS, h5py.h5d.CHUNKED)
+STRUCTURE = Structure(members=40, groups=(GROUP,), unpacked=MAX_UNPACKED)
+"""What a score file may hold: plain numbers of its own, in one group beside the root."""
 
 MEMORY = 768 << 20
 """Address space of the child [bytes]."""
@@ -88,10 +85,14 @@ def reported_frames(size: Size) -> tuple[int, ...]:
 
 def read_stored(path: Path, size: Size | None = None) -> Stored:
     """Read a score file."""
-    _check_length(path)
+    if path.is_symlink():  # it could lead out of the folder
+        raise UnreadableFileError(
+            "not a score file", where=str(path), expected="a regular file", got="a link"
+        )
+    check_regular(path, longest=MAX_SCORE_BYTES, fix="`lagbench submit` writes it beside the entry")
     try:
         with opened(path) as file:
-            _check_members(file)
+            check_structure(file, path, STRUCTURE)
         scores = read_statistics(path)
         tallies = list(scores.tallies.values())
         if not tallies or len(tallies[0].names) > MAX_STATISTICS:
@@ -106,66 +107,6 @@ def read_stored(path: Path, size: Size | None = None) -> Stored:
     except Exception as error:  # HDF5 on damaged bytes raises nearly any type
         raise unreadable_scores(path, error) from error
     return Stored(scores=scores, preview=preview, precision=precision)
-
-
-def _check_length(path: Path) -> None:
-    try:
-        status = path.lstat()
-    except OSError as error:
-        raise UnreadableFileError(
-            "cannot read the score file",
-            where=str(path),
-            expected="the file that `lagbench submit` wrote beside the entry",
-            got=error.strerror,
-            fix="bring it back, or submit the predictions again; `lagbench leaderboard check` names all such",
-        ) from error
-    regular = stat.S_ISREG(status.st_mode)
-    if not regular or status.st_size > MAX_SCORE_BYTES:
-        raise UnreadableFileError(
-            "not a score file",
-            where=str(path),
-            expected=f"a regular file of at most {MAX_SCORE_BYTES} bytes",
-            got=f"{status.st_size} bytes" if regular else "a link, folder or device",
-            fix="`lagbench submit` writes it",
-        )
-
-
-def _check_members(file: h5py.File) -> None:
-    """Refuse links, foreign storage and filters, and data that unpack to too much."""
-    total = 0
-    for dataset in _datasets(file):
-        plist = dataset.id.get_create_plist()
-        filters = [plist.get_filter(i)[0] for i in range(plist.get_nfilters())]
-        if plist.get_layout() not in LAYOUTS or plist.get_external_count():
-            raise ValueError("a variable that does not lie in this file")
-        if not set(filters).issubset(FILTERS) or len(set(filters)) < len(filters):
-            raise ValueError("a variable that is packed in another way, or twice")
-        if dataset.id.get_type().get_class() not in NUMBERS:  # strings may share one long piece of heap
-            raise ValueError("a variable that holds no plain numbers")
-        total += dataset.id.get_space().get_simple_extent_npoints() * dataset.id.get_type().get_size()
-        if plist.get_layout() == h5py.h5d.CHUNKED:
-            total += int(np.prod(plist.get_chunk(), dtype=object)) * dataset.id.get_type().get_size()
-        if total > MAX_UNPACKED:
-            raise ValueError(f"more than {MAX_UNPACKED} bytes when unpacked")
-
-
-def _datasets(file: h5py.File) -> Iterator[h5py.Dataset]:
-    groups = [file["/"]]
-    while groups:
-        group = groups.pop()
-        if group.id.get_num_objs() > MAX_LINKS:
-            raise ValueError(f"more than {MAX_LINKS} members")
-        for index in range(group.id.get_num_objs()):
-            name = group.id.get_objname_by_idx(index)
-            if group.id.links.get_info(name).type != h5py.h5l.TYPE_HARD:
-                raise ValueError("a link instead of a variable")
-            kind = h5py.h5o.get_info(group.id, name).type
-            if kind == h5py.h5o.TYPE_DATASET:
-                yield group[name]
-            elif kind == h5py.h5o.TYPE_GROUP and group.name == "/" and name == GROUP.encode():
-                groups.append(group[name])
-            else:
-                raise ValueError("a group that score files do not have")
 
 
 def _read_preview(path: Path) -> tuple[Preview, float]:

@@ -10,6 +10,7 @@ from lagbench.metrics import Direction, Metric
 from lagbench.report.html import Markup, clipped, escaped, join, tag, text, words
 
 from .columns import columns_of, presets_of, value_of, written
+from .cost import cost_figure
 from .model import Board, Row, Tab
 from .table import EXPLAINED, draw_table
 
@@ -141,7 +142,7 @@ def section(tab: Tab, metrics: Mapping[str, Metric]) -> Markup:
             tabindex=0,
         ),
         tag("div", *(tag("p", note) for note in _notes(tab)), class_="notes"),
-        tag("div", class_="figures"),
+        tag("div", cost_figure(tab), class_="figures"),
         id=tab.id,
         class_="tab",
     )
@@ -238,12 +239,12 @@ def _notes(tab: Tab) -> Iterator[Markup]:
     told = "There are too few test scenarios to tell entries apart: the intervals speak alone."
     if tab.decided:
         told = (
-            "≈ cannot be told from the leader: exact sign-flip test over scenarios, p-values corrected"
-            " for the number of entries by Holm's method."
+            "≈ cannot be told from the leader at 5 %: two-way bootstrap over scenarios and seeds, with one"
+            " seed each the exact sign-flip test over scenarios; p-values corrected by Holm's method."
         )
     yield escaped(f"{told} Shaded rows are floors: what costs no learning, never ranked.")
     yield escaped(
-        "Mean over test scenarios and seeds; below it the 95 % bootstrap interval."
+        "Mean over test scenarios and seeds; below it the 95 % interval, of both resampled together."
         " ↓ lower, ↑ higher, ◎ closer to the perfect value is better;"
         " bold is best, floors included, and the bluer a cell, the nearer to it."
         " † some frames have no value. – not measured or undefined."

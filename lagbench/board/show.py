@@ -11,12 +11,10 @@ from lagbench.scoring.card import digits
 from lagbench.scoring.tables import Table
 
 from .columns import held
+from .entry import Cost
 from .model import Board, Floor, Row, Tab, Value
 
 __all__ = ["as_plain", "chosen_tabs", "tables"]
-
-SHOWN = 5
-"""Metrics in a table unless some are named."""
 
 
 def chosen_tabs(board: Board, split: str | None, size: str | None) -> tuple[Tab, ...]:
@@ -36,13 +34,16 @@ def chosen_tabs(board: Board, split: str | None, size: str | None) -> tuple[Tab,
     raise UsageError("no entries there", where=f"leaderboard {wanted}".strip(), fix=fix)
 
 
-def tables(board: Board, tabs: Collection[Tab], metrics: Collection[str] = ()) -> Iterator[Table]:
+def tables(
+    board: Board, tabs: Collection[Tab], metrics: Collection[str] = (), *, wide: bool = False
+) -> Iterator[Table]:
     """Yield a table per tab: ranked rows, then floors, then what is not ranked.
 
     Args:
         board: the board.
         tabs: its tabs to show.
-        metrics: names of metrics to show beside the ranking one; the tab's first ones by default.
+        metrics: names of metrics to show beside skill and the ranking one.
+        wide: whether to show the tab's first metrics too.
 
     Raises:
         UsageError: a metric that the board does not have.
@@ -52,7 +53,7 @@ def tables(board: Board, tabs: Collection[Tab], metrics: Collection[str] = ()) -
             raise UsageError(f"no metric {name!r} here", where="--metric", fix=nearest(name, board.metrics))
     for tab in tabs:
         skill = ("skill",) if any(row.skill for row in tab.rows) else ()
-        names = list(dict.fromkeys((*skill, tab.ranking, *(metrics or tab.columns[:SHOWN]))))
+        names = list(dict.fromkeys((*skill, tab.ranking, *metrics, *(tab.columns if wide else ()))))
         claim = "" if tab.decided else ", too few scenarios to tell entries apart"
         cost = "; cost self-reported" if any(row.entry.cost for row in tab.rows) else ""
         title = f"{tab.size.split} {tab.size.name} {tab.size.version}, by {tab.ranking}{claim}{cost}"
@@ -63,6 +64,7 @@ def tables(board: Board, tabs: Collection[Tab], metrics: Collection[str] = ()) -
             title,
             ("rank", "method", *names, "s/frame", "speed-up", "remarks"),
             tuple(_cells(row, names) for row in shown),
+            keys=2,
         )
 
 
@@ -111,16 +113,16 @@ def _plain_value(value: Value) -> dict[str, float | None]:
 def _cells(row: Row | Floor, names: list[str]) -> tuple[str, ...]:
     values = tuple(_spelt(held(row, name)) for name in names)
     if isinstance(row, Floor):
-        return ("-", row.name, *values, "", "", "floor")
-    cost = row.entry.cost
-    return (
-        "-" if row.rank is None else f"{row.rank}{'≈' if row.tied else ''}",
-        row.id,
-        *values,
-        "" if cost is None else f"{cost.seconds_per_frame:.3g}",
-        "" if cost is None or cost.speed_up is None else f"{cost.speed_up:.3g}",
-        ", ".join(_remarks(row)),
-    )
+        return ("-", row.name, *values, *_spent(row.cost), "floor")
+    rank = "-" if row.rank is None else f"{row.rank}{'≈' if row.tied else ''}"
+    return (rank, row.id, *values, *_spent(row.entry.cost), ", ".join(_remarks(row)))
+
+
+def _spent(cost: Cost | None) -> tuple[str, str]:
+    """Return the time of a frame and the speed-up over the solver."""
+    if cost is None:
+        return "", ""
+    return f"{cost.seconds_per_frame:.3g}", "" if cost.speed_up is None else f"{cost.speed_up:.3g}"
 
 
 def _spelt(value: Value | None) -> str:

@@ -116,21 +116,24 @@ class _Shades:
     """Colours of a column: the nearer a cell is to the best of entries and floors, the deeper."""
 
     def __init__(self, tab: Tab, column: Column) -> None:
-        judged = [row for row in tab.lines if isinstance(row, Floor) or row.active]
-        values = [value_of(row, column) for row in judged if column.form != "text"]
-        losses = [column.loss(float(value)) for value in values]
+        # the floors' costs are measured, and no merit
+        judged = [row for row in tab.lines if (row.active if isinstance(row, Row) else not column.reported)]
+        values = [float(value_of(row, column)) for row in judged if column.form != "text"]
+        losses = [column.loss(value) for value in values]
         self._column = column
         self._known = sorted(loss for loss in losses if math.isfinite(loss))
+        best = [v for v, loss in zip(values, losses, strict=True) if self._known and loss == self._known[0]]
+        self._best = {written(value, column.form) for value in best}  # what reads the same is no worse
 
     def classes(self, row: Row | Floor) -> Iterator[str]:
         """Yield the classes of a row's cell."""
         value = value_of(row, self._column)
-        inactive = isinstance(row, Row) and not row.active
+        aside = not row.active if isinstance(row, Row) else self._column.reported
         loss = math.nan if isinstance(value, str) else self._column.loss(value)
-        if inactive or not math.isfinite(loss) or len(self._known) < 2:
+        if aside or not math.isfinite(loss) or len(self._known) < 2:
             return
         low, high = self._known[0], self._known[-1]
-        if loss == low:
+        if written(value, self._column.form) in self._best:
             yield "best"
         if high > low and len(self._known) >= FEWEST_SHADED:
             bend = math.log if low > 0.0 else float

@@ -7,7 +7,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .options import JsonFlag, QuietFlag, RootOption, SplitArgument, SplitOption, WorkersOption, chosen
+from .options import (
+    JsonFlag,
+    QuietFlag,
+    RootOption,
+    SizeOption,
+    SplitArgument,
+    SplitOption,
+    WorkersOption,
+    chosen,
+)
 from .output import print_json, print_table, progress_bar, say, spell_bytes
 
 if TYPE_CHECKING:
@@ -149,13 +158,29 @@ def check(
         bool,
         typer.Option("--record", help="With --predictions: note what is confirmed in verified.yaml."),
     ] = False,
-    root: RootOption = None,
+    root: Annotated[
+        Path | None,
+        typer.Option(
+            "--root",
+            metavar="FOLDER",
+            help="Where data sets live; without --predictions the shipped floors of those there are measured"
+            " again.",
+        ),
+    ] = None,
+    split: Annotated[
+        str | None, typer.Option("--split", metavar="NAME", help="With --root: floors of this split only.")
+    ] = None,
+    size: Annotated[
+        str | None, typer.Option("--size", metavar="NAME", help="With --root: floors of this size only.")
+    ] = None,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
     """Check entries, score files and every aggregate; for every pull request."""
     from lagbench.board.check import check_board
+    from lagbench.scoring.floors import measured_sizes
 
+    sizes = measured_sizes(root, split=split, name=size) if root and not predictions else []
     with progress_bar(quiet=quiet or as_json) as draw:
         result = check_board(
             board,
@@ -164,6 +189,7 @@ def check(
             own=own or (),
             predictions=predictions or (),
             recording=recording,
+            floors=sizes,
             root=root,
             progress=draw,
         )
@@ -180,11 +206,35 @@ def _checked(result: CheckResult, *, quiet: bool) -> None:
     for one in result.confirmed:
         close = "exactly" if one.difference == 0.0 else f"to {one.difference:.1e}, relative"
         say(f"{one.predictions}: confirms {one.score_file} of {one.entry} {close}", quiet=quiet)
+    for name, floors in result.floors.items():
+        say(f"{name}: measured again {', '.join(floors)}", quiet=quiet)
     for entry in result.recorded:
         say(f"recorded as verified: {entry}", quiet=quiet)
     state = f"{len(result.findings)} findings" if result.findings else "nothing wrong"
     looked = ", page compared" if result.page_checked else ""
     say(f"{result.folder}: {result.entries} entries, {state}{looked}", quiet=quiet)
+
+
+@leaderboard.command("picture", epilog="Example: lagbench leaderboard picture cavity --size mini -o cost.svg")
+def picture(
+    name: SplitArgument = None,
+    split: SplitOption = None,
+    size: SizeOption = "full",
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="SVG file to write.")] = Path(
+        "cost.svg"
+    ),
+    board: BoardOption = BOARD,
+    quiet: QuietFlag = False,
+) -> None:
+    """Draw accuracy against cost of a data set as an SVG file."""
+    from lagbench.atomic import write_atomically
+    from lagbench.board.collect import collect
+    from lagbench.board.cost import picture as draw
+    from lagbench.data.registry import load
+
+    drawn = draw(collect(board), load().size(chosen(name, split), size))
+    write_atomically(output, drawn.encode(), option="--output")
+    say(str(output), quiet=quiet)
 
 
 @leaderboard.command("show", epilog="Example: lagbench leaderboard show cavity --size mini")
@@ -197,6 +247,7 @@ def show(
     metric: Annotated[
         list[str] | None, typer.Option("--metric", metavar="NAME", help="Metric to show; repeatable.")
     ] = None,
+    wide: Annotated[bool, typer.Option("--wide", help="Show the first metrics of each data set.")] = False,
     board: BoardOption = BOARD,
     as_json: JsonFlag = False,
 ) -> None:
@@ -209,7 +260,8 @@ def show(
     if as_json:
         print_json(as_plain(tabs))
         return
-    for table in tables(held, tabs, metric or ()):
-        print_table(table.title, table.columns, table.rows)
+    for table in tables(held, tabs, metric or (), wide=wide):
+        for block in table.blocks():
+            print_table(block.title, block.columns, block.rows)
     if not tabs:
         say(f"{board}: no entries yet; the first: lagbench submit predictions.nc --from meta.yaml")

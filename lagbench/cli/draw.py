@@ -11,7 +11,7 @@ import typer
 
 from lagbench.errors import DataError, UnreadableFileError, UsageError
 
-from .options import JsonFlag, QuietFlag, RootOption, SizeOption, chosen
+from .options import JsonFlag, PresentSizeOption, QuietFlag, RootOption, chosen
 from .output import print_json, say
 
 __all__ = ["animate", "plot"]
@@ -28,10 +28,12 @@ OutputOption = Annotated[
 ]
 
 
-def _source(name: str | None, split: str | None, size: str, scenario: int | None, root: Path | None) -> Path:
+def _source(
+    name: str | None, split: str | None, size: str | None, scenario: int | None, root: Path | None
+) -> Path:
     """Return the scenario file that a user means by its path or by split, size and id."""
     from lagbench.data.layout import ScenarioKey, scenario_path
-    from lagbench.data.local import locate
+    from lagbench.data.local import locate, remedy
     from lagbench.store.copy import bring
 
     if name is not None and name.endswith(".nc"):
@@ -40,8 +42,14 @@ def _source(name: str | None, split: str | None, size: str, scenario: int | None
     wanted = tier.subsets["test"][0] if scenario is None else scenario
     subset = tier.subset_of(wanted)
     bring(tier, folder, [wanted])
-    key = ScenarioKey(split=tier.split, size=size, version=tier.version, scenario=wanted, subset=subset)
-    return scenario_path(folder, key)
+    key = ScenarioKey(split=tier.split, size=tier.name, version=tier.version, scenario=wanted, subset=subset)
+    path = scenario_path(folder, key)
+    if not path.is_file():
+        option = f"--subset {subset}" if scenario is None else f"--scenarios {wanted}"
+        raise DataError(
+            f"scenario {wanted} is not there", where=str(path), fix=remedy(tier, option, root=folder)
+        )
+    return path
 
 
 @contextmanager
@@ -86,7 +94,7 @@ def _done(path: Path, *, as_json: bool, quiet: bool) -> None:
 def plot(
     name: SourceArgument = None,
     split: SplitNameOption = None,
-    size: SizeOption = "full",
+    size: PresentSizeOption = None,
     scenario: ScenarioOption = None,
     frame: Annotated[int, typer.Option("--frame", help="Frame number; negative ones from the end.")] = -1,
     kind: Annotated[
@@ -96,22 +104,29 @@ def plot(
         bool, typer.Option("--sheet", help="Draw many scenarios of the split on one page instead.")
     ] = False,
     output: OutputOption = None,
+    dpi: Annotated[
+        int, typer.Option("--dpi", help="Pixels per inch of PNG, and of clouds in PDF.", min=32, max=1200)
+    ] = 128,
     root: RootOption = None,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
     """Draw one frame of a scenario: particles, vorticity, streamlines."""
-    from lagbench.draw.plot import contact_sheet, plot_frame
+    from lagbench.data.local import locate
+    from lagbench.draw.plot import check_kind, contact_sheet, plot_frame
 
     if sheet:
         chosen_split = chosen(name, split)
-        page = _target(output or Path(f"{Path(chosen_split).name}-{size}-sheet.png"))
-        _done(contact_sheet(chosen_split, size, page, root=root), as_json=as_json, quiet=quiet)
+        tier = locate(chosen_split, size, root=root).size
+        page = _target(output or Path(f"{tier.split}-{tier.name}-sheet.png"))
+        drawn = contact_sheet(chosen_split, tier.name, page, root=root, dpi=dpi)
+        _done(drawn, as_json=as_json, quiet=quiet)
         return
+    check_kind(kind)
     source = _source(name, split, size, scenario, root)
     target = _target(output or _default_name(source, f"-frame{frame}.png"))
     with _told_as_given(name):
-        plot_frame(source, frame, target, kind=kind)
+        plot_frame(source, frame, target, kind=kind, dpi=dpi)
     _done(target, as_json=as_json, quiet=quiet)
 
 
@@ -121,7 +136,7 @@ def animate(
         str | None, typer.Argument(metavar="FILE", help="Second scenario file, drawn beside the first.")
     ] = None,
     split: SplitNameOption = None,
-    size: SizeOption = "full",
+    size: PresentSizeOption = None,
     scenario: ScenarioOption = None,
     beside: Annotated[
         int | None, typer.Option("--beside", metavar="ID", help="Second scenario of the split.")
@@ -136,7 +151,10 @@ def animate(
 ) -> None:
     """Turn a scenario into an MP4 or GIF film; two scenarios stand side by side."""
     from lagbench.draw.animate import animate as run
+    from lagbench.draw.animate import check_ending
 
+    if output is not None:
+        check_ending(output)
     source = _source(name, split, size, scenario, root)
     other = Path(second) if second else None
     if beside is not None:

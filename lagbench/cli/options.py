@@ -17,6 +17,7 @@ __all__ = [
     "ScenariosOption",
     "SchedulerOption",
     "SizeOption",
+    "PresentSizeOption",
     "SplitArgument",
     "SplitOption",
     "SubsetOption",
@@ -29,6 +30,10 @@ SplitOption = Annotated[
     str | None, typer.Option("--split", metavar="NAME", help="Data set; `lagbench list` names them.")
 ]
 SizeOption = Annotated[str, typer.Option("--size", metavar="NAME", help="tiny, mini or full.")]
+PresentSizeOption = Annotated[
+    str | None,
+    typer.Option("--size", metavar="NAME", help="tiny, mini or full; by default the only one there is."),
+]
 SubsetOption = Annotated[
     str | None, typer.Option("--subset", metavar="NAMES", help="Some of train,valid,test; all by default.")
 ]

@@ -14,10 +14,10 @@ from lagbench.errors import UsageError
 
 from .options import (
     JsonFlag,
+    PresentSizeOption,
     QuietFlag,
     RootOption,
     SchedulerOption,
-    SizeOption,
     SplitArgument,
     SplitOption,
     WorkersOption,
@@ -28,6 +28,7 @@ from .output import print_json, print_table, progress_bar, say, spell_bytes
 if TYPE_CHECKING:
     from lagbench.scoring.card import ScoreCard
     from lagbench.scoring.compare import ComparisonResult
+    from lagbench.scoring.tables import Table
     from lagbench.submission import ValidationResult
 
 __all__ = ["compare", "score", "template", "validate"]
@@ -41,15 +42,17 @@ OwnSplitOption = Annotated[
     typer.Option("--split", metavar="NAME", help="Split that they must be for; a local one by its folder."),
 ]
 EveryFlag = Annotated[bool, typer.Option("--all", help="Show every metric.")]
+FloorsFlag = Annotated[bool, typer.Option("--all-floors", help="Show every floor, not only the best.")]
 
 
 def template(
     name: SplitArgument = None,
     split: SplitOption = None,
-    size: SizeOption = "full",
+    size: PresentSizeOption = None,
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="File to write.")] = Path(
         "predictions.nc"
     ),
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file of that name.")] = False,
     root: RootOption = None,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
@@ -57,7 +60,7 @@ def template(
     """Write a valid predictions.nc to fill: the persistence prediction."""
     from lagbench.submission import template as run
 
-    result = run(chosen(name, split), size, output=output, root=root)
+    result = run(chosen(name, split), size, output=output, overwrite=overwrite, root=root)
     if as_json:
         print_json(result)
         return
@@ -89,8 +92,9 @@ def validate(
 def _checked(result: ValidationResult) -> None:
     for finding in result.findings:
         say(str(finding))
-    for check, reason in result.skipped.items():
-        say(f"not made [{check}]: {reason}")
+    for reason in dict.fromkeys(result.skipped.values()):
+        checks = ", ".join(check for check, why in result.skipped.items() if why == reason)
+        say(f"not made, since {reason}: {checks}")
     counts = (
         f"{len(result.errors)} errors, {len(result.warnings)} warnings, {len(result.passed)} checks passed"
     )
@@ -107,7 +111,8 @@ def score(
             "--output",
             "-o",
             metavar="FOLDER",
-            help="Where scores go; beside FILE by default. With several, in folders named like them.",
+            help="Where scores go; beside predictions.nc by default, of other and of several files in folders"
+            " named like them.",
         ),
     ] = None,
     report: Annotated[
@@ -120,6 +125,7 @@ def score(
         str, typer.Option("--extras", metavar="NAMES", help="Extras with metrics, as in transport.")
     ] = "",
     every: EveryFlag = False,
+    floors: FloorsFlag = False,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
@@ -149,7 +155,7 @@ def score(
             )
         cards.append(card)
         if not as_json and not quiet:
-            _scored(card, every=every)
+            _scored(card, every=every, floors=floors)
     if as_json:
         print_json(cards[0].as_json() if len(cards) == 1 else [card.as_json() for card in cards])
     if report is not None:
@@ -158,10 +164,10 @@ def score(
         say(f"report: {write_report(report, cards, predictions, root=root)}", quiet=quiet or as_json)
 
 
-def _targets(predictions: Sequence[Path], output: Path | None) -> list[Path]:
+def _targets(predictions: Sequence[Path], output: Path | None) -> Sequence[Path | None]:
     """Return the folder for the scores of each file; refuse two files with one folder."""
     if len(predictions) == 1:
-        return [output or predictions[0].parent]
+        return [output]
     targets = [(output or path.parent) / path.stem for path in predictions]
     held: dict[Path, Path] = {}
     for path, target in zip(predictions, targets, strict=True):
@@ -238,14 +244,19 @@ def _complain(result: ValidationResult) -> None:
         typer.echo("\n".join(str(finding) for finding in result.errors), err=True)
 
 
-def _scored(card: ScoreCard, *, every: bool) -> None:
+def _scored(card: ScoreCard, *, every: bool, floors: bool) -> None:
     from lagbench.scoring.tables import card_tables, flag_lines
 
-    for table in card_tables(card, every=every):
-        print_table(table.title, table.columns, table.rows)
+    for table in card_tables(card, every=every, floors=floors):
+        _print(table)
     for line in flag_lines(card):
         say(line)
     say("written: " + ", ".join(str(path) for path in card.files))
+
+
+def _print(table: Table) -> None:
+    for block in table.blocks():
+        print_table(block.title, block.columns, block.rows)
 
 
 def compare(
@@ -274,8 +285,8 @@ def compare(
 
 
 def _compared(result: ComparisonResult, *, every: bool) -> None:
-    from lagbench.scoring.tables import comparison_table
+    from lagbench.scoring.tables import comparison_tables
 
-    table = comparison_table(result, every=every)
-    print_table(table.title, table.columns, table.rows)
+    for table in comparison_tables(result, every=every):
+        _print(table)
     say(result.verdict)

@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 from lagbench.errors import UnreadableFileError, UsageError, nearest
 
-from .layout import resolve_root, url_of
+from .layout import dataset_folder, resolve_root, url_of
 from .registry import NO_GENERATOR, Measured, Registry, Size, Split, load
 
 __all__ = [
@@ -142,16 +142,45 @@ def home(split: str, *, root: str | Path | None = None, registry: Registry | Non
 
 
 def locate(
-    split: str, size: str = "full", *, root: str | Path | None = None, registry: Registry | None = None
+    split: str,
+    size: str | None = None,
+    *,
+    root: str | Path | None = None,
+    registry: Registry | None = None,
 ) -> Located:
     """Return one size of the split that a user means, and where its data live; see :func:`home`.
 
+    Args:
+        split: name or path.
+        size: name of the size; the only one that is there when None.
+        root: folder of all data sets.
+        registry: the other splits; ours when None.
+
     Raises:
-        UsageError: see :func:`home`; or the split has no such size.
+        UsageError: see :func:`home`; the split has no such size, or of several or no sizes that
+            are there none is named.
         UnreadableFileError: the description of the local split is not right.
     """
     name, folder, known = home(split, root=root, registry=registry)
-    return Located(known.size(name, size), folder, known)
+    return Located(known.size(name, size or _only_size(name, folder, known)), folder, known)
+
+
+def _only_size(split: str, root: Path, known: Registry) -> str:
+    """Return the size that a split has, or of which there are data."""
+    sizes = [known.size(split, name) for name in known.split(split).sizes]
+    here = [s for s in sizes if any(dataset_folder(root, split, s.name, s.major).glob("*/*.nc"))]
+    found = here or (sizes if len(sizes) == 1 else [])
+    if len(found) == 1:
+        return found[0].name
+    names = ", ".join(size.name for size in here) or f"no data of {split}"
+    option = f"--size {here[0].name}" if here else remedy(sizes[-1], root=root)
+    raise UsageError(
+        "several sizes are there: name one" if here else "no size is named, and none is there",
+        where="--size",
+        expected=", ".join(size.name for size in sizes),
+        got=f"{names} in {url_of(root) or root}",
+        fix=option,
+    )
 
 
 def _at(folder: Path, root: str | Path | None, registry: Registry | None) -> Home:

@@ -54,6 +54,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Packed",
     "Painter",
+    "check_ending",
     "halve",
     "pack",
     "unpack",
@@ -338,7 +339,8 @@ def animate(
     return path
 
 
-def _check(path: Path, kind: Panel | str | None, rate: float, every: int) -> None:
+def check_ending(path: Path) -> None:
+    """Refuse a name that is none of a film."""
     if path.suffix.lower() not in SUFFIXES:
         raise UsageError(
             "no such kind of video",
@@ -346,6 +348,10 @@ def _check(path: Path, kind: Panel | str | None, rate: float, every: int) -> Non
             expected=f"a name ending in {' or '.join(SUFFIXES)}",
             got=path,
         )
+
+
+def _check(path: Path, kind: Panel | str | None, rate: float, every: int) -> None:
+    check_ending(path)
     if kind is not None and kind not in KINDS:
         raise UsageError(
             f"an animation cannot show {kind!r}", where="--kind", fix=nearest(str(kind), map(str, KINDS))

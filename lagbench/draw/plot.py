@@ -25,7 +25,7 @@ from lagbench.store.copy import bring
 
 from .panels import TITLES, Panel, colour_bar, draw, limit_of, material_key, moving_walls
 from .recording import Recording, Scene, open_recording
-from .style import MUTED, figure, header, save_png
+from .style import DPI, MUTED, figure, header, save
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -37,6 +37,7 @@ __all__ = [
     "KINDS",
     "Panel",
     "describe",
+    "check_kind",
     "plot_frame",
 ]
 
@@ -81,18 +82,20 @@ def contact_sheet(
     root: str | Path | None = None,
     kind: Panel | str | None = None,
     frame: int | None = None,
+    dpi: int = DPI,
     registry: Registry | None = None,
 ) -> Path:
-    """Draw many scenarios of a split on one page as a PNG file; return its path.
+    """Draw many scenarios of a split on one page; return the path of the file.
 
     Args:
         split: name of the split.
         size: name of the size.
-        output: file to write, ending in .png.
+        output: file to write, ending in .png, .pdf or .svg.
         root: folder that holds all data sets; see ``resolve_root``.
         kind: what each panel shows; the default suits the split.
         frame: frame to show where the sheet is a table of scenarios; when None, the first, or
             the last frame of interest of what starts at rest or is driven.
+        dpi: pixels per inch.
         registry: where splits are described; ours when None.
 
     Raises:
@@ -114,10 +117,10 @@ def contact_sheet(
     columns = max(len(row) for row in sheet.rows)
     width = 2 * MARGIN + columns * (SIDE + GAP) - GAP
     height = TOP + len(sheet.rows) * (SIDE + LABEL + GAP) + BAR
-    with figure(max(width, 5.0), height) as drawn:
+    with figure(max(width, 5.0), height, dpi=dpi) as drawn:
         header(drawn, f"{splits.split(tier.split).title} · {tier.split} {size}", sheet.subtitle, left=MARGIN)
         _draw_sheet(drawn, sheet)
-        return save_png(drawn, output)
+        return save(drawn, output)
 
 
 def scenario_files(size: Size, root: Path) -> list[Path]:
@@ -231,39 +234,46 @@ SEPARATOR = "  ·  "
 DIRECTIONS = {(1, 0): "right", (-1, 0): "left", (0, 1): "up", (0, -1): "down"}
 
 
+def check_kind(kind: str) -> None:
+    """Refuse a kind of picture that :func:`plot_frame` cannot draw."""
+    if kind not in KINDS:
+        raise UsageError(f"no kind of picture {kind!r}", where="--kind", fix=nearest(kind, KINDS))
+
+
 def plot_frame(
     source: str | Path | xr.Dataset,
     frame: int,
     output: str | Path,
     *,
     kind: str = ALL,
+    dpi: int = DPI,
     registry: Registry | None = None,
 ) -> Path:
-    """Draw one frame of a scenario as a PNG file; return its path.
+    """Draw one frame of a scenario; return the path of the file.
 
     Args:
         source: scenario file, or a data set of one scenario.
         frame: absolute frame number; negative ones count from the end.
-        output: file to write, ending in .png.
+        output: file to write, ending in .png, .pdf or .svg.
         kind: one of :data:`KINDS`; ``all`` draws three panels side by side.
+        dpi: pixels per inch.
         registry: where splits are described; ours when None.
 
     Raises:
-        UsageError: unknown kind, no such frame, a name that is no .png, no matplotlib.
+        UsageError: unknown kind, no such frame, a name with another ending, no matplotlib.
         DataError: the scenario file is missing or damaged.
     """
-    if kind not in KINDS:
-        raise UsageError(f"no kind of picture {kind!r}", where="--kind", fix=nearest(kind, KINDS))
+    check_kind(kind)
     with open_recording(source, registry=registry) as recording:
         scene = recording.scene(frame)
     panels = _panels(recording) if kind == ALL else [Panel(kind)]
     width = 2 * MARGIN + len(panels) * SIDE + (len(panels) - 1) * GAP
-    with figure(width, TOP + SIDE + BAR) as drawn:
+    with figure(width, TOP + SIDE + BAR, dpi=dpi) as drawn:
         single = len(panels) == 1
         subtitle = describe(recording) if single else SEPARATOR.join([describe(recording), *_moment(scene)])
         header(drawn, recording.title, subtitle, left=MARGIN)
         _draw_panels(drawn, panels, scene)
-        return save_png(drawn, output)
+        return save(drawn, output)
 
 
 def describe(recording: Recording) -> str:

@@ -46,7 +46,7 @@ __all__ = [
     "header",
     "pixels_of",
     "png_bytes",
-    "save_png",
+    "save",
 ]
 
 
@@ -131,6 +131,9 @@ def _cut(name: str, low: float, high: float, levels: int) -> ListedColormap:
     return cut
 
 
+ENDINGS = (".png", ".pdf", ".svg")
+"""Endings of files that pictures can be."""
+
 DPI = 128  # a power of two: every whole number of pixels is exact in inches
 
 _STYLE = {
@@ -153,7 +156,7 @@ _STYLE = {
 
 
 @contextmanager
-def figure(width: float, height: float) -> Iterator[Figure]:
+def figure(width: float, height: float, *, dpi: int = DPI) -> Iterator[Figure]:
     """Yield an empty figure in lagbench's style, whatever the user's matplotlibrc says.
 
     Draw and save it inside the context.
@@ -165,7 +168,7 @@ def figure(width: float, height: float) -> Iterator[Figure]:
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
         matplotlib.rcParams.update(_STYLE)
-        drawn = Figure(figsize=(width, height), dpi=DPI)
+        drawn = Figure(figsize=(width, height), dpi=dpi)
         FigureCanvasAgg(drawn)
         yield drawn
 
@@ -184,6 +187,18 @@ def pixels_of(drawn: Figure) -> NDArray[np.uint8]:
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()  # type: ignore[no-untyped-call]
 
 
+def file_bytes(drawn: Figure, ending: str) -> bytes:
+    """Return the figure as a file of a kind in :data:`ENDINGS`, with the same bytes every time."""
+    if ending == ".png":
+        return png_bytes(drawn)
+    import matplotlib as mpl
+
+    nothing = dict.fromkeys(("Date",) if ending == ".svg" else ("CreationDate", "Producer", "Creator"))
+    with mpl.rc_context({"svg.hashsalt": "lagbench"}), io.BytesIO() as buffer:
+        drawn.savefig(buffer, format=ending[1:], metadata=nothing)
+        return buffer.getvalue()
+
+
 def png_bytes(drawn: Figure) -> bytes:
     """Return the figure as PNG without date or software, in lagbench's 256 colours."""
     from PIL import Image
@@ -194,10 +209,16 @@ def png_bytes(drawn: Figure) -> bytes:
         return buffer.getvalue()
 
 
-def save_png(drawn: Figure, output: str | Path) -> Path:
+def save(drawn: Figure, output: str | Path) -> Path:
     """Write the figure to a file that appears whole or not at all; return its path."""
     path = Path(output)
-    if path.suffix.lower() != ".png":
-        raise UsageError("pictures are PNG files", where="output", expected="a name ending in .png", got=path)
-    write_atomically(path, png_bytes(drawn))
+    ending = path.suffix.lower()
+    if ending not in ENDINGS:
+        raise UsageError(
+            "pictures are PNG, PDF or SVG files",
+            where="output",
+            expected=f"a name ending in {', '.join(ENDINGS)}",
+            got=path,
+        )
+    write_atomically(path, file_bytes(drawn, ending))
     return path

@@ -7,7 +7,16 @@ Rows of every table, report and board, none of which is ranked. :data:`FLOORS` n
 from __future__ import annotations
 
 from .floor import Floor, Given, given_in
-from .shipped import FloorScores, shipped
+from .shipped import FloorScores, shipped, solver_seconds
 from .table import FLOORS, floors_of
 
-__all__ = ["FLOORS", "Floor", "FloorScores", "Given", "floors_of", "given_in", "shipped"]
+__all__ = [
+    "FLOORS",
+    "Floor",
+    "FloorScores",
+    "Given",
+    "floors_of",
+    "given_in",
+    "shipped",
+    "solver_seconds",
+]

@@ -3,7 +3,8 @@
 ``measured/<split>-<size>.json`` is bound to the hash of the data set. It has the value of every
 metric per scenario, and of what is told frame by frame the mean over scenarios: at the reported
 frames, and for the metrics in :data:`CURVES` at all frames (of long rollouts at a hundred, linear
-between). Numbers have five significant digits, means at frames four, curves three.
+between). Numbers have five significant digits, means at frames four, curves three. Beside them
+stands what a frame costs the floors and the solver itself on the machine that measured.
 """
 
 from __future__ import annotations
@@ -20,9 +21,20 @@ from numpy.typing import NDArray
 
 from lagbench.atomic import write_atomically
 from lagbench.data.registry import Size
+from lagbench.errors import DataError
 from lagbench.metrics import Score, available
 
-__all__ = ["CURVES", "FOLDER", "FloorScores", "correlation_of", "shipped", "shipped_path", "write_shipped"]
+__all__ = [
+    "CURVES",
+    "FOLDER",
+    "FloorScores",
+    "correlation_of",
+    "shipped",
+    "shipped_path",
+    "solver_seconds",
+    "write_shipped",
+    "write_solver_seconds",
+]
 
 FOLDER = Path(__file__).parent / "measured"
 
@@ -79,11 +91,8 @@ def shipped(size: Size, folder: Path = FOLDER) -> Mapping[str, FloorScores] | No
     Returns:
         None where none were measured on the data set that the registry describes.
     """
-    path = shipped_path(size, folder)
-    if size.measured is None or not path.is_file():
-        return None
-    held = json.loads(path.read_text(encoding="utf-8"))
-    if held["lagbench_floors"] != FORMAT or held["dataset_sha256"] != size.measured.dataset_sha256:
+    held = _held(size, folder)
+    if held is None:
         return None
     frames = range(held["frames"][0], held["frames"][1] + 1)
     return {
@@ -95,6 +104,22 @@ def shipped(size: Size, folder: Path = FOLDER) -> Mapping[str, FloorScores] | No
         )
         for name, said in held["floors"].items()
     }
+
+
+def solver_seconds(size: Size, folder: Path = FOLDER) -> float | None:
+    """Return the processor time that a frame costs the solver itself, where the floors were measured [s]."""
+    held = _held(size, folder)
+    return None if held is None else held.get("solver_seconds_per_frame")
+
+
+def _held(size: Size, folder: Path) -> dict[str, Any] | None:
+    """Return what was measured on the data set that the registry describes."""
+    path = shipped_path(size, folder)
+    if size.measured is None or not path.is_file():
+        return None
+    held: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    same = held["lagbench_floors"] == FORMAT and held["dataset_sha256"] == size.measured.dataset_sha256
+    return held if same else None
 
 
 def _scores(
@@ -154,6 +179,17 @@ def write_shipped(
         "floors": {name: _said(floor, reported) for name, floor in floors.items()},
     }
     path = shipped_path(size, folder)
+    write_atomically(path, f"{_spelled(held)}\n".encode(), option="--folder")
+    return path
+
+
+def write_solver_seconds(size: Size, seconds: float, folder: Path = FOLDER) -> Path:
+    """Add what a frame costs the solver itself to the measured floors of a data set [s]."""
+    held, path = _held(size, folder), shipped_path(size, folder)
+    if held is None:
+        raise DataError("no floors were measured on this data set", where=str(path))
+    floors = held.pop("floors")
+    held |= {"solver_seconds_per_frame": _number(seconds, 3), "floors": floors}
     write_atomically(path, f"{_spelled(held)}\n".encode(), option="--folder")
     return path
 

@@ -23,13 +23,13 @@ from .frame import Floats, FramePair
 from .metric import Metric, mean
 
 __all__ = [
-    "LEVEL",
-    "RESAMPLES",
+    "FEWEST_FOR_INTERVAL",
     "Resampling",
     "Score",
     "Tally",
     "aggregate",
     "bootstrap_interval",
+    "mean_over_seeds",
     "measure",
     "resample",
     "score",
@@ -41,6 +41,9 @@ LEVEL = 0.95
 
 RESAMPLES = 10_000
 """Resamples of scenarios and of seeds."""
+
+FEWEST_FOR_INTERVAL = 4
+"""Scenarios below which no interval is given: of three, Student's quantile alone doubles its width."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +157,12 @@ class Resampling:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """95 % percentile interval, as much wider as Student's quantile exceeds the normal one's."""
+        """95 % percentile interval, as much wider as Student's quantile exceeds the normal one's.
+
+        NaN of fewer than four scenarios.
+        """
+        if len(self.parts[0]) < FEWEST_FOR_INTERVAL:
+            return math.nan, math.nan
         if not self.error:
             return self.mean, self.mean
         from scipy.special import ndtri, stdtrit
@@ -163,6 +171,14 @@ class Resampling:
         wider = float(stdtrit(self.freedom, tails[1]) / ndtri(tails[1]))
         low, high = self.mean + wider * np.quantile(self.deviations, tails)
         return float(low), float(high)
+
+
+def mean_over_seeds(values: ArrayLike) -> Floats:
+    """Return the mean over the seeds that have a value, NaN where none has: shape without the first axis."""
+    seeds = np.asarray(values, np.float64)
+    known = ~np.isnan(seeds)
+    total, count = np.where(known, seeds, 0.0).sum(axis=0), known.sum(axis=0)
+    return np.where(count > 0, total / np.maximum(count, 1), math.nan)
 
 
 def resample(values: ArrayLike, minus: ArrayLike | None = None) -> Resampling | None:
@@ -176,8 +192,7 @@ def resample(values: ArrayLike, minus: ArrayLike | None = None) -> Resampling | 
 
     The rest enters both sums once, which errs on the side of too wide. With one seed only the
     scenarios are drawn: the mean is then that of these weights, not of the method. The draws are
-    seeded; two calls with as many scenarios draw the same ones, so that ratios can be formed of
-    them.
+    seeded: two calls with as many scenarios draw the same ones.
 
     Args:
         values: NaN where undefined, shape [scenario] or [seed, scenario].
@@ -193,7 +208,7 @@ def resample(values: ArrayLike, minus: ArrayLike | None = None) -> Resampling | 
     means, seeds = np.zeros(np.count_nonzero(defined)), []
     for sign, side in zip((1.0, -1.0), sides, strict=False):
         kept = side[:, defined]
-        over_seeds = np.nanmean(kept, axis=0)
+        over_seeds = mean_over_seeds(kept)
         means += sign * over_seeds
         rows = np.array([mean(row) for row in kept - over_seeds])
         seeds.append(sign * rows[~np.isnan(rows)])
@@ -209,7 +224,7 @@ def bootstrap_interval(values: ArrayLike, minus: ArrayLike | None = None) -> tup
         minus: values of another method: the interval is that of the difference.
 
     Returns:
-        Lower and upper bound; NaN when fewer than two scenarios are defined.
+        Lower and upper bound; NaN when fewer than four scenarios are defined.
     """
     found = resample(values, minus)
     return (math.nan, math.nan) if found is None else found.interval

@@ -17,8 +17,9 @@ from numpy.typing import ArrayLike
 
 from lagbench.errors import UsageError
 
-from .aggregate import Score, resample
+from .aggregate import Score, mean_over_seeds, resample
 from .frame import Floats
+from .metric import mean
 
 __all__ = [
     "FEWEST_SCENARIOS",
@@ -162,13 +163,12 @@ def compare(first: Seeds, second: Seeds) -> Comparison:
     losses = [[_losses(score) for score in side] for side in sides]
     defined = [set().union(*side) for side in losses]
     common = tuple(sorted(defined[0] & defined[1]))
-    one, two = (np.array([[loss.get(i, math.nan) for i in common] for loss in side]) for side in losses)
+    one, two = (_table(side, common) for side in losses)
     found = resample(one, two) if common else None
-    gap = np.nanmean(one, axis=0) - np.nanmean(two, axis=0) if common else np.array([math.nan])
     return Comparison(
         metric=names.pop(),
         scenarios=common,
-        difference=float(np.mean(gap)),
+        difference=mean(mean_over_seeds(one) - mean_over_seeds(two)),
         interval=(math.nan, math.nan) if found is None else found.interval,
         p=differ(one, two) if common else math.nan,
         seeds=(len(one), len(two)),
@@ -185,10 +185,16 @@ def _losses(score: Score) -> dict[int, float]:
     return {i: score.metric.loss(value) for i, value in values if not math.isnan(value)}
 
 
+def _table(seeds: Sequence[Mapping[int, float]], scenarios: Sequence[int]) -> Floats:
+    """Return losses, NaN where undefined, shape [seed, scenario]."""
+    return np.array([[loss.get(i, math.nan) for i in scenarios] for loss in seeds])
+
+
 def mean_loss(seeds: Seeds) -> float:
-    """Return the mean over seeds and scenarios of the loss; infinite where nothing is defined."""
-    losses = [loss for score in _listed(seeds) for loss in _losses(score).values()]
-    return float(np.mean(losses)) if losses else math.inf
+    """Return the loss of the mean over seeds, then scenarios, as tables show it; infinite without any."""
+    losses = [_losses(score) for score in _listed(seeds)]
+    found = mean(mean_over_seeds(_table(losses, sorted(set().union(*losses)))))
+    return math.inf if math.isnan(found) else found
 
 
 @dataclass(frozen=True, kw_only=True)

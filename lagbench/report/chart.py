@@ -15,16 +15,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .html import Markup, decimals, join, path_data, power, tag
+from .html import Markup, clipped, decimals, join, path_data, power, tag
 
 __all__ = [
     "Scale",
     "Tick",
     "linear",
+    "close_logarithmic",
     "logarithmic",
     "spanning",
     "Bar",
     "Plot",
+    "Spot",
     "bar_chart",
 ]
 
@@ -111,6 +113,25 @@ def logarithmic(low: float, high: float) -> Scale:
     return Scale(10.0**first, 10.0**last, True, 0, tuple(ticks))
 
 
+def close_logarithmic(low: float, high: float) -> Scale:
+    """Return a logarithmic axis that ends at the next 1, 2 or 5; of many ticks the powers of ten are kept."""
+    decades = range(math.floor(math.log10(low)) - 1, math.ceil(math.log10(high)) + 1)
+    marks = [(factor * 10.0**k, factor, k) for k in decades for factor in (1, 2, 5)]
+    first = max(i for i, (value, *_) in enumerate(marks) if value <= 0.8 * low)
+    last = min(i for i, (value, *_) in enumerate(marks) if value >= 1.25 * high)
+    kept = marks[first : last + 1]
+    shown = [mark for mark in kept if mark[1] == 1] if len(kept) > 8 else kept
+    ticks = tuple(Tick(value, _spelt(value, factor, k)) for value, factor, k in shown)
+    return Scale(kept[0][0], kept[-1][0], True, 0, ticks)
+
+
+def _spelt(value: float, factor: int, exponent: int) -> str:
+    """Return a round number, in powers of ten where it would be long."""
+    if -3 <= exponent <= 3:
+        return f"{value:g}"
+    return power(exponent) if factor == 1 else f"{factor}×{power(exponent)}"
+
+
 def spanning(series: Sequence[ArrayLike], *, zero: bool = True, log: bool | None = None) -> Scale:
     """Return an axis for series of values; what is not finite is left out."""
     values = np.concatenate([np.asarray(s, np.float64).ravel() for s in series] or [np.zeros(0)])
@@ -138,6 +159,18 @@ ROW, BAR = 40, 11
 """Height of a bar's row, and of the bar [pixel]."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Spot:
+    """A dot that has a name, and that the keyboard reaches."""
+
+    x: float
+    y: float
+    name: str  # drawn beside it where there is room
+    said: str  # what it is in words, for those who do not see it
+    kind: str  # classes of the mark
+    href: str | None = None  # where it leads
+
+
 class Plot:
     """One chart, built mark by mark."""
 
@@ -147,6 +180,7 @@ class Plot:
         self._height = height  # height [pixel]; the width is 460
         self._across, self._up = WIDTH - LEFT - RIGHT, height - TOP - BOTTOM
         self._marks: list[Markup] = []
+        self._linked = False  # whether the keyboard reaches marks
 
     def line(self, x: ArrayLike, y: ArrayLike, kind: str, title: str = "") -> None:
         """Draw a line through points; NaN leaves a gap."""
@@ -187,6 +221,50 @@ class Plot:
         place = row - 5 if above else row + 13
         self._marks.append(tag("text", label, x=self._across, y=f"{place:.1f}", class_="note end"))
 
+    def upright(self, value: float, label: str) -> None:
+        """Draw a vertical line with a name at its top."""
+        column = float(self._columns(np.array([value]))[0])
+        self._add("path", "", d=path_data([(column, 0), (column, self._up)]), class_="level")
+        left = column > self._across / 2
+        x, kind = (column - 5, "note end") if left else (column + 5, "note")
+        self._marks.append(_text(label, x, 11, kind))
+
+    def spots(self, spots: Sequence[Spot]) -> None:
+        """Draw dots that the keyboard reaches, and their names where they touch nothing; first come first."""
+        self._linked = True
+        columns = self._columns([spot.x for spot in spots]).tolist()
+        rows = self._rows([spot.y for spot in spots]).tolist()
+        taken = [(x - 7, y - 7, x + 7, y + 7) for x, y in zip(columns, rows, strict=True)]
+        for spot, x, y in zip(spots, columns, rows, strict=True):
+            drawn = [
+                tag("title", spot.said),
+                tag("circle", cx=f"{x:.1f}", cy=f"{y:.1f}", r=14, class_="reach"),
+                tag("circle", cx=f"{x:.1f}", cy=f"{y:.1f}", r=5),
+                *self._name_beside(clipped(spot.name, 22), x, y, taken),
+            ]
+            kind = f"dot {spot.kind}".strip()
+            if spot.href is None:
+                mark = tag("g", *drawn, class_=kind, tabindex=0, role="img", aria_label=spot.said)
+            else:
+                mark = tag("a", *drawn, class_=kind, href=spot.href, aria_label=spot.said)
+            self._marks.append(mark)
+
+    def _name_beside(
+        self, name: str, x: float, y: float, taken: list[tuple[float, float, float, float]]
+    ) -> list[Markup]:
+        """Return the name of a dot in the first free place around it, none where there is none."""
+        width = 7.4 * len(name)
+        tries = [(9, 4, 0), (-9, 4, 1), (4, -9, 0), (4, 17, 0), (-4, -9, 1)]
+        for right, down, end in tries:
+            left = x + right - width * end
+            box = (left, y + down - 11, left + width, y + down + 3)
+            inside = box[0] >= 0 and box[2] <= self._across and box[1] >= 0 and box[3] <= self._up
+            others = [one for one in taken if not (one[0] <= x <= one[2] and one[1] <= y <= one[3])]
+            if inside and not any(_meet(box, one) for one in others):
+                taken.append(box)
+                return [_text(name, x + right, y + down, "name end" if end else "name")]
+        return []
+
     def svg(self, title: str, description: str) -> Markup:
         """Return the chart."""
         area = tag(
@@ -197,7 +275,7 @@ class Plot:
             width=self._across + 2 * MARGIN,
             height=self._up + 2 * MARGIN,
         )
-        return _canvas(self._height, title, description, *self._axes(), area)
+        return _canvas(self._height, title, description, *self._axes(), area, linked=self._linked)
 
     def _add(self, name: str, title: str, **attributes: object) -> None:
         self._marks.append(tag(name, *([tag("title", title)] if title else []), **attributes))
@@ -275,7 +353,12 @@ def _bar(bar: Bar, top: int, zero: float, place: object) -> list[Markup]:
     return drawn
 
 
-def _canvas(height: int, title: str, description: str, *drawn: object) -> Markup:
+def _meet(one: tuple[float, float, float, float], other: tuple[float, float, float, float]) -> bool:
+    """Tell whether two boxes (left, top, right, bottom) overlap."""
+    return one[0] < other[2] and one[2] > other[0] and one[1] < other[3] and one[3] > other[1]
+
+
+def _canvas(height: int, title: str, description: str, *drawn: object, linked: bool = False) -> Markup:
     return tag(
         "svg",
         tag("title", title),
@@ -283,7 +366,8 @@ def _canvas(height: int, title: str, description: str, *drawn: object) -> Markup
         *drawn,
         viewBox=f"0 0 {WIDTH} {height}",
         class_="chart",
-        role="img",
+        role="group" if linked else "img",
+        aria_label=title,
     )
 
 

@@ -95,7 +95,7 @@ def _method_figure(subject: Subject, rows: Sequence[Row], name: str, thesis: str
     metric = rows[0].scores[name].metric
     series = [(row, _mean(row.scores[name])) for row in rows]
     correlation = name == "vorticity_pearson"
-    twin = np.asarray(subject.exam.twin_floor)
+    twin = np.asarray(subject.task.twin_floor)
     twinned = name == "position_rmse" and len(twin) == len(subject.frames)
     y = spanning([*(values for _, values in series), *([twin] if twinned else [])])
     if correlation:

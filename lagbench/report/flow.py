@@ -300,14 +300,14 @@ def _head(x: Floats, y: Floats) -> str:
 
 def _places(subject: Subject, fields: Fields, i: Floats, k: Floats) -> tuple[Floats, Floats]:
     """Return node numbers as coordinates of a panel, which shows the inside of the box."""
-    (left, _), (_, top) = subject.exam.size.bounds
+    (left, _), (_, top) = subject.task.size.bounds
     scale = SIDE / _width(subject)
     x, y = ((n + fields.grid.origin) * fields.grid.spacing for n in (i, k))
     return (x - left) * scale, (top - y) * scale
 
 
 def _width(subject: Subject) -> float:
-    (left, right), _ = subject.exam.size.bounds
+    (left, right), _ = subject.task.size.bounds
     return right - left
 
 

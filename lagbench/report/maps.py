@@ -37,11 +37,11 @@ TOP = 99.5
 """Full colour is the percentile of the truth's magnitudes."""
 
 
-def inside(exam: ScoredTask, field: Floats) -> Floats:
+def inside(task: ScoredTask, field: Floats) -> Floats:
     """Return the nodes of a field that lie within the walls, shape [x node, y node]."""
-    grid_ = exam.setting.grid
+    grid_ = task.setting.grid
     kept = []
-    for low, high in exam.size.bounds:
+    for low, high in task.size.bounds:
         room = 0.26 * grid_.spacing  # nodes on a wall are seen, those in it are not
         kept.append((grid_.axis >= low - room) & (grid_.axis <= high + room))
     return field[np.ix_(*kept)]
@@ -67,7 +67,7 @@ def field_figure(subject: Subject, gallery: Gallery) -> Figure:
     def pictures(what: str, fields: Sequence[Floats], limit: float, *, signed: bool) -> list[Markup]:
         draw = diverging if signed else sequential
         return [
-            image(draw(inside(subject.exam, f), limit), walls, f"{what} of {n}, frame {frame}")
+            image(draw(inside(subject.task, f), limit), walls, f"{what} of {n}, frame {frame}")
             for n, f in zip(names, fields, strict=True)
         ]
 
@@ -102,7 +102,7 @@ def vorticity_figure(subject: Subject, gallery: Gallery) -> Figure:
     limit = limit_of([moment.true_vorticity for moment in moments])
 
     def picture(field: Floats, what: str, frame: int) -> Markup:
-        return image(diverging(inside(subject.exam, field), limit), walls, f"{what}, frame {frame}")
+        return image(diverging(inside(subject.task, field), limit), walls, f"{what}, frame {frame}")
 
     rows = [("truth", [picture(m.true_vorticity, "true vorticity", m.frame) for m in moments])]
     for i, entry in enumerate(subject.entries):
@@ -141,7 +141,7 @@ def scenario_figure(subject: Subject, gallery: Gallery) -> Figure:
     def pictures(what: str, fields: Sequence[Floats]) -> list[Markup]:
         return [
             image(
-                diverging(inside(subject.exam, field), limit),
+                diverging(inside(subject.task, field), limit),
                 gallery.walls[moment.scenario],
                 f"{what}, scenario {moment.scenario}",
             )
@@ -224,7 +224,7 @@ def _figure(subject: Subject, gallery: Gallery, scenario: int, *, left_out: int)
         panels = [_panel(subject, gallery, m, m.pairs[i].prediction, "prediction") for m in moments]
         rows.append((entry.name, panels))
     present = np.unique(moments[0].setting_of.material).tolist()
-    seconds = [f"frame {m.frame}\u2002{m.frame * subject.exam.size.frame_interval:.2f} s" for m in moments]
+    seconds = [f"frame {m.frame}\u2002{m.frame * subject.task.size.frame_interval:.2f} s" for m in moments]
     more = f" For want of room {left_out} more test scenarios are not drawn." if left_out else ""
     what = f": {walls.mark}" if walls.mark else ""
     return Figure(
@@ -242,7 +242,7 @@ def _figure(subject: Subject, gallery: Gallery, scenario: int, *, left_out: int)
 def _panel(subject: Subject, gallery: Gallery, moment: Moment, snapshot: Snapshot, what: str) -> Markup:
     material, area = moment.setting_of.material, moment.setting_of.area
     spacing = float(np.sqrt(area / len(material)))
-    png = paint(snapshot.position, material, subject.exam.size.bounds, spacing)
+    png = paint(snapshot.position, material, subject.task.size.bounds, spacing)
     return image(png, gallery.walls[moment.scenario], f"{what}, frame {moment.frame}", smooth=True)
 
 

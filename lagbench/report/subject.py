@@ -82,7 +82,7 @@ class Row:
 class Subject:
     """Everything that the figures are drawn from."""
 
-    exam: ScoredTask  # the test subset
+    task: ScoredTask  # the test subset
     title: str  # title of the split
     entries: tuple[Entry, ...]  # the submissions in the order in which they were given
 
@@ -121,29 +121,29 @@ class Subject:
     @property
     def full_box(self) -> bool:
         """Whether the material fills the box: no surface, one material."""
-        return self.exam.setting.full_box
+        return self.task.setting.full_box
 
     @property
     def scenarios(self) -> tuple[int, ...]:
         """Ids of the test scenarios, ascending."""
-        return self.exam.scenarios
+        return self.task.scenarios
 
     @property
     def frames(self) -> NDArray[np.int64]:
         """Absolute numbers of the predicted frames, shape [frame]."""
-        return np.array(self.exam.setting.predicted_frames)
+        return np.array(self.task.setting.predicted_frames)
 
     @property
     def key_frame(self) -> int:
         """The frame of interest nearest to the one at which the thesis compares."""
-        wanted = THESIS_FRAMES.get(self.exam.size.split, OTHER_FRAME)
+        wanted = THESIS_FRAMES.get(self.task.size.split, OTHER_FRAME)
         return min(self.frames_of_interest, key=lambda frame: (abs(frame - wanted), frame))
 
     @property
     def frames_of_interest(self) -> tuple[int, ...]:
         """Frames of interest, the last predicted one if there are none."""
-        predicted = self.exam.setting.predicted_frames
-        known = sorted(set(self.exam.setting.frames_of_interest).intersection(predicted))
+        predicted = self.task.setting.predicted_frames
+        known = sorted(set(self.task.setting.frames_of_interest).intersection(predicted))
         return tuple(known) or (predicted[-1],)
 
     @property
@@ -155,7 +155,7 @@ class Subject:
     @property
     def times(self) -> tuple[int, ...]:
         """Frames of the pictures over time, the first and the last predicted one among them."""
-        predicted = self.exam.setting.predicted_frames
+        predicted = self.task.setting.predicted_frames
         if len(self.frames_of_interest) >= TIMES:
             chosen = _spaced(self.frames_of_interest, TIMES - 1)
         else:
@@ -195,13 +195,13 @@ def subject_of(
         _check_same(cards[0], card, path)
     folder, header = resolve_root(root), cards[0].header
     described = rooted(folder, registry)
-    exam = load_scored_task(described.size(header.split, header.size), folder)
+    task = load_scored_task(described.size(header.split, header.size), folder)
     names = told_apart([card.header.method for card in cards], taken=cards[0].scores)
     entries = [
         Entry(number=i, name=name, card=card, predictions=Path(path))
         for i, (name, card, path) in enumerate(zip(names, cards, predictions, strict=True))
     ]
-    return Subject(exam=exam, title=described.split(header.split).title, entries=tuple(entries))
+    return Subject(task=task, title=described.split(header.split).title, entries=tuple(entries))
 
 
 def _check_same(first: ScoreCard, card: ScoreCard, path: Path) -> None:
@@ -278,7 +278,7 @@ def open_gallery(subject: Subject) -> Gallery:
     with ExitStack() as stack:
         files = [stack.enter_context(open_predictions(entry.predictions)) for entry in subject.entries]
         for scenario in subject.scenarios:
-            with subject.exam.opened(scenario) as truth:
+            with subject.task.opened(scenario) as truth:
                 walls[scenario] = _walls(truth)
                 for moment in _moments(truth, files, scenario, _frames(subject, scenario)):
                     moments[scenario, moment.frame] = moment

@@ -90,7 +90,7 @@ def _score_rows(subject: Subject, names: Sequence[str]) -> Markup:
         cells.append(
             [
                 _named(metric, ranks=name == subject.ranking.name),
-                *("" if score is None else _cell(score, best=i == best) for i, score in enumerate(scores)),
+                *("" if score is None else _cell(score, best=i in best) for i, score in enumerate(scores)),
             ]
         )
     return table(["metric", *(_heading(row) for row in rows)], cells, kind="scores", label="Scores")
@@ -100,11 +100,12 @@ def _heading(row: Row) -> Markup:
     return tag("span", row.name) if row.entry else tag("span", row.name, class_="muted")
 
 
-def _best(metric: Metric, means: Sequence[float]) -> int | None:
-    """Return which is best, None where nothing is judged or defined."""
+def _best(metric: Metric, means: Sequence[float]) -> frozenset[int]:
+    """Return which are best, those that read the same included; none where nothing is judged or defined."""
     if metric.direction is Direction.NONE or not np.isfinite(means).any():
-        return None
-    return int(np.nanargmin([metric.loss(value) for value in means]))
+        return frozenset()
+    least = text(means[int(np.nanargmin([metric.loss(value) for value in means]))])
+    return frozenset(i for i, value in enumerate(means) if text(value) == least)
 
 
 def _named(metric: Metric, *, ranks: bool) -> Markup:
@@ -131,7 +132,7 @@ def frame_table(subject: Subject) -> Markup:
     best = {n: _best(subject.rows[0].scores[n].metric, values) for n, values in means.items()}
     cells = []
     for i, row in enumerate(subject.rows):
-        numbers = [tag("span", text(means[n][i]), class_="n best" if best[n] == i else "n") for n in names]
+        numbers = [tag("span", text(means[n][i]), class_="n best" if i in best[n] else "n") for n in names]
         cells.append([_heading(row), *numbers])
     return table(["method", *(words(n) for n in names)], cells, label=f"Scores at frame {frame}")
 
@@ -146,7 +147,7 @@ def scenario_table(subject: Subject) -> Markup:
 
 
 def verdict_table(subject: Subject) -> Markup:
-    """Return how all compare with the leader: exact sign-flip test over scenarios."""
+    """Return how all compare with the leader: sign-flip tests of these weights, corrected by Holm."""
     name = subject.ranking.name
     by_name = {row.name: row for row in subject.rows}
     placed = standings({row.name: row.scores[name] for row in subject.rows})
@@ -187,13 +188,13 @@ TILE_NOTES = {
 def title(subject: Subject) -> str:
     """Return the title of the window."""
     names = ", ".join(entry.name for entry in subject.entries)
-    return f"{names} on {subject.exam.size.split} {subject.exam.size.name}"
+    return f"{names} on {subject.task.size.split} {subject.task.size.name}"
 
 
 def head(subject: Subject) -> Markup:
     """Return the top of the page."""
-    size, header = subject.exam.size, subject.entries[0].card.header
-    setting = subject.exam.setting
+    size, header = subject.task.size, subject.entries[0].card.header
+    setting = subject.task.setting
     names = " · ".join(entry.name for entry in subject.entries)
     lede = (
         f"Given {setting.input_frames} frames of each of {len(subject.scenarios)} test scenarios, predict the"

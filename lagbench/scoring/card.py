@@ -101,7 +101,7 @@ class ScoreCard:
         """How much better than the best floor; None where no floor that counts has a score."""
         floors = {row: scores for row, scores in self.scores.items() if row != SUBMISSION}
         ranked = {row: scores[self.ranking] for row, scores in floors.items() if self.ranking in scores}
-        return skill(self.submission[self.ranking], ranked)
+        return skill([self.submission[self.ranking]], ranked)
 
     def against(self, row: str) -> Comparison:
         """Compare the submission with a floor in the ranking metric."""

@@ -14,12 +14,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from lagbench.data.registry import Registry
 from lagbench.errors import DataError, UnreadableFileError, UsageError, nearest
-from lagbench.metrics import Comparison, Direction, Score, mean
+from lagbench.metrics import Comparison, Direction, Metric, Score, mean, mean_over_seeds
 from lagbench.metrics import compare as compare_scores
+from lagbench.metrics.aggregate import FEWEST_FOR_INTERVAL
 from lagbench.metrics.significance import FEWEST_SCENARIOS
 from lagbench.submission.format import MAX_NAME
 
@@ -70,7 +69,7 @@ class Contestant:
 class MetricComparison:
     """Two methods in one metric."""
 
-    unit: str  # of the means
+    metric: Metric
     first: float  # mean of the first over seeds and scenarios
     second: float  # mean of the second
     test: Comparison  # difference, interval and p-value, in the metric's loss
@@ -93,17 +92,16 @@ class ComparisonResult:
     @property
     def verdict(self) -> str:
         """What the ranking metric says, in one sentence that claims no more than it may."""
-        said = self.metrics[self.ranking].test
+        test = self.metrics[self.ranking].test
         if self.same_predictions:
             return "both hold the same predictions"
         if self.scenarios < FEWEST_SCENARIOS:
-            return (
-                f"{self.scenarios} scenarios: no significance is claimed under {FEWEST_SCENARIOS};"
-                " read the intervals"
-            )
-        if not said.significant:
+            said = f"{self.scenarios} scenarios: no significance is claimed under {FEWEST_SCENARIOS}"
+            few = self.scenarios < FEWEST_FOR_INTERVAL
+            return said + (f", no interval under {FEWEST_FOR_INTERVAL}" if few else "; read the intervals")
+        if not test.significant:
             return f"{self.ranking}: no difference at 5 % ({self._sample})"
-        better = self.first if said.difference < 0.0 else self.second
+        better = self.first if test.difference < 0.0 else self.second
         return f"{self.ranking}: {better} is better ({self._sample})"
 
     @property
@@ -118,7 +116,7 @@ class ComparisonResult:
         """Return the comparison as plain values; what is undefined is None."""
         metrics = {
             name: {
-                "unit": found.unit,
+                "unit": found.metric.unit,
                 "first": digits(found.first),
                 "second": digits(found.second),
                 "difference": digits(found.test.difference),
@@ -285,7 +283,5 @@ def _known(name: str, judged: Collection[str]) -> str:
 
 
 def _compared(first: tuple[Score, ...], second: tuple[Score, ...]) -> MetricComparison:
-    one, two = (mean(np.array([score.mean for score in side])) for side in (first, second))
-    return MetricComparison(
-        unit=first[0].metric.unit, first=one, second=two, test=compare_scores(first, second)
-    )
+    one, two = (mean(mean_over_seeds([score.values for score in side])) for side in (first, second))
+    return MetricComparison(metric=first[0].metric, first=one, second=two, test=compare_scores(first, second))

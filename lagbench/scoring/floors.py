@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from lagbench.atomic import atomic_path
 from lagbench.data.layout import ScenarioKey, scenario_path
-from lagbench.data.registry import Size
-from lagbench.floors import FLOORS, FloorScores, floors_of, given_in
+from lagbench.data.registry import Registry, Size, load
+from lagbench.floors import FLOORS, Floor, FloorScores, floors_of, given_in, shipped
 from lagbench.floors.shipped import correlation_of
 from lagbench.metrics import Tally, aggregate, select, snapshots
 from lagbench.work.pool import Report
@@ -28,7 +28,16 @@ from lagbench.work.run import run_all
 from .scenario import measure_rows
 from .task import ScoredTask, load_scored_task
 
-__all__ = ["FloorJob", "differences", "kept_in", "measurable", "measure", "measure_scenario"]
+__all__ = [
+    "FloorJob",
+    "differences",
+    "kept_in",
+    "measurable",
+    "measure",
+    "measure_scenario",
+    "measured_again",
+    "measured_sizes",
+]
 
 TOLERANCE = 1e-4
 """Relative difference up to which shipped and measured values are equal: libraries round differently."""
@@ -39,19 +48,53 @@ def measurable(size: Size, root: Path) -> tuple[str, ...]:
 
     Those that count for the best floor; what looks at train only where all of train is there.
     """
-    train = [
-        ScenarioKey(split=size.split, size=size.name, version=size.version, scenario=i, subset="train")
-        for i in size.subsets.get("train", ())
+    return tuple(floor.name for floor in _possible(size, root) if floor.counts)
+
+
+def _possible(size: Size, root: Path) -> list[Floor]:
+    trained = _has(size, root, "train")
+    return [floor for floor in floors_of(size) if trained or not floor.reads_train]
+
+
+def _has(size: Size, root: Path, subset: str) -> bool:
+    """Tell whether all files of a subset, which is not empty, are there."""
+    keys = [
+        ScenarioKey(split=size.split, size=size.name, version=size.version, scenario=i, subset=subset)
+        for i in size.subsets.get(subset, ())
     ]
-    trained = bool(train) and all(scenario_path(root, key).is_file() for key in train)
-    return tuple(f.name for f in floors_of(size) if f.counts and (trained or not f.reads_train))
+    return bool(keys) and all(scenario_path(root, key).is_file() for key in keys)
+
+
+def measured_sizes(
+    root: Path, *, split: str | None = None, name: str | None = None, registry: Registry | None = None
+) -> list[Size]:
+    """Return the sizes of our splits whose test subset lies under a root, or those that are named."""
+    described = registry or load()
+    sizes = [
+        described.size(one, tier)
+        for one in ((split,) if split else described.splits)
+        for tier in ((name,) if name else described.split(one).sizes)
+    ]
+    return [size for size in sizes if (split and name) or _has(size, root, "test")]
+
+
+def measured_again(
+    size: Size, root: Path, *, progress: Callable[[Progress], None] | None = None
+) -> tuple[tuple[str, ...], dict[str, tuple[str, ...]]]:
+    """Measure the shipped floors of a data set again: which were measured, and what differs in them.
+
+    What looks at train is measured only where all of train is there.
+    """
+    names = tuple(floor.name for floor in _possible(size, root))
+    known = {name: held for name, held in (shipped(size) or {}).items() if name in names}
+    return names, differences(known, measure(size, root, floors=names, progress=progress))
 
 
 @dataclass(frozen=True, kw_only=True)
 class FloorJob:
     """What a worker needs to measure the floors on one scenario."""
 
-    exam: ScoredTask  # the test subset
+    task: ScoredTask  # the test subset
     scenario: int  # id of the scenario
     floors: tuple[str, ...]  # names of the floors
     metrics: tuple[str, ...]  # names of the metrics
@@ -70,11 +113,11 @@ class FloorTallies:
 def measure_scenario(job: FloorJob, report: Report) -> FloorTallies:
     """Measure the floors on one scenario, or read what was measured before."""
     if job.keep is not None and job.keep.is_file():
-        report(job.exam.setting.horizon)
+        report(job.task.setting.horizon)
         return _kept(job, job.keep)
     seconds: dict[str, list[float]] = {name: [] for name in job.floors}
-    with job.exam.opened(job.scenario) as truth:
-        given = given_in(truth.file, job.exam.size, job.exam.truth.root)
+    with job.task.opened(job.scenario) as truth:
+        given = given_in(truth.file, job.task.size, job.task.truth.root)
         rows = {
             name: snapshots(truth.scenario, _timed(FLOORS[name].predict(given), taken))
             for name, taken in seconds.items()
@@ -158,20 +201,20 @@ def measure(
         DataError: the data are missing or damaged.
         UsageError: a floor needs an extra that is not installed.
     """
-    exam = load_scored_task(size, root)
+    task = load_scored_task(size, root)
     names = tuple(floor.name for floor in floors_of(size) if floors is None or floor.name in floors)
     jobs = {
         f"floors on scenario {i}": FloorJob(
-            exam=exam,
+            task=task,
             scenario=i,
             floors=names,
             metrics=tuple(metric.name for metric in select()),
             keep=kept_in(size, root) / f"{i:04d}.npz" if resume else None,
         )
-        for i in exam.scenarios
+        for i in task.scenarios
     }
     meter = Meter(progress)
-    meter.begin("measuring floors", total=len(jobs) * exam.setting.horizon, scenarios=len(jobs))
+    meter.begin("measuring floors", total=len(jobs) * task.setting.horizon, scenarios=len(jobs))
     found = run_all(measure_scenario, jobs, workers=workers, report=meter.count)
     return {name: _together(name, found) for name in names}
 

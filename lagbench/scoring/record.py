@@ -1,32 +1,33 @@
 """Measure the floors of data sets and write what the package ships of them.
 
 usage: python -m lagbench.scoring.record [--split cavity] [--size mini] [--root FOLDER]
-           [--workers 2] [--check]
+           [--workers 2] [--solver]
 
 All splits and sizes whose data are there, or those named. What is measured is kept under the
-root folder scenario by scenario: an interrupted run goes on where it stopped. With --check
-nothing is written; exit code 4 says that what is shipped is not what was measured.
+root folder scenario by scenario: an interrupted run goes on where it stopped. Last the solver
+itself is timed (``lagbench bench solver``); with --solver nothing else is done. What is shipped
+is checked by ``lagbench leaderboard check --root FOLDER``.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import shutil
+import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from lagbench.data.layout import resolve_root
-from lagbench.data.registry import Size, load
-from lagbench.errors import DataError, LagbenchError
-from lagbench.floors import shipped
-from lagbench.floors.shipped import FOLDER, shipped_path, write_shipped
-from lagbench.submission.truth import Truth
+from lagbench.data.registry import Size
+from lagbench.errors import DataError, LagbenchError, WorkFailedError
+from lagbench.floors.shipped import FOLDER, write_shipped, write_solver_seconds
 
-from .floors import differences, kept_in, measure
+from .floors import kept_in, measure, measured_sizes
 from .task import load_scored_task
 
-__all__ = ["main", "record"]
+__all__ = ["main", "record", "time_solver"]
 
 
 def record(size: Size, root: Path, *, workers: int = 1, folder: Path = FOLDER) -> Path:
@@ -50,28 +51,18 @@ def record(size: Size, root: Path, *, workers: int = 1, folder: Path = FOLDER) -
     return path
 
 
-def _check(size: Size, root: Path, workers: int) -> None:
-    """Measure again, from the data and not from what was kept, and compare."""
-    unlike = differences(shipped(size) or {}, measure(size, root, workers=workers))
-    if unlike:
-        listing = "; ".join(f"{name}: {', '.join(metrics)}" for name, metrics in unlike.items())
-        raise DataError(
-            "the shipped scores of floors are not those of the data",
-            where=str(shipped_path(size)),
-            got=listing,
-            fix=f"python -m lagbench.scoring.record --split {size.split} --size {size.name}",
-        )
+def time_solver(size: Size, *, folder: Path = FOLDER) -> Path:
+    """Time the solver in a process of its own and write what a frame costs.
 
-
-def _sizes(split: str | None, name: str | None, root: Path) -> Iterator[Size]:
-    """Yield what was named; else every size of ours whose test subset is there."""
-    registry = load()
-    for held in (split,) if split else registry.splits:
-        for tier in (name,) if name else registry.split(held).sizes:
-            size = registry.size(held, tier)
-            truth = Truth(size, root)
-            if (split and name) or all(truth.path(i).is_file() for i in size.subsets["test"]):
-                yield size
+    Raises:
+        WorkFailedError: the process failed.
+    """
+    options = ["--split", size.split, "--size", size.name, "--json"]
+    command = [sys.executable, "-m", "lagbench", "bench", "solver", *options]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise WorkFailedError("the solver could not be timed", got=done.stderr.strip()[-300:])
+    return write_solver_seconds(size, json.loads(done.stdout)["seconds_per_frame"], folder)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -83,17 +74,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--size")
     parser.add_argument("--root", type=Path)
     parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--check", action="store_true")
+    parser.add_argument("--solver", action="store_true")
     options = parser.parse_args(arguments)
     root = resolve_root(options.root)
     try:
-        for size in _sizes(options.split, options.size, root):
-            if options.check:
-                _check(size, root, options.workers)
-                sys.stdout.write(f"{size.split} {size.name}: as shipped\n")
-            else:
-                path = record(size, root, workers=options.workers)
-                sys.stdout.write(f"{size.split} {size.name}: {path.name}, {path.stat().st_size} bytes\n")
+        for size in measured_sizes(root, split=options.split, name=options.size):
+            if not options.solver:
+                record(size, root, workers=options.workers)
+            path = time_solver(size)
+            sys.stdout.write(f"{size.split} {size.name}: {path.name}, {path.stat().st_size} bytes\n")
             sys.stdout.flush()
     except LagbenchError as error:
         sys.stderr.write(f"record: {error}\n")

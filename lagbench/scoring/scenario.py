@@ -141,7 +141,7 @@ LONG_BITS = 11
 class ScenarioJob:
     """What a worker needs to score one scenario."""
 
-    exam: ScoredTask  # the test subset
+    task: ScoredTask  # the test subset
     scenario: int  # id of the scenario
     predictions: Path  # a predictions.nc that has been validated
     metrics: tuple[str, ...]  # names of the metrics
@@ -162,18 +162,18 @@ class ScenarioScores:
 def score_scenario(job: ScenarioJob, report: Report) -> ScenarioScores:
     """Score one scenario of a submission and of the floors that are to be measured."""
     metrics = select(job.metrics)
-    with job.exam.opened(job.scenario) as truth, open_predictions(job.predictions) as predictions:
+    with job.task.opened(job.scenario) as truth, open_predictions(job.predictions) as predictions:
         scenario = truth.scenario
         rows = {SUBMISSION: _predicted(predictions, job.scenario, scenario)}
-        rows |= {name: floor_snapshots(name, truth, job.exam) for name in job.floors}
+        rows |= {name: floor_snapshots(name, truth, job.task) for name in job.floors}
         photographer = PreviewRecorder(job.scenario, scenario) if job.pictured else None
         tallies, trace = measure_rows(scenario, truth.snapshots(), rows, metrics, photographer, report)
     return ScenarioScores(job.scenario, tallies, trace, photographer.result() if photographer else None)
 
 
-def floor_snapshots(name: str, truth: OpenScenario, exam: ScoredTask) -> Iterator[Snapshot]:
+def floor_snapshots(name: str, truth: OpenScenario, task: ScoredTask) -> Iterator[Snapshot]:
     """Yield the snapshots that a floor predicts."""
-    given = given_in(truth.file, exam.size, exam.truth.root)
+    given = given_in(truth.file, task.size, task.truth.root)
     return snapshots(truth.scenario, FLOORS[name].predict(given))
 
 

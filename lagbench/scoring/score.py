@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,15 +11,16 @@ from lagbench.atomic import check_writable
 from lagbench.data.layout import resolve_root
 from lagbench.data.local import rooted
 from lagbench.data.registry import Registry
-from lagbench.errors import UsageError, nearest
+from lagbench.errors import UnreadableFileError, UsageError, nearest
 from lagbench.floors import persistence, shipped
 from lagbench.make.overview import available_cores
-from lagbench.metrics import Metric, Score, aggregate, available, select
-from lagbench.submission import ValidationResult, open_predictions, validate
+from lagbench.metrics import FramePair, Metric, Score, aggregate, available, select
+from lagbench.metrics.metric import MINIMUM_NODES
+from lagbench.submission import Finding, Header, Severity, ValidationResult, open_predictions, validate
 from lagbench.work.progress import Meter, Progress
 from lagbench.work.run import run_all
 
-from .card import JSON_NAME, ScoreCard, write_json
+from .card import JSON_NAME, ScoreCard, read_scores, write_json
 from .flags import Flag, below_twin_floor, copy_suspect, physics
 from .floors import measurable
 from .scenario import SUBMISSION, ScenarioJob, ScenarioScores, score_scenario
@@ -30,6 +31,9 @@ __all__ = [
     "score",
 ]
 
+
+PREDICTIONS = "predictions.nc"
+"""The usual name of a submission; its scores lie beside it."""
 
 WORTH_WORKERS = 1_000_000
 """Particles times predicted frames below which starting worker processes costs more than it gains."""
@@ -54,7 +58,8 @@ def score(
     Args:
         predictions: a predictions.nc.
         root: folder of all data sets, see :func:`lagbench.data.layout.resolve_root`.
-        output_dir: folder for the two files; that of the predictions by default.
+        output_dir: folder for the two files; by default that of a predictions.nc, and beside a file of
+            another name the folder of that name.
         workers: worker processes; by default one per core where the work is worth it.
         scheduler: address of a Dask scheduler that takes the scenarios instead.
         extras: extras whose metrics are wanted too, as in ("transport",).
@@ -69,7 +74,8 @@ def score(
         The score card; ``files`` names what was written.
 
     Raises:
-        UsageError: an extra that brings no metrics, or that is not installed.
+        UsageError: an extra that brings no metrics, or that is not installed; scores of another method
+            lie where these would go.
         UnreadableFileError: the predictions cannot be read.
         ChecksFailedError: they are not valid.
         DataError: they were made from another data set, or the test subset is missing or damaged.
@@ -79,7 +85,7 @@ def score(
     metrics = _chosen(extras)
     path, holder = Path(predictions).absolute(), resolve_root(root)
     described = rooted(holder, registry)
-    folder = Path(predictions).parent if output_dir is None else Path(output_dir)
+    folder = scores_folder(Path(predictions)) if output_dir is None else Path(output_dir)
     result = validated or validate(path, root=holder, require_truth=True, registry=described)
     if result.path != path:
         raise UsageError("the validation is of another file", where=str(path), got=result.path)
@@ -90,11 +96,13 @@ def score(
         check_writable(folder, option="--output")
     with open_predictions(path) as opened:
         header, content = opened.header, result.sha256 or opened.content_sha256()
-    exam = load_scored_task(described.size(header.split, header.size), holder)
-    known = shipped(exam.size) or {}
-    floors = () if known else measurable(exam.size, holder)
+    if write:
+        _check_own(folder / JSON_NAME, header)
+    task = load_scored_task(described.size(header.split, header.size), holder)
+    known = shipped(task.size) or {}
+    floors = () if known else measurable(task.size, holder)
     outcomes = _outcomes(
-        exam, path, tuple(m.name for m in metrics), floors, workers, scheduler, Meter(progress)
+        task, path, tuple(m.name for m in metrics), floors, workers, scheduler, Meter(progress)
     )
     tallies = {
         row: {outcome.scenario: outcome.tallies[row] for outcome in outcomes} for row in outcomes[0].tallies
@@ -105,15 +113,64 @@ def score(
     card = ScoreCard(
         header=header,
         predictions_sha256=content,
-        setting=exam.setting,
-        ranking=ranking_metric(exam.size),
+        setting=task.setting,
+        ranking=ranking_metric(task.size),
         tallies=tallies,
         scores=scores,
-        flags=_flags(exam, outcomes, scores),
-        warnings=result.warnings,
+        flags=_flags(task, outcomes, scores),
+        warnings=(*result.warnings, *_undefined(task, scores[SUBMISSION])),
         preview=preview,
     )
     return _written(card, folder) if write else card
+
+
+def scores_folder(predictions: Path) -> Path:
+    """Return where the scores of a file go by default.
+
+    >>> scores_folder(Path("runs/predictions.nc")).as_posix(), scores_folder(Path("runs/gns.nc")).as_posix()
+    ('runs', 'runs/gns')
+    """
+    usual = predictions.name == PREDICTIONS
+    return predictions.parent if usual else predictions.parent / predictions.stem
+
+
+def _check_own(path: Path, header: Header) -> None:
+    """Refuse to write over scores of another method or data set."""
+    if not path.exists():
+        return
+    try:
+        held = read_scores(path).identity
+        found = " ".join(held[name] for name in ("method", "split", "size"))
+    except UnreadableFileError:
+        found = "something else"
+    own = f"{header.method} {header.split} {header.size}"
+    if found != own:
+        raise UsageError(
+            "the scores of another submission lie there",
+            where=str(path),
+            expected=f"no such file, or the scores of {own}",
+            got=found,
+            fix="keep them: --output FOLDER; or remove them first",
+        )
+
+
+def _undefined(task: ScoredTask, scores: Mapping[str, Score]) -> Iterator[Finding]:
+    """Warn where nothing of the vorticity is defined, and say how many nodes it would take."""
+    found = scores.get("vorticity_nrmse")
+    if found is None or not np.isnan(found.values).all() or np.isfinite(scores["vorticity_mse"].values).any():
+        return
+    with task.opened(task.scenarios[0]) as truth:
+        true = next(truth.snapshots())
+        nodes = FramePair(truth.scenario, task.setting.predicted_frames[0], true, true).node_count
+    yield Finding(
+        check="undefined",
+        severity=Severity.WARNING,
+        what="the vorticity has no value in any frame",
+        where=f"score grid of {task.setting.grid.cells} cells",
+        expected=f"{MINIMUM_NODES} nodes with particles enough around them",
+        got=f"{nodes} of {MINIMUM_NODES} nodes counted in the first frame",
+        fix="a coarser score grid: lagbench adopt --cells, or lagbench import --cells",
+    )
 
 
 def _written(card: ScoreCard, folder: Path) -> ScoreCard:
@@ -133,7 +190,7 @@ def _chosen(extras: Collection[str]) -> tuple[Metric, ...]:
 
 
 def _outcomes(
-    exam: ScoredTask,
+    task: ScoredTask,
     path: Path,
     metrics: tuple[str, ...],
     floors: tuple[str, ...],
@@ -142,26 +199,26 @@ def _outcomes(
     meter: Meter,
 ) -> list[ScenarioScores]:
     """Return what was measured of every scenario, by ascending id."""
-    ids, horizon = exam.scenarios, exam.setting.horizon
+    ids, horizon = task.scenarios, task.setting.horizon
     jobs = {
         f"scenario {i}": ScenarioJob(
-            exam=exam, scenario=i, predictions=path, metrics=metrics, floors=floors, pictured=i == ids[0]
+            task=task, scenario=i, predictions=path, metrics=metrics, floors=floors, pictured=i == ids[0]
         )
         for i in ids
     }
     if workers is None:
-        worth = len(ids) * horizon * exam.size.particles >= WORTH_WORKERS
+        worth = len(ids) * horizon * task.size.particles >= WORTH_WORKERS
         workers = available_cores() if worth else 1
     meter.begin("scoring", total=len(ids) * horizon, scenarios=len(ids))
     return run_all(score_scenario, jobs, workers=workers, scheduler=scheduler, report=meter.count)
 
 
 def _flags(
-    exam: ScoredTask, outcomes: Sequence[ScenarioScores], scores: Mapping[str, Mapping[str, Score]]
+    task: ScoredTask, outcomes: Sequence[ScenarioScores], scores: Mapping[str, Mapping[str, Score]]
 ) -> tuple[Flag, ...]:
     traces = [outcome.trace for outcome in outcomes]
     error, still = (
         np.asarray(np.mean(scores[row]["position_rmse"].per_frame, axis=0))
         for row in (SUBMISSION, persistence.FLOOR.name)
     )
-    return copy_suspect(traces), below_twin_floor(error, still, exam.twin_floor), physics(traces)
+    return copy_suspect(traces), below_twin_floor(error, still, task.twin_floor), physics(traces)

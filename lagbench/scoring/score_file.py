@@ -175,7 +175,7 @@ class StoredScores:
         if self.best_floor is None or ours is None:
             return None
         floor = replace(ours, values=self.best_floor_values)
-        return skill(ours, {self.best_floor: floor})
+        return skill([ours], {self.best_floor: floor})
 
     def scores(self) -> dict[str, Score]:
         """Return the scores of all installed metrics whose statistics are here, by name."""

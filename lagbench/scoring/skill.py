@@ -8,19 +8,15 @@ nothing was learned, below 0 it is worse than not learning.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from lagbench.floors import FLOORS
-from lagbench.metrics import Direction, Score
+from lagbench.metrics import Direction, Score, bootstrap_interval, mean_over_seeds
 
-__all__ = ["Skill", "best_floor", "ratio_interval", "skill"]
-
-RESAMPLES, SEED = 10_000, 0
-LEVEL = 0.95
+__all__ = ["Skill", "best_floor", "skill"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +26,9 @@ class Skill:
     metric: str  # name of the ranking metric
     floor: str  # name of the best floor
     value: float  # 1 - score / score of that floor
-    interval: tuple[float, float]  # 95 %, both resampled over the same scenarios
+    # 95 %: scenarios, those of the floor with them, and seeds are resampled; NaN of few scenarios
+    interval: tuple[float, float]
+    std: float = math.nan  # sample standard deviation over seeds; NaN for one
 
 
 def best_floor(floors: Mapping[str, Score]) -> str | None:
@@ -40,51 +38,39 @@ def best_floor(floors: Mapping[str, Score]) -> str | None:
     return min(known, key=lambda name: known[name]) if known else None
 
 
-def skill(score: Score, floors: Mapping[str, Score]) -> Skill | None:
-    """Return the skill of a score beside those of the floors in the same metric.
+def skill(seeds: Sequence[Score], floors: Mapping[str, Score]) -> Skill | None:
+    """Return the skill of a method beside the scores of the floors in the same metric.
 
-    None without a floor that counts, without a scenario that both have, and for a metric of which
-    less is not better.
-    """
-    name = best_floor(floors)
-    if name is None or score.metric.direction is not Direction.LOWER:
-        return None
-    theirs = dict(zip(floors[name].scenarios, floors[name].values.tolist(), strict=True))
-    pairs = np.array(
-        [
-            (own, theirs.get(i, math.nan))
-            for i, own in zip(score.scenarios, score.values.tolist(), strict=True)
-        ]
-    )
-    ours, base = pairs[~np.isnan(pairs).any(axis=1)].T
-    if not ours.size or not base.any():
-        return None
-    low, high = ratio_interval(ours, base)
-    return Skill(
-        metric=score.metric.name,
-        floor=name,
-        value=1.0 - float(np.mean(ours) / np.mean(base)),
-        interval=(1.0 - high, 1.0 - low),
-    )
-
-
-def ratio_interval(numerator: ArrayLike, denominator: ArrayLike) -> tuple[float, float]:
-    """Return the 95 % percentile interval of a ratio of means, both over the same resampled scenarios.
+    The interval is that of the ratio of means r = A / B, by its linear part: the two-way bootstrap
+    of (a_si - r b_i) / B, with a_si the score of seed s and b_i that of the floor in scenario i.
+    It is finite whatever is drawn, and none at all where the ratio is the same everywhere.
 
     Args:
-        numerator: one value per scenario, shape [scenario].
-        denominator: likewise, not negative.
+        seeds: score of each seed, over the same scenarios.
+        floors: scores of the floors by name.
 
     Returns:
-        Lower and upper bound; NaN with fewer than two scenarios.
+        None without a floor that counts, without a scenario that both have, and for a metric of
+        which less is not better.
     """
-    above, below = np.asarray(numerator, np.float64), np.asarray(denominator, np.float64)
-    if above.size < 2:
-        return math.nan, math.nan
-    # Generator.random is the one distribution whose stream NumPy keeps across versions
-    uniform = np.random.Generator(np.random.PCG64(SEED)).random((RESAMPLES, above.size))
-    draws = np.floor(uniform * above.size).astype(np.intp)
-    ratios, totals = np.full(RESAMPLES, np.inf), np.sum(below[draws], axis=1)
-    np.divide(np.sum(above[draws], axis=1), totals, out=ratios, where=totals > 0.0)
-    low, high = np.quantile(ratios, [(1.0 - LEVEL) / 2.0, (1.0 + LEVEL) / 2.0])
-    return float(low), float(high)
+    name, metric, scenarios = best_floor(floors), seeds[0].metric, seeds[0].scenarios
+    if name is None or metric.direction is not Direction.LOWER:
+        return None
+    theirs = dict(zip(floors[name].scenarios, floors[name].values.tolist(), strict=True))
+    base = np.array([theirs.get(i, math.nan) for i in scenarios])
+    own = np.stack([score.values for score in seeds])
+    both = ~np.isnan(base) & ~np.isnan(own).all(axis=0)
+    own, base = own[:, both], base[both]
+    if not base.any():
+        return None
+    scale = float(np.mean(base))
+    ratio = float(np.mean(mean_over_seeds(own))) / scale
+    low, high = bootstrap_interval((own - ratio * base) / scale)
+    with_all = own[~np.isnan(own).any(axis=1)]
+    return Skill(
+        metric=metric.name,
+        floor=name,
+        value=1.0 - ratio,
+        interval=(1.0 - ratio - high, 1.0 - ratio - low),
+        std=float(np.std(np.mean(with_all, axis=1) / scale, ddof=1)) if len(with_all) > 1 else math.nan,
+    )

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 
-from lagbench.metrics import CHOSEN, Direction, Score, mean
+from lagbench.metrics import CHOSEN, Direction, Metric, Score, mean
 
 from .card import ScoreCard
 from .compare import ComparisonResult
@@ -15,9 +15,8 @@ from .scenario import SUBMISSION
 __all__ = [
     "Table",
     "card_tables",
-    "comparison_table",
+    "comparison_tables",
     "flag_lines",
-    "skill_line",
 ]
 
 
@@ -28,7 +27,17 @@ SHOWN_AT_FRAMES = (
 )
 """Metrics in the table of frames of interest."""
 
-ARROWS = {Direction.LOWER: "lower", Direction.HIGHER: "higher", Direction.TARGET: "to", Direction.NONE: ""}
+ARROWS = {Direction.LOWER: " ↓", Direction.HIGHER: " ↑", Direction.TARGET: " ◎", Direction.NONE: ""}
+"""How the better side of a metric is marked, behind its name."""
+
+WIDTH = 80
+"""Characters that a table may be wide; a wider one comes in blocks."""
+
+GAP = 3
+"""Characters between two columns."""
+
+LAST = 24
+"""Characters to which the last column, which wraps, may shrink."""
 
 
 @dataclass(frozen=True)
@@ -36,23 +45,48 @@ class Table:
     """A table of text."""
 
     title: str  # what it shows
-    columns: tuple[str, ...]  # names of the columns
+    columns: tuple[str, ...]  # names of the columns, perhaps in lines
     rows: tuple[tuple[str, ...], ...]  # cells, row by row
+    keys: int = 1  # how many columns say what a row is
+
+    def blocks(self, width: int = WIDTH) -> Iterator[Table]:
+        """Yield the table in pieces that are no wider, each with the columns that say what a row is."""
+        columns = list(zip(self.columns, *self.rows, strict=True))
+        widths = [max(len(line) for cell in column for line in cell.split("\n")) for column in columns]
+        widths[-1] = min(widths[-1], LAST)
+        own, chosen = sum(widths[: self.keys]) + GAP * self.keys, list[list[int]]([[]])
+        for i in range(self.keys, len(columns)):
+            taken = own + sum(widths[j] + GAP for j in chosen[-1])
+            if chosen[-1] and taken + widths[i] > width:
+                chosen.append([])
+            chosen[-1].append(i)
+        for number, block in enumerate(chosen):
+            kept = [*range(self.keys), *block]
+            yield Table(
+                self.title if number == 0 else "",
+                tuple(self.columns[i] for i in kept),
+                tuple(tuple(row[i] for i in kept) for row in self.rows),
+                self.keys,
+            )
 
 
-def card_tables(card: ScoreCard, *, every: bool = False) -> Iterator[Table]:
+def card_tables(card: ScoreCard, *, every: bool = False, floors: bool = False) -> Iterator[Table]:
     """Yield the tables of a score card: over the horizon, at frames of interest, per scenario.
 
     Args:
         card: the score card.
         every: whether to show all metrics instead of the chosen ones.
+        floors: whether to show all floors instead of the best one.
     """
     names = list(card.submission) if every else _ranked_first(card, CHOSEN)
     at_frames = [n for n in names if card.submission[n].metric.per_frame] if every else SHOWN_AT_FRAMES
     task = f"{card.header.split} {card.header.size}, {card.setting.horizon} frames"
-    yield _over_horizon(card, names, f"{card.header.method} on {task}, mean over scenarios")
+    beside = [row for row in card.scores if row != SUBMISSION]
+    if not floors:
+        beside = [card.skill.floor] if card.skill else beside[:1]
+    yield _over_horizon(card, names, beside, f"{card.header.method} on {task}, mean over scenarios")
     yield _at_frames(card, at_frames, f"{card.header.method} at frames, mean over scenarios")
-    yield _per_scenario(card)
+    yield _per_scenario(card, beside)
 
 
 def _ranked_first(card: ScoreCard, names: Collection[str]) -> list[str]:
@@ -60,48 +94,31 @@ def _ranked_first(card: ScoreCard, names: Collection[str]) -> list[str]:
     return [name for name in ordered if name in card.submission]
 
 
-def _over_horizon(card: ScoreCard, names: Collection[str], title: str) -> Table:
-    floors = [row for row in card.scores if row != SUBMISSION]
-    rows = [_skill_row(card, len(floors))]
+def _over_horizon(card: ScoreCard, names: Collection[str], floors: Collection[str], title: str) -> Table:
+    found = card.skill
+    skill = "-" if found is None else _with_interval(found.value, found.interval)
+    rows = [("skill ↑", skill, *("0" if found and row == found.floor else "" for row in floors))]
     for name in names:
         score = card.submission[name]
-        undefined = sum(score.undefined)
-        rows.append(
-            (
-                name,
-                _number(score.mean),
-                _interval(score),
-                *(
-                    _number(card.scores[row][name].mean) if name in card.scores[row] else "-"
-                    for row in floors
-                ),
-                _better(score),
-                f"{undefined} of {len(score.scenarios) * len(score.frames)}" if undefined else "",
-                score.metric.unit,
-            )
-        )
-    heads = (row.replace("-", "-\n") for row in floors)  # narrow enough for 120 characters
-    columns = ("metric", SUBMISSION, "95 % interval", *heads, "better", "undefined", "unit")
-    return Table(title, columns, tuple(rows))
+        mark = " †" if any(score.undefined) else ""
+        own = f"{_with_interval(score.mean, score.interval)}{mark}"
+        rows.append((_named(score.metric), own, *(_mean_of(card.scores[row], name) for row in floors)))
+    return Table(title, ("metric", f"{SUBMISSION} [95 %]", *map(_head, floors)), tuple(rows))
 
 
-def _skill_row(card: ScoreCard, floors: int) -> tuple[str, ...]:
-    found = card.skill
-    if found is None:
-        return ("skill", "-", "", *("" for _ in range(floors)), "higher", "", "1")
-    low, high = found.interval
-    interval = "" if math.isnan(low) else f"{low:.3g} to {high:.3g}"
-    return ("skill", _number(found.value), interval, *("" for _ in range(floors)), "higher", "", "1")
+def _named(metric: Metric) -> str:
+    """Return the name of a metric, which side is better, and its unit."""
+    unit = "" if metric.unit == "1" else f" [{metric.unit}]"
+    return f"{metric.name}{ARROWS[metric.direction]}{unit}"
 
 
-def skill_line(card: ScoreCard) -> str:
-    """Return the skill in one line."""
-    found = card.skill
-    if found is None:
-        return "skill: undefined, no floor that counts has a score"
-    low, high = found.interval
-    interval = "" if math.isnan(low) else f" ({low:.3g} to {high:.3g})"
-    return f"skill {found.value:.3g}{interval}: 1 - {found.metric} / {found.metric} of {found.floor}"
+def _head(name: str) -> str:
+    """Return a name as the head of a column, in lines."""
+    return "-\n".join(name.split("-"))
+
+
+def _mean_of(scores: Mapping[str, Score], name: str) -> str:
+    return _number(scores[name].mean) if name in scores else "-"
 
 
 def _at_frames(card: ScoreCard, names: Collection[str], title: str) -> Table:
@@ -114,16 +131,23 @@ def _at_frames(card: ScoreCard, names: Collection[str], title: str) -> Table:
     return Table(title, ("metric", *map(str, frames)), tuple(rows))
 
 
-def _per_scenario(card: ScoreCard) -> Table:
+def _per_scenario(card: ScoreCard, floors: Collection[str]) -> Table:
+    shown = [SUBMISSION, *floors]
+    columns = [card.scores[row][card.ranking].values.tolist() for row in shown]
     rows = [
-        (row, *(_number(value) for value in scores[card.ranking].values.tolist()))
-        for row, scores in card.scores.items()
+        (str(i), *map(_number, values))
+        for i, values in zip(card.scenarios, zip(*columns, strict=True), strict=True)
     ]
-    return Table(f"{card.ranking} per scenario", ("row", *map(str, card.scenarios)), tuple(rows))
+    return Table(f"{card.ranking} per scenario", ("scenario", *map(_head, shown)), tuple(rows))
 
 
 def flag_lines(card: ScoreCard) -> Iterator[str]:
-    """Yield what flags, warnings and the comparison with the floors say, one line each."""
+    """Yield what is undefined, and what flags, warnings and floors say, one line each."""
+    lost = {name: sum(score.undefined) for name, score in card.submission.items() if name in CHOSEN}
+    if any(lost.values()):
+        frames = len(card.scenarios) * card.setting.horizon
+        said = ", ".join(f"{name} {count}" for name, count in lost.items() if count)
+        yield f"† frames without a value, of {frames}: {said}"
     for row in card.scores:
         if row != SUBMISSION:
             yield f"against {row}: {_against(card, row)}"
@@ -144,52 +168,49 @@ def _against(card: ScoreCard, row: str) -> str:
         word, low, high = "better", -high, -low  # the bounds of what is printed: how much better
     else:
         word = "worse" if found.difference > 0.0 else "equal"
-    p = (
-        f", p = {found.p:.3g}"
-        if not math.isnan(found.p)
-        else f", {len(found.scenarios)} scenarios: no p-value"
-    )
-    return f"{card.ranking} {word} by {_number(abs(found.difference))} ({_number(low)} to {_number(high)}{p})"
+    spread = [] if math.isnan(low) else [f"{_number(low)} to {_number(high)}"]
+    spread += [
+        f"{len(found.scenarios)} scenarios: no p-value" if math.isnan(found.p) else f"p = {found.p:.3g}"
+    ]
+    return f"{card.ranking} {word} by {_number(abs(found.difference))} ({', '.join(spread)})"
 
 
-def comparison_table(result: ComparisonResult, *, every: bool = False) -> Table:
-    """Return the table of a comparison; differences are in the loss: negative favours the first.
+def comparison_tables(result: ComparisonResult, *, every: bool = False) -> Iterator[Table]:
+    """Yield the tables of a comparison: differences in the loss, negative favours the first; means.
 
     Args:
         result: the comparison.
         every: whether to show all its metrics instead of the chosen ones.
     """
-    rows = []
-    for name, found in result.metrics.items():
-        if not every and name not in (result.ranking, *CHOSEN):
-            continue
-        low, high = found.test.interval
-        rows.append(
-            (
-                name,
-                _number(found.first),
-                _number(found.second),
-                _number(found.test.difference),
-                "" if math.isnan(low) else f"{low:.3g} to {high:.3g}",
-                "" if math.isnan(found.test.p) else f"{found.test.p:.3g}",
-                found.unit,
-            )
+    shown = {
+        name: found
+        for name, found in result.metrics.items()
+        if every or name == result.ranking or name in CHOSEN
+    }
+    title = f"{result.first} against {result.second} on {result.split} {result.size}"
+    differences = tuple(
+        (
+            _named(found.metric),
+            _with_interval(found.test.difference, found.test.interval),
+            "-" if math.isnan(found.test.p) else f"{found.test.p:.3g}",
         )
-    columns = ("metric", result.first, result.second, "loss difference", "95 % interval", "p", "unit")
-    return Table(
-        f"{result.first} against {result.second} on {result.split} {result.size}", columns, tuple(rows)
+        for found in shown.values()
     )
+    yield Table(title, ("metric", "loss difference [95 %]", "p"), differences)
+    means = tuple(
+        (_named(found.metric), _number(found.first), _number(found.second)) for found in shown.values()
+    )
+    yield Table("means", ("metric", _head(result.first), _head(result.second)), means)
 
 
-def _better(score: Score) -> str:
-    metric = score.metric
-    goal = f" {metric.perfect:g}" if metric.direction is Direction.TARGET else ""
-    return f"{ARROWS[metric.direction]}{goal}"
+def _with_interval(value: float, interval: tuple[float, float]) -> str:
+    """Return a number with its interval.
 
-
-def _interval(score: Score) -> str:
-    low, high = score.interval
-    return "" if math.isnan(low) else f"{low:.3g} to {high:.3g}"
+    >>> _with_interval(0.5, (0.25, 0.75)), _with_interval(0.5, (math.nan, math.nan))
+    ('0.5 [0.25, 0.75]', '0.5')
+    """
+    low, high = interval
+    return _number(value) if math.isnan(low) else f"{value:.3g} [{low:.3g}, {high:.3g}]"
 
 
 def _number(value: float) -> str:

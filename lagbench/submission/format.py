@@ -14,7 +14,7 @@ from typing import Any
 
 import h5py
 
-from lagbench.errors import nearest
+from lagbench.errors import UnreadableFileError, nearest
 
 from .budget import Budget, budget_in
 from .findings import Findings, quoted
@@ -38,6 +38,7 @@ __all__ = [
     "fits",
     "header_of",
     "kind_of",
+    "refuse_other_kinds",
 ]
 
 FORMAT = 1
@@ -48,6 +49,12 @@ DIMS = ("scenario", "frame", "particle", "space")
 
 SPACE = 2
 """Components of a position."""
+
+OTHERS: Mapping[str, str] = {
+    "measured": "scores.nc, which `lagbench score` writes of predictions",
+    "particle_mass": "a scenario file, which `lagbench generate` writes",
+}
+"""Files of ours that are taken for predictions, by a variable that only they have."""
 
 NEVER = -1
 """Value of ``diverged_at`` for a rollout that did not diverge."""
@@ -202,6 +209,17 @@ def _optional(value: object, kind: type[Any]) -> Any:  # noqa: ANN401
     if kind is float and isinstance(value, int):
         return float(value)
     return value if isinstance(value, kind) else None
+
+
+def refuse_other_kinds(anatomy: Anatomy, path: Path) -> None:
+    """Refuse a file of ours that holds no predictions: all that could be said of it would mislead."""
+    if {"position", "scenario"} <= anatomy.links.keys():
+        return
+    for name, what in OTHERS.items():
+        if name in anatomy.links:
+            raise UnreadableFileError(
+                "a file of another kind", where=str(path), expected="predictions", got=what, fix=_START
+            )
 
 
 def check_format(anatomy: Anatomy, out: Findings) -> bool:

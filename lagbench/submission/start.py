@@ -47,6 +47,7 @@ class Start:
     true: Positions  # the truth of the first predicted frame
     first: Positions  # the first predicted frame
     second: Positions  # the second predicted frame; the first again where there is none
+    horizon: int = 0  # frames to predict
 
 
 class Mistake(NamedTuple):
@@ -90,7 +91,8 @@ def _start(predictions: Predictions, truth: Truth, scenario: int) -> Start:
     frames = predictions.header.frames
     predicted = predictions.frames(scenario, frames[0], min(2, len(frames)))
     given, true = truth.around_start(scenario)
-    return Start(*(held.astype(np.float64) for held in (given, true, predicted[0], predicted[-1])))
+    first, second = predicted[0].astype(np.float64), predicted[-1].astype(np.float64)
+    return Start(given.astype(np.float64), true.astype(np.float64), first, second, len(frames))
 
 
 def _check_continuity(scenario: int, start: Start, truth: Truth, frame: int, out: Findings) -> None:
@@ -155,6 +157,9 @@ def mistake(
         return Mistake("the positions seem to be standardised", "undo that before writing")
     if _rms(first[:, ::-1] - given) <= NEARER * apart:
         return Mistake("x and y seem to be swapped", "store x first: positions[..., ::-1]")
+    if _is_reshaped(start):
+        what = "frames and particles seem to be mixed up"
+        return Mistake(what, "transpose an array [particle, frame, space], do not reshape it")
     for i, other in others.items():
         if _rms(first - other.given) <= min(NEARER * apart, 2 * _rms(other.true - other.given)):
             what, fix = f"this seems to be the prediction of scenario {i}", "store each under its own id"
@@ -173,6 +178,18 @@ def _is_scaled(first: Positions, given: Positions) -> bool:
     scaled = (first - first.mean(axis=0)) / spread[0], (given - given.mean(axis=0)) / spread[1]
     alike = (scaled[0] * scaled[1]).mean(axis=0)  # correlation
     return bool((alike >= 0.9).all() and (spread[0] >= 1.5 * spread[1]).all())
+
+
+def _is_reshaped(start: Start) -> bool:
+    """Tell whether an array [particle, frame, space] was read as [frame, particle, space].
+
+    The rows of the first frame are then the frames of one particle after the other.
+    """
+    if not 0 < 3 * start.horizon <= len(start.first):
+        return False
+    rows = start.first[:: start.horizon]
+    apart = _rms(rows - start.given[:: start.horizon])
+    return _rms(rows - start.given[: len(rows)]) <= NEARER * apart
 
 
 def _is_permuted(start: Start) -> bool:

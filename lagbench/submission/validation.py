@@ -32,7 +32,15 @@ from lagbench.errors import DataError, UnreadableFileError, UsageError, WorkFail
 
 from .checks import check_domain, check_finite, check_frozen, check_jumps, survey
 from .findings import CHECKS, Finding, Findings, Severity, ValidationResult
-from .format import Anatomy, check_dims, check_dtype, check_format, check_marks, dissect
+from .format import (
+    Anatomy,
+    check_dims,
+    check_dtype,
+    check_format,
+    check_marks,
+    dissect,
+    refuse_other_kinds,
+)
 from .hdf5 import check_file, opened
 from .predictions import attach
 from .start import check_start
@@ -289,6 +297,7 @@ def _examine(path: Path, root: Path, registry: Registry, *, require_truth: bool)
     try:
         with opened(path) as file:
             anatomy = dissect(file, path)
+            refuse_other_kinds(anatomy, path)
             texts = {name: anatomy.attributes[name] for name in ("split", "size", "method")}
             names = {name: text for name, text in texts.items() if isinstance(text, str)}
             out.made("readable")

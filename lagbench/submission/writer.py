@@ -181,7 +181,11 @@ class PredictionsWriter:
         with np.errstate(over="ignore"):
             array = np.asarray(values).astype(np.float32)
         if array.shape != self.shape:
-            raise UsageError("the shape is another", where=where, expected=self.shape, got=array.shape)
+            turned = sorted(array.shape) == sorted(self.shape)
+            fix = "transpose it: frame, particle, space" if turned else None
+            raise UsageError(
+                "the shape is another", where=where, expected=self.shape, got=array.shape, fix=fix
+            )
         wrong = np.argwhere(~np.isfinite(array))
         if len(wrong):
             frame, particle, axis = (int(i) for i in wrong[0])
@@ -369,9 +373,10 @@ class TemplateResult:
 
 def template(
     split: str,
-    size: str = "full",
+    size: str | None = None,
     *,
     output: str | Path = "predictions.nc",
+    overwrite: bool = False,
     root: str | Path | None = None,
     registry: Registry | None = None,
 ) -> TemplateResult:
@@ -379,22 +384,29 @@ def template(
 
     Args:
         split: name of the split.
-        size: name of the size.
+        size: name of the size; the only one that is there when None.
         output: file to write.
+        overwrite: whether to replace a file of that name.
         root: folder of all data sets, see :func:`lagbench.data.layout.resolve_root`.
         registry: where splits are described; ours when None.
 
     Raises:
-        UsageError: unknown split or size.
+        UsageError: unknown split or size, or there is such a file.
         DataError: test scenarios are missing or damaged, or their data set has no recorded hash.
         WorkFailedError: the disk is full or not writable.
     """
+    if Path(output).exists() and not overwrite:
+        raise UsageError(
+            "there is such a file already",
+            where=str(output),
+            fix="write elsewhere: -o template.nc; or replace it: --overwrite",
+        )
     entry, folder, described = locate(split, size, root=root, registry=registry)
     bring(entry, folder, entry.subsets["test"])
     truth = Truth(entry, folder)
     truth.require()
     writer = PredictionsWriter(
-        output, split=entry.split, size=size, method="persistence", root=folder, registry=described
+        output, split=entry.split, size=entry.name, method="persistence", root=folder, registry=described
     )
     ids = tuple(sorted(entry.subsets["test"]))
     with writer:
@@ -404,7 +416,7 @@ def template(
     return TemplateResult(
         path=writer.path,
         split=entry.split,
-        size=size,
+        size=entry.name,
         scenarios=ids,
         frames=(task.input_frames, task.input_frames + task.horizon - 1),
         particles=entry.particles,

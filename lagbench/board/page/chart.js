@@ -59,14 +59,6 @@ class Plot {
     this.marks.push(svg("text", { x: left ? 4 : this.across, y: (row - 5).toFixed(1), class: left ? "note" : "note end" }, label));
   }
 
-  upright(value, label) {
-    const column = this.column(value);
-    if (column < 0 || column > this.across) return;
-    const place = column > this.across / 2 ? [column - 5, "note end"] : [column + 5, "note"];
-    this.marks.push(svg("path", { d: `M${column.toFixed(1)} 0V${this.up}`, class: "level" }));
-    this.marks.push(svg("text", { x: place[0].toFixed(1), y: 11, class: place[1] }, label));
-  }
-
   axes() {
     const bottom = EDGE.top + this.up;
     const right = this.width - EDGE.right;
@@ -92,7 +84,7 @@ class Plot {
     area.append(svg("g", { transform: "translate(3 3)" }, this.marks));
     const whole = svg(
       "svg",
-      { viewBox: `0 0 ${this.width} ${this.height}`, class: "chart", role: this.linked ? "group" : "img", "aria-label": title },
+      { viewBox: `0 0 ${this.width} ${this.height}`, class: "chart", role: "img", "aria-label": title },
       svg("desc", {}, description),
       this.axes(),
       area,

@@ -6,7 +6,6 @@ let opener = null;
 const panel = document.getElementById("panel");
 const act = {
   sort: (by) => change({ sort: nextSort(tabOf(state), by, state.sort) }, `th [data-sort="${by}"]`),
-  cost: (cost) => change({ cost }, '[data-figure="cost"] select'),
   curve: (curve) => change({ curve }, '[data-figure="lines"] select'),
 };
 
@@ -38,7 +37,8 @@ function draw() {
   const inactive = tools.querySelector("input[type=checkbox]");
   if (inactive) inactive.checked = state.inactive;
   const { every, entries } = arrange(tab, state);
-  section().querySelector(".figures").replaceChildren(...drawFigures(tab, state, entries, act));
+  const figures = section().querySelector(".figures");
+  figures.replaceChildren(figures.querySelector('[data-figure="cost"]'), drawLines(tab, state, entries, act));
   const of = entries.length === every.length ? "" : `${entries.length} of `;
   tools.querySelector(".count").textContent = `${of}${every.length} ${every.length === 1 ? "entry" : "entries"}`;
 }

@@ -65,25 +65,3 @@ function spanning(values, { zero = true, log = null } = {}) {
   if (wanted && usable) return logarithmic(positive[0], high);
   return linear(zero ? Math.min(low, 0) : low, zero ? Math.max(high, 0) : high);
 }
-
-/** Return a logarithmic axis that ends at the next 1, 2 or 5. */
-function closeLogarithmic(low, high) {
-  const marks = [];
-  for (let k = Math.floor(Math.log10(low)) - 1; k <= Math.ceil(Math.log10(high)); k += 1) {
-    for (const factor of [1, 2, 5]) marks.push([factor * 10 ** k, plainPower(k, factor)]);
-  }
-  const first = marks.findLastIndex(([value]) => value <= low * 0.98);
-  const last = marks.findIndex(([value]) => value >= high * 1.02);
-  const kept = marks.slice(first, last + 1);
-  const few = kept.length > 8 ? kept.filter(([value]) => Math.abs(Math.log10(value) % 1) < 1e-9) : kept;
-  const ticks = few.map(([value, label]) => ({ value, label }));
-  return makeScale(kept[0][0], kept.at(-1)[0], true, 0, ticks);
-}
-
-/** Return an axis for points: logarithmic where all are positive and the range is more than double. */
-function scattered(values) {
-  const known = values.filter(Number.isFinite);
-  const low = Math.min(...known);
-  const high = Math.max(...known);
-  return known.length && low > 0 && high > 2 * low ? closeLogarithmic(low, high) : spanning(known, { zero: false, log: false });
-}

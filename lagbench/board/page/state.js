@@ -18,7 +18,7 @@ function readAddress(hash) {
   const given = new URLSearchParams(text.includes("=") ? text : `tab=${text}`);
   const tab = BOARD.tabs.find((one) => one.id === given.get("tab"));
   const sort = given.get("sort") ?? "rank";
-  const state = { tab: tab?.id ?? OVERVIEW, preset: "main", sort: { key: "rank", down: false }, filter: "", inactive: false, entry: "", cost: "", curve: "" };
+  const state = { tab: tab?.id ?? OVERVIEW, preset: "main", sort: { key: "rank", down: false }, filter: "", inactive: false, entry: "", curve: "" };
   if (!tab) return state;
   const presets = presetsOf(tab);
   if (Object.hasOwn(presets, given.get("columns") ?? "")) state.preset = given.get("columns");
@@ -27,7 +27,6 @@ function readAddress(hash) {
   state.filter = (given.get("filter") ?? "").slice(0, 200);
   state.inactive = given.get("inactive") === "1";
   state.entry = tab.rows.find((row) => row.id === given.get("entry"))?.id ?? "";
-  state.cost = given.get("cost") ?? "";
   state.curve = given.get("curve") ?? "";
   return state;
 }
@@ -39,7 +38,7 @@ function addressOf(state) {
   if (state.sort.key !== "rank" || state.sort.down) parts.set("sort", (state.sort.down ? "-" : "") + state.sort.key);
   if (state.filter) parts.set("filter", state.filter);
   if (state.inactive) parts.set("inactive", "1");
-  for (const name of ["cost", "curve", "entry"]) {
+  for (const name of ["curve", "entry"]) {
     if (state[name]) parts.set(name, state[name]);
   }
   return `#${parts}`;
