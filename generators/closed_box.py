@@ -8,6 +8,7 @@ Valid while max abs(v) dt <= dx, which also bounds every fixed-point sum, and wh
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,11 +87,15 @@ class ClosedBox(Driver[ClosedBoxParameters]):
 
         Node (i, j) lies at (i, j) / grid; nodes beyond the ghost layer hold 0.
         """
-        return np.asarray(self._kernels.moved.to_numpy()[..., :2])
+        return self._on_grid(self._kernels.moved.to_numpy()[..., :2])
 
     def mean_grid_velocity(self) -> NDArray[np.float64]:
         """Mean nodal velocity of the substeps advanced with ``average=True``; shape as above."""
-        return np.asarray(self._kernels.total.to_numpy()) / max(self._averaged, 1)
+        return self._on_grid(self._kernels.total.to_numpy()) / max(self._averaged, 1)
+
+    def _on_grid(self, values: NDArray[Any]) -> NDArray[Any]:
+        width = self.parameters.grid + 1
+        return values.reshape(self.scenarios, width, width, 2)
 
     def restart_mean(self) -> None:
         """Forget the substeps averaged so far."""
@@ -99,8 +104,8 @@ class ClosedBox(Driver[ClosedBoxParameters]):
 
     def health(self) -> list[Health]:
         """Return what each scenario went through during the last advance."""
-        extremes = self._kernels.extremes.to_numpy().max(axis=1)
-        peak = self._kernels.peak.to_numpy().max(axis=(1, 2))
+        extremes = self._read(self._kernels.extremes).max(axis=1)
+        peak = self._kernels.peak.to_numpy().max(axis=1)
         return [
             Health(
                 finite=bool(np.isfinite(most).all() and np.isfinite(nodal)),

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
+import taichi as ti
 from numpy.typing import NDArray
 
 from lagbench.errors import UsageError, WorkFailedError
@@ -16,6 +17,7 @@ from lagbench.errors import UsageError, WorkFailedError
 from . import backend
 from .solver import Device, Health
 from .split import ClosedBoxParameters, FreeSurfaceParameters, InitialState
+from .transfer import Nothing, Template
 
 __all__ = ["Driver", "Kernels", "stack"]
 
@@ -33,7 +35,7 @@ class _Field(Protocol):
 class Kernels(Protocol):
     """What a driver asks of the kernels of a formulation."""
 
-    x: _Field  # particle positions [length]
+    x: _Field  # particle positions [length], and two zeros
     least: float  # smallest coordinate of a particle
     most: float  # largest coordinate of a particle
     speed_bound: float  # the CFL bound dx/dt [length/s]
@@ -101,7 +103,7 @@ class Driver(ABC, Generic[Parameters]):
             raise UsageError("wrong number of scenarios", expected=self.scenarios, got=len(states))
         for index, state in enumerate(states):
             self._check_state(index, state)
-        self._kernels.x.from_numpy(self._kept(stack(states, "position")))
+        self._place(stack(states, "position"))
         self._start(states)
         self._substeps = 0
         self._kernels.restart_extremes()
@@ -136,14 +138,23 @@ class Driver(ABC, Generic[Parameters]):
 
     def position(self) -> NDArray[np.float32]:
         """Particle positions [length], shape [scenario, particle, 2]."""
-        return np.asarray(self._kernels.x.to_numpy())
+        return self._read(self._kernels.x)[..., :2]
+
+    def _read(self, field: _Field) -> NDArray[np.float32]:
+        """Return a field of the particles, shape [scenario, particle, 4]."""
+        if self.device is not Device.CPU:
+            return np.asarray(field.to_numpy())
+        values = np.empty((1, self.parameters.particles, 4), np.float32)
+        _copy(field, values)
+        return values
 
     def displace(self, offset: NDArray[np.float32]) -> None:
         """Add an offset to the positions [length], shape [scenario, particle, 2]; kept in the box."""
-        self._kernels.x.from_numpy(self._kept(self.position() + offset.astype(np.float32)))
+        self._place(self.position() + offset.astype(np.float32))
 
-    def _kept(self, position: NDArray[np.float32]) -> NDArray[np.float32]:
-        return np.clip(position, np.float32(self._kernels.least), np.float32(self._kernels.most))
+    def _place(self, position: NDArray[np.float32]) -> None:
+        kept = np.clip(position, np.float32(self._kernels.least), np.float32(self._kernels.most))
+        self._kernels.x.from_numpy(np.concatenate((kept, np.zeros_like(kept)), axis=-1))
 
     def _check_state(self, index: int, state: InitialState) -> None:
         shape = (self.parameters.particles, 2)
@@ -184,6 +195,15 @@ class Driver(ABC, Generic[Parameters]):
                 got="; ".join(broken.values()),
                 fix="a smaller dt (a larger substeps_per_frame), a softer material or smaller velocities",
             )
+
+
+@ti.kernel
+def _copy(field: Template, values: ti.types.ndarray()) -> Nothing:  # type: ignore[valid-type]
+    # In this thread: to wake others, as `to_numpy` does, takes longer than the copy.
+    ti.loop_config(serialize=True)
+    for p in range(values.shape[1]):
+        for c in ti.static(range(4)):
+            values[0, p, c] = field[0, p][c]
 
 
 def stack(states: Sequence[InitialState], name: str) -> NDArray[np.float32]:

@@ -72,11 +72,18 @@ class FreeSurface(Driver[FreeSurfaceParameters]):
 
     def _start(self, states: Sequence[InitialState]) -> None:
         p, k = self.parameters, self._kernels
-        k.v.from_numpy(stack(states, "velocity"))
-        k.c.from_numpy(stack(states, "affine"))
+        carried = np.ones((self.scenarios, p.particles, 4), np.float32)
+        carried[:, :, :2] = stack(states, "velocity")
+        k.carried.from_numpy(carried)
+        for axis, field in enumerate((k.slope_x, k.slope_y)):
+            slope = np.zeros_like(carried)
+            slope[:, :, :2] = stack(states, "affine")[:, :, :, axis]
+            field.from_numpy(slope)
         self._material = stack(states, "material").astype(np.int32)
-        k.material.from_numpy(self._material)
-        k.ratio.fill(1.0)
+        k.solid = bool((self._material != Material.LIQUID).any())
+        matter = np.zeros_like(carried)
+        matter[:, :, 0], matter[:, :, 1] = self._material, 1.0
+        k.matter.from_numpy(matter)
         shape = (self.scenarios, p.particles, 2, 2)
         k.f.from_numpy(np.broadcast_to(np.eye(2, dtype=np.float32), shape).copy())
         self._volume = np.array([state.area / p.particles for state in states])
@@ -85,11 +92,12 @@ class FreeSurface(Driver[FreeSurfaceParameters]):
 
     def velocity(self) -> NDArray[np.float32]:
         """Particle velocities v_p [length/s], shape [scenario, particle, 2]."""
-        return np.asarray(self._kernels.v.to_numpy())
+        return np.asarray(self._kernels.carried.to_numpy()[..., :2])
 
     def affine(self) -> NDArray[np.float32]:
         """APIC matrices C = grad v [1/s], shape [scenario, particle, 2, 2]."""
-        return np.asarray(self._kernels.c.to_numpy())
+        slopes = [field.to_numpy()[..., :2] for field in (self._kernels.slope_x, self._kernels.slope_y)]
+        return np.stack(slopes, axis=-1)
 
     def deformation(self) -> NDArray[np.float32]:
         """Deformation gradients F, elastic in snow, I in liquid [1], shape [scenario, particle, 2, 2]."""
@@ -97,7 +105,7 @@ class FreeSurface(Driver[FreeSurfaceParameters]):
 
     def volume_ratio(self) -> NDArray[np.float32]:
         """J of liquid, plastic Jp of snow, 1 in other solids [1], shape [scenario, particle]."""
-        return np.asarray(self._kernels.ratio.to_numpy())
+        return np.asarray(self._kernels.matter.to_numpy()[..., 1])
 
     def jacobian(self) -> NDArray[np.float32]:
         """J of liquid, det F of solids (elastic in snow) [1], shape [scenario, particle]."""
@@ -139,7 +147,8 @@ class FreeSurface(Driver[FreeSurfaceParameters]):
 
     def health(self) -> list[Health]:
         """Return what each scenario went through during the last advance."""
-        extremes = self._kernels.extremes.to_numpy()
+        extremes = self._read(self._kernels.extremes)
+        self._reach = extremes[:, :, 3].max(axis=1)
         # The kernels keep a huge number where they saw something that is none.
         extremes = np.where(np.abs(extremes) < _LARGEST, extremes, np.nan)
         return [
@@ -153,8 +162,7 @@ class FreeSurface(Driver[FreeSurfaceParameters]):
         ]
 
     def _broken(self, index: int, health: Health) -> dict[str, str]:
-        reach = self._kernels.extremes.to_numpy()[index, :, 3].max()
-        bound = self._kernels.reach_bound
+        reach, bound = self._reach[index], self._kernels.reach_bound
         what = "abs(v) + abs(A o)"
         left = bound < reach < _LARGEST
         return {} if not left else {f"fixed-point sums: {what} <= {bound:.6g}": f"{what} = {reach:.6g}"}

@@ -31,6 +31,7 @@ from .transfer import (
     Template,
     Value,
     accumulate,
+    base_node,
     bounded,
     fixed_point_scale,
     from_fixed,
@@ -61,7 +62,7 @@ class NodalStress:
     """Fields of a batch of scenarios and the kernels that advance them.
 
     Attributes:
-        x: particle positions [length].
+        x: particle positions [length], and two zeros.
         carried: what P2G spreads: v_x, v_y, 1, J.
         slope_x: d/dx of the nodal (v_x, v_y, r, Jbar) at the particles.
         slope_y: d/dy of the same.
@@ -97,7 +98,7 @@ class NodalStress:
     def _set_constants(self) -> None:
         p = self.parameters
         dx = 1.0 / p.grid
-        self.inv_dx = float(p.grid)
+        self.inv_dx, self.width = float(p.grid), p.grid + 1
         self.dt = p.dt
         self.least = (p.wall + 0.5 + _INSET) * dx
         self.most = (p.grid - p.wall - 0.5 - _INSET) * dx
@@ -113,11 +114,14 @@ class NodalStress:
 
     def _make_fields(self) -> None:
         p = self.parameters
-        self.x = ti.Vector.field(2, ti.f32)
+        self.x = ti.Vector.field(4, ti.f32)
         self.carried = ti.Vector.field(4, ti.f32)
         self.slope_x = ti.Vector.field(4, ti.f32)
         self.slope_y = ti.Vector.field(4, ti.f32)
         self.extremes = ti.Vector.field(4, ti.f32)
+        self.rows = [ti.Vector.field(4, ti.f32) for _ in range(3)]  # of the stencil
+        self.here = ti.Vector.field(4, ti.f32)  # nodal v_x, v_y, r, Jbar at the particles
+        self.push = ti.Vector.field(4, ti.f32)  # nodal dt a at the particles, and two zeros
         self.sums = ti.Vector.field(4, ti.i64)  # n v_x, n v_y, n, n J
         self.node = ti.Vector.field(4, ti.f32)
         self.moved = ti.Vector.field(4, ti.f32)
@@ -127,10 +131,10 @@ class NodalStress:
         self.spread = ti.field(ti.f32)
         self.fill = ti.field(ti.f32)
         particles = (self.scenarios, p.particles)
-        nodes = (self.scenarios, p.grid + 1, p.grid + 1)
+        nodes = (self.scenarios, self.width**2)
         self._tree = backend.place(
-            (particles, [self.x, self.carried, self.slope_x, self.slope_y]),
-            (particles, [self.extremes]),
+            *((particles, [field]) for field in (self.x, self.carried, self.slope_x, self.slope_y)),
+            *((particles, [field]) for field in (*self.rows, self.here, self.push, self.extremes)),
             (nodes, [self.sums]),
             (nodes, [self.node]),
             (nodes, [self.moved]),
@@ -140,49 +144,62 @@ class NodalStress:
             ((self.scenarios,), [self.walls.speed, self.spread, self.fill]),
         )
 
+    @ti.func
+    def at(self, i: ti.i32, j: ti.i32) -> ti.i32:
+        """Return the index of a node."""
+        return i * self.width + j
+
     # The phases: each function is one phase at one particle or node.
 
     @ti.func
     def clear(self, s: ti.i32, i: ti.i32, j: ti.i32) -> None:
         """Set a node's sums to zero."""
-        self.sums[s, i, j] = ti.Vector([0, 0, 0, 0], ti.i64)
+        self.sums[s, self.at(i, j)] = ti.Vector([0, 0, 0, 0], ti.i64)
+
+    @ti.func
+    def locate(self, s: ti.i32, p: ti.i32) -> None:
+        """Keep for P2G and G2P which nodes a particle touches, and with what weights."""
+        self.rows[0][s, p], self.rows[1][s, p], self.rows[2][s, p] = stencil(
+            self.x[s, p], self.inv_dx, self.width
+        )
 
     @ti.func
     def p2g(self, s: ti.i32, p: ti.i32) -> None:
         """Spread n v, n and n J, from the middle node to its neighbours, dx away."""
-        base, f, weight = stencil(self.x[s, p], self.inv_dx)
+        base, offset = base_node(self.rows, s, p)
         scale = ti.Vector([self.velocity_scale, self.velocity_scale, self.count_scale, self.count_scale])
-        c_x = self.cell_scale * ti.Vector([self.slope_x[s, p][0], self.slope_x[s, p][1], 0.0, 0.0])
-        c_y = self.cell_scale * ti.Vector([self.slope_y[s, p][0], self.slope_y[s, p][1], 0.0, 0.0])
-        middle = scale * self.carried[s, p] - (f[0] - 1.0) * c_x - (f[1] - 1.0) * c_y
+        # n and J have no slope; a product with 0 is one, as nodes, and so slopes, are finite.
+        only_v = ti.Vector([self.cell_scale, self.cell_scale, 0.0, 0.0])
+        c_x, c_y = only_v * self.slope_x[s, p], only_v * self.slope_y[s, p]
+        middle = scale * self.carried[s, p] - offset[0] * c_x - offset[1] * c_y
         for i, j in ti.static(ti.ndrange(3, 3)):
             value = stepped(stepped(middle, c_x, i - 1), c_y, j - 1)
-            node = ti.Vector([s, base[0] + i, base[1] + j])
-            accumulate(self.sums, node, (weight[i, 0] * weight[j, 1]) * value, self.atomic)
+            node = ti.Vector([s, base + i * self.width + j])
+            accumulate(self.sums, node, self.rows[i][s, p][j] * value, self.atomic)
 
     @ti.func
     def received(self, s: ti.i32, i: ti.i32, j: ti.i32) -> Value:
         """Return a node's sums and its mirror images' ones, and the momentum that moving walls add."""
-        total = self.sums[s, i, j]
+        total = self.sums[s, self.at(i, j)]
         drag = ti.Vector([0.0, 0.0])
         x_ghost, y_ghost = self.walls.beyond(i), self.walls.beyond(j)
         if x_ghost != i:
-            image = self.sums[s, x_ghost, j]
+            image = self.sums[s, self.at(x_ghost, j)]
             total += ti.Vector([-1, self.walls.tangential, 1, 1]) * image
             drag[1] += self.walls.doubled_speed(s, 0, x_ghost) * from_fixed(image[2], self.count_unit)
         if y_ghost != j:
-            image = self.sums[s, i, y_ghost]
+            image = self.sums[s, self.at(i, y_ghost)]
             total += ti.Vector([self.walls.tangential, -1, 1, 1]) * image
             drag[0] += self.walls.doubled_speed(s, 2, y_ghost) * from_fixed(image[2], self.count_unit)
         if x_ghost != i and y_ghost != j:
-            image = self.sums[s, x_ghost, y_ghost]
+            image = self.sums[s, self.at(x_ghost, y_ghost)]
             total += ti.Vector([-self.walls.tangential, -self.walls.tangential, 1, 1]) * image
             drag[0] += self.walls.doubled_speed(s, 2, y_ghost) * from_fixed(image[2], self.count_unit)
             drag[1] += self.walls.doubled_speed(s, 0, x_ghost) * from_fixed(image[2], self.count_unit)
         return total, drag
 
     @ti.func
-    def fold(self, s: ti.i32, i: ti.i32, j: ti.i32) -> None:
+    def fold(self, s: ti.i32, i: ti.i32, j: ti.i32, fill: ti.f32) -> None:
         """Turn the sums of an interior node into v, r and Jbar."""
         total, drag = self.received(s, i, j)
         state = ti.Vector([0.0, 0.0, 0.0, 1.0])
@@ -190,17 +207,17 @@ class NodalStress:
             count = from_fixed(total[2], self.count_unit)
             state[0] = (from_fixed(total[0], self.velocity_unit) + drag[0]) / count
             state[1] = (from_fixed(total[1], self.velocity_unit) + drag[1]) / count
-            state[2] = count * self.fill[s]
+            state[2] = count * fill
             state[3] = from_fixed(total[3], self.count_unit) / count
-        self.node[s, i, j] = state
+        self.node[s, self.at(i, j)] = state
 
     @ti.func
     def mirror(self, state: Template, s: ti.i32, k: ti.i32) -> None:
         """Fill the k-th ghost node of (v, r, Jbar): r and Jbar even, v odd about the wall's."""
         i, j = self.walls.ring(k)
-        image = state[s, self.walls.source(i), self.walls.source(j)]
+        image = state[s, self.at(self.walls.source(i), self.walls.source(j))]
         sign, add = self.walls.reflection(i, j), self.walls.drive(s, i, j)
-        state[s, i, j] = ti.Vector(
+        state[s, self.at(i, j)] = ti.Vector(
             [sign[0] * image[0] + add[0], sign[1] * image[1] + add[1], image[2], image[3]]
         )
 
@@ -208,67 +225,63 @@ class NodalStress:
     def mirror_gain(self, s: ti.i32, k: ti.i32) -> None:
         """Fill the k-th ghost node of dt a: as the velocity by walls at rest."""
         i, j = self.walls.ring(k)
-        self.gain[s, i, j] = (
-            self.walls.reflection(i, j) * self.gain[s, self.walls.source(i), self.walls.source(j)]
+        self.gain[s, self.at(i, j)] = (
+            self.walls.reflection(i, j) * self.gain[s, self.at(self.walls.source(i), self.walls.source(j))]
         )
 
     @ti.func
     def force(self, s: ti.i32, i: ti.i32, j: ti.i32) -> None:
         """Add dt a = dt (E/rho) grad Jbar + dt nu lap v; gradients weighted 1/8, 3/4, 1/8 across."""
-        east, west = self.node[s, i + 1, j], self.node[s, i - 1, j]
-        north, south = self.node[s, i, j + 1], self.node[s, i, j - 1]
-        rising = self.node[s, i + 1, j + 1][3] - self.node[s, i - 1, j - 1][3]
-        falling = self.node[s, i + 1, j - 1][3] - self.node[s, i - 1, j + 1][3]
+        east, west = self.node[s, self.at(i + 1, j)], self.node[s, self.at(i - 1, j)]
+        north, south = self.node[s, self.at(i, j + 1)], self.node[s, self.at(i, j - 1)]
+        rising = self.node[s, self.at(i + 1, j + 1)][3] - self.node[s, self.at(i - 1, j - 1)][3]
+        falling = self.node[s, self.at(i + 1, j - 1)][3] - self.node[s, self.at(i - 1, j + 1)][3]
         grad_x = 0.75 * (east[3] - west[3]) + 0.125 * (rising + falling)
         grad_y = 0.75 * (north[3] - south[3]) + 0.125 * (rising - falling)
-        here = self.node[s, i, j]
+        here = self.node[s, self.at(i, j)]
         laplacian = ((east + west) + (north + south)) - 4.0 * here
         gain_x = self.pressure * grad_x + self.spread[s] * laplacian[0]
         gain_y = self.pressure * grad_y + self.spread[s] * laplacian[1]
         v_x, v_y = here[0] + gain_x, here[1] + gain_y
-        self.gain[s, i, j] = ti.Vector([gain_x, gain_y])
-        self.moved[s, i, j] = ti.Vector([v_x, v_y, here[2], here[3]])
-        self.peak[s, i, j] = largest(ti.abs(v_x), largest(ti.abs(v_y), self.peak[s, i, j]))
+        self.gain[s, self.at(i, j)] = ti.Vector([gain_x, gain_y])
+        self.moved[s, self.at(i, j)] = ti.Vector([v_x, v_y, here[2], here[3]])
+        self.peak[s, self.at(i, j)] = largest(ti.abs(v_x), largest(ti.abs(v_y), self.peak[s, self.at(i, j)]))
 
     @ti.func
     def g2p(self, s: ti.i32, p: ti.i32) -> None:
-        """Interpolate (v, r, Jbar), their slopes and dt a; update the particle."""
-        base, f, weight = stencil(self.x[s, p], self.inv_dx)
+        """Interpolate (v, r, Jbar), their slopes and dt a."""
+        base, offset = base_node(self.rows, s, p)
         here, gain = ti.Vector([0.0, 0.0, 0.0, 0.0]), ti.Vector([0.0, 0.0])
         slope_x, slope_y = here, here
         for i, j in ti.static(ti.ndrange(3, 3)):
-            w = weight[i, 0] * weight[j, 1]
-            share = w * self.moved[s, base[0] + i, base[1] + j]
-            gain += w * self.gain[s, base[0] + i, base[1] + j]
+            w, node = self.rows[i][s, p][j], base + i * self.width + j
+            share = w * self.moved[s, node]
+            gain += w * self.gain[s, node]
             here += share
             slope_x = stepped(slope_x, share, i - 1)
             slope_y = stepped(slope_y, share, j - 1)
-        slope_x = self.gradient * (slope_x - (f[0] - 1.0) * here)
-        slope_y = self.gradient * (slope_y - (f[1] - 1.0) * here)
-        self.slope_x[s, p], self.slope_y[s, p] = slope_x, slope_y
-        self.update(s, p, here, slope_x, slope_y, gain)
+        self.slope_x[s, p] = self.gradient * (slope_x - offset[0] * here)
+        self.slope_y[s, p] = self.gradient * (slope_y - offset[1] * here)
+        self.here[s, p] = here
+        self.push[s, p] = ti.Vector([gain[0], gain[1], 0.0, 0.0])
 
     @ti.func
-    def update(
-        self,
-        s: ti.i32,
-        p: ti.i32,
-        here: ti.math.vec4,
-        slope_x: ti.math.vec4,
-        slope_y: ti.math.vec4,
-        gain: ti.math.vec2,
-    ) -> None:
+    def update(self, s: ti.i32, p: ti.i32) -> None:
         """Relax v_p and J_p towards the grid, move and shift x_p."""
+        here, slope_x, slope_y = self.here[s, p], self.slope_x[s, p], self.slope_y[s, p]
         volume = 1.0 / largest(here[2], 0.5)
         push = self.shift * volume * ti.Vector([slope_x[2], slope_y[2]])
         push = bounded(push, -self.shift_bound, self.shift_bound)
         grid_v = ti.Vector([here[0], here[1]])
-        v = ti.Vector([self.carried[s, p][0], self.carried[s, p][1]]) + gain
+        v = ti.Vector([self.carried[s, p][0], self.carried[s, p][1]])
+        v = v + ti.Vector([self.push[s, p][0], self.push[s, p][1]])
         v = v + self.parameters.velocity_relaxation * (grid_v - v)
         v = v + (
             push[0] * ti.Vector([slope_x[0], slope_x[1]]) + push[1] * ti.Vector([slope_y[0], slope_y[1]])
         )
-        self.x[s, p] = bounded(self.x[s, p] + (self.dt * grid_v + push), self.least, self.most)
+        x = ti.Vector([self.x[s, p][0], self.x[s, p][1]])
+        x = bounded(x + (self.dt * grid_v + push), self.least, self.most)
+        self.x[s, p] = ti.Vector([x[0], x[1], 0.0, 0.0])
         jacobian = self.carried[s, p][3]
         jacobian = (
             jacobian
@@ -281,10 +294,10 @@ class NodalStress:
         self.extremes[s, p] = largest(reached, self.extremes[s, p])
 
     @ti.func
-    def sum_velocity(self, s: ti.i32, i: ti.i32, j: ti.i32) -> None:
+    def sum_velocity(self, s: ti.i32, n: ti.i32) -> None:
         """Add a node's velocity to its sum over time, outside the path of the bits."""
-        v = ti.Vector([self.moved[s, i, j][0], self.moved[s, i, j][1]])
-        self.total[s, i, j] = self.total[s, i, j] + ti.cast(v, ti.f64)
+        v = ti.Vector([self.moved[s, n][0], self.moved[s, n][1]])
+        self.total[s, n] = self.total[s, n] + ti.cast(v, ti.f64)
 
     # The drivers: the same phases in the same order.
 
@@ -302,14 +315,18 @@ class NodalStress:
     def _serial_substeps(self, substeps: ti.i32, average: ti.i32) -> Nothing:
         ti.loop_config(serialize=True)
         for _ in range(substeps):
+            # Read first, so that the address of the fields stays out of the loops: else no vectors.
+            fill = self.fill[0]
             for i in range(self.walls.ghost[0], self.walls.ghost[1] + 1):
                 for j in range(self.walls.ghost[0], self.walls.ghost[1] + 1):
                     self.clear(0, i, j)
             for p in range(self.parameters.particles):
+                self.locate(0, p)
+            for p in range(self.parameters.particles):
                 self.p2g(0, p)
             for i in range(self.walls.edge[0], self.walls.edge[1] + 1):
                 for j in range(self.walls.edge[0], self.walls.edge[1] + 1):
-                    self.fold(0, i, j)
+                    self.fold(0, i, j, fill)
             for k in range(self.walls.ring_size):
                 self.mirror(self.node, 0, k)
             for i in range(self.walls.edge[0], self.walls.edge[1] + 1):
@@ -319,11 +336,12 @@ class NodalStress:
                 self.mirror(self.moved, 0, k)
                 self.mirror_gain(0, k)
             if average:
-                for i in range(self.walls.ghost[0], self.walls.ghost[1] + 1):
-                    for j in range(self.walls.ghost[0], self.walls.ghost[1] + 1):
-                        self.sum_velocity(0, i, j)
+                for n in range(self.width**2):
+                    self.sum_velocity(0, n)
             for p in range(self.parameters.particles):
                 self.g2p(0, p)
+            for p in range(self.parameters.particles):
+                self.update(0, p)
 
     @ti.kernel
     def _parallel_substep(self) -> Nothing:
@@ -334,10 +352,11 @@ class NodalStress:
             self.clear(s, i, j)
         ti.loop_config(parallelize=self.threads)
         for s, p in ti.ndrange(self.scenarios, self.parameters.particles):
+            self.locate(s, p)
             self.p2g(s, p)
         ti.loop_config(parallelize=self.threads)
         for s, i, j in ti.ndrange(self.scenarios, interior, interior):
-            self.fold(s, i, j)
+            self.fold(s, i, j, self.fill[s])
         ti.loop_config(parallelize=self.threads)
         for s, k in ti.ndrange(self.scenarios, self.walls.ring_size):
             self.mirror(self.node, s, k)
@@ -351,17 +370,20 @@ class NodalStress:
         ti.loop_config(parallelize=self.threads)
         for s, p in ti.ndrange(self.scenarios, self.parameters.particles):
             self.g2p(s, p)
+            self.update(s, p)
 
     @ti.kernel
     def restart_extremes(self) -> Nothing:
         """Start an advance: the extremes are those of the present state."""
-        for s, p in self.extremes:
+        ti.loop_config(serialize=ti.static(not self.atomic))
+        for s, p in ti.ndrange(self.scenarios, self.parameters.particles):
             now = self.carried[s, p]
             self.extremes[s, p] = ti.Vector([ti.abs(now[0]), ti.abs(now[1]), now[3], -now[3]])
-        for s, i, j in self.peak:
-            self.peak[s, i, j] = 0.0
+        ti.loop_config(serialize=ti.static(not self.atomic))
+        for s, n in ti.ndrange(self.scenarios, self.width**2):
+            self.peak[s, n] = 0.0
 
     @ti.kernel
     def _add_to_total(self) -> Nothing:
-        for s, i, j in self.moved:
-            self.sum_velocity(s, i, j)
+        for s, n in self.moved:
+            self.sum_velocity(s, n)

@@ -33,7 +33,18 @@ from .constitutive import (
     viscous_stress,
 )
 from .split import FreeSurfaceParameters, Material
-from .transfer import Nothing, Value, accumulate, bounded, fixed_point_scale, from_fixed, stencil
+from .transfer import (
+    Nothing,
+    Template,
+    Value,
+    accumulate,
+    base_node,
+    bounded,
+    fixed_point_scale,
+    from_fixed,
+    stencil,
+    stepped,
+)
 
 __all__ = ["ParticleStress"]
 
@@ -54,12 +65,12 @@ class ParticleStress:
     """Fields of a batch of scenarios and the kernels that advance them.
 
     Attributes:
-        x: particle positions [length].
-        v: particle velocities [length/s].
-        c: APIC matrices C [1/s].
+        x: particle positions [length], and two zeros.
+        carried: what P2G spreads: v_x, v_y, 1, and J of liquid or 1.
+        slope_x: d/dx of the nodal v_x, v_y, r and Jbar at the particles, the first column of C.
+        slope_y: d/dy of the same.
         f: deformation gradients of the solids [1].
-        ratio: J of liquid, plastic Jp of snow, 1 in other solids [1].
-        material: :class:`.Material` of each particle.
+        matter: :class:`.Material`, J of liquid or plastic Jp of snow (1 in other solids), and two zeros.
         extremes: largest speed, smallest and largest J, and largest abs(v) + abs(A o) of each
             particle since the advance began.
         fill: m / (rho dx^2), shape [scenario].
@@ -78,6 +89,7 @@ class ParticleStress:
         self.scenarios = scenarios  # scenarios advanced together
         self.atomic = atomic  # whether several threads run the phases
         self.threads = threads  # threads of the parallel loops on a CPU
+        self.solid = True  # whether some particles are no liquid
         self._set_constants()
         self._make_fields()
 
@@ -85,6 +97,7 @@ class ParticleStress:
         p = self.parameters
         dx = 1.0 / p.grid
         self.inv_dx, self.dx, self.dt = float(p.grid), dx, p.dt
+        self.width = p.grid + 1
         self.low, self.high = p.wall, p.grid - p.wall
         self.least, self.most = (self.low + _INSET) * dx, (self.high - _INSET) * dx
         self.speed_bound = dx / p.dt
@@ -102,23 +115,25 @@ class ParticleStress:
         self.yield_low, self.yield_high = 1.0 - p.snow_compression, 1.0 + p.snow_stretch
 
     def _make_fields(self) -> None:
-        self.x = ti.Vector.field(2, ti.f32)
-        self.v = ti.Vector.field(2, ti.f32)
-        self.c = ti.Matrix.field(2, 2, ti.f32)
+        self.x = ti.Vector.field(4, ti.f32)
+        self.carried = ti.Vector.field(4, ti.f32)
+        self.slope_x = ti.Vector.field(4, ti.f32)
+        self.slope_y = ti.Vector.field(4, ti.f32)
         self.f = ti.Matrix.field(2, 2, ti.f32)
-        self.ratio = ti.field(ti.f32)
-        self.material = ti.field(ti.i32)
+        self.matter = ti.Vector.field(4, ti.f32)
         self.extremes = ti.Vector.field(4, ti.f32)
-        self.slope = ti.Matrix.field(2, 2, ti.f32)  # A, scaled
-        self.around = ti.Vector.field(2, ti.f32)  # r and Jbar at the particle
+        self.rows = [ti.Vector.field(4, ti.f32) for _ in range(3)]  # of the stencil
+        self.a_x = ti.Vector.field(4, ti.f32)  # first column of A, scaled, and two zeros
+        self.a_y = ti.Vector.field(4, ti.f32)  # second column
+        self.here = ti.Vector.field(4, ti.f32)  # v_x, v_y, r, Jbar at the particle
         self.sums = ti.Vector.field(4, ti.i64)  # n v_x, n v_y, n, n J
         self.node = ti.Vector.field(4, ti.f32)  # v_x, v_y, r, Jbar
         self.fill = ti.field(ti.f32)
         self.friction = ti.field(ti.f32)
         particles = (self.scenarios, self.parameters.particles)
-        nodes = (self.scenarios, self.parameters.grid + 1, self.parameters.grid + 1)
-        carried = (self.x, self.v, self.c, self.f, self.ratio, self.material)
-        derived = (self.extremes, self.slope, self.around)
+        nodes = (self.scenarios, self.width**2)
+        carried = (self.x, self.carried, self.slope_x, self.slope_y, self.f, self.matter, self.extremes)
+        derived = (*self.rows, self.a_x, self.a_y, self.here)
         self._tree = backend.place(
             *((particles, [field]) for field in carried + derived),
             *((nodes, [field]) for field in (self.sums, self.node)),
@@ -128,77 +143,86 @@ class ParticleStress:
     # --- one substep: each function is one phase at one particle or node ---------------------
 
     @ti.func
-    def stress(self, s: ti.i32, p: ti.i32) -> ti.math.mat2:
+    def stress(self, s: ti.i32, p: ti.i32, c: ti.math.mat2, solid: Template) -> ti.math.mat2:
         """Return the Kirchhoff stress tau of a particle."""
-        tau = ti.Matrix.zero(ti.f32, 2, 2)
-        viscosity = self.solid_viscosity
-        if self.material[s, p] == _LIQUID:
-            pull = liquid_stress(self.ratio[s, p], self.parameters.liquid_modulus)
-            tau = ti.Matrix([[pull, 0.0], [0.0, pull]])
-            viscosity = self.liquid_viscosity
-        else:
-            mu, la = self.jelly[0], self.jelly[1]
-            if self.material[s, p] == _ROPE:
+        kind, ratio = self.matter[s, p][0], self.matter[s, p][1]
+        pull = liquid_stress(ratio, self.parameters.liquid_modulus)
+        tau, viscosity = ti.Matrix([[pull, 0.0], [0.0, pull]]), self.liquid_viscosity
+        if ti.static(solid):
+            mu, la, damping = self.jelly[0], self.jelly[1], self.solid_viscosity
+            if kind == _ROPE:
                 mu, la = self.rope[0], self.rope[1]
-            if self.material[s, p] == _SNOW:
+            if kind == _SNOW:
                 factor = hardening(
-                    self.ratio[s, p],
+                    ratio,
                     self.parameters.snow_hardening,
                     self.parameters.snow_hardening_min,
                     self.parameters.snow_hardening_max,
                 )
-                mu, la = self.snow[0] * factor, self.snow[1] * factor
-                viscosity = 0.0
-            tau = corotated_stress(self.f[s, p], mu, la)
-        return tau + viscous_stress(self.c[s, p], viscosity)
+                mu, la, damping = self.snow[0] * factor, self.snow[1] * factor, 0.0
+            tau = ti.select(kind == _LIQUID, tau, corotated_stress(self.f[s, p], mu, la))
+            viscosity = ti.select(kind == _LIQUID, viscosity, damping)
+        return tau + viscous_stress(c, viscosity)
 
     @ti.func
-    def prepare(self, s: ti.i32, p: ti.i32) -> None:
-        """Compute the slope A of what a particle carries; a loop of its own is faster."""
-        a = self.dx * self.c[s, p] - self.impulse * self.stress(s, p)
-        v = self.v[s, p]
+    def gradient(self, s: ti.i32, p: ti.i32) -> ti.math.mat2:
+        """Return C of a particle."""
+        slope_x, slope_y = self.slope_x[s, p], self.slope_y[s, p]
+        return ti.Matrix([[slope_x[0], slope_y[0]], [slope_x[1], slope_y[1]]])
+
+    @ti.func
+    def prepare(self, s: ti.i32, p: ti.i32, solid: Template) -> None:
+        """Compute the stencil of a particle, and the slope A of what it carries."""
+        self.rows[0][s, p], self.rows[1][s, p], self.rows[2][s, p] = stencil(
+            self.x[s, p], self.inv_dx, self.width
+        )
+        c = self.gradient(s, p)
+        a = self.dx * c - self.impulse * self.stress(s, p, c, solid)
+        v, seen = self.carried[s, p], self.extremes[s, p]
         reach_x = ti.abs(v[0]) + 1.5 * (ti.abs(a[0, 0]) + ti.abs(a[0, 1]))
         reach_y = ti.abs(v[1]) + 1.5 * (ti.abs(a[1, 0]) + ti.abs(a[1, 1]))
-        self.extremes[s, p][3] = larger(largest_of(reach_x, reach_y), self.extremes[s, p][3])
-        self.slope[s, p] = self.velocity_scale * a
+        reach = larger(largest_of(reach_x, reach_y), seen[3])
+        self.extremes[s, p] = ti.Vector([seen[0], seen[1], seen[2], reach])
+        scaled = self.velocity_scale * a
+        self.a_x[s, p] = ti.Vector([scaled[0, 0], scaled[1, 0], 0.0, 0.0])
+        self.a_y[s, p] = ti.Vector([scaled[0, 1], scaled[1, 1], 0.0, 0.0])
 
     @ti.func
     def p2g(self, s: ti.i32, p: ti.i32) -> None:
-        """Spread n v, n and n J; centred on the middle node, whose neighbours lie dx away."""
-        base, f, weight = stencil(self.x[s, p], self.inv_dx)
-        jacobian = 1.0
-        if self.material[s, p] == _LIQUID:
-            jacobian = self.ratio[s, p]
-        a, v = self.slope[s, p], self.velocity_scale * self.v[s, p]
-        a_x = ti.Vector([a[0, 0], a[1, 0], 0.0, 0.0])
-        a_y = ti.Vector([a[0, 1], a[1, 1], 0.0, 0.0])
-        carried = ti.Vector([v[0], v[1], self.count_scale, self.count_scale * jacobian])
-        centre = carried - (f[0] - 1.0) * a_x - (f[1] - 1.0) * a_y
-        for i in ti.static(range(3)):
-            column = centre + (i - 1) * a_x
-            for j in ti.static(range(3)):
-                value = (weight[i, 0] * weight[j, 1]) * (column + (j - 1) * a_y)
-                accumulate(self.sums, ti.Vector([s, base[0] + i, base[1] + j]), value, self.atomic)
+        """Spread n v, n and n J, from the middle node to its neighbours, dx away."""
+        base, offset = base_node(self.rows, s, p)
+        scale = ti.Vector([self.velocity_scale, self.velocity_scale, self.count_scale, self.count_scale])
+        a_x, a_y = self.a_x[s, p], self.a_y[s, p]
+        middle = scale * self.carried[s, p] - offset[0] * a_x - offset[1] * a_y
+        for i, j in ti.static(ti.ndrange(3, 3)):
+            value = stepped(stepped(middle, a_x, i - 1), a_y, j - 1)
+            node = ti.Vector([s, base + i * self.width + j])
+            accumulate(self.sums, node, self.rows[i][s, p][j] * value, self.atomic)
+
+    @ti.func
+    def at(self, i: ti.i32, j: ti.i32) -> ti.i32:
+        """Return the index of a node."""
+        return i * self.width + j
 
     @ti.func
     def clear(self, s: ti.i32, i: ti.i32, j: ti.i32) -> None:
         """Empty the sums of a node."""
-        self.sums[s, i, j] = ti.Vector.zero(ti.i64, 4)
+        self.sums[s, self.at(i, j)] = ti.Vector.zero(ti.i64, 4)
 
     @ti.func
-    def update(self, s: ti.i32, i: ti.i32, j: ti.i32) -> None:
+    def update(self, s: ti.i32, i: ti.i32, j: ti.i32, fill: ti.f32, friction: ti.f32) -> None:
         """Divide by n, add gravity, meet the walls; an empty node is at rest."""
-        total = self.sums[s, i, j]
+        total = self.sums[s, self.at(i, j)]
         u, v, jacobian = 0.0, 0.0, 1.0
         if total[2] > 0:
             n = from_fixed(total[2], self.count_unit)
             u = from_fixed(total[0], self.velocity_unit) / n
             v = from_fixed(total[1], self.velocity_unit) / n - self.fall
             jacobian = from_fixed(total[3], self.count_unit) / n
-            u, v = self.contact(i, u, v, self.friction[s])
-            v, u = self.contact(j, v, u, self.friction[s])
-        density = from_fixed(self.mirrored_count(s, i, j), self.count_unit) * self.fill[s]
-        self.node[s, i, j] = ti.Vector([u, v, density, jacobian])
+            u, v = self.contact(i, u, v, friction)
+            v, u = self.contact(j, v, u, friction)
+        density = from_fixed(self.mirrored_count(s, i, j), self.count_unit) * fill
+        self.node[s, self.at(i, j)] = ti.Vector([u, v, density, jacobian])
 
     @ti.func
     def contact(self, index: ti.i32, normal: ti.f32, tangential: ti.f32, friction: ti.f32) -> Value:
@@ -222,75 +246,90 @@ class ParticleStress:
     @ti.func
     def mirrored_count(self, s: ti.i32, i: ti.i32, j: ti.i32) -> ti.i64:
         """Return n of a node with its images: a wall node holds half a cell, a corner a quarter."""
-        count = self.sums[s, i, j][2]
+        count = self.sums[s, self.at(i, j)][2]
         image_i, image_j = self.image(i), self.image(j)
         if image_i >= 0:
-            count += self.sums[s, image_i, j][2]
+            count += self.sums[s, self.at(image_i, j)][2]
         if image_j >= 0:
-            count += self.sums[s, i, image_j][2]
+            count += self.sums[s, self.at(i, image_j)][2]
             if image_i >= 0:
-                count += self.sums[s, image_i, image_j][2]
+                count += self.sums[s, self.at(image_i, image_j)][2]
         return count
 
     @ti.func
     def g2p(self, s: ti.i32, p: ti.i32) -> None:
-        """Gather velocity, its gradient, r and Jbar; move the particle."""
-        base, f, weight = stencil(self.x[s, p], self.inv_dx)
-        mean = ti.Vector.zero(ti.f32, 4)
-        b = ti.Vector.zero(ti.f32, 4)
+        """Gather (v, r, Jbar) and their slopes."""
+        base, offset = base_node(self.rows, s, p)
+        here = ti.Vector.zero(ti.f32, 4)
+        slope_x, slope_y = here, here
         for i, j in ti.static(ti.ndrange(3, 3)):
-            part = (weight[i, 0] * weight[j, 1]) * self.node[s, base[0] + i, base[1] + j]
-            offset = ti.Vector([i - f[0], i - f[0], j - f[1], j - f[1]])
-            mean += part
-            b += offset * ti.Vector([part[0], part[1], part[0], part[1]])
-        v = ti.Vector([mean[0], mean[1]])
-        self.c[s, p] = (4.0 * self.inv_dx) * ti.Matrix([[b[0], b[2]], [b[1], b[3]]])
-        self.v[s, p] = v
-        self.x[s, p] = bounded(self.x[s, p] + self.dt * v, self.least, self.most)
-        self.around[s, p] = ti.Vector([mean[2], mean[3]])
-        self.extremes[s, p][0] = larger(largest_of(ti.abs(v[0]), ti.abs(v[1])), self.extremes[s, p][0])
+            part = self.rows[i][s, p][j] * self.node[s, base + i * self.width + j]
+            here += part
+            slope_x += ((i - 1.0) - offset[0]) * part
+            slope_y += ((j - 1.0) - offset[1]) * part
+        self.slope_x[s, p] = (4.0 * self.inv_dx) * slope_x
+        self.slope_y[s, p] = (4.0 * self.inv_dx) * slope_y
+        self.here[s, p] = here
 
     @ti.func
-    def flow(self, s: ti.i32, p: ti.i32) -> None:
-        """Update J of a liquid or F of a solid."""
-        c = self.c[s, p]
-        if self.material[s, p] == _LIQUID:
-            old, r, mean = self.ratio[s, p], self.around[s, p][0], self.around[s, p][1]
-            j = old + self.dt * (c[0, 0] + c[1, 1]) * old
-            j += self.parameters.jacobian_relaxation * (mean - old)
-            j += self.parameters.density_coupling * (1.0 / larger(r, 1.0) - j)
-            self.ratio[s, p] = bounded(j, self.parameters.jacobian_min, self.parameters.jacobian_max)
-        else:
-            f = self.f[s, p] + self.dt * (c @ self.f[s, p])
-            if self.material[s, p] == _SNOW:
-                f, growth = plastic_return(f, self.yield_low, self.yield_high)
-                self.ratio[s, p] = bounded(
-                    self.ratio[s, p] * growth, self.parameters.snow_jp_min, self.parameters.snow_jp_max
-                )
+    def flow(self, s: ti.i32, p: ti.i32, solid: Template) -> None:
+        """Move a particle; update J of a liquid or F of a solid."""
+        here, kind, old = self.here[s, p], self.matter[s, p][0], self.matter[s, p][1]
+        x = bounded(
+            ti.Vector([self.x[s, p][0], self.x[s, p][1]]) + self.dt * ti.Vector([here[0], here[1]]),
+            self.least,
+            self.most,
+        )
+        self.x[s, p] = ti.Vector([x[0], x[1], 0.0, 0.0])
+        c = self.gradient(s, p)
+        j = old + self.dt * (c[0, 0] + c[1, 1]) * old
+        j += self.parameters.jacobian_relaxation * (here[3] - old)
+        j += self.parameters.density_coupling * (1.0 / larger(here[2], 1.0) - j)
+        j = bounded(j, self.parameters.jacobian_min, self.parameters.jacobian_max)
+        ratio, jacobian, spread = j, j, j
+        if ti.static(solid):
+            resting = self.f[s, p]
+            f = resting + self.dt * (c @ resting)
+            yielded, growth = plastic_return(f, self.yield_low, self.yield_high)
+            jp = bounded(old * growth, self.parameters.snow_jp_min, self.parameters.snow_jp_max)
+            # Chosen, not branched upon: else no vectors.
+            f = ti.select(kind == _LIQUID, resting, ti.select(kind == _SNOW, yielded, f))
             self.f[s, p] = f
-        jacobian = self.volume(s, p)
-        self.extremes[s, p][1] = -larger(-jacobian, -self.extremes[s, p][1])
-        self.extremes[s, p][2] = larger(jacobian, self.extremes[s, p][2])
-
-    @ti.func
-    def volume(self, s: ti.i32, p: ti.i32) -> ti.f32:
-        """Return J of a liquid, det F of a solid (its elastic part in snow)."""
-        jacobian = self.ratio[s, p]
-        if self.material[s, p] != _LIQUID:
-            f = self.f[s, p]
-            jacobian = f[0, 0] * f[1, 1] - f[0, 1] * f[1, 0]
-        return jacobian
+            ratio = ti.select(kind == _LIQUID, j, ti.select(kind == _SNOW, jp, old))
+            jacobian = ti.select(kind == _LIQUID, j, f[0, 0] * f[1, 1] - f[0, 1] * f[1, 0])
+            spread = ti.select(kind == _LIQUID, j, 1.0)
+        self.matter[s, p] = ti.Vector([kind, ratio, 0.0, 0.0])
+        self.carried[s, p] = ti.Vector([here[0], here[1], 1.0, spread])
+        seen, speed = self.extremes[s, p], largest_of(ti.abs(here[0]), ti.abs(here[1]))
+        self.extremes[s, p] = ti.Vector(
+            [
+                larger(speed, seen[0]),
+                -larger(-jacobian, -seen[1]),
+                larger(jacobian, seen[2]),
+                seen[3],
+            ]
+        )
 
     # --- the drivers: the same phases in the same order --------------------------------------
 
-    @ti.kernel
-    def run_serially(self, substeps: ti.i32) -> Nothing:
+    def run_serially(self, substeps: int) -> None:
         """Advance scenario 0 by many substeps in one thread, on the nodes that particles touch."""
+        self._serial_substeps(substeps, self.solid)
+
+    def run_in_parallel(self) -> None:
+        """Advance every scenario by one substep: one launch per phase."""
+        self._parallel_substep(self.solid)
+
+    @ti.kernel
+    def _serial_substeps(self, substeps: ti.i32, solid: Template) -> Nothing:
         ti.loop_config(serialize=True)
         for _ in range(substeps):
+            # Read first, so that the address of the fields stays out of the loops: else no vectors.
+            fill, friction = self.fill[0], self.friction[0]
             first, last = ti.Vector([self.high, self.high]), ti.Vector([0, 0])
             for p in range(self.parameters.particles):
-                base = ti.cast(self.x[0, p] * self.inv_dx - 0.5, ti.i32)
+                x = ti.Vector([self.x[0, p][0], self.x[0, p][1]])
+                base = ti.cast(x * self.inv_dx - 0.5, ti.i32)
                 first, last = ti.min(first, base), ti.max(last, base + 3)
             # A node next to a wall counts its image, which no particle need touch.
             for a in ti.static(range(2)):
@@ -302,41 +341,44 @@ class ParticleStress:
                 for j in range(first[1], last[1]):
                     self.clear(0, i, j)
             for p in range(self.parameters.particles):
-                self.prepare(0, p)
+                self.prepare(0, p, solid)
             for p in range(self.parameters.particles):
                 self.p2g(0, p)
             for i in range(first[0], last[0]):
                 for j in range(first[1], last[1]):
-                    self.update(0, i, j)
+                    self.update(0, i, j, fill, friction)
             for p in range(self.parameters.particles):
                 self.g2p(0, p)
             for p in range(self.parameters.particles):
-                self.flow(0, p)
+                self.flow(0, p, solid)
 
     @ti.kernel
-    def run_in_parallel(self) -> Nothing:
-        """Advance every scenario by one substep: one launch per phase."""
+    def _parallel_substep(self, solid: Template) -> Nothing:
         nodes = ti.static((self.low - 1, self.high + 2))
         ti.loop_config(parallelize=self.threads)
         for s, i, j in ti.ndrange(self.scenarios, nodes, nodes):
             self.clear(s, i, j)
         ti.loop_config(parallelize=self.threads)
         for s, p in ti.ndrange(self.scenarios, self.parameters.particles):
-            self.prepare(s, p)
+            self.prepare(s, p, solid)
             self.p2g(s, p)
         ti.loop_config(parallelize=self.threads)
         for s, i, j in ti.ndrange(self.scenarios, nodes, nodes):
-            self.update(s, i, j)
+            self.update(s, i, j, self.fill[s], self.friction[s])
         ti.loop_config(parallelize=self.threads)
         for s, p in ti.ndrange(self.scenarios, self.parameters.particles):
             self.g2p(s, p)
-            self.flow(s, p)
+            self.flow(s, p, solid)
 
     @ti.kernel
     def restart_extremes(self) -> Nothing:
         """Start an advance: the extremes are those of the present state."""
-        for s, p in self.extremes:
-            v, jacobian = self.v[s, p], self.volume(s, p)
+        ti.loop_config(serialize=ti.static(not self.atomic))
+        for s, p in ti.ndrange(self.scenarios, self.parameters.particles):
+            v, f = self.carried[s, p], self.f[s, p]
+            jacobian = f[0, 0] * f[1, 1] - f[0, 1] * f[1, 0]
+            if self.matter[s, p][0] == _LIQUID:
+                jacobian = v[3]
             speed = largest_of(ti.abs(v[0]), ti.abs(v[1]))
             self.extremes[s, p] = ti.Vector([speed, jacobian, jacobian, 0.0])
 

@@ -8,6 +8,10 @@ weight w_i w_j, where f = x/dx - base lies in [1/2, 3/2) and per axis
 Nodes sum 64-bit integers, q = round(scale x value): integer addition commutes, so neither the
 order of particles nor threads nor devices can change a bit of the sum.
 
+What is stored of a particle is vectors of four, each in an array of its own. Loops that only look
+at one particle (stencil, stress, motion) then have one stride, and LLVM takes eight particles at a
+time; P2G and G2P, whose nodes lie anywhere, take the four numbers of a node at a time.
+
 In the signatures of Taichi functions ``Template`` is a field or a compile-time constant and
 ``Value`` a scalar or vector of any type, for which Taichi wants no annotation; nor does it for a
 kernel that returns ``Nothing``.
@@ -32,6 +36,7 @@ __all__ = [
     "Template",
     "Value",
     "accumulate",
+    "base_node",
     "bounded",
     "fixed_point_scale",
     "from_fixed",
@@ -43,6 +48,9 @@ __all__ = [
 
 _ROUNDING_SHIFT = 6755399441055744.0
 """1.5 x 2^52: added to a float64 below 2^51, it leaves the rounded integer in the low bits."""
+
+_SHIFT_BITS = 0x4338000000000000
+"""The bits of that float64."""
 
 
 def fixed_point_scale(particles: int, bound: float) -> float:
@@ -73,14 +81,28 @@ def power_of_two_above(value: float) -> float:
 
 
 @ti.func
-def stencil(position: ti.math.vec2, inv_dx: ti.f32) -> Value:
-    """Return the base node, the offset f from it in cells, and the weights [node, axis]."""
-    scaled = position * inv_dx
+def stencil(x: ti.math.vec4, inv_dx: ti.f32, width: ti.i32) -> Value:
+    """Return three rows of weights w_i w_j, and in their fourth places what else a transfer needs.
+
+    These are the bits of the base node's index i width + j, and the offset f - 1 along x and y.
+    """
+    scaled = ti.Vector([x[0], x[1]]) * inv_dx
     base = ti.cast(scaled - 0.5, ti.i32)
     f = scaled - ti.cast(base, ti.f32)
     to_low, to_mid, to_high = 1.5 - f, f - 1.0, f - 0.5
-    weight = ti.Matrix.rows([0.5 * (to_low * to_low), 0.75 - to_mid * to_mid, 0.5 * (to_high * to_high)])
-    return base, f, weight
+    low, mid, high = 0.5 * (to_low * to_low), 0.75 - to_mid * to_mid, 0.5 * (to_high * to_high)
+    node = ti.bit_cast(base[0] * width + base[1], ti.f32)
+    return (
+        ti.Vector([low[0] * low[1], low[0] * mid[1], low[0] * high[1], node]),
+        ti.Vector([mid[0] * low[1], mid[0] * mid[1], mid[0] * high[1], to_mid[0]]),
+        ti.Vector([high[0] * low[1], high[0] * mid[1], high[0] * high[1], to_mid[1]]),
+    )
+
+
+@ti.func
+def base_node(rows: Template, s: ti.i32, p: ti.i32) -> Value:
+    """Return a particle's base node, and its offset from the middle one in cells, from its stencil."""
+    return ti.bit_cast(rows[0][s, p][3], ti.i32), ti.Vector([rows[1][s, p][3], rows[2][s, p][3]])
 
 
 @ti.func
@@ -89,8 +111,13 @@ def to_fixed(scaled: Value) -> Value:
 
     NaN and larger values give some integer, never a trap: the float's bits are only read.
     """
-    shift = ti.cast(_ROUNDING_SHIFT, ti.f64)
-    return ti.bit_cast(ti.cast(scaled, ti.f64) + shift, ti.i64) - ti.bit_cast(shift, ti.i64)
+    return shifted(scaled) - ti.i64(_SHIFT_BITS)
+
+
+@ti.func
+def shifted(scaled: Value) -> Value:
+    """Return :func:`to_fixed` plus the bits of the shift."""
+    return ti.bit_cast(ti.cast(scaled, ti.f64) + ti.cast(_ROUNDING_SHIFT, ti.f64), ti.i64)
 
 
 @ti.func
@@ -100,11 +127,11 @@ def from_fixed(total: Value, inverse_scale: ti.f32) -> Value:
 
 
 @ti.func
-def accumulate(sums: Template, node: ti.math.ivec3, scaled: ti.math.vec4, atomic: Template) -> None:
+def accumulate(sums: Template, node: ti.math.ivec2, scaled: ti.math.vec4, atomic: Template) -> None:
     """Add scaled contributions to one node's fixed-point sums.
 
     Args:
-        sums: vector field of int64, shape [scenario, node_x, node_y].
+        sums: vector field of int64, shape [scenario, node].
         node: its index.
         scaled: contributions, already times their scales.
         atomic: whether other threads may add to the same node.
@@ -113,7 +140,8 @@ def accumulate(sums: Template, node: ti.math.ivec3, scaled: ti.math.vec4, atomic
     if ti.static(atomic):
         ti.atomic_add(sums[node], to_fixed(scaled))
     else:
-        sums[node] = sums[node] + to_fixed(scaled)
+        # The shift comes off the sum: off the contribution, LLVM finds vectors for two lanes only.
+        sums[node] = (sums[node] - ti.i64(_SHIFT_BITS)) + shifted(scaled)
 
 
 @ti.func

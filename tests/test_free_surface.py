@@ -156,9 +156,9 @@ def test_runaway_particle_is_reported() -> None:
 def test_what_is_not_a_number_is_reported(poison: float, device: Device) -> None:
     """A corrupt velocity neither crashes the process nor passes unseen."""
     solver = start(CONSTANTS, [ball(Material.JELLY)], device)
-    velocity = solver.velocity()
-    velocity[0, 7] = poison
-    solver._kernels.v.from_numpy(velocity)
+    carried = solver._kernels.carried.to_numpy()
+    carried[0, 7, :2] = poison
+    solver._kernels.carried.from_numpy(carried)
     with pytest.raises(WorkFailedError, match="blew up") as caught:
         solver.advance(20)
     assert ("every number is finite" in str(caught.value.expected)) == (

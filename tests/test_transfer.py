@@ -14,13 +14,12 @@ DX = 1.0 / 32.0
 
 
 @ti.kernel
-def evaluate_stencil(x: ti.types.ndarray(), base: ti.types.ndarray(), weight: ti.types.ndarray()):  # type: ignore[no-untyped-def,valid-type] # noqa: ANN201, D103
+def evaluate_stencil(x: ti.types.ndarray(), rows: ti.types.ndarray(), base: ti.types.ndarray()):  # type: ignore[no-untyped-def,valid-type] # noqa: ANN201, D103
     for p in range(x.shape[0]):
-        node, _, w = transfer.stencil(ti.Vector([x[p, 0], x[p, 1]]), 32.0)
-        for axis in ti.static(range(2)):
-            base[p, axis] = node[axis]
-            for i in ti.static(range(3)):
-                weight[p, i, axis] = w[i, axis]
+        row = transfer.stencil(ti.Vector([x[p, 0], x[p, 1], 0.0, 0.0]), 32.0, 33)
+        base[p] = ti.bit_cast(row[0][3], ti.i32)
+        for i, j in ti.static(ti.ndrange(3, 4)):
+            rows[p, i, j] = row[i][j]
 
 
 @ti.kernel
@@ -43,17 +42,20 @@ def taichi_runtime() -> None:
 
 
 def test_weights_are_the_quadratic_b_spline() -> None:
-    """Each weight is SciPy's B-spline at the node's distance; moments are 1, 0 and dx^2/4."""
+    """Each weight is a product of SciPy's B-splines; moments are 1, 0 and dx^2/4; the rest fits."""
     x = (np.random.default_rng(0).random((500, 2)) * 0.9 + 0.05).astype(np.float32)
-    base, weight = np.zeros((500, 2), np.int32), np.zeros((500, 3, 2), np.float32)
-    evaluate_stencil(x, base, weight)
-    distance = (base[:, None, :] + np.arange(3)[None, :, None]) - x[:, None, :].astype(np.float64) / DX
+    rows, base = np.zeros((500, 3, 4), np.float32), np.zeros(500, np.int32)
+    evaluate_stencil(x, rows, base)
+    node, weight = np.stack(np.divmod(base, 33), axis=-1), rows[:, :, :3]
+    distance = (node[:, None, :] + np.arange(3)[None, :, None]) - x[:, None, :].astype(np.float64) / DX
     assert np.abs(distance).max() <= 1.5
-    spline = BSpline.basis_element([-1.5, -0.5, 0.5, 1.5], extrapolate=False)
-    np.testing.assert_allclose(weight, spline(distance), rtol=0, atol=2e-6)
-    np.testing.assert_allclose(weight.sum(axis=1), 1.0, rtol=0, atol=1e-6)
-    np.testing.assert_allclose((weight * distance).sum(axis=1), 0.0, rtol=0, atol=4e-6)
-    np.testing.assert_allclose((weight * distance**2).sum(axis=1), 0.25, rtol=0, atol=4e-6)
+    spline = BSpline.basis_element([-1.5, -0.5, 0.5, 1.5], extrapolate=False)(distance)
+    np.testing.assert_allclose(weight, spline[:, :, None, 0] * spline[:, None, :, 1], rtol=0, atol=2e-6)
+    np.testing.assert_allclose(weight.sum(axis=(1, 2)), 1.0, rtol=0, atol=1e-6)
+    for axis, along in enumerate((weight.sum(axis=2), weight.sum(axis=1))):
+        np.testing.assert_allclose((along * distance[:, :, axis]).sum(axis=1), 0.0, rtol=0, atol=4e-6)
+        np.testing.assert_allclose((along * distance[:, :, axis] ** 2).sum(axis=1), 0.25, rtol=0, atol=4e-6)
+        np.testing.assert_allclose(rows[:, axis + 1, 3], -distance[:, 1, axis], rtol=0, atol=1e-6)
 
 
 def test_fixed_point_rounds_to_even() -> None:

@@ -1,0 +1,78 @@
+"""The solver of this tree against that of another commit, on one core, in one run.
+
+    python benchmarks/solver_against.py --against main~20
+
+checks the other commit out beside this one, runs both alternately in processes of their own and
+prints, per split, the particle-substeps per second of processor time (best of the rounds) of both
+and their ratio. ``lagbench bench solver`` times frames as generation makes them, with the checks
+and the positions read out after each; the row ``kernels`` is ``whole_frame.py``, substeps alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from lagbench.baselines.machine import hardware
+
+HERE = Path(__file__).resolve().parent.parent
+SPLITS = ("cavity", "curl-noise", "fluid", "multimaterial")
+
+
+def rate(tree: Path, case: str, size: str) -> float:
+    """Return the particle-substeps per second of processor time that a tree reaches."""
+    command = ["benchmarks/whole_frame.py"]
+    if case != "kernels":
+        command = ["-m", "lagbench", "bench", "solver", "--split", case, "--size", size, "--json"]
+    core = min(os.sched_getaffinity(0))
+    done = subprocess.run(
+        [sys.executable, *command],
+        cwd=tree,
+        env={**os.environ, "PYTHONPATH": str(tree)},
+        preexec_fn=lambda: os.sched_setaffinity(0, {core}),
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    found: dict[str, Any] = json.loads(done.stdout[done.stdout.index("{") :])
+    if case == "kernels":
+        return float(found["per_processor_second"])
+    return float(found["particles"] * found["substeps"] / found["seconds_per_frame"])
+
+
+def main() -> int:
+    """Check the other commit out, run both trees alternately and print a table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--against", required=True, metavar="REV")
+    parser.add_argument("--size", default="mini")
+    parser.add_argument("--rounds", type=int, default=3)
+    given = parser.parse_args()
+    print(f"{hardware()['processor']}, size {given.size}; M particle-substeps/s of processor time")
+    print(f"| case | {given.against} | this tree | ratio |\n|---|---|---|---|")
+    with tempfile.TemporaryDirectory() as folder:
+        other = Path(folder) / "other"
+        git = ["git", "-C", str(HERE), "worktree"]
+        subprocess.run([*git, "add", "--quiet", "--detach", str(other), given.against], check=True)
+        try:
+            for case in ("kernels", *SPLITS):
+                best = dict.fromkeys((other, HERE), 0.0)
+                for _ in range(given.rounds):
+                    for tree, so_far in best.items():
+                        best[tree] = max(so_far, rate(tree, case, given.size))
+                theirs, ours = best[other] / 1e6, best[HERE] / 1e6
+                print(f"| {case} | {theirs:.1f} | {ours:.1f} | {ours / theirs:.2f} |", flush=True)
+        finally:
+            subprocess.run([*git, "remove", "--force", str(other)], check=True)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
