@@ -11,7 +11,15 @@ from pathlib import Path
 from lagbench.data.layout import MANIFEST_NAME, dataset_folder, scenario_path
 from lagbench.data.local import locate
 from lagbench.data.lock import dataset_lock
-from lagbench.data.manifest import FileEntry, Manifest, describe_file, read_manifest, write_manifest
+from lagbench.data.manifest import (
+    FileEntry,
+    Manifest,
+    describe_file,
+    merged,
+    read_manifest,
+    read_or_empty,
+    write_manifest,
+)
 from lagbench.data.registry import Registry, Size, spell_ids
 from lagbench.errors import DataError, UsageError, WorkFailedError
 from lagbench.generators.simulate import scenario_key
@@ -22,9 +30,7 @@ from lagbench.make.verify import State, compare, examine, told
 from lagbench.store.copy import (
     MANIFEST_LIMIT,
     address_of,
-    merged,
     parse_manifest,
-    read_or_empty,
     refuse_strangers,
 )
 from lagbench.store.fetch import CONNECTIONS, Wanted, fetch_scenarios, fetch_text

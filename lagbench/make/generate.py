@@ -22,17 +22,16 @@ from lagbench.data.layout import MANIFEST_NAME, dataset_folder, scenario_path
 from lagbench.data.local import locate
 from lagbench.data.lock import dataset_lock
 from lagbench.data.manifest import (
-    FileEntry,
     Manifest,
     describe_file,
-    merge,
+    merged,
     note,
-    read_manifest,
+    read_or_empty,
     write_manifest,
 )
 from lagbench.data.registry import Registry, Size, Split, spell_ids
 from lagbench.data.statistics import file_moments, round_digits, statistics
-from lagbench.errors import DataError, UsageError, check_installed, nearest
+from lagbench.errors import UsageError, check_installed, nearest
 from lagbench.generators.batch import SimulationJob
 from lagbench.generators.simulate import Simulated, scenario_key, simulate, twin_floors, twin_substeps
 from lagbench.generators.solver import Device
@@ -41,9 +40,9 @@ from lagbench.work.cluster import Cluster, await_file
 from lagbench.work.machine import environment_of, promises_bits
 from lagbench.work.pool import Event, Pool, Task, worker_count
 from lagbench.work.progress import Meter, Progress
+from lagbench.work.run import ONE_THREAD, read_many
 
 from .cards import card_texts, write_cards
-from .crew import Crew
 from .gather import gather
 from .plan import Estimate, Scenarios, Selection, check_disk, estimate, free_bytes, select
 from .verify import Finding, Look, compare, look
@@ -69,17 +68,19 @@ class Generation:
         size: Size,
         root: Path,
         device: Device,
-        crew: Crew,
+        workers: int,
         meter: Meter,
         *,
         split: Split,
+        scheduler: str | None = None,
         sources: Sequence[Path] = (),
     ) -> None:
-        self.size, self.root, self.device, self.crew = size, root, device, crew
+        self.size, self.root, self.device = size, root, device
+        self.workers, self.scheduler = workers, scheduler  # processes here, or a Dask scheduler's workers
         self.sources = sources  # other root folders to take finished scenarios from
         # the store that the root folder is a working copy of; None for a plain folder
         self.store: Publication | None = None
-        self.manifest = self._merged(None, [])  # what the folder holds, as far as is known
+        self.manifest = merged(self.size, None)  # what the folder holds, as far as is known
         self.kept: list[int] = []  # ids whose files were there and right
         self.to_do: Estimate = estimate(size, ())  # ids to simulate and what that takes
         self.verdict = ""  # how the hashes compare with datasets.yaml, in words
@@ -89,7 +90,7 @@ class Generation:
 
     def survey(self, wanted: Sequence[int], *, force: bool = False) -> None:
         """Find out what is there and what is to do; writes nothing."""
-        old = self._old_manifest()
+        old = read_or_empty(self.size, self.root)
         held = self.store.held if self.store else {}
         local = [i for i in self.size.scenarios if i not in held]
         suspects = [i for i in local if i in wanted or self._has_changed(i, old)]
@@ -98,7 +99,7 @@ class Generation:
         bad = set(suspects) - {entry.scenario for entry in good}
         good += held.values()
         kept = tuple(e for e in old.files if e.scenario not in bad)
-        self.manifest = self._merged(old.model_copy(update={"files": kept}), good)
+        self.manifest = merged(self.size, old.model_copy(update={"files": kept}), good)
         self.kept = [i for i in wanted if i not in bad and not force]
         self.to_do = estimate(self.size, [i for i in wanted if i not in self.kept])
 
@@ -107,7 +108,7 @@ class Generation:
         folder = dataset_folder(self.root, self.size.split, self.size.name, self.size.major)
         remove_leftovers(folder)
         for source in self.sources:
-            self._keep(gather(self.size, self.root, source, self._old_manifest()))
+            self._keep(gather(self.size, self.root, source, read_or_empty(self.size, self.root)))
         self.survey(wanted, force=force)
         check_disk(self.root, self.to_do.bytes)
         self._keep(self.manifest)
@@ -124,20 +125,19 @@ class Generation:
         """Return the ids of the size that the manifest does not hold."""
         return tuple(i for i in self.size.scenarios if self.manifest.entry(i) is None)
 
-    def _old_manifest(self) -> Manifest:
-        """Return the manifest on disk, an empty one where there is none that can be read."""
-        try:
-            old = read_manifest(self.root, self.size.split, self.size.name, self.size.major)
-        except DataError:  # it is written anew from the files
-            old = None
-        return self._merged(old, [])
-
     def _examined(self, suspects: Sequence[int], old: Manifest) -> list[Finding]:
         orders = {
             f"scenario {i}": Look(root=self.root, size=self.size, scenario=i, manifest=old.only(i))
             for i in suspects
         }
-        return self.crew.read(look, orders, map(self._path, suspects), self._count_files)
+        return read_many(
+            look,
+            orders,
+            map(self._path, suspects),
+            self._count_files,
+            workers=self.workers,
+            scheduler=self.scheduler,
+        )
 
     def _count_files(self, files: int) -> None:
         self._meter.count(files, scenarios=files)
@@ -150,23 +150,6 @@ class Generation:
         entry, path = old.entry(scenario), self._path(scenario)
         return (path.stat().st_size if path.exists() else None) != (entry.bytes if entry else None)
 
-    def _merged(
-        self,
-        base: Manifest | None,
-        files: Sequence[FileEntry],
-        environment: Mapping[str, str] | None = None,
-    ) -> Manifest:
-        return merge(
-            base,
-            files,
-            split=self.size.split,
-            size=self.size.name,
-            version=self.size.version,
-            subsets=self.size.subsets,
-            environment=environment,
-            recorded=self.size.measured.scenario_sha256 if self.size.measured else None,
-        )
-
     def _simulate(self) -> None:
         """Run everything that is to do in workers, and the twins of test scenarios."""
         twins = [i for i in self.kept if self._lacks_twin(i)]
@@ -178,11 +161,13 @@ class Generation:
         total += sum(twin_substeps(self.size, i) for i in self.to_do.scenarios if self._is_test(i))
         self._meter.begin("simulating", total=total, scenarios=len(self.to_do.scenarios))
         folder = dataset_folder(self.root, self.size.split, self.size.name, self.size.major)
-        with self.crew.simulating(len(tasks), self.device, folder) as crew:
+        environment = ONE_THREAD if self.device is Device.CPU else {}
+        here = Pool(min(self.workers, len(tasks)), environment)
+        with here if self.scheduler is None else Cluster(self.scheduler, folder=folder) as team:
             for task in tasks:
-                crew.submit(task)
-            for event in crew.events():
-                self._take(event, crew)
+                team.submit(task)
+            for event in team.events():
+                self._take(event, team)
 
     def _tasks(self) -> list[Task]:
         """Return one task per batch of scenarios of similar length."""
@@ -218,19 +203,19 @@ class Generation:
         entry = self.manifest.entry(scenario)
         return self._is_test(scenario) and (entry is None or not entry.twin_floor)
 
-    def _take(self, event: Event, crew: Pool | Cluster) -> None:
+    def _take(self, event: Event, team: Pool | Cluster) -> None:
         """Act on news from a worker."""
         if event.kind == "progress":
             self._meter.count(event.value)
         elif event.kind == "lost":
             self._meter.count(-event.value)
         elif event.task.function is simulate:
-            self._take_outcomes(event.value, crew, event.machine or environment_of(self.device))
+            self._take_outcomes(event.value, team, event.machine or environment_of(self.device))
         else:
             self._take_floors(event.value)
 
     def _take_outcomes(
-        self, outcomes: Sequence[Simulated], crew: Pool | Cluster, machine: Mapping[str, str]
+        self, outcomes: Sequence[Simulated], team: Pool | Cluster, machine: Mapping[str, str]
     ) -> None:
         environment = {**machine, "device": self.device.value}
         if promises_bits(environment):
@@ -244,10 +229,10 @@ class Generation:
         tested = [outcome for outcome in outcomes if self._is_test(outcome.scenario)]
         folder = dataset_folder(self.root, self.size.split, self.size.name, self.size.major)
         note(folder, {self._path(outcome.scenario): outcome.content_sha256 for outcome in tested})
-        self._keep(self._merged(self.manifest, entries, environment))
+        self._keep(merged(self.size, self.manifest, entries, environment))
         self._meter.count(scenarios=len(entries))
         for outcome in tested:
-            crew.submit(self._twin(outcome.scenario))
+            team.submit(self._twin(outcome.scenario))
 
     def _take_floors(self, floors: dict[int, tuple[float, ...]]) -> None:
         entries = [
@@ -255,7 +240,7 @@ class Generation:
             for entry in self.manifest.files
             if entry.scenario in floors
         ]
-        self._keep(self._merged(self.manifest, entries))
+        self._keep(merged(self.size, self.manifest, entries))
 
     def _keep(self, manifest: Manifest) -> None:
         self.manifest = manifest
@@ -279,7 +264,14 @@ class Generation:
             self._bring(train)
             self._meter.begin("statistics", total=len(train), scenarios=len(train))
             paths = {f"scenario {i}": self._path(i) for i in train}
-            moments = self.crew.read(file_moments, paths, paths.values(), self._count_files)
+            moments = read_many(
+                file_moments,
+                paths,
+                paths.values(),
+                self._count_files,
+                workers=self.workers,
+                scheduler=self.scheduler,
+            )
             manifest = manifest.model_copy(update={"statistics": statistics(moments)})
         self._keep(manifest)
 
@@ -374,9 +366,10 @@ def generate(
         tier,
         folder,
         target,
-        Crew(workers=cores, scheduler=scheduler),
+        cores,
         Meter(progress),
         split=splits.split(tier.split),
+        scheduler=scheduler,
         sources=[Path(source).expanduser().absolute() for source in gather],
     )
     if dry_run:
@@ -403,13 +396,13 @@ def _result(campaign: Generation, *, bytes_free: int, seconds: float, dry_run: b
         root=campaign.root,
         folder=dataset_folder(campaign.root, size.split, size.name, size.major),
         device=campaign.device.value,
-        workers=campaign.crew.workers,
+        workers=campaign.workers,
         simulated=campaign.to_do.scenarios,
         kept=tuple(campaign.kept),
         missing=campaign.missing(),
         bytes_needed=campaign.to_do.bytes,
         bytes_free=bytes_free,
-        seconds_expected=campaign.to_do.seconds(campaign.crew.workers),
+        seconds_expected=campaign.to_do.seconds(campaign.workers),
         seconds=seconds,
         complete=campaign.manifest.complete,
         dataset_sha256=campaign.manifest.dataset_sha256,
