@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from lagbench.atomic import write_atomically
+from lagbench.data.hdf5 import check_regular
 from lagbench.data.statistics import round_digits
 from lagbench.errors import UnreadableFileError
 from lagbench.metrics import (
@@ -34,7 +35,6 @@ from lagbench.metrics import (
 )
 from lagbench.submission import Finding, Header
 from lagbench.submission.format import MAX_NAME
-from lagbench.submission.hdf5 import check_regular
 
 from .flags import Flag
 from .scenario import SUBMISSION, Preview

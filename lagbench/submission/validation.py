@@ -25,6 +25,7 @@ from typing import Any, NamedTuple
 
 import h5py
 
+from lagbench.data.hdf5 import check_file, opened
 from lagbench.data.layout import resolve_root
 from lagbench.data.local import RootedRegistry, rooted
 from lagbench.data.registry import Registry, Size
@@ -32,8 +33,7 @@ from lagbench.errors import DataError, UnreadableFileError, UsageError, WorkFail
 
 from .checks import check_domain, check_finite, check_frozen, check_jumps, survey
 from .findings import CHECKS, Finding, Findings, Severity, ValidationResult
-from .format import Anatomy, check_dims, check_dtype, check_format, check_marks, dissect
-from .hdf5 import check_file, opened
+from .format import WRITE, Anatomy, check_dims, check_dtype, check_format, check_marks, dissect
 from .predictions import attach
 from .start import check_start
 from .task_checks import check_dataset, check_frames, check_particles, check_scenarios, check_split
@@ -225,7 +225,7 @@ def _with_hashed_truth(result: ValidationResult, truth: Truth) -> ValidationResu
 def _isolated(path: Path, root: Path, registry: Registry, *, require_truth: bool) -> ValidationResult:
     """Examine a file in a child process; whatever stops the child fails the check ``readable``."""
     try:
-        check_file(path)
+        check_file(path, fix=WRITE)
         extra = seconds_for(path)
     except UnreadableFileError as error:
         return _unreadable(path, error)
@@ -287,7 +287,7 @@ def _examine(path: Path, root: Path, registry: Registry, *, require_truth: bool)
     names: dict[str, str] = {}
     content = None
     try:
-        with opened(path) as file:
+        with opened(path, fix=WRITE) as file:
             anatomy = dissect(file, path)
             texts = {name: anatomy.attributes[name] for name in ("split", "size", "method")}
             names = {name: text for name, text in texts.items() if isinstance(text, str)}
