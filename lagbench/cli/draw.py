@@ -12,7 +12,7 @@ import typer
 from lagbench.errors import DataError, UnreadableFileError, UsageError
 
 from .options import JsonFlag, QuietFlag, RootOption, SizeOption, chosen
-from .output import print_json, say
+from .output import show
 
 __all__ = ["animate", "plot"]
 
@@ -76,13 +76,6 @@ def _default_name(source: Path, ending: str) -> Path:
     return Path("-".join(words) + ending)
 
 
-def _done(path: Path, *, as_json: bool, quiet: bool) -> None:
-    if as_json:
-        print_json({"output": path})
-    else:
-        say(str(path), quiet=quiet)
-
-
 def plot(
     name: SourceArgument = None,
     split: SplitNameOption = None,
@@ -106,13 +99,14 @@ def plot(
     if sheet:
         chosen_split = chosen(name, split)
         page = _target(output or Path(f"{Path(chosen_split).name}-{size}-sheet.png"))
-        _done(contact_sheet(chosen_split, size, page, root=root), as_json=as_json, quiet=quiet)
+        contact_sheet(chosen_split, size, page, root=root)
+        show({"output": page}, [str(page)], as_json=as_json, quiet=quiet)
         return
     source = _source(name, split, size, scenario, root)
     target = _target(output or _default_name(source, f"-frame{frame}.png"))
     with _told_as_given(name):
         plot_frame(source, frame, target, kind=kind)
-    _done(target, as_json=as_json, quiet=quiet)
+    show({"output": target}, [str(target)], as_json=as_json, quiet=quiet)
 
 
 def animate(
@@ -145,4 +139,4 @@ def animate(
     hidden = quiet or as_json
     with _told_as_given(name, second):
         run(source, target, beside=other, kind=kind, frames_per_second=fps, every=every, quiet=hidden)
-    _done(target, as_json=as_json, quiet=quiet)
+    show({"output": target}, [str(target)], as_json=as_json, quiet=quiet)

@@ -21,7 +21,7 @@ from .options import (
     WorkersOption,
     chosen,
 )
-from .output import print_json, progress_bar, say, spell_bytes
+from .output import progress_bar, show, spell_bytes
 
 if TYPE_CHECKING:
     from lagbench.exchange.local_split import LocalSplit
@@ -115,19 +115,18 @@ def download(
             progress=draw,
             announce=lambda text: typer.echo(f"lagbench: {text}", err=True),
         )
-    if as_json:
-        print_json(result)
-        return
     counts = (
         f"{len(result.downloaded)} downloaded, {len(result.generated)} simulated, {len(result.kept)} kept"
     )
-    say(f"{result.split} {result.size}: {counts}, {spell_bytes(result.bytes)}", quiet=quiet)
-    say(f"  folder  {result.folder}", quiet=quiet)
+    words = [
+        f"{result.split} {result.size}: {counts}, {spell_bytes(result.bytes)}",
+        f"  folder  {result.folder}",
+    ]
     if result.downloaded:
-        say(f"  mirror  {result.mirror}: scenarios {spell_ids(sorted(result.downloaded))}", quiet=quiet)
+        words.append(f"  mirror  {result.mirror}: scenarios {spell_ids(sorted(result.downloaded))}")
     if result.dataset_sha256:
-        say(f"  hash    {result.dataset_sha256}", quiet=quiet)
-    say(f"  check   {result.verdict}", quiet=quiet)
+        words.append(f"  hash    {result.dataset_sha256}")
+    show(result, [*words, f"  check   {result.verdict}"], as_json=as_json, quiet=quiet)
 
 
 def export(
@@ -174,15 +173,12 @@ def export(
             force=force,
             progress=draw,
         )
-    if as_json:
-        print_json(result)
-        return
-    say(f"{result.split} {result.size} as {result.format} in {result.folder}", quiet=quiet)
-    for subset, count in result.trajectories.items():
-        say(f"  {subset:<6}{count} trajectories, {result.frames[subset]} frames", quiet=quiet)
+    words = [f"{result.split} {result.size} as {result.format} in {result.folder}"]
+    for name, count in result.trajectories.items():
+        words.append(f"  {name:<6}{count} trajectories, {result.frames[name]} frames")
     if result.left_out:
-        say(f"  {result.left_out} frames left out: readers of this format want equal lengths", quiet=quiet)
-    say(f"  {spell_bytes(result.bytes)}", quiet=quiet)
+        words.append(f"  {result.left_out} frames left out: readers of this format want equal lengths")
+    show(result, [*words, f"  {spell_bytes(result.bytes)}"], as_json=as_json, quiet=quiet)
 
 
 def import_split(
@@ -293,15 +289,15 @@ def _box(text: str) -> tuple[tuple[float, float], tuple[float, float]]:
 
 
 def _made(made: LocalSplit, *, as_json: bool, quiet: bool) -> None:
-    if as_json:
-        print_json(made)
-        return
     counts = ", ".join(f"{count} {subset}" for subset, count in made.scenarios.items())
     fewest, most = made.particles
     span = f"{fewest}" if fewest == most else f"{fewest} to {most}"
-    say(f"{made.folder}: {counts}, {made.frames} frames, {span} particles", quiet=quiet)
-    say(f"  task    {made.input_frames} frames given, {made.horizon} to predict", quiet=quiet)
-    say(f"  hash    {made.dataset_sha256}", quiet=quiet)
+    words = [
+        f"{made.folder}: {counts}, {made.frames} frames, {span} particles",
+        f"  task    {made.input_frames} frames given, {made.horizon} to predict",
+        f"  hash    {made.dataset_sha256}",
+        f"  use it  lagbench template --split {made.folder}/",
+    ]
+    show(made, words, as_json=as_json, quiet=quiet)
     for note in made.notes:
         typer.echo(f"warning: {note}", err=True)
-    say(f"  use it  lagbench template --split {made.folder}/", quiet=quiet)

@@ -22,6 +22,7 @@ __all__ = [
     "print_json",
     "print_table",
     "say",
+    "show",
     "spell_bytes",
     "spell_seconds",
     "progress_bar",
@@ -44,6 +45,15 @@ def say(text: str, *, quiet: bool = False) -> None:
 def print_json(value: object) -> None:
     """Print a value, a dataclass too, as one JSON object on stdout."""
     typer.echo(json.dumps(_plain(value), indent=2, sort_keys=True, allow_nan=False))
+
+
+def show(value: object, words: Iterable[str], *, as_json: bool, quiet: bool = False) -> None:
+    """Print a result as one JSON object, or the lines that say it in words, formed only then."""
+    if as_json:
+        print_json(value)
+    elif not quiet:
+        for line in words:
+            typer.echo(line)
 
 
 def _plain(value: object) -> object:
