@@ -33,10 +33,13 @@ FolderOption = Annotated[
     Path,
     typer.Option("--output", "-o", metavar="FOLDER", help="Folder to make; its last part names the split."),
 ]
-TitleOption = Annotated[str | None, typer.Option("--title", metavar="TEXT", help="Title of the split.")]
-CitationOption = Annotated[str | None, typer.Option("--citation", metavar="TEXT", help="Whom to cite.")]
-LicenceOption = Annotated[
-    str | None, typer.Option("--licence", metavar="NAME", help="Licence of the data, as in CC-BY-4.0.")
+DescribeOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--describe",
+        metavar="FILE",
+        help="YAML that says what the data are, see docs/exchange.md; options win.",
+    ),
 ]
 RadiusOption = Annotated[
     float | None, typer.Option("--radius", metavar="LENGTH", help="Connectivity radius of graph models.")
@@ -49,13 +52,6 @@ BoundsOption = Annotated[
 ]
 RescaleFlag = Annotated[
     bool, typer.Option("--rescale", help="Fit the bounds into the unit box, by a power of two.")
-]
-DensityOption = Annotated[
-    float | None, typer.Option("--density", metavar="NUMBER", help="Rest density; 1 by default.")
-]
-SpacingOption = Annotated[
-    float | None,
-    typer.Option("--spacing", metavar="LENGTH", help="Distance of particles at first; estimated by default."),
 ]
 InputFramesOption = Annotated[
     int | None, typer.Option("--input-frames", metavar="N", help="Frames given to a model; 6 by default.")
@@ -193,15 +189,11 @@ def import_split(
         str | None,
         typer.Option("--kinds", metavar="LIST", help="Material of kinds of particles, as in 3=jelly,0=drop."),
     ] = None,
-    title: TitleOption = None,
-    citation: CitationOption = None,
-    licence: LicenceOption = None,
+    describe: DescribeOption = None,
     radius: RadiusOption = None,
     frame_interval: IntervalOption = None,
     bounds: BoundsOption = None,
     rescale: RescaleFlag = False,
-    density: DensityOption = None,
-    spacing: SpacingOption = None,
     input_frames: InputFramesOption = None,
     horizon: HorizonOption = None,
     frames_of_interest: InterestOption = None,
@@ -233,6 +225,7 @@ def adopt(
         list[Path], typer.Argument(metavar="FILE...", help=".npy, .npz or .nc files, or a folder of them.")
     ],
     output: FolderOption,
+    describe: DescribeOption = None,
     radius: RadiusOption = None,
     frame_interval: IntervalOption = None,
     valid: Annotated[
@@ -241,13 +234,8 @@ def adopt(
     test: Annotated[
         int | None, typer.Option("--test", metavar="N", help="Trajectories for test; a tenth by default.")
     ] = None,
-    title: TitleOption = None,
-    citation: CitationOption = None,
-    licence: LicenceOption = None,
     bounds: BoundsOption = None,
     rescale: RescaleFlag = False,
-    density: DensityOption = None,
-    spacing: SpacingOption = None,
     input_frames: InputFramesOption = None,
     horizon: HorizonOption = None,
     frames_of_interest: InterestOption = None,
@@ -265,16 +253,19 @@ def adopt(
 
 
 def _wishes(ctx: typer.Context) -> Any:  # noqa: ANN401 (the functions type them)
-    """Return what a user says of the data: the options that import and adopt share."""
+    """Return what a user says of the data: a file, and the options that import and adopt share."""
     from lagbench.data.registry import parse_ids
-    from lagbench.exchange.trajectory import Wishes
+    from lagbench.exchange.trajectory import Wishes, read_wishes
 
+    file = ctx.params["describe"]
     said = {n: v for n, v in ctx.params.items() if n in Wishes.__annotations__ and v is not None}
+    if not said["rescale"]:  # a flag that is not given says nothing
+        del said["rescale"]
     if "bounds" in said:
         said["bounds"] = _box(said["bounds"])
     if "frames_of_interest" in said:
         said["frames_of_interest"] = parse_ids(said["frames_of_interest"])
-    return said
+    return said if file is None else {**read_wishes(file), **said}
 
 
 def _box(text: str) -> tuple[tuple[float, float], tuple[float, float]]:
