@@ -25,8 +25,8 @@ from lagbench.errors import DataError, UsageError, WorkFailedError
 from lagbench.generators.simulate import scenario_key
 from lagbench.make.cards import write_cards
 from lagbench.make.generate import generate
+from lagbench.make.inventory import State, compare, examine
 from lagbench.make.plan import Scenarios, Selection, check_disk, scenario_bytes, select
-from lagbench.make.verify import State, compare, examine, told
 from lagbench.store.copy import (
     MANIFEST_LIMIT,
     address_of,
@@ -125,7 +125,7 @@ def download(
             if store:
                 store.follow(manifest, at_once=True)
         if not work.missing:
-            verdict = told(compare(tier, manifest), tier)
+            verdict = compare(tier, manifest)
             if work.downloaded and tier.simulated:
                 if store:
                     store.bring(held)

@@ -44,8 +44,8 @@ from lagbench.work.run import ONE_THREAD, read_many
 
 from .cards import card_texts, write_cards
 from .gather import gather
+from .inventory import Finding, Look, compare, look
 from .plan import Estimate, Scenarios, Selection, check_disk, estimate, free_bytes, select
-from .verify import Finding, Look, compare, look
 
 __all__ = [
     "Generation",
