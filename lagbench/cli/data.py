@@ -33,15 +33,7 @@ if TYPE_CHECKING:
     from lagbench.make.overview import Overview
     from lagbench.make.verify import VerificationResult
 
-__all__ = [
-    "generate",
-    "verify",
-    "cite",
-    "info",
-    "list_splits",
-    "clean",
-    "doctor",
-]
+__all__ = ["cite", "clean", "doctor", "generate", "info", "list_splits", "verify"]
 
 
 def generate(

@@ -23,14 +23,7 @@ from lagbench.errors import LagbenchError, WorkFailedError, check_installed
 from lagbench.make.plan import free_bytes
 from lagbench.work.pool import available_cores
 
-__all__ = [
-    "Check",
-    "Diagnosis",
-    "doctor",
-    "SolverBench",
-    "bench_apart",
-    "bench_solver",
-]
+__all__ = ["Check", "Diagnosis", "SolverBench", "bench_apart", "bench_solver", "doctor"]
 
 
 NEEDED = (

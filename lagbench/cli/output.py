@@ -18,15 +18,7 @@ import typer
 if TYPE_CHECKING:
     from lagbench.work.progress import Progress as State
 
-__all__ = [
-    "print_json",
-    "print_table",
-    "say",
-    "show",
-    "spell_bytes",
-    "spell_seconds",
-    "progress_bar",
-]
+__all__ = ["print_json", "print_table", "progress_bar", "say", "show", "spell_bytes", "spell_seconds"]
 
 
 LAST_COLUMN = 24

@@ -31,14 +31,7 @@ if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.figure import Figure
 
-__all__ = [
-    "contact_sheet",
-    "scenario_files",
-    "KINDS",
-    "Panel",
-    "describe",
-    "plot_frame",
-]
+__all__ = ["KINDS", "Panel", "contact_sheet", "describe", "plot_frame", "scenario_files"]
 
 
 COLUMNS = 6

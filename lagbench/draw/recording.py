@@ -25,11 +25,7 @@ from lagbench.errors import UsageError
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = [
-    "Recording",
-    "Scene",
-    "open_recording",
-]
+__all__ = ["Recording", "Scene", "open_recording"]
 
 
 Read = Callable[[str, slice | int], NDArray[Any]]

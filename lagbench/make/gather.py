@@ -20,9 +20,7 @@ from lagbench.data.registry import Size
 from lagbench.data.scenario import check_scenario
 from lagbench.errors import UsageError
 
-__all__ = [
-    "gather",
-]
+__all__ = ["gather"]
 
 
 def gather(size: Size, root: Path, source: Path, manifest: Manifest) -> Manifest:

@@ -4,8 +4,6 @@ A scenario's file appears whole or not at all, and the manifest is brought up to
 each, so that an interrupted generation goes on where it stopped and ends with the same bytes
 as an uninterrupted one.
 
-One generation: what is there, what is simulated, what is recorded.
-
 The parent process plans, hands scenarios to workers and keeps the manifest; it never
 simulates, so that Ctrl-C reaches it at once and a crash of the solver cannot take it along.
 """
@@ -16,6 +14,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 from lagbench.atomic import remove_leftovers
 from lagbench.data.layout import MANIFEST_NAME, dataset_folder, scenario_path
@@ -38,23 +37,20 @@ from lagbench.generators.solver import Device
 from lagbench.store.publication import Publication, look_at, publication
 from lagbench.work.cluster import Cluster, await_file
 from lagbench.work.machine import environment_of, promises_bits
-from lagbench.work.pool import Event, Pool, Task, worker_count
+from lagbench.work.pool import Event, Pool, Report, Task, worker_count
 from lagbench.work.progress import Meter, Progress
 from lagbench.work.run import ONE_THREAD, read_many
 
 from .cards import card_texts, write_cards
 from .gather import gather
-from .inventory import Finding, Look, compare, look
+from .inventory import Look, compare, look
 from .plan import Estimate, Scenarios, Selection, check_disk, estimate, free_bytes, select
 
-__all__ = [
-    "Generation",
-    "GenerationResult",
-    "Progress",
-    "generate",
-    "parse_device",
-]
+__all__ = ["Generation", "GenerationResult", "Progress", "generate"]
 
+
+Job = TypeVar("Job")
+Result = TypeVar("Result")
 
 BATCH_PARTICLES = 1 << 19
 """Particles that a parallel device advances together at the most."""
@@ -95,7 +91,12 @@ class Generation:
         local = [i for i in self.size.scenarios if i not in held]
         suspects = [i for i in local if i in wanted or self._has_changed(i, old)]
         self._meter.begin("checking", total=len(suspects), scenarios=len(suspects))
-        good = [finding.entry for finding in self._examined(suspects, old) if finding.entry]
+        looks = {
+            f"scenario {i}": Look(root=self.root, size=self.size, scenario=i, manifest=old.only(i))
+            for i in suspects
+        }
+        findings = self._read(look, looks, map(self._path, suspects))
+        good = [finding.entry for finding in findings if finding.entry]
         bad = set(suspects) - {entry.scenario for entry in good}
         good += held.values()
         kept = tuple(e for e in old.files if e.scenario not in bad)
@@ -125,22 +126,18 @@ class Generation:
         """Return the ids of the size that the manifest does not hold."""
         return tuple(i for i in self.size.scenarios if self.manifest.entry(i) is None)
 
-    def _examined(self, suspects: Sequence[int], old: Manifest) -> list[Finding]:
-        orders = {
-            f"scenario {i}": Look(root=self.root, size=self.size, scenario=i, manifest=old.only(i))
-            for i in suspects
-        }
+    def _read(
+        self, function: Callable[[Job, Report], Result], jobs: Mapping[str, Job], files: Iterable[Path]
+    ) -> list[Result]:
+        """Run a function that reads files, here or by the workers; the meter counts files."""
         return read_many(
-            look,
-            orders,
-            map(self._path, suspects),
-            self._count_files,
+            function,
+            jobs,
+            files,
+            lambda count: self._meter.count(count, scenarios=count),
             workers=self.workers,
             scheduler=self.scheduler,
         )
-
-    def _count_files(self, files: int) -> None:
-        self._meter.count(files, scenarios=files)
 
     def _path(self, scenario: int) -> Path:
         return scenario_path(self.root, scenario_key(self.size, scenario))
@@ -152,7 +149,8 @@ class Generation:
 
     def _simulate(self) -> None:
         """Run everything that is to do in workers, and the twins of test scenarios."""
-        twins = [i for i in self.kept if self._lacks_twin(i)]
+        with_twin = {entry.scenario for entry in self.manifest.files if entry.twin_floor}
+        twins = [i for i in self.kept if self._is_test(i) and i not in with_twin]
         self._bring(twins)
         tasks = [*self._tasks(), *(self._twin(i) for i in twins)]
         if not tasks:
@@ -198,10 +196,6 @@ class Generation:
 
     def _is_test(self, scenario: int) -> bool:
         return self.size.subset_of(scenario) == "test"
-
-    def _lacks_twin(self, scenario: int) -> bool:
-        entry = self.manifest.entry(scenario)
-        return self._is_test(scenario) and (entry is None or not entry.twin_floor)
 
     def _take(self, event: Event, team: Pool | Cluster) -> None:
         """Act on news from a worker."""
@@ -264,14 +258,7 @@ class Generation:
             self._bring(train)
             self._meter.begin("statistics", total=len(train), scenarios=len(train))
             paths = {f"scenario {i}": self._path(i) for i in train}
-            moments = read_many(
-                file_moments,
-                paths,
-                paths.values(),
-                self._count_files,
-                workers=self.workers,
-                scheduler=self.scheduler,
-            )
+            moments = self._read(file_moments, paths, paths.values())
             manifest = manifest.model_copy(update={"statistics": statistics(moments)})
         self._keep(manifest)
 
@@ -359,10 +346,13 @@ def generate(
     started = time.monotonic()
     tier, folder, splits = locate(split, size, root=root, registry=registry)
     wanted = select(tier, subset=subset, scenarios=scenarios)
-    target = parse_device(device)
+    devices = [known.value for known in Device]
+    if device not in devices:
+        raise UsageError(f"no device {device!r}", where="--device", fix=nearest(device, devices))
+    target = Device(device)
     cores = worker_count(workers, default=None if target.value == "cpu" else 1)
     free = free_bytes(dataset_folder(folder, tier.split, size, tier.major))
-    campaign = Generation(
+    generation = Generation(
         tier,
         folder,
         target,
@@ -373,49 +363,34 @@ def generate(
         sources=[Path(source).expanduser().absolute() for source in gather],
     )
     if dry_run:
-        campaign.store = look_at(tier, folder)
-        campaign.survey(wanted, force=force)
+        generation.store = look_at(tier, folder)
+        generation.survey(wanted, force=force)
     else:
         if scheduler is None:
             check_installed("taichi", extra="generate")
         with (
             dataset_lock(folder, tier.split, size, tier.major, on_wait=on_wait),
-            publication(tier, folder) as campaign.store,
+            publication(tier, folder) as generation.store,
         ):
-            campaign.run(wanted, force=force)
+            generation.run(wanted, force=force)
     seconds = time.monotonic() - started
-    return _result(campaign, bytes_free=free, seconds=seconds, dry_run=dry_run)
-
-
-def _result(campaign: Generation, *, bytes_free: int, seconds: float, dry_run: bool) -> GenerationResult:
-    size = campaign.size
     return GenerationResult(
-        split=size.split,
-        size=size.name,
-        version=size.version,
-        root=campaign.root,
-        folder=dataset_folder(campaign.root, size.split, size.name, size.major),
-        device=campaign.device.value,
-        workers=campaign.workers,
-        simulated=campaign.to_do.scenarios,
-        kept=tuple(campaign.kept),
-        missing=campaign.missing(),
-        bytes_needed=campaign.to_do.bytes,
-        bytes_free=bytes_free,
-        seconds_expected=campaign.to_do.seconds(campaign.workers),
+        split=tier.split,
+        size=size,
+        version=tier.version,
+        root=folder,
+        folder=dataset_folder(folder, tier.split, size, tier.major),
+        device=target.value,
+        workers=cores,
+        simulated=generation.to_do.scenarios,
+        kept=tuple(generation.kept),
+        missing=generation.missing(),
+        bytes_needed=generation.to_do.bytes,
+        bytes_free=free,
+        seconds_expected=generation.to_do.seconds(cores),
         seconds=seconds,
-        complete=campaign.manifest.complete,
-        dataset_sha256=campaign.manifest.dataset_sha256,
-        verdict=campaign.verdict,
+        complete=generation.manifest.complete,
+        dataset_sha256=generation.manifest.dataset_sha256,
+        verdict=generation.verdict,
         dry_run=dry_run,
     )
-
-
-def parse_device(name: str) -> Device:
-    """Return a device by name."""
-    from lagbench.generators.solver import Device
-
-    names = [device.value for device in Device]
-    if name not in names:
-        raise UsageError(f"no device {name!r}", where="--device", fix=nearest(name, names))
-    return Device(name)
