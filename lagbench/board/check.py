@@ -19,7 +19,7 @@ from typing import Any
 from lagbench.data.checksums import file_sha256
 from lagbench.data.registry import Registry, Size, load
 from lagbench.errors import LagbenchError, UnreadableFileError, UsageError
-from lagbench.submission import Finding
+from lagbench.submission.findings import Finding
 from lagbench.work.progress import Progress
 
 from .base import check_base

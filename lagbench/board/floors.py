@@ -16,9 +16,9 @@ import numpy as np
 
 from lagbench.data.registry import Size
 from lagbench.errors import UnreadableFileError
-from lagbench.floors import FLOORS as KNOWN
 from lagbench.floors import shipped
-from lagbench.metrics import Score
+from lagbench.floors.table import FLOORS as KNOWN
+from lagbench.metrics.aggregate import Score
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.scenario import SUBMISSION
 from lagbench.scoring.score_file import write_statistics

@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 
 from lagbench.data.layout import major_of
 from lagbench.data.registry import Size
-from lagbench.metrics import METRICS, Score, aggregate, bootstrap_interval
+from lagbench.metrics import aggregate
+from lagbench.metrics.aggregate import Score, bootstrap_interval
+from lagbench.metrics.table import METRICS
 from lagbench.scoring.card import digits
 from lagbench.scoring.score_file import StoredScores
 

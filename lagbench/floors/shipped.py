@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from lagbench.atomic import write_atomically
 from lagbench.data.registry import Size
-from lagbench.metrics import Score, available
+from lagbench.metrics.aggregate import Score
+from lagbench.metrics.table import available
 
 __all__ = ["CURVES", "FOLDER", "FloorScores", "correlation_of", "shipped", "shipped_path", "write_shipped"]
 

@@ -18,9 +18,10 @@ import numpy as np
 
 from lagbench.data.registry import Registry
 from lagbench.errors import DataError, UnreadableFileError, UsageError, nearest
-from lagbench.metrics import Comparison, Direction, Score, mean
-from lagbench.metrics import compare as compare_scores
-from lagbench.metrics.significance import FEWEST_SCENARIOS
+from lagbench.metrics.aggregate import Score
+from lagbench.metrics.metric import Direction, mean
+from lagbench.metrics.significance import FEWEST_SCENARIOS, Comparison
+from lagbench.metrics.significance import compare as compare_scores
 from lagbench.submission.format import MAX_NAME
 
 from .card import JSON_NAME, PublishedScores, digits, parse_scores, read_scores

@@ -18,9 +18,13 @@ from numpy.typing import NDArray
 from lagbench.atomic import atomic_path
 from lagbench.data.layout import ScenarioKey, scenario_path
 from lagbench.data.registry import Size
-from lagbench.floors import FLOORS, FloorScores, floors_of, given_in
-from lagbench.floors.shipped import correlation_of
-from lagbench.metrics import Tally, aggregate, select, snapshots
+from lagbench.floors.floor import given_in
+from lagbench.floors.shipped import FloorScores, correlation_of
+from lagbench.floors.table import FLOORS, floors_of
+from lagbench.metrics import aggregate
+from lagbench.metrics.aggregate import Tally
+from lagbench.metrics.frame import snapshots
+from lagbench.metrics.table import select
 from lagbench.work.pool import Report
 from lagbench.work.progress import Meter, Progress
 from lagbench.work.run import run_all

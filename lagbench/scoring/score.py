@@ -13,9 +13,14 @@ from lagbench.data.local import rooted
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError, nearest
 from lagbench.floors import persistence, shipped
-from lagbench.make.overview import available_cores
-from lagbench.metrics import Metric, Score, aggregate, available, select
-from lagbench.submission import ValidationResult, open_predictions, validate
+from lagbench.metrics import aggregate
+from lagbench.metrics.aggregate import Score
+from lagbench.metrics.metric import Metric
+from lagbench.metrics.table import available, select
+from lagbench.submission.findings import ValidationResult
+from lagbench.submission.predictions import open_predictions
+from lagbench.submission.validation import validate
+from lagbench.work.pool import available_cores
 from lagbench.work.progress import Meter, Progress
 from lagbench.work.run import run_all
 

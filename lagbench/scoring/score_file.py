@@ -20,8 +20,10 @@ from numpy.typing import NDArray
 
 from lagbench.atomic import atomic_path
 from lagbench.errors import WorkFailedError
-from lagbench.floors import FLOORS
-from lagbench.metrics import Score, Tally, aggregate, available
+from lagbench.floors.table import FLOORS
+from lagbench.metrics import aggregate
+from lagbench.metrics.aggregate import Score, Tally
+from lagbench.metrics.table import available
 
 from .card import FORMAT, IDENTITY, ScoreCard, unreadable_scores
 from .scenario import SUBMISSION, Preview

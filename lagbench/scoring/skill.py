@@ -14,8 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lagbench.floors import FLOORS
-from lagbench.metrics import Direction, Score
+from lagbench.floors.table import FLOORS
+from lagbench.metrics.aggregate import Score
+from lagbench.metrics.metric import Direction
 
 __all__ = ["Skill", "best_floor", "ratio_interval", "skill"]
 
