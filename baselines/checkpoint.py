@@ -32,9 +32,9 @@ from torch.nn.modules.module import register_module_parameter_registration_hook
 from torch.nn.parameter import is_lazy
 
 from lagbench.atomic import atomic_path
+from lagbench.data.hdf5 import check_regular
 from lagbench.data.registry import Registry
 from lagbench.errors import DataError, LagbenchError, UnreadableFileError, WorkFailedError
-from lagbench.submission.hdf5 import check_regular
 
 from .baseline import Baseline
 from .catalogue import find

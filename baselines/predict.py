@@ -20,8 +20,8 @@ from lagbench.atomic import write_atomically
 from lagbench.data.layout import resolve_root
 from lagbench.data.local import rooted
 from lagbench.data.registry import Registry
-from lagbench.submission import PredictionsWriter
 from lagbench.submission.budget import budget_in
+from lagbench.submission.writer import PredictionsWriter
 from lagbench.work.progress import Meter, Progress
 
 from .baseline import Baseline, Batch

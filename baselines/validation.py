@@ -12,7 +12,9 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from lagbench.metrics import METRICS, FramePair, Tally, score, select, snapshots, tally
+from lagbench.metrics.aggregate import Tally, score, tally
+from lagbench.metrics.frame import FramePair, snapshots
+from lagbench.metrics.table import METRICS, select
 from lagbench.scoring.scenario import as_stored
 from lagbench.scoring.task import ScoredTask, load_scored_task, ranking_metric
 

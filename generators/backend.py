@@ -17,11 +17,7 @@ from lagbench.work.pool import available_cores
 
 from .solver import Device
 
-__all__ = [
-    "HARMLESS",
-    "place",
-    "start",
-]
+__all__ = ["HARMLESS", "place", "start"]
 
 
 # Taichi greets on stdout as it is imported, which would spoil `--json`, and asks the network.

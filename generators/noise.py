@@ -20,13 +20,7 @@ from numpy.typing import NDArray
 
 from .draws import RandomSource, direction
 
-__all__ = [
-    "Jet",
-    "coordinates",
-    "gradients",
-    "noise",
-    "ramp",
-]
+__all__ = ["Jet", "coordinates", "gradients", "noise", "ramp"]
 
 
 Array = NDArray[np.float64]

@@ -24,8 +24,10 @@ from dataclasses import asdict, dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.data.layout import ScenarioKey, scenario_path
 from lagbench.data.registry import Size, Task
-from lagbench.data.writer import ScenarioFile, ScenarioKey, ScenarioWriter, read_scenario, scenario_path
+from lagbench.data.scenario import ScenarioFile, read_scenario
+from lagbench.data.writer import ScenarioWriter
 
 from .batch import Batch, Report, SimulationJob, split_module, substeps_of
 from .draws import QUANTUM, entropy, seed_text

@@ -16,12 +16,7 @@ from numpy.typing import NDArray
 
 from .split import ClosedBoxParameters, FreeSurfaceParameters, InitialState
 
-__all__ = [
-    "Device",
-    "Health",
-    "Solver",
-    "build",
-]
+__all__ = ["Device", "Health", "Solver", "build"]
 
 
 class Device(enum.StrEnum):

@@ -16,14 +16,7 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from lagbench.data.registry import Size
 
-__all__ = [
-    "WALLS",
-    "ClosedBoxParameters",
-    "FreeSurfaceParameters",
-    "InitialState",
-    "Material",
-    "Split",
-]
+__all__ = ["WALLS", "ClosedBoxParameters", "FreeSurfaceParameters", "InitialState", "Material", "Split"]
 
 
 WALLS = ("left", "right", "bottom", "top")

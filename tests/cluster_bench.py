@@ -26,13 +26,13 @@ with LocalCluster(**options, protocol="tcp://") as cluster:
 
 
 @contextmanager
-def local_cluster() -> Iterator[Any]:
+def local_cluster(threads: int = 1) -> Iterator[Any]:
     """Run a scheduler here and two worker processes that can import the test modules."""
     import distributed
 
     before = os.environ.get("PYTHONPATH")
     os.environ["PYTHONPATH"] = str(TESTS)
-    options = {"n_workers": 2, "threads_per_worker": 1, "processes": True, "dashboard_address": None}
+    options = {"n_workers": 2, "threads_per_worker": threads, "processes": True, "dashboard_address": ":0"}
     try:
         with distributed.LocalCluster(**options, silence_logs=50) as running:
             yield running
@@ -55,20 +55,6 @@ def scheduler_process() -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
         process.kill()
 
 
-def children(process: int) -> list[int]:
-    """Return the process ids of the children of a process, whichever of its threads started them."""
-    found: list[int] = []
-    for task in Path(f"/proc/{process}/task").glob("*"):
-        with suppress(OSError):
-            found += map(int, (task / "children").read_text().split())
-    return found
-
-
-def parent(process: int) -> int:
-    """Return the process id of the parent of a process."""
-    return int(Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[1])
-
-
 def writers(root: Path) -> dict[int, Path]:
     """Return the unfinished scenario files below a folder by the process that writes them."""
     files = root.rglob(".*.nc.*.partial")
@@ -84,7 +70,7 @@ class Sabotage(threading.Thread):
 
     Attributes:
         killed: process id of the worker killed, and the file that it wrote.
-        slowed: process ids of the simulating processes that were slowed.
+        slowed: process ids of the workers that were slowed.
     """
 
     def __init__(self, root: Path, witness: Callable[[], None] = lambda: None) -> None:
@@ -113,10 +99,9 @@ class Sabotage(threading.Thread):
 
     def _harm(self, process: int, path: Path) -> None:
         if self.killed is None:
-            worker = parent(process)
             self.witness()
-            os.kill(worker, signal.SIGKILL)
-            self.killed = worker, path
+            os.kill(process, signal.SIGKILL)
+            self.killed = process, path
         else:
             os.kill(process, signal.SIGSTOP)
             time.sleep(0.05)

@@ -195,7 +195,7 @@ def test_a_second_call_hashes_each_file_once_and_draws_nothing(
     def refuse(*_: object) -> list[str]:
         pytest.fail("pictures are drawn again")
 
-    for module in ("make.verify", "data.manifest"):
+    for module in ("make.inventory", "data.manifest"):
         monkeypatch.setattr(f"lagbench.{module}.file_sha256", counted)
     monkeypatch.setattr(cards, "_draw", refuse)
     generate(SPLIT, SIZE, root=root, registry=unmeasured, progress=news.append)

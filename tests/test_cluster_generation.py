@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +16,7 @@ from typing import Any
 import pytest
 from cluster_bench import Sabotage, gone, local_cluster, scheduler_process, writers
 from conftest import SIZE, SPLIT
+from spread_jobs import report_for_ever
 
 from lagbench.data.layout import NOTES_NAME
 from lagbench.data.lock import Holder, read_holder
@@ -24,7 +26,7 @@ from lagbench.errors import UsageError, WorkFailedError
 from lagbench.make import generate as campaign
 from lagbench.make.generate import GenerationResult, generate
 from lagbench.work import cluster
-from lagbench.work.cluster import Mark, Order, fulfil, marked
+from lagbench.work.cluster import Client, Mark, marked
 from lagbench.work.pool import Task
 from lagbench.work.progress import Progress
 
@@ -76,7 +78,7 @@ def test_a_worker_killed_and_one_slowed(
     assert holders[0].pid == os.getpid()
     simulating = [state for state in news if state.stage == "simulating"]
     assert (simulating[-1].done, simulating[-1].scenarios_done) == (simulating[-1].total, 5)
-    assert all(gone(process) for process in sabotage.slowed)
+    assert writers(tmp_path) == {}
 
 
 def test_a_lost_scheduler_is_an_error_and_resumed(
@@ -134,10 +136,31 @@ def test_a_missing_folder_and_a_late_mark(tmp_path: Path) -> None:
 
 def test_another_version_is_refused() -> None:
     """A worker with another lagbench might write other bits: it does nothing."""
-    order = Order(task=Task(name="any", function=print), number=0, client="c", version="0", environment={})
     with pytest.raises(WorkFailedError, match="another version of lagbench") as caught:
-        fulfil(order)
+        Client("c", version="0").check("w", threads=1)
     assert caught.value.expected == "0"
+
+
+def test_workers_of_several_threads_are_refused(tmp_path: Path, unmeasured: Registry) -> None:
+    """Taichi and HDF5 want a process for themselves: exit code 5, and the command for such workers."""
+    with local_cluster(threads=2) as running, pytest.raises(WorkFailedError) as caught:
+        generate(SPLIT, SIZE, root=tmp_path, scheduler=running.scheduler_address, registry=unmeasured)
+    assert caught.value.exit_code == 5
+    assert (caught.value.expected, caught.value.got) == ("1 thread", "2 threads")
+    assert "--nthreads 1" in str(caught.value.fix)
+    assert not list(tmp_path.rglob("*.nc"))
+
+
+def test_what_nobody_waits_for_ends(workers: Any, tmp_path: Path) -> None:
+    """A client that leaves in the middle of a task frees its worker, which a thread's task must do itself."""
+    marker = tmp_path / "ended"
+    with cluster.Cluster(workers.scheduler_address) as here:
+        here.submit(Task(name="endless", function=report_for_ever, arguments=(marker,)))
+        next(here.events())
+    end = time.monotonic() + 30.0
+    while not marker.exists() and time.monotonic() < end:
+        time.sleep(0.05)
+    assert marker.read_text() == "WorkFailedError"
 
 
 def test_no_scheduler_there(tmp_path: Path, unmeasured: Registry, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -346,3 +346,37 @@ def test_command(tmp_path: Path) -> None:
     refused = CliRunner().invoke(app, ["generate", "--split", str(target)])
     assert refused.exit_code == 2
     assert "cannot be simulated" in refused.output
+
+
+def test_a_file_describes_the_data_and_options_win(tmp_path: Path) -> None:
+    """Keys of `--describe` count where no option says otherwise; unknown keys and wrong types are refused."""
+    paths = save_runs(tmp_path / "in", straight_runs(4))
+    told = tmp_path / "data.yaml"
+    words = [
+        "adopt",
+        *map(str, paths),
+        "-o",
+        str(tmp_path / "mine"),
+        "--describe",
+        str(told),
+        "--free-surface",
+        "--horizon",
+        "3",
+    ]
+    for line in ("colour: red", "radius: far", "- radius"):
+        told.write_text(line)
+        assert CliRunner().invoke(app, words).exit_code == 2
+    assert not (tmp_path / "mine").exists()
+    told.write_text(
+        "radius: 0.1\nframe_interval: 0.25\nbounds: [[0, 1], [0.25, 1]]\nhorizon: 4\n"
+        "frames_of_interest: [8]\nlicence: CC0-1.0\ndensity: 2\nspacing: 0.05\nfull_box: true\n"
+    )
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 0, done.output
+    found = locate(str(tmp_path / "mine"))
+    size = found.size
+    assert (size.task.radius, size.task.horizon, size.task.frames_of_interest) == (0.1, 3, (8,))
+    assert size.bounds == ((0.0, 1.0), (0.25, 1.0))
+    assert size.value("density") == 2.0
+    assert found.registry.split("mine").licence == "CC0-1.0"
+    assert size.task.score_grid.placement == "nodes"

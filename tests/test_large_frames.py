@@ -14,8 +14,8 @@ from scenario_factory import make_key, write_scenario
 
 from lagbench.data import writer as files
 from lagbench.data.scenario import check_scenario, read_scenario
-from lagbench.make.crew import Crew
 from lagbench.work.pool import Report
+from lagbench.work.run import read_many
 
 PARTICLES = (1 << 17) + 1000
 """One chunk and a bit."""
@@ -113,11 +113,10 @@ def test_reading_much_is_shared_out(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         path.write_bytes(bytes(8))
     monkeypatch.syspath_prepend(Path(__file__).parent)
     units: list[int] = []
-    crew = Crew(workers=2)
-    here = crew.read(note, paths, paths.values(), units.append)
+    here = read_many(note, paths, paths.values(), units.append, workers=2)
     with (tmp_path / "0.nc").open("r+b") as stream:
         stream.truncate(1 << 30)  # sparse
-    there = crew.read(note, paths, paths.values(), units.append)
+    there = read_many(note, paths, paths.values(), units.append, workers=2)
     assert here == [("0.nc", True), ("1.nc", True), ("2.nc", True)]
     assert [name for name, _ in there] == ["0.nc", "1.nc", "2.nc"]
     assert sum(units) == 6

@@ -13,8 +13,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from lagbench.metrics import CHOSEN, Comparison, Direction, compare, holm
-from lagbench.metrics.significance import SIGNIFICANCE
+from lagbench.metrics.metric import Direction
+from lagbench.metrics.significance import SIGNIFICANCE, Comparison, compare, holm
+from lagbench.metrics.table import CHOSEN
 from lagbench.scoring.tables import Table
 
 from .evidence import Evidence, ordered

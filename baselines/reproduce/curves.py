@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.errors import require
-from lagbench.metrics import METRICS, Score
+from lagbench.metrics.aggregate import Score
 from lagbench.metrics.metric import mean
+from lagbench.metrics.table import METRICS
 from lagbench.scoring.tables import Table
 
 from .drawing import TRUTH, charts, png, tidy

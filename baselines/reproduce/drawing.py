@@ -15,8 +15,8 @@ from lagbench.data.scenario import ScenarioFile
 from lagbench.draw.panels import Panel, colour_bar, colour_scale, draw, draw_walls, limit_of
 from lagbench.draw.recording import Recording, Scene, open_recording
 from lagbench.draw.style import INK, figure, pixels_of, png_bytes
-from lagbench.metrics import FramePair, Scenario, Snapshot
-from lagbench.submission import Predictions, open_predictions
+from lagbench.metrics.frame import FramePair, Scenario, Snapshot
+from lagbench.submission.predictions import Predictions, open_predictions
 
 from .runs import Plan
 

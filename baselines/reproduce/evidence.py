@@ -23,8 +23,8 @@ import numpy as np
 from lagbench.data.registry import Registry, Size, load
 from lagbench.data.yamlfile import read_yaml
 from lagbench.errors import UnreadableFileError
-from lagbench.floors import FLOORS
-from lagbench.metrics import Score
+from lagbench.floors.table import FLOORS
+from lagbench.metrics.aggregate import Score
 from lagbench.metrics.metric import mean
 from lagbench.scoring.score_file import NETCDF_NAME, read_statistics
 from lagbench.scoring.task import ranking_metric

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lagbench.data.registry import Size
-from lagbench.metrics import METRICS
+from lagbench.metrics.table import METRICS
 from lagbench.scoring.tables import Table
 
 from .claims import compared, comparison_table

@@ -20,8 +20,9 @@ from typing import Any
 from lagbench.atomic import write_atomically
 from lagbench.draw.markdown import table
 from lagbench.errors import LagbenchError
-from lagbench.floors import FLOORS
-from lagbench.metrics import CHOSEN, Direction, Metric
+from lagbench.floors.table import FLOORS
+from lagbench.metrics.metric import Direction, Metric
+from lagbench.metrics.table import CHOSEN
 from lagbench.scoring.tables import ARROWS, Table
 
 from .claims import CLAIMS, answer, claim_rows, comparison_table, floors_ahead

@@ -17,7 +17,7 @@ from lagbench.errors import DataError, UsageError
 from lagbench.scoring.card import JSON_NAME
 from lagbench.scoring.score_file import NETCDF_NAME, read_statistics
 from lagbench.scoring.task import ScoredTask, load_scored_task
-from lagbench.submission import open_predictions
+from lagbench.submission.predictions import open_predictions
 
 from .evidence import RECORD_NAME, WEIGHTS, Evidence, Sources, read_json
 from .thesis import Model

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from lagbench.atomic import write_atomically
 from lagbench.draw.markdown import table
-from lagbench.metrics import Score
+from lagbench.metrics.aggregate import Score
 from lagbench.scoring.tables import Table
 
 if TYPE_CHECKING:

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from lagbench.data.manifest import read_manifest
 from lagbench.errors import DataError
-from lagbench.metrics import METRICS
 from lagbench.metrics.distributions import kl, normalised
+from lagbench.metrics.table import METRICS
 from lagbench.scoring.tables import Table
 
 from .drawing import charts, opened, png, tidy

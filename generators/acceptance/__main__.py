@@ -34,12 +34,7 @@ from .cases import Result, run
 from .diagnostics import box_of, draw
 from .experiment import Case, Experiment, plan, solver_parameters
 
-__all__ = [
-    "document",
-    "main",
-    "parser",
-    "settings",
-]
+__all__ = ["document", "main", "parser", "settings"]
 
 
 DIGITS = 9

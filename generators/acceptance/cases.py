@@ -34,13 +34,7 @@ from .experiment import Case, Experiment, initial_state, solver_parameters
 if TYPE_CHECKING:
     from lagbench.generators.closed_box import ClosedBox
 
-__all__ = [
-    "AVERAGED",
-    "CHECK_EVERY",
-    "Check",
-    "Result",
-    "run",
-]
+__all__ = ["AVERAGED", "CHECK_EVERY", "Check", "Result", "run"]
 
 
 CHECK_EVERY = 10_000

@@ -23,13 +23,7 @@ from lagbench.generators.split import WALLS, ClosedBoxParameters, InitialState, 
 
 from .diagnostics import Box, box_of
 
-__all__ = [
-    "Case",
-    "Experiment",
-    "initial_state",
-    "plan",
-    "solver_parameters",
-]
+__all__ = ["Case", "Experiment", "initial_state", "plan", "solver_parameters"]
 
 
 _FULL_GRID = 40

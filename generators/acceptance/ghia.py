@@ -16,15 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "REYNOLDS",
-    "X",
-    "Y",
-    "CentreLines",
-    "Deviation",
-    "centre_lines",
-    "deviation",
-]
+__all__ = ["REYNOLDS", "X", "Y", "CentreLines", "Deviation", "centre_lines", "deviation"]
 
 
 _MISPRINT = float("nan")

@@ -14,7 +14,7 @@ from typing import Any
 import yaml
 
 from lagbench.errors import UsageError
-from lagbench.submission import Finding
+from lagbench.submission.findings import Finding
 
 from .entry_file import MAX_ENTRY_BYTES
 from .findings import finding

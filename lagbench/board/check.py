@@ -22,7 +22,7 @@ from lagbench.data.registry import Registry, Size, load
 from lagbench.errors import LagbenchError, UnreadableFileError, UsageError
 from lagbench.floors.shipped import shipped_path
 from lagbench.scoring.floors import measured_again
-from lagbench.submission import Finding
+from lagbench.submission.findings import Finding
 from lagbench.work.progress import Progress
 
 from .base import check_base

@@ -16,10 +16,12 @@ from numpy.typing import NDArray
 
 from lagbench.data.registry import Registry, Size, load
 from lagbench.errors import ChecksFailedError, UnreadableFileError
-from lagbench.floors import FLOORS, FloorScores, solver_seconds
-from lagbench.metrics import METRICS, Score
+from lagbench.floors.shipped import FloorScores, solver_seconds
+from lagbench.floors.table import FLOORS
+from lagbench.metrics.aggregate import Score
 from lagbench.metrics.metric import mean
 from lagbench.metrics.significance import FEWEST_SCENARIOS, Standing, mean_loss, standings
+from lagbench.metrics.table import METRICS
 from lagbench.scoring.scenario import Preview
 from lagbench.scoring.skill import skill
 from lagbench.submission.task_checks import frames_to_predict

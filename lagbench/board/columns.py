@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from lagbench.metrics import Direction, Metric
+from lagbench.metrics.metric import Direction, Metric
 from lagbench.report.html import MISSING, sentence, text, words
 
 from .entry import Budget

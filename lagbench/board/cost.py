@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 
 from lagbench.data.registry import Size
 from lagbench.errors import DataError
-from lagbench.floors import shipped, solver_seconds
-from lagbench.metrics import METRICS
+from lagbench.floors.shipped import shipped, solver_seconds
+from lagbench.metrics.table import METRICS
 from lagbench.report.chart import WIDTH, Plot, Spot, close_logarithmic
 from lagbench.report.html import Markup, tag, text, words
 from lagbench.scoring.task import ranking_metric

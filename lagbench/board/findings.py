@@ -11,8 +11,9 @@ from typing import NamedTuple
 import numpy as np
 
 from lagbench.errors import LagbenchError
-from lagbench.metrics import METRICS, Direction
-from lagbench.submission import Finding, Severity
+from lagbench.metrics.metric import Direction
+from lagbench.metrics.table import METRICS
+from lagbench.submission.findings import Finding, Severity
 
 from .score_file import MAX_SCORE_BYTES, Stored
 

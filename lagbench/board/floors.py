@@ -17,8 +17,8 @@ import numpy as np
 
 from lagbench.data.registry import Size
 from lagbench.errors import UnreadableFileError
-from lagbench.floors import FLOORS as KNOWN
-from lagbench.floors import FloorScores, shipped
+from lagbench.floors.shipped import FloorScores, shipped
+from lagbench.floors.table import FLOORS as KNOWN
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.scenario import SUBMISSION
 from lagbench.scoring.score_file import write_statistics

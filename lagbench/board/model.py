@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.registry import Size
-from lagbench.metrics import Metric
+from lagbench.metrics.metric import Metric
 
 from .entry import Cost, Entry, Flag, Status
 from .verified import Verification

@@ -14,7 +14,8 @@ import numpy as np
 
 from lagbench.data.layout import major_of
 from lagbench.data.registry import Size
-from lagbench.metrics import METRICS, Score, aggregate, bootstrap_interval, mean_over_seeds
+from lagbench.metrics.aggregate import Score, aggregate, bootstrap_interval, mean_over_seeds
+from lagbench.metrics.table import METRICS
 from lagbench.scoring.card import digits
 from lagbench.scoring.score_file import StoredScores
 

@@ -11,12 +11,13 @@ import numpy as np
 
 from lagbench.data.registry import Registry
 from lagbench.errors import ChecksFailedError, UnreadableFileError, UsageError
-from lagbench.metrics import METRICS, Tally
+from lagbench.metrics.aggregate import Tally
+from lagbench.metrics.table import METRICS
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.scenario import LONG_BITS, LONG_ROLLOUT, SUBMISSION
 from lagbench.scoring.score import score
 from lagbench.scoring.score_file import FILM_RANGE, LEVELS, StoredScores, write_statistics
-from lagbench.submission import Finding
+from lagbench.submission.findings import Finding
 from lagbench.work.progress import Progress
 
 from .entry import Entry, ScoredFile

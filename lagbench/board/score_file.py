@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.grid import Grid, Placement
+from lagbench.data.hdf5 import Structure, check_regular, check_structure, opened
 from lagbench.data.registry import Size
 from lagbench.errors import UnreadableFileError
 from lagbench.metrics.distributions import BINS
@@ -31,7 +32,6 @@ from lagbench.scoring.card import unreadable_scores
 from lagbench.scoring.scenario import FRAMES, PARTICLES, Preview
 from lagbench.scoring.score_file import FILM_RANGE, StoredScores, read_statistics
 from lagbench.scoring.task import ranking_metric
-from lagbench.submission.hdf5 import Structure, check_regular, check_structure, opened
 from lagbench.submission.task_checks import frames_to_predict
 
 __all__ = ["MAX_SCORE_BYTES", "Stored", "main", "read_stored", "reported_frames", "unreadable_in_child"]

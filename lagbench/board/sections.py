@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
 
-from lagbench.metrics import Direction, Metric
+from lagbench.metrics.metric import Direction, Metric
 from lagbench.report.html import Markup, clipped, escaped, join, tag, text, words
 
 from .columns import columns_of, presets_of, value_of, written

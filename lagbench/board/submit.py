@@ -14,11 +14,11 @@ import re
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 
-from lagbench import __version__
 from lagbench.atomic import write_atomically
 from lagbench.data.checksums import file_sha256
 from lagbench.data.registry import Registry, Size, load
@@ -26,7 +26,10 @@ from lagbench.errors import ChecksFailedError, UsageError, WorkFailedError
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.score import score
 from lagbench.scoring.score_file import write_statistics
-from lagbench.submission import Header, Predictions, ValidationResult, open_predictions, validate
+from lagbench.submission.findings import ValidationResult
+from lagbench.submission.format import Header
+from lagbench.submission.predictions import Predictions, open_predictions
+from lagbench.submission.validation import validate
 from lagbench.work.progress import Progress
 
 from .entry import (
@@ -346,7 +349,7 @@ def _entry(
     """Return the entry with the score block that follows from the score files."""
     header = cards[0].header
     block = ScoreBlock(
-        lagbench=__version__,
+        lagbench=version("lagbench"),
         dataset_sha256=header.dataset_sha256,
         ranking_metric=cards[0].ranking,
         files=files,

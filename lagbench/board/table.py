@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from types import MappingProxyType
 
-from lagbench.metrics import Direction, Metric
+from lagbench.metrics.metric import Direction, Metric
 from lagbench.report.html import MISSING, Markup, interval, join, tag, text
 
 from .columns import Column, columns_of, held, presets_of, value_of, written

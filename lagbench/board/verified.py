@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import datetime
 from collections.abc import Mapping, Sequence
+from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated
 
 from pydantic import Field, RootModel
 
-from lagbench import __version__
 from lagbench.atomic import write_atomically
 from lagbench.errors import ChecksFailedError
 
@@ -69,7 +69,7 @@ def record(folder: Folder, entries: Sequence[Entry], date: datetime.date) -> Pat
     for entry in entries:
         held[entry.yaml_path.as_posix()] = {
             "scores": tuple(file.sha256 for file in entry.score.files),
-            "lagbench": __version__,
+            "lagbench": version("lagbench"),
             "date": date,
         }
     path = folder.path / VERIFIED

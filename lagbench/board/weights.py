@@ -12,7 +12,8 @@ from pathlib import Path
 from lagbench.atomic import write_atomically
 from lagbench.data.checksums import file_sha256
 from lagbench.errors import UsageError, check_installed
-from lagbench.submission import Finding, Header
+from lagbench.submission.findings import Finding
+from lagbench.submission.format import Header
 
 from .entry import Entry, Weights
 from .findings import finding

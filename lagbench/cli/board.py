@@ -22,7 +22,7 @@ from .output import print_json, print_table, progress_bar, say, spell_bytes
 if TYPE_CHECKING:
     from lagbench.board.check import CheckResult
     from lagbench.board.submit import SubmitResult
-    from lagbench.submission import ValidationResult
+    from lagbench.submission.findings import ValidationResult
 
 __all__ = ["leaderboard", "submit"]
 

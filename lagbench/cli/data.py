@@ -1,12 +1,11 @@
 """Commands that make and check data: generate, verify.
 
-Commands that say what there is: list, info, cite.
-
-Commands that look after the installation: doctor, clean.
+Commands that say what there is: list, info, cite. Commands that look after the installation: doctor, clean.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -26,7 +25,7 @@ from .options import (
     WorkersOption,
     chosen,
 )
-from .output import print_json, print_table, progress_bar, say, spell_bytes, spell_seconds
+from .output import print_json, print_table, progress_bar, show, spell_bytes, spell_seconds
 
 if TYPE_CHECKING:
     from lagbench.data.registry import Registry, Size
@@ -34,15 +33,7 @@ if TYPE_CHECKING:
     from lagbench.make.overview import Overview
     from lagbench.make.verify import VerificationResult
 
-__all__ = [
-    "generate",
-    "verify",
-    "cite",
-    "info",
-    "list_splits",
-    "clean",
-    "doctor",
-]
+__all__ = ["cite", "clean", "doctor", "generate", "info", "list_splits", "verify"]
 
 
 def generate(
@@ -85,10 +76,7 @@ def generate(
             progress=draw,
             on_wait=lambda holder: typer.echo(f"lagbench: waiting for {holder}", err=True),
         )
-    if as_json:
-        print_json(result)
-    else:
-        say("\n".join(_generated(result)), quiet=quiet)
+    show(result, _generated(result), as_json=as_json, quiet=quiet)
 
 
 def _generated(result: GenerationResult) -> list[str]:
@@ -147,16 +135,14 @@ def verify(
             complete=complete,
             progress=draw,
         )
-    if as_json:
-        print_json({**vars(result), "complete": result.complete})
-    elif not quiet:
-        _verified(result)
+    value = {**vars(result), "complete": result.complete}
+    show(value, _verified(result), as_json=as_json, quiet=quiet)
     for warning in result.warnings:
         typer.echo(f"warning: {warning}", err=True)
     result.check()
 
 
-def _verified(result: VerificationResult) -> None:
+def _verified(result: VerificationResult) -> Iterator[str]:
     rows = [
         (r.name, r.present, len(r.missing), len(r.wrong), len(r.extra), r.verdict) for r in result.subsets
     ]
@@ -164,8 +150,8 @@ def _verified(result: VerificationResult) -> None:
     print_table(f"{result.split} {result.size} in {result.folder}", columns, rows)
     if result.regenerated:
         listing = ", ".join(f"scenario {i} {word}" for i, word in result.regenerated.items())
-        say(f"regenerated: {listing}")
-    say(f"data set hash: {result.verdict}")
+        yield f"regenerated: {listing}"
+    yield f"data set hash: {result.verdict}"
 
 
 def list_splits(root: RootOption = None, as_json: JsonFlag = False) -> None:
@@ -180,21 +166,17 @@ def list_splits(root: RootOption = None, as_json: JsonFlag = False) -> None:
     found = [
         overview(registry.size(name, size), folder)
         for name in (*registry.splits, *registry.local_names())
-        for size in _sizes(registry, name)
+        for size in registry.split(name).sizes
     ]
-    if as_json:
-        print_json({"root": folder, "sizes": found})
-        return
-    rows = [_row(entry) for entry in found]
-    print_table("", ("split", "size", *_COLUMNS), rows)
-    say(f"data sets live in {url_of(folder) or folder}")
+
+    def listed() -> Iterator[str]:
+        print_table("", ("split", "size", *_COLUMNS), [_row(entry) for entry in found])
+        yield f"data sets live in {url_of(folder) or folder}"
+
+    show({"root": folder, "sizes": found}, listed(), as_json=as_json)
 
 
 _COLUMNS = ("scenarios", "particles", "frames", "disk", "time", "here")
-
-
-def _sizes(registry: Registry, split: str) -> list[str]:
-    return list(registry.split(split).sizes)
 
 
 def _row(entry: Overview) -> tuple[object, ...]:
@@ -227,23 +209,20 @@ def info(
     entry = registry.split(split_name)
     sizes = [registry.size(split_name, one) for one in ([size] if size else entry.sizes)]
     found = [overview(one, folder) for one in sizes]
-    if as_json:
-        print_json(_facts(registry, split_name, sizes, found))
-        return
-    say(f"{entry.title} ({split_name} {entry.version}, {entry.licence})\n{entry.description}\n")
-    print_table("Sizes", ("split", "size", *_COLUMNS), [_row(one) for one in found])
-    print_table("Parameters", ("name", *entry.sizes, "unit", "meaning"), _parameters(registry, split_name))
-    for one, tier in zip(found, sizes, strict=True):
-        say("\n".join(_details(one, tier)))
 
+    def told() -> Iterator[str]:
+        yield f"{entry.title} ({split_name} {entry.version}, {entry.licence})\n{entry.description}\n"
+        print_table("Sizes", ("split", "size", *_COLUMNS), [_row(one) for one in found])
+        tiers = [registry.size(split_name, one) for one in entry.sizes]
+        parameters = [
+            (name, *(tier.value(name) for tier in tiers), parameter.unit, parameter.description)
+            for name, parameter in entry.parameters.items()
+        ]
+        print_table("Parameters", ("name", *entry.sizes, "unit", "meaning"), parameters)
+        for one, tier in zip(found, sizes, strict=True):
+            yield from _details(one, tier)
 
-def _parameters(registry: Registry, split: str) -> list[tuple[object, ...]]:
-    entry = registry.split(split)
-    tiers = [registry.size(split, size) for size in entry.sizes]
-    return [
-        (name, *(tier.value(name) for tier in tiers), parameter.unit, parameter.description)
-        for name, parameter in entry.parameters.items()
-    ]
+    show(_facts(registry, split_name, sizes, found), told(), as_json=as_json)
 
 
 def _details(entry: Overview, size: Size) -> list[str]:
@@ -301,13 +280,12 @@ def cite(
         "citation": entry.citation,
         "dataset_sha256": hashes,
     }
-    if as_json:
-        print_json(facts)
-        return
-    say(f"lagbench, split {split_name!r} ({entry.title}), version {entry.version}, {entry.licence}.")
-    say(f"After: {entry.citation}.")
-    for size, value in hashes.items():
-        say(f"Data set hash of size {size}: {value}")
+    words = [
+        f"lagbench, split {split_name!r} ({entry.title}), version {entry.version}, {entry.licence}.",
+        f"After: {entry.citation}.",
+        *(f"Data set hash of size {size}: {value}" for size, value in hashes.items()),
+    ]
+    show(facts, words, as_json=as_json)
 
 
 def doctor(root: RootOption = None, as_json: JsonFlag = False) -> None:
@@ -342,10 +320,6 @@ def clean(
     from lagbench.make.clean import clean as run
 
     result = run(chosen(name, split), size, root=root, leftovers=leftovers, dry_run=dry_run)
-    if as_json:
-        print_json(result)
-        return
-    for path in result.removed:
-        say(str(path), quiet=quiet)
     word = "would be removed" if dry_run else "removed"
-    say(f"{len(result.removed)} files, {spell_bytes(result.bytes)} {word}", quiet=quiet)
+    words = [*map(str, result.removed), f"{len(result.removed)} files, {spell_bytes(result.bytes)} {word}"]
+    show(result, words, as_json=as_json, quiet=quiet)

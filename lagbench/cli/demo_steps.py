@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any
 from lagbench.data.layout import ScenarioKey, resolve_root, scenario_path
 from lagbench.data.registry import Registry, Size, load
 from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError, check_installed
-from lagbench.make.generate import GenerationResult, Progress, generate
+from lagbench.make.generate import GenerationResult, generate
 from lagbench.make.verify import VerificationResult, verify
+from lagbench.work.progress import Progress
 
 if TYPE_CHECKING:
     from lagbench.baselines.predict import PredictionResult

@@ -12,7 +12,7 @@ import typer
 from lagbench.errors import DataError, UnreadableFileError, UsageError
 
 from .options import JsonFlag, PresentSizeOption, QuietFlag, RootOption, chosen
-from .output import print_json, say
+from .output import show
 
 __all__ = ["animate", "plot"]
 
@@ -84,13 +84,6 @@ def _default_name(source: Path, ending: str) -> Path:
     return Path("-".join(words) + ending)
 
 
-def _done(path: Path, *, as_json: bool, quiet: bool) -> None:
-    if as_json:
-        print_json({"output": path})
-    else:
-        say(str(path), quiet=quiet)
-
-
 def plot(
     name: SourceArgument = None,
     split: SplitNameOption = None,
@@ -120,14 +113,14 @@ def plot(
         tier = locate(chosen_split, size, root=root).size
         page = _target(output or Path(f"{tier.split}-{tier.name}-sheet.png"))
         drawn = contact_sheet(chosen_split, tier.name, page, root=root, dpi=dpi)
-        _done(drawn, as_json=as_json, quiet=quiet)
+        show({"output": drawn}, [str(drawn)], as_json=as_json, quiet=quiet)
         return
     check_kind(kind)
     source = _source(name, split, size, scenario, root)
     target = _target(output or _default_name(source, f"-frame{frame}.png"))
     with _told_as_given(name):
         plot_frame(source, frame, target, kind=kind, dpi=dpi)
-    _done(target, as_json=as_json, quiet=quiet)
+    show({"output": target}, [str(target)], as_json=as_json, quiet=quiet)
 
 
 def animate(
@@ -163,4 +156,4 @@ def animate(
     hidden = quiet or as_json
     with _told_as_given(name, second):
         run(source, target, beside=other, kind=kind, frames_per_second=fps, every=every, quiet=hidden)
-    _done(target, as_json=as_json, quiet=quiet)
+    show({"output": target}, [str(target)], as_json=as_json, quiet=quiet)

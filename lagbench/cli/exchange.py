@@ -21,7 +21,7 @@ from .options import (
     WorkersOption,
     chosen,
 )
-from .output import print_json, progress_bar, say, spell_bytes
+from .output import progress_bar, show, spell_bytes
 
 if TYPE_CHECKING:
     from lagbench.exchange.local_split import LocalSplit
@@ -33,10 +33,13 @@ FolderOption = Annotated[
     Path,
     typer.Option("--output", "-o", metavar="FOLDER", help="Folder to make; its last part names the split."),
 ]
-TitleOption = Annotated[str | None, typer.Option("--title", metavar="TEXT", help="Title of the split.")]
-CitationOption = Annotated[str | None, typer.Option("--citation", metavar="TEXT", help="Whom to cite.")]
-LicenceOption = Annotated[
-    str | None, typer.Option("--licence", metavar="NAME", help="Licence of the data, as in CC-BY-4.0.")
+DescribeOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--describe",
+        metavar="FILE",
+        help="YAML that says what the data are, see docs/exchange.md; options win.",
+    ),
 ]
 RadiusOption = Annotated[
     float | None, typer.Option("--radius", metavar="LENGTH", help="Connectivity radius of graph models.")
@@ -49,13 +52,6 @@ BoundsOption = Annotated[
 ]
 RescaleFlag = Annotated[
     bool, typer.Option("--rescale", help="Fit the bounds into the unit box, by a power of two.")
-]
-DensityOption = Annotated[
-    float | None, typer.Option("--density", metavar="NUMBER", help="Rest density; 1 by default.")
-]
-SpacingOption = Annotated[
-    float | None,
-    typer.Option("--spacing", metavar="LENGTH", help="Distance of particles at first; estimated by default."),
 ]
 InputFramesOption = Annotated[
     int | None, typer.Option("--input-frames", metavar="N", help="Frames given to a model; 6 by default.")
@@ -115,19 +111,18 @@ def download(
             progress=draw,
             announce=lambda text: typer.echo(f"lagbench: {text}", err=True),
         )
-    if as_json:
-        print_json(result)
-        return
     counts = (
         f"{len(result.downloaded)} downloaded, {len(result.generated)} simulated, {len(result.kept)} kept"
     )
-    say(f"{result.split} {result.size}: {counts}, {spell_bytes(result.bytes)}", quiet=quiet)
-    say(f"  folder  {result.folder}", quiet=quiet)
+    words = [
+        f"{result.split} {result.size}: {counts}, {spell_bytes(result.bytes)}",
+        f"  folder  {result.folder}",
+    ]
     if result.downloaded:
-        say(f"  mirror  {result.mirror}: scenarios {spell_ids(sorted(result.downloaded))}", quiet=quiet)
+        words.append(f"  mirror  {result.mirror}: scenarios {spell_ids(sorted(result.downloaded))}")
     if result.dataset_sha256:
-        say(f"  hash    {result.dataset_sha256}", quiet=quiet)
-    say(f"  check   {result.verdict}", quiet=quiet)
+        words.append(f"  hash    {result.dataset_sha256}")
+    show(result, [*words, f"  check   {result.verdict}"], as_json=as_json, quiet=quiet)
 
 
 def export(
@@ -174,15 +169,12 @@ def export(
             force=force,
             progress=draw,
         )
-    if as_json:
-        print_json(result)
-        return
-    say(f"{result.split} {result.size} as {result.format} in {result.folder}", quiet=quiet)
-    for subset, count in result.trajectories.items():
-        say(f"  {subset:<6}{count} trajectories, {result.frames[subset]} frames", quiet=quiet)
+    words = [f"{result.split} {result.size} as {result.format} in {result.folder}"]
+    for name, count in result.trajectories.items():
+        words.append(f"  {name:<6}{count} trajectories, {result.frames[name]} frames")
     if result.left_out:
-        say(f"  {result.left_out} frames left out: readers of this format want equal lengths", quiet=quiet)
-    say(f"  {spell_bytes(result.bytes)}", quiet=quiet)
+        words.append(f"  {result.left_out} frames left out: readers of this format want equal lengths")
+    show(result, [*words, f"  {spell_bytes(result.bytes)}"], as_json=as_json, quiet=quiet)
 
 
 def import_split(
@@ -197,15 +189,11 @@ def import_split(
         str | None,
         typer.Option("--kinds", metavar="LIST", help="Material of kinds of particles, as in 3=jelly,0=drop."),
     ] = None,
-    title: TitleOption = None,
-    citation: CitationOption = None,
-    licence: LicenceOption = None,
+    describe: DescribeOption = None,
     radius: RadiusOption = None,
     frame_interval: IntervalOption = None,
     bounds: BoundsOption = None,
     rescale: RescaleFlag = False,
-    density: DensityOption = None,
-    spacing: SpacingOption = None,
     input_frames: InputFramesOption = None,
     horizon: HorizonOption = None,
     frames_of_interest: InterestOption = None,
@@ -237,6 +225,7 @@ def adopt(
         list[Path], typer.Argument(metavar="FILE...", help=".npy, .npz or .nc files, or a folder of them.")
     ],
     output: FolderOption,
+    describe: DescribeOption = None,
     radius: RadiusOption = None,
     frame_interval: IntervalOption = None,
     valid: Annotated[
@@ -245,13 +234,8 @@ def adopt(
     test: Annotated[
         int | None, typer.Option("--test", metavar="N", help="Trajectories for test; a tenth by default.")
     ] = None,
-    title: TitleOption = None,
-    citation: CitationOption = None,
-    licence: LicenceOption = None,
     bounds: BoundsOption = None,
     rescale: RescaleFlag = False,
-    density: DensityOption = None,
-    spacing: SpacingOption = None,
     input_frames: InputFramesOption = None,
     horizon: HorizonOption = None,
     frames_of_interest: InterestOption = None,
@@ -269,16 +253,19 @@ def adopt(
 
 
 def _wishes(ctx: typer.Context) -> Any:  # noqa: ANN401 (the functions type them)
-    """Return what a user says of the data: the options that import and adopt share."""
+    """Return what a user says of the data: a file, and the options that import and adopt share."""
     from lagbench.data.registry import parse_ids
-    from lagbench.exchange.trajectory import Wishes
+    from lagbench.exchange.trajectory import Wishes, read_wishes
 
+    file = ctx.params["describe"]
     said = {n: v for n, v in ctx.params.items() if n in Wishes.__annotations__ and v is not None}
+    if not said["rescale"]:  # a flag that is not given says nothing
+        del said["rescale"]
     if "bounds" in said:
         said["bounds"] = _box(said["bounds"])
     if "frames_of_interest" in said:
         said["frames_of_interest"] = parse_ids(said["frames_of_interest"])
-    return said
+    return said if file is None else {**read_wishes(file), **said}
 
 
 def _box(text: str) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -293,15 +280,15 @@ def _box(text: str) -> tuple[tuple[float, float], tuple[float, float]]:
 
 
 def _made(made: LocalSplit, *, as_json: bool, quiet: bool) -> None:
-    if as_json:
-        print_json(made)
-        return
     counts = ", ".join(f"{count} {subset}" for subset, count in made.scenarios.items())
     fewest, most = made.particles
     span = f"{fewest}" if fewest == most else f"{fewest} to {most}"
-    say(f"{made.folder}: {counts}, {made.frames} frames, {span} particles", quiet=quiet)
-    say(f"  task    {made.input_frames} frames given, {made.horizon} to predict", quiet=quiet)
-    say(f"  hash    {made.dataset_sha256}", quiet=quiet)
+    words = [
+        f"{made.folder}: {counts}, {made.frames} frames, {span} particles",
+        f"  task    {made.input_frames} frames given, {made.horizon} to predict",
+        f"  hash    {made.dataset_sha256}",
+        f"  use it  lagbench template --split {made.folder}/",
+    ]
+    show(made, words, as_json=as_json, quiet=quiet)
     for note in made.notes:
         typer.echo(f"warning: {note}", err=True)
-    say(f"  use it  lagbench template --split {made.folder}/", quiet=quiet)

@@ -5,11 +5,8 @@ Time our solver: what a surrogate has to beat on the same machine.
 
 from __future__ import annotations
 
-import json
 import os
 import platform
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -19,18 +16,11 @@ from pathlib import Path
 
 from lagbench.data.layout import resolve_root
 from lagbench.data.registry import load
-from lagbench.errors import LagbenchError, WorkFailedError, check_installed
+from lagbench.errors import LagbenchError, check_installed
 from lagbench.make.plan import free_bytes
-from lagbench.work.pool import available_cores
+from lagbench.work.pool import Pool, Report, Task, available_cores
 
-__all__ = [
-    "Check",
-    "Diagnosis",
-    "doctor",
-    "SolverBench",
-    "bench_apart",
-    "bench_solver",
-]
+__all__ = ["Check", "Diagnosis", "SolverBench", "bench_apart", "bench_solver", "doctor"]
 
 
 NEEDED = (
@@ -211,9 +201,12 @@ def bench_apart(split: str, size: str = "full", *, frames: int = FRAMES) -> Solv
     """
     load().size(split, size)
     check_installed("taichi", extra="generate")
-    options = ["--split", split, "--size", size, "--frames", str(frames), "--json"]
-    command = [sys.executable, "-m", "lagbench", "bench", "solver", *options]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode != 0:
-        raise WorkFailedError("the solver could not be timed", got=done.stderr.strip()[-300:])
-    return SolverBench(**json.loads(done.stdout))
+    with Pool(1) as pool:
+        pool.submit(Task(name=f"bench of {split} {size}", function=_bench, arguments=(split, size, frames)))
+        timed: SolverBench = next(event.value for event in pool.events() if event.kind == "done")
+    return timed
+
+
+def _bench(split: str, size: str, frames: int, report: Report) -> SolverBench:
+    """Time the solver in a worker process; there is nothing to report meanwhile."""
+    return bench_solver(split, size, frames=frames)

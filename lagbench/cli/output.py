@@ -18,14 +18,7 @@ import typer
 if TYPE_CHECKING:
     from lagbench.work.progress import Progress as State
 
-__all__ = [
-    "print_json",
-    "print_table",
-    "say",
-    "spell_bytes",
-    "spell_seconds",
-    "progress_bar",
-]
+__all__ = ["print_json", "print_table", "progress_bar", "say", "show", "spell_bytes", "spell_seconds"]
 
 
 LAST_COLUMN = 24
@@ -44,6 +37,15 @@ def say(text: str, *, quiet: bool = False) -> None:
 def print_json(value: object) -> None:
     """Print a value, a dataclass too, as one JSON object on stdout."""
     typer.echo(json.dumps(_plain(value), indent=2, sort_keys=True, allow_nan=False))
+
+
+def show(value: object, words: Iterable[str], *, as_json: bool, quiet: bool = False) -> None:
+    """Print a result as one JSON object, or the lines that say it in words, formed only then."""
+    if as_json:
+        print_json(value)
+    elif not quiet:
+        for line in words:
+            typer.echo(line)
 
 
 def _plain(value: object) -> object:

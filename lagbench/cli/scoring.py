@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from lagbench.scoring.card import ScoreCard
     from lagbench.scoring.compare import ComparisonResult
     from lagbench.scoring.tables import Table
-    from lagbench.submission import ValidationResult
+    from lagbench.submission.findings import ValidationResult
 
 __all__ = ["compare", "score", "template", "validate"]
 
@@ -58,7 +58,7 @@ def template(
     quiet: QuietFlag = False,
 ) -> None:
     """Write a valid predictions.nc to fill: the persistence prediction."""
-    from lagbench.submission import template as run
+    from lagbench.submission.writer import template as run
 
     result = run(chosen(name, split), size, output=output, overwrite=overwrite, root=root)
     if as_json:
@@ -77,7 +77,7 @@ def validate(
     quiet: QuietFlag = False,
 ) -> None:
     """Check a predictions.nc and say all that is wrong with it and how to mend it."""
-    from lagbench.submission import validate as run
+    from lagbench.submission.validation import validate as run
 
     wanted = _wanted(split, root)
     result = run(predictions, root=wanted.root)
@@ -159,7 +159,7 @@ def score(
     if as_json:
         print_json(cards[0].as_json() if len(cards) == 1 else [card.as_json() for card in cards])
     if report is not None:
-        from lagbench.report import write_report
+        from lagbench.report.report import write_report
 
         say(f"report: {write_report(report, cards, predictions, root=root)}", quiet=quiet or as_json)
 
@@ -184,7 +184,7 @@ def _targets(predictions: Sequence[Path], output: Path | None) -> Sequence[Path 
 
 def _checked_together(predictions: Sequence[Path], root: Path | None) -> list[ValidationResult]:
     """Refuse, before any is scored, an invalid file and one to another split or size."""
-    from lagbench.submission import validate as examine
+    from lagbench.submission.validation import validate as examine
 
     results: list[ValidationResult] = []
     for path in predictions:

@@ -13,13 +13,7 @@ from dataclasses import dataclass
 
 from lagbench.errors import nearest
 
-__all__ = [
-    "SUBSETS",
-    "Limit",
-    "check_frames",
-    "check_parameters",
-    "check_subsets",
-]
+__all__ = ["SUBSETS", "Limit", "check_frames", "check_parameters", "check_subsets"]
 
 
 Value = int | float | bool | str

@@ -25,11 +25,7 @@ from .layout import dataset_folder
 if TYPE_CHECKING:
     import filelock
 
-__all__ = [
-    "Holder",
-    "dataset_lock",
-    "read_holder",
-]
+__all__ = ["Holder", "dataset_lock", "read_holder"]
 
 
 LOCK_NAME = ".lock"

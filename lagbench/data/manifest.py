@@ -22,6 +22,7 @@ from lagbench.work.machine import may_differ
 
 from .checksums import HASHED_SUBSETS, dataset_hash, file_sha256, subset_hash
 from .layout import MANIFEST_NAME, NOTES_NAME, ScenarioKey, dataset_folder, major_of, scenario_path
+from .registry import Size
 from .scenario import read_scenario
 from .statistics import round_digits
 
@@ -30,9 +31,11 @@ __all__ = [
     "Manifest",
     "describe_file",
     "merge",
+    "merged",
     "note",
     "noted_content",
     "read_manifest",
+    "read_or_empty",
     "write_manifest",
 ]
 
@@ -173,6 +176,25 @@ def merge(
     )
 
 
+def merged(
+    size: Size,
+    base: Manifest | None,
+    files: Iterable[FileEntry] = (),
+    environment: Mapping[str, str] | None = None,
+) -> Manifest:
+    """Return a manifest of a size with entries put in; an empty one without any."""
+    return merge(
+        base,
+        files,
+        split=size.split,
+        size=size.name,
+        version=size.version,
+        subsets=size.subsets,
+        environment=environment,
+        recorded=size.measured.scenario_sha256 if size.measured else None,
+    )
+
+
 def read_manifest(root: Path, split: str, size: str, major: int) -> Manifest | None:
     """Return the manifest of a data set folder; None where there is none."""
     path = dataset_folder(root, split, size, major) / MANIFEST_NAME
@@ -192,6 +214,15 @@ def read_manifest(root: Path, split: str, size: str, major: int) -> Manifest | N
             got=first["msg"],
             fix="remove it; lagbench generate checks the files and writes it anew",
         ) from None
+
+
+def read_or_empty(size: Size, root: Path) -> Manifest:
+    """Return the manifest of a folder, an empty one where there is none that can be read."""
+    try:
+        found = read_manifest(root, size.split, size.name, size.major)
+    except DataError:  # it is written anew from the files
+        found = None
+    return found or merged(size, None)
 
 
 def write_manifest(root: Path, manifest: Manifest) -> Path:

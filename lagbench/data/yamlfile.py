@@ -16,12 +16,7 @@ import yaml
 
 from lagbench.errors import UnreadableFileError
 
-__all__ = [
-    "MAX_BYTES",
-    "MAX_DEPTH",
-    "read_yaml",
-    "spell_yaml",
-]
+__all__ = ["MAX_BYTES", "MAX_DEPTH", "read_yaml", "spell_yaml"]
 
 
 MAX_BYTES = 4 * 2**20

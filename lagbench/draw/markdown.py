@@ -5,10 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-__all__ = [
-    "escape",
-    "table",
-]
+__all__ = ["escape", "table"]
 
 
 _SPECIAL = re.compile(r"([\\`*_\[\]<>|#&~$])")

@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lagbench.data.layout import ScenarioKey, scenario_path
 from lagbench.data.local import locate, remedy
 from lagbench.data.registry import Registry, Size
-from lagbench.data.writer import ScenarioKey, scenario_path
 from lagbench.errors import DataError, UsageError, nearest
 from lagbench.store.copy import bring
 

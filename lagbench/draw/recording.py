@@ -19,17 +19,13 @@ from numpy.typing import NDArray
 from lagbench.data import grid as gridding
 from lagbench.data.local import rooted
 from lagbench.data.registry import Registry, Size, load
-from lagbench.data.writer import read_scenario
+from lagbench.data.scenario import read_scenario
 from lagbench.errors import UsageError
 
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = [
-    "Recording",
-    "Scene",
-    "open_recording",
-]
+__all__ = ["Recording", "Scene", "open_recording"]
 
 
 Read = Callable[[str, slice | int], NDArray[Any]]

@@ -11,20 +11,26 @@ from pathlib import Path
 from lagbench.data.layout import MANIFEST_NAME, dataset_folder, scenario_path
 from lagbench.data.local import locate
 from lagbench.data.lock import dataset_lock
-from lagbench.data.manifest import FileEntry, Manifest, describe_file, read_manifest, write_manifest
+from lagbench.data.manifest import (
+    FileEntry,
+    Manifest,
+    describe_file,
+    merged,
+    read_manifest,
+    read_or_empty,
+    write_manifest,
+)
 from lagbench.data.registry import Registry, Size, spell_ids
 from lagbench.errors import DataError, UsageError, WorkFailedError
 from lagbench.generators.simulate import scenario_key
 from lagbench.make.cards import write_cards
 from lagbench.make.generate import generate
+from lagbench.make.inventory import State, compare, examine
 from lagbench.make.plan import Scenarios, Selection, check_disk, scenario_bytes, select
-from lagbench.make.verify import State, compare, examine, told
 from lagbench.store.copy import (
     MANIFEST_LIMIT,
     address_of,
-    merged,
     parse_manifest,
-    read_or_empty,
     refuse_strangers,
 )
 from lagbench.store.fetch import CONNECTIONS, Wanted, fetch_scenarios, fetch_text
@@ -119,7 +125,7 @@ def download(
             if store:
                 store.follow(manifest, at_once=True)
         if not work.missing:
-            verdict = told(compare(tier, manifest), tier)
+            verdict = compare(tier, manifest)
             if work.downloaded and tier.simulated:
                 if store:
                     store.bring(held)

@@ -9,21 +9,18 @@ write none and run none.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.atomic import atomic_path
+from lagbench.data.hdf5 import Structure, check_structure, opened, reading
 from lagbench.errors import UnreadableFileError
 
 from .metadata import Format, materials_of
-from .trajectory import Frame, Trajectory, check_array, check_inflation
-
-if TYPE_CHECKING:
-    import h5py
+from .trajectory import Frame, Trajectory, check_array
 
 __all__ = ["ENDING", "FORCE", "trajectories", "write"]
 
@@ -36,6 +33,9 @@ Run = tuple[int, Callable[[int], NDArray[np.float32]], NDArray[np.int64]]
 
 _LEVEL = 1
 
+MOST_TRAJECTORIES = 100_000
+"""Most trajectories of a file that are looked at."""
+
 
 def write(path: Path, runs: Iterable[Run], *, length: int, origin: Sequence[float]) -> list[tuple[int, int]]:
     """Write one subset; the file appears whole or not at all; return frames and particles of each trajectory.
@@ -44,8 +44,6 @@ def write(path: Path, runs: Iterable[Run], *, length: int, origin: Sequence[floa
     end is not written. ``origin`` is taken off every position [length]. Chunks of one frame, with gzip
     and shuffle, are read there 5 to 10 times faster than those that HDF5 chooses.
     """
-    import h5py
-
     shapes: list[tuple[int, int]] = []
     with (
         atomic_path(path, option="--output") as temporary,
@@ -80,71 +78,23 @@ def trajectories(
     to every position [length]. A group that is no trajectory is an UnreadableFileError, positions that
     are not of two components are a DataError.
     """
-    import h5py
-
-    try:
-        file = h5py.File(path, "r")
-    except OSError as error:
-        raise UnreadableFileError("cannot read an HDF5 file", where=str(path), got=error) from error
-    with file:
-        with _whole(str(path)):
-            keys = sorted(file)
-        for key in keys:
+    with opened(path) as file:
+        # A stranger's file shall read none of ours, and hold no more than it shows.
+        check_structure(file, path, Structure(members=MOST_TRAJECTORIES, groups=None))
+        for key in sorted(file):
             name = f"{path}, group {key!r}"
-            with _whole(name):
-                _check_links(name, file, key)
-                found = _trajectory(name, file[key], kinds, np.asarray(origin, np.float32))
+            with reading(path):
+                found = _trajectory(path, name, file[key], kinds, np.asarray(origin, np.float32))
             yield found
 
 
-@contextmanager
-def _whole(name: str) -> Iterator[None]:
-    """Tell what HDF5 says of damaged files, which it does by errors of many types, as one of ours."""
-    try:
-        yield
-    except (OSError, RuntimeError, LookupError, TypeError, ValueError, MemoryError) as error:
-        raise UnreadableFileError("a file is damaged", where=name, got=error) from error
-
-
-def _check_links(name: str, file: h5py.File, key: str) -> None:
-    """Refuse what HDF5 would fetch from other files: a stranger's file shall read none of ours."""
-    import h5py
-
-    places = [(file, key)]
-    if isinstance(file.get(key, getlink=True), h5py.HardLink) and isinstance(file[key], h5py.Group):
-        places += [(file[key], part) for part in file[key]]
-    for parent, part in places:
-        found = parent[part] if isinstance(parent.get(part, getlink=True), h5py.HardLink) else None
-        elsewhere = isinstance(found, h5py.Dataset) and (found.is_virtual or found.external)
-        if found is None or elsewhere:
-            raise UnreadableFileError(
-                "the file leads to another file",
-                where=f"{name}, {part!r}",
-                expected="data in the file itself",
-                fix="write it again without links, virtual data sets and external storage",
-            )
-
-
-def _array(name: str, group: h5py.Group, part: str) -> h5py.Dataset:
-    """Return an array of a trajectory that is one, and no larger than the file bears out."""
-    import h5py
-
-    found = group.get(part) if isinstance(group, h5py.Group) else None
-    if not isinstance(found, h5py.Dataset) or found.shape is None:
-        raise UnreadableFileError("this is no trajectory", where=name, expected="position and particle_type")
-    check_inflation(f"{name}, {part}", packed=found.id.get_storage_size(), unpacked=found.nbytes)
-    created = found.id.get_create_plist()
-    filters = [created.get_filter(number)[0] for number in range(created.get_nfilters())]
-    if len(filters) > len({*filters}):
-        # Each round of the same filter may unpack to a thousand times its length.
-        raise UnreadableFileError("a filter is applied twice", where=f"{name}, {part}", got=filters)
-    return found
-
-
 def _trajectory(
-    name: str, group: h5py.Group, given: Mapping[int, str], origin: NDArray[np.float32]
+    path: Path, name: str, group: h5py.Group, given: Mapping[int, str], origin: NDArray[np.float32]
 ) -> Trajectory:
-    position, kinds = (_array(name, group, part) for part in ("position", "particle_type"))
+    parts = set() if isinstance(group, h5py.Dataset) else set(group)
+    if not {"position", "particle_type"} <= parts:
+        raise UnreadableFileError("this is no trajectory", where=name, expected="position and particle_type")
+    position, kinds = group["position"], group["particle_type"]
     shape = position.shape
     check_array(name, shape, position.dtype)
     numbers = np.asarray(kinds)
@@ -159,7 +109,7 @@ def _trajectory(
 
     def read() -> Iterator[Frame]:
         for number in range(shape[0]):
-            with _whole(f"{name}, frame {number}"):
+            with reading(path, f"{position.name}, frame {number}"):
                 frame = position[number]
             yield (frame[kept] + origin if origin.any() else frame[kept]), None
 

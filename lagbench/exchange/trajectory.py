@@ -6,12 +6,15 @@ import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TypedDict
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ConfigDict, TypeAdapter, ValidationError, with_config
+from typing_extensions import TypedDict  # pydantic reads that of Python 3.12 and later only
 
 from lagbench.data.local import is_name
+from lagbench.data.yamlfile import read_yaml
 from lagbench.errors import DataError, UnreadableFileError, UsageError
 
 __all__ = [
@@ -26,6 +29,7 @@ __all__ = [
     "check_array",
     "check_inflation",
     "estimate_spacing",
+    "read_wishes",
 ]
 
 Array = NDArray[np.floating]
@@ -114,6 +118,7 @@ def _power(length: float) -> float:
     return 2.0 ** max(0, math.ceil(math.log2(length))) if length > 1.0 else 1.0
 
 
+@with_config(ConfigDict(extra="forbid"))
 class Wishes(TypedDict, total=False):
     """What a user may say of data from elsewhere; see :class:`Description`."""
 
@@ -132,6 +137,26 @@ class Wishes(TypedDict, total=False):
     frames_of_interest: Sequence[int]
     cells: int
     full_box: bool
+
+
+def read_wishes(path: Path) -> Wishes:
+    """Return what a YAML file says of the data.
+
+    Raises:
+        UnreadableFileError: no plain YAML.
+        UsageError: an unknown key, or a value that does not fit.
+    """
+    try:
+        return TypeAdapter(Wishes).validate_python(read_yaml(path))
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise UsageError(
+            "the file does not describe data",
+            where=f"{path}, key {'.'.join(map(str, first['loc'])) or '(whole file)'}",
+            expected=first["msg"],
+            got=first["input"],
+            fix="docs/exchange.md has the keys",
+        ) from None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,8 +199,8 @@ class Description:
         positive = {
             "--radius": self.radius,
             "--frame-interval": self.frame_interval,
-            "--density": self.density,
-            "--spacing": 1.0 if self.spacing is None else self.spacing,
+            "density": self.density,
+            "spacing": 1.0 if self.spacing is None else self.spacing,
         }
         for option, value in positive.items():
             if not (LEAST <= value <= MOST):
@@ -214,7 +239,7 @@ def estimate_spacing(position: Array, radius: float) -> float:
             where="--radius",
             expected=f"neighbours within {WIDE:g} radii",
             got=radius,
-            fix="a larger --radius, or say how far particles are apart: --spacing",
+            fix="a larger --radius, or say in a file how far particles are apart: --describe, key spacing",
         )
     return math.sqrt(math.pi * reach**2 / inside)
 

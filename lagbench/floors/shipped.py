@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 from lagbench.atomic import write_atomically
 from lagbench.data.registry import Size
 from lagbench.errors import DataError
-from lagbench.metrics import Score, available
+from lagbench.metrics.aggregate import Score
+from lagbench.metrics.table import available
 
 __all__ = [
     "CURVES",

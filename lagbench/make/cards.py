@@ -1,13 +1,9 @@
 """Data set cards: README.md with pictures, and croissant.json, beside the manifest.
 
 Both follow from the registry and the manifest alone and hold no date, so the same data set
-gets the same bytes. Pictures are drawn where matplotlib is installed.
-
-Croissant 1.1 metadata: a data set described for search engines and loaders.
-
-The document passes ``mlcroissant validate``. It names every file with its SHA-256 and lists
-the scenarios as records. There is no date in it: the same manifest gives the same bytes.
-Specification: https://docs.mlcommons.org/croissant/docs/croissant-spec-1.1.html
+gets the same bytes. Pictures are drawn where matplotlib is installed. The Croissant 1.1 document,
+for search engines and loaders, names every file with its SHA-256, lists the scenarios as records
+and passes ``mlcroissant validate``. Specification: https://docs.mlcommons.org/croissant/docs/croissant-spec-1.1.html
 """
 
 from __future__ import annotations
@@ -35,7 +31,6 @@ __all__ = [
     "dataset_card",
     "write_cards",
 ]
-
 
 CONFORMS_TO = "http://mlcommons.org/croissant/1.1"
 LICENCES = {"CC-BY-4.0": "https://creativecommons.org/licenses/by/4.0/"}
@@ -209,7 +204,7 @@ def _pictures(manifest: Manifest) -> list[str]:
 
 
 def _are_there(texts: Mapping[Path, bytes], pictures: Sequence[Path]) -> bool:
-    """Return whether all files of a card are on disk, with these texts."""
+    """Tell whether all files of a card are on disk, with these texts."""
     found = all(path.is_file() for path in (*texts, *pictures))
     return found and all(path.read_bytes() == text for path, text in texts.items())
 
@@ -362,12 +357,11 @@ def _statistics(manifest: Manifest) -> Iterator[str]:
 
 
 def _parameters(size: Size) -> str:
-    rows = [(f"`{name}`", _plain(p.value), p.unit, p.description) for name, p in size.parameters.items()]
+    rows = [
+        (f"`{name}`", f"{p.value:g}" if isinstance(p.value, float) else p.value, p.unit, p.description)
+        for name, p in size.parameters.items()
+    ]
     return table(("parameter", "value", "unit", "meaning"), rows)
-
-
-def _plain(value: object) -> str:
-    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _commands(size: Size, manifest: Manifest) -> str:
@@ -390,13 +384,17 @@ def _commands(size: Size, manifest: Manifest) -> str:
 
 def _scenarios(manifest: Manifest) -> str:
     names = sorted({name for entry in manifest.files for name in entry.facts})
-    rows = [_scenario_row(entry, names) for entry in manifest.files]
+    rows = [
+        (
+            entry.scenario,
+            f"`{entry.path}`",
+            entry.frames,
+            *(f"{entry.facts[name]:.6g}" if name in entry.facts else "" for name in names),
+            f"`{entry.content_sha256}`",
+        )
+        for entry in manifest.files
+    ]
     listing = table(
         ("id", "file", "frames", *(name.replace("_", " ") for name in names), "content hash"), rows
     )
     return f"<details><summary>{len(rows)} files</summary>\n\n{listing}\n\n</details>"
-
-
-def _scenario_row(entry: FileEntry, names: list[str]) -> tuple[object, ...]:
-    facts = [f"{entry.facts[name]:.6g}" if name in entry.facts else "" for name in names]
-    return (entry.scenario, f"`{entry.path}`", entry.frames, *facts, f"`{entry.content_sha256}`")

@@ -15,14 +15,12 @@ from pathlib import Path
 
 from lagbench.atomic import atomic_path
 from lagbench.data.layout import dataset_folder
-from lagbench.data.manifest import FileEntry, Manifest, merge, read_manifest
+from lagbench.data.manifest import FileEntry, Manifest, merged, read_manifest
 from lagbench.data.registry import Size
 from lagbench.data.scenario import check_scenario
 from lagbench.errors import UsageError
 
-__all__ = [
-    "gather",
-]
+__all__ = ["gather"]
 
 
 def gather(size: Size, root: Path, source: Path, manifest: Manifest) -> Manifest:
@@ -38,10 +36,9 @@ def gather(size: Size, root: Path, source: Path, manifest: Manifest) -> Manifest
             got="the folder to write to" if found else "no manifest of that data set",
         )
     taken = list(_taken(there, here, found, manifest))
-    merged = manifest
     for environment in found.environments:
-        merged = _merged(size, merged, [], environment)
-    return _merged(size, merged, taken)
+        manifest = merged(size, manifest, environment=environment)
+    return merged(size, manifest, taken)
 
 
 def _taken(there: Path, here: Path, found: Manifest, held: Manifest) -> Iterator[FileEntry]:
@@ -66,18 +63,3 @@ def _link(origin: Path, target: Path) -> None:
         os.link(origin, target)
         return
     shutil.copyfile(origin, target)
-
-
-def _merged(
-    size: Size, base: Manifest, files: list[FileEntry], environment: dict[str, str] | None = None
-) -> Manifest:
-    return merge(
-        base,
-        files,
-        split=size.split,
-        size=size.name,
-        version=size.version,
-        subsets=size.subsets,
-        environment=environment,
-        recorded=size.measured.scenario_sha256 if size.measured else None,
-    )

@@ -4,8 +4,6 @@ A scenario's file appears whole or not at all, and the manifest is brought up to
 each, so that an interrupted generation goes on where it stopped and ends with the same bytes
 as an uninterrupted one.
 
-One generation: what is there, what is simulated, what is recorded.
-
 The parent process plans, hands scenarios to workers and keeps the manifest; it never
 simulates, so that Ctrl-C reaches it at once and a crash of the solver cannot take it along.
 """
@@ -16,46 +14,43 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 from lagbench.atomic import remove_leftovers
 from lagbench.data.layout import MANIFEST_NAME, dataset_folder, scenario_path
 from lagbench.data.local import locate
 from lagbench.data.lock import dataset_lock
 from lagbench.data.manifest import (
-    FileEntry,
     Manifest,
     describe_file,
-    merge,
+    merged,
     note,
-    read_manifest,
+    read_or_empty,
     write_manifest,
 )
 from lagbench.data.registry import Registry, Size, Split, spell_ids
 from lagbench.data.statistics import file_moments, round_digits, statistics
-from lagbench.errors import DataError, UsageError, check_installed, nearest
+from lagbench.errors import UsageError, check_installed, nearest
 from lagbench.generators.batch import SimulationJob
 from lagbench.generators.simulate import Simulated, scenario_key, simulate, twin_floors, twin_substeps
 from lagbench.generators.solver import Device
 from lagbench.store.publication import Publication, look_at, publication
 from lagbench.work.cluster import Cluster, await_file
 from lagbench.work.machine import environment_of, promises_bits
-from lagbench.work.pool import Event, Pool, Task, worker_count
+from lagbench.work.pool import Event, Pool, Report, Task, worker_count
 from lagbench.work.progress import Meter, Progress
+from lagbench.work.run import ONE_THREAD, read_many
 
 from .cards import card_texts, write_cards
-from .crew import Crew
 from .gather import gather
+from .inventory import Look, compare, look
 from .plan import Estimate, Scenarios, Selection, check_disk, estimate, free_bytes, select
-from .verify import Finding, Look, compare, look
 
-__all__ = [
-    "Generation",
-    "GenerationResult",
-    "Progress",
-    "generate",
-    "parse_device",
-]
+__all__ = ["Generation", "GenerationResult", "Progress", "generate"]
 
+
+Job = TypeVar("Job")
+Result = TypeVar("Result")
 
 BATCH_PARTICLES = 1 << 19
 """Particles that a parallel device advances together at the most."""
@@ -69,17 +64,19 @@ class Generation:
         size: Size,
         root: Path,
         device: Device,
-        crew: Crew,
+        workers: int,
         meter: Meter,
         *,
         split: Split,
+        scheduler: str | None = None,
         sources: Sequence[Path] = (),
     ) -> None:
-        self.size, self.root, self.device, self.crew = size, root, device, crew
+        self.size, self.root, self.device = size, root, device
+        self.workers, self.scheduler = workers, scheduler  # processes here, or a Dask scheduler's workers
         self.sources = sources  # other root folders to take finished scenarios from
         # the store that the root folder is a working copy of; None for a plain folder
         self.store: Publication | None = None
-        self.manifest = self._merged(None, [])  # what the folder holds, as far as is known
+        self.manifest = merged(self.size, None)  # what the folder holds, as far as is known
         self.kept: list[int] = []  # ids whose files were there and right
         self.to_do: Estimate = estimate(size, ())  # ids to simulate and what that takes
         self.verdict = ""  # how the hashes compare with datasets.yaml, in words
@@ -89,16 +86,21 @@ class Generation:
 
     def survey(self, wanted: Sequence[int], *, force: bool = False) -> None:
         """Find out what is there and what is to do; writes nothing."""
-        old = self._old_manifest()
+        old = read_or_empty(self.size, self.root)
         held = self.store.held if self.store else {}
         local = [i for i in self.size.scenarios if i not in held]
         suspects = [i for i in local if i in wanted or self._has_changed(i, old)]
         self._meter.begin("checking", total=len(suspects), scenarios=len(suspects))
-        good = [finding.entry for finding in self._examined(suspects, old) if finding.entry]
+        looks = {
+            f"scenario {i}": Look(root=self.root, size=self.size, scenario=i, manifest=old.only(i))
+            for i in suspects
+        }
+        findings = self._read(look, looks, map(self._path, suspects))
+        good = [finding.entry for finding in findings if finding.entry]
         bad = set(suspects) - {entry.scenario for entry in good}
         good += held.values()
         kept = tuple(e for e in old.files if e.scenario not in bad)
-        self.manifest = self._merged(old.model_copy(update={"files": kept}), good)
+        self.manifest = merged(self.size, old.model_copy(update={"files": kept}), good)
         self.kept = [i for i in wanted if i not in bad and not force]
         self.to_do = estimate(self.size, [i for i in wanted if i not in self.kept])
 
@@ -107,7 +109,7 @@ class Generation:
         folder = dataset_folder(self.root, self.size.split, self.size.name, self.size.major)
         remove_leftovers(folder)
         for source in self.sources:
-            self._keep(gather(self.size, self.root, source, self._old_manifest()))
+            self._keep(gather(self.size, self.root, source, read_or_empty(self.size, self.root)))
         self.survey(wanted, force=force)
         check_disk(self.root, self.to_do.bytes)
         self._keep(self.manifest)
@@ -124,23 +126,18 @@ class Generation:
         """Return the ids of the size that the manifest does not hold."""
         return tuple(i for i in self.size.scenarios if self.manifest.entry(i) is None)
 
-    def _old_manifest(self) -> Manifest:
-        """Return the manifest on disk, an empty one where there is none that can be read."""
-        try:
-            old = read_manifest(self.root, self.size.split, self.size.name, self.size.major)
-        except DataError:  # it is written anew from the files
-            old = None
-        return self._merged(old, [])
-
-    def _examined(self, suspects: Sequence[int], old: Manifest) -> list[Finding]:
-        orders = {
-            f"scenario {i}": Look(root=self.root, size=self.size, scenario=i, manifest=old.only(i))
-            for i in suspects
-        }
-        return self.crew.read(look, orders, map(self._path, suspects), self._count_files)
-
-    def _count_files(self, files: int) -> None:
-        self._meter.count(files, scenarios=files)
+    def _read(
+        self, function: Callable[[Job, Report], Result], jobs: Mapping[str, Job], files: Iterable[Path]
+    ) -> list[Result]:
+        """Run a function that reads files, here or by the workers; the meter counts files."""
+        return read_many(
+            function,
+            jobs,
+            files,
+            lambda count: self._meter.count(count, scenarios=count),
+            workers=self.workers,
+            scheduler=self.scheduler,
+        )
 
     def _path(self, scenario: int) -> Path:
         return scenario_path(self.root, scenario_key(self.size, scenario))
@@ -150,26 +147,10 @@ class Generation:
         entry, path = old.entry(scenario), self._path(scenario)
         return (path.stat().st_size if path.exists() else None) != (entry.bytes if entry else None)
 
-    def _merged(
-        self,
-        base: Manifest | None,
-        files: Sequence[FileEntry],
-        environment: Mapping[str, str] | None = None,
-    ) -> Manifest:
-        return merge(
-            base,
-            files,
-            split=self.size.split,
-            size=self.size.name,
-            version=self.size.version,
-            subsets=self.size.subsets,
-            environment=environment,
-            recorded=self.size.measured.scenario_sha256 if self.size.measured else None,
-        )
-
     def _simulate(self) -> None:
         """Run everything that is to do in workers, and the twins of test scenarios."""
-        twins = [i for i in self.kept if self._lacks_twin(i)]
+        with_twin = {entry.scenario for entry in self.manifest.files if entry.twin_floor}
+        twins = [i for i in self.kept if self._is_test(i) and i not in with_twin]
         self._bring(twins)
         tasks = [*self._tasks(), *(self._twin(i) for i in twins)]
         if not tasks:
@@ -178,11 +159,13 @@ class Generation:
         total += sum(twin_substeps(self.size, i) for i in self.to_do.scenarios if self._is_test(i))
         self._meter.begin("simulating", total=total, scenarios=len(self.to_do.scenarios))
         folder = dataset_folder(self.root, self.size.split, self.size.name, self.size.major)
-        with self.crew.simulating(len(tasks), self.device, folder) as crew:
+        environment = ONE_THREAD if self.device is Device.CPU else {}
+        here = Pool(min(self.workers, len(tasks)), environment)
+        with here if self.scheduler is None else Cluster(self.scheduler, folder=folder) as team:
             for task in tasks:
-                crew.submit(task)
-            for event in crew.events():
-                self._take(event, crew)
+                team.submit(task)
+            for event in team.events():
+                self._take(event, team)
 
     def _tasks(self) -> list[Task]:
         """Return one task per batch of scenarios of similar length."""
@@ -214,23 +197,19 @@ class Generation:
     def _is_test(self, scenario: int) -> bool:
         return self.size.subset_of(scenario) == "test"
 
-    def _lacks_twin(self, scenario: int) -> bool:
-        entry = self.manifest.entry(scenario)
-        return self._is_test(scenario) and (entry is None or not entry.twin_floor)
-
-    def _take(self, event: Event, crew: Pool | Cluster) -> None:
+    def _take(self, event: Event, team: Pool | Cluster) -> None:
         """Act on news from a worker."""
         if event.kind == "progress":
             self._meter.count(event.value)
         elif event.kind == "lost":
             self._meter.count(-event.value)
         elif event.task.function is simulate:
-            self._take_outcomes(event.value, crew, event.machine or environment_of(self.device))
+            self._take_outcomes(event.value, team, event.machine or environment_of(self.device))
         else:
             self._take_floors(event.value)
 
     def _take_outcomes(
-        self, outcomes: Sequence[Simulated], crew: Pool | Cluster, machine: Mapping[str, str]
+        self, outcomes: Sequence[Simulated], team: Pool | Cluster, machine: Mapping[str, str]
     ) -> None:
         environment = {**machine, "device": self.device.value}
         if promises_bits(environment):
@@ -244,10 +223,10 @@ class Generation:
         tested = [outcome for outcome in outcomes if self._is_test(outcome.scenario)]
         folder = dataset_folder(self.root, self.size.split, self.size.name, self.size.major)
         note(folder, {self._path(outcome.scenario): outcome.content_sha256 for outcome in tested})
-        self._keep(self._merged(self.manifest, entries, environment))
+        self._keep(merged(self.size, self.manifest, entries, environment))
         self._meter.count(scenarios=len(entries))
         for outcome in tested:
-            crew.submit(self._twin(outcome.scenario))
+            team.submit(self._twin(outcome.scenario))
 
     def _take_floors(self, floors: dict[int, tuple[float, ...]]) -> None:
         entries = [
@@ -255,7 +234,7 @@ class Generation:
             for entry in self.manifest.files
             if entry.scenario in floors
         ]
-        self._keep(self._merged(self.manifest, entries))
+        self._keep(merged(self.size, self.manifest, entries))
 
     def _keep(self, manifest: Manifest) -> None:
         self.manifest = manifest
@@ -279,7 +258,7 @@ class Generation:
             self._bring(train)
             self._meter.begin("statistics", total=len(train), scenarios=len(train))
             paths = {f"scenario {i}": self._path(i) for i in train}
-            moments = self.crew.read(file_moments, paths, paths.values(), self._count_files)
+            moments = self._read(file_moments, paths, paths.values())
             manifest = manifest.model_copy(update={"statistics": statistics(moments)})
         self._keep(manifest)
 
@@ -367,62 +346,51 @@ def generate(
     started = time.monotonic()
     tier, folder, splits = locate(split, size, root=root, registry=registry)
     wanted = select(tier, subset=subset, scenarios=scenarios)
-    target = parse_device(device)
+    devices = [known.value for known in Device]
+    if device not in devices:
+        raise UsageError(f"no device {device!r}", where="--device", fix=nearest(device, devices))
+    target = Device(device)
     cores = worker_count(workers, default=None if target.value == "cpu" else 1)
     free = free_bytes(dataset_folder(folder, tier.split, size, tier.major))
-    campaign = Generation(
+    generation = Generation(
         tier,
         folder,
         target,
-        Crew(workers=cores, scheduler=scheduler),
+        cores,
         Meter(progress),
         split=splits.split(tier.split),
+        scheduler=scheduler,
         sources=[Path(source).expanduser().absolute() for source in gather],
     )
     if dry_run:
-        campaign.store = look_at(tier, folder)
-        campaign.survey(wanted, force=force)
+        generation.store = look_at(tier, folder)
+        generation.survey(wanted, force=force)
     else:
         if scheduler is None:
             check_installed("taichi", extra="generate")
         with (
             dataset_lock(folder, tier.split, size, tier.major, on_wait=on_wait),
-            publication(tier, folder) as campaign.store,
+            publication(tier, folder) as generation.store,
         ):
-            campaign.run(wanted, force=force)
+            generation.run(wanted, force=force)
     seconds = time.monotonic() - started
-    return _result(campaign, bytes_free=free, seconds=seconds, dry_run=dry_run)
-
-
-def _result(campaign: Generation, *, bytes_free: int, seconds: float, dry_run: bool) -> GenerationResult:
-    size = campaign.size
     return GenerationResult(
-        split=size.split,
-        size=size.name,
-        version=size.version,
-        root=campaign.root,
-        folder=dataset_folder(campaign.root, size.split, size.name, size.major),
-        device=campaign.device.value,
-        workers=campaign.crew.workers,
-        simulated=campaign.to_do.scenarios,
-        kept=tuple(campaign.kept),
-        missing=campaign.missing(),
-        bytes_needed=campaign.to_do.bytes,
-        bytes_free=bytes_free,
-        seconds_expected=campaign.to_do.seconds(campaign.crew.workers),
+        split=tier.split,
+        size=size,
+        version=tier.version,
+        root=folder,
+        folder=dataset_folder(folder, tier.split, size, tier.major),
+        device=target.value,
+        workers=cores,
+        simulated=generation.to_do.scenarios,
+        kept=tuple(generation.kept),
+        missing=generation.missing(),
+        bytes_needed=generation.to_do.bytes,
+        bytes_free=free,
+        seconds_expected=generation.to_do.seconds(cores),
         seconds=seconds,
-        complete=campaign.manifest.complete,
-        dataset_sha256=campaign.manifest.dataset_sha256,
-        verdict=campaign.verdict,
+        complete=generation.manifest.complete,
+        dataset_sha256=generation.manifest.dataset_sha256,
+        verdict=generation.verdict,
         dry_run=dry_run,
     )
-
-
-def parse_device(name: str) -> Device:
-    """Return a device by name."""
-    from lagbench.generators.solver import Device
-
-    names = [device.value for device in Device]
-    if name not in names:
-        raise UsageError(f"no device {name!r}", where="--device", fix=nearest(name, names))
-    return Device(name)

@@ -13,11 +13,7 @@ from lagbench.work.pool import available_cores
 from .cards import PICTURES
 from .plan import estimate, scenario_bytes
 
-__all__ = [
-    "Overview",
-    "available_cores",
-    "overview",
-]
+__all__ = ["Overview", "available_cores", "overview"]
 
 
 @dataclass(frozen=True, kw_only=True)

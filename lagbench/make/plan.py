@@ -14,14 +14,7 @@ from pathlib import Path
 from lagbench.data.registry import Size, parse_ids, spell_ids
 from lagbench.errors import UsageError, WorkFailedError, nearest
 
-__all__ = [
-    "Estimate",
-    "check_disk",
-    "estimate",
-    "free_bytes",
-    "scenario_bytes",
-    "select",
-]
+__all__ = ["Estimate", "check_disk", "estimate", "free_bytes", "scenario_bytes", "select"]
 
 
 SECONDS_PER_PARTICLE_SUBSTEP = 45e-9

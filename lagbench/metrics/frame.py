@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lagbench.data.grid import Fields, Grid, Placement, fields
-from lagbench.data.writer import MATERIALS
+from lagbench.data.scenario import MATERIALS
 from lagbench.errors import ChecksFailedError, UsageError
 
 __all__ = [

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lagbench.data.writer import MATERIALS
+from lagbench.data.scenario import MATERIALS
 
 from .frame import Floats, FramePair
 from .metric import Direction, FirstFrames, Metric, last, mean, metric, root_mean_square

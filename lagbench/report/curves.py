@@ -10,7 +10,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.metrics import Direction, Metric, Score, bootstrap_interval, mean
+from lagbench.metrics.aggregate import Score, bootstrap_interval
+from lagbench.metrics.metric import Direction, Metric, mean
 
 from .chart import Bar, Plot, Scale, bar_chart, linear, spanning
 from .html import Markup, clipped, html, join, quantity, sentence, tag, text, words

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.metrics import FramePair
+from lagbench.metrics.frame import FramePair
 
 from .chart import Plot, Scale, linear
 from .html import Markup, join, tag, text

@@ -14,7 +14,7 @@ import math
 from collections.abc import Iterable, Sequence
 from unicodedata import east_asian_width
 
-from lagbench.metrics import Metric
+from lagbench.metrics.metric import Metric
 
 __all__ = [
     "Markup",

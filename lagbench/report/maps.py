@@ -10,9 +10,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.data.writer import MATERIALS
+from lagbench.data.scenario import MATERIALS
 from lagbench.draw.style import MATERIAL_COLOURS, rgb
-from lagbench.metrics import FramePair, Snapshot
+from lagbench.metrics.frame import FramePair, Snapshot
 from lagbench.scoring.task import ScoredTask
 
 from .html import Markup, join, tag

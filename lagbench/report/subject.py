@@ -18,12 +18,14 @@ from lagbench.data.layout import resolve_root
 from lagbench.data.local import rooted
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
-from lagbench.metrics import FramePair, Metric, Scenario, Score, Snapshot
+from lagbench.metrics.aggregate import Score
+from lagbench.metrics.frame import FramePair, Scenario, Snapshot
+from lagbench.metrics.metric import Metric
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.compare import told_apart
 from lagbench.scoring.scenario import SUBMISSION
 from lagbench.scoring.task import OpenScenario, ScoredTask, load_scored_task
-from lagbench.submission import Predictions, open_predictions
+from lagbench.submission.predictions import Predictions, open_predictions
 
 __all__ = [
     "COLOURS",

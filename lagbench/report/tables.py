@@ -11,21 +11,13 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from lagbench.metrics import (
-    CHOSEN,
-    FAMILIES,
-    Direction,
-    Metric,
-    Score,
-    bootstrap_interval,
-    compare,
-    mean,
-    standings,
-)
-from lagbench.metrics.significance import FEWEST_SCENARIOS
+from lagbench.metrics.aggregate import Score, bootstrap_interval
+from lagbench.metrics.metric import Direction, Metric, mean
+from lagbench.metrics.significance import FEWEST_SCENARIOS, compare, standings
+from lagbench.metrics.table import CHOSEN, FAMILIES
 from lagbench.metrics.vorticity import STABLE_PEARSON
 from lagbench.scoring.flags import Flag
-from lagbench.submission import Finding
+from lagbench.submission.findings import Finding
 
 from .html import Markup, html, interval, join, tag, text, unit, words
 from .html import unit as unit_of

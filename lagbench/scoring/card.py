@@ -19,22 +19,16 @@ from typing import Any
 import numpy as np
 
 from lagbench.atomic import write_atomically
+from lagbench.data.hdf5 import check_regular
 from lagbench.data.statistics import round_digits
 from lagbench.errors import UnreadableFileError
-from lagbench.metrics import (
-    Comparison,
-    Metric,
-    Score,
-    Setting,
-    Tally,
-    available,
-    bootstrap_interval,
-    compare,
-    mean,
-)
-from lagbench.submission import Finding, Header
-from lagbench.submission.format import MAX_NAME
-from lagbench.submission.hdf5 import check_regular
+from lagbench.metrics.aggregate import Score, Tally, bootstrap_interval
+from lagbench.metrics.frame import Setting
+from lagbench.metrics.metric import Metric, mean
+from lagbench.metrics.significance import Comparison, compare
+from lagbench.metrics.table import available
+from lagbench.submission.findings import Finding
+from lagbench.submission.format import MAX_NAME, Header
 
 from .flags import Flag
 from .scenario import SUBMISSION, Preview

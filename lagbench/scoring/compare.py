@@ -16,10 +16,10 @@ from typing import Any
 
 from lagbench.data.registry import Registry
 from lagbench.errors import DataError, UnreadableFileError, UsageError, nearest
-from lagbench.metrics import Comparison, Direction, Metric, Score, mean, mean_over_seeds
-from lagbench.metrics import compare as compare_scores
-from lagbench.metrics.aggregate import FEWEST_FOR_INTERVAL
-from lagbench.metrics.significance import FEWEST_SCENARIOS
+from lagbench.metrics.aggregate import FEWEST_FOR_INTERVAL, Score, mean_over_seeds
+from lagbench.metrics.metric import Direction, Metric, mean
+from lagbench.metrics.significance import FEWEST_SCENARIOS, Comparison
+from lagbench.metrics.significance import compare as compare_scores
 from lagbench.submission.format import MAX_NAME
 
 from .card import JSON_NAME, PublishedScores, digits, parse_scores, read_scores

@@ -26,8 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.grid import counted_nodes
-from lagbench.metrics import FramePair, Scenario, mean
-from lagbench.metrics.frame import dot, mean_square
+from lagbench.metrics.frame import FramePair, Scenario, dot, mean_square
+from lagbench.metrics.metric import mean
 
 __all__ = [
     "SHIFTS",

@@ -18,9 +18,12 @@ from numpy.typing import NDArray
 from lagbench.atomic import atomic_path
 from lagbench.data.layout import ScenarioKey, scenario_path
 from lagbench.data.registry import Registry, Size, load
-from lagbench.floors import FLOORS, Floor, FloorScores, floors_of, given_in, shipped
-from lagbench.floors.shipped import correlation_of
-from lagbench.metrics import Tally, aggregate, select, snapshots
+from lagbench.floors.floor import Floor, given_in
+from lagbench.floors.shipped import FloorScores, correlation_of, shipped
+from lagbench.floors.table import FLOORS, floors_of
+from lagbench.metrics.aggregate import Tally, aggregate
+from lagbench.metrics.frame import snapshots
+from lagbench.metrics.table import select
 from lagbench.work.pool import Report
 from lagbench.work.progress import Meter, Progress
 from lagbench.work.run import run_all

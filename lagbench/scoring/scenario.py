@@ -15,10 +15,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.floors import FLOORS, given_in
-from lagbench.metrics import FramePair, Metric, Scenario, Snapshot, Tally, measure, select, snapshots
+from lagbench.floors.floor import given_in
+from lagbench.floors.table import FLOORS
+from lagbench.metrics.aggregate import Tally, measure
 from lagbench.metrics.distributions import BINS, histograms
-from lagbench.submission import Predictions, open_predictions
+from lagbench.metrics.frame import FramePair, Scenario, Snapshot, snapshots
+from lagbench.metrics.metric import Metric
+from lagbench.metrics.table import select
+from lagbench.submission.predictions import Predictions, open_predictions
 from lagbench.work.pool import Report
 
 from .flags import Trace, Tracer

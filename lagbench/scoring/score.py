@@ -12,11 +12,17 @@ from lagbench.data.layout import resolve_root
 from lagbench.data.local import rooted
 from lagbench.data.registry import Registry
 from lagbench.errors import UnreadableFileError, UsageError, nearest
-from lagbench.floors import persistence, shipped
+from lagbench.floors import persistence
+from lagbench.floors.shipped import shipped
 from lagbench.make.overview import available_cores
-from lagbench.metrics import FramePair, Metric, Score, aggregate, available, select
-from lagbench.metrics.metric import MINIMUM_NODES
-from lagbench.submission import Finding, Header, Severity, ValidationResult, open_predictions, validate
+from lagbench.metrics.aggregate import Score, aggregate
+from lagbench.metrics.frame import FramePair
+from lagbench.metrics.metric import MINIMUM_NODES, Metric
+from lagbench.metrics.table import available, select
+from lagbench.submission.findings import Finding, Severity, ValidationResult
+from lagbench.submission.format import Header
+from lagbench.submission.predictions import open_predictions
+from lagbench.submission.validation import validate
 from lagbench.work.progress import Meter, Progress
 from lagbench.work.run import run_all
 

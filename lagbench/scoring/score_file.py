@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 
 from lagbench.atomic import atomic_path
 from lagbench.errors import WorkFailedError
-from lagbench.floors import FLOORS
-from lagbench.metrics import Score, Tally, aggregate, available
+from lagbench.floors.table import FLOORS
+from lagbench.metrics.aggregate import Score, Tally, aggregate
+from lagbench.metrics.table import available
 
 from .card import FORMAT, IDENTITY, ScoreCard, unreadable_scores
 from .scenario import SUBMISSION, Preview

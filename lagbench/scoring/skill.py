@@ -13,8 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lagbench.floors import FLOORS
-from lagbench.metrics import Direction, Score, bootstrap_interval, mean_over_seeds
+from lagbench.floors.table import FLOORS
+from lagbench.metrics.aggregate import Score, bootstrap_interval, mean_over_seeds
+from lagbench.metrics.metric import Direction
 
 __all__ = ["Skill", "best_floor", "skill"]
 

@@ -6,7 +6,9 @@ import math
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 
-from lagbench.metrics import CHOSEN, Direction, Metric, Score, mean
+from lagbench.metrics.aggregate import Score
+from lagbench.metrics.metric import Direction, Metric, mean
+from lagbench.metrics.table import CHOSEN
 
 from .card import ScoreCard
 from .compare import ComparisonResult

@@ -19,10 +19,9 @@ from lagbench.data.grid import Grid, Placement
 from lagbench.data.local import remedy
 from lagbench.data.manifest import Manifest, read_manifest
 from lagbench.data.registry import Size
-from lagbench.data.scenario import ScenarioFile
-from lagbench.data.writer import MATERIALS
+from lagbench.data.scenario import MATERIALS, ScenarioFile
 from lagbench.errors import DataError
-from lagbench.metrics import Scenario, Setting, Snapshot, snapshots
+from lagbench.metrics.frame import Scenario, Setting, Snapshot, snapshots
 from lagbench.store.copy import bring
 from lagbench.submission.truth import Truth
 

@@ -19,7 +19,7 @@ from pydantic import ValidationError
 from lagbench.data.checksums import file_sha256
 from lagbench.data.layout import MANIFEST_NAME, dataset_folder, url_of
 from lagbench.data.lock import dataset_lock
-from lagbench.data.manifest import FileEntry, Manifest, merge, read_manifest, write_manifest
+from lagbench.data.manifest import FileEntry, Manifest, merged, read_or_empty, write_manifest
 from lagbench.data.registry import Size, spell_ids
 from lagbench.errors import DataError
 from lagbench.work.machine import may_differ
@@ -35,10 +35,8 @@ __all__ = [
     "is_here",
     "is_right",
     "join",
-    "merged",
     "parse_manifest",
     "quietly",
-    "read_or_empty",
     "refuse_strangers",
     "remote_manifest",
     "unstored",
@@ -69,28 +67,6 @@ def folder_of(size: Size) -> str:
 
 def _remedy(size: Size, url: str) -> str:
     return f"lagbench generate --split {size.split} --size {size.name} --root {url} writes it anew"
-
-
-def merged(size: Size, base: Manifest | None, files: Iterable[FileEntry] = ()) -> Manifest:
-    """Return a manifest of a size with entries put in; an empty one without any."""
-    return merge(
-        base,
-        files,
-        split=size.split,
-        size=size.name,
-        version=size.version,
-        subsets=size.subsets,
-        recorded=size.measured.scenario_sha256 if size.measured else None,
-    )
-
-
-def read_or_empty(size: Size, root: Path) -> Manifest:
-    """Return the manifest of a folder, an empty one where there is none that can be read."""
-    try:
-        found = read_manifest(root, size.split, size.name, size.major)
-    except DataError:  # it is written anew from the files
-        found = None
-    return found or merged(size, None)
 
 
 def parse_manifest(text: bytes, *, where: str, remedy: str) -> Manifest:

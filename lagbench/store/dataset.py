@@ -17,11 +17,7 @@ if TYPE_CHECKING:
     from lagbench.data.manifest import Manifest
     from lagbench.data.registry import Size
 
-__all__ = [
-    "list_splits",
-    "load_manifest",
-    "open_split",
-]
+__all__ = ["list_splits", "load_manifest", "open_split"]
 
 
 CHUNK_BYTES = 4 << 20

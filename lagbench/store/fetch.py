@@ -18,8 +18,9 @@ from typing import TypeVar
 
 from lagbench.atomic import SUFFIX
 from lagbench.data.checksums import file_sha256
+from lagbench.data.hdf5 import Structure, check_structure, opened
 from lagbench.data.scenario import check_scenario
-from lagbench.errors import DataError, WorkFailedError
+from lagbench.errors import DataError, UnreadableFileError, WorkFailedError
 
 from .objects import (
     Answer,
@@ -288,8 +289,10 @@ def _accept(wanted: Wanted) -> None:
         # The bytes first: HDF5 is best not given what a bad line has garbled.
         if wanted.file_sha256 is not None and file_sha256(partial) != wanted.file_sha256:
             raise DataError("its bytes are not those of the store's manifest")
+        with opened(partial) as file:
+            check_structure(file, partial, Structure(texts=True))
         check_scenario(partial, wanted.content_sha256)
-    except DataError as error:
+    except (DataError, UnreadableFileError) as error:
         raise WrongContentError(
             "an object has other content",
             where=wanted.url,

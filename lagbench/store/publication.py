@@ -16,7 +16,7 @@ from pathlib import Path
 
 from lagbench.data.checksums import file_sha256
 from lagbench.data.layout import MANIFEST_NAME, dataset_folder, url_of
-from lagbench.data.manifest import FileEntry, Manifest, write_manifest
+from lagbench.data.manifest import FileEntry, Manifest, merged, write_manifest
 from lagbench.data.registry import Size
 from lagbench.errors import DataError, LagbenchError
 
@@ -26,7 +26,6 @@ from .copy import (
     is_here,
     is_right,
     join,
-    merged,
     remote_manifest,
     with_local,
     writing,

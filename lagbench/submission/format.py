@@ -14,11 +14,20 @@ from typing import Any
 
 import h5py
 
+from lagbench.data.hdf5 import (
+    MAX_LINKS,
+    Array,
+    Odd,
+    attribute_of,
+    describe,
+    members_of,
+    reading,
+    storage_problems,
+)
 from lagbench.errors import UnreadableFileError, nearest
 
 from .budget import Budget, budget_in
 from .findings import Findings, quoted
-from .hdf5 import MAX_LINKS, Array, Odd, attribute_of, describe, members_of, reading, storage_problems
 
 __all__ = [
     "DIMS",
@@ -28,6 +37,7 @@ __all__ = [
     "OPTIONAL",
     "REQUIRED",
     "SPACE",
+    "WRITE",
     "Anatomy",
     "Header",
     "check_dims",
@@ -86,6 +96,9 @@ INTEGERS = ("scenario", "frame", "diverged_at")
 PACKING = ("scale_factor", "add_offset")
 
 _START = "start from what `lagbench template` writes, or use lagbench.submission.write"
+WRITE = "write it with lagbench.submission.write, or fill what `lagbench template` writes"
+"""How to get a right file."""
+
 _WRITE = "write it with lagbench.submission.write, or with chunks (1, 1, particle, space)"
 _KINDS = {str: "text", int: "an integer", float: "a positive number"}
 

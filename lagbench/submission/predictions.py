@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.checksums import ContentHasher
+from lagbench.data.hdf5 import cache_of, opened, reading
 from lagbench.data.registry import spell_ids
 from lagbench.errors import UsageError
 
@@ -20,6 +21,7 @@ from .format import (
     DIMS,
     REQUIRED,
     SPACE,
+    WRITE,
     Anatomy,
     Header,
     check_dims,
@@ -29,7 +31,6 @@ from .format import (
     dissect,
     header_of,
 )
-from .hdf5 import cache_of, opened, reading
 
 __all__ = ["Predictions", "attach", "open_predictions"]
 
@@ -140,7 +141,7 @@ def open_predictions(path: str | Path) -> Predictions:
     """
     path = Path(path)
     with ExitStack() as stack:
-        file = stack.enter_context(opened(path))
+        file = stack.enter_context(opened(path, fix=WRITE))
         anatomy = dissect(file, path)
         out = Findings()
         for check in (check_format, check_dims, check_dtype, check_marks):

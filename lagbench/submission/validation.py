@@ -25,6 +25,7 @@ from typing import Any, NamedTuple
 
 import h5py
 
+from lagbench.data.hdf5 import check_file, opened
 from lagbench.data.layout import resolve_root
 from lagbench.data.local import RootedRegistry, rooted
 from lagbench.data.registry import Registry, Size
@@ -33,6 +34,7 @@ from lagbench.errors import DataError, UnreadableFileError, UsageError, WorkFail
 from .checks import check_domain, check_finite, check_frozen, check_jumps, survey
 from .findings import CHECKS, Finding, Findings, Severity, ValidationResult
 from .format import (
+    WRITE,
     Anatomy,
     check_dims,
     check_dtype,
@@ -41,7 +43,6 @@ from .format import (
     dissect,
     refuse_other_kinds,
 )
-from .hdf5 import check_file, opened
 from .predictions import attach
 from .start import check_start
 from .task_checks import check_dataset, check_frames, check_particles, check_scenarios, check_split
@@ -233,7 +234,7 @@ def _with_hashed_truth(result: ValidationResult, truth: Truth) -> ValidationResu
 def _isolated(path: Path, root: Path, registry: Registry, *, require_truth: bool) -> ValidationResult:
     """Examine a file in a child process; whatever stops the child fails the check ``readable``."""
     try:
-        check_file(path)
+        check_file(path, fix=WRITE)
         extra = seconds_for(path)
     except UnreadableFileError as error:
         return _unreadable(path, error)
@@ -295,7 +296,7 @@ def _examine(path: Path, root: Path, registry: Registry, *, require_truth: bool)
     names: dict[str, str] = {}
     content = None
     try:
-        with opened(path) as file:
+        with opened(path, fix=WRITE) as file:
             anatomy = dissect(file, path)
             refuse_other_kinds(anatomy, path)
             texts = {name: anatomy.attributes[name] for name in ("split", "size", "method")}

@@ -1,19 +1,12 @@
-"""Workers of a Dask cluster, used like the :class:`.Pool` of this machine.
+"""The workers of a Dask cluster, used like the :class:`.Pool` of this machine.
 
-The scheduler runs what a lost worker held on another one. A lost scheduler ends the work with
-an error; results that have arrived by then are not lost.
+The scheduler runs what a lost worker held on another one. A lost scheduler ends the work with an
+error; results that have arrived by then are not lost. A task runs in the worker itself, which must
+have one thread: Taichi and HDF5 want a process for themselves. How far a task is comes as Dask events.
 
-A folder that several machines write to: see that they do, and wait for each other's files.
-
-A cluster writes a data set to one folder on storage that all its machines share. A mark with
-a random word shows that a worker's folder of that path is the client's. Network file systems
-remember for a while that a file was missing; listing its folder makes them look again.
-
-What a worker of a Dask cluster does: it runs each task in a process of its own.
-
-Dask workers run tasks in threads; Taichi and HDF5 want a process for themselves. So every
-thread keeps a :class:`.Pool` of one process, which dies with the worker. Its work is told to
-the client as Dask events.
+A cluster writes a data set to one folder on storage that all its machines share. A mark with a
+random word shows that a worker's folder of that path is the client's. Network file systems remember
+for a while that a file was missing; listing its folder makes them look again.
 """
 
 from __future__ import annotations
@@ -24,42 +17,56 @@ import logging
 import os
 import queue
 import secrets
-import signal
-import socket
-import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from concurrent.futures import CancelledError
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 from lagbench.atomic import check_writable, temporary_name, write_atomically
 from lagbench.errors import LagbenchError, UsageError, WorkFailedError, require
 
 from .machine import environment_of
-from .pool import Event, Pool, Task
+from .pool import Event, Task, crashed
 
-__all__ = [
-    "Mark",
-    "await_file",
-    "marked",
-    "Delivery",
-    "Order",
-    "fulfil",
-    "stop",
-    "Cluster",
-]
-
+__all__ = ["Client", "Cluster", "Mark", "await_file", "marked", "run_task"]
 
 PATIENCE = 30.0
 """How long a file of another machine may take to appear [s]."""
 
 PAUSE = 0.1
-"""Pause between two looks [s]."""
+"""Pause between two looks for a file [s]."""
+
+TELL_SECONDS = 0.5
+"""Time between two events that tell how far a task is [s]."""
+
+CONNECT_SECONDS = 20
+"""How long a Dask scheduler may take to answer."""
+
+POLL_SECONDS = 0.02
+"""Pause between two looks at the tasks [s]."""
+
+LOOK_SECONDS = 1.0
+"""Pause between two looks at the workers [s]."""
+
+LOST_SECONDS = 60.0
+"""How long a Dask cluster may be without any worker."""
+
+STOP_SECONDS = 5
+"""How long to wait for the workers to hear that they shall stop."""
+
+WORKERS = "dask worker ADDRESS --nworkers -1 --nthreads 1"
+"""The command that starts workers as they must be: one a core, each with one thread."""
+
+LOGGERS = ("distributed", "distributed.client", "distributed.comm", "distributed.core")
+"""Loggers that print when a cluster is lost."""
+
+
+# --- a folder that several machines write to -----------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -125,165 +132,104 @@ def _look_again(folder: Path) -> None:
         os.listdir(folder)
 
 
-TELL_SECONDS = 0.5
-"""Time between two events that tell how far a task is [s]."""
+# --- in a worker ---------------------------------------------------------------------------
+
+_STOPPED: set[str] = set()
+"""Clients whose tasks are void."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Order:
-    """A task on its way to a worker."""
+@dataclass(frozen=True)
+class Client:
+    """For whom a worker works."""
 
-    task: Task  # what to do
-    number: int  # number of the order
-    client: str  # word that the orders of one client share; Dask events carry it too
-    version: str  # version of lagbench that the client runs
-    environment: Mapping[str, str]  # variables added to the environment of the process
-    mark: Mark | None = None  # what shows that the worker sees the client's folder; None where none is needed
+    name: str  # topic of the events that tell of its tasks
+    version: str  # its version of lagbench
+    mark: Mark | None = None  # what shows that the worker sees its folder; None where none is needed
+
+    def check(self, worker: str, *, threads: int) -> None:
+        """Refuse a worker that could not make the client's bits."""
+        if self.version != version("lagbench"):
+            raise WorkFailedError(
+                "a worker runs another version of lagbench",
+                where=f"worker {worker}",
+                expected=self.version,
+                got=version("lagbench"),
+                fix="install the same version on every worker",
+            )
+        if threads != 1:
+            raise WorkFailedError(
+                "a worker runs several tasks in one process",
+                where=f"worker {worker}",
+                expected="1 thread",
+                got=f"{threads} threads",
+                fix=f"start the workers with `{WORKERS}`",
+            )
+        if self.mark is not None:
+            self.mark.check(worker)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Delivery:
-    """What became of an order."""
+class Done(NamedTuple):
+    """What became of a task."""
 
-    value: Any  # result of the task
+    value: Any  # its result
     units: int  # units of work done
     machine: dict[str, str]  # what identity says of the machine that did it
 
 
-@dataclass
-class _Desk:
-    """The process of one thread, and the client that it works for."""
+def run_task(task: Task, number: int, client: Client) -> Done:
+    """Run a client's task in this process, the only thread of a Dask worker."""
+    from distributed import get_worker
 
-    client: str
-    pool: Pool
-    busy: bool = False
+    worker = get_worker()
+    client.check(worker.address, threads=worker.state.nthreads)
+    units, told = 0, time.monotonic()
 
+    def report(done: int) -> None:
+        nonlocal units, told
+        units += done
+        # Dask cannot stop a thread: a task ends itself when nobody waits for it any more.
+        if client.name in _STOPPED:
+            raise WorkFailedError("the client is gone", where=task.name)
+        if time.monotonic() - told >= TELL_SECONDS:
+            told = time.monotonic()
+            worker.log_event(client.name, [number, units])
 
-_DESKS: dict[int, _Desk] = {}
-"""Desks by the thread that sits there."""
-
-_STOPPED: set[str] = set()
-"""Clients whose orders are void."""
-
-
-def fulfil(order: Order) -> Delivery:
-    """Run a task in this thread's process, started now or kept from the last order."""
-    name = socket.gethostname()
-    if version("lagbench") != order.version:
-        raise WorkFailedError(
-            "a worker runs another version of lagbench",
-            where=f"worker {name}",
-            expected=order.version,
-            got=version("lagbench"),
-            fix="install the same version on every worker",
-        )
-    if order.mark is not None:
-        order.mark.check(name)
-    desk = _desk(order)
-    desk.busy = True
     try:
-        return _work(order, desk.pool)
-    finally:
-        desk.busy = False
-        if order.client in _STOPPED:
-            _clear(threading.get_ident())
+        value = task.function(*task.arguments, report)
+    except LagbenchError:
+        raise
+    except Exception as error:
+        raise crashed(error) from None
+    return Done(value, units, environment_of("unknown"))
 
 
 def stop(client: str) -> None:
-    """End what is done for a client, and its processes."""
+    """End what this worker does for a client."""
     _STOPPED.add(client)
-    for thread, desk in list(_DESKS.items()):
-        if desk.client != client:
-            continue
-        if not desk.busy:
-            _clear(thread)
-            continue
-        for process in desk.pool.process_ids():  # its thread notices, and clears the desk itself
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(process, signal.SIGKILL)
 
 
-def _desk(order: Order) -> _Desk:
-    """Return this thread's desk; one of an earlier client, which may have been killed, goes."""
-    thread = threading.get_ident()
-    if thread in _DESKS and _DESKS[thread].client != order.client:
-        _clear(thread)
-    return _DESKS.setdefault(thread, _Desk(order.client, Pool(1, order.environment)))
-
-
-def _clear(thread: int) -> None:
-    desk = _DESKS.pop(thread, None)
-    if desk is not None:
-        desk.pool.close()
-
-
-def _work(order: Order, pool: Pool) -> Delivery:
-    units, told = 0, time.monotonic()
-    pool.submit(order.task)
-    for event in pool.events():
-        if event.kind == "done":
-            return Delivery(value=event.value, units=units, machine=environment_of("unknown"))
-        if order.client in _STOPPED:
-            raise WorkFailedError("the client is gone", where=order.task.name)
-        units += _units(event)
-        if time.monotonic() - told >= TELL_SECONDS:
-            told = time.monotonic()
-            _tell(order, units)
-    raise WorkFailedError("a task ended without a result", where=order.task.name)
-
-
-def _units(event: Event) -> int:
-    return int(event.value if event.kind == "progress" else -event.value)
-
-
-def _tell(order: Order, units: int) -> None:
-    from distributed import get_worker
-
-    get_worker().log_event(order.client, [order.number, units])
-
-
-CONNECT_SECONDS = 20
-"""How long a Dask scheduler may take to answer."""
-
-POLL_SECONDS = 0.02
-"""Pause between two looks at the orders [s]."""
-
-LOOK_SECONDS = 1.0
-"""Pause between two looks at the workers [s]."""
-
-LOST_SECONDS = 60.0
-"""How long a Dask cluster may be without any worker."""
-
-STOP_SECONDS = 5
-"""How long to wait for the workers to stop."""
-
-LOGGERS = ("distributed", "distributed.client", "distributed.comm", "distributed.core")
-"""Loggers that print when a cluster is lost."""
+# --- at the client -------------------------------------------------------------------------
 
 
 class Cluster:
     """The workers of a Dask cluster; use it as a context manager."""
 
-    def __init__(
-        self, address: str, environment: Mapping[str, str] | None = None, *, folder: Path | None = None
-    ) -> None:
-        self.address, self.folder = address, folder
-        self._environment = dict(environment or {})
-        self._name = f"lagbench-{secrets.token_hex(8)}"
+    def __init__(self, address: str, *, folder: Path | None = None) -> None:
+        self.address = address  # that of the scheduler
+        self.folder = folder  # what the workers must share with this machine; None where they write nothing
         self._numbers = itertools.count()
         self._pending: dict[int, tuple[Task, Any]] = {}
         self._seen: dict[int, int] = {}
         self._heard: queue.SimpleQueue[tuple[int, int]] = queue.SimpleQueue()
-        self._mark: Mark | None = None
 
     def __enter__(self) -> Self:
         """Connect, and mark the shared folder."""
         with ExitStack() as stack:
             stack.enter_context(_quiet())
-            self._client = stack.enter_context(_connected(self.address))
-            if self.folder is not None:
-                self._mark = stack.enter_context(marked(self.folder))
-            self._client.subscribe_topic(self._name, lambda event: self._heard.put(tuple(event[1])))
+            self._dask = stack.enter_context(_connected(self.address))
+            mark = None if self.folder is None else stack.enter_context(marked(self.folder))
+            self._client = Client(f"lagbench-{secrets.token_hex(8)}", version("lagbench"), mark)
+            self._dask.subscribe_topic(self._client.name, lambda event: self._heard.put(tuple(event[1])))
             stack.callback(self._dismiss)
             self._stack = stack.pop_all()
         return self
@@ -297,47 +243,32 @@ class Cluster:
     def submit(self, task: Task) -> None:
         """Send a task to the scheduler; also while :meth:`events` runs."""
         number = next(self._numbers)
-        order = Order(
-            task=task,
-            number=number,
-            client=self._name,
-            version=version("lagbench"),
-            environment=self._environment,
-            mark=self._mark,
-        )
-        options = {"key": f"{self._name}-{number}", "priority": round(task.cost), "pure": False}
-        self._pending[number] = task, self._client.submit(fulfil, order, **options)
+        options = {"key": f"{self._client.name}-{number}", "priority": round(task.cost), "pure": False}
+        self._pending[number] = task, self._dask.submit(run_task, task, number, self._client, **options)
 
     def events(self) -> Iterator[Event]:
         """Yield news until all tasks are done; lost work counts as negative progress."""
         looked = alive = time.monotonic()
         while self._pending:
-            yield from self._progress()
-            done = [number for number, (_, future) in self._pending.items() if future.done()]
-            for number in done:
-                yield from self._finished(number)
+            with contextlib.suppress(queue.Empty):
+                while True:
+                    number, units = self._heard.get_nowait()
+                    if number in self._pending:
+                        yield self._counted(number, self._pending[number][0], units)
+            ended = [number for number, (_, future) in self._pending.items() if future.done()]
+            for number in ended:
+                task, future = self._pending.pop(number)
+                done = _fetch(task.name, future)
+                yield self._counted(number, task, done.units)
+                yield Event(task=task, kind="done", value=done.value, machine=done.machine)
             now = time.monotonic()
             if now - looked >= LOOK_SECONDS:
                 looked = now
-                alive = now if _has_workers(self._client) else alive
-            if self._client.status in ("closed", "failed") or now - alive > LOST_SECONDS:
-                raise _lost(f"{self._client.status}, no worker for {now - alive:.0f} s")
-            if not done:
+                alive = now if _has_workers(self._dask) else alive
+            if self._dask.status in ("closed", "failed") or now - alive > LOST_SECONDS:
+                raise _lost(f"{self._dask.status}, no worker for {now - alive:.0f} s")
+            if not ended:
                 time.sleep(POLL_SECONDS)
-
-    def _progress(self) -> Iterator[Event]:
-        """Yield what was told of orders that are not finished."""
-        with contextlib.suppress(queue.Empty):
-            while True:
-                number, units = self._heard.get_nowait()
-                if number in self._pending:
-                    yield self._counted(number, self._pending[number][0], units)
-
-    def _finished(self, number: int) -> Iterator[Event]:
-        task, future = self._pending.pop(number)
-        delivery = _fetch(task.name, future)
-        yield self._counted(number, task, delivery.units)
-        yield Event(task=task, kind="done", value=delivery.value, machine=delivery.machine)
 
     def _counted(self, number: int, task: Task, units: int) -> Event:
         """Return the progress since the last news; another worker may have begun anew."""
@@ -345,12 +276,12 @@ class Cluster:
         return Event(task=task, kind="progress", value=units - before)
 
     def _dismiss(self) -> None:
-        """Make the workers drop what they hold, and end their processes."""
+        """Make the workers drop what they hold."""
         pending, self._pending = [future for _, future in self._pending.values()], {}
-        if self._client.status == "running":
+        if pending and self._dask.status == "running":
             with contextlib.suppress(Exception):  # what cannot be reached is lost anyway
-                self._client.cancel(pending)
-                self._client.run(stop, self._name, on_error="ignore", callback_timeout=STOP_SECONDS)
+                self._dask.cancel(pending)
+                self._dask.run(stop, self._client.name, on_error="ignore", callback_timeout=STOP_SECONDS)
 
 
 @contextmanager
@@ -368,7 +299,7 @@ def _connected(address: str) -> Iterator[Any]:
             where=f"--scheduler {address}",
             expected="the address of a running scheduler, as in tcp://10.0.0.5:8786",
             got=f"{type(error).__name__}: {error}",
-            fix="start one with `dask scheduler` and workers with `dask worker ADDRESS`",
+            fix=f"start one with `dask scheduler` and workers with `{WORKERS}`",
         ) from error
     try:
         yield client
@@ -409,11 +340,11 @@ def _has_workers(client: Any) -> bool:  # noqa: ANN401
         return False
 
 
-def _fetch(name: str, future: Any) -> Delivery:  # noqa: ANN401
-    """Return what came of an order; put whatever else came into an error of ours."""
+def _fetch(name: str, future: Any) -> Done:  # noqa: ANN401
+    """Return what came of a task; put whatever else came into an error of ours."""
     killed = require("distributed", extra="cluster").KilledWorker
     try:
-        delivery: Delivery = future.result()
+        done: Done = future.result()
     except LagbenchError:
         raise
     except killed as error:
@@ -423,7 +354,7 @@ def _fetch(name: str, future: Any) -> Delivery:  # noqa: ANN401
             got=str(error),
             fix="give the workers more memory, or leave --scheduler out",
         ) from error
-    except Exception as error:  # whatever a worker raises that cannot even read the order
+    except Exception as error:  # whatever a worker raises that cannot even read the task
         if future.status != "error":
             raise _lost(error) from error
         raise WorkFailedError(
@@ -432,4 +363,4 @@ def _fetch(name: str, future: Any) -> Delivery:  # noqa: ANN401
             got=f"{type(error).__name__}: {error}",
             fix="install the same version of lagbench with its extras on every worker",
         ) from error
-    return delivery
+    return done

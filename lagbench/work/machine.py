@@ -11,11 +11,7 @@ import platform
 from collections.abc import Iterable, Mapping
 from importlib.metadata import version
 
-__all__ = [
-    "environment_of",
-    "may_differ",
-    "promises_bits",
-]
+__all__ = ["environment_of", "may_differ", "promises_bits"]
 
 
 _MACHINES = {"x86_64", "amd64"}

@@ -36,6 +36,7 @@ __all__ = [
     "Report",
     "Task",
     "available_cores",
+    "crashed",
     "serve",
     "worker_count",
 ]
@@ -246,6 +247,12 @@ def _last_words(code: int) -> str:
     return f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit status {code}"
 
 
+def crashed(error: Exception) -> WorkFailedError:
+    """Return what a task raised that it should not, as an error of ours."""
+    last = "".join(traceback.format_exception(error, limit=-6))
+    return WorkFailedError("a worker crashed", got=f"{error!r}\n{last}")
+
+
 def serve(descriptor: int) -> None:
     """Run the tasks that arrive on a socket until the other end closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -258,8 +265,7 @@ def serve(descriptor: int) -> None:
         except LagbenchError as error:
             reply = ("error", error)
         except Exception as error:
-            last = traceback.format_exc(limit=-6)
-            reply = ("error", WorkFailedError("a worker crashed", got=f"{error!r}\n{last}"))
+            reply = ("error", crashed(error))
         channel.send(reply)
 
 

@@ -6,10 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-__all__ = [
-    "Meter",
-    "Progress",
-]
+__all__ = ["Meter", "Progress"]
 
 
 @dataclass(frozen=True, kw_only=True)

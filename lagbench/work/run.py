@@ -6,22 +6,26 @@ jobs ran.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
 from typing import TypeVar
 
 from .cluster import Cluster
 from .pool import Pool, Report, Task
 
-__all__ = [
-    "run_all",
-]
-
+__all__ = ["ONE_THREAD", "read_many", "run_all"]
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
-ENVIRONMENT = {"OMP_NUM_THREADS": "1"}
-"""Threads of a library would only take the cores from the other workers."""
+WORTH_WORKERS = 1 << 30
+"""Bytes of files below which starting processes to read them costs more than it gains."""
+
+ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+"""Environment of workers: threads of NumPy and HDF5 would only take the cores from the others.
+
+A Dask worker has it from Dask.
+"""
 
 
 def run_all(
@@ -34,10 +38,25 @@ def run_all(
 ) -> list[Result]:
     """Run a function on jobs and return the results in the order of the jobs."""
     if scheduler is not None:
-        return _with(Cluster(scheduler, ENVIRONMENT), function, jobs, report)
+        return _with(Cluster(scheduler), function, jobs, report)
     if workers > 1 and len(jobs) > 1:
-        return _with(Pool(min(workers, len(jobs)), ENVIRONMENT), function, jobs, report)
+        return _with(Pool(min(workers, len(jobs)), ONE_THREAD), function, jobs, report)
     return [function(job, report) for job in jobs.values()]
+
+
+def read_many(
+    function: Callable[[Job, Report], Result],
+    jobs: Mapping[str, Job],
+    files: Iterable[Path],
+    report: Report,
+    *,
+    workers: int = 1,
+    scheduler: str | None = None,
+) -> list[Result]:
+    """Run a function that reads files: here where they hold little, else by the workers."""
+    if sum(path.stat().st_size for path in files if path.exists()) < WORTH_WORKERS:
+        return run_all(function, jobs, report=report)
+    return run_all(function, jobs, workers=workers, scheduler=scheduler, report=report)
 
 
 def _with(
@@ -47,10 +66,10 @@ def _with(
     report: Report,
 ) -> list[Result]:
     results: dict[str, Result] = {}
-    with workers as crew:
+    with workers as team:
         for name, job in jobs.items():
-            crew.submit(Task(name=name, function=function, arguments=(job,)))
-        for event in crew.events():
+            team.submit(Task(name=name, function=function, arguments=(job,)))
+        for event in team.events():
             if event.kind == "done":
                 results[event.task.name] = event.value
             else:

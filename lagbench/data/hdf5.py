@@ -89,7 +89,7 @@ KINDS = {
 LINKS = {h5py.h5l.TYPE_SOFT: "soft link", h5py.h5l.TYPE_EXTERNAL: "external link"}
 OBJECTS = {h5py.h5o.TYPE_GROUP: "group", h5py.h5o.TYPE_DATASET: "variable"}
 
-_WRITE = "write it with lagbench.submission.write, or with chunks (1, 1, particle, space)"
+AGAIN = "write the file again; if it was copied or downloaded, compare its length"
 
 
 # --- the file itself -----------------------------------------------------------------------
@@ -124,9 +124,8 @@ def check_regular(path: Path, *, longest: int | None = None, fix: str | None = N
     return status.st_size
 
 
-def check_file(path: Path, *, longest: int | None = None) -> None:
+def check_file(path: Path, *, longest: int | None = None, fix: str = AGAIN) -> None:
     """Refuse what is no HDF5 file by its kind, length and first bytes."""
-    fix = "write it with lagbench.submission.write, or fill what `lagbench template` writes"
     check_regular(path, longest=longest, fix=fix)
     try:
         with path.open("rb") as stream:
@@ -142,7 +141,7 @@ def check_file(path: Path, *, longest: int | None = None) -> None:
     if head != SIGNATURE:
         got = next((what for start, what in FOREIGN.items() if head.startswith(start)), _guess(head))
         raise UnreadableFileError(
-            "not a netCDF4 file", where=str(path), expected="netCDF4, which is HDF5", got=got, fix=fix
+            "not an HDF5 file", where=str(path), expected="HDF5, as netCDF4 is", got=got, fix=fix
         )
 
 
@@ -163,16 +162,16 @@ def reading(path: Path, variable: str | None = None) -> Iterator[None]:
         raise UnreadableFileError(
             "HDF5 cannot read the file",
             where=str(path) if variable is None else f"{path}, variable {variable!r}",
-            expected="an undamaged netCDF4 file",
+            expected="an undamaged HDF5 file",
             got=f"{type(error).__name__}: {' '.join(str(error).split())[:300]}",
-            fix="write the file again; if it was copied or downloaded, compare its length",
+            fix=AGAIN,
         ) from error
 
 
 @contextmanager
-def opened(path: Path, *, longest: int | None = None) -> Iterator[h5py.File]:
+def opened(path: Path, *, longest: int | None = None, fix: str = AGAIN) -> Iterator[h5py.File]:
     """Open an HDF5 file for reading: no lock, nothing but a regular file of bounded length."""
-    check_file(path, longest=longest)
+    check_file(path, longest=longest, fix=fix)
     with reading(path):
         file = h5py.File(path, "r", locking=False)
     try:

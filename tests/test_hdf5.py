@@ -11,8 +11,8 @@ import h5py
 import numpy as np
 import pytest
 
+from lagbench.data.hdf5 import Structure, check_regular, check_structure, opened
 from lagbench.errors import UnreadableFileError
-from lagbench.submission.hdf5 import Structure, check_regular, check_structure, opened
 
 ANY = Structure(groups=None)
 

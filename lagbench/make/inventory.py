@@ -1,0 +1,257 @@
+"""Which scenarios of a data set are on disk, and whether their content is right, hash by hash.
+
+Right means: the file says what it is in the place where it stands, its parameters are those
+of the registry, its values have the hash that it states, and that hash is the one in
+datasets.yaml; where there is none yet, the one in the manifest. A file of a machine that
+promises no equal bits may differ from datasets.yaml, but not from its manifest.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from pathlib import Path
+
+from lagbench.data.checksums import file_sha256, plain
+from lagbench.data.layout import dataset_folder, scenario_path
+from lagbench.data.local import DESCRIPTION
+from lagbench.data.manifest import FileEntry, Manifest, describe_file
+from lagbench.data.registry import Size, spell_ids
+from lagbench.data.scenario import ScenarioHeader, check_scenario, read_scenario
+from lagbench.errors import DataError
+from lagbench.generators.batch import draw
+from lagbench.generators.simulate import OUTCOMES, file_parameters, scenario_key
+from lagbench.work.machine import may_differ
+
+__all__ = [
+    "Finding",
+    "Look",
+    "State",
+    "compare",
+    "examine",
+    "extra_files",
+    "hash_verdict",
+    "look",
+    "other_bits",
+    "record_of",
+    "recorded_hash",
+    "unlike",
+    "unlike_measures",
+]
+
+
+class State(enum.StrEnum):
+    """What became of a scenario's file."""
+
+    GOOD = "good"
+    MISSING = "missing"
+    WRONG = "wrong"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """What a look at one scenario's file showed."""
+
+    scenario: int  # its id
+    state: State  # whether the file is there and right
+    content_sha256: str | None = None  # content hash of a good file
+    problem: str | None = None  # what is wrong, naming file and, where it can be told, variable
+    entry: FileEntry | None = None  # manifest entry of a good file, where one was asked for
+    tolerated: bool = False  # whether a good file has other bits than datasets.yaml
+
+
+def recorded_hash(size: Size, scenario: int) -> str | None:
+    """Return the first 16 digits of a content hash as they are recorded, or None."""
+    return size.measured.scenario_sha256.get(scenario) if size.measured else None
+
+
+def examine(
+    root: Path, size: Size, scenario: int, *, manifest: Manifest | None = None, quick: bool = False
+) -> Finding:
+    """Look at the file of one scenario."""
+    key = scenario_key(size, scenario)
+    path = scenario_path(root, key)
+    if not path.exists():
+        return Finding(scenario=scenario, state=State.MISSING)
+    claim = manifest.entry(scenario) if manifest else None
+    try:
+        digest = file_sha256(path) if quick else None
+        with read_scenario(path) as file:
+            _check_header(path, file.header, size, scenario)
+            unchanged = claim is not None and digest == claim.file_sha256
+            if unchanged:
+                file.check_attributes()
+        content = claim.content_sha256 if claim and unchanged else check_scenario(path)
+        recorded = recorded_hash(size, scenario)
+        tolerated = _check_known(path, content, recorded, claim, manifest, record=record_of(size))
+        entry = describe_file(root, key, digest=digest) if digest and not unchanged else claim
+    except (DataError, OSError) as error:
+        return Finding(scenario=scenario, state=State.WRONG, problem=_spelled(error, path))
+    return Finding(
+        scenario=scenario,
+        state=State.GOOD,
+        content_sha256=content,
+        entry=entry if quick else None,
+        tolerated=tolerated,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Look:
+    """The arguments of a quick :func:`examine`, for a worker."""
+
+    root: Path  # folder that holds all data sets
+    size: Size  # tier of a split
+    scenario: int  # id
+    manifest: Manifest  # what the folder's manifest says of this scenario
+
+
+def look(order: Look, report: Callable[[int], None]) -> Finding:
+    """Examine the file of one scenario quickly and report it as one unit of work."""
+    finding = examine(order.root, order.size, order.scenario, manifest=order.manifest, quick=True)
+    report(1)
+    return finding
+
+
+def _spelled(error: DataError | OSError, path: Path) -> str:
+    if not isinstance(error, DataError):
+        return f"cannot read {path}: {error.strerror}"
+    # How to mend it depends on the split, and is said once for all files.
+    return str(DataError(error.what, where=error.where, expected=error.expected, got=error.got))
+
+
+def extra_files(root: Path, size: Size) -> dict[str, list[str]]:
+    """Return, by subset folder, the names of files that no scenario of the size has."""
+    folder = dataset_folder(root, size.split, size.name, size.major)
+    known = {(subset, f"{i:04d}.nc") for subset, ids in size.subsets.items() for i in ids}
+    extra: dict[str, list[str]] = {}
+    for path in sorted(folder.glob("*/*.nc")):
+        if (path.parent.name, path.name) not in known and not path.name.startswith("."):
+            extra.setdefault(path.parent.name, []).append(path.name)
+    return extra
+
+
+def _check_header(path: Path, header: ScenarioHeader, size: Size, scenario: int) -> None:
+    """Refuse a file of another scenario or simulated with other parameters."""
+    key = header.key
+    found = (key.split, key.size, key.major, key.scenario, key.subset)
+    wanted = (size.split, size.name, size.major, scenario, size.subset_of(scenario))
+    if found != wanted:
+        raise DataError("a file holds another scenario", where=str(path), expected=wanted, got=found)
+    if not size.simulated:  # then the recorded content hash covers the parameters
+        return
+    drawn = file_parameters(size, draw(size, scenario))
+    parameters = {name: plain(value) for name, value in drawn.items()}
+    # What only the simulation tells is covered by the content hash.
+    stated = {name: value for name, value in header.parameters.items() if name not in OUTCOMES}
+    if parameters != stated:
+        names = sorted(n for n in parameters.keys() | stated.keys() if parameters.get(n) != stated.get(n))
+        raise DataError(
+            "a file was simulated with other parameters",
+            where=f"{path}, attributes {', '.join(names)}",
+            expected="those of datasets.yaml",
+        )
+
+
+def _check_known(
+    path: Path,
+    content: str,
+    recorded: str | None,
+    claim: FileEntry | None,
+    manifest: Manifest | None,
+    *,
+    record: str,
+) -> bool:
+    """Compare a content hash with what is known; return whether its being another is tolerated."""
+    expected = recorded or (claim.content_sha256 if claim else None)
+    if expected is None or content.startswith(expected):
+        return False
+    if (
+        manifest is not None
+        and manifest.identity == "tolerance"
+        and claim is not None
+        and claim.content_sha256 == content
+        and may_differ(claim.device, manifest.environments)
+    ):
+        return True
+    raise DataError(
+        "the file has another content hash",
+        where=str(path),
+        expected=f"{expected} of {record if recorded else 'the manifest'}",
+        got=content,
+    )
+
+
+def record_of(size: Size) -> str:
+    """Return the name of the file that records the hashes of a split."""
+    return "datasets.yaml" if size.simulated else DESCRIPTION
+
+
+def compare(size: Size, manifest: Manifest, *, promised: Collection[int] = ()) -> str:
+    """Return how the hashes of a manifest compare with datasets.yaml, in words."""
+    measured, record = size.measured, record_of(size)
+    if measured is None:
+        return f"{record} holds no hash of this size yet: nothing to compare with"
+    recorded = measured.scenario_sha256
+    differing = [e.scenario for e in manifest.files if not e.has_hash(recorded.get(e.scenario))]
+    tolerated = {e.scenario for e in manifest.files if may_differ(e.device, manifest.environments)}
+    tolerated -= set(promised)
+    broken = [i for i in differing if i not in tolerated]
+    if broken:
+        what = f"{len(broken)} of {len(manifest.files)} scenarios have another hash"
+        raise _broken(what, f"{size.split} {size.name}, scenarios {spell_ids(broken)}", record)
+    if differing:
+        return f"scenarios {spell_ids(differing)} have {other_bits(size)}"
+    found = {**manifest.subset_sha256, "the data set": manifest.dataset_sha256}
+    wanted = {**measured.subset_sha256, "the data set": measured.dataset_sha256}
+    others = [name for name, digest in found.items() if digest is not None and digest != wanted.get(name)]
+    if others:
+        where = f"{size.split} {size.name}, {', '.join(others)}"
+        raise _broken(
+            "subsets or the data set have another hash though every scenario has its own", where, record
+        )
+    return f"equal to {record}" if manifest.complete else f"what is there is equal to {record}"
+
+
+def unlike(size: Size) -> str:
+    """Return the words for a hash that is not the recorded one."""
+    return f"NOT that of {record_of(size)}"
+
+
+def other_bits(size: Size) -> str:
+    """Return the words for bits that may be others."""
+    return f"other bits than {record_of(size)} (identity: tolerance)"
+
+
+def hash_verdict(size: Size, computed: str | None, recorded: str | None, *, tolerated: bool = False) -> str:
+    """Return how one subset or data set hash compares with the recorded one, in words."""
+    if recorded is None:
+        return f"no hash in {record_of(size)} yet"
+    if computed is None:
+        return "incomplete"
+    if computed == recorded:
+        return f"equal to {record_of(size)}"
+    return other_bits(size) if tolerated else unlike(size)
+
+
+def unlike_measures(size: Size, manifest: Manifest) -> list[str]:
+    """Return the statistics, and the twin floor, of a manifest that datasets.yaml has otherwise.
+
+    They follow from the bits, so a manifest that is complete and bitwise must have them.
+    """
+    measured = size.measured
+    if measured is None or not manifest.complete or manifest.identity != "bitwise":
+        return []
+    names = sorted(measured.statistics.keys() | manifest.statistics.keys())
+    found = [n for n in names if measured.statistics.get(n) != manifest.statistics.get(n)]
+    return found + (["twin floor"] if manifest.mean_twin_floor() != measured.twin_floor else [])
+
+
+def _broken(what: str, where: str, record: str) -> DataError:
+    return DataError(
+        what,
+        where=where,
+        expected=f"the hashes in {record}",
+        fix="see docs/determinism.md; `lagbench doctor` prints what a report needs",
+    )
