@@ -25,8 +25,8 @@ from pytest_benchmark.fixture import BenchmarkFixture
 from torch.utils.data import DataLoader
 from window_data import FRAMES, write_gns_npz, write_lagrangebench_h5, write_ours
 
-from lagbench.baselines.windows import WindowDataset, WindowSampler, collate
 from lagbench.data.registry import load
+from lagbench.torch import WindowDataset, WindowSampler, collate
 
 TARGET = 1000.0
 """Windows per second in one process."""
@@ -46,7 +46,7 @@ SEED = 0
 CHILD = """
 import json, sys
 from pathlib import Path
-from lagbench.baselines.windows import WindowDataset, WindowSampler
+from lagbench.torch import WindowDataset, WindowSampler
 from lagbench.data.registry import load
 root, windows = Path(sys.argv[1]), int(sys.argv[2])
 data = WindowDataset("cavity", root=root, history=6, registry=load(root / "datasets.yaml"))
