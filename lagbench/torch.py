@@ -65,7 +65,7 @@ def tensors(window: Arrays) -> Window:
 class WindowDataset(WindowReader, Dataset[Window]):
     """Map-style data set of all windows of ``history + future`` consecutive frames.
 
-    Give :func:`collate` to the DataLoader: windows may differ in their number of particles.
+    Give `collate` to the DataLoader: windows may differ in their number of particles.
     Workers open files of their own, so any start method works. Memory does not grow with the
     size of the split: each process keeps at most `cache_bytes` of frames.
 
@@ -73,7 +73,7 @@ class WindowDataset(WindowReader, Dataset[Window]):
         split: name of the split, or path of a local split's folder.
         subset: train, valid, test or, for multimaterial, extra; or several of them.
         size: name of the size.
-        root: folder of all data sets, see :func:`lagbench.data.layout.resolve_root`.
+        root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
         history: frames that a model is given; those of the task by default.
         future: frames after them.
         registry: what describes the data set; ours by default.
@@ -220,7 +220,7 @@ class WindowSampler(Sampler[int]):
         self.epoch, self.position = epoch, position
 
     def state_dict(self) -> dict[str, int]:
-        """Return what :meth:`load_state_dict` takes to continue here, in mid-epoch too."""
+        """Return what `load_state_dict` takes to continue here, in mid-epoch too."""
         return {"seed": self.seed, "epoch": self.epoch, "position": self.position}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:

@@ -214,7 +214,7 @@ def bibtex_fields(text: str) -> dict[str, str]:
     assert text.count("{") == text.count("}")
     kind, _, body = text.strip().partition("{")
     assert kind in {"@software", "@misc"}
-    return {name: value for name, value in re.findall(r"^  (\w+) = \{(.*)\},$", body, re.MULTILINE)}
+    return dict(re.findall(r"^  (\w+) = \{(.*)\},$", body, re.MULTILINE))
 
 
 def test_doctor_finds_this_machine_fit(run: Run, tmp_path: Path) -> None:

@@ -46,7 +46,10 @@ __all__ = [
     "doctor",
 ]
 
-TITLE = "lagbench: bit-reproducible data sets and benchmarks for neural surrogates of Lagrangian continuum simulators"
+TITLE = (
+    "lagbench: bit-reproducible data sets and benchmarks "
+    "for neural surrogates of Lagrangian continuum simulators"
+)
 RELEASED = 2026
 """Year of this version; it and the title as in CITATION.cff."""
 

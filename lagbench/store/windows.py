@@ -43,7 +43,7 @@ class WindowReader:
 
     Files are opened by the process that reads from them, at most 32 at a time; decompressed
     frames are kept up to `cache_bytes` in each process. Stored data are never changed: every
-    window is a copy. :func:`windows` says what the arguments are.
+    window is a copy. `windows` says what the arguments are.
     """
 
     def __init__(
@@ -142,13 +142,13 @@ def windows(
     ``data[i]`` has ``position`` [length], float32, shape [particle, frame, 2]; ``material``, int8,
     shape [particle]; ``wall_velocity`` [length/s], float32, shape [frame, wall, 2], or None; the
     ids ``scenario`` and ``frame``. ``data.size`` holds what is published of the data set.
-    :class:`lagbench.torch.WindowDataset` gives the same windows as tensors.
+    `lagbench.torch.WindowDataset` gives the same windows as tensors.
 
     Args:
         split: name of the split, or path of a local split's folder.
         subset: train, valid, test or, for multimaterial, extra; or several of them.
         size: name of the size.
-        root: folder of all data sets, see :func:`lagbench.data.layout.resolve_root`.
+        root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
         history: frames that a model is given; those of the task by default.
         future: frames after them.
         registry: what describes the data set; ours by default.
