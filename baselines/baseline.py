@@ -3,20 +3,19 @@
 A baseline is one file: a subclass of :class:`Baseline` with its options, named by an entry
 point of the group ``lagbench.baselines``. Training, checkpoints, rollouts, predictions and
 scores then work without another line.
-
-Windows of trajectories side by side: what every baseline is trained on and rolled out from.
 """
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar, Self
 
 import torch
 from pydantic import BaseModel, ConfigDict
 from torch import Tensor, nn
+
+from lagbench.torch import Batch
 
 from .facts import Facts
 
@@ -25,46 +24,6 @@ __all__ = [
     "Baseline",
     "Options",
 ]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Batch:
-    """Several windows of consecutive frames, their particles in one row."""
-
-    position: Tensor  # particle positions [length], float32, shape [particle, frame, 2]
-    sample: Tensor  # window that each particle belongs to, ascending, int64, shape [particle]
-    material: Tensor  # 0 liquid, 1 jelly, 2 snow, 3 rope, int64, shape [particle]
-    # what acts on the way to each frame of the windows, and to those after them as far as it is known: the
-    # forcing of a scenario is given for all frames. Velocity of the walls [length/s], shape
-    # [window, frame, wall, 2]; None in a split without moving walls.
-    wall_velocity: Tensor | None
-    scenario: Tensor  # scenario id of each window, int64, shape [window]
-    frame: Tensor  # absolute number of each window's first frame, int64, shape [window]
-
-    @property
-    def windows(self) -> int:
-        """Windows in the batch."""
-        return len(self.scenario)
-
-    @property
-    def frames(self) -> int:
-        """Frames in every window."""
-        return self.position.shape[1]
-
-    def part(self, frames: slice) -> Self:
-        """Return some frames of every window; `frame` follows, and the forcing of later frames stays."""
-        first = range(self.frames)[frames][0]
-        walls = None if self.wall_velocity is None else self.wall_velocity[:, first:]
-        return replace(self, position=self.position[:, frames], wall_velocity=walls, frame=self.frame + first)
-
-    def to(self, device: torch.device | str) -> Self:
-        """Return the batch on a device."""
-        moved = {
-            field.name: value.to(device)
-            for field in fields(self)
-            if isinstance(value := getattr(self, field.name), Tensor)
-        }
-        return replace(self, **moved)
 
 
 class Options(BaseModel):

@@ -13,11 +13,11 @@ from torch.optim import AdamW, Optimizer
 from torch.utils.data import DataLoader
 
 from lagbench.errors import WorkFailedError
+from lagbench.torch import Window
 
 from .baseline import Baseline, Batch
 from .recipe import TrainingOptions
 from .seeding import reseed, seed_of
-from .windows import Window
 
 __all__ = ["TOTAL", "TrainingModule", "weighted_sum"]
 

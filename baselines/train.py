@@ -31,6 +31,7 @@ from lagbench.data.local import locate
 from lagbench.data.registry import Registry
 from lagbench.errors import DataError, UsageError
 from lagbench.submission.budget import Track, track_of
+from lagbench.torch import Window, WindowDataset, WindowSampler, collate
 from lagbench.work.progress import Meter, Progress
 
 from .baseline import Baseline
@@ -52,7 +53,7 @@ from .recipe import recipe_for
 from .seeding import generators_kept, reseed, seed_of
 from .symmetry import check_symmetry
 from .validation import validation_of
-from .windows import Window, WindowDataset, WindowSampler, collate, scenario_batch
+from .windows import scenario_batch
 
 __all__ = [
     "TrainingResult",

@@ -22,7 +22,7 @@ from lagbench.baselines.catalogue import find
 from lagbench.baselines.facts import facts_of
 from lagbench.baselines.machine import multiplies_bfloat16
 from lagbench.baselines.recipe import Recipe, recipe_for
-from lagbench.baselines.windows import WindowDataset, collate
+from lagbench.torch import WindowDataset, collate
 
 SPLITS = ("cavity", "curl-noise", "fluid", "multimaterial")
 OPERATORS = ("gns", "supergat", "gat", "gatv2", "pointnet", "transformer")

@@ -25,8 +25,9 @@ from pytest_benchmark.fixture import BenchmarkFixture
 from torch.utils.data import DataLoader
 from window_data import FRAMES, write_gns_npz, write_lagrangebench_h5, write_ours
 
-from lagbench.baselines.windows import WindowDataset, WindowSampler, collate
-from lagbench.data.registry import load
+import lagbench
+from lagbench.data.registry import REGISTRY_VARIABLE, load
+from lagbench.torch import RUN, WindowDataset, WindowSampler, collate
 
 TARGET = 1000.0
 """Windows per second in one process."""
@@ -46,7 +47,7 @@ SEED = 0
 CHILD = """
 import json, sys
 from pathlib import Path
-from lagbench.baselines.windows import WindowDataset, WindowSampler
+from lagbench.torch import WindowDataset, WindowSampler
 from lagbench.data.registry import load
 root, windows = Path(sys.argv[1]), int(sys.argv[2])
 data = WindowDataset("cavity", root=root, history=6, registry=load(root / "datasets.yaml"))
@@ -99,6 +100,35 @@ def test_windows_per_second(benchmark: BenchmarkFixture, root: Path) -> None:
     print(f"\nours, sampler's order: {min(rates):.0f} windows/s (target {TARGET:.0f})")
     print(f"ours through DataLoader and collate, batch 2: {loaded:.0f}; any order, cold cache: {plain:.0f}")
     assert min(rates) >= TARGET
+
+
+def test_public_routes(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The public arrays are read within 10 % of the rate of the trainer's tensors."""
+    tensors = dataset(root)
+    arrays = lagbench.windows("cavity", root=root, history=HISTORY, registry=load(root / "datasets.yaml"))
+    order = list(WindowSampler(tensors, seed=SEED))
+    spent: dict[str, float] = {"tensors": 0.0, "arrays": 0.0}
+    # In turns over the same windows, so that a machine that slows down slows both.
+    for first in range(0, len(order), RUN):
+        for name, data in (("tensors", tensors), ("arrays", arrays)):
+            start = time.process_time()
+            for index in order[first : first + RUN]:
+                data[index]
+            spent[name] += time.process_time() - start
+    monkeypatch.setenv(REGISTRY_VARIABLE, str(root / "datasets.yaml"))
+    lazy = lagbench.open_split("cavity", subset="train", root=root)
+
+    def read(index: int) -> NDArray[np.float32]:
+        scenario, frame = tensors.place(index)
+        part = lazy.position.sel(scenario=scenario).isel(frame=slice(frame, frame + tensors.length))
+        values: NDArray[np.float32] = part.values
+        return values
+
+    ratio = spent["tensors"] / spent["arrays"]
+    print(f"\nlagbench.torch.WindowDataset, the trainer's: {len(order) / spent['tensors']:.0f} windows/s")
+    print(f"lagbench.windows: {len(order) / spent['arrays']:.0f}, {ratio:.2f} times that")
+    print(f"open_split: {rate(read, iter(order), 60):.0f}")
+    assert ratio > 0.9
 
 
 def test_memory_is_flat(root: Path, tmp_path: Path) -> None:

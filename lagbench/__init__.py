@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from lagbench.scoring.compare import compare
     from lagbench.scoring.score import score
     from lagbench.store.dataset import list_splits, load_manifest, open_split
+    from lagbench.store.windows import windows
 
     from . import submission
     from .submission import template, validate
@@ -34,12 +35,14 @@ __all__ = [
     "template",
     "validate",
     "verify",
+    "windows",
 ]
 
 _HOMES = {
     "open_split": "store.dataset",
     "list_splits": "store.dataset",
     "load_manifest": "store.dataset",
+    "windows": "store.windows",
     "generate": "make.generate",
     "verify": "make.verify",
     "template": "submission",

@@ -9,11 +9,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import yaml
 from conftest import SIZE, SPLIT
 from typer.testing import CliRunner, Result
 
 from lagbench.cli.app import app
-from lagbench.data.registry import default_path
+from lagbench.data.registry import default_path, load
 from lagbench.make.generate import GenerationResult
 
 COMMANDS = ["list", "info", "generate", "verify", "plot", "animate", "cite", "doctor", "clean"]
@@ -189,6 +190,31 @@ def test_cite_names_version_hash_and_works(run: Run) -> None:
     assert "version 2.0.0" in text
     assert "Ghia" in text
     assert json.loads(run("cite", "cavity", "--json").stdout)["licence"] == "CC-BY-4.0"
+
+
+def test_bibtex_is_what_citation_cff_says(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of lagbench: title, version and year of CITATION.cff; of a split: its version and every hash."""
+    monkeypatch.delenv("LAGBENCH_REGISTRY")
+    cff = yaml.safe_load((Path(__file__).parent.parent / "CITATION.cff").read_text())
+    own = bibtex_fields(run("cite", "--bibtex").stdout)
+    assert own == {
+        "author": "{The lagbench authors}",
+        "title": cff["title"],
+        "version": cff["version"],
+        "year": str(cff["date-released"].year),
+    }
+    split = bibtex_fields(run("cite", "cavity", "--bibtex").stdout)
+    hashes = [held.dataset_sha256 for held in load().measured["cavity"].values()]
+    assert split["version"] == load().split("cavity").version
+    assert len(hashes) == sum(value in split["note"] for value in hashes) == 3
+
+
+def bibtex_fields(text: str) -> dict[str, str]:
+    """Return the fields of the one entry of a BibTeX text, whose braces must match."""
+    assert text.count("{") == text.count("}")
+    kind, _, body = text.strip().partition("{")
+    assert kind in {"@software", "@misc"}
+    return dict(re.findall(r"^  (\w+) = \{(.*)\},$", body, re.MULTILINE))
 
 
 def test_doctor_finds_this_machine_fit(run: Run, tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ LAYERS = (
     ("work",),
     ("data",),
     ("store",),
-    ("generators", "metrics", "draw"),
+    ("generators", "metrics", "draw", "torch"),
     ("submission",),
     ("make",),
     ("floors",),
@@ -159,6 +159,7 @@ assert CliRunner().invoke(app, {}).exit_code == 0
     [
         ("import lagbench", set()),
         ("import lagbench; lagbench.generate", {"numpy"}),
+        ("import lagbench; lagbench.windows", {"numpy"}),
         ("import lagbench.cli.app", set()),
         (RUN.format(["--help"]), set()),
         (RUN.format(["generate", "--help"]), set()),

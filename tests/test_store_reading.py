@@ -16,7 +16,6 @@ from typer.testing import CliRunner
 
 import lagbench
 from lagbench.baselines.facts import facts_of
-from lagbench.baselines.frame_store import sources_of
 from lagbench.cli.app import app
 from lagbench.data.layout import as_url, resolve_root, url_of
 from lagbench.data.registry import Registry
@@ -27,6 +26,7 @@ from lagbench.make.overview import overview
 from lagbench.make.verify import verify
 from lagbench.store import copy
 from lagbench.store.fetch import partial_name
+from lagbench.store.frames import sources_of
 from lagbench.store.objects import WrongContentError, WrongLengthError
 from lagbench.submission import template
 

@@ -24,10 +24,10 @@ from lagbench.baselines.checkpoint import load
 from lagbench.baselines.module import TrainingModule
 from lagbench.baselines.recipe import TrainingOptions
 from lagbench.baselines.train import StepBatches, TrainingResult, train
-from lagbench.baselines.windows import WindowDataset, WindowSampler
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError, WorkFailedError
 from lagbench.make.generate import GenerationResult
+from lagbench.torch import WindowDataset, WindowSampler
 from lagbench.work.progress import Progress
 
 Run = Callable[..., TrainingResult]

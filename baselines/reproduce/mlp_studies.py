@@ -88,7 +88,7 @@ def one_step_error(plan: Plan, split: str, folder: Path, subset: str) -> float:
     import torch
 
     from lagbench.baselines.checkpoint import load, restore
-    from lagbench.baselines.windows import WindowDataset, collate
+    from lagbench.torch import WindowDataset, collate
 
     model = restore(load(folder / "weights.pt")).eval()
     data = WindowDataset(

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+import lagbench
+
 from .options import (
     DeviceOption,
     JsonFlag,
@@ -25,7 +27,7 @@ from .options import (
     WorkersOption,
     chosen,
 )
-from .output import print_json, print_table, progress_bar, show, spell_bytes, spell_seconds
+from .output import print_json, print_table, progress_bar, say, show, spell_bytes, spell_seconds
 
 if TYPE_CHECKING:
     from lagbench.data.registry import Registry, Size
@@ -34,6 +36,13 @@ if TYPE_CHECKING:
     from lagbench.make.verify import VerificationResult
 
 __all__ = ["cite", "clean", "doctor", "generate", "info", "list_splits", "verify"]
+
+TITLE = (
+    "lagbench: bit-reproducible data sets and benchmarks "
+    "for neural surrogates of Lagrangian continuum simulators"
+)
+RELEASED = 2026
+"""Year of this version; it and the title as in CITATION.cff."""
 
 
 def generate(
@@ -262,12 +271,18 @@ def _facts(registry: Registry, split: str, sizes: list[Size], found: list[Overvi
 def cite(
     name: SplitArgument = None,
     split: SplitOption = None,
+    bibtex: Annotated[
+        bool, typer.Option("--bibtex", help="Print BibTeX; without a split, of lagbench itself.")
+    ] = False,
     root: RootOption = None,
     as_json: JsonFlag = False,
 ) -> None:
     """Print how to cite a split: version, hashes of its sizes, and the works behind it."""
     from lagbench.data.local import home
 
+    if bibtex and not (name or split):
+        say(_bibtex("software", "lagbench", title=TITLE, version=lagbench.__version__))
+        return
     split_name, _, registry = home(chosen(name, split), root=root)
     entry = registry.split(split_name)
     measured = registry.measured.get(split_name, {})
@@ -280,12 +295,36 @@ def cite(
         "citation": entry.citation,
         "dataset_sha256": hashes,
     }
+    if bibtex:
+        held = ", ".join(f"{size} {value}" for size, value in hashes.items())
+        note = f"After {entry.citation}. SHA-256 of the data sets: {held}"
+        title = f"{entry.title}: split {split_name} of lagbench"
+        say(
+            _bibtex(
+                "misc",
+                f"lagbench-{split_name}",
+                title=title,
+                version=entry.version,
+                license=entry.licence,
+                note=note,
+            )
+        )
+        return
     words = [
         f"lagbench, split {split_name!r} ({entry.title}), version {entry.version}, {entry.licence}.",
         f"After: {entry.citation}.",
         *(f"Data set hash of size {size}: {value}" for size, value in hashes.items()),
     ]
     show(facts, words, as_json=as_json)
+
+
+def _bibtex(kind: str, key: str, **fields: str) -> str:
+    """Return a BibTeX entry by the authors of lagbench; what TeX would read as a command is escaped."""
+    plain = str.maketrans({character: f"\\{character}" for character in "&%$#_{}"} | {"\\": "/"})
+    year = str(RELEASED)
+    lines = [f"  {name} = {{{value.translate(plain)}}}," for name, value in {**fields, "year": year}.items()]
+    # The inner braces keep BibTeX from taking the name apart.
+    return "\n".join([f"@{kind}{{{key},", "  author = {{The lagbench authors}},", *lines, "}"])
 
 
 def doctor(root: RootOption = None, as_json: JsonFlag = False) -> None:

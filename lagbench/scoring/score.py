@@ -63,7 +63,7 @@ def score(
 
     Args:
         predictions: a predictions.nc.
-        root: folder of all data sets, see :func:`lagbench.data.layout.resolve_root`.
+        root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
         output_dir: folder for the two files; by default that of a predictions.nc, and beside a file of
             another name the folder of that name.
         workers: worker processes; by default one per core where the work is worth it.

@@ -38,7 +38,7 @@ def load_manifest(split: str, *, size: str = "full", root: str | Path | None = N
     Args:
         split: name of the split, or path of a local split's folder.
         size: name of the size.
-        root: folder of all data sets, see :func:`lagbench.data.layout.resolve_root`.
+        root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
 
     Raises:
         UsageError: unknown split or size.
@@ -73,7 +73,7 @@ def open_split(
         split: name of the split, or path of a local split's folder.
         subset: train, valid, test or, for multimaterial, extra.
         size: name of the size.
-        root: folder of all data sets, see :func:`lagbench.data.layout.resolve_root`.
+        root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
 
     Returns:
         ``position`` and ``velocity`` with dims (scenario, frame, particle, space) as dask

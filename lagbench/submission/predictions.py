@@ -133,7 +133,7 @@ def open_predictions(path: str | Path) -> Predictions:
     """Open a predictions.nc without trusting it.
 
     Only the layout of the file is checked here, not its agreement with a data set: that is
-    :func:`lagbench.validate`, which also guards against files that make HDF5 loop or crash.
+    `lagbench.validate`, which also guards against files that make HDF5 loop or crash.
 
     Raises:
         UnreadableFileError: missing, not netCDF4, or damaged.

@@ -173,7 +173,7 @@ def validate(
 
     Args:
         path: the file.
-        root: folder of all data sets, see :func:`lagbench.data.layout.resolve_root`; the checks
+        root: folder of all data sets, else LAGBENCH_ROOT, else the user data folder; the checks
             ``start``, ``discontinuous_start`` and ``max_displacement`` need the test subset there.
         require_truth: whether a missing test subset is an error of the check ``dataset``, as it
             is for scoring; else those checks are skipped and say so.

@@ -387,7 +387,7 @@ def template(
         size: name of the size; the only one that is there when None.
         output: file to write.
         overwrite: whether to replace a file of that name.
-        root: folder of all data sets, see :func:`lagbench.data.layout.resolve_root`.
+        root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
         registry: where splits are described; ours when None.
 
     Raises:

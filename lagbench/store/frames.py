@@ -20,7 +20,8 @@ from lagbench.data.layout import ScenarioKey, major_of, scenario_path
 from lagbench.data.local import remedy
 from lagbench.data.registry import Size, spell_ids
 from lagbench.errors import DataError, LagbenchError, UsageError, nearest
-from lagbench.store.copy import bring
+
+from .copy import bring
 
 if TYPE_CHECKING:
     import h5py

@@ -1,0 +1,239 @@
+"""Windows of a split as PyTorch tensors: data set, order and batches.
+
+>>> from torch.utils.data import DataLoader
+>>> from lagbench.torch import WindowDataset, WindowSampler, collate
+>>> data = WindowDataset("cavity", size="mini")  # doctest: +SKIP
+>>> loader = DataLoader(data, 2, sampler=WindowSampler(data, seed=0), collate_fn=collate)  # doctest: +SKIP
+
+``shuffle=True`` works too; the sampler's order reads each frame about once, where a data set is larger than
+the cache. Needs PyTorch: ``pip install 'lagbench[baselines]'``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.utils.data import Dataset, Sampler
+
+from lagbench.errors import UsageError
+from lagbench.store.frames import CACHE_BYTES
+from lagbench.store.windows import Window as Arrays
+from lagbench.store.windows import WindowReader
+
+__all__ = [
+    "POOL_BYTES",
+    "RUN",
+    "Batch",
+    "Window",
+    "WindowDataset",
+    "WindowSampler",
+    "collate",
+    "tensors",
+]
+
+
+class Window(NamedTuple):
+    """Consecutive frames of one scenario."""
+
+    position: Tensor  # particle positions [length], float32, shape [particle, frame, 2]
+    material: Tensor  # 0 liquid, 1 jelly, 2 snow, 3 rope, int64, shape [particle]
+    # velocity of the walls [length/s], float32, shape [frame, wall, 2], of these frames and perhaps of later
+    # ones; None in a split without moving walls
+    wall_velocity: Tensor | None
+    scenario: int  # scenario id
+    frame: int  # absolute number of the first frame
+
+
+def tensors(window: Arrays) -> Window:
+    """Return a window's arrays as tensors; float32 arrays are shared, not copied."""
+    walls = window.wall_velocity
+    return Window(
+        torch.from_numpy(window.position),
+        torch.from_numpy(window.material).long(),
+        None if walls is None else torch.from_numpy(walls),
+        window.scenario,
+        window.frame,
+    )
+
+
+class WindowDataset(WindowReader, Dataset[Window]):
+    """Map-style data set of all windows of ``history + future`` consecutive frames.
+
+    Give `collate` to the DataLoader: windows may differ in their number of particles.
+    Workers open files of their own, so any start method works. Memory does not grow with the
+    size of the split: each process keeps at most `cache_bytes` of frames.
+
+    Args:
+        split: name of the split, or path of a local split's folder.
+        subset: train, valid, test or, for multimaterial, extra; or several of them.
+        size: name of the size.
+        root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
+        history: frames that a model is given; those of the task by default.
+        future: frames after them.
+        registry: what describes the data set; ours by default.
+        cache_bytes: frames kept decompressed [bytes]; with less, reading is slower, never different.
+
+    Raises:
+        UsageError: unknown split, size or subset, or no scenario is long enough.
+        DataError: scenarios are missing; the message has the command that makes them.
+    """
+
+    def __getitem__(self, index: int) -> Window:
+        """Return a window as tensors of its own."""
+        return tensors(self.read(index))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Batch:
+    """Several windows of consecutive frames, their particles in one row."""
+
+    position: Tensor  # particle positions [length], float32, shape [particle, frame, 2]
+    sample: Tensor  # window that each particle belongs to, ascending, int64, shape [particle]
+    material: Tensor  # 0 liquid, 1 jelly, 2 snow, 3 rope, int64, shape [particle]
+    # what acts on the way to each frame of the windows, and to those after them as far as it is known: the
+    # forcing of a scenario is given for all frames. Velocity of the walls [length/s], shape
+    # [window, frame, wall, 2]; None in a split without moving walls.
+    wall_velocity: Tensor | None
+    scenario: Tensor  # scenario id of each window, int64, shape [window]
+    frame: Tensor  # absolute number of each window's first frame, int64, shape [window]
+
+    @property
+    def windows(self) -> int:
+        """Windows in the batch."""
+        return len(self.scenario)
+
+    @property
+    def frames(self) -> int:
+        """Frames in every window."""
+        return self.position.shape[1]
+
+    def part(self, frames: slice) -> Self:
+        """Return some frames of every window; `frame` follows, and the forcing of later frames stays."""
+        first = range(self.frames)[frames][0]
+        walls = None if self.wall_velocity is None else self.wall_velocity[:, first:]
+        return replace(self, position=self.position[:, frames], wall_velocity=walls, frame=self.frame + first)
+
+    def to(self, device: torch.device | str) -> Self:
+        """Return the batch on a device."""
+        moved = {
+            field.name: value.to(device)
+            for field in fields(self)
+            if isinstance(value := getattr(self, field.name), Tensor)
+        }
+        return replace(self, **moved)
+
+
+def collate(windows: Sequence[Window]) -> Batch:
+    """Put windows side by side."""
+    walls = [window.wall_velocity for window in windows if window.wall_velocity is not None]
+    frames = {window.position.shape[1] for window in windows}
+    if len(frames) != 1 or len(walls) not in (0, len(windows)):
+        raise UsageError(
+            "windows do not fit side by side",
+            where="collate",
+            expected="windows of one split and one length",
+            got=f"lengths {sorted(frames)}, {len(walls)} of {len(windows)} with moving walls",
+        )
+    particles = torch.tensor([len(window.material) for window in windows])
+    return Batch(
+        position=torch.cat([window.position for window in windows]),
+        sample=torch.arange(len(windows)).repeat_interleave(particles),
+        material=torch.cat([window.material for window in windows]),
+        wall_velocity=torch.stack([wall[: min(map(len, walls))] for wall in walls]) if walls else None,
+        scenario=torch.tensor([window.scenario for window in windows]),
+        frame=torch.tensor([window.frame for window in windows]),
+    )
+
+
+RUN = 32
+"""Windows that follow each other in a scenario and are drawn from one pool, to share their frames."""
+
+POOL_BYTES = CACHE_BYTES
+"""Frames of the windows that are shuffled together [bytes]."""
+
+
+class WindowSampler(Sampler[int]):
+    """Draw every window once an epoch, in an order that follows from seed and epoch alone.
+
+    Windows of one scenario that follow each other are cut into runs of 32. An epoch is a random
+    order of all runs, taken in pools whose frames fill 256 MiB; the windows of a pool are shuffled.
+    So a frame is decompressed about once, not once for each window that holds it; where all frames
+    fit one pool, every order is equally likely.
+
+    With several ranks each takes every ranks-th window of the one order, and the last few windows
+    that do not go round are left out.
+    """
+
+    def __init__(
+        self, data: WindowDataset, *, seed: int, rank: int | None = None, ranks: int | None = None
+    ) -> None:
+        grouped = torch.distributed.is_available() and torch.distributed.is_initialized()
+        self.rank = rank if rank is not None else torch.distributed.get_rank() if grouped else 0
+        self.ranks = ranks if ranks is not None else torch.distributed.get_world_size() if grouped else 1
+        if not 0 <= self.rank < self.ranks <= len(data):
+            raise UsageError(
+                "no window for a rank",
+                where="WindowSampler",
+                expected=f"0 <= rank < ranks <= {len(data)}",
+                got=f"rank {self.rank} of {self.ranks}",
+            )
+        self.data = data  # what is drawn from
+        self.seed = seed  # seed of all epochs
+        self.epoch = 0  # epoch that is drawn from
+        self.position = 0  # windows of its order that the ranks together have drawn
+
+    def __len__(self) -> int:
+        """Return the windows of a whole epoch for one rank."""
+        return len(self.data) // self.ranks
+
+    def order(self, epoch: int) -> NDArray[np.int64]:
+        """Return the windows of an epoch in the order of all ranks together, shape [window]."""
+        rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence([self.seed, epoch])))
+        runs = [
+            run for ends in zip(self.data.starts, self.data.starts[1:], strict=False) for run in _cut(*ends)
+        ]
+        shuffled = [runs[i] for i in _permutation(rng, len(runs))]
+        pool = max(1, POOL_BYTES // (self.data.frame_bytes * (RUN + self.data.length - 1)))
+        pools = [np.concatenate(shuffled[i : i + pool]) for i in range(0, len(shuffled), pool)]
+        return np.concatenate([windows[_permutation(rng, len(windows))] for windows in pools])
+
+    def __iter__(self) -> Iterator[int]:
+        """Yield this rank's windows from the position to the end of the epoch; begin the next one."""
+        order = self.order(self.epoch)
+        for turn in range(self.position // self.ranks, len(self)):
+            self.position = (turn + 1) * self.ranks
+            yield int(order[turn * self.ranks + self.rank])
+        self.seek(self.epoch + 1)
+
+    def seek(self, epoch: int, position: int = 0) -> None:
+        """Continue at a place of an epoch.
+
+        Loaders with worker processes draw ahead of the training: give the position that follows
+        from the steps taken.
+        """
+        self.epoch, self.position = epoch, position
+
+    def state_dict(self) -> dict[str, int]:
+        """Return what `load_state_dict` takes to continue here, in mid-epoch too."""
+        return {"seed": self.seed, "epoch": self.epoch, "position": self.position}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue where another sampler of the same data stood."""
+        self.seed = int(state["seed"])
+        self.seek(int(state["epoch"]), int(state["position"]))
+
+
+def _cut(start: int, stop: int) -> list[NDArray[np.int64]]:
+    """Return the windows from start to stop in runs."""
+    return [np.arange(first, min(first + RUN, stop)) for first in range(start, stop, RUN)]
+
+
+def _permutation(rng: np.random.Generator, length: int) -> NDArray[np.intp]:
+    """Return a random order; NumPy promises the same bits for `random` alone."""
+    return np.argsort(rng.random(length), kind="stable")
