@@ -88,10 +88,10 @@ class GraphNetworkOptions(Options):
 
 
 class GraphNetwork(Baseline):
-    """A graph network whose node update is an operator; :meth:`with_operator` names it.
+    """A graph network that gathers by an operator; :meth:`with_operator` names it.
 
     Class attributes:
-        operator: node update of every processor layer.
+        operator: what every processor layer gathers by.
     """
 
     Options = GraphNetworkOptions
