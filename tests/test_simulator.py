@@ -262,7 +262,7 @@ def test_velocities_shown_are_the_last_ones() -> None:
 
 
 def test_forgetful_windows_know_what_a_rollout_knows_at_its_start() -> None:
-    """Each forgetful window's velocities are those from a number of its last frames, and all numbers come up."""
+    """A forgetful window starts as from its last few frames do; every number of them comes up."""
     window = batch(*(swirl(seed, 7) for seed in range(24)))
     seen: list[State] = []
 
