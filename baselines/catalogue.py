@@ -2,8 +2,8 @@
 
 An entry point of the group ``lagbench.baselines`` names a subclass of
 :class:`~lagbench.baselines.baseline.Baseline`, or one of
-:class:`~lagbench.baselines.operators.operator.Operator`, which becomes a graph network whose
-node update it is.
+:class:`~lagbench.baselines.operators.operator.Operator`, which becomes a graph network that
+gathers by it.
 """
 
 from __future__ import annotations

@@ -9,8 +9,10 @@ A file of recipes holds defaults and what differs from them::
       cavity/full: {training: {steps: 20000}}
       cavity/full-short: {training: {steps: 2000}}    # --recipe short
       "*/tiny": {model: {latent: 16}, training: {steps: 50}}
+      fluid/mini: {training: {steps: 900}, baselines: {gat: {training: {steps: 500}}}}
 
-Later layers win: defaults, recipe, ``--set``. ``steps`` and ``epochs`` replace each other.
+Later layers win: defaults, recipe, what it says of the baseline by name, ``--set``. ``steps`` and
+``epochs`` replace each other.
 
 How a model is trained: the budget, the optimiser, and how often it is looked at.
 """

@@ -65,6 +65,8 @@ class GraphNetworkOptions(Options):
     # whether the sums of a node's messages are inputs of its operator; not for GNS, which is the sum itself
     sum_messages: bool = True
     velocities: int = Field(default=5, ge=1)  # last velocities that a particle shows
+    # share of training windows that know but some of their last velocities, as rollouts do at their start
+    forgetful: float = Field(default=0.0, ge=0.0, le=1.0)
     target: Target = Target.ACCELERATION  # what the network predicts
     # deviation of the noise on the last given velocity, per component [length/frame]; near the error of one
     # predicted step is good, far above it training learns to remove noise and little else
@@ -86,10 +88,10 @@ class GraphNetworkOptions(Options):
 
 
 class GraphNetwork(Baseline):
-    """A graph network whose node update is an operator; :meth:`with_operator` names it.
+    """A graph network that gathers by an operator; :meth:`with_operator` names it.
 
     Class attributes:
-        operator: node update of every processor layer.
+        operator: what every processor layer gathers by.
     """
 
     Options = GraphNetworkOptions
@@ -167,6 +169,8 @@ class GraphNetwork(Baseline):
         """Return the six terms of Eq. 5.35 and the operator's own, raw, means over the steps."""
         batch = batch if generator is None else self._disturbed(batch, generator)
         state = self.start(batch.part(slice(self.history)))
+        if generator is not None and self.options.forgetful > 0.0:
+            state = self._forgetful(state, batch.windows, generator)
         steps = []
         for frame in range(self.history, self.history + self.future):
             following, own = self.step(state, generator)
@@ -185,6 +189,15 @@ class GraphNetwork(Baseline):
             position = noisy(batch.position, self.history, self.options.noise_std, generator)
             batch = replace(batch, position=self._inside(position))
         return batch
+
+    def _forgetful(self, state: State, windows: int, generator: torch.Generator) -> State:
+        """Return a state in which some windows know their last velocities only; the first one repeats."""
+        count, device = self.options.velocities, generator.device
+        forgotten = torch.randint(count, (windows,), generator=generator, device=device)
+        forgotten *= torch.rand(windows, generator=generator, device=device) < self.options.forgetful
+        first = forgotten.to(state.sample.device)[state.sample]
+        index = torch.arange(count, device=first.device).expand(len(first), -1).clamp(min=first[:, None])
+        return replace(state, velocity=state.velocity.gather(1, index[..., None].expand(-1, -1, 2)))
 
     def _loss(self, state: State, following: State, position: Tensor, velocity: Tensor) -> dict[str, Tensor]:
         """Return the six terms of one step; both accelerations start from the state's velocity."""

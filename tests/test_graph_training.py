@@ -11,9 +11,14 @@ from graph_cases import SMALL, batch, facts, jittered, network, oracle, rolled, 
 
 from lagbench.baselines.baseline import Batch
 from lagbench.baselines.catalogue import find
+from lagbench.baselines.facts import facts_of
 from lagbench.baselines.loss import TERMS, Motion, Scales, State, loss_terms
 from lagbench.baselines.operators.supergat import SuperGAT
+from lagbench.baselines.recipe import recipe_for
 from lagbench.baselines.simulator import GraphNetwork
+from lagbench.baselines.windows import WindowDataset, collate
+from lagbench.data.registry import Registry
+from lagbench.make.generate import GenerationResult
 
 OPERATORS = ("gns", "supergat", "gat", "gatv2", "pointnet", "transformer")
 
@@ -120,6 +125,26 @@ def test_the_operators_own_loss_has_its_weight() -> None:
     heavy = linked.build(SMALL | {"link_weight": 0.5, "loss": {"vorticity": 0.0}}, facts())
     assert (heavy.weights["link"], heavy.weights["vorticity"]) == (0.5, 0.0)
     assert "link" not in network(link_weight=0.5).weights
+
+
+@pytest.mark.parametrize("name", ["gns", "supergat"])
+def test_terms_that_count_start_alive(name: str, generated: GenerationResult, unmeasured: Registry) -> None:
+    """On generated data every term of the recipe's loss starts between 0.01 and 1, the link loss too."""
+    recipe = recipe_for(find(name), "curl-noise", "tiny")
+    torch.manual_seed(0)
+    made = facts_of("curl-noise", "tiny", root=generated.root, registry=unmeasured)
+    model = find(name).model.build(recipe.model, made)
+    data = WindowDataset(
+        "curl-noise", size="tiny", root=generated.root, history=model.history, registry=unmeasured
+    )
+    windows = collate([data[index] for index in range(0, len(data), 4)])
+    with torch.no_grad():
+        terms = model(windows, torch.Generator().manual_seed(0))
+    counting = {term: model.weights[term] * float(value) for term, value in terms.items()}
+    alive = {term: value for term, value in counting.items() if value}
+    assert set(alive) == {"acceleration", "divergence", "vorticity"} | set(model.operator.weights)
+    # Targets are standardised: half the sum of two components starts at 1 by construction.
+    assert all(0.01 < value < 1.05 for value in alive.values()), alive
 
 
 @pytest.mark.parametrize("name", OPERATORS)

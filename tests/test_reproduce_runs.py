@@ -162,7 +162,7 @@ def test_the_way_to_full_is_told_without_data(tmp_path: Path, capsys: pytest.Cap
     assert "table_5_4" in capsys.readouterr().out
     assert command.main([*places, "--recipe", "short", "--dry-run"]) == 0
     told = capsys.readouterr()
-    assert "cavity full gns-0: to train, cavity/full-short: 4,000 steps" in told.out
+    assert "cavity full gns-0: to train, cavity/full-short: 14,000 steps" in told.out
     assert "mlp" not in told.out
     assert "fluid full mlp: left out" in told.err
     assert "studies of table_4_2: left out" in told.err

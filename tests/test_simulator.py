@@ -261,6 +261,31 @@ def test_velocities_shown_are_the_last_ones() -> None:
     assert torch.equal(rolled(model, given, 2), rolled(model, given.part(slice(4, 6)), 2))
 
 
+def test_forgetful_windows_know_what_a_rollout_knows_at_its_start() -> None:
+    """A forgetful window starts as from its last few frames do; every number of them comes up."""
+    window = batch(*(swirl(seed, 7) for seed in range(24)))
+    seen: list[State] = []
+
+    class Watched(GraphNetwork):
+        operator, method = GNS, "watched"
+
+        def predict(self, state: State, *_: object) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+            seen.append(state)
+            return torch.zeros_like(state.position), {}
+
+    model = Watched.build(SMALL | {"forgetful": 1.0}, facts())
+    model(window, torch.Generator().manual_seed(0))
+    starts = [model.start(window.part(slice(6 - known, 6))).velocity for known in range(2, 7)]
+    numbers = set()
+    for sample in range(24):
+        mine = window.sample == sample
+        (number,) = (i for i, start in enumerate(starts) if torch.equal(seen[0].velocity[mine], start[mine]))
+        numbers.add(number)
+    assert numbers == set(range(5))
+    model(window)  # without a generator, as in validation, nothing is forgotten
+    assert torch.equal(seen[1].velocity, starts[-1])
+
+
 def test_options_are_checked() -> None:
     """Unknown keys, negative weights and unknown targets are refused."""
     for wrong in ({"latnt": 3}, {"loss": {"vorticity": -1.0}}, {"target": "jerk"}, {"rollout_loss_steps": 0}):

@@ -209,7 +209,10 @@ _MODELS = (
     Model("supergat-sd", "SuperGAT, scaled dot product"),
     Model("gns-novorticity", "GNS without vorticity loss", "#e3b4d6", "gns", ("model.loss.vorticity=0",)),
     Model(
-        "gns-tenfold", "GNS, ten times the vorticity loss", varied="gns", settings=("model.loss.vorticity=1",)
+        "gns-tenfold",
+        "GNS, ten times the vorticity loss",
+        varied="gns",
+        settings=("model.loss.vorticity=10",),
     ),
     Model("gns-velocity", "GNS of velocities", varied="gns", settings=("model.target=velocity",)),
     Model("gns-l1", "GNS, L1 loss", varied="gns", settings=("model.loss_norm=l1",)),
