@@ -16,9 +16,9 @@ from lagbench.baselines.loss import TERMS, Motion, Scales, State, loss_terms
 from lagbench.baselines.operators.supergat import SuperGAT
 from lagbench.baselines.recipe import recipe_for
 from lagbench.baselines.simulator import GraphNetwork
-from lagbench.baselines.windows import WindowDataset, collate
 from lagbench.data.registry import Registry
 from lagbench.make.generate import GenerationResult
+from lagbench.torch import WindowDataset, collate
 
 OPERATORS = ("gns", "supergat", "gat", "gatv2", "pointnet", "transformer")
 
