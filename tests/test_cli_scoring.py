@@ -18,6 +18,7 @@ from lagbench import submission
 from lagbench.cli.app import app
 from lagbench.make.generate import GenerationResult
 from lagbench.scoring import score
+from lagbench.submission import validation
 
 COMMANDS = ["template", "validate", "score", "compare"]
 Run = Callable[..., Result]
@@ -229,7 +230,7 @@ def test_several_files_are_checked_before_any_is_scored(
 ) -> None:
     """Another size, or a broken last file, ends the command before the first is scored."""
     first, second = copies(predictions, "a.nc", "b.nc")
-    real = submission.validate
+    real = validation.validate
 
     def other(path: Path, **options: Any) -> submission.ValidationResult:
         found = real(path, **options)
@@ -237,7 +238,7 @@ def test_several_files_are_checked_before_any_is_scored(
 
     rep = predictions.parent / "rep"
     with monkeypatch.context() as patch:
-        patch.setattr(submission, "validate", other)
+        patch.setattr(validation, "validate", other)
         result = run("score", first, second, "--report", rep)
     assert result.exit_code == 2
     assert "two data sets" in result.stderr

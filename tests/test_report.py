@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from html_check import Reading, read_html
 from hypothesis import given
@@ -230,7 +231,7 @@ def test_undefined_and_huge_numbers_are_drawn_around(
 def test_scores_on_the_page_are_those_of_the_card(
     bench_of: Callable[[str], ReportBench], tmp_path: Path
 ) -> None:
-    """Mean and interval of the ranking metric stand in the table, the floors beside them."""
+    """The mean of the ranking metric stands in the table, and no interval of two scenarios."""
     bench = bench_of("cavity")
     path = bench.submit(tmp_path / "p.nc", damped, "damped", parameters=1_600_000, seconds_per_frame=0.25)
     card = bench.card(path)
@@ -240,7 +241,8 @@ def test_scores_on_the_page_are_those_of_the_card(
     means = [element.text for element in reading.of_class("n")]
     intervals = [element.text for element in reading.of_class("ci")]
     assert means[: len(ranked)] == [text(score.mean) for score in ranked]
-    assert intervals[: len(ranked)] == [" … ".join(map(text, score.interval)) for score in ranked]
+    assert np.isnan([score.interval for score in ranked]).all()
+    assert not [element for element in intervals if "…" in element]
     everything = " ".join(e.text for e in reading.named("main"))
     for said in (card.predictions_sha256, card.header.dataset_sha256, "lagbench score p.nc --report report"):
         assert said in everything
