@@ -114,7 +114,7 @@ class TrainingRecord:
         """Enter a validation at the present step; return whether it is the best so far."""
         self.metric = metric
         self.validation.append({"step": self.step, metric: value})
-        if math.isnan(value) or (self.best_value is not None and not value < self.best_value):
+        if not math.isfinite(value) or (self.best_value is not None and not value < self.best_value):
             return False
         self.best_step, self.best_value = self.step, value
         return True
@@ -282,11 +282,13 @@ class TrainingJob:
         known = [(int(one["step"]), one[str(ledger.metric)]) for one in ledger.validation]
         told = [one for one in known if math.isfinite(one[1])]
         stride = -(-len(told) // MOST_VALIDATIONS) or 1
+        # Processes that read windows ahead live on, so that nobody has their time.
+        seconds = None if self.workers else ledger.cpu_seconds - ledger.validation_cpu_seconds
         return Budget(
             windows=ledger.windows_seen or None,
             epochs=_rounded(ledger.epochs),
             steps=ledger.step,
-            cpu_hours=_rounded((ledger.cpu_seconds - ledger.validation_cpu_seconds) / 3600.0),
+            cpu_hours=None if seconds is None else _rounded(seconds / 3600.0),
             validation_hours=_rounded(ledger.validation_cpu_seconds / 3600.0),
             gpu_hours=_rounded(ledger.gpu_seconds / 3600.0),
             device=device.encode("ascii", "replace").decode()[:100],

@@ -48,7 +48,7 @@ class ProcessorLayer(nn.Module):
         """
         message = self.message(edge, node, edge_index)
         given = node
-        if self.sum_messages:
+        if self.sum_messages and self.operator.reads_nodes:
             given = torch.cat([node, summed(edge_index, message, len(node))], dim=-1)
         gathered, losses = self.operator(given, edge_index, message, generator=generator)
         update = self.update(torch.cat([node, gathered], dim=-1))

@@ -31,7 +31,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from lagbench.data.yamlfile import read_yaml
 from lagbench.errors import LagbenchError, UnreadableFileError, UsageError, nearest
 
-from .catalogue import Entry
+from .catalogue import Entry, names
 
 __all__ = [
     "Schedule",
@@ -226,6 +226,11 @@ def recipe_for(
     file = _read(path) if path else _File(format=1)
     name, part = _choose(entry, file, split, size if own_file or not variant else f"{size}-{variant}")
     model, training = _merge(file.model, part.model), _merge(file.training, part.training)
+    for other in part.baselines:
+        if other not in names():
+            raise UsageError(
+                f"unknown baseline {other!r}", where=f"{path}, {name}, baselines", fix=nearest(other, names())
+            )
     own = part.baselines.get(entry.name, _Part())
     model, training = _merge(model, own.model), _merge(training, own.training)
     for setting in settings:

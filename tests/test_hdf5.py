@@ -85,6 +85,7 @@ REFUSED: dict[str, Callable[[h5py.File], object]] = {
     "texts": lambda f: f.__setitem__("x", ["a", "b"]),
     "chunk bomb": _bomb,
     "inflated": _inflated,
+    "nothing stored": lambda f: f.create_dataset("x", (3, 1 << 32, 2), "f4", chunks=(1, 1 << 20, 2)),
     "crowd": lambda f: [f.create_group(f"g{i}") for i in range(1100)],
 }
 

@@ -23,7 +23,7 @@ recipes:
   cavity/tiny: {training: {steps: 7}}
   cavity/tiny-long: {model: {start: 2.0}, training: {steps: 70, schedule: {every: 10}}}
   "*/mini": {training: {learning_rate: 1.0e-2}}
-  fluid/full: {model: {start: 1.0}, training: {steps: 8}, baselines: {other: {training: {steps: 9}}}}
+  fluid/full: {model: {start: 1.0}, training: {steps: 8}, baselines: {gns: {training: {steps: 9}}}}
 """
 
 
@@ -88,7 +88,7 @@ def test_any_split(entry: Entry) -> None:
 
 def test_a_baseline_among_others(entry: Entry) -> None:
     """Of baselines that share a recipe, one has what is said of it by name beside what all have."""
-    for name, steps in (("drift", 8), ("other", 9)):
+    for name, steps in (("drift", 8), ("gns", 9)):
         recipe = recipe_for(replace(entry, name=name), "fluid", "full")
         assert (recipe.model["start"], recipe.training.steps, recipe.training.batch) == (1.0, steps, 4)
 
@@ -141,6 +141,7 @@ def test_no_such_recipe(entry: Entry) -> None:
         ("{format: 1, receipts: {}}", "did you mean 'recipes'"),
         ("{format: 1, recipes: {a/b: {modell: {}}}}", "did you mean 'model'"),
         ("{format: 1, recipes: {a/b: {baselines: {gns: {trainin: {}}}}}}", "did you mean 'training'"),
+        ("{format: 1, recipes: {fluid/tiny: {baselines: {gnss: {}}}}}", "did you mean 'gns'"),
         ("[1, 2]", "dictionary"),
         ("{format: 1, a: &x 1, b: *x}", "aliases"),
     ],

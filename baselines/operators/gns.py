@@ -20,6 +20,7 @@ class GNS(Operator):
     """
 
     method = "GNS"
+    reads_nodes = False
 
     def forward(
         self,

@@ -21,6 +21,7 @@ class Operator(nn.Module):
     Class attributes:
         method: what the board calls a graph network with this operator.
         weights: weight of each of its own losses in training.
+        reads_nodes: whether it looks at the nodes; else they are not put beside the sums for it.
 
     Args:
         inputs: width of a node's input.
@@ -30,6 +31,7 @@ class Operator(nn.Module):
 
     method: ClassVar[str]
     weights: ClassVar[Mapping[str, float]] = {}
+    reads_nodes: ClassVar[bool] = True
 
     def __init__(self, inputs: int, latent: int, hidden: int) -> None:
         super().__init__()

@@ -78,7 +78,6 @@ class SuperGAT(Operator):
     ) -> tuple[Tensor, Losses]:
         """Return what each node gathers, and the link loss in training."""
         node = node / self.scale
-        self.conv.training = self.training
         if not self.training:
             return self.scale * self.conv(node, edge_index), {}
         count = int(self.negatives * edge_index.shape[1])

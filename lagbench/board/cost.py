@@ -101,7 +101,7 @@ def draw(marks: Sequence[Mark], solver: float | None, ranking: str, title: str) 
     plot = Plot(
         close_logarithmic(min(reach), max(reach)),
         close_logarithmic(min(errors), max(errors)),
-        x_label="processor time of a frame, one core [s]",
+        x_label="time of a frame [s]",
         y_label=words(ranking) + _unit(ranking),
         height=HEIGHT,
     )

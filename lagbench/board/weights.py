@@ -39,6 +39,15 @@ def require_weights(weights: Sequence[str | Path], headers: Sequence[Header]) ->
             got=len(weights),
             fix="give one file per predictions.nc, in their order, or none",
         )
+    length = sum(Path(path).stat().st_size for path in weights if Path(path).is_file())
+    if length > MOST_BYTES:
+        raise UsageError(
+            "the weights are too large to lie beside entries",
+            where="--weights",
+            expected=f"at most {MOST_BYTES} bytes on the whole board",
+            got=f"{length} bytes",
+            fix="leave --weights out, and name a file of a release by `weights: https://...` in --from",
+        )
     check_installed("torch", extra="baselines")
     from lagbench.baselines.checkpoint import load
 
@@ -80,6 +89,8 @@ def copy_weights(folder: Folder, named: Sequence[Weights | None], paths: Sequenc
         write_atomically(target, path.read_bytes(), option="--board")
         if record.is_file():
             write_atomically(target.with_suffix(".json"), record.read_bytes(), option="--board")
+        else:  # that of weights which stood here before
+            target.with_suffix(".json").unlink(missing_ok=True)
 
 
 def check_weights(folder: Folder, entries: Sequence[Entry]) -> Iterator[Finding]:

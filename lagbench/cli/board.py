@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from lagbench.errors import DataError, UsageError
+
 from .options import (
     JsonFlag,
     QuietFlag,
@@ -180,7 +182,15 @@ def check(
     from lagbench.board.check import check_board
     from lagbench.scoring.floors import measured_sizes
 
+    if (split or size) and not root:
+        raise UsageError("--split and --size say whose floors are measured again", fix="give --root as well")
     sizes = measured_sizes(root, split=split, name=size) if root and not predictions else []
+    if root and not predictions and not sizes:
+        raise DataError(
+            "no test scenarios are there",
+            where=str(root),
+            fix="make them with `lagbench generate`, or name another --root",
+        )
     with progress_bar(quiet=quiet or as_json) as draw:
         result = check_board(
             board,

@@ -459,7 +459,7 @@ def _type_problems(array: Array, expected: Structure) -> list[Problem]:
 
 def _inflation(dataset: h5py.Dataset, array: Array) -> list[Problem]:
     """Hold what an array declares against what its chunks hold."""
-    if array.packed and array.unpacked > max(HARMLESS, MOST * array.packed):
+    if array.unpacked > max(HARMLESS, MOST * array.packed):
         expected = f"at most {MOST} times {array.packed} bytes"
         return [
             Problem(

@@ -1,6 +1,6 @@
 """Panels of a picture: one frame seen one way, inside the walls of its box.
 
-Needs matplotlib; :mod:`lagbench.draw.plot` and :mod:`lagbench.draw.plot` compose panels.
+Needs matplotlib; :mod:`lagbench.draw.plot` composes them.
 """
 
 from __future__ import annotations

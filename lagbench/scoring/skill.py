@@ -1,7 +1,7 @@
 """Skill: how much better than the best floor, ``1 - score / score of the best floor``.
 
-Over the ranking metric, means over the scenarios that both have; the best floor is the one with
-the least mean among those that count (see :mod:`lagbench.floors`). 1 is perfect, 0 says that
+Over the ranking metric. The best floor has the least mean over its own scenarios, among those that
+count (see :mod:`lagbench.floors`); the ratio is over the scenarios that both have. 1 is perfect, 0 says that
 nothing was learned, below 0 it is worse than not learning.
 """
 
