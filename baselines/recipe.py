@@ -228,9 +228,8 @@ def recipe_for(
     model, training = _merge(file.model, part.model), _merge(file.training, part.training)
     for other in part.baselines:
         if other not in names():
-            raise UsageError(
-                f"unknown baseline {other!r}", where=f"{path}, {name}, baselines", fix=nearest(other, names())
-            )
+            where = f"{path}, {name}, baselines"
+            raise UnreadableFileError(f"unknown baseline {other!r}", where=where, fix=nearest(other, names()))
     own = part.baselines.get(entry.name, _Part())
     model, training = _merge(model, own.model), _merge(training, own.training)
     for setting in settings:

@@ -141,7 +141,7 @@ def test_no_such_recipe(entry: Entry) -> None:
         ("{format: 1, receipts: {}}", "did you mean 'recipes'"),
         ("{format: 1, recipes: {a/b: {modell: {}}}}", "did you mean 'model'"),
         ("{format: 1, recipes: {a/b: {baselines: {gns: {trainin: {}}}}}}", "did you mean 'training'"),
-        ("{format: 1, recipes: {fluid/tiny: {baselines: {gnss: {}}}}}", "did you mean 'gns'"),
+        ("{format: 1, recipes: {cavity/tiny: {baselines: {gnss: {}}}}}", "did you mean 'gns'"),
         ("[1, 2]", "dictionary"),
         ("{format: 1, a: &x 1, b: *x}", "aliases"),
     ],

@@ -185,7 +185,7 @@ def list_splits(root: RootOption = None, as_json: JsonFlag = False) -> None:
     show({"root": folder, "sizes": found}, listed(), as_json=as_json)
 
 
-_COLUMNS = ("scenarios", "particles", "frames", "disk", "time", "here")
+_COLUMNS = ("scenarios", "particles", "frames", "disk at most", "time", "here")
 
 
 def _row(entry: Overview) -> tuple[object, ...]:

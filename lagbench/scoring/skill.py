@@ -31,6 +31,12 @@ class Skill:
     interval: tuple[float, float]
     std: float = math.nan  # sample standard deviation over seeds; NaN for one
 
+    def __str__(self) -> str:
+        """Return the value, its interval where it has one, and the floor, as in a table."""
+        low, high = self.interval
+        interval = "" if math.isnan(low) else f" [{low:.3f}, {high:.3f}]"
+        return f"{self.value:.3f}{interval} over {self.floor}"
+
 
 def best_floor(floors: Mapping[str, Score]) -> str | None:
     """Return the floor with the least mean; None where none that counts has a mean above 0."""
