@@ -158,6 +158,8 @@ def test_two_processes_keep_one_model(lagbench: Command, tmp_path: Path) -> None
         "training.validate_every=0",
         "--set",
         "model.noise_std=0",
+        "--set",
+        "model.symmetry=none",
     ]
     common = ["train", "--baseline", "gns", *TINY, *settings]
     shared = command(*common, "--processes", "2", "-o", "shared", "--set", "training.batch=2")
