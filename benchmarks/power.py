@@ -3,9 +3,9 @@
     python benchmarks/power.py                    # prints the tables
     python benchmarks/power.py --write            # and writes docs/power.md
 
-From the score files below leaderboard/scores: how much seeds, scenarios and the rest scatter,
-relative to a method's mean; from that model, seeded draws of methods that are equal, or 5, 10
-and 20 % apart. Where no method of a data set has two seeds, cavity's seeds stand in.
+Seeds, scenarios and the rest scatter, relative to a method's mean: by three stated assumptions,
+and as the score files below leaderboard/scores say, for a data set with two near methods, one of
+them of several seeds. From that model, seeded draws of methods that are equal, or 5, 10 and 20 % apart.
 """
 
 from __future__ import annotations
@@ -14,29 +14,22 @@ import argparse
 import itertools
 import re
 from collections import defaultdict
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.data.registry import load
 from lagbench.metrics import differ
 from lagbench.metrics.significance import SIGNIFICANCE
 from lagbench.scoring.score_file import read_statistics
+from lagbench.scoring.task import ranking_metric
 
 Floats = NDArray[np.float64]
 
 ROOT = Path(__file__).parent.parent
 TEST = {"cavity": 20, "curl-noise": 16, "fluid": 16, "multimaterial": 16}
-RANKING = {
-    "cavity": ("vorticity_nrmse", "vorticity_rmse"),
-    "curl-noise": ("vorticity_nrmse", "vorticity_rmse"),
-    "fluid": ("cloud_distance", "sliced_w2"),
-    "multimaterial": ("cloud_distance", "sliced_w2"),
-}
-"""The metric that ranks, and what stands for it in score files that do not have it yet."""
-
-FLOORS = ("persistence", "constant-velocity", "frozen-field", "free-flight", "analog", "coarse-solver")
 DIFFERENCES = (0.05, 0.10, 0.20)
 SEEDS = 3
 DRAWS = 1000
@@ -51,16 +44,20 @@ class Scatter:
     method: float  # of one scenario, from method to method, their means aside
 
 
-def read_methods(split: str) -> tuple[str, dict[str, Floats]]:
-    """Return the metric, and the values of each method of the mini size, shape [seed, scenario]."""
-    held: dict[str, list[dict[str, Floats]]] = defaultdict(list)
+ASSUMED = {
+    "small scatter": Scatter(0.02, 0.05, 0.05),
+    "middling": Scatter(0.05, 0.10, 0.10),
+    "large": Scatter(0.10, 0.20, 0.20),
+}
+"""What is assumed of methods and seeds that nobody has measured."""
+
+
+def read_methods(split: str) -> dict[str, Floats]:
+    """Return the ranking metric's values of each method of the mini size, shape [seed, scenario]."""
+    metric, held = ranking_metric(load().size(split, "mini")), defaultdict(list)
     for path in sorted((ROOT / "leaderboard" / "scores" / split / "mini").glob("*.nc")):
-        scores = read_statistics(path).scores()
-        held[re.sub(r"_\d+$", "", path.stem)].append({name: s.values for name, s in scores.items()})
-    runs = [run for method in held.values() for run in method]
-    metric = next((m for m in RANKING[split] if runs and all(m in run for run in runs)), RANKING[split][0])
-    named = {name: np.array([run[metric] for run in method]) for name, method in held.items() if runs}
-    return metric, {name: values for name, values in named.items() if name not in FLOORS}
+        held[re.sub(r"_\d+$", "", path.stem)].append(read_statistics(path).scores()[metric].values)
+    return {name: np.array(seeds) for name, seeds in held.items()}
 
 
 def measured_scatter(methods: dict[str, Floats]) -> Scatter:
@@ -105,7 +102,7 @@ def pairs_of_seeds() -> tuple[int, int]:
     p = [
         differ(a, b)
         for split in TEST
-        for values in read_methods(split)[1].values()
+        for values in read_methods(split).values()
         for a, b in itertools.combinations(values, 2)
     ]
     return len(p), sum(value < SIGNIFICANCE for value in p)
@@ -113,42 +110,36 @@ def pairs_of_seeds() -> tuple[int, int]:
 
 def tables() -> str:
     """Return the page."""
-    rows, wrong = [], []
-    reference = measured_scatter(read_methods("cavity")[1])
+    cases = [(f"assumed: {name}", 16, scatter) for name, scatter in ASSUMED.items()]
     for split, scenarios in TEST.items():
-        metric, methods = read_methods(split)
-        scatter = measured_scatter(methods)
-        borrowed = "" if np.isfinite(scatter.seed) else " (cavity's)"
-        if borrowed:
-            scatter = replace(scatter, seed=reference.seed, rest=reference.rest)
-        spread = [f"{100 * value:.1f} %" for value in (scatter.seed, scatter.rest, scatter.method)]
-        power = [f"{share_told_apart(scatter, scenarios, d, SEEDS):.2f}" for d in DIFFERENCES]
-        rows.append(
-            f"| {split} | `{metric}`, {len(methods)} methods | {scenarios} |"
-            f" {spread[0]}{borrowed} | {spread[1]} | {spread[2]} | {' | '.join(power)} |"
-        )
+        scatter = measured_scatter(read_methods(split))
+        if np.isfinite(astuple(scatter)).all():
+            cases.append((split, scenarios, scatter))
+    rows, wrong = [], []
+    for name, scenarios, scatter in cases:
+        spread = " | ".join(f"{100 * value:.1f} %" for value in astuple(scatter))
+        power = " | ".join(f"{share_told_apart(scatter, scenarios, d, SEEDS):.2f}" for d in DIFFERENCES)
+        rows.append(f"| {name} | {scenarios} | {spread} | {power} |")
         false = [100 * share_told_apart(scatter, scenarios, 0.0, seeds) for seeds in (1, 2, 3, 5)]
-        wrong.append(f"| {split} | {' | '.join(f'{share:.1f} %' for share in false)} |")
+        wrong.append(f"| {name} | {' | '.join(f'{share:.1f} %' for share in false)} |")
     pairs, differing = pairs_of_seeds()
     return f"""# Power: what the test can tell apart
 
-Written by `python benchmarks/power.py --write` from the score files of the mini sizes below
-leaderboard/scores; the model behind it stands in the script's docstring.
+Written by `python benchmarks/power.py --write`: by three assumptions about how much methods and seeds
+scatter, and from the score files of the mini sizes below leaderboard/scores, a row for each data set that
+has two near methods, one of them of several seeds.
 
 The value of seed s in scenario i is read as mean x (1 + scenario + method-in-scenario + seed + rest).
 Two methods share the scenarios; what is left are the three standard deviations below, relative to a
 method's mean. The last three columns say how often `lagbench.metrics.differ` tells two methods apart
 at 5 %, with {SEEDS} seeds each, if one is better by 5, 10 and 20 % ({DRAWS} draws).
 
-| split | from | test scenarios | seed | rest | method in scenario | 5 % | 10 % | 20 % |
-|---|---|---|---|---|---|---|---|---|
+| case | test scenarios | seed | rest | method in scenario | 5 % | 10 % | 20 % |
+|---|---|---|---|---|---|---|---|
 {chr(10).join(rows)}
 
 A difference that is small beside the scatter of seeds is not found with more scenarios: only with
 more seeds. A board that ranks by hundredths ranks by chance.
-
-Few methods of these score files have two seeds, and those of curl-noise chance to agree: its power is
-an upper bound until three seeds of each method are in.
 
 ## Equal methods that are told apart
 
@@ -156,11 +147,11 @@ Both sides are seeds of one method: at most 5 % may differ. With one seed a side
 sign-flip test over scenarios. It is right about those weights, and wrong about the method as
 often as the first column says: why such a row says "these weights".
 
-| split | 1 seed a side | 2 | 3 | 5 |
+| case | 1 seed a side | 2 | 3 | 5 |
 |---|---|---|---|---|
 {chr(10).join(wrong)}
 
-Of the {pairs} pairs of single seeds of one method in these score files {differing} differ as weights.
+The score files have {pairs} pairs of single seeds of one method; {differing} of them differ as weights.
 """
 
 
