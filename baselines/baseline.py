@@ -15,6 +15,7 @@ import torch
 from pydantic import BaseModel, ConfigDict
 from torch import Tensor, nn
 
+from lagbench.errors import UsageError
 from lagbench.torch import Batch
 
 from .facts import Facts
@@ -82,6 +83,20 @@ class Baseline(nn.Module):
     def weights(self) -> Mapping[str, float]:
         """Weight of each loss term; terms that are missing have weight 1, weight 0 is only logged."""
         return {}
+
+    def compile_layers(self) -> None:
+        """Compile, in place, what a training step repeats.
+
+        Raises:
+            UsageError: by default, the model has nothing to compile.
+        """
+        raise UsageError(
+            f"{self.method} has no layers to compile",
+            where="training.compile",
+            expected="false; true for graph networks",
+            got=True,
+            fix="leave the option out",
+        )
 
     @abstractmethod
     def start(self, given: Batch) -> Any:  # noqa: ANN401 (each model has its own state)

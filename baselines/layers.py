@@ -216,7 +216,8 @@ class EdgeMLP(nn.Module):
         """
         of_edge, of_receiver, of_sender = self.first.weight.tensor_split(3, dim=1)
         ends = linear(node, of_sender), linear(node, of_receiver, self.first.bias)
-        if edge.device.type == "cpu" and self._bytes(edge) > LARGEST_KEPT:
+        large = edge.device.type == "cpu" and self._bytes(edge) > LARGEST_KEPT
+        if large and not torch.compiler.is_compiling():
             tensors = edge_index, edge, *ends, of_edge, *self.rest.parameters()
             update: Tensor = Recomputed.apply(self.rest, *tensors)  # type: ignore[no-untyped-call]
             return update

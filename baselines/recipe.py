@@ -107,6 +107,8 @@ class TrainingOptions(_Strict):
     # 'bf16' runs matrix products in bfloat16, weights stay float32; 'auto' does so where the
     # hardware multiplies in it
     precision: Literal["float32", "bf16", "auto"] = "float32"
+    # fuse what a processor layer of a graph network does, by torch.compile; needs a C++ compiler on CPUs
+    compile: bool = False
     windows: tuple[str, ...] = ("train",)  # subsets to train on
     # steps between validations, 0 never; by default up to eight, as many as take 15 % of the processor time
     validate_every: int | None = Field(default=None, ge=0)

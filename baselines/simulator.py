@@ -165,6 +165,14 @@ class GraphNetwork(Baseline):
             own["link"] = self.options.link_weight
         return self.options.loss.model_dump() | own
 
+    def compile_layers(self) -> None:
+        """Compile the edges' encoder and the processor layers, for any number of edges.
+
+        The layers are compiled once for all: their code is the same.
+        """
+        for part in (self.network.edge_encoder, *self.network.processor):
+            part.compile(dynamic=True)
+
     def forward(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """Return the six terms of Eq. 5.35 and the operator's own, raw, means over the steps."""
         batch = batch if generator is None else self._disturbed(batch, generator)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import logging
 import os
+import shutil
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -297,6 +298,8 @@ def _module(
     options, earlier = job.recipe.training, job.earlier
     if earlier is not None:
         load_weights(model, earlier.weights, where=str(job.folder.checkpoint))
+    if options.compile:
+        _compile(model, job.device)
 
     def loader(rank: int, ranks: int) -> DataLoader[Window]:
         sampler = WindowSampler(data, seed=options.seed, rank=rank, ranks=ranks)
@@ -319,6 +322,19 @@ def _module(
         step=ledger.step,
         optimizer=earlier.optimizer if earlier else None,
     )
+
+
+def _compile(model: Baseline, device: str) -> None:
+    compilers = [os.environ.get("CXX", ""), "g++", "clang++"]
+    if device == "cpu" and not any(map(shutil.which, filter(None, compilers))):
+        raise UsageError(
+            "no C++ compiler",
+            where="training.compile",
+            expected="g++ or clang++ on the PATH, or CXX",
+            got="none",
+            fix="install one, or leave the option out",
+        )
+    model.compile_layers()
 
 
 def _trainer(job: TrainingJob, keeper: TrainingCallback) -> Trainer:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 
 import torch
@@ -32,6 +33,7 @@ class Validation:
 
     task: ScoredTask  # the valid subset
     frames: Mapping[int, int]  # frames to predict, by scenario id: later ones do not count
+    compiled: bool = False  # whether the training compiles layers
 
     @property
     def metric(self) -> str:
@@ -49,7 +51,9 @@ class Validation:
         ids = list(self.frames)
         groups = [[i] for i in ids] if device.type == "cpu" else [ids]
         tallies: dict[int, Tally] = {}
-        with as_published(model):
+        # A rollout needs no gradients: its layers would be compiled anew.
+        stance = torch.compiler.set_stance("force_eager") if self.compiled else nullcontext()
+        with as_published(model), stance:
             for group in groups:
                 paths = [self.task.truth.path(i) for i in group]
                 given = scenario_batch(paths, slice(0, self.task.setting.input_frames)).to(device)
@@ -81,4 +85,4 @@ def validation_of(job: TrainingJob) -> Validation | None:
     for i in task.scenarios[: options.validation_scenarios]:
         with task.opened(i) as opened:
             frames[i] = len(opened.scenario.active)
-    return Validation(task=task, frames=frames)
+    return Validation(task=task, frames=frames, compiled=options.compile)

@@ -7,7 +7,7 @@ prints one JSON object: processor seconds of the fastest step (network, mean squ
 backward pass, Adam; without neighbour search, features and grid losses), its peak memory [byte],
 edges and parameters. ``--edge-layer plain`` multiplies the concatenation of an edge and its ends,
 as public codes do, ``--products torch`` uses torch's linear layer, ``--hidden kept`` never
-computes a hidden layer twice.
+computes a hidden layer twice. ``--compiled`` compiles the processor layers (``training.compile``).
 """
 
 from __future__ import annotations
@@ -73,6 +73,9 @@ def one_step(given: argparse.Namespace) -> tuple[Callable[[], None], dict[str, i
         latent=given.latent,
         layers=given.layers,
     )
+    if given.compiled:
+        for part in (model.edge_encoder, *model.processor):
+            part.compile(dynamic=True)
     edge_index = particles(given.particles, given.windows)
     rows, edges = given.particles * given.windows, edge_index.shape[1]
     node, edge, target = (
@@ -108,6 +111,7 @@ def main() -> int:
     parser.add_argument("--precision", choices=("float32", "bfloat16"), default="float32")
     parser.add_argument("--edge-layer", choices=("split", "plain"), default="split")
     parser.add_argument("--products", choices=("onednn", "torch"), default="onednn")
+    parser.add_argument("--compiled", action="store_true")
     parser.add_argument("--hidden", choices=("recomputed", "kept"), default="recomputed")
     given = parser.parse_args()
     torch.set_num_threads(1)

@@ -16,6 +16,7 @@ from lagbench.baselines.layers import EdgeMLP, LayerNorm, Linear, linear, mlp
 from lagbench.baselines.network import EncodeProcessDecode, ProcessorLayer
 from lagbench.baselines.operators.gns import GNS
 from lagbench.baselines.operators.operator import Losses, Operator
+from lagbench.baselines.operators.supergat import SuperGAT
 
 EVERY = pytest.mark.parametrize("operator", OPERATORS)
 
@@ -247,3 +248,24 @@ def test_operator_of_others() -> None:
     prediction, losses = model(*inputs)
     assert prediction.shape == (12, 2)
     assert losses["size"].item() == pytest.approx(torch.stack(sizes).mean().item())
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:The .grad attribute")  # torch, while it traces
+@pytest.mark.parametrize("operator", [GNS, SuperGAT])
+def test_compiled_layers(operator: type[Operator]) -> None:
+    """Compiled layers give the values and gradients of the plain ones, for any number of edges."""
+    results = []
+    for compiled in (False, True):
+        model = network(operator)
+        for part in (model.edge_encoder, *model.processor) if compiled else ():
+            part.compile(dynamic=True)
+        for edges in (500, 731):
+            node, edge_index, edge = graph(60, edges, node=7, edge=3)
+            output, losses = model(node, edge_index, edge, torch.Generator().manual_seed(0))
+            total = output.square().sum() + sum(losses.values())
+            results.append([output, *torch.autograd.grad(total, list(model.parameters()))])
+    half = len(results) // 2
+    for plain_ones, compiled_ones in zip(results[:half], results[half:], strict=True):
+        for expected, found in zip(plain_ones, compiled_ones, strict=True):
+            torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)

@@ -21,6 +21,8 @@ others and one neighbour has all the attention.
 """
 
 
+# Compilers know neither generators nor results of unknown size.
+@torch.compiler.disable  # type: ignore[untyped-decorator]
 def unlinked_pairs(
     edge_index: Tensor, nodes: int, count: int, generator: torch.Generator | None = None
 ) -> Tensor:
