@@ -55,7 +55,7 @@ def a_method(name: str, *seeds: list[float]) -> Method:
 def known(models: Mapping[str, list[float]]) -> Evidence:
     """Return what is known of the mini cavity: models and floors of one seed each."""
     evidence = Evidence(Sources(board=None), SPLIT, "mini")
-    evidence.methods |= {name: a_method(name, values) for name, values in models.items()}
+    evidence.methods = {name: a_method(name, values) for name, values in models.items()}
     return evidence
 
 

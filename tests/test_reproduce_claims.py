@@ -27,6 +27,7 @@ from lagbench.baselines.reproduce.results import agreement
 from lagbench.baselines.reproduce.tables import cubic_errors, cubic_vorticity, rollout_table
 from lagbench.data.registry import load
 from lagbench.metrics import METRICS, Score
+from lagbench.scoring.score_file import read_statistics
 
 FIRST = Claim(question="", first="supergat", rivals=thesis.OPERATORS[1:])
 
@@ -241,3 +242,15 @@ def test_a_table_of_rollouts_puts_ours_beside_theirs() -> None:
     assert (circle["thesis's id"], circle["our id"]) == ("26", "38")
     assert circle["average, MLP"] == f"{ids.index(38)} / 2.127"
     assert circle["average, LSTM"] == "- / 3.583"
+
+
+@pytest.mark.parametrize("split", ["cavity", "curl-noise", "fluid", "multimaterial"])
+def test_skill_is_the_score_files(split: str) -> None:
+    """The skill of results is the one that each committed score file holds the floor of."""
+    board = Path(__file__).parents[1] / "leaderboard"
+    evidence = Evidence(Sources(board=board), split, "mini")
+    assert evidence.models
+    for name, method in evidence.models.items():
+        stored = [read_statistics(held.path).skill() for held in method.seeds]
+        values = [skill.value for skill in stored if skill is not None]
+        assert evidence.skill(name) == pytest.approx(np.mean(values), abs=1e-4)

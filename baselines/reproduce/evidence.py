@@ -23,10 +23,12 @@ import numpy as np
 from lagbench.data.registry import Registry, Size, load
 from lagbench.data.yamlfile import read_yaml
 from lagbench.errors import UnreadableFileError
+from lagbench.floors.shipped import shipped, shipped_path
 from lagbench.floors.table import FLOORS
 from lagbench.metrics.aggregate import Score
 from lagbench.metrics.metric import mean
 from lagbench.scoring.score_file import NETCDF_NAME, read_statistics
+from lagbench.scoring.skill import best_floor
 from lagbench.scoring.task import ranking_metric
 
 __all__ = ["BOARD", "WEIGHTS", "Cost", "Evidence", "Method", "Seeded", "Sources", "ordered", "read_json"]
@@ -104,10 +106,15 @@ class Method:
         return float(np.std(means, ddof=1)) if len(means) > 1 else math.nan
 
     def at(self, metric: str, frame: int, scenario: int | None = None) -> float:
-        """Return a metric at an absolute frame, of one scenario or the mean over all; NaN if not measured."""
+        """Return a metric at an absolute frame, of one scenario or the mean over all; NaN if not measured.
+
+        Of floors only means are kept.
+        """
         if metric not in self.scores:
             return math.nan
         values = self.scores[metric].at(frame)
+        if scenario is not None and len(values) < len(self.scores[metric].scenarios):
+            return math.nan
         return (
             mean(values) if scenario is None else float(values[self.scores[metric].scenarios.index(scenario)])
         )
@@ -202,6 +209,9 @@ class Evidence:
             if file.is_file() and not {(name, seed), (name, None)} & committed:
                 record = read_json(folder / RECORD_NAME) or sources.record(split, size, name, seed)
                 self._add(name, seed, file, record, _run_cost(folder))
+        for floor in (shipped(self.size) or {}).values():
+            held = Seeded(seed=None, scores=floor.scores, record={}, path=shipped_path(self.size))
+            self.methods.setdefault(floor.name, Method(name=floor.name, seeds=(held,)))
 
     def _add(
         self,
@@ -252,8 +262,10 @@ class Evidence:
 
     @property
     def best_floor(self) -> str | None:
-        """Name of the floor that is best by the ranking metric; None where none was scored."""
-        return next(iter(self.order(self.floors)), None)
+        """Name of the floor that skill is measured from, as the scorer has it; None where none was scored."""
+        return best_floor(
+            {n: m.scores[self.ranking] for n, m in self.floors.items() if self.ranking in m.scores}
+        )
 
     def skill(self, name: str) -> float:
         """Return ``1 - score / score of the best floor`` by the ranking metric: 1 perfect, 0 no learning."""
