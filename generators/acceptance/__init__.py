@@ -1,1 +1,1 @@
-"""Is the physics right: Ghia, energy, settling."""
+"""Is the physics of the closed box right: Ghia, energy, decay."""

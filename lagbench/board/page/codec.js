@@ -1,4 +1,4 @@
-// Packed arrays: two letters a number, twelve bits; see lagbench/board/packing.py.
+// Packed arrays: two letters a number, twelve bits; see lagbench/board/payload.py.
 
 const BOARD = JSON.parse(document.getElementById("board").textContent);
 
