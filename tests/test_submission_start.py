@@ -95,6 +95,14 @@ def permuted_and_wrong(world: World, scenario: int) -> Floats:
     return np.broadcast_to(world.last(scenario)[order], world.truth(scenario).shape)
 
 
+def partly_permuted(world: World, scenario: int) -> Floats:
+    """The truth with a third of the particles in another order."""
+    order = np.arange(world.size.particles)
+    some = rng(scenario).choice(order, len(order) // 3, replace=False)
+    order[np.sort(some)] = some
+    return world.truth(scenario)[:, order]
+
+
 def swapped(world: World, scenario: int) -> Floats:
     """The truth with y first."""
     return world.truth(scenario)[..., ::-1]
@@ -103,6 +111,12 @@ def swapped(world: World, scenario: int) -> Floats:
 def early(world: World, scenario: int) -> Floats:
     """The last given frame first, then the truth."""
     return world.truth(scenario, late=-1)
+
+
+def late(world: World, scenario: int) -> Floats:
+    """The truth without its first frame; the last one is repeated."""
+    held = world.truth(scenario)
+    return np.concatenate([held[1:], held[-1:]])
 
 
 def steps(world: World, scenario: int) -> Floats:
@@ -132,10 +146,12 @@ def another_scenario(world: World, scenario: int) -> Floats:
     [
         (permuted, "order"),
         (permuted_within, "order"),
+        (partly_permuted, "order"),
         (rolled, "order"),
         (permuted_and_wrong, "order"),
         (swapped, "swapped"),
         (early, "shifted"),
+        (late, "shifted"),
         (steps, "displacements"),
         (displacements, "displacements"),
         (standardised, "standardised"),
@@ -171,6 +187,19 @@ def linear_map(world: World, scenario: int) -> Floats:
     return held + 0.03 * rng(scenario).normal(size=held.shape)
 
 
+def too_fast(world: World, scenario: int) -> Floats:
+    """Every particle twice as far from the last given frame as it should be."""
+    return 2 * world.truth(scenario) - world.last(scenario)
+
+
+def partly_lost(world: World, scenario: int) -> Floats:
+    """A third of the particles anywhere within a twentieth of the box."""
+    held = world.truth(scenario).copy()
+    some = rng(scenario).random(held.shape[1]) < 1 / 3
+    held[:, some] += rng(scenario).uniform(-0.05, 0.05, held[:, some].shape)
+    return held
+
+
 def shifted_cloud(world: World, scenario: int) -> Floats:
     """All particles a tenth of the box to the right."""
     return world.truth(scenario) + np.array([0.1, 0.0])
@@ -188,7 +217,10 @@ def one_point(world: World, scenario: int) -> Floats:
 
 @pytest.mark.parametrize(
     "predict",
-    [mean_of_scenarios, noisy(0.01), noisy(0.1), noisy(0.5), linear_map, shifted_cloud, anywhere, one_point],
+    [
+        *(mean_of_scenarios, noisy(0.01), noisy(0.1), noisy(0.5), linear_map, too_fast, partly_lost),
+        *(shifted_cloud, anywhere, one_point),
+    ],
 )
 def test_a_bad_model_is_scored(world: World, tmp_path: Path, predict: Predict) -> None:
     """Nothing rejects it; a jump at the start, where there is one, is a warning with its size."""

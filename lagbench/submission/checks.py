@@ -12,7 +12,7 @@ from lagbench.data.registry import Size
 from .findings import Findings
 from .predictions import Predictions
 from .start import JUMP
-from .truth import Truth
+from .truth import Truth, squared_steps
 
 __all__ = [
     "MAX_DISTANCE",
@@ -83,8 +83,11 @@ class Survey:
     def _add_places(self, first: int, block: NDArray[np.float32], size: Size) -> None:
         slack = 1.0 / size.grid
         low, high = np.array(size.bounds, np.float64).T
+        self.positions += block[..., 0].size
+        sides = zip(np.moveaxis(block, -1, 0), low, high, strict=True)
+        if all(left - x.min() <= slack and x.max() - right <= slack for x, left, right in sides):
+            return  # nearly always, and 20 times as fast; NaN goes on
         beyond = np.fmax(low - block, block - high).max(axis=-1)
-        self.positions += beyond.size
         far = beyond > slack
         if far.any():
             if self.first_outside is None:
@@ -105,8 +108,9 @@ class Survey:
 
     def _add_jumps(self, first: int, joined: NDArray[np.float32]) -> None:
         """Take in the steps between consecutive frames, of which the first leads to ``first``."""
-        steps = np.diff(joined.astype(np.float64), axis=0)
-        squares = np.nan_to_num(np.sum(steps * steps, axis=-1))
+        squares = squared_steps(joined)
+        if squares.size and np.isnan(squares.max()):
+            squares = np.nan_to_num(squares)
         if squares.size and squares.max() > self.jump**2:
             frame, particle = np.unravel_index(int(squares.argmax()), squares.shape)
             self.jump = float(np.sqrt(squares.max()))

@@ -19,7 +19,7 @@ from .findings import Findings
 from .predictions import Predictions
 from .truth import Truth
 
-__all__ = ["JUMP", "Mistake", "Start", "check_start", "mistake", "shifted"]
+__all__ = ["JUMP", "Mistake", "Start", "check_start", "mistake", "shift"]
 
 JUMP = 10.0
 """A step is suspect beyond this many of the truth's largest per-frame displacement."""
@@ -29,6 +29,9 @@ NEARER = 0.25
 
 SAMPLE = 200
 """Particles whose neighbours are looked for, evenly spaced over the ids."""
+
+FEWEST = 40
+"""Particles astray from which on another order is looked for: chance does not put half of them on others."""
 
 ON = 0.2
 """A prediction lies on a true particle within this many spacings; at random 13 % do at the most."""
@@ -48,6 +51,7 @@ class Start:
     first: Positions  # the first predicted frame
     second: Positions  # the second predicted frame; the first again where there is none
     horizon: int = 0  # frames to predict
+    later: Positions | None = None  # the truth of the second predicted frame, where there is one
 
 
 class Mistake(NamedTuple):
@@ -90,9 +94,9 @@ def _without(starts: Mapping[int, Start], scenario: int) -> Mapping[int, Start]:
 def _start(predictions: Predictions, truth: Truth, scenario: int) -> Start:
     frames = predictions.header.frames
     predicted = predictions.frames(scenario, frames[0], min(2, len(frames)))
-    given, true = truth.around_start(scenario)
+    given, true, *later = truth.around_start(scenario).astype(np.float64)
     first, second = predicted[0].astype(np.float64), predicted[-1].astype(np.float64)
-    return Start(given.astype(np.float64), true.astype(np.float64), first, second, len(frames))
+    return Start(given, true, first, second, len(frames), next(iter(later), None))
 
 
 def _check_continuity(scenario: int, start: Start, truth: Truth, frame: int, out: Findings) -> None:
@@ -112,30 +116,42 @@ def _check_continuity(scenario: int, start: Start, truth: Truth, frame: int, out
 
 
 def _check_shift(starts: Mapping[int, Start], frame: int, out: Findings) -> None:
-    told = {scenario: said for scenario, start in starts.items() if (said := shifted(start)) is not None}
-    wrong = [scenario for scenario, said in told.items() if said]
-    if wrong:
-        report = out.error if len(wrong) == len(told) else out.warning
-        report(
-            "start",
-            "the frames seem to be shifted by one",
-            where=f"scenario {wrong[0]}, frame {frame}",
-            expected="the frame after the last given one first",
-            got=f"the last given frame, in {len(wrong)} of {len(told)} scenarios whose truth moves",
-            fix="leave the last given frame out: predictions begin one frame later",
-        )
+    told = {scenario: said for scenario, start in starts.items() if (said := shift(start)) is not None}
+    for by, what, fix in (
+        (-1, "the last given frame", "leave the last given frame out: predictions begin one frame later"),
+        (1, "the second frame of the truth", "predictions begin one frame earlier, after the last given one"),
+    ):
+        wrong = [scenario for scenario, said in told.items() if said == by]
+        if wrong:
+            report = out.error if len(wrong) == len(told) else out.warning
+            report(
+                "start",
+                "the frames seem to be shifted by one",
+                where=f"scenario {wrong[0]}, frame {frame}",
+                expected="the frame after the last given one first",
+                got=f"{what}, in {len(wrong)} of {len(told)} scenarios whose truth moves",
+                fix=fix,
+            )
 
 
-def shifted(start: Start) -> bool | None:
-    """Tell whether the first predicted frame is the last given one; None where the truth stands still.
+def shift(start: Start) -> int | None:
+    """Return by how many frames the prediction begins too late; None where the truth stands still.
 
-    A prediction that then stays there, as persistence does, is a bad one and no mistake.
+    -1: the first predicted frame is the last given one and the second moves on. A prediction that
+    then stays there, as persistence does, is a bad one and no mistake. 1: the first predicted frame
+    is the second one of the truth and the next step is as long as the truth's; a model that is
+    twice too fast takes a second long step. 0: neither.
     """
     moved = _rms(start.true - start.given)
     if moved < 1e-6:
         return None
-    stays = _rms(start.first - start.given) <= 0.1 * moved
-    return stays and _rms(start.second - start.first) >= 0.5 * moved
+    step = _rms(start.second - start.first)
+    if step >= 0.5 * moved and _rms(start.first - start.given) <= 0.1 * moved:
+        return -1
+    skips = start.later is not None and (
+        _rms(start.first - start.later) <= min(NEARER * _rms(start.first - start.true), 0.1 * moved)
+    )
+    return int(skips and 0.5 * moved <= step <= 1.5 * moved)
 
 
 def mistake(
@@ -193,30 +209,39 @@ def _is_reshaped(start: Start) -> bool:
 
 
 def _is_permuted(start: Start) -> bool:
-    """Tell whether most particles lie on another particle, next to which they did not move there.
+    """Tell whether most particles that lie on neither of their own places lie on those of others.
 
     Clouds that fill a box agree whatever a model does, so it is not their shape that tells a
-    permutation but that predictions lie *on* true or given particles, though not on their own.
+    permutation, of all particles or of some, but that predictions lie *on* true or given
+    particles, though not on their own, next to which they did not move there.
     """
     count = len(start.given)
-    sample = np.unique(np.linspace(0, count - 1, min(SAMPLE, count)).astype(int))
     if count < 8:
         return False
-    beside, spacing = _nearest(start.given[sample], start.given, skip=sample)
-    apart = float(np.median(spacing))
+    sample = _spaced(np.arange(count))
+    apart = float(np.median(_nearest(start.given[sample], start.given, skip=sample)[1]))
     move = start.first - start.given
-    if np.median(np.linalg.norm(move[sample], axis=-1)) <= ON * apart:
+    own = np.hypot(*move.T) <= ON * apart
+    own |= np.hypot(*(start.first - start.true).T) <= ON * apart
+    astray = np.flatnonzero(~own)
+    if len(astray) < min(FEWEST, count / 2):
         return False
+    sample = _spaced(astray)
+    beside, _ = _nearest(start.given[sample], start.given, skip=sample)
     # Neighbours that move alike, as a lattice that shifts by its spacing, are no permutation.
-    torn = np.linalg.norm(move[sample] - move[beside], axis=-1) > apart
+    torn = np.hypot(*(move[sample] - move[beside]).T) > apart
     for cloud in (start.given, start.true):
         found, distance = _nearest(start.first[sample], cloud)
-        own = np.linalg.norm(start.first[sample] - cloud[sample], axis=-1) <= ON * apart
         other = ((distance <= ON * apart) & torn) | (distance <= EXACTLY * apart)
         # A cloud that shrank to one point may lie on a particle too, but on one only.
-        if len(np.unique(found[other & ~own])) >= 0.5 * len(sample):
+        if len(np.unique(found[other])) >= 0.5 * len(sample):
             return True
     return False
+
+
+def _spaced(ids: NDArray[np.int_]) -> NDArray[np.int_]:
+    """Return at most :data:`SAMPLE` of the ids, evenly spaced."""
+    return ids[np.unique(np.linspace(0, len(ids) - 1, min(SAMPLE, len(ids))).astype(int))]
 
 
 def _nearest(
@@ -224,8 +249,10 @@ def _nearest(
 ) -> tuple[NDArray[np.int_], Positions]:
     """Return for every point the nearest particle of a cloud but ``skip``, and its distance."""
     found, distance = np.empty(len(points), np.int_), np.empty(len(points))
+    columns = np.ascontiguousarray(cloud.T)  # a sum over two neighbours in memory takes ten times as long
     for row, point in enumerate(points):
-        squares = np.sum((cloud - point) ** 2, axis=-1)
+        x, y = columns - point[:, None]
+        squares = x * x + y * y
         if skip is not None:
             squares[skip[row]] = np.inf
         found[row] = np.argmin(squares)
@@ -235,4 +262,4 @@ def _nearest(
 
 def _rms(distances: Positions) -> float:
     """Return the root mean square length of vectors [length]."""
-    return float(np.sqrt(np.mean(np.sum(distances**2, axis=-1))))
+    return float(np.sqrt(np.einsum("ij,ij->", distances, distances) / len(distances)))

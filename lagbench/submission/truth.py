@@ -14,7 +14,7 @@ from lagbench.data.registry import Size, spell_ids
 from lagbench.data.scenario import ScenarioFile, check_scenario, read_scenario
 from lagbench.errors import DataError
 
-__all__ = ["Truth"]
+__all__ = ["Truth", "squared_steps"]
 
 BLOCK = 16
 """Frames that are read at a time."""
@@ -121,9 +121,13 @@ class Truth:
         return self._frames(scenario, 0, self.size.task.input_frames)
 
     def around_start(self, scenario: int) -> NDArray[np.float32]:
-        """Return the last given frame and the first to be predicted [length], shape [2, particle, space]."""
-        last = self.size.task.input_frames - 1
-        return self._frames(scenario, last, last + 2)
+        """Return the last given frame and the first two to be predicted, or the only one.
+
+        Positions [length], shape [2 or 3, particle, space].
+        """
+        task = self.size.task
+        last = task.input_frames - 1
+        return self._frames(scenario, last, last + 1 + min(2, task.horizon))
 
     def _frames(self, scenario: int, start: int, stop: int) -> NDArray[np.float32]:
         with self.open(scenario) as file:
@@ -147,7 +151,7 @@ class Truth:
             last = min(file.header.frames, task.input_frames + task.horizon)
             for start in range(0, last - 1, BLOCK):
                 frames = file.read("position", slice(start, min(start + BLOCK + 1, last)))
-                largest = max(largest, float(np.sqrt(np.max(_squares(frames)))))
+                largest = max(largest, float(np.sqrt(np.max(squared_steps(frames)))))
                 if largest >= enough:
                     break
         return largest
@@ -163,7 +167,9 @@ class Truth:
         return measured.scenario_sha256.get(scenario, "") if measured else ""
 
 
-def _squares(frames: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Return squared distances of particles between consecutive frames."""
-    squares: NDArray[np.float64] = np.sum(np.diff(frames.astype(np.float64), axis=0) ** 2, axis=-1)
+def squared_steps(frames: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return the squared distances of particles between frames [length^2], shape [frame - 1, particle]."""
+    steps = np.diff(frames.astype(np.float64), axis=0)
+    steps *= steps
+    squares: NDArray[np.float64] = steps[..., 0] + steps[..., 1]  # ten times as fast as a sum over the axis
     return squares

@@ -1,0 +1,109 @@
+"""The scorer of this tree against that of another commit, on one core, in one run.
+
+    python benchmarks/scoring_against.py --against 0e958a2
+
+checks the other commit out beside this one (0e958a2 is the last with version 1 of the data). Each
+tree makes a submission to cavity full of the same swirls by its own ``score_data.py`` and scores
+it in processes of its own, in turns, after one that is not counted, which hashes the truth. Printed
+is the processor time per scenario of 90 frames, imports aside (best of the rounds), what the
+validation and other children take of it, the memory of the largest process, and the ratios.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+from lagbench.baselines.machine import hardware
+
+HERE = Path(__file__).resolve().parent.parent
+
+MAKE = """
+import sys
+from pathlib import Path
+sys.path.insert(0, "benchmarks")
+from score_data import make_score_data
+make_score_data(Path(sys.argv[1]))
+"""
+
+SCORE = """
+import json, resource, sys
+from pathlib import Path
+import lagbench.scoring.score, netCDF4
+from lagbench.data.registry import load
+folder, who = Path(sys.argv[1]), (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+def used():
+    return [sum(resource.getrusage(one)[:2]) for one in who]
+before, registry = used(), load(folder / "datasets.yaml")
+lagbench.scoring.score.score(
+    folder / "predictions.nc", root=folder / "root", registry=registry, workers=1
+)
+own, children = (after - then for after, then in zip(used(), before))
+count = len(registry.size("cavity", "full").subsets["test"])
+peak = int(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0])
+peak = max(peak, resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
+print(json.dumps({"cpu": (own + children) / count, "children": children / count, "memory": 1024 * peak}))
+"""
+
+
+def run(tree: Path, code: str, folder: Path) -> str:
+    """Run a program in a tree on one core; return what it prints."""
+    core = min(os.sched_getaffinity(0))
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(folder)],
+        cwd=tree,
+        env={**os.environ, "PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1"},
+        preexec_fn=lambda: os.sched_setaffinity(0, {core}),
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return done.stdout
+
+
+def main() -> int:
+    """Check the other commit out, score in both trees in turns and print a table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--against", required=True, metavar="REV")
+    parser.add_argument("--rounds", type=int, default=3)
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory() as held:
+        folder, other = Path(held), Path(held) / "other"
+        git = ["git", "-C", str(HERE), "worktree"]
+        subprocess.run([*git, "add", "--quiet", "--detach", str(other), given.against], check=True)
+        try:
+            best: dict[Path, dict[str, float]] = {}
+            made = {other: folder / "theirs", HERE: folder / "ours"}
+            for tree, data in made.items():
+                data.mkdir()
+                run(tree, MAKE, data)
+                run(tree, SCORE, data)
+            for _ in range(given.rounds):
+                for tree, data in made.items():
+                    found: dict[str, float] = json.loads(run(tree, SCORE, data))
+                    best[tree] = min(best.get(tree, found), found, key=lambda one: one["cpu"])
+        finally:
+            subprocess.run([*git, "remove", "--force", str(other)], check=True)
+    print(f"{hardware()['processor']}, one core, cavity full, all metrics but Sinkhorn")
+    print(f"| per scenario of 90 frames | {given.against} | this tree | ratio |\n|---|---|---|---|")
+    shown: tuple[tuple[str, str, Callable[[float], str]], ...] = (
+        ("processor time", "cpu", lambda seconds: f"{seconds:.2f} s"),
+        ("of it in children", "children", lambda seconds: f"{seconds:.2f} s"),
+        ("memory of the largest process", "memory", lambda size: f"{size / 1e6:.0f} MB"),
+    )
+    for name, key, text in shown:
+        theirs, ours = best[other][key], best[HERE][key]
+        print(f"| {name} | {text(theirs)} | {text(ours)} | {ours / theirs:.2f} |")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
