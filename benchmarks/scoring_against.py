@@ -4,9 +4,9 @@
 
 checks the other commit out beside this one (0e958a2 is the last with version 1 of the data). Each
 tree makes a submission to cavity full of the same swirls by its own ``score_data.py`` and scores
-it in processes of its own, in turns, after one that is not counted, which hashes the truth. Printed
-is the processor time per scenario of 90 frames, imports aside (best of the rounds), what the
-validation and other children take of it, the memory of the largest process, and the ratios.
+it in processes of its own, in turns; the first round, which may hash the truth, is not counted.
+Printed is the processor time per scenario of 90 frames, imports aside (best of the rounds), what
+the validation's child takes of it, the memory of the largest process, and the ratios.
 """
 
 from __future__ import annotations
@@ -37,6 +37,9 @@ import json, resource, sys
 from pathlib import Path
 import lagbench.scoring.score, netCDF4
 from lagbench.data.registry import load
+for name, module in list(sys.modules.items()):
+    if name.startswith("lagbench.submission.") and hasattr(module, "CPU_SECONDS"):
+        module.CPU_SECONDS = 600.0  # on a busy machine processor time is no constant
 folder, who = Path(sys.argv[1]), (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
 def used():
     return [sum(resource.getrusage(one)[:2]) for one in who]
@@ -60,7 +63,7 @@ def run(tree: Path, code: str, folder: Path) -> str:
         cwd=tree,
         env={**os.environ, "PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1"},
         preexec_fn=lambda: os.sched_setaffinity(0, {core}),
-        capture_output=True,
+        stdout=subprocess.PIPE,
         text=True,
         check=True,
     )
@@ -85,6 +88,7 @@ def main() -> int:
             for tree, data in made.items():
                 data.mkdir()
                 run(tree, MAKE, data)
+            for tree, data in made.items():
                 run(tree, SCORE, data)
             for _ in range(given.rounds):
                 for tree, data in made.items():
