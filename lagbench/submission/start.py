@@ -241,7 +241,8 @@ def _is_permuted(start: Start) -> bool:
 
 def _spaced(ids: NDArray[np.int_]) -> NDArray[np.int_]:
     """Return at most :data:`SAMPLE` of the ids, evenly spaced."""
-    return ids[np.unique(np.linspace(0, len(ids) - 1, min(SAMPLE, len(ids))).astype(int))]
+    chosen: NDArray[np.int_] = ids[np.unique(np.linspace(0, len(ids) - 1, min(SAMPLE, len(ids))).astype(int))]
+    return chosen
 
 
 def _nearest(
