@@ -17,6 +17,7 @@ import os
 import subprocess
 import sys
 import tempfile
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -70,6 +71,18 @@ def run(tree: Path, code: str, folder: Path) -> str:
     return done.stdout
 
 
+def declare(tree: Path) -> None:
+    """Write the entry points that a tree declares, which an installation of another tree would hide."""
+    groups = tomllib.loads((tree / "pyproject.toml").read_text())["project"]["entry-points"]
+    lines = [
+        f"[{group}]\n" + "".join(f"{k} = {v}\n" for k, v in named.items()) for group, named in groups.items()
+    ]
+    folder = tree / "lagbench.egg-info"
+    folder.mkdir()
+    (folder / "PKG-INFO").write_text("Metadata-Version: 2.1\nName: lagbench\nVersion: 0\n")
+    (folder / "entry_points.txt").write_text("\n".join(lines))
+
+
 def main() -> int:
     """Check the other commit out, score in both trees in turns and print a table."""
     parser = argparse.ArgumentParser(
@@ -83,6 +96,7 @@ def main() -> int:
         git = ["git", "-C", str(HERE), "worktree"]
         subprocess.run([*git, "add", "--quiet", "--detach", str(other), given.against], check=True)
         try:
+            declare(other)
             best: dict[Path, dict[str, float]] = {}
             made = {other: folder / "theirs", HERE: folder / "ours"}
             for tree, data in made.items():
