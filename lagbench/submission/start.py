@@ -145,13 +145,12 @@ def shift(start: Start) -> int | None:
     moved = _rms(start.true - start.given)
     if moved < 1e-6:
         return None
-    step = _rms(start.second - start.first)
-    if step >= 0.5 * moved and _rms(start.first - start.given) <= 0.1 * moved:
-        return -1
-    skips = start.later is not None and (
-        _rms(start.first - start.later) <= min(NEARER * _rms(start.first - start.true), 0.1 * moved)
-    )
-    return int(skips and 0.5 * moved <= step <= 1.5 * moved)
+    if _rms(start.first - start.given) <= 0.1 * moved:
+        return -int(_rms(start.second - start.first) >= 0.5 * moved)
+    if start.later is None or _rms(start.first - start.later) > 0.1 * moved:
+        return 0
+    skips = _rms(start.first - start.later) <= NEARER * _rms(start.first - start.true)
+    return int(skips and 0.5 * moved <= _rms(start.second - start.first) <= 1.5 * moved)
 
 
 def mistake(
