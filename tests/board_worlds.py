@@ -6,8 +6,7 @@ import datetime
 import functools
 import hashlib
 import shutil
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,6 @@ import yaml
 from numpy.typing import NDArray
 from report_bench import Method, ReportBench, damped, make_report_bench, noisy
 
-from lagbench.board import submit as submitting
 from lagbench.board.entry import Budget, Cost, DataSet, Entry, Flag, Meta, Prediction, ScoreBlock, ScoredFile
 from lagbench.board.entry_file import read_entry
 from lagbench.board.model import Board, Curve, Floor, Histogram, Pictures, Row, Tab, Value
@@ -29,8 +27,6 @@ from lagbench.board.verified import Verification
 from lagbench.data.checksums import file_sha256
 from lagbench.data.registry import Registry, load
 from lagbench.metrics import METRICS
-from lagbench.scoring import score
-from lagbench.submission import validate
 from lagbench.submission.task_checks import frames_to_predict
 
 Floats = NDArray[np.float64]
@@ -348,15 +344,6 @@ def _histogram(field: NDArray[np.floating], top: float) -> Histogram:
     return Histogram(low=-top, high=top, shares=counts / max(1, counts.sum()))
 
 
-@contextmanager
-def in_process() -> Iterator[None]:
-    """Validate predictions without a child process, which has tests of its own, to save its start."""
-    with pytest.MonkeyPatch.context() as patch:
-        for module in (score, submitting):
-            patch.setattr(module, "validate", functools.partial(validate, isolated=False))
-        yield
-
-
 @dataclass(frozen=True)
 class BoardBench:
     """A leaderboard's folder, and the data and registry that its entries were scored with.
@@ -380,8 +367,7 @@ class BoardBench:
     def submit(self, *paths: Path, replace: bool = False, **keys: Any) -> SubmitResult:
         """Submit predictions."""
         meta = Meta(**{"authors": ("A. Author",), "command": "make", "date": DAY, **keys})
-        with in_process():
-            return submit(paths, meta, replace=replace, new_board=True, **self.where)
+        return submit(paths, meta, replace=replace, new_board=True, **self.where)
 
     @property
     def where(self) -> dict[str, Any]:

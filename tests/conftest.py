@@ -2,17 +2,65 @@
 
 from __future__ import annotations
 
+import os
+import pickle
 import shutil
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
+from filelock import FileLock
 
 from lagbench.data.registry import Registry, default_path, load
 from lagbench.make.generate import GenerationResult, generate
+from lagbench.submission import ValidationResult
+from lagbench.submission.validation import validate
+from lagbench.work.pool import Pool
 
 SPLIT, SIZE = "curl-noise", "tiny"
 """The quickest data set to generate: five scenarios of 312 substeps."""
+
+
+@pytest.fixture(scope="session", autouse=True)
+def lasting_workers() -> Iterator[None]:
+    """Simulate in workers that outlive a generation, unless it fails: starting Taichi takes seconds.
+
+    Generations that are killed or counted are started by their tests as processes of their own.
+    """
+    held: dict[object, Pool] = {}
+
+    @contextmanager
+    def lasting(size: int, environment: Mapping[str, str] | None = None) -> Iterator[Pool]:
+        key = size, tuple((environment or {}).items()), tuple(sys.path)
+        if key not in held:
+            held[key] = stack.enter_context(Pool(size, environment or {}))
+        try:
+            yield held[key]
+        except BaseException:
+            held.pop(key).close()
+            raise
+
+    with ExitStack() as stack, pytest.MonkeyPatch.context() as patch:
+        for module in ("generate", "verify"):
+            patch.setattr(f"lagbench.make.{module}.Pool", lasting)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def validation_here() -> Iterator[None]:
+    """Score and submit without the child that looks at predictions first, which has tests of its own."""
+
+    def here(path: str | Path, *, isolated: bool = True, **options: Any) -> ValidationResult:
+        assert isolated
+        return validate(path, isolated=False, **options)
+
+    with pytest.MonkeyPatch.context() as patch:
+        for module in ("scoring.score", "board.submit"):
+            patch.setattr(f"lagbench.{module}.validate", here)
+        yield
 
 
 @pytest.fixture(scope="session")
@@ -30,10 +78,28 @@ def unmeasured(unmeasured_path: Path) -> Registry:
 
 
 @pytest.fixture(scope="session")
-def generated(tmp_path_factory: pytest.TempPathFactory, unmeasured: Registry) -> GenerationResult:
-    """The tiny curl-noise data set, generated once by two workers; do not change its files."""
-    root = tmp_path_factory.mktemp("generated")
-    return generate(SPLIT, SIZE, root=root, workers=2, registry=unmeasured)
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., GenerationResult]:
+    """A function that generates the tiny data of a split once for all tests; do not change the files."""
+    own = tmp_path_factory.getbasetemp()
+    # Under pytest-xdist each process has a folder of its own in one that all share.
+    home = own.parent if "PYTEST_XDIST_WORKER" in os.environ else own
+
+    def made(split: str, name: str = "tiny", **options: Any) -> GenerationResult:
+        root = home / f"{name}-{split}"
+        told = root.with_suffix(".pickle")
+        with FileLock(root.with_suffix(".lock")):
+            if not told.exists():
+                told.write_bytes(pickle.dumps(generate(split, SIZE, root=root, **options)))
+        found: GenerationResult = pickle.loads(told.read_bytes())
+        return found
+
+    return made
+
+
+@pytest.fixture(scope="session")
+def generated(tiny: Callable[..., GenerationResult], unmeasured: Registry) -> GenerationResult:
+    """The tiny curl-noise data, generated once by two workers and compared with no hash."""
+    return tiny(SPLIT, "generated", workers=2, registry=unmeasured)
 
 
 @pytest.fixture

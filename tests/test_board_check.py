@@ -12,14 +12,13 @@ import netCDF4
 import numpy as np
 import pytest
 import yaml
-from board_worlds import PLACE, SCORES, BoardBench, copied, in_process, master
+from board_worlds import PLACE, SCORES, BoardBench, copied, master
 from report_bench import damped, noisy
 
 from lagbench.board import check as checking
 from lagbench.board import submit as submitting
 from lagbench.board.check import CheckResult, check_board
 from lagbench.board.collect import collect
-from lagbench.board.entry import Entry
 from lagbench.board.findings import CHECKS, skeleton
 from lagbench.board.page import build
 from lagbench.data.registry import load
@@ -354,8 +353,7 @@ def predictions(own: BoardBench) -> Path:
 def rescored(bench: BoardBench, *paths: Path, **options: Any) -> CheckResult:
     """Check with predictions scored again."""
     where = {"registry": bench.registry, "root": bench.data.root, "isolated": False}
-    with in_process():
-        return check_board(bench.folder, predictions=paths, **where, **options)
+    return check_board(bench.folder, predictions=paths, **where, **options)
 
 
 def test_scoring_again_confirms_and_is_recorded(own: BoardBench, predictions: Path) -> None:
@@ -479,9 +477,3 @@ def test_a_stale_page_is_found(own: BoardBench) -> None:
     (own.folder / "schema.json").write_text("{}")
     assert build(own.folder, registry=own.registry).written == (page, own.folder / "schema.json")
     assert found(own, page=True) == []
-
-
-def test_an_entry_has_no_key_that_is_not_checked() -> None:
-    """Strict at every depth: what the schema does not know cannot pass."""
-    assert Entry.model_config["extra"] == "forbid"
-    assert Entry.model_config["strict"] is True

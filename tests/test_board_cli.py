@@ -22,7 +22,6 @@ from lagbench.make.generate import GenerationResult
 
 DOCS = Path(__file__).parent.parent / "docs"
 TOY = DOCS / "examples" / "toy_model"
-COMMANDS = (["submit"], ["leaderboard", "build"], ["leaderboard", "check"], ["leaderboard", "show"])
 Run = Callable[..., Result]
 
 
@@ -130,15 +129,6 @@ def test_errors_have_their_codes(run: Run, words: list[str], code: int, message:
     assert message in " ".join(result.stderr.split())
     assert "Traceback" not in result.output
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("words", COMMANDS)
-def test_help_has_an_example_that_parses(run: Run, words: list[str]) -> None:
-    """The help of every command ends with an example whose words it accepts."""
-    text = " ".join(run(*words, "--help").stdout.split())
-    example = re.search(rf"Example: lagbench ({' '.join(words)}.*?)$", text)
-    assert example is not None
-    assert run(*example[1].split(), "--help").exit_code == 0
 
 
 def test_the_page_of_docs_is_true(run: Run) -> None:

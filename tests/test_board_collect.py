@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import shutil
 from pathlib import Path
@@ -22,7 +21,6 @@ from lagbench.board.score_file import read_stored
 from lagbench.board.show import as_plain, chosen_tabs, tables
 from lagbench.errors import ChecksFailedError, UsageError
 from lagbench.metrics import METRICS, Score, bootstrap_interval
-from lagbench.metrics.significance import standings
 from lagbench.scoring.card import ScoreCard, digits
 from lagbench.scoring.scenario import SUBMISSION
 from lagbench.scoring.score_file import read_statistics
@@ -112,54 +110,6 @@ def made_up(values: list[float], per_frame: Any = None) -> Score:
         values=np.array(values),
         undefined=(0,) * len(values),
     )
-
-
-def brute_force_p(first: list[float], second: list[float]) -> float:
-    """Return the sign-flip p-value by listing every pattern of signs."""
-    differences = [one - two for one, two in zip(first, second, strict=True)]
-    seen = abs(sum(differences)) - 1e-12
-    patterns = list(itertools.product((-1, 1), repeat=len(differences)))
-    return sum(abs(sum(s * d for s, d in zip(p, differences, strict=True))) >= seen for p in patterns) / len(
-        patterns
-    )
-
-
-def holm_by_definition(p: list[float]) -> list[float]:
-    """Return Holm's p-values as the smallest level at which each hypothesis is rejected, by search."""
-
-    def rejected(level: float) -> set[int]:
-        order = sorted(range(len(p)), key=lambda i: p[i])
-        found = set()
-        for step, i in enumerate(order):
-            if p[i] > level / (len(p) - step):
-                break
-            found.add(i)
-        return found
-
-    levels = sorted({min(1.0, k * value) for value in p for k in range(1, len(p) + 1)})
-    return [
-        next((level for level in levels if i in rejected(level * (1 + 1e-12))), 1.0) for i in range(len(p))
-    ]
-
-
-def test_ranks_follow_the_numbers_and_ties_are_a_sign() -> None:
-    """Ranks are the order of the means; p-values are those of all sign patterns, corrected."""
-    rng = np.random.Generator(np.random.PCG64(5))
-    best = (1.0 + 0.1 * rng.random(8)).tolist()
-    held = {
-        "best": best,
-        "close": [value + (-1) ** i * 0.05 + 0.01 for i, value in enumerate(best)],
-        "worse": [value + 0.1 + 0.01 * i for i, value in enumerate(best)],
-        "worst": [value + 0.5 for value in best],
-    }
-    found = standings({name: made_up(values) for name, values in held.items()})
-    assert math.isnan(found["best"].p)
-    others = ["close", "worse", "worst"]
-    plain = [brute_force_p(held[name], best) for name in others]
-    assert [found[name].p for name in others] == pytest.approx(holm_by_definition(plain))
-    assert [found[name].rank for name in held] == [1, 2, 3, 4]
-    assert [found[name].tied for name in held] == [False, True, False, False]
-    assert standings({}) == {}
 
 
 def test_few_scenarios_decide_nothing(board: Board) -> None:

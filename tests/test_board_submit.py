@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from board_worlds import DAY, BoardBench, copied, in_process, nearer
+from board_worlds import DAY, BoardBench, copied, nearer
 from report_bench import damped, motion, noisy, still
 
 from lagbench import __version__
@@ -226,12 +226,11 @@ def test_no_board_is_begun_by_mistake(own: BoardBench, predictions: Path, tmp_pa
     """Where there is no leaderboard one has to be asked for."""
     meta = Meta(authors=("A. Author",), command="make", date=DAY)
     where = own.where | {"board": tmp_path / "elsewhere"}
-    with in_process():
-        with pytest.raises(UsageError) as error:
-            submitting.submit([predictions], meta, **where)
-        assert "--new-board" in str(error.value.fix)
-        assert not (tmp_path / "elsewhere").exists()
-        assert submitting.submit([predictions], meta, new_board=True, **where).board == tmp_path / "elsewhere"
+    with pytest.raises(UsageError) as error:
+        submitting.submit([predictions], meta, **where)
+    assert "--new-board" in str(error.value.fix)
+    assert not (tmp_path / "elsewhere").exists()
+    assert submitting.submit([predictions], meta, new_board=True, **where).board == tmp_path / "elsewhere"
 
 
 def test_what_is_not_given(own: BoardBench) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from board_worlds import BoardBench, copied, in_process
+from board_worlds import BoardBench, copied
 from report_bench import noisy
 from simple_models import FACTS, Drift
 
@@ -66,9 +66,8 @@ def submitted(
     """Submit the predictions of runs, with their weights unless others are given."""
     files = [folder / "predictions.nc" for folder in folders]
     given = tuple(folder / "weights.pt" for folder in folders) if weights is None else weights
-    with in_process():
-        meta = Meta(authors=("A. Author",), command="make")
-        submit(files, meta, weights=given, **own.where, **options)
+    meta = Meta(authors=("A. Author",), command="make")
+    submit(files, meta, weights=given, **own.where, **options)
 
 
 def found(own: BoardBench) -> set[str]:
@@ -184,8 +183,7 @@ def test_a_budget_is_that_of_the_file(own: BoardBench) -> None:
     own.edit("drift", shorten)
     assert found(own) == set()
     where = {"registry": own.registry, "root": own.data.root, "page": False}
-    with in_process():
-        again = check_board(own.folder, predictions=[run / "predictions.nc"], **where)
+    again = check_board(own.folder, predictions=[run / "predictions.nc"], **where)
     assert {one.check for one in again.findings} == {"rescored"}
 
 

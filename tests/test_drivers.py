@@ -124,7 +124,7 @@ def test_a_wall_program_is_a_wall_moved_by_hand(device: Device) -> None:
     programmed = snapshot(solver)
     health = solver.health()
     resting = [dataclasses.replace(state, wall_velocity=np.zeros((4, 2))) for state in states]
-    by_hand = loaded(constants, resting, device=device, copy=1)
+    by_hand = loaded(constants, resting, device=device)
     for frame in range(1, 8):
         rows = [state.wall_velocity[min(frame, len(state.wall_velocity) - 1)] for state in states]
         by_hand.move_walls(np.stack(rows).astype(np.float32))
@@ -137,16 +137,16 @@ def test_a_wall_program_is_a_wall_moved_by_hand(device: Device) -> None:
 
 def test_extremes_of_an_advance_span_its_frames() -> None:
     """A wall that is fast in the first of three frames only shows in the health of the whole advance."""
-    constants = parameters(substeps_per_frame=20)
+    constants = parameters(substeps_per_frame=10)
     state = scenario(constants, seed=3, viscosity=1e-2)
     program = np.zeros((4, 4, 2))
     program[1, 3, 0] = 0.5
     state = dataclasses.replace(state, wall_velocity=program)
     solver = loaded(constants, [state])
-    solver.advance(60)
+    solver.advance(30)
     fastest = solver.health()[0].max_speed
     solver.load([state])
-    solver.advance(20)
+    solver.advance(10)
     first = solver.health()[0].max_speed
-    solver.advance(40)
+    solver.advance(20)
     assert solver.health()[0].max_speed < first == fastest

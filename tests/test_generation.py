@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -89,12 +90,10 @@ def test_a_file_holds_what_its_scenario_says(generated: GenerationResult, unmeas
     assert header.parameters["modulus"] == size.value("modulus")
 
 
-def test_cavity_files_hold_the_walls_of_every_frame(tmp_path: Path, unmeasured: Registry) -> None:
+def test_cavity_files_hold_the_walls_of_every_frame(tiny: Callable[..., GenerationResult]) -> None:
     """Row f of ``wall_velocity`` is what the program says of frame f, counted from where recording starts."""
-    generate("cavity", "tiny", scenarios="3", root=tmp_path, registry=unmeasured)
-    size = unmeasured.size("cavity", "tiny")
-    state = draw(size, 3)
-    with read_scenario(tmp_path / "cavity" / "tiny" / "v2" / "test" / "0003.nc") as file:
+    state = draw(load().size("cavity", "tiny"), 3)
+    with read_scenario(tiny("cavity").folder / "test" / "0003.nc") as file:
         walls, start = file.read("wall_velocity"), file.header.parameters["start_frame"]
         assert "active_frames" not in file.header.parameters
     assert start == state.start_frame
@@ -112,12 +111,12 @@ def test_active_frames_end_when_little_energy_is_left() -> None:
 
 @pytest.mark.parametrize("split", ["fluid", "multimaterial"])
 def test_active_frames_stand_in_the_file_and_its_hash(
-    split: str, tmp_path: Path, unmeasured: Registry
+    split: str, tmp_path: Path, tiny: Callable[..., GenerationResult]
 ) -> None:
     """They follow from the stored velocities; another number is another content hash."""
-    generate(split, "tiny", subset="test", root=tmp_path, registry=unmeasured)
-    task = unmeasured.size(split, "tiny").task
-    for path in sorted((tmp_path / split / "tiny" / "v2" / "test").glob("*.nc")):
+    shutil.copytree(tiny(split).folder / "test", tmp_path / "test")
+    task = load().size(split, "tiny").task
+    for path in sorted((tmp_path / "test").glob("*.nc")):
         with read_scenario(path) as file:
             energy = (file.read("velocity").astype(np.float64) ** 2).sum(axis=(1, 2))
             stated = file.header.parameters["active_frames"]
@@ -168,16 +167,6 @@ def test_the_nudge_has_a_stream_of_its_own(unmeasured: Registry) -> None:
     assert not np.array_equal(signs, nudge(size, 4) * 2**20)
     plain = generator(SPLIT, SIZE, 2, 3).random((size.particles, 2))
     assert not np.array_equal(signs > 0, plain >= 0.5)
-
-
-def test_a_second_call_simulates_nothing(copied: Callable[[], Path], unmeasured: Registry) -> None:
-    """What is there and right stays, byte for byte, and so does the manifest."""
-    root = copied()
-    before, manifest = contents(root), (folder_of(root) / "manifest.json").read_bytes()
-    result = generate(SPLIT, SIZE, root=root, registry=unmeasured)
-    assert (result.simulated, result.kept) == ((), (0, 1, 2, 3, 4))
-    assert contents(root) == before
-    assert (folder_of(root) / "manifest.json").read_bytes() == manifest
 
 
 def test_resuming_makes_what_is_missing_or_wrong(
@@ -259,29 +248,28 @@ def test_progress_ends_at_its_total(tmp_path: Path, unmeasured: Registry) -> Non
     assert simulating[-1].scenarios_done == 1
 
 
-def test_batches_start_each_scenario_at_its_own_frame(tmp_path: Path, unmeasured: Registry) -> None:
+def test_batches_start_each_scenario_at_its_own_frame(
+    tmp_path: Path, tiny: Callable[..., GenerationResult]
+) -> None:
     """Three cavities with programs and starts of their own: one batch and single runs, equal hashes."""
-    size = unmeasured.size("cavity", "tiny")
-    options = {"scenarios": "0-2", "registry": unmeasured}
-    one = generate("cavity", "tiny", root=tmp_path / "cpu", workers=2, **options)  # type: ignore[arg-type]
-    generate("cavity", "tiny", root=tmp_path / "parallel", device="parallel", **options)  # type: ignore[arg-type]
+    size = load().size("cavity", "tiny")
     assert len({draw(size, i).start_frame for i in range(3)}) == 3
-    manifests = [read_manifest(tmp_path / device, "cavity", "tiny", 2) for device in ("cpu", "parallel")]
-    hashes = [[entry.content_sha256 for entry in manifest.files] for manifest in manifests if manifest]
-    assert one.simulated == (0, 1, 2)
-    assert hashes[0] == hashes[1]
+    batch = generate("cavity", "tiny", root=tmp_path, device="parallel", scenarios="0-2")
+    manifests = [read_manifest(made.root, "cavity", "tiny", 2) for made in (tiny("cavity"), batch)]
+    hashes = [[manifest.entry(i) for i in range(3)] for manifest in manifests if manifest]
+    single, together = ([entry.content_sha256 for entry in row if entry] for row in hashes)
+    assert len(single) == 3
+    assert single == together
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("split", ["curl-noise", "fluid", "multimaterial"])
-def test_parallel_driver_gives_the_same_data_set(split: str, tmp_path: Path, unmeasured: Registry) -> None:
+def test_parallel_driver_gives_the_same_data_set(
+    split: str, tmp_path: Path, tiny: Callable[..., GenerationResult]
+) -> None:
     """The GPU's kernels with all scenarios in one batch agree to the bit with the serial kernel."""
-    hashes = {
-        generate(split, "tiny", root=tmp_path / device, device=device, registry=unmeasured).dataset_sha256
-        for device in ("cpu", "parallel")
-    }
-    assert len(hashes) == 1
-    assert None not in hashes
+    together = generate(split, "tiny", root=tmp_path, device="parallel").dataset_sha256
+    assert together == tiny(split).dataset_sha256 is not None
 
 
 def test_selection_by_subset_and_id(unmeasured: Registry) -> None:
@@ -328,13 +316,3 @@ def test_a_worker_stays_small(split: str, scenario: int, unmeasured_path: Path, 
     kilobytes, heavy = done.stdout.splitlines()[-1].split(" ", 1)
     assert int(kilobytes) <= 400_000
     assert heavy == "[]"
-
-
-def test_this_process_never_loads_taichi(generated: GenerationResult) -> None:
-    """The parent only plans: Taichi lives in the workers."""
-    code = (
-        "import sys, lagbench.make.generate as g; "
-        f"g.generate({SPLIT!r}, {SIZE!r}, root={str(generated.root)!r}, dry_run=True); "
-        "assert not {'taichi', 'torch'} & sys.modules.keys()"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-import subprocess
 import sys
 from pathlib import Path
 
@@ -83,13 +82,6 @@ def test_a_scenario_of_an_opened_split_draws_what_its_file_draws(tmp_path: Path)
     from_split = plot_frame(split.sel(scenario=0), -1, tmp_path / "split.png")
     from_file = plot_frame(tmp_path / "fluid/tiny/v2/train/0000.nc", 3, tmp_path / "file.png")
     assert from_split.read_bytes() == from_file.read_bytes()
-
-
-def test_importing_draws_in_nothing_heavy() -> None:
-    """The modules can be imported without matplotlib, and importing them does not load it."""
-    code = "import sys, lagbench.draw.plot, lagbench.draw.animate, lagbench.make.cards; print(*sys.modules)"
-    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert not {"matplotlib", "PIL", "xarray", "taichi", "torch"} & set(loaded.split())
 
 
 def test_a_data_set_of_several_scenarios_is_refused(swirl: Path, tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ from typer.main import get_command
 
 import lagbench
 from lagbench.cli.app import app
+from lagbench.make.generate import GenerationResult
 
 CLONE = Path(__file__).parent.parent
 README = (CLONE / "README.md").read_text()
@@ -64,17 +66,17 @@ def test_the_notebook_runs(tmp_path: Path) -> None:
     assert (tmp_path / "truth.gif").read_bytes().startswith(b"GIF89a")
 
 
-def test_the_quickstart_programs_run(tmp_path: Path) -> None:
+def test_the_quickstart_programs_run(tmp_path: Path, tiny: Callable[..., GenerationResult]) -> None:
     """The blocks of the quickstart page, one after the other on one data set; the stated number comes out."""
-    lagbench.generate("cavity", "tiny", root=tmp_path)
-    where = {**os.environ, "LAGBENCH_ROOT": str(tmp_path), "OMP_NUM_THREADS": "1"}
+    root = tiny("cavity").root
+    where = {**os.environ, "LAGBENCH_ROOT": str(root), "OMP_NUM_THREADS": "1"}
     look, windows, predict = blocks((CLONE / "docs" / "quickstart.md").read_text(), "python")
     command = [sys.executable, "-c", "\n".join((look, windows, predict))]
     done = subprocess.run(command, cwd=tmp_path, env=where, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     stated = re.findall(r"# (0\.\d+)$", look, re.MULTILINE)
     assert done.stdout.splitlines()[0] == stated[0]
-    assert lagbench.validate(tmp_path / "predictions.nc", root=tmp_path).valid
+    assert lagbench.validate(tmp_path / "predictions.nc", root=root).valid
 
 
 def test_every_command_of_the_pages_exists() -> None:

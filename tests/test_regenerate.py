@@ -1,13 +1,14 @@
 """Data made here have the hashes of datasets.yaml: the promise of docs/determinism.md."""
 
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from lagbench.data.manifest import read_manifest
 from lagbench.data.registry import Size, load
-from lagbench.make.generate import generate
+from lagbench.make.generate import GenerationResult, generate
 from lagbench.make.verify import verify
 
 ROOT = Path(__file__).parent.parent
@@ -29,20 +30,20 @@ def _size(split: str, name: str) -> Size:
 
 
 @pytest.mark.parametrize("split", SPLITS)
-def test_tiny_is_made_to_the_bit(split: str, tmp_path: Path) -> None:
+def test_tiny_is_made_to_the_bit(split: str, tiny: Callable[..., GenerationResult]) -> None:
     """All of tiny: scenario, subset and data set hashes, statistics and twin floor."""
     size = _size(split, "tiny")
     measured = size.measured
     assert measured is not None
-    result = generate(split, "tiny", root=tmp_path)
+    result = tiny(split)
     assert result.dataset_sha256 == measured.dataset_sha256
-    manifest = read_manifest(tmp_path, split, "tiny", size.major)
+    manifest = read_manifest(result.root, split, "tiny", size.major)
     assert manifest is not None
     assert manifest.subset_sha256 == measured.subset_sha256
     for name, row in measured.statistics.items():
         assert tuple(manifest.statistics[name]) == row
     assert manifest.mean_twin_floor() == measured.twin_floor
-    verified = verify(split, "tiny", root=tmp_path, complete=True)
+    verified = verify(split, "tiny", root=result.root, complete=True)
     verified.check()
     assert verified.warnings == ()
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lagbench.data.registry import Size, load
 from lagbench.data.scenario import read_scenario
-from lagbench.make.generate import generate
+from lagbench.make.generate import GenerationResult
 from lagbench.submission import PredictionsWriter, ValidationResult, template, validate
 from lagbench.submission.start import Start, mistake
 from lagbench.submission.truth import Truth
@@ -53,10 +53,9 @@ class World:
 
 
 @pytest.fixture(scope="module", params=["cavity", "curl-noise", "fluid", "multimaterial"])
-def world(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> World:
-    """The test subset of each split, simulated once."""
-    root = tmp_path_factory.mktemp("root")
-    generate(request.param, "tiny", subset="test", root=root, workers=1)
+def world(request: pytest.FixtureRequest, tiny: Callable[..., GenerationResult]) -> World:
+    """The test subset of each split."""
+    root = tiny(request.param).root
     size = load().size(request.param, "tiny")
     positions, material = {}, {}
     for scenario in sorted(size.subsets["test"]):

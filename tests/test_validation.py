@@ -22,7 +22,7 @@ from lagbench.baselines.train import TrainingResult, train
 from lagbench.baselines.validation import Validation
 from lagbench.data.registry import Registry
 from lagbench.errors import DataError
-from lagbench.make.generate import GenerationResult, generate
+from lagbench.make.generate import GenerationResult
 from lagbench.scoring.score import score
 from lagbench.scoring.task import load_scored_task
 
@@ -73,9 +73,11 @@ def test_digits_of_the_scorer_in_a_full_box(
     assert validated_on_test(*there, "curl-noise") == scored(*there, "vorticity_nrmse")
 
 
-def test_digits_of_the_scorer_on_the_free_surface(run: Run, unmeasured: Registry, tmp_path: Path) -> None:
+def test_digits_of_the_scorer_on_the_free_surface(
+    run: Run, unmeasured: Registry, tiny: Callable[..., GenerationResult]
+) -> None:
     """The same for the distance of clouds, although rollouts end where the truth rests."""
-    root = generate("fluid", "tiny", root=tmp_path, workers=2, registry=unmeasured).root
+    root = tiny("fluid").root
     result = run("neuralmpm", "training.steps=2", root=root, split="fluid")
     assert result.metric == "cloud_distance"
     there = (result.weights, unmeasured, root)
