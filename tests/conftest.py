@@ -13,7 +13,9 @@ from typing import Any
 
 import pytest
 from filelock import FileLock
+from typer.testing import CliRunner, Result
 
+from lagbench.cli.app import app
 from lagbench.data.registry import Registry, default_path, load
 from lagbench.make.generate import GenerationResult, generate
 from lagbench.submission import ValidationResult
@@ -78,7 +80,7 @@ def unmeasured(unmeasured_path: Path) -> Registry:
 
 
 @pytest.fixture(scope="session")
-def tiny(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., GenerationResult]:
+def tiny_split(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., GenerationResult]:
     """A function that generates the tiny data of a split once for all tests; do not change the files."""
     own = tmp_path_factory.getbasetemp()
     # Under pytest-xdist each process has a folder of its own in one that all share.
@@ -97,9 +99,17 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., GenerationRe
 
 
 @pytest.fixture(scope="session")
-def generated(tiny: Callable[..., GenerationResult], unmeasured: Registry) -> GenerationResult:
+def generated(tiny_split: Callable[..., GenerationResult], unmeasured: Registry) -> GenerationResult:
     """The tiny curl-noise data, generated once by two workers and compared with no hash."""
-    return tiny(SPLIT, "generated", workers=2, registry=unmeasured)
+    return tiny_split(SPLIT, "generated", workers=2, registry=unmeasured)
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, unmeasured_path: Path) -> Callable[..., Result]:
+    """A function that runs lagbench with our splits and no recorded hashes."""
+    monkeypatch.setenv("LAGBENCH_REGISTRY", str(unmeasured_path))
+    monkeypatch.delenv("LAGBENCH_DEBUG", raising=False)
+    return lambda *words: CliRunner().invoke(app, [str(word) for word in words])
 
 
 @pytest.fixture

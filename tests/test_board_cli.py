@@ -13,11 +13,10 @@ from pathlib import Path
 import pytest
 import yaml
 from conftest import SIZE, SPLIT
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
 from lagbench.board.entry import Budget, Entry, Meta
 from lagbench.board.findings import CHECKS
-from lagbench.cli.app import app
 from lagbench.make.generate import GenerationResult
 
 DOCS = Path(__file__).parent.parent / "docs"
@@ -26,15 +25,11 @@ Run = Callable[..., Result]
 
 
 @pytest.fixture
-def run(
-    monkeypatch: pytest.MonkeyPatch, unmeasured_path: Path, generated: GenerationResult, tmp_path: Path
-) -> Run:
+def run(run: Run, monkeypatch: pytest.MonkeyPatch, generated: GenerationResult, tmp_path: Path) -> Run:
     """A function that runs lagbench in an empty folder on the generated data set."""
-    monkeypatch.setenv("LAGBENCH_REGISTRY", str(unmeasured_path))
     monkeypatch.setenv("LAGBENCH_ROOT", str(generated.root))
-    monkeypatch.delenv("LAGBENCH_DEBUG", raising=False)
     monkeypatch.chdir(tmp_path)
-    return lambda *words: CliRunner().invoke(app, [str(word) for word in words])
+    return run
 
 
 def make_toy(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -98,15 +93,6 @@ def test_machines_are_answered_in_json(run: Run, monkeypatch: pytest.MonkeyPatch
     assert "lagbench leaderboard build" in result.stderr
     assert run("leaderboard", "build", *board, "--quiet").output == ""
     assert run("leaderboard", "check", *board, "--base", "main").exit_code == 2
-
-
-def test_an_empty_board_is_well(run: Run, tmp_path: Path) -> None:
-    """Without any entry it is built, checked and shown."""
-    (tmp_path / "leaderboard" / "submissions").mkdir(parents=True)
-    for words in (["build"], ["check", "--page"], ["show"], ["show", "--json"]):
-        result = run("leaderboard", *words)
-        assert result.exit_code == 0, result.output
-    assert json.loads(result.stdout) == {"tabs": []}
 
 
 @pytest.mark.parametrize(

@@ -12,21 +12,13 @@ import pytest
 import yaml
 from conftest import SIZE, SPLIT
 from typer.main import get_command
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
 from lagbench.cli.app import app
 from lagbench.data.registry import default_path, load
 from lagbench.make.generate import GenerationResult
 
 COMMANDS = ["list", "info", "generate", "verify", "plot", "animate", "cite", "doctor", "clean"]
-
-
-@pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, unmeasured_path: Path) -> Callable[..., Result]:
-    """A function that runs lagbench with our splits and no recorded hashes."""
-    monkeypatch.setenv("LAGBENCH_REGISTRY", str(unmeasured_path))
-    monkeypatch.delenv("LAGBENCH_DEBUG", raising=False)
-    return lambda *words: CliRunner().invoke(app, [str(word) for word in words])
 
 
 Run = Callable[..., Result]

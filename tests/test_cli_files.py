@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable
 from importlib.metadata import requires
@@ -10,21 +9,12 @@ from pathlib import Path
 
 import pytest
 from conftest import SIZE, SPLIT
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
-from lagbench.cli.app import app
 from lagbench.cli.machine import NEEDED
 from lagbench.make.generate import GenerationResult
 
 Run = Callable[..., Result]
-
-
-@pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, unmeasured_path: Path) -> Run:
-    """A function that runs lagbench with our splits and no recorded hashes."""
-    monkeypatch.setenv("LAGBENCH_REGISTRY", str(unmeasured_path))
-    monkeypatch.delenv("LAGBENCH_DEBUG", raising=False)
-    return lambda *words: CliRunner().invoke(app, [str(word) for word in words])
 
 
 def files_below(folder: Path) -> set[str]:
@@ -99,27 +89,6 @@ def test_pictures_go_to_folders_that_are_there(
     assert result.exit_code == 2, result.output
     assert str(lost) in result.stderr
     assert not lost.exists()
-
-
-@pytest.mark.parametrize("rate", ["nan", "inf", "0", "-3"])
-def test_a_rate_that_is_no_rate_exits_2(
-    rate: str, run: Run, generated: GenerationResult, tmp_path: Path
-) -> None:
-    """Neither a fault of ours nor raw output of ffmpeg."""
-    for ending in ("gif", "mp4"):
-        target = tmp_path / f"a.{ending}"
-        result = run("animate", generated.folder / "test" / "0003.nc", "--fps", rate, "-o", target)
-        assert result.exit_code == 2, result.output
-        assert "0.01 to 1000 frames/s" in result.stderr
-
-
-def test_verify_says_as_json_whether_all_is_there(run: Run, copied: Callable[[], Path]) -> None:
-    """`complete` is true, and false once a file is gone."""
-    root = copied()
-    words = ("verify", SPLIT, "--size", SIZE, "--root", root, "--json")
-    assert json.loads(run(*words).stdout)["complete"] is True
-    (root / SPLIT / SIZE / "v2" / "test" / "0003.nc").unlink()
-    assert json.loads(run(*words).stdout)["complete"] is False
 
 
 def test_doctor_looks_at_every_dependency() -> None:

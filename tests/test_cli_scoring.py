@@ -12,10 +12,9 @@ from typing import Any
 import h5py
 import pytest
 from conftest import SIZE, SPLIT
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
 from lagbench import submission
-from lagbench.cli.app import app
 from lagbench.make.generate import GenerationResult
 from lagbench.scoring import score
 from lagbench.submission import validation
@@ -24,12 +23,10 @@ Run = Callable[..., Result]
 
 
 @pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, unmeasured_path: Path, generated: GenerationResult) -> Run:
+def run(run: Run, monkeypatch: pytest.MonkeyPatch, generated: GenerationResult) -> Run:
     """A function that runs lagbench on the generated data set with no recorded hashes."""
-    monkeypatch.setenv("LAGBENCH_REGISTRY", str(unmeasured_path))
     monkeypatch.setenv("LAGBENCH_ROOT", str(generated.root))
-    monkeypatch.delenv("LAGBENCH_DEBUG", raising=False)
-    return lambda *words: CliRunner().invoke(app, [str(word) for word in words])
+    return run
 
 
 @pytest.fixture
@@ -156,13 +153,6 @@ def test_unreadable_files(run: Run, predictions: Path, make: Callable[[Path], ob
     assert scored.exit_code == validated.exit_code == code
     assert "fix:" in scored.stderr
     assert "Traceback" not in scored.stderr + scored.stdout
-
-
-def test_a_root_without_data(run: Run, predictions: Path, tmp_path: Path) -> None:
-    """Scoring without the test subset exits with 4 and names the command that generates it."""
-    result = run("score", predictions, "--root", tmp_path / "empty")
-    assert result.exit_code == 4
-    assert "lagbench generate" in result.stderr
 
 
 def copies(predictions: Path, *names: str) -> list[Path]:

@@ -90,10 +90,10 @@ def test_a_file_holds_what_its_scenario_says(generated: GenerationResult, unmeas
     assert header.parameters["modulus"] == size.value("modulus")
 
 
-def test_cavity_files_hold_the_walls_of_every_frame(tiny: Callable[..., GenerationResult]) -> None:
+def test_cavity_files_hold_the_walls_of_every_frame(tiny_split: Callable[..., GenerationResult]) -> None:
     """Row f of ``wall_velocity`` is what the program says of frame f, counted from where recording starts."""
     state = draw(load().size("cavity", "tiny"), 3)
-    with read_scenario(tiny("cavity").folder / "test" / "0003.nc") as file:
+    with read_scenario(tiny_split("cavity").folder / "test" / "0003.nc") as file:
         walls, start = file.read("wall_velocity"), file.header.parameters["start_frame"]
         assert "active_frames" not in file.header.parameters
     assert start == state.start_frame
@@ -111,10 +111,10 @@ def test_active_frames_end_when_little_energy_is_left() -> None:
 
 @pytest.mark.parametrize("split", ["fluid", "multimaterial"])
 def test_active_frames_stand_in_the_file_and_its_hash(
-    split: str, tmp_path: Path, tiny: Callable[..., GenerationResult]
+    split: str, tmp_path: Path, tiny_split: Callable[..., GenerationResult]
 ) -> None:
     """They follow from the stored velocities; another number is another content hash."""
-    shutil.copytree(tiny(split).folder / "test", tmp_path / "test")
+    shutil.copytree(tiny_split(split).folder / "test", tmp_path / "test")
     task = load().size(split, "tiny").task
     for path in sorted((tmp_path / "test").glob("*.nc")):
         with read_scenario(path) as file:
@@ -249,13 +249,13 @@ def test_progress_ends_at_its_total(tmp_path: Path, unmeasured: Registry) -> Non
 
 
 def test_batches_start_each_scenario_at_its_own_frame(
-    tmp_path: Path, tiny: Callable[..., GenerationResult]
+    tmp_path: Path, tiny_split: Callable[..., GenerationResult]
 ) -> None:
     """Three cavities with programs and starts of their own: one batch and single runs, equal hashes."""
     size = load().size("cavity", "tiny")
     assert len({draw(size, i).start_frame for i in range(3)}) == 3
     batch = generate("cavity", "tiny", root=tmp_path, device="parallel", scenarios="0-2")
-    manifests = [read_manifest(made.root, "cavity", "tiny", 2) for made in (tiny("cavity"), batch)]
+    manifests = [read_manifest(made.root, "cavity", "tiny", 2) for made in (tiny_split("cavity"), batch)]
     hashes = [[manifest.entry(i) for i in range(3)] for manifest in manifests if manifest]
     single, together = ([entry.content_sha256 for entry in row if entry] for row in hashes)
     assert len(single) == 3
@@ -265,11 +265,11 @@ def test_batches_start_each_scenario_at_its_own_frame(
 @pytest.mark.slow
 @pytest.mark.parametrize("split", ["curl-noise", "fluid", "multimaterial"])
 def test_parallel_driver_gives_the_same_data_set(
-    split: str, tmp_path: Path, tiny: Callable[..., GenerationResult]
+    split: str, tmp_path: Path, tiny_split: Callable[..., GenerationResult]
 ) -> None:
     """The GPU's kernels with all scenarios in one batch agree to the bit with the serial kernel."""
     together = generate(split, "tiny", root=tmp_path, device="parallel").dataset_sha256
-    assert together == tiny(split).dataset_sha256 is not None
+    assert together == tiny_split(split).dataset_sha256 is not None
 
 
 def test_selection_by_subset_and_id(unmeasured: Registry) -> None:

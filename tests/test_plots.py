@@ -16,7 +16,7 @@ from swirls import OMEGA, TOP_TO_THE_RIGHT, write_swirl
 from lagbench import errors
 from lagbench.draw import style
 from lagbench.draw.panels import Panel, draw_walls, limit_of
-from lagbench.draw.plot import KINDS, contact_sheet, describe, plot_frame
+from lagbench.draw.plot import KINDS, contact_sheet, plot_frame
 from lagbench.draw.recording import open_recording
 from lagbench.draw.style import figure, pixels_of
 from lagbench.errors import DataError, UsageError
@@ -58,12 +58,6 @@ def test_every_kind_of_picture_is_small_and_has_the_same_bytes_twice(
     assert data == second.read_bytes()
     assert len(data) < 300_000
     assert set(chunks(data)) == {b"IHDR", b"PLTE", b"IDAT", b"IEND"}
-
-
-def test_kinds_differ(swirl: Path, tmp_path: Path) -> None:
-    """No two kinds draw the same picture."""
-    drawn = {plot_frame(swirl, 2, tmp_path / f"{kind}.png", kind=kind).read_bytes() for kind in KINDS}
-    assert len(drawn) == len(KINDS)
 
 
 def test_a_data_set_draws_what_its_file_draws(swirl: Path, tmp_path: Path) -> None:
@@ -136,23 +130,6 @@ def test_moving_walls_are_marked_and_point_where_they_slide(tmp_path: Path) -> N
     assert mirrored < 0.2 * np.abs(drawn["right"].astype(int) - drawn["left"]).mean()
 
 
-def test_captions_say_what_sets_a_scenario_apart(swirl: Path, tmp_path: Path) -> None:
-    """Reynolds number, family or frequency stand beside split, size and id."""
-    with open_recording(swirl) as recording:
-        assert describe(recording) == "cavity tiny  ·  scenario 0  ·  Re 100"
-    splash = write_swirl(tmp_path, "fluid", 3, walls=None, parameters={"family": "splash"})
-    with open_recording(splash) as recording:
-        assert describe(recording) == "fluid tiny  ·  scenario 3  ·  family splash"
-
-
-@pytest.mark.parametrize("kind", ["vortcity", "Speed", ""])
-def test_unknown_kinds_are_refused(swirl: Path, tmp_path: Path, kind: str) -> None:
-    """The message lists the kinds there are."""
-    with pytest.raises(UsageError, match="no kind of picture") as caught:
-        plot_frame(swirl, 0, tmp_path / "x.png", kind=kind)
-    assert "vorticity" in str(caught.value)
-
-
 @pytest.mark.parametrize(("name", "head"), [("x.pdf", b"%PDF"), ("x.svg", b"<?xml")])
 def test_vector_pictures_have_the_same_bytes_twice(
     swirl: Path, tmp_path: Path, name: str, head: bytes
@@ -181,12 +158,6 @@ def test_only_known_endings_are_taken(swirl: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError):
         plot_frame(swirl, 0, tmp_path / "x.jpg")
     assert not list(tmp_path.iterdir())
-
-
-def test_a_missing_file_is_a_data_error(tmp_path: Path) -> None:
-    """The path stands in the message."""
-    with pytest.raises(DataError, match="missing"):
-        plot_frame(tmp_path / "none.nc", 0, tmp_path / "x.png")
 
 
 def test_without_matplotlib_the_extra_is_named(

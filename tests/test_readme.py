@@ -66,9 +66,9 @@ def test_the_notebook_runs(tmp_path: Path) -> None:
     assert (tmp_path / "truth.gif").read_bytes().startswith(b"GIF89a")
 
 
-def test_the_quickstart_programs_run(tmp_path: Path, tiny: Callable[..., GenerationResult]) -> None:
+def test_the_quickstart_programs_run(tmp_path: Path, tiny_split: Callable[..., GenerationResult]) -> None:
     """The blocks of the quickstart page, one after the other on one data set; the stated number comes out."""
-    root = tiny("cavity").root
+    root = tiny_split("cavity").root
     where = {**os.environ, "LAGBENCH_ROOT": str(root), "OMP_NUM_THREADS": "1"}
     look, windows, predict = blocks((CLONE / "docs" / "quickstart.md").read_text(), "python")
     command = [sys.executable, "-c", "\n".join((look, windows, predict))]

@@ -30,12 +30,12 @@ def _size(split: str, name: str) -> Size:
 
 
 @pytest.mark.parametrize("split", SPLITS)
-def test_tiny_is_made_to_the_bit(split: str, tiny: Callable[..., GenerationResult]) -> None:
+def test_tiny_is_made_to_the_bit(split: str, tiny_split: Callable[..., GenerationResult]) -> None:
     """All of tiny: scenario, subset and data set hashes, statistics and twin floor."""
     size = _size(split, "tiny")
     measured = size.measured
     assert measured is not None
-    result = tiny(split)
+    result = tiny_split(split)
     assert result.dataset_sha256 == measured.dataset_sha256
     manifest = read_manifest(result.root, split, "tiny", size.major)
     assert manifest is not None

@@ -28,9 +28,9 @@ from lagbench.scoring.score_file import read_statistics
 
 
 @pytest.fixture(scope="session")
-def cavity(tiny: Callable[..., GenerationResult], unmeasured: Registry) -> ScoreBench:
+def cavity(tiny_split: Callable[..., GenerationResult], unmeasured: Registry) -> ScoreBench:
     """The tiny cavity."""
-    return bench_of(tiny(SPLIT), unmeasured)
+    return bench_of(tiny_split(SPLIT), unmeasured)
 
 
 @pytest.fixture(scope="session")
@@ -280,12 +280,12 @@ def test_what_fails_is_said_and_the_rest_is_made(
 
 @pytest.mark.slow
 def test_everything_is_made_at_tiny(
-    tmp_path: Path, unmeasured: Registry, tiny: Callable[..., GenerationResult]
+    tmp_path: Path, unmeasured: Registry, tiny_split: Callable[..., GenerationResult]
 ) -> None:
     """From nothing but data, every table and figure of a size; two steps of training are enough for that."""
     root, folder = tmp_path / "data", tmp_path / "runs" / "reproduce" / SIZE
     for split in EXPECTED:
-        shutil.copytree(tiny(split).root, root, dirs_exist_ok=True)
+        shutil.copytree(tiny_split(split).root, root, dirs_exist_ok=True)
     places = ["--size", SIZE, "--root", str(root), "--runs", str(tmp_path / "runs"), "--device", "cpu"]
     short = [*places, "--threads", "1", "--set", "training.steps=2"]
     frames = {name for name, figure in FIGURES.items() if {"fluid", "multimaterial"} & figure.needs.keys()}

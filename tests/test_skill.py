@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -129,6 +130,12 @@ def bench(generated: GenerationResult, unmeasured: Registry) -> ScoreBench:
     return bench_of(generated, unmeasured)
 
 
+@pytest.fixture(scope="module")
+def measured_floors(bench: ScoreBench) -> dict[str, Any]:
+    """All floors of it, measured once."""
+    return measure(bench.size, bench.root)
+
+
 def recorded(size: Size, sha256: str = "a" * 64) -> Size:
     """Return a size as if its data set were recorded."""
     statistics = {"position_std": (0.3, 0.3), "velocity_std": (1e-3, 1e-3)}
@@ -138,9 +145,11 @@ def recorded(size: Size, sha256: str = "a" * 64) -> Size:
     return size.model_copy(update={"measured": measured})
 
 
-def test_shipped_scores_are_the_measured_ones(bench: ScoreBench, tmp_path: Path) -> None:
+def test_shipped_scores_are_the_measured_ones(
+    bench: ScoreBench, measured_floors: dict[str, Any], tmp_path: Path
+) -> None:
     """Written and read again they are equal to five digits, curves to three; another data set has none."""
-    found = measure(bench.size, bench.root)
+    found = measured_floors
     assert list(found) == [floor.name for floor in floors_of(bench.size)]
     size, frames = recorded(bench.size), (15, 25)
     path = write_shipped(size, found, dataset_sha256="a" * 64, reported=frames, folder=tmp_path)
@@ -164,9 +173,11 @@ def test_shipped_scores_are_the_measured_ones(bench: ScoreBench, tmp_path: Path)
     assert shipped(bench.size, tmp_path) is None
 
 
-def test_a_forged_shipped_score_is_found(bench: ScoreBench, tmp_path: Path) -> None:
+def test_a_forged_shipped_score_is_found(
+    bench: ScoreBench, measured_floors: dict[str, Any], tmp_path: Path
+) -> None:
     """One value changed by 1 % differs from what is measured; so does a floor that is left out."""
-    found = measure(bench.size, bench.root, floors=["persistence", "constant-velocity"])
+    found = {name: measured_floors[name] for name in ("persistence", "constant-velocity")}
     size = recorded(bench.size)
     path = write_shipped(size, found, dataset_sha256="a" * 64, reported=(15,), folder=tmp_path)
     said = json.loads(path.read_text())
@@ -180,12 +191,15 @@ def test_a_forged_shipped_score_is_found(bench: ScoreBench, tmp_path: Path) -> N
     assert set(unlike["constant-velocity"]) == set(found["constant-velocity"].scores)
 
 
-def test_shipped_floors_are_measured_again(bench: ScoreBench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_shipped_floors_are_measured_again(
+    bench: ScoreBench, measured_floors: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """What is shipped agrees with a second measurement; one value changed by 1 % is named with its floor."""
     assert [size.name for size in measured_sizes(bench.root, registry=bench.registry)] == [bench.size.name]
-    held = measure(bench.size, bench.root)
+    held = dict(measured_floors)
     monkeypatch.setattr(floors_of_scoring, "shipped", lambda size: held)
     assert measured_again(bench.size, bench.root) == (tuple(held), {})
+    monkeypatch.setattr(floors_of_scoring, "measure", lambda *_, **__: measured_floors)
     still = held["persistence"]
     score = still.scores["position_rmse"]
     forged = {**still.scores, "position_rmse": replace(score, values=1.01 * score.values)}
@@ -210,13 +224,12 @@ def test_an_interrupted_measurement_goes_on(bench: ScoreBench, copied: Callable[
 
 
 def test_scoring_takes_what_is_shipped(
-    bench: ScoreBench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    bench: ScoreBench, measured_floors: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With shipped scores nothing but the submission is measured, and the card says the same."""
     path = bench.submit(tmp_path / "predictions.nc", straight)
     measured = bench.evaluate(path)
-    held = measure(bench.size, bench.root)
-    monkeypatch.setattr(scoring, "shipped", lambda size: held)
+    monkeypatch.setattr(scoring, "shipped", lambda size: measured_floors)
     card = bench.evaluate(path)
     assert list(card.tallies) == [SUBMISSION]
     assert set(measured.tallies) == {SUBMISSION, *measurable(bench.size, bench.root)}

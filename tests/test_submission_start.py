@@ -53,9 +53,9 @@ class World:
 
 
 @pytest.fixture(scope="module", params=["cavity", "curl-noise", "fluid", "multimaterial"])
-def world(request: pytest.FixtureRequest, tiny: Callable[..., GenerationResult]) -> World:
+def world(request: pytest.FixtureRequest, tiny_split: Callable[..., GenerationResult]) -> World:
     """The test subset of each split."""
-    root = tiny(request.param).root
+    root = tiny_split(request.param).root
     size = load().size(request.param, "tiny")
     positions, material = {}, {}
     for scenario in sorted(size.subsets["test"]):

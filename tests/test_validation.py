@@ -74,10 +74,10 @@ def test_digits_of_the_scorer_in_a_full_box(
 
 
 def test_digits_of_the_scorer_on_the_free_surface(
-    run: Run, unmeasured: Registry, tiny: Callable[..., GenerationResult]
+    run: Run, unmeasured: Registry, tiny_split: Callable[..., GenerationResult]
 ) -> None:
     """The same for the distance of clouds, although rollouts end where the truth rests."""
-    root = tiny("fluid").root
+    root = tiny_split("fluid").root
     result = run("neuralmpm", "training.steps=2", root=root, split="fluid")
     assert result.metric == "cloud_distance"
     there = (result.weights, unmeasured, root)

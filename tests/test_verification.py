@@ -302,13 +302,6 @@ def test_simulating_anew_finds_other_bits(tmp_path: Path, measured: Registry) ->
         result.check()
 
 
-def test_unknown_names_are_usage_errors(tmp_path: Path, measured: Registry) -> None:
-    """Split, size, subset, ids and workers are checked as generate checks them."""
-    for options in ({"subset": "trian"}, {"scenarios": "7"}, {"workers": 0}, {"workers": -1}):
-        with pytest.raises(UsageError):
-            verify(SPLIT, SIZE, root=tmp_path, registry=measured, **options)
-
-
 @given(st.lists(st.integers(0, 9999), min_size=1, unique=True).map(sorted), st.integers(0, 80))
 def test_evenly_spaced_ids(ids: list[int], count: int) -> None:
     """As many distinct ids as asked for (or all), ascending, first and last included, gaps alike."""
