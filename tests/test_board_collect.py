@@ -136,14 +136,6 @@ def test_withdrawn_superseded_and_outdated_are_not_ranked(own: BoardBench) -> No
     assert not rows["flipping"].current
 
 
-def test_cost_and_speed_up(board: Board) -> None:
-    """Mean seconds per frame of the seeds, and the solver's time over it."""
-    cost = row_of(board, "damped").entry.cost
-    assert cost is not None
-    assert (cost.seconds_per_frame, cost.solver_seconds_per_frame, cost.speed_up) == (0.5, 2.0, 4.0)
-    assert row_of(board, "noisy").entry.cost is None
-
-
 def test_the_truth_is_not_that_of_an_explosion(bench: BoardBench, board: Board) -> None:
     """Maps of truth and prediction share one packing: the tab's truth is the finest."""
     names = ("flipping", "noisy")

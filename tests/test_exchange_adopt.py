@@ -110,16 +110,6 @@ def test_a_local_split_is_verified_templated_and_scored(own: LocalSplit, tmp_pat
     assert card.header.split == "mine"
 
 
-def test_damage_is_told(tmp_path: Path, runs: list[NDArray[np.float32]]) -> None:
-    """A scenario put in the place of another is found by its hash."""
-    made = adopt(save_runs(tmp_path / "in", runs), output=tmp_path / "mine", **BASIC)
-    scenario(made, 0).write_bytes(scenario(made, 1).read_bytes())
-    with pytest.raises(DataError, match="another scenario") as caught:
-        lagbench.verify(str(made.folder)).check()
-    assert "lagbench adopt" in str(caught.value)
-    assert "lagbench generate" not in str(caught.value)
-
-
 def test_ten_comes_after_two(tmp_path: Path) -> None:
     """Files count by the numbers in their names, as a shell lists them or in a folder; others stay."""
     names = [f"run{n}.npz" for n in (0, 1, 10, 11, 2)]

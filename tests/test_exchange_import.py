@@ -17,7 +17,7 @@ from lagbench.cli.app import app
 from lagbench.data.local import locate
 from lagbench.data.registry import Registry
 from lagbench.errors import DataError, UnreadableFileError, UsageError
-from lagbench.exchange import adopt, export, import_split
+from lagbench.exchange import export, import_split
 from lagbench.make.generate import GenerationResult
 
 
@@ -68,16 +68,6 @@ def test_windows_of_imported_data_equal_the_source(tmp_path: Path, form: str) ->
         np.testing.assert_array_equal(window, wanted)
     interval = 0.01 if gns else 0.05
     assert locate(str(made.folder)).size.frame_interval == pytest.approx(interval)
-
-
-def test_imported_data_are_verified_and_scored(tmp_path: Path) -> None:
-    """An imported split has hashes of its own, a template that is valid, and scores."""
-    source = write_h5(tmp_path / "in", straight_runs(3))
-    made = import_split(source, format="lagrangebench-h5", output=tmp_path / "own")
-    assert lagbench.verify(str(made.folder), complete=True).problems == ()
-    lagbench.template(str(made.folder), output=tmp_path / "p.nc")
-    card = lagbench.score(tmp_path / "p.nc", root=tmp_path, write=False, workers=1)
-    assert np.max(card.scores["constant-velocity"]["position_rmse"].per_frame) < 1e-5
 
 
 def test_pickles_are_refused_unless_allowed(tmp_path: Path) -> None:
@@ -163,20 +153,6 @@ def test_what_the_user_says_goes_before_the_metadata(tmp_path: Path) -> None:
     assert (size.task.radius, size.task.input_frames, size.task.horizon) == (0.1, 2, 4)
     assert size.task.score_grid.placement == "cell_centres"
     assert size.value("spacing") == 0.05
-
-
-def test_the_other_way_round(tmp_path: Path) -> None:
-    """A user's own data, adopted and exported, come back from either format with the same bits."""
-    np.save(tmp_path / "runs.npy", np.stack(straight_runs(3)))
-    own = adopt(tmp_path / "runs.npy", output=tmp_path / "own", radius=0.1, frame_interval=0.1)
-    hashes = []
-    for form in ("gns-npz", "lagrangebench-h5"):
-        export(str(own.folder), format=form, output=tmp_path / form)
-        back = import_split(
-            tmp_path / form, format=form, output=tmp_path / f"from-{form}" / "own", allow_pickle=True
-        )
-        hashes.append(back.dataset_sha256)
-    assert hashes == [own.dataset_sha256] * 2
 
 
 def test_the_other_format_is_recognised(tmp_path: Path) -> None:

@@ -180,12 +180,6 @@ def test_budget_is_one() -> None:
         TrainingOptions(steps=1, epochs=1)
 
 
-def test_unknown_baseline() -> None:
-    """An unknown name is a usage error that names the nearest."""
-    with pytest.raises(UsageError, match="did you mean 'supergat'"):
-        find("supergatt")
-
-
 def test_other_packages_add_baselines(monkeypatch: pytest.MonkeyPatch) -> None:
     """A class of another package is found by its name; ours cannot be replaced."""
     install(monkeypatch, drift=Drift, gns=Drift)

@@ -14,7 +14,7 @@ from hypothesis.extra import numpy as hnp
 from scenario_factory import frames_of
 from submission_data import FRAMES, GIVEN, HORIZON, PARTICLES, TESTS, Bench, make_bench, truth
 
-from lagbench.data.registry import Registry, load
+from lagbench.data.registry import Registry
 from lagbench.errors import DataError, UsageError, WorkFailedError
 from lagbench.submission import PredictionsWriter, open_predictions, template, write
 
@@ -174,9 +174,3 @@ def test_a_folder_that_cannot_be_written_is_named(bench: Bench) -> None:
     """A parent that is a file."""
     with pytest.raises(WorkFailedError, match="cannot write"):
         write(bench.valid / "p.nc", {i: truth(i) for i in TESTS}, **options(bench))
-
-
-def test_unknown_splits_suggest_the_nearest(bench: Bench) -> None:
-    """As everywhere."""
-    with pytest.raises(UsageError, match="did you mean 'cavity'"):
-        write(bench.folder / "p.nc", {}, split="cavty", method="m", registry=load(bench.registry_path))
