@@ -46,6 +46,9 @@ COLUMNS = 6
 TIMES = (0.0, 0.05, 0.1, 0.2, 0.5, 1.0)
 """Moments of a row over time, as shares of the last frame."""
 
+MOMENTS = (1 / 9, 1 / 2, 1.0)
+"""Shares of the last frame of interest at which flows that walls drive are shown."""
+
 DRIVEN, DECAYING = 30, 36
 """Scenarios on a sheet of flows that walls drive, and of those that only decay (Figs. 5.7, 5.20)."""
 
@@ -93,8 +96,8 @@ def contact_sheet(
         output: file to write, ending in .png, .pdf or .svg.
         root: folder that holds all data sets; see ``resolve_root``.
         kind: what each panel shows; the default suits the split.
-        frame: frame to show where the sheet is a table of scenarios; when None, the first, or
-            the last frame of interest of what starts at rest or is driven.
+        frame: frame to show where the sheet is a table of scenarios; when None, the first, the last
+            frame of interest of what starts at rest, or three frames up to that of what is driven.
         dpi: pixels per inch.
         registry: where splits are described; ours when None.
 
@@ -173,7 +176,7 @@ def _moment_label(kind: str, scene: Scene, *, first: bool) -> str:
 
 
 def _table(files: Sequence[Path], panel: Panel | None, frame: int | None, splits: Registry) -> _Sheet:
-    """Return a table of scenarios at one frame."""
+    """Return a table of scenarios at one frame, or at three of what is driven."""
     with open_recording(files[0], registry=splits) as recording:
         driven = bool(recording.wall_velocity.any())
         panel = panel or (Panel.STREAMLINES if driven else Panel.VORTICITY)
@@ -181,18 +184,25 @@ def _table(files: Sequence[Path], panel: Panel | None, frame: int | None, splits
             starts_at_rest = driven or not recording.scene(0).speed.any()
             latest = recording.size.task.frames_of_interest[-1] if starts_at_rest else 0
             frame = min(latest, recording.frames - 1)
+            frames = [round(share * frame) for share in MOMENTS] if driven else [frame]
+        else:
+            frames = [frame]
     scenes = []
     for path in files[: DRIVEN if driven else DECAYING]:
         with open_recording(path, registry=splits) as recording:
-            scenes.append(recording.scene(frame))
+            scenes += [recording.scene(moment) for moment in frames]
     scaled = driven and panel in (Panel.STREAMLINES, Panel.SPEED)
     common = float(np.median([limit_of(panel, scene) for scene in scenes]))
     limits = [WALL_SHARE * np.abs(s.recording.wall_velocity).max() if scaled else common for s in scenes]
-    cells = [_Cell(scene=s, label=_name(s), limit=m) for s, m in zip(scenes, limits, strict=True)]
+    cells = [
+        _Cell(scene=s, label=_name(s) if s.frame == frames[0] else f"frame {s.frame}", limit=m)
+        for s, m in zip(scenes, limits, strict=True)
+    ]
+    columns = COLUMNS if len(frames) == 1 else 3 * len(frames)
     return _Sheet(
-        rows=[cells[i : i + COLUMNS] for i in range(0, len(cells), COLUMNS)],
+        rows=[cells[i : i + columns] for i in range(0, len(cells), columns)],
         panel=panel,
-        subtitle=f"{len(cells)} scenarios at frame {scenes[0].frame}",
+        subtitle=f"{len(cells) // len(frames)} scenarios at frame {', '.join(map(str, frames))}",
         limit=WALL_SHARE if scaled else common,
         unit="speed / wall speed" if scaled else None,
     )
