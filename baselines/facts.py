@@ -59,18 +59,18 @@ class Facts:
 
 
 def facts_of(
-    split: str, size: str = "full", *, root: str | Path | None = None, registry: Registry | None = None
+    split: str, size: str | None = None, *, root: str | Path | None = None, registry: Registry | None = None
 ) -> Facts:
     """Return the public figures of a generated data set."""
     tier, folder, _ = locate(split, size, root=root, registry=registry)
     bring(tier, folder)
-    manifest = read_manifest(folder, tier.split, size, tier.major)
+    manifest = read_manifest(folder, tier.split, tier.name, tier.major)
     if manifest is None:
         raise _absent(tier, folder, "the data set is not generated")
     task = tier.task
     return Facts(
         split=tier.split,
-        size=size,
+        size=tier.name,
         version=tier.version,
         dataset_sha256=_hash(tier, manifest, folder),
         particles=tier.particles,

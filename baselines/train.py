@@ -103,7 +103,7 @@ class TrainingResult:
 def train(
     baseline: str,
     split: str,
-    size: str = "full",
+    size: str | None = None,
     *,
     recipe: str | None = None,
     settings: tuple[str, ...] = (),
@@ -124,7 +124,7 @@ def train(
     Args:
         baseline: name of the baseline.
         split: name of the split, or the path of a local one.
-        size: name of the size.
+        size: name of the size; the only one that is there when None.
         recipe: variant of the recipe, or a YAML file of recipes.
         settings: changes to the recipe, as in ``training.steps=100``.
         seed: seed in place of the recipe's.
@@ -149,9 +149,9 @@ def train(
     """
     entry = find(baseline)
     tier, home, known = locate(split, size, root=root, registry=registry)
-    plan = recipe_for(entry, tier.split, size, variant=recipe, settings=settings, seed=seed)
+    plan = recipe_for(entry, tier.split, tier.name, variant=recipe, settings=settings, seed=seed)
     check_symmetry(plan.model.get("symmetry"), tier)
-    facts = facts_of(tier.split, size, root=home, registry=known)
+    facts = facts_of(tier.split, tier.name, root=home, registry=known)
     folder = RunFolder(Path(output) if output else default_folder(plan))
     check_writable(folder.path, option="--output")
     shared = int(os.environ.get("WORLD_SIZE", processes))

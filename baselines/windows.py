@@ -30,7 +30,7 @@ def scenario_paths(
     split: str,
     *,
     subset: str = "test",
-    size: str = "full",
+    size: str | None = None,
     root: str | Path | None = None,
     registry: Registry | None = None,
 ) -> dict[int, Path]:

@@ -72,7 +72,7 @@ class WindowDataset(WindowReader, Dataset[Window]):
     Args:
         split: name of the split, or path of a local split's folder.
         subset: train, valid, test or, for multimaterial, extra; or several of them.
-        size: name of the size.
+        size: name of the size; the only one that is there when None.
         root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
         history: frames that a model is given; those of the task by default.
         future: frames after them.

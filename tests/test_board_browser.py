@@ -120,6 +120,48 @@ def test_badges_say_what_is_wrong(page: Page, board: Board) -> None:
     assert "leaves the box" in page.value("document.querySelector('#panel .flags').textContent")
 
 
+def test_film_above_the_fold(running: Browser, file: Path, board: Board) -> None:
+    """Truth beside the leader of the tab, in view at once on both widths; a key pauses it."""
+    play = "document.querySelector('#stage .play')"
+    at = "Number(document.querySelector('#stage input').value)"
+    for width, height in ((1280, 800), (390, 844)):
+        page = running.open(file, width=width, height=height)
+        assert page.value("document.querySelector('#stage .films').getBoundingClientRect().bottom") <= height
+        until(page, f"{at} > 0")
+        assert page.value(f"{play}.textContent") == "Pause"
+        run(page, f"{play}.focus()")
+        press(page, "Enter")
+        stopped = page.value(at)
+        time.sleep(0.2)
+        assert 0 < page.value(at) == stopped
+        drawn = (
+            "[...document.querySelectorAll('#stage canvas')].map(c =>"
+            " new Set(c.getContext('2d').getImageData(0, 0, c.width, c.height).data).size)"
+        )
+        assert min(page.value(drawn)) > 4
+        for tab in board.tabs:
+            go(page, tab)
+            assert tab.rows[0].entry.name in page.value("document.querySelector('#stage').textContent")
+            assert page.value(f"{play}.textContent") == "Play"  # a pause holds for the next film
+        assert page.messages == []
+        close(page)
+
+
+def test_film_above_the_fold_waits_where_motion_is_unwanted(page: Page, board: Board) -> None:
+    """With reduced motion nothing moves by itself; the film plays when asked, and rests under a panel."""
+    label = "document.querySelector('#stage .play').textContent"
+    at = "document.querySelector('#stage input').value"
+    restored(page, board.tabs[0].id)
+    assert (page.value(label), page.value(at)) == ("Play", "0")
+    run(page, "document.querySelector('#stage .play').click()")
+    until(page, f"{at} > 0")
+    run(page, "document.querySelector('#stage figcaption a').click()")
+    until(page, "document.getElementById('panel').open")
+    assert page.value(label) == "Play"
+    run(page, "document.getElementById('panel').close()")
+    until(page, f"{label} === 'Pause'")
+
+
 def test_overview_leads_to_every_board(page: Page, board: Board) -> None:
     """One row per method with its skill on every data set; a cell opens the entry there."""
     assert page.value("document.querySelector('section.tab:not([hidden])').id") == "overview"

@@ -75,6 +75,15 @@ def test_names_do_not_meet_other_dots() -> None:
     assert len(texts) < 5
 
 
+def test_a_crowd_at_the_edge_keeps_its_names() -> None:
+    """Five dots close together near the right edge: each has its name."""
+    crowd = {"VAR(1)": (0.052, 50.0), "SuperGAT": (0.075, 1.2), "GNS": (0.045, 0.89)}
+    crowd |= {"GNS, noise 1e-3": (0.036, 0.59), "analog": (0.0245, 1.5), "persistence": (4e-6, 1.0)}
+    marks = [Mark(name=name, seconds=s, error=e, kind="entry") for name, (s, e) in crowd.items()]
+    svg = ElementTree.fromstring(draw(marks, None, "vorticity_nrmse", "title"))
+    assert {e.text for e in svg.iter("text") if e.attrib["class"].startswith("name")} == set(crowd)
+
+
 def test_axes_end_past_their_values() -> None:
     """All ticks within the axis; values a step off its ends."""
     scale = close_logarithmic(0.3, 1.4)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from lagbench.board.entry import Cost
 from lagbench.board.model import Board
 from lagbench.board.page import BUDGET, FEWEST, render
-from lagbench.board.payload import FINENESS, LEVELS, coarse, embedded, pack, payload
+from lagbench.board.payload import FINENESS, LEVELS, coarse, embedded, pack, pack_film, payload
 
 DIGITS = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789-_"
 
@@ -46,6 +46,18 @@ def unpack(packed: list[Any]) -> NDArray[np.float64]:
     share = np.array(steps) / LEVELS
     values = low * (high / low) ** share if log else low + (high - low) * share
     return np.where(share > 1.0, np.nan, values)
+
+
+def unpack_film(packed: list[Any]) -> NDArray[np.float64]:
+    """Read a film back: a first frame as above, then one letter a number beside constant velocity."""
+    letters, low, high, kind, count, reach = packed
+    assert kind == 2
+    frames = [unpack([letters[: 2 * count], low, high, 0])]
+    for at in range(2 * count, len(letters), count):
+        steps = np.array([DIGITS.index(letter) - 31 for letter in letters[at : at + count]])
+        before = frames[-2] if len(frames) > 1 else frames[-1]
+        frames.append(2 * frames[-1] - before + reach * np.sign(steps) * (steps / 31) ** 2)
+    return np.concatenate(frames)
 
 
 def held_by(page: str) -> Any:
@@ -78,6 +90,22 @@ def test_packed_numbers_come_back(values: list[float], log: bool) -> None:
         )
 
 
+@given(st.floats(-1.0, 1.0), st.floats(-5e-3, 5e-3), st.floats(0.0, 3e-2))
+def test_films_come_back(speed: float, pull: float, kick: float) -> None:
+    """Parabolas, one kicked, one at rest: rounding does not add up.
+
+    Neighbouring letters are at most 61 / 31^2 of the reach apart, so that half of it may be off.
+    """
+    t = np.arange(40.0)
+    moved = 0.5 + 0.01 * speed * t + 0.05 * pull * t**2
+    film = np.stack([moved, np.full(40, 0.25), moved + kick * (t > 20)], axis=1)
+    packed = pack_film(np.stack([film, film], axis=-1))
+    back = unpack_film(packed).reshape(40, 3, 2)
+    reach = float(packed[5])
+    assert reach < 1.2 * max(0.011, abs(kick) + 0.001)
+    assert np.abs(back - film[..., None]).max() <= max(0.5 * 2.0 / LEVELS, 0.5 * 61 / 31**2 * reach) + 1e-9
+
+
 def test_coarse_field_keeps_its_mean() -> None:
     """Blocks average the known nodes: 4 x 4 nodes become 2 x 2, worked by hand."""
     field = np.arange(16.0).reshape(4, 4)
@@ -98,10 +126,10 @@ def test_board_arrives_at_the_script(board: Board, page: str) -> None:
             packed = given_row["curves"][tab.curves[0]]
             assert pool[packed["frames"]] == list(curve.frames)
             np.testing.assert_allclose(unpack(pool[packed["mean"]]), curve.mean, rtol=2e-3)
-            film = unpack(pool[given_row["pictures"]["film"]])
+            film = unpack_film(pool[given_row["pictures"]["film"]])
             count = len(pool[given_row["pictures"]["material"]])
             np.testing.assert_allclose(film[:2], row.pictures.film[0, 0], atol=3e-4)
-            np.testing.assert_allclose(film[-2:], row.pictures.film[-1, -1], atol=3e-4)
+            np.testing.assert_allclose(film[-2:], row.pictures.film[-1, -1], atol=1e-3)
             assert film.size == 2 * count * len(pool[given_row["pictures"]["filmFrames"]])
 
 
@@ -238,10 +266,11 @@ def test_any_text_survives_embedding(text: str) -> None:
     assert json.loads(said)["text"] == text
 
 
-def test_fifty_entries_fit() -> None:
-    """Fifty entries make a page of less than 2 MB."""
-    size = len(render(make_board((("cavity", "full"), ("fluid", "full")), entries=25)).encode())
-    assert size <= BUDGET * FEWEST < 2_000_000
+@pytest.mark.parametrize(("entries", "limit"), [(16, 1_000_000), (25, 1_500_000)])
+def test_many_entries_fit(entries: int, limit: int) -> None:
+    """Thirty-two entries make a page of less than 1 MB, fifty one of at most 1.5 MB."""
+    size = len(render(make_board((("cavity", "full"), ("fluid", "full")), entries=entries)).encode())
+    assert size <= BUDGET * max(FEWEST, 2 * entries) <= limit
 
 
 def test_finer_is_longer(board: Board) -> None:

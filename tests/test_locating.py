@@ -11,11 +11,13 @@ import pytest
 from exchange_readers import straight_runs
 
 import lagbench
-from lagbench.data.local import home, is_name, locate, rooted
+from lagbench.data.layout import dataset_folder
+from lagbench.data.local import home, is_name, locate, locate_new, rooted
 from lagbench.data.registry import load
 from lagbench.errors import UnreadableFileError, UsageError
 from lagbench.exchange import adopt
 from lagbench.exchange.local_split import LocalSplit
+from lagbench.make.verify import verify
 
 
 @pytest.fixture(scope="module")
@@ -54,6 +56,29 @@ def test_ours_are_found_as_before(tmp_path: Path) -> None:
     assert (found.size.generator, found.root) == ("lagbench.generators.cavity", tmp_path)
     with pytest.raises(UsageError, match="taken by another split"):
         locate(str(tmp_path / "cavity"), "tiny")
+
+
+def test_the_only_size_there_is_the_default(tmp_path: Path) -> None:
+    """One size there: that one. None or several: an error that names them. What is to be made: mini."""
+    with pytest.raises(UsageError) as none:
+        lagbench.open_split("cavity", root=tmp_path)
+    assert none.value.where == "--size"
+    for size in ("tiny", "full"):
+        folder = dataset_folder(tmp_path, "cavity", size, load().size("cavity", size).major) / "test"
+        folder.mkdir(parents=True)
+        (folder / "0000.nc").touch()
+        if size == "tiny":
+            assert locate("cavity", root=tmp_path).size.name == "tiny"
+    for opened in (lagbench.open_split, lagbench.windows, lagbench.load_manifest, verify):
+        with pytest.raises(UsageError) as several:
+            opened("cavity", root=tmp_path)
+        assert (several.value.where, several.value.fix) == ("--size", "--size tiny")
+    assert locate_new("cavity", root=tmp_path).size.name == "mini"
+
+
+def test_a_local_split_has_one_size_to_make(own: Path) -> None:
+    """Where a split has no mini, its only size is the default."""
+    assert locate_new("own", root=own.parent).size.name == locate("own", root=own.parent).size.name
 
 
 def test_unknown_names_list_local_ones(own: Path) -> None:

@@ -385,8 +385,8 @@ def test_frames_that_do_not_exist_are_refused(root: Path) -> None:
         ({"subset": "trian"}, "did you mean 'train'"),
         ({"size": "tiney"}, "did you mean 'tiny'"),
         ({"split": "cavty"}, "did you mean 'cavity'"),
-        ({"history": 40}, "no scenario holds a window"),
-        ({"history": 0}, "no scenario holds a window"),
+        ({"history": 40}, "no scenario is as long as a window"),
+        ({"history": 0}, "at least one given frame"),
         ({"subset": "valid"}, "1 of 1 scenarios are not there.*missing: 3.*lagbench generate"),
     ],
 )

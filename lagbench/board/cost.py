@@ -28,6 +28,9 @@ HEIGHT = 330
 
 COARSE = "coarse-solver"
 
+NAME_ROOM = 8.0
+"""The axis of time reaches so many times the dearest, so that its name has a place beside it."""
+
 STYLE = """
 .chart{background:#fff;font-family:system-ui,sans-serif}.chart text{font-size:12px;fill:#1c2330}
 .chart .tick,.chart .note{fill:#667085;font-size:11.5px}.grid{stroke:#e4e7ec}.axis,.mark{stroke:#98a2b3}
@@ -99,7 +102,7 @@ def draw(marks: Sequence[Mark], solver: float | None, ranking: str, title: str) 
     reach = [mark.seconds for mark in marks] + ([solver] if solver else [])
     errors = [mark.error for mark in marks]
     plot = Plot(
-        close_logarithmic(min(reach), max(reach)),
+        close_logarithmic(min(reach), NAME_ROOM * max(reach)),
         close_logarithmic(min(errors), max(errors)),
         x_label="time of a frame [s]",
         y_label=words(ranking) + _unit(ranking),

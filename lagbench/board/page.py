@@ -27,19 +27,19 @@ from .entry_file import schema_bytes
 from .folder import PAGE, SCHEMA, Folder
 from .model import Board
 from .payload import FINENESS, embedded, payload
-from .sections import empty, lede, navigation, overview, section
+from .sections import empty, lede, navigation, overview, section, stage
 
 __all__ = ["BUDGET", "FEWEST", "LINKS", "BuildResult", "build", "render"]
 
-BUDGET = 39_000
-"""Most bytes an entry may take, all in all: 50 of them make a page of less than 2 MB."""
+BUDGET = 30_000
+"""Most bytes an entry may take, all in all."""
 
-FEWEST = 50
-"""Fewer entries than these share what so many may take."""
+FEWEST = 33
+"""Fewer entries than these share what so many may take: a page of less than 1 MB."""
 
 SCRIPTS = (
     *("codec", "text", "scale", "chart", "state", "table"),
-    *("overview", "maps", "film", "detail", "main"),
+    *("overview", "maps", "film", "stage", "detail", "main"),
 )
 """Parts of the script, in this order."""
 
@@ -142,6 +142,7 @@ def render(board: Board, links: Mapping[str, str] = LINKS) -> str:
         "script": script,
         "links": join(tag("a", label, href=address) for label, address in links.items()),
         "lede": lede(board),
+        "stage": stage(board),
         "navigation": navigation(board),
         "sections": join([overview(board), *(section(tab, board.metrics) for tab in board.tabs)], "\n"),
         "empty": empty(board),

@@ -14,7 +14,7 @@ from .cost import cost_figure
 from .model import Board, Row, Tab
 from .table import EXPLAINED, draw_table
 
-__all__ = ["empty", "lede", "navigation", "overview", "section"]
+__all__ = ["empty", "lede", "navigation", "overview", "section", "stage"]
 
 
 def lede(board: Board) -> Markup:
@@ -24,15 +24,23 @@ def lede(board: Board) -> Markup:
         entries += len(tab.rows)
         checked += sum(row.verified is not None for row in tab.rows)
     shown = f"{_counted(entries, 'entry', 'entries')} on {_counted(len(board.tabs), 'data set', 'data sets')}"
+    told = f"those of {checked}" if checked else "none yet"
     return escaped(
         "Neural surrogates of Lagrangian continuum simulators on data that anyone regenerates bit for bit:"
-        f" {shown}. Every score follows from a score file; of {checked} the maintainers scored the"
-        " predictions again. Costs are self-reported."
+        f" {shown}. Every score follows from a score file; predictions that the maintainers scored again:"
+        f" {told}. Costs are self-reported."
     )
 
 
 def _counted(count: int, one: str, many: str) -> str:
     return f"{count} {one if count == 1 else many}"
+
+
+def stage(board: Board) -> Markup:
+    """Return the place of the film above the fold, which the script fills."""
+    if not board.tabs:
+        return Markup("")
+    return tag("figure", id="stage", class_="scripted", aria_label="The truth beside the leader")
 
 
 def navigation(board: Board) -> Markup:

@@ -134,8 +134,12 @@ def build(
         print_json(result)
         return
     state = "written" if result.page in result.written else "up to date"
-    what = f"{result.rows} entries, {result.tabs} tabs, {spell_bytes(result.bytes)}"
+    what = f"{_entries(result.rows)}, {result.tabs} tabs, {spell_bytes(result.bytes)}"
     say(f"{result.page}: {what}, {state}", quiet=quiet)
+
+
+def _entries(count: int) -> str:
+    return f"{count} {'entry' if count == 1 else 'entries'}"
 
 
 @leaderboard.command("check", epilog="Example: lagbench leaderboard check --base origin/main")
@@ -222,7 +226,7 @@ def _checked(result: CheckResult, *, quiet: bool) -> None:
         say(f"recorded as verified: {entry}", quiet=quiet)
     state = f"{len(result.findings)} findings" if result.findings else "nothing wrong"
     looked = ", page compared" if result.page_checked else ""
-    say(f"{result.folder}: {result.entries} entries, {state}{looked}", quiet=quiet)
+    say(f"{result.folder}: {_entries(result.entries)}, {state}{looked}", quiet=quiet)
 
 
 @leaderboard.command("picture", epilog="Example: lagbench leaderboard picture cavity --size mini -o cost.svg")

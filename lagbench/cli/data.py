@@ -16,6 +16,8 @@ import lagbench
 from .options import (
     DeviceOption,
     JsonFlag,
+    NewSizeOption,
+    PresentSizeOption,
     QuietFlag,
     RootOption,
     ScenariosOption,
@@ -48,7 +50,7 @@ RELEASED = 2026
 def generate(
     name: SplitArgument = None,
     split: SplitOption = None,
-    size: SizeOption = "full",
+    size: NewSizeOption = None,
     subset: SubsetOption = None,
     scenarios: ScenariosOption = None,
     root: RootOption = None,
@@ -117,7 +119,7 @@ def _generated(result: GenerationResult) -> list[str]:
 def verify(
     name: SplitArgument = None,
     split: SplitOption = None,
-    size: SizeOption = "full",
+    size: PresentSizeOption = None,
     subset: SubsetOption = None,
     scenarios: ScenariosOption = None,
     root: RootOption = None,

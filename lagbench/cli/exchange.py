@@ -11,10 +11,11 @@ from lagbench.errors import UsageError
 
 from .options import (
     JsonFlag,
+    NewSizeOption,
+    PresentSizeOption,
     QuietFlag,
     RootOption,
     ScenariosOption,
-    SizeOption,
     SplitArgument,
     SplitOption,
     SubsetOption,
@@ -75,7 +76,7 @@ FullBoxFlag = Annotated[
 def download(
     name: SplitArgument = None,
     split: SplitOption = None,
-    size: SizeOption = "full",
+    size: NewSizeOption = None,
     mirror: Annotated[
         str | None, typer.Option("--from", metavar="URL", help="Store; else the mirrors of datasets.yaml.")
     ] = None,
@@ -128,7 +129,7 @@ def download(
 def export(
     name: SplitArgument = None,
     split: SplitOption = None,
-    size: SizeOption = "full",
+    size: PresentSizeOption = None,
     form: FormatOption = "gns-npz",
     output: Annotated[
         Path | None,
@@ -153,9 +154,11 @@ def export(
     quiet: QuietFlag = False,
 ) -> None:
     """Write a split in the format of another code base: train, valid, test, metadata."""
+    from lagbench.data.local import locate
     from lagbench.exchange.exporting import export as run
 
     wanted = chosen(name, split)
+    size = locate(wanted, size, root=root).size.name
     folder = output or Path(f"{Path(wanted).name}-{size}-{form}")
     with progress_bar(quiet=quiet) as draw:
         result = run(

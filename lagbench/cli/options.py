@@ -17,6 +17,7 @@ __all__ = [
     "ScenariosOption",
     "SchedulerOption",
     "SizeOption",
+    "NewSizeOption",
     "PresentSizeOption",
     "SplitArgument",
     "SplitOption",
@@ -30,6 +31,9 @@ SplitOption = Annotated[
     str | None, typer.Option("--split", metavar="NAME", help="Data set; `lagbench list` names them.")
 ]
 SizeOption = Annotated[str, typer.Option("--size", metavar="NAME", help="tiny, mini or full.")]
+NewSizeOption = Annotated[
+    str | None, typer.Option("--size", metavar="NAME", help="tiny, mini or full; mini by default.")
+]
 PresentSizeOption = Annotated[
     str | None,
     typer.Option("--size", metavar="NAME", help="tiny, mini or full; by default the only one there is."),

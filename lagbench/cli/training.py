@@ -13,7 +13,16 @@ import typer
 
 from lagbench.errors import LagbenchError, UsageError
 
-from .options import JsonFlag, QuietFlag, RootOption, SizeOption, SplitArgument, SplitOption, chosen
+from .options import (
+    JsonFlag,
+    PresentSizeOption,
+    QuietFlag,
+    RootOption,
+    SizeOption,
+    SplitArgument,
+    SplitOption,
+    chosen,
+)
 from .output import print_json, progress_bar, say, spell_seconds
 
 if TYPE_CHECKING:
@@ -44,7 +53,7 @@ def train(
         typer.Option("--baseline", metavar="NAME", help="Model, as in gns; see docs/baselines.md."),
     ] = None,
     split: SplitOption = None,
-    size: SizeOption = "full",
+    size: PresentSizeOption = None,
     recipe: Annotated[
         str | None, typer.Option("--recipe", metavar="NAME", help="Variant, as in short; or a YAML file.")
     ] = None,

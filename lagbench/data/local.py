@@ -30,6 +30,7 @@ __all__ = [
     "home",
     "is_name",
     "locate",
+    "locate_new",
     "rooted",
     "remedy",
 ]
@@ -163,6 +164,24 @@ def locate(
     """
     name, folder, known = home(split, root=root, registry=registry)
     return Located(known.size(name, size or _only_size(name, folder, known)), folder, known)
+
+
+SIZE_TO_MAKE = "mini"
+"""The size that is generated or downloaded where none is named: minutes and some hundred MB."""
+
+
+def locate_new(
+    split: str,
+    size: str | None = None,
+    *,
+    root: str | Path | None = None,
+    registry: Registry | None = None,
+) -> Located:
+    """Return what :func:`locate` does for what is yet to be made: mini, or the only size, when None."""
+    name, folder, known = home(split, root=root, registry=registry)
+    sizes = known.split(name).sizes
+    default = SIZE_TO_MAKE if SIZE_TO_MAKE in sizes else next(iter(sizes))
+    return Located(known.size(name, size or default), folder, known)
 
 
 def _only_size(split: str, root: Path, known: Registry) -> str:

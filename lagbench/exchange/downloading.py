@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lagbench.data.layout import MANIFEST_NAME, dataset_folder, scenario_path
-from lagbench.data.local import locate
+from lagbench.data.local import locate_new
 from lagbench.data.lock import dataset_lock
 from lagbench.data.manifest import (
     FileEntry,
@@ -69,7 +69,7 @@ class DownloadResult:
 
 def download(
     split: str,
-    size: str = "full",
+    size: str | None = None,
     *,
     mirror: str | None = None,
     subset: Selection = None,
@@ -89,7 +89,7 @@ def download(
 
     Args:
         split: name of the split, or path of a local split's folder.
-        size: name of the size.
+        size: name of the size; mini when None, or the only one that the split has.
         mirror: URL of a copy of a root folder; else the mirrors of datasets.yaml, in order.
         subset: some subsets only.
         scenarios: some ids only.
@@ -112,7 +112,7 @@ def download(
     started = time.monotonic()
     if connections < 1:
         raise UsageError("no file comes without a connection", where="--connections", expected=">= 1")
-    tier, folder, splits = locate(split, size, root=root, registry=registry)
+    tier, folder, splits = locate_new(split, size, root=root, registry=registry)
     wanted = select(tier, subset=subset, scenarios=scenarios)
     urls = (mirror,) if mirror else splits.split(tier.split).mirrors
     with dataset_lock(folder, tier.split, tier.name, tier.major), publication(tier, folder) as store:

@@ -56,7 +56,7 @@ class ExportResult:
 
 def export(
     split: str,
-    size: str = "full",
+    size: str | None = None,
     *,
     format: str,
     output: str | Path,
@@ -73,7 +73,7 @@ def export(
 
     Args:
         split: name of the split, or path of a local split's folder.
-        size: name of the size.
+        size: name of the size; the only one that is there when None.
         format: "gns-npz" or "lagrangebench-h5".
         output: folder for the files.
         root: folder of all data sets, see :func:`lagbench.data.layout.resolve_root`.

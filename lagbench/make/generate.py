@@ -18,7 +18,7 @@ from typing import TypeVar
 
 from lagbench.atomic import remove_leftovers
 from lagbench.data.layout import MANIFEST_NAME, dataset_folder, scenario_path
-from lagbench.data.local import locate
+from lagbench.data.local import locate_new
 from lagbench.data.lock import dataset_lock
 from lagbench.data.manifest import (
     Manifest,
@@ -300,7 +300,7 @@ class GenerationResult:
 
 def generate(
     split: str,
-    size: str = "full",
+    size: str | None = None,
     *,
     subset: Selection = None,
     scenarios: Scenarios = None,
@@ -319,7 +319,7 @@ def generate(
 
     Args:
         split: name of the split.
-        size: name of the size.
+        size: name of the size; mini when None, or the only one that the split has.
         subset: some subsets only.
         scenarios: some ids only, as numbers or as text such as "0,3-5".
         root: folder of all data sets; else ``LAGBENCH_ROOT``, else the user data folder. With a
@@ -344,14 +344,14 @@ def generate(
         DataError: the result has other hashes than datasets.yaml, or there is no such bucket.
     """
     started = time.monotonic()
-    tier, folder, splits = locate(split, size, root=root, registry=registry)
+    tier, folder, splits = locate_new(split, size, root=root, registry=registry)
     wanted = select(tier, subset=subset, scenarios=scenarios)
     devices = [known.value for known in Device]
     if device not in devices:
         raise UsageError(f"no device {device!r}", where="--device", fix=nearest(device, devices))
     target = Device(device)
     cores = worker_count(workers, default=None if target.value == "cpu" else 1)
-    free = free_bytes(dataset_folder(folder, tier.split, size, tier.major))
+    free = free_bytes(dataset_folder(folder, tier.split, tier.name, tier.major))
     generation = Generation(
         tier,
         folder,
@@ -369,17 +369,17 @@ def generate(
         if scheduler is None:
             check_installed("taichi", extra="generate")
         with (
-            dataset_lock(folder, tier.split, size, tier.major, on_wait=on_wait),
+            dataset_lock(folder, tier.split, tier.name, tier.major, on_wait=on_wait),
             publication(tier, folder) as generation.store,
         ):
             generation.run(wanted, force=force)
     seconds = time.monotonic() - started
     return GenerationResult(
         split=tier.split,
-        size=size,
+        size=tier.name,
         version=tier.version,
         root=folder,
-        folder=dataset_folder(folder, tier.split, size, tier.major),
+        folder=dataset_folder(folder, tier.split, tier.name, tier.major),
         device=target.value,
         workers=cores,
         simulated=generation.to_do.scenarios,

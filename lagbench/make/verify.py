@@ -95,7 +95,7 @@ class VerificationResult:
 
 def verify(
     split: str,
-    size: str = "full",
+    size: str | None = None,
     *,
     root: str | Path | None = None,
     subset: Selection = None,
@@ -110,7 +110,7 @@ def verify(
 
     Args:
         split: name of the split.
-        size: name of the size.
+        size: name of the size; the only one that is there when None.
         root: folder of all data sets; else ``LAGBENCH_ROOT``, else the user data folder.
         subset: some subsets only.
         scenarios: some ids only.
@@ -133,7 +133,7 @@ def verify(
     manifest, warnings = _manifest(folder, tier)
     findings = _examine_all(folder, tier, ids, manifest, meter)
     # Which test files are right is noted, so that the scorer need not hash their values again.
-    there = dataset_folder(folder, tier.split, size, tier.major)
+    there = dataset_folder(folder, tier.split, tier.name, tier.major)
     hashed = {i: findings[i].content_sha256 for i in tier.subsets["test"] if i in findings}
     note(there, {there / "test" / f"{i:04d}.nc": content for i, content in hashed.items() if content})
     anew = _regenerate(tier, evenly_spaced(ids, regenerate), cores, meter)
@@ -152,7 +152,7 @@ def verify(
     gaps += [f"{r.name} has files of no scenario: {', '.join(r.extra)}" for r in reports if r.extra]
     return VerificationResult(
         split=tier.split,
-        size=size,
+        size=tier.name,
         folder=there,
         subsets=reports,
         identity=manifest.identity if manifest else "unknown",

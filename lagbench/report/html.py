@@ -183,7 +183,7 @@ def _minus(written: str) -> str:
     return written.replace("-", "−")
 
 
-_CAPITALS = {"mse": "MSE", "mae": "MAE", "rmse": "RMSE", "kl": "KL", "w1": "W1", "w2": "W2"}
+_CAPITALS = {"mse": "MSE", "mae": "MAE", "rmse": "RMSE", "nrmse": "NRMSE", "kl": "KL", "w1": "W1", "w2": "W2"}
 _OTHERS = {"pearson": "correlation", "avg": "average", "hist": "histogram", "abs": "magnitudes"}
 
 

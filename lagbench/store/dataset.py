@@ -32,12 +32,12 @@ def list_splits() -> tuple[str, ...]:
     return tuple(sorted(registry.load().splits))
 
 
-def load_manifest(split: str, *, size: str = "full", root: str | Path | None = None) -> Manifest:
+def load_manifest(split: str, *, size: str | None = None, root: str | Path | None = None) -> Manifest:
     """Return the manifest of a generated data set.
 
     Args:
         split: name of the split, or path of a local split's folder.
-        size: name of the size.
+        size: name of the size; the only one that is there when None.
         root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
 
     Raises:
@@ -50,11 +50,11 @@ def load_manifest(split: str, *, size: str = "full", root: str | Path | None = N
 
     entry, folder, _ = locate(split, size, root=root)
     bring(entry, folder)
-    manifest = read_manifest(folder, entry.split, size, entry.major)
+    manifest = read_manifest(folder, entry.split, entry.name, entry.major)
     if manifest is None:
         raise DataError(
             "the data set has no manifest",
-            where=str(dataset_folder(folder, entry.split, size, entry.major)),
+            where=str(dataset_folder(folder, entry.split, entry.name, entry.major)),
             fix=remedy(entry, root=folder),
         )
     return manifest
@@ -64,7 +64,7 @@ def open_split(
     split: str,
     *,
     subset: str = "test",
-    size: str = "full",
+    size: str | None = None,
     root: str | Path | None = None,
 ) -> xr.Dataset:
     """Open one subset of a generated data set; arrays are read when computed.
@@ -72,7 +72,7 @@ def open_split(
     Args:
         split: name of the split, or path of a local split's folder.
         subset: train, valid, test or, for multimaterial, extra.
-        size: name of the size.
+        size: name of the size; the only one that is there when None.
         root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
 
     Returns:
@@ -92,12 +92,12 @@ def open_split(
 
     entry, folder, _ = locate(split, size, root=root)
     if subset not in entry.subsets:
-        where = f"{split} {size}"
+        where = f"{split} {entry.name}"
         raise UsageError(f"no subset {subset!r}", where=where, fix=nearest(subset, entry.subsets))
     ids = entry.subsets[subset]
     bring(entry, folder, ids)
     keys = [
-        ScenarioKey(split=entry.split, size=size, version=entry.version, scenario=i, subset=subset)
+        ScenarioKey(split=entry.split, size=entry.name, version=entry.version, scenario=i, subset=subset)
         for i in ids
     ]
     _require(entry, folder, keys)

@@ -51,7 +51,7 @@ class WindowReader:
         split: str,
         *,
         subset: str | Sequence[str] = "train",
-        size: str = "full",
+        size: str | None = None,
         root: str | Path | None = None,
         history: int | None = None,
         future: int = 1,
@@ -70,13 +70,23 @@ class WindowReader:
         counts = [max(0, source.frames - self.length + 1) for source in sources.values()]
         # number of the first window of each scenario, and the number of all windows
         self.starts = (0, *accumulate(counts))
-        if self.history < 1 or future < 0 or not len(self):
+        where = f"{split} {entry.name}, {', '.join(names)}"
+        if self.history < 1 or future < 0:
+            raise UsageError(
+                "a window has at least one given frame",
+                where=where,
+                expected="history >= 1, future >= 0",
+                got=f"history {self.history}, future {future}",
+                fix=f"leave history out for the task's {entry.task.input_frames}",
+            )
+        if not len(self):
             longest = max(source.frames for source in sources.values())
             raise UsageError(
-                "no scenario holds a window",
-                where=f"{split} {size}, {', '.join(names)}",
-                expected=f"1 to {longest} frames, at least one of them given",
-                got=f"history {self.history}, future {future}",
+                "no scenario is as long as a window",
+                where=where,
+                expected=f"at most {longest} frames",
+                got=f"{self.length}: history {self.history}, future {future}",
+                fix="ask for fewer frames",
             )
         self.store = FrameStore(sources, cache_bytes=cache_bytes)
 
@@ -130,7 +140,7 @@ def windows(
     split: str,
     *,
     subset: str | Sequence[str] = "train",
-    size: str = "full",
+    size: str | None = None,
     root: str | Path | None = None,
     history: int | None = None,
     future: int = 1,
@@ -147,7 +157,7 @@ def windows(
     Args:
         split: name of the split, or path of a local split's folder.
         subset: train, valid, test or, for multimaterial, extra; or several of them.
-        size: name of the size.
+        size: name of the size; the only one that is there when None.
         root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
         history: frames that a model is given; those of the task by default.
         future: frames after them.

@@ -1,4 +1,4 @@
-// Packed arrays: two letters a number, twelve bits; see lagbench/board/payload.py.
+// Packed arrays: two letters a number, twelve bits, films one letter; see lagbench/board/payload.py.
 
 const BOARD = JSON.parse(document.getElementById("board").textContent);
 
@@ -19,10 +19,24 @@ function unpack([text, low, high, log]) {
   return values;
 }
 
+/** Return positions of a film: its first frame as above, then what each coordinate does beside constant velocity. */
+function unpackFilm([text, low, high, , count, reach]) {
+  const start = unpack([text.slice(0, 2 * count), low, high, 0]);
+  const values = new Float64Array(text.length - count);
+  values.set(start);
+  for (let i = count; i < values.length; i += 1) {
+    const now = values[i - count];
+    const before = i < 2 * count ? now : values[i - 2 * count];
+    const steps = PLACES[text.charCodeAt(i + count)] - 31;
+    values[i] = 2 * now - before + (reach * steps * Math.abs(steps)) / 961;
+  }
+  return values;
+}
+
 /** Return what a number in the payload refers to; arrays are unpacked once. */
 function pooled(index) {
   const held = BOARD.pool[index];
-  return typeof held[0] === "string" ? (unpacked[index] ??= unpack(held)) : held;
+  return typeof held[0] === "string" ? (unpacked[index] ??= (held[3] === 2 ? unpackFilm : unpack)(held)) : held;
 }
 
 const unpacked = [];

@@ -2,6 +2,7 @@
 
 const SECONDS = 9;
 const TRAIL = 7;
+const TRAIL_LENGTH = 0.05;
 const MATERIALS = ["#0072b2", "#d55e00", "#56b4e9", "#e69f00"];
 const quiet = matchMedia("(prefers-reduced-motion: reduce)");
 
@@ -20,6 +21,14 @@ function positionsAt(film, count, frames, time) {
   return found;
 }
 
+/** Return the frames between the points of a trail: the slower most particles are, the more, so that slow flows show. */
+function trailGap(film, count) {
+  const steps = [];
+  for (let k = 0; k + 2 * count < film.length; k += 2) steps.push(Math.hypot(film[k + 2 * count] - film[k], film[k + 1 + 2 * count] - film[k + 1]));
+  const median = steps.sort((a, b) => a - b)[steps.length >> 1] || 1;
+  return Math.min(1.5, Math.max(0.35, TRAIL_LENGTH / (TRAIL * median)));
+}
+
 /** Return a colour per particle: its material, or where it started, so that mixing shows. */
 function particleColours(materials, first) {
   const one = materials.every((material) => material === materials[0]);
@@ -29,22 +38,28 @@ function particleColours(materials, first) {
   return materials.map((_, k) => shades[Math.min(2, Math.max(0, Math.floor(3 * first[2 * k])))]);
 }
 
-/** Plays one film on some canvases; `stop` ends it. */
+/** Plays one film on two canvases, `pixels` wide; `ended` is called `rest` seconds after its last frame, `stop` ends it. */
 class Film {
-  constructor(tab, row) {
+  constructor(tab, row, { pixels = 560, rest = 0, ended = () => this.toggle(false) } = {}) {
+    Object.assign(this, { rest, ended, rested: 0 });
     this.frames = pooled(row.pictures.filmFrames);
     this.materials = pooled(row.pictures.material);
     this.sides = [["truth", pooled(tab.truth.film)], [short(row.name), pooled(row.pictures.film)]];
     this.time = 0;
     this.playing = false;
-    this.canvases = this.sides.map(([name]) => el("canvas", { width: 560, height: 560, class: "film", role: "img", "aria-label": `Particles of ${name}` }));
+    this.canvases = this.sides.map(([name]) => el("canvas", { width: pixels, height: pixels, class: "film", role: "img", "aria-label": `Particles of ${name}` }));
     this.play = button("Play", () => this.toggle(), { class: "plain play" });
     this.slider = el("input", { type: "range", min: 0, max: this.frames.length - 1, step: "any", value: 0, "aria-label": "Frame of the film" });
     this.slider.addEventListener("input", () => this.show(Number(this.slider.value)));
     this.told = el("output", { class: "muted n" });
-    this.repaint = () => this.show(this.time);
+    this.gap = trailGap(this.sides[0][1], this.materials.length);
+    this.start = positionsAt(this.sides[0][1], this.materials.length, this.frames.length, 0);
+    this.repaint = () => {
+      this.colours = particleColours(this.materials, this.start);
+      this.show(this.time);
+    };
     document.addEventListener("schemechange", this.repaint);
-    this.show(0);
+    this.repaint();
   }
 
   element() {
@@ -63,8 +78,9 @@ class Film {
       const passed = before === null ? 0 : (now - before) / 1000;
       before = now;
       this.show(this.time + (passed * (this.frames.length - 1)) / SECONDS);
-      if (this.time >= this.frames.length - 1) this.toggle(false);
-      else requestAnimationFrame(step);
+      this.rested = this.time < this.frames.length - 1 ? 0 : this.rested + passed;
+      if (this.time >= this.frames.length - 1 && this.rested >= this.rest) this.ended();
+      if (this.playing) requestAnimationFrame(step);
     };
     requestAnimationFrame(step);
   }
@@ -73,30 +89,30 @@ class Film {
     this.time = Math.min(time, this.frames.length - 1);
     this.slider.value = this.time;
     this.told.textContent = `frame ${this.frames[Math.round(this.time)]}`;
-    const count = this.materials.length;
-    const colours = particleColours(this.materials, positionsAt(this.sides[0][1], count, this.frames.length, 0));
-    this.sides.forEach(([, film], i) => this.paint(this.canvases[i], film, count, colours));
+    this.sides.forEach(([, film], i) => this.paint(this.canvases[i], film));
   }
 
-  paint(canvas, film, count, colours) {
+  paint(canvas, film) {
     const context = canvas.getContext("2d");
     const { width } = canvas;
+    const count = this.materials.length;
+    const radius = 1.5 + width / 160;
     context.clearRect(0, 0, width, width);
     const path = [];
     for (let k = TRAIL; k >= 0; k -= 1) {
-      if (this.time - 0.35 * k >= 0) path.push(positionsAt(film, count, this.frames.length, this.time - 0.35 * k));
+      if (this.time - this.gap * k >= 0) path.push(positionsAt(film, count, this.frames.length, this.time - this.gap * k));
     }
     const place = (spots, k) => [width * spots[2 * k], width * (1 - spots[2 * k + 1])];
     for (let k = 0; k < count; k += 1) {
-      context.strokeStyle = context.fillStyle = colours[k];
+      context.strokeStyle = context.fillStyle = this.colours[k];
       context.globalAlpha = 0.3;
-      context.lineWidth = 2.5;
+      context.lineWidth = radius / 2;
       context.beginPath();
       path.forEach((spots, j) => (j ? context.lineTo(...place(spots, k)) : context.moveTo(...place(spots, k))));
       context.stroke();
       context.globalAlpha = 0.9;
       context.beginPath();
-      context.arc(...place(path.at(-1), k), 5, 0, 2 * Math.PI);
+      context.arc(...place(path.at(-1), k), radius, 0, 2 * Math.PI);
       context.fill();
     }
   }

@@ -29,6 +29,7 @@ function draw() {
     link.tabIndex = chosen ? 0 : -1;
   }
   const tab = tabOf(state);
+  setStage(tab);
   if (!tab) return;
   const tools = section().querySelector(".tools");
   const filter = tools.querySelector("input[type=search]");
@@ -92,6 +93,7 @@ function openPanel() {
   if (!panel.open) panel.showModal();
   panel.scrollTop = 0;
   panel.querySelector("h2").focus();
+  playStage();
   if (!quiet.matches) film.toggle(true);
 }
 
@@ -100,6 +102,7 @@ panel.addEventListener("close", () => {
   film = null;
   const back = state.entry || opener;
   panel.replaceChildren();
+  playStage();
   if (state.entry) change({ entry: "" });
   if (back) section().querySelector(`[data-entry="${CSS.escape(back)}"] a.name`)?.focus();
 });
