@@ -72,7 +72,7 @@ def test_the_only_size_there_is_the_default(tmp_path: Path) -> None:
     for opened in (lagbench.open_split, lagbench.windows, lagbench.load_manifest, verify):
         with pytest.raises(UsageError) as several:
             opened("cavity", root=tmp_path)
-        assert (several.value.where, several.value.fix) == ("--size", "--size tiny")
+        assert (several.value.where, several.value.fix) == ("--size", "--size full")
     assert locate_new("cavity", root=tmp_path).size.name == "mini"
 
 
