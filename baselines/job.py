@@ -1,8 +1,6 @@
-"""A training as it was asked for: recipe, data, folder, machine.
+"""A training: what was asked for, the folder it writes, the record of what it did and what it cost.
 
-The folder of a training: checkpoint.pt, weights.pt, training.json, tensorboard/.
-
-The ledger of a training: what it did, what it cost, on what machine.
+The folder holds checkpoint.pt, weights.pt, training.json and tensorboard/.
 """
 
 from __future__ import annotations

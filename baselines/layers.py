@@ -1,8 +1,7 @@
-"""Multi-layer perceptrons of the graph networks, for nodes and for edges.
+"""Layers of the graph networks: perceptrons of nodes and edges, fast and exact on CPUs.
 
-Linear and normalising layers, made fast and exact on CPUs.
-
-An edge update that keeps no hidden layer: the backward pass computes them again.
+Products go to oneDNN, normalising layers learn in bfloat16 too, and large edge updates keep no hidden
+layer: the backward pass computes them again.
 """
 
 from __future__ import annotations

@@ -3,8 +3,7 @@
 All terms are in normalised units, as in the thesis: accelerations, velocities and positions
 over their deviations in train; the grid's velocities too, so that vorticity and divergence
 have the unit 1/length; density over that around a particle. Weights are applied by the trainer.
-
-Particles in motion: the frame of a loss, the state of a rollout, the step between two.
+Rollouts share the state and the step between two frames.
 """
 
 from __future__ import annotations

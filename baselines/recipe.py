@@ -1,5 +1,7 @@
 """Recipes: the options of a model and of its training for one split and size, from YAML.
 
+A training's options are its budget, its optimiser, and how often it is looked at.
+
 A file of recipes holds defaults and what differs from them::
 
     format: 1
@@ -13,8 +15,6 @@ A file of recipes holds defaults and what differs from them::
 
 Later layers win: defaults, recipe, what it says of the baseline by name, ``--set``. ``steps`` and
 ``epochs`` replace each other.
-
-How a model is trained: the budget, the optimiser, and how often it is looked at.
 """
 
 from __future__ import annotations

@@ -1,11 +1,8 @@
-"""Train a baseline: seeded, resumable, on one processor or several.
+"""Train a baseline: seeded, resumable, on one device or several.
 
-A step draws its windows and its noise from (seed, step, process) alone, so that a training
-that was interrupted and resumed ends, on one thread, with the same bits as one that was not.
-
-Gradient descent over windows, by pytorch-lightning, on one device or several.
-
-Models that are fitted in closed form, through the same door as those that are trained.
+Most descend over windows, by pytorch-lightning; models with a closed form are fitted to whole
+scenarios instead. A step draws its windows and its noise from (seed, step, process) alone, so that
+a training that was interrupted and resumed ends, on one thread, with the same bits as one that was not.
 """
 
 from __future__ import annotations

@@ -17,7 +17,17 @@ import yaml
 from numpy.typing import NDArray
 from report_bench import Method, ReportBench, damped, make_report_bench, noisy
 
-from lagbench.board.entry import Budget, Cost, DataSet, Entry, Flag, Meta, Prediction, ScoreBlock, ScoredFile
+from lagbench.board.entry import (
+    Cost,
+    DataSet,
+    Entry,
+    EntryBudget,
+    Flag,
+    Meta,
+    Prediction,
+    ScoreBlock,
+    ScoredFile,
+)
 from lagbench.board.entry_file import read_entry
 from lagbench.board.model import Board, Curve, Floor, Histogram, Pictures, Row, Tab, Value
 from lagbench.board.ranking import combine, summarise
@@ -212,7 +222,7 @@ def make_entry(name: str, place: int, split: str, size: str, cost: Cost | None) 
         date=datetime.date(2026, 1 + len(name) % 12, 14),
         notes="Weights of the best of three seeds.",
         training="48 train scenarios, 20000 steps, batch 2, bf16",
-        budget=Budget(track="equal compute", windows=40_000 * (place + 1), epochs=1.5, cpu_hours=0.25),
+        budget=EntryBudget(track="equal compute", windows=40_000 * (place + 1), epochs=1.5, cpu_hours=0.25),
         parameters=int(1.6e6 * (1 + place**2)),
         hardware="NVIDIA H200, 1.2 h",
         command=f"lagbench train --baseline {method} --split cavity --seed 0\n"

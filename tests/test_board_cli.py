@@ -15,7 +15,7 @@ import yaml
 from conftest import SIZE, SPLIT
 from typer.testing import Result
 
-from lagbench.board.entry import Budget, Entry, Meta
+from lagbench.board.entry import Entry, EntryBudget, Meta
 from lagbench.board.findings import CHECKS
 from lagbench.make.generate import GenerationResult
 
@@ -122,7 +122,7 @@ def test_the_page_of_docs_is_true(run: Run) -> None:
     text = (DOCS / "submitting.md").read_text()
     for name, check in CHECKS.items():
         assert f"| `{name}` | {check.meaning} |" in text
-    for key in (*Meta.model_fields, *Entry.model_fields, *Budget.model_fields):
+    for key in (*Meta.model_fields, *Entry.model_fields, *EntryBudget.model_fields):
         assert f"`{key}`" in text
     assert (TOY / "meta.yaml").read_text() in text
     blocks = re.findall(r"```(?:bash|console)\n(.*?)```", text, re.DOTALL)

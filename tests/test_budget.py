@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from lagbench.board.entry import Budget as EntryBudget
+from lagbench.board.entry import EntryBudget
 from lagbench.submission.budget import MOST_VALIDATIONS, Budget, budget_in, track_of
 
 

@@ -26,7 +26,7 @@ from lagbench.submission.findings import Finding
 from lagbench.work.progress import Progress
 
 from .base import check_base
-from .entry import Budget, Entry, Status, Summary
+from .entry import Entry, EntryBudget, Status, Summary
 from .entry_file import examine, load_plain
 from .findings import finding, finding_of, impossible, print_of, skeleton
 from .floors import dataset_of, floor_names
@@ -196,7 +196,7 @@ class _Look:
             if made.path is not None and (got := self._length(Path(made.path))) != made.bytes:
                 expected = f"{made.path}, a file of {made.bytes} bytes"
                 self.add("predictions", f"{path}, predictions.{number}", got, expected=expected)
-        formed = Budget.of(entry.size, [made.budget for made in entry.predictions])
+        formed = EntryBudget.of(entry.size, [made.budget for made in entry.predictions])
         if formed is not None and entry.budget != formed:
             self.add("budget", f"{path}, budget", entry.budget, expected=formed)
         elif formed is None and entry.budget is not None and entry.budget.track is not None:

@@ -10,7 +10,7 @@ from types import MappingProxyType
 from lagbench.metrics.metric import Direction, Metric
 from lagbench.report.html import MISSING, sentence, text, words
 
-from .entry import Budget
+from .entry import EntryBudget
 from .model import Floor, Row, Tab, Value
 
 __all__ = ["Column", "columns_of", "held", "presets_of", "value_of", "written"]
@@ -156,7 +156,7 @@ OF_ENTRY = (
 """Columns that no metric stands behind."""
 
 
-def _budget(budget: Budget | None) -> str:
+def _budget(budget: EntryBudget | None) -> str:
     """Return the computing time of a training in words."""
     if budget is None:
         return ""

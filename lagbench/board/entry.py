@@ -28,8 +28,7 @@ from pydantic import (
     model_validator,
 )
 
-from lagbench.submission.budget import Budget as SeedBudget
-from lagbench.submission.budget import Track, track_of
+from lagbench.submission.budget import Budget, Track, track_of
 
 from .folder import Place, entry_path, score_paths, weights_path
 
@@ -40,7 +39,7 @@ __all__ = [
     "MOST_SEEDS",
     "PATTERNS",
     "About",
-    "Budget",
+    "EntryBudget",
     "Cost",
     "DataSet",
     "Date",
@@ -195,7 +194,7 @@ class Prediction(Strict):
     url: Link | None = None
     path: InnerPath | None = Field(default=None, description="inside the leaderboard's folder")
     bytes: int | None = Field(default=None, gt=0, lt=MOST_BYTES, description="length of the file")
-    budget: SeedBudget | None = Field(default=None, description="what its training took, as the file says")
+    budget: Budget | None = Field(default=None, description="what its training took, as the file says")
     weights: Weights | None = None
 
 
@@ -213,7 +212,7 @@ class Cost(Strict):
         return None if solver is None else solver / self.seconds_per_frame
 
 
-class Budget(SeedBudget):
+class EntryBudget(Budget):
     """What the training of one seed took: of several the mean, and the track that all of them belong to."""
 
     track: Track | None = Field(
@@ -221,7 +220,7 @@ class Budget(SeedBudget):
     )
 
     @classmethod
-    def of(cls, size: str, seeds: Sequence[SeedBudget | None]) -> Self | None:
+    def of(cls, size: str, seeds: Sequence[Budget | None]) -> Self | None:
         """Return the mean over seeds, with the track that all belong to; None unless each has a budget."""
         known = [seed for seed in seeds if seed is not None]
         if len(known) < len(seeds):
@@ -289,7 +288,7 @@ class About(Strict):
     date: Date | None = None
     notes: Long = ""
     training: Long = Field(default="", description="what it was trained on, in words")
-    budget: Budget | None = None
+    budget: EntryBudget | None = None
     parameters: int | None = Field(default=None, ge=0, lt=10**15, description="trainable parameters")
     hardware: Line = Field(default="", description="machine of the training")
     command: Long = Field(default="", description="shell commands that make the predictions again")

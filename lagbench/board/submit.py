@@ -38,10 +38,10 @@ from .entry import (
     LONGEST_TEXT,
     MOST_SEEDS,
     About,
-    Budget,
     Cost,
     DataSet,
     Entry,
+    EntryBudget,
     Flag,
     Meta,
     Prediction,
@@ -253,7 +253,7 @@ def _about(headers: Sequence[Header], meta: Meta) -> About:
             where="budget.track",
             fix="leave it out: it follows from the budget that `lagbench predict` writes into predictions.nc",
         )
-    held["budget"] = Budget.of(first.size, [header.budget for header in headers]) or meta.budget
+    held["budget"] = EntryBudget.of(first.size, [header.budget for header in headers]) or meta.budget
     return About(**held)
 
 

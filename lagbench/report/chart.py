@@ -255,15 +255,10 @@ class Plot:
         """Return the name of a dot in the first free place around it, none where there is none."""
         width = sum(9.0 if letter.isupper() else 6.4 for letter in name)
         tries = [
-            (9, 4, 0),
-            (-9, 4, 1),
-            (4, -9, 0),
-            (4, 17, 0),
-            (-4, -9, 1),
-            (-4, 17, 1),
-            (0, -9, 0.5),
-            (0, 17, 0.5),
+            *((9, 4, 0.0), (-9, 4, 1.0), (4, -9, 0.0), (4, 17, 0.0)),
+            *((-4, -9, 1.0), (-4, 17, 1.0), (0, -9, 0.5), (0, 17, 0.5)),
         ]
+        anchors = {0.0: "name", 0.5: "name middle", 1.0: "name end"}
         for right, down, end in tries:
             left = x + right - width * end
             box = (left, y + down - 11, left + width, y + down + 3)
@@ -271,7 +266,7 @@ class Plot:
             others = [one for one in taken if not (one[0] <= x <= one[2] and one[1] <= y <= one[3])]
             if inside and not any(_meet(box, one) for one in others):
                 taken.append(box)
-                return [_text(name, x + right, y + down, {0: "name", 1: "name end"}.get(end, "name middle"))]
+                return [_text(name, x + right, y + down, anchors[end])]
         return []
 
     def svg(self, title: str, description: str) -> Markup:
