@@ -53,10 +53,10 @@ __all__ = ["CPU_SECONDS", "MEMORY", "WALL_SECONDS", "Answers", "in_child", "seco
 MEMORY = 768 << 20
 """Address space of a child [bytes]."""
 
-CPU_SECONDS = 10.0
+CPU_SECONDS = 5.0
 """Computing time for a small file, the start of the child aside [s]; a sound one takes 2 on a busy core."""
 
-WALL_SECONDS = 1000.0
+WALL_SECONDS = 600.0
 """Time for a child and a small file [s]; only a child that waits gets that far.
 
 What computes too long is stopped by the kernel, which counts computing time: on a machine that is
