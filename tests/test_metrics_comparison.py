@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import gc
 import itertools
 import math
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
 import scipy.stats
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from statsmodels.stats.multitest import multipletests
 
@@ -179,7 +181,16 @@ def test_seeds_of_one_method_seldom_differ() -> None:
     assert told / 400 <= 0.05
 
 
-@settings(deadline=None)
+@pytest.fixture
+def frozen_garbage() -> Iterator[None]:
+    """Nothing that is there is looked at: statsmodels collects garbage at every call, seconds in a suite."""
+    gc.freeze()
+    yield
+    gc.unfreeze()
+
+
+@pytest.mark.usefixtures("frozen_garbage")
+@settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(st.floats(0.0, 1.0), min_size=1, max_size=9))
 def test_holm_is_that_of_statsmodels(p: list[float]) -> None:
     """The corrected p-values are those of statsmodels' step-down method."""
