@@ -11,12 +11,16 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from exchange_readers import straight_runs
 from filelock import FileLock
 from typer.testing import CliRunner, Result
 
 from lagbench.cli.app import app
 from lagbench.data.registry import Registry, default_path, load
+from lagbench.exchange import adopt
+from lagbench.exchange.local_split import LocalSplit
 from lagbench.make.generate import GenerationResult, generate
 from lagbench.submission import ValidationResult
 from lagbench.submission.validation import validate
@@ -122,3 +126,19 @@ def copied(generated: GenerationResult, tmp_path: Path) -> Callable[[], Path]:
         return root
 
     return copy
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory: pytest.TempPathFactory) -> LocalSplit:
+    """A data set of four files of about 40 kB."""
+    folder = tmp_path_factory.mktemp("original")
+    np.save(folder / "runs.npy", np.stack(straight_runs(4, frames=12, particles=400)))
+    return adopt(folder / "runs.npy", output=folder / "root" / "own", radius=0.1, frame_interval=0.1)
+
+
+@pytest.fixture
+def here(original: LocalSplit, tmp_path: Path) -> Path:
+    """A root folder that knows the data set by its description alone."""
+    (tmp_path / "own").mkdir()
+    shutil.copy(original.folder / "split.yaml", tmp_path / "own")
+    return tmp_path

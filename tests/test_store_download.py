@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import socket
 from collections.abc import Iterator
 from pathlib import Path
@@ -32,14 +31,6 @@ def _impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(scope="module")
-def original(tmp_path_factory: pytest.TempPathFactory) -> LocalSplit:
-    """A data set of four files of about 40 kB."""
-    folder = tmp_path_factory.mktemp("original")
-    np.save(folder / "runs.npy", np.stack(straight_runs(4, frames=12, particles=400)))
-    return adopt(folder / "runs.npy", output=folder / "root" / "own", radius=0.1, frame_interval=0.1)
-
-
-@pytest.fixture(scope="module")
 def s3() -> Iterator[str]:
     """An S3 server."""
     with s3_server() as url:
@@ -61,14 +52,6 @@ def server(original: LocalSplit) -> Iterator[Mirror]:
     """An HTTP server that can be told to lie."""
     with serving(original.folder.parent) as running:
         yield running
-
-
-@pytest.fixture
-def here(original: LocalSplit, tmp_path: Path) -> Path:
-    """A root folder that knows the data set by its description alone."""
-    (tmp_path / "own").mkdir()
-    shutil.copy(original.folder / "split.yaml", tmp_path / "own")
-    return tmp_path
 
 
 def left(root: Path) -> set[str]:

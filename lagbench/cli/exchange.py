@@ -78,7 +78,8 @@ def download(
     split: SplitOption = None,
     size: NewSizeOption = None,
     mirror: Annotated[
-        str | None, typer.Option("--from", metavar="URL", help="Store; else the mirrors of datasets.yaml.")
+        str | None,
+        typer.Option("--from", metavar="URL", help="Store or folder of archives; else mirrors."),
     ] = None,
     subset: SubsetOption = None,
     scenarios: ScenariosOption = None,

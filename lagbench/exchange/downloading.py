@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,6 +27,7 @@ from lagbench.make.cards import write_cards
 from lagbench.make.generate import generate
 from lagbench.make.inventory import State, compare, examine
 from lagbench.make.plan import Scenarios, Selection, check_disk, scenario_bytes, select
+from lagbench.store.archive import RELEASES, RELEASES_VARIABLE, fetch_archive, releases
 from lagbench.store.copy import (
     MANIFEST_LIMIT,
     address_of,
@@ -90,7 +91,8 @@ def download(
     Args:
         split: name of the split, or path of a local split's folder.
         size: name of the size; mini when None, or the only one that the split has.
-        mirror: URL of a copy of a root folder; else the mirrors of datasets.yaml, in order.
+        mirror: URL of a copy of a root folder, or of a folder of archives, see
+            :mod:`lagbench.store.archive`; else the mirrors of datasets.yaml in order, then releases.
         subset: some subsets only.
         scenarios: some ids only.
         root: folder of all data sets, see :func:`lagbench.data.layout.resolve_root`.
@@ -114,7 +116,7 @@ def download(
         raise UsageError("no file comes without a connection", where="--connections", expected=">= 1")
     tier, folder, splits = locate_new(split, size, root=root, registry=registry)
     wanted = select(tier, subset=subset, scenarios=scenarios)
-    urls = (mirror,) if mirror else splits.split(tier.split).mirrors
+    urls = (mirror,) if mirror else (*splits.split(tier.split).mirrors, *releases(tier))
     with dataset_lock(folder, tier.split, tier.name, tier.major), publication(tier, folder) as store:
         held = [i for i in wanted if store and i in store.held]
         work = _Download(tier, folder, [i for i in wanted if i not in held], Meter(progress), connections)
@@ -190,7 +192,8 @@ class _Download:
         reason: Reason = UsageError(
             "no store is known to download from",
             where=place,
-            fix="name one: --from URL; or let it be simulated: leave out --no-generate",
+            got=f"{RELEASES}, a placeholder" if self.size.simulated else None,
+            fix=f"name one: --from URL, or {RELEASES_VARIABLE}=URL; or leave out --no-generate",
         )
         unknown = [i for i in self.missing if i not in self._recorded]
         if unknown:
@@ -207,8 +210,13 @@ class _Download:
 
     def _fetch_from(self, url: str) -> NotInStoreError | None:
         """Fetch what one store has; return the error of the last file that it has not."""
-        claims = self._claims(url)
         check_disk(self.root, sum(scenario_bytes(self.size, i) for i in self.missing))
+        claims = self._claims(url)
+        if claims is None:
+            with suppress(NotInStoreError):
+                self._fetch_archive(url)
+                return None
+            claims = {}
         wanted = {i: self._wanted(url, i, claims.get(i)) for i in self.missing}
         total = sum(one.length or scenario_bytes(self.size, i) for i, one in wanted.items())
         self._meter.begin("downloading", total=total, scenarios=len(wanted))
@@ -223,13 +231,28 @@ class _Download:
             self.missing = [i for i in self.missing if i not in self.downloaded]
         return last
 
-    def _claims(self, url: str) -> dict[int, FileEntry]:
-        """Return what the store's manifest says of the files that datasets.yaml means."""
+    def _fetch_archive(self, url: str) -> None:
+        """Fetch what is missing from the archive of the data set in a store."""
+        wanted = {i: self._wanted(url, i, None) for i in self.missing}
+        total = sum(scenario_bytes(self.size, i) for i in wanted)
+        self._meter.begin("downloading", total=total, scenarios=len(wanted))
+        limit = sum(self._limit(i) for i in self.size.scenarios) + MANIFEST_LIMIT
+        try:
+            with closing(
+                fetch_archive(self.size, url, wanted, self._count, limit=limit, remedy=REMEDY)
+            ) as arrivals:
+                for claim in arrivals:
+                    self._take(url, claim.scenario, claim)
+        finally:
+            self.missing = [i for i in self.missing if i not in self.downloaded]
+
+    def _claims(self, url: str) -> dict[int, FileEntry] | None:
+        """Return what the store's manifest says of the files that datasets.yaml means; None without one."""
         place = address_of(self.size, url, MANIFEST_NAME)
         try:
             text = fetch_text(place, limit=MANIFEST_LIMIT, remedy=REMEDY)
         except NotInStoreError:
-            return {}
+            return None
         manifest = parse_manifest(text, where=place, remedy=REMEDY)
         found = {entry.scenario: entry for entry in manifest.files}
         other = [i for i in self.missing if i in found and not found[i].has_hash(self._recorded[i])]
@@ -241,12 +264,16 @@ class _Download:
         return Wanted(
             url=address_of(self.size, url, f"{key.subset}/{scenario:04d}.nc"),
             target=scenario_path(self.root, key),
-            limit=round(SLACK * scenario_bytes(self.size, scenario)) + (1 << 20),
+            limit=self._limit(scenario),
             content_sha256=self._recorded[scenario],
             length=claim.bytes if claim else None,
             file_sha256=claim.file_sha256 if claim else None,
             remedy=REMEDY,
         )
+
+    def _limit(self, scenario: int) -> int:
+        """Return the bytes beyond which no file of a scenario goes."""
+        return round(SLACK * scenario_bytes(self.size, scenario)) + (1 << 20)
 
     def _take(self, url: str, scenario: int, claim: FileEntry | None) -> None:
         """Note a new file; what cannot be told from it is the store's word."""

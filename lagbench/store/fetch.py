@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -35,7 +35,19 @@ from .objects import (
     open_object,
 )
 
-__all__ = ["CONNECTIONS", "Wanted", "fetch_scenarios", "fetch_text", "partial_name"]
+__all__ = [
+    "BLOCK",
+    "CONNECTIONS",
+    "Pace",
+    "Wanted",
+    "accept",
+    "fetch_scenarios",
+    "fetch_text",
+    "insist",
+    "partial_name",
+    "received",
+    "saving",
+]
 
 CONNECTIONS = 4
 """Objects that are fetched side by side."""
@@ -85,13 +97,13 @@ def partial_name(target: Path) -> Path:
 
 def fetch_text(url: str, *, limit: int, remedy: str) -> bytes:
     """Return a small object, tried again from its start where the line breaks."""
-    pace = _Pace(url)
+    pace = Pace(url)
 
     def attempt() -> bytes:
         with closing(open_object(url, 0, remedy=remedy)) as answer:
-            return b"".join(_received(answer, pace, limit=limit, remedy=remedy))
+            return b"".join(received(answer, pace, limit=limit, remedy=remedy))
 
-    return _insist(attempt, url)
+    return insist(attempt, url)
 
 
 def fetch_scenarios(
@@ -121,7 +133,7 @@ def fetch_scenarios(
                     yield scenario, error
                 else:
                     # Here and not in the threads: netCDF4 stands one at a time.
-                    _accept(wanted[scenario])
+                    accept(wanted[scenario])
                     yield scenario, None
         except DataError:
             stop.set()
@@ -140,7 +152,7 @@ class _StoppedError(Exception):
 
 def _fetch(wanted: Wanted, report: Callable[[int], None]) -> None:
     """Fetch one object under its temporary name, going on where an earlier attempt stopped."""
-    partial, pace = partial_name(wanted.target), _Pace(wanted.url)
+    partial, pace = partial_name(wanted.target), Pace(wanted.url)
 
     def attempt() -> None:
         report(0)
@@ -152,7 +164,7 @@ def _fetch(wanted: Wanted, report: Callable[[int], None]) -> None:
                 if answer.start < have:
                     out.seek(answer.start)
                     out.truncate()
-                for block in _received(
+                for block in received(
                     answer,
                     pace,
                     limit=wanted.limit,
@@ -163,9 +175,16 @@ def _fetch(wanted: Wanted, report: Callable[[int], None]) -> None:
                     out.write(block)
                     report(len(block))
 
+    with saving(partial):
+        insist(attempt, wanted.url, partial)
+
+
+@contextmanager
+def saving(partial: Path) -> Iterator[None]:
+    """Write a temporary file: after a lie it goes, after a broken line it stays."""
     try:
         partial.parent.mkdir(parents=True, exist_ok=True)
-        _insist(attempt, wanted.url, partial)
+        yield
     except DataError:
         partial.unlink(missing_ok=True)
         raise
@@ -178,10 +197,14 @@ def _fetch(wanted: Wanted, report: Callable[[int], None]) -> None:
         ) from error
 
 
-def _insist(attempt: Callable[[], T], url: str, partial: Path | None = None) -> T:
-    """Attempt until it succeeds, or attempts bring a partial file no further."""
+def insist(
+    attempt: Callable[[], T], url: str, partial: Path | None = None, place: Callable[[], int] | None = None
+) -> T:
+    """Attempt until it succeeds, or attempts bring a partial file, or a place, no further."""
 
     def held() -> int:
+        if place is not None:
+            return place()
         return partial.stat().st_size if partial and partial.exists() else 0
 
     failures, restarted = 0, False
@@ -205,7 +228,7 @@ def _insist(attempt: Callable[[], T], url: str, partial: Path | None = None) -> 
     )
 
 
-class _Pace:
+class Pace:
     """How fast an object arrives, over all attempts at it."""
 
     def __init__(self, url: str) -> None:
@@ -229,8 +252,8 @@ class _Pace:
         self._arrived, self._waited = 0, 0.0
 
 
-def _received(
-    answer: Answer, pace: _Pace, *, limit: int, length: int | None = None, begins: bytes = b"", remedy: str
+def received(
+    answer: Answer, pace: Pace, *, limit: int, length: int | None = None, begins: bytes = b"", remedy: str
 ) -> Iterator[bytes]:
     """Yield what a store sends; refuse a page, another length than is known, and more than can be."""
 
@@ -262,7 +285,7 @@ def _received(
         raise refused(TruncatedError, "an object ends too early", f"{length} bytes", f"{place} bytes")
 
 
-def _blocks(answer: Answer, pace: _Pace) -> Iterator[bytes]:
+def _blocks(answer: Answer, pace: Pace) -> Iterator[bytes]:
     """Yield what arrives until the end; whatever a library raises is a broken line."""
     block = b"more"
     while block:
@@ -282,7 +305,7 @@ def _blocks(answer: Answer, pace: _Pace) -> Iterator[bytes]:
         yield block
 
 
-def _accept(wanted: Wanted) -> None:
+def accept(wanted: Wanted) -> None:
     """Give a file its name once its content is right."""
     partial = partial_name(wanted.target)
     try:
