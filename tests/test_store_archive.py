@@ -14,6 +14,7 @@ from conftest import SIZE, SPLIT
 from lying_server import Mirror, serving
 
 import lagbench
+from lagbench.data.manifest import Manifest
 from lagbench.errors import DataError, LagbenchError, UsageError
 from lagbench.exchange import download
 from lagbench.exchange.downloading import DownloadResult
@@ -198,7 +199,7 @@ def test_a_bad_line_costs_time_only(server: Mirror, here: Path, fault: str) -> N
         ("chopped", objects.TruncatedError),
         ("ends early", objects.TruncatedError),
         ("announces more", objects.TruncatedError),
-        ("drops always", objects.LagbenchError),
+        ("drops always", LagbenchError),
         ("page", objects.NotDataError),
         ("hidden page", objects.NotDataError),
         ("endless", objects.NotDataError),
@@ -275,7 +276,7 @@ def test_another_data_set_under_the_name(server: Mirror, packed: Path, here: Pat
 
     def other(members: Members) -> Members:
         (head, text), *rest = members
-        manifest = archive.parse_manifest(text, where="", remedy="")
+        manifest = Manifest.model_validate_json(text)
         files = [entry.model_copy(update={"content_sha256": "0" * 64}) for entry in manifest.files]
         changed = manifest.model_copy(update={"files": tuple(files)})
         return [(head, changed.model_dump_json().encode()), *rest]
