@@ -84,6 +84,14 @@ class EncodeProcessDecode(nn.Module):
         )
         self.decoder = mlp([latent, hidden, hidden, outputs], norm=False)
 
+    def compile_layers(self) -> None:
+        """Compile the edges' encoder and the processor layers, for any number of edges.
+
+        The layers are compiled once for all: their code is the same. All hidden layers are then kept.
+        """
+        for part in (self.edge_encoder, *self.processor):
+            part.compile(dynamic=True)
+
     def forward(
         self, node: Tensor, edge_index: Tensor, edge: Tensor, generator: torch.Generator | None = None
     ) -> tuple[Tensor, Losses]:

@@ -183,6 +183,8 @@ class Recipe:
     def as_json(self) -> dict[str, Any]:
         """Return plain values."""
         training = self.training.model_dump(mode="json")
+        if not self.training.compile:
+            del training["compile"]  # a record without the key is of a training that compiles nothing
         return {"baseline": self.baseline, "name": self.name, "model": dict(self.model), "training": training}
 
 

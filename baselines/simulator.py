@@ -68,8 +68,8 @@ class GraphNetworkOptions(Options):
     # share of training windows that know but some of their last velocities, as rollouts do at their start
     forgetful: float = Field(default=0.0, ge=0.0, le=1.0)
     target: Target = Target.ACCELERATION  # what the network predicts
-    # deviation of the noise on the last given velocity, per component [length/frame]; near the error of one
-    # predicted step is good, far above it training learns to remove noise and little else
+    # deviation of the noise on the last given velocity, per component [length/frame]; some times the deviation
+    # of an acceleration is good: rollouts of models that saw less drift away
     noise_std: float = Field(default=6.7e-4, ge=0.0, allow_inf_nan=False)
     loss: LossWeights = LossWeights()  # weights of the six terms
     loss_norm: LossNorm = LossNorm.L2  # L2 or L1
@@ -166,12 +166,8 @@ class GraphNetwork(Baseline):
         return self.options.loss.model_dump() | own
 
     def compile_layers(self) -> None:
-        """Compile the edges' encoder and the processor layers, for any number of edges.
-
-        The layers are compiled once for all: their code is the same.
-        """
-        for part in (self.network.edge_encoder, *self.network.processor):
-            part.compile(dynamic=True)
+        """Compile the network's layers."""
+        self.network.compile_layers()
 
     def forward(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """Return the six terms of Eq. 5.35 and the operator's own, raw, means over the steps."""

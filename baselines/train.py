@@ -280,6 +280,8 @@ def descend(job: TrainingJob, model: Baseline) -> tuple[TrainingRecord, int]:
         ledger.state = "finished" if ledger.step >= steps else "running"
     if ledger.state != "running":
         return ledger, steps
+    if options.compile:
+        _compile(model, job.device)
     keeper = TrainingCallback(job, ledger, validation=validation_of(job), steps=steps, windows=len(data))
     with quiet():
         _fit(_trainer(job, keeper), module)
@@ -295,8 +297,6 @@ def _module(
     options, earlier = job.recipe.training, job.earlier
     if earlier is not None:
         load_weights(model, earlier.weights, where=str(job.folder.checkpoint))
-    if options.compile:
-        _compile(model, job.device)
 
     def loader(rank: int, ranks: int) -> DataLoader[Window]:
         sampler = WindowSampler(data, seed=options.seed, rank=rank, ranks=ranks)
@@ -322,14 +322,14 @@ def _module(
 
 
 def _compile(model: Baseline, device: str) -> None:
-    compilers = [os.environ.get("CXX", ""), "g++", "clang++"]
-    if device == "cpu" and not any(map(shutil.which, filter(None, compilers))):
+    compiler = os.environ.get("CXX") or "g++"  # the one that torch takes
+    if device == "cpu" and shutil.which(compiler) is None:
         raise UsageError(
             "no C++ compiler",
             where="training.compile",
-            expected="g++ or clang++ on the PATH, or CXX",
-            got="none",
-            fix="install one, or leave the option out",
+            expected="g++ on the PATH, or another in CXX",
+            got=f"no {compiler}",
+            fix="install it, or leave the option out",
         )
     model.compile_layers()
 

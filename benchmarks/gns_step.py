@@ -74,8 +74,7 @@ def one_step(given: argparse.Namespace) -> tuple[Callable[[], None], dict[str, i
         layers=given.layers,
     )
     if given.compiled:
-        for part in (model.edge_encoder, *model.processor):
-            part.compile(dynamic=True)
+        model.compile_layers()
     edge_index = particles(given.particles, given.windows)
     rows, edges = given.particles * given.windows, edge_index.shape[1]
     node, edge, target = (

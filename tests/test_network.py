@@ -258,8 +258,8 @@ def test_compiled_layers(operator: type[Operator]) -> None:
     results = []
     for compiled in (False, True):
         model = network(operator)
-        for part in (model.edge_encoder, *model.processor) if compiled else ():
-            part.compile(dynamic=True)
+        if compiled:
+            model.compile_layers()
         for edges in (500, 731):
             node, edge_index, edge = graph(60, edges, node=7, edge=3)
             output, losses = model(node, edge_index, edge, torch.Generator().manual_seed(0))

@@ -193,8 +193,11 @@ def _only_size(split: str, root: Path, known: Registry) -> str:
         return found[0].name
     names = ", ".join(size.name for size in here) or f"no data of {split}"
     option = f"--size {here[0].name}" if here else remedy(sizes[-1], root=root)
+    wrong = "several sizes are there: name one" if here else "no size is named, and none is there"
+    if url_of(root) is not None and not here:  # the store may hold it: only what was fetched is known
+        wrong, option = "no size is named, and none was fetched from the store", "name it with --size"
     raise UsageError(
-        "several sizes are there: name one" if here else "no size is named, and none is there",
+        wrong,
         where="--size",
         expected=", ".join(size.name for size in sizes),
         got=f"{names} in {url_of(root) or root}",

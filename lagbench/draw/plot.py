@@ -195,14 +195,15 @@ def _table(files: Sequence[Path], panel: Panel | None, frame: int | None, splits
     common = float(np.median([limit_of(panel, scene) for scene in scenes]))
     limits = [WALL_SHARE * np.abs(s.recording.wall_velocity).max() if scaled else common for s in scenes]
     cells = [
-        _Cell(scene=s, label=_name(s) if s.frame == frames[0] else f"frame {s.frame}", limit=m)
-        for s, m in zip(scenes, limits, strict=True)
+        _Cell(scene=s, label=f"frame {s.frame}" if i % len(frames) else _name(s), limit=m)
+        for i, (s, m) in enumerate(zip(scenes, limits, strict=True))
     ]
+    shown = ", ".join(str(scene.frame) for scene in scenes[: len(frames)])
     columns = COLUMNS if len(frames) == 1 else 3 * len(frames)
     return _Sheet(
         rows=[cells[i : i + columns] for i in range(0, len(cells), columns)],
         panel=panel,
-        subtitle=f"{len(cells) // len(frames)} scenarios at frame {', '.join(map(str, frames))}",
+        subtitle=f"{len(cells) // len(frames)} scenarios at frame {shown}",
         limit=WALL_SHARE if scaled else common,
         unit="speed / wall speed" if scaled else None,
     )

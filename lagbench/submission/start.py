@@ -233,7 +233,7 @@ def _is_permuted(start: Start) -> bool:
         found, distance = _nearest(start.first[sample], cloud)
         other = ((distance <= ON * apart) & torn) | (distance <= EXACTLY * apart)
         # A cloud that shrank to one point may lie on a particle too, but on one only.
-        if len(np.unique(found[other])) >= 0.5 * len(sample):
+        if len(np.unique(found[other])) >= 0.5 * (count if count < 2 * FEWEST else len(sample)):
             return True
     return False
 

@@ -40,7 +40,7 @@ class PredictionsWriter:
     Args:
         path: file to write.
         split: name of the split.
-        size: name of the size.
+        size: name of the size; the only one that is there when None.
         method: what makes the predictions.
         velocity: whether velocities are stored too (they are not scored).
         dataset_sha256: hash of the data set that the model was given; else the recorded one.
@@ -58,7 +58,7 @@ class PredictionsWriter:
         path: str | Path,
         *,
         split: str,
-        size: str = "full",
+        size: str | None = None,
         method: str,
         velocity: bool = False,
         dataset_sha256: str | None = None,
@@ -291,7 +291,7 @@ def write(
     positions: Mapping[int, ArrayLike] | ArrayLike,
     *,
     split: str,
-    size: str = "full",
+    size: str | None = None,
     method: str,
     velocities: Mapping[int, ArrayLike] | ArrayLike | None = None,
     diverged_at: Mapping[int, int] | None = None,
@@ -307,7 +307,7 @@ def write(
         positions: scenario id to positions [length], shape [frame, particle, space]; or one
             array [scenario, frame, particle, space] with the test scenarios by ascending id.
         split: name of the split.
-        size: name of the size.
+        size: name of the size; the only one that is there when None.
         method: what made the predictions.
         velocities: velocities [length/s], in the same form; stored, not scored.
         diverged_at: scenario id to the absolute frame from which its rollout is frozen.

@@ -79,8 +79,9 @@ class Film {
       before = now;
       this.show(this.time + (passed * (this.frames.length - 1)) / SECONDS);
       this.rested = this.time < this.frames.length - 1 ? 0 : this.rested + passed;
+      // What follows the end stops the film or starts it itself: a second loop would run beside this one.
       if (this.time >= this.frames.length - 1 && this.rested >= this.rest) this.ended();
-      if (this.playing) requestAnimationFrame(step);
+      else requestAnimationFrame(step);
     };
     requestAnimationFrame(step);
   }
