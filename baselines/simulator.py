@@ -68,7 +68,7 @@ class GraphNetworkOptions(Options):
     # share of training windows that know but some of their last velocities, as rollouts do at their start
     forgetful: float = Field(default=0.0, ge=0.0, le=1.0)
     target: Target = Target.ACCELERATION  # what the network predicts
-    # deviation of the noise on the last given velocity, per component [length/frame]; some times the deviation
+    # deviation of the noise on the last given velocity, per component [length/frame]; some times the one
     # of an acceleration is good: rollouts of models that saw less drift away
     noise_std: float = Field(default=6.7e-4, ge=0.0, allow_inf_nan=False)
     loss: LossWeights = LossWeights()  # weights of the six terms

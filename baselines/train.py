@@ -407,6 +407,8 @@ def fit(job: TrainingJob, model: Baseline) -> tuple[TrainingRecord, int]:
         load_weights(model, job.earlier.weights, where=str(job.folder.checkpoint))
         ledger.state = "finished"
         return ledger, STEPS
+    if job.recipe.training.compile:
+        model.compile_layers()  # refuses: a closed form has none
     figures = model.fit(_scenarios(job))  # type: ignore[operator]
     ledger.step, ledger.loss = STEPS, {name: float(value) for name, value in figures.items()}
     ledger.epochs = 1.0

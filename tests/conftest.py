@@ -40,7 +40,8 @@ def lasting_workers() -> Iterator[None]:
 
     @contextmanager
     def lasting(size: int, environment: Mapping[str, str] | None = None) -> Iterator[Pool]:
-        key = size, tuple((environment or {}).items()), tuple(sys.path)
+        inherited = sorted((k, v) for k, v in os.environ.items() if not k.startswith("PYTEST_"))
+        key = size, tuple((environment or {}).items()), tuple(sys.path), tuple(inherited)
         if key not in held:
             held[key] = stack.enter_context(Pool(size, environment or {}))
         try:

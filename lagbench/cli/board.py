@@ -11,9 +11,9 @@ from lagbench.errors import DataError, UsageError
 
 from .options import (
     JsonFlag,
+    NewSizeOption,
     QuietFlag,
     RootOption,
-    SizeOption,
     SplitArgument,
     SplitOption,
     WorkersOption,
@@ -233,7 +233,7 @@ def _checked(result: CheckResult, *, quiet: bool) -> None:
 def picture(
     name: SplitArgument = None,
     split: SplitOption = None,
-    size: SizeOption = "full",
+    size: NewSizeOption = None,
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="SVG file to write.")] = Path(
         "cost.svg"
     ),
@@ -244,9 +244,9 @@ def picture(
     from lagbench.atomic import write_atomically
     from lagbench.board.collect import collect
     from lagbench.board.cost import picture as draw
-    from lagbench.data.registry import load
+    from lagbench.data.local import locate_new
 
-    drawn = draw(collect(board), load().size(chosen(name, split), size))
+    drawn = draw(collect(board), locate_new(chosen(name, split), size).size)
     write_atomically(output, drawn.encode(), option="--output")
     say(str(output), quiet=quiet)
 

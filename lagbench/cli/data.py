@@ -22,7 +22,6 @@ from .options import (
     RootOption,
     ScenariosOption,
     SchedulerOption,
-    SizeOption,
     SplitArgument,
     SplitOption,
     SubsetOption,
@@ -348,7 +347,7 @@ def doctor(root: RootOption = None, as_json: JsonFlag = False) -> None:
 def clean(
     name: SplitArgument = None,
     split: SplitOption = None,
-    size: SizeOption = "full",
+    size: PresentSizeOption = None,
     root: RootOption = None,
     leftovers: Annotated[
         bool, typer.Option("--leftovers", help="Only temporary files of killed writers.")

@@ -154,7 +154,7 @@ class SolverBench:
     seconds_per_frame: float
 
 
-def bench_solver(split: str, size: str = "full", *, frames: int = FRAMES) -> SolverBench:
+def bench_solver(split: str, size: str, *, frames: int = FRAMES) -> SolverBench:
     """Simulate the first test scenario for some frames and time them.
 
     Taichi starts once per process: call this from one of its own, as :func:`bench_apart` does.
@@ -192,7 +192,7 @@ def bench_solver(split: str, size: str = "full", *, frames: int = FRAMES) -> Sol
     )
 
 
-def bench_apart(split: str, size: str = "full", *, frames: int = FRAMES) -> SolverBench:
+def bench_apart(split: str, size: str, *, frames: int = FRAMES) -> SolverBench:
     """Time the solver in a process of its own, which this one's memory and threads do not disturb.
 
     Raises:

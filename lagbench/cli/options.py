@@ -16,7 +16,6 @@ __all__ = [
     "RootOption",
     "ScenariosOption",
     "SchedulerOption",
-    "SizeOption",
     "NewSizeOption",
     "PresentSizeOption",
     "SplitArgument",
@@ -30,7 +29,6 @@ SplitArgument = Annotated[str | None, typer.Argument(metavar="SPLIT", help="The 
 SplitOption = Annotated[
     str | None, typer.Option("--split", metavar="NAME", help="Data set; `lagbench list` names them.")
 ]
-SizeOption = Annotated[str, typer.Option("--size", metavar="NAME", help="tiny, mini or full.")]
 NewSizeOption = Annotated[
     str | None, typer.Option("--size", metavar="NAME", help="tiny, mini or full; mini by default.")
 ]

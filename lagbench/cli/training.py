@@ -15,10 +15,10 @@ from lagbench.errors import LagbenchError, UsageError
 
 from .options import (
     JsonFlag,
+    NewSizeOption,
     PresentSizeOption,
     QuietFlag,
     RootOption,
-    SizeOption,
     SplitArgument,
     SplitOption,
     chosen,
@@ -267,19 +267,22 @@ def _predicted(result: PredictionResult, solver: SolverBench | None, where: str)
 def bench(
     what: Annotated[str, typer.Argument(metavar="WHAT", help="solver.")],
     split: SplitOption = None,
-    size: SizeOption = "full",
+    size: NewSizeOption = None,
     frames: Annotated[int, typer.Option("--frames", metavar="N", help="Frames to time.", min=1)] = 20,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
     """Time our solver on this machine: processor seconds per frame of one scenario on one core."""
+    from lagbench.data.local import locate_new
+
     from .machine import bench_solver
 
     if what != "solver":
         raise UsageError(
             f"nothing to time is called {what!r}", expected="solver", fix="lagbench bench solver"
         )
-    result = bench_solver(chosen(None, split), size, frames=frames)
+    tier = locate_new(chosen(None, split), size).size
+    result = bench_solver(tier.split, tier.name, frames=frames)
     if as_json:
         print_json(result)
         return

@@ -34,7 +34,7 @@ class CleanResult:
 
 def clean(
     split: str,
-    size: str,
+    size: str | None = None,
     *,
     root: str | Path | None = None,
     leftovers: bool = False,
@@ -45,7 +45,7 @@ def clean(
 
     Args:
         split: name of the split.
-        size: name of the size.
+        size: name of the size; the only one that is there when None.
         root: folder of all data sets; else ``LAGBENCH_ROOT``, else the user data folder.
         leftovers: remove only temporary files of killed writers.
         dry_run: only say what would go; writes nothing, a lock neither.
@@ -56,10 +56,10 @@ def clean(
         WorkFailedError: another process writes the data set, or a file cannot be removed.
     """
     tier, home, _ = locate(split, size, root=root, registry=registry)
-    folder = dataset_folder(home, tier.split, size, tier.major)
+    folder = dataset_folder(home, tier.split, tier.name, tier.major)
     if not folder.is_dir():
         return CleanResult(removed=(), bytes=0, dry_run=dry_run)
-    with nullcontext() if dry_run else dataset_lock(home, tier.split, size, tier.major, timeout=0):
+    with nullcontext() if dry_run else dataset_lock(home, tier.split, tier.name, tier.major, timeout=0):
         found = tuple(_leftovers(folder) if leftovers else _generated(folder, tier))
         length = sum(path.stat().st_size for path in found)
         if not dry_run:
