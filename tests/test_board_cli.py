@@ -132,3 +132,12 @@ def test_the_page_of_docs_is_true(run: Run) -> None:
     for words in commands:
         result = run(*words, "--help")
         assert result.exit_code == 0, words
+
+
+def test_an_empty_board_is_well(run: Run, tmp_path: Path) -> None:
+    """Without any entry it is built, checked and shown."""
+    (tmp_path / "leaderboard" / "submissions").mkdir(parents=True)
+    for words in (["build"], ["check", "--page"], ["show"], ["show", "--json"]):
+        result = run("leaderboard", *words)
+        assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout) == {"tabs": []}

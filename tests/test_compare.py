@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -298,3 +299,17 @@ def test_booleans_are_no_ids_and_no_values(tmp_path: Path) -> None:
         odd = published(tmp_path, values, method=f"b{number}", task=task)
         with pytest.raises(UnreadableFileError):
             compare(whole, odd)
+
+
+@pytest.mark.parametrize(("predict", "row", "word"), [(straight, 0, "better"), (still, 1, "worse")])
+def test_how_much_better_is_said(
+    bench: ScoreBench, tmp_path: Path, predict: Any, row: int, word: str
+) -> None:
+    """The printed number is the size of the difference, and the word its sign."""
+    card = bench.evaluate(bench.submit(tmp_path / "predictions.nc", predict))
+    line = [line for line in flag_lines(card) if line.startswith("against ")][row]
+    found = re.search(rf"{word} by ([\d.e-]+) \(2 scenarios: no p-value\)", line)
+    assert found, line
+    against = card.against(list(card.scores)[1 + row])
+    assert float(found[1]) == pytest.approx(abs(against.difference), rel=1e-3)
+    assert (against.difference < 0.0) == (word == "better")

@@ -16,7 +16,7 @@ from swirls import OMEGA, TOP_TO_THE_RIGHT, write_swirl
 from lagbench import errors
 from lagbench.draw import style
 from lagbench.draw.panels import Panel, draw_walls, limit_of
-from lagbench.draw.plot import KINDS, contact_sheet, plot_frame
+from lagbench.draw.plot import KINDS, contact_sheet, describe, plot_frame
 from lagbench.draw.recording import open_recording
 from lagbench.draw.style import figure, pixels_of
 from lagbench.errors import DataError, UsageError
@@ -266,3 +266,18 @@ def test_materials_stay_apart_for_colour_blind_readers(vision: str) -> None:
     back = np.where(seen <= 0.0031308, 12.92 * seen, 1.055 * seen ** (1 / 2.4) - 0.055)
     distance = np.sqrt(((back[:, None] - back[None]) ** 2).sum(axis=-1))
     assert distance[np.triu_indices(4, 1)].min() > 0.2
+
+
+def test_kinds_differ(swirl: Path, tmp_path: Path) -> None:
+    """No two kinds draw the same picture."""
+    drawn = {plot_frame(swirl, 2, tmp_path / f"{kind}.png", kind=kind).read_bytes() for kind in KINDS}
+    assert len(drawn) == len(KINDS)
+
+
+def test_captions_say_what_sets_a_scenario_apart(swirl: Path, tmp_path: Path) -> None:
+    """Reynolds number, family or frequency stand beside split, size and id."""
+    with open_recording(swirl) as recording:
+        assert describe(recording) == "cavity tiny  ·  scenario 0  ·  Re 100"
+    splash = write_swirl(tmp_path, "fluid", 3, walls=None, parameters={"family": "splash"})
+    with open_recording(splash) as recording:
+        assert describe(recording) == "fluid tiny  ·  scenario 3  ·  family splash"
