@@ -162,6 +162,25 @@ def test_film_above_the_fold_waits_where_motion_is_unwanted(page: Page, board: B
     until(page, f"{label} === 'Pause'")
 
 
+def test_a_film_that_begins_again_runs_no_faster(page: Page, board: Board) -> None:
+    """After three ends one picture is asked for per picture of the screen, not four."""
+    slider = "document.querySelector('#stage input')"
+    restored(page, board.tabs[0].id)
+    run(
+        page,
+        "window.plain = window.requestAnimationFrame.bind(window),"
+        " window.requestAnimationFrame = then => { window.asked += 1; return window.plain(then); },"
+        " window.tick = () => { window.ticks += 1; window.plain(window.tick); }, window.tick()",
+    )
+    run(page, "document.querySelector('#stage .play').click()")
+    for _ in range(3):
+        run(page, f"{slider}.value = {slider}.max, {slider}.dispatchEvent(new Event('input'))")
+        until(page, f"Number({slider}.value) < 0.5 * Number({slider}.max)")
+    run(page, "window.asked = window.ticks = 0")
+    until(page, "window.ticks >= 20")
+    assert 0 < page.value("window.asked") <= 1.5 * page.value("window.ticks")
+
+
 def test_overview_leads_to_every_board(page: Page, board: Board) -> None:
     """One row per method with its skill on every data set; a cell opens the entry there."""
     assert page.value("document.querySelector('section.tab:not([hidden])').id") == "overview"

@@ -180,6 +180,16 @@ def test_budget_is_one() -> None:
         TrainingOptions(steps=1, epochs=1)
 
 
+def test_records_without_compile_are_of_plain_trainings() -> None:
+    """The record of a training that compiles nothing has no such key, so those without it go on."""
+    plain, compiled = (
+        recipe_for(find("gns"), "cavity", "tiny", settings=settings).as_json()["training"]
+        for settings in ([], ["training.compile=true"])
+    )
+    assert "compile" not in plain
+    assert compiled == plain | {"compile": True}
+
+
 def test_other_packages_add_baselines(monkeypatch: pytest.MonkeyPatch) -> None:
     """A class of another package is found by its name; ours cannot be replaced."""
     install(monkeypatch, drift=Drift, gns=Drift)

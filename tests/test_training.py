@@ -204,6 +204,13 @@ def test_early_stop(run: Run) -> None:
     assert load(result.weights).training["step"] == result.best_step
 
 
+def test_what_has_no_layers_is_not_compiled(run: Run) -> None:
+    """A model without layers to compile refuses the option before it trains."""
+    with pytest.raises(UsageError) as caught:
+        run("drift", "run", "steps=2", "compile=true")
+    assert caught.value.where == "training.compile"
+
+
 def test_folders_are_guarded(run: Run) -> None:
     """Another recipe in a folder is refused unless the user wants to train anew."""
     run("drift", "run", "steps=2")
