@@ -61,7 +61,7 @@ def test_a_strangers_path(run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: P
     assert run("leaderboard", "build", "--check").exit_code == 0
     checked = run("leaderboard", "check", "--page", "--predictions", "predictions.nc")
     assert checked.exit_code == 0, checked.output
-    assert "1 entries, nothing wrong" in checked.stdout
+    assert "1 entry, nothing wrong" in checked.stdout
     assert f"confirms scores/{SPLIT}/{SIZE}/toy-model.nc of" in checked.stdout
     shown = run("leaderboard", "show", SPLIT, "--size", SIZE)
     assert "toy-model" in shown.stdout
