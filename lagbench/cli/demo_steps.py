@@ -45,14 +45,11 @@ __all__ = [
 
 DEMO_SIZE = "tiny"
 
-MODEL, MODEL_SPLIT = "gns", "cavity"
+MODEL, MODEL_SPLIT = "neuralmpm", "cavity"
 """The baseline that the demo trains, and the split that it learns."""
 
-SETTINGS = (
-    *("training.steps=150", "training.batch=4", "training.learning_rate=2.0e-3"),
-    *("model.noise_std=3.0e-4", "model.symmetry=square", "model.wall_velocity=true"),
-)
-"""Changes to the recipe of size tiny, which is shorter: those of cavity mini."""
+SETTINGS = ("training.steps=150",)
+"""Changes to the recipe of size tiny: half a minute, and better than what costs no learning with any seed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -247,11 +244,12 @@ def _solver_time() -> SolverBench | None:
 
 def _said(training: TrainingResult, prediction: PredictionResult, solver: SolverBench | None) -> Meta:
     """Return what the entry says of the model."""
+    from lagbench.baselines.catalogue import find
     from lagbench.board.entry import Meta
 
     return Meta(
         method=MODEL,
-        name=f"{MODEL.upper()}, {training.steps} steps",
+        name=f"{find(MODEL).model.method}, {training.steps} steps",
         authors=("lagbench demo",),
         licence="MIT",
         notes="Trained for seconds to show the way; it says little of what such a model can do.",
