@@ -34,17 +34,19 @@ def run(run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
 
 
 @pytest.fixture
-def only_one(monkeypatch: pytest.MonkeyPatch, unmeasured: Registry) -> Registry:
+def only_one(run: Run, monkeypatch: pytest.MonkeyPatch, unmeasured_path: Path, tmp_path: Path) -> Registry:
     """A registry of two splits, of which one has a size tiny; the demo's model, quickly trained, is its."""
-    small = unmeasured.split(SPLIT)
-    large = small.model_copy(update={"sizes": {"full": small.sizes["full"]}})
-    registry = Registry({"large": large, SPLIT: small}, {})
-    monkeypatch.setattr("lagbench.data.registry.load", lambda: registry)
+    file = yaml.safe_load(unmeasured_path.read_text())
+    small = file["splits"][SPLIT]
+    large = {**small, "sizes": {"full": small["sizes"]["full"]}}
+    path = tmp_path / "datasets.yaml"
+    path.write_text(json.dumps({**file, "splits": {"large": large, SPLIT: small}}))  # JSON is YAML
+    monkeypatch.setenv("LAGBENCH_REGISTRY", str(path))
     monkeypatch.setattr(demo_steps, "MODEL_SPLIT", SPLIT)
     monkeypatch.setattr(demo_steps, "SETTINGS", ("training.steps=2", "model.width=4"))
     timed = SolverBench(split=SPLIT, size=SIZE, particles=1, substeps=1, frames=1, seconds_per_frame=0.5)
     monkeypatch.setattr("lagbench.cli.machine.bench_apart", lambda *_: timed)
-    return registry
+    return load(path)
 
 
 def made_by(result: Result) -> dict[str, Any]:
