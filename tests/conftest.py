@@ -70,6 +70,15 @@ def validation_here() -> Iterator[None]:
         yield
 
 
+@pytest.fixture
+def as_shipped(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Take the two above back for one test: workers of its own, and the child looks first."""
+    for module in ("make.generate", "make.verify"):
+        monkeypatch.setattr(f"lagbench.{module}.Pool", Pool)
+    for module in ("scoring.score", "board.submit"):
+        monkeypatch.setattr(f"lagbench.{module}.validate", validate)
+
+
 @pytest.fixture(scope="session")
 def unmeasured_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy of datasets.yaml without its measured block, so that tests hold before and after a record."""

@@ -36,6 +36,7 @@ def predictions(own: BoardBench) -> Path:
     return own.predict(nearer, "my-model", **labels)
 
 
+@pytest.mark.usefixtures("as_shipped")
 def test_the_entry_says_all_that_is_known(own: BoardBench, predictions: Path) -> None:
     """Labels of the predictions, what the submitter adds, data set, hashes, scores and their origin."""
     result = own.submit(predictions, name="My model", code="https://a.org/x", solver_seconds_per_frame=0.5)

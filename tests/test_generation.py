@@ -200,6 +200,7 @@ def test_parts_complete_each_other(tmp_path: Path, unmeasured: Registry, generat
     assert rest.dataset_sha256 == generated.dataset_sha256
 
 
+@pytest.mark.usefixtures("as_shipped")
 def test_force_simulates_what_is_there(copied: Callable[[], Path], unmeasured: Registry) -> None:
     """With force a good scenario is written again, with the same bytes."""
     root = copied()

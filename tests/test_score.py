@@ -44,6 +44,7 @@ def held(card: ScoreCard) -> dict[str, Any]:
     return dict(json.loads(card.files[0].read_bytes()))
 
 
+@pytest.mark.usefixtures("as_shipped")
 def test_truth_scores_perfectly(bench: ScoreBench, tmp_path: Path) -> None:
     """The truth itself gets the perfect value of every metric that has one, and is suspect."""
     card = bench.evaluate(bench.submit(tmp_path / "predictions.nc", right))
@@ -197,6 +198,7 @@ def test_progress_reaches_its_total(bench: ScoreBench, standing: ScoreCard) -> N
         assert seen[-1].done == seen[-1].total == 2 * bench.size.task.horizon
 
 
+@pytest.mark.usefixtures("as_shipped")
 def test_invalid_predictions_are_refused(bench: ScoreBench, standing: ScoreCard, tmp_path: Path) -> None:
     """What the validation rejects is not scored and nothing is written; the listener saw why."""
     broken = tmp_path / "predictions.nc"
