@@ -268,7 +268,7 @@ def test_any_text_survives_embedding(text: str) -> None:
 
 @pytest.mark.parametrize(("entries", "limit"), [(16, 1_000_000), (25, 1_500_000)])
 def test_many_entries_fit(entries: int, limit: int) -> None:
-    """Thirty-two entries make a page of less than 1 MB, fifty one of at most 1.5 MB."""
+    """On two splits: thirty-two entries in less than 1 MB, fifty in at most 1.5 MB."""
     size = len(render(make_board((("cavity", "full"), ("fluid", "full")), entries=entries)).encode())
     assert size <= BUDGET * max(FEWEST, 2 * entries) <= limit
 

@@ -32,10 +32,10 @@ from .sections import empty, lede, navigation, overview, section, stage
 __all__ = ["BUDGET", "FEWEST", "LINKS", "BuildResult", "build", "render"]
 
 BUDGET = 30_000
-"""Most bytes an entry may take, all in all."""
+"""Bytes that an entry shall take, all in all; more only where its coarsest data need them."""
 
 FEWEST = 33
-"""Fewer entries than these share what so many may take: a page of less than 1 MB."""
+"""Fewer entries than these share what so many may take, 1 MB."""
 
 SCRIPTS = (
     *("codec", "text", "scale", "chart", "state", "table"),
