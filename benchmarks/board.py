@@ -5,8 +5,8 @@
 Entries stand on every split's `mini`: errors grow over the frames by a law of their own, films and maps are
 noise, so that nothing compresses away because two entries are alike. Every fifth has three seeds, some
 are superseded, withdrawn or flagged, and their texts hold markup. The same call gives the same bytes.
-Exit code 1 if `lagbench leaderboard check` finds anything, if the page has more than 2 MB, if the build
-takes 20 s of processor time or more, or if a second build, in another order of files, gives other bytes.
+Exit code 1 if `lagbench leaderboard check` finds anything, if the page has more than 2 MB, or if a second
+build, in another order of files, gives other bytes.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ from lagbench.scoring.task import ranking_metric
 from lagbench.submission import Header
 from lagbench.submission.task_checks import frames_to_predict
 
-MOST_BYTES, MOST_SECONDS = 2_000_000, 20.0
+MOST_BYTES = 2_000_000
 SEEDS = 3
 SIZE = "mini"
 NAMES = ("Graph <b>network</b>", "Ünïcode & co.", "A model with a rather long name, as they have", "MLP")
@@ -89,10 +89,10 @@ def _measured(target: Path, entries: int) -> int:
     print(f"entries      {result.rows} on {result.tabs} tabs")
     print(f"score files  {len(files)}, at most {max(files)} bytes")
     print(f"page         {spell_bytes(result.bytes)} ({result.bytes} bytes; limit {MOST_BYTES})")
-    print(f"build        {cpu:.1f} s of processor time, {wall:.1f} s (limit {MOST_SECONDS:.0f} s)")
+    print(f"build        {cpu:.1f} s of processor time, {wall:.1f} s")
     print(f"second build {'the same bytes' if same else 'OTHER BYTES'}")
     print(f"check        {len(findings)} findings")
-    return 0 if same and not findings and result.bytes <= MOST_BYTES and cpu < MOST_SECONDS else 1
+    return 0 if same and not findings and result.bytes <= MOST_BYTES else 1
 
 
 def make_entry(size: Size, target: Path, number: int) -> None:
