@@ -15,8 +15,10 @@ from typer.main import get_command
 from typer.testing import Result
 
 from lagbench.cli.app import app
+from lagbench.cli.output import progress_bar
 from lagbench.data.registry import default_path, load
 from lagbench.make.generate import GenerationResult
+from lagbench.work.progress import Progress
 
 COMMANDS = ["list", "info", "generate", "verify", "plot", "animate", "cite", "doctor", "clean"]
 
@@ -262,3 +264,28 @@ def test_plot_and_animate_name_their_files(
     assert (tmp_path / "two.gif").read_bytes()[:3] == b"GIF"
     lost = run("plot", SPLIT, "--size", SIZE, "--root", tmp_path)
     assert lost.exit_code == 4
+
+
+@pytest.mark.parametrize(("pause", "told"), [(0.0, [("60", "3 min"), ("200", "40 s")]), (3600.0, [])])
+def test_progress_goes_to_a_file_in_lines(
+    pause: float,
+    told: list[tuple[str, str]],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """A line after every pause says the count and what is left; quick work and --quiet leave none."""
+    monkeypatch.setattr("lagbench.cli.output.SECONDS_PER_LINE", pause)
+    with progress_bar(quiet=False, counted="steps") as tell:
+        assert tell is not None
+        for done in (60, 200):
+            tell(
+                Progress(
+                    stage="loss 1", done=done, total=240, scenarios_done=done, scenarios=240, seconds=done
+                )
+            )
+    said = capsys.readouterr()
+    assert said.out == ""
+    counts = [re.search(r"(\d+)/240 steps, 1.00/s, (.+) left", line) for line in said.err.splitlines()]
+    assert [found and found.groups() for found in counts] == told
+    with progress_bar(quiet=True) as silent:
+        assert silent is None

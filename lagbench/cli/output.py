@@ -1,13 +1,15 @@
 """What commands print: JSON for machines, tables and sentences for people.
 
-A progress bar on stderr, drawn only where a person watches.
+Progress on stderr: a bar where a person watches, else a line per minute.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -26,6 +28,9 @@ LAST_COLUMN = 24
 
 COLUMN_GAP = 3
 """Characters between two columns of a table."""
+
+SECONDS_PER_LINE = 60.0
+"""Time between two lines of progress that go to a file [s]."""
 
 
 def say(text: str, *, quiet: bool = False) -> None:
@@ -112,14 +117,16 @@ def spell_seconds(seconds: float) -> str:
 
 @contextmanager
 def progress_bar(*, quiet: bool, counted: str = "scenarios") -> Iterator[Callable[[State], None] | None]:
-    """Yield what draws progress: overall bar, scenarios, scenarios per second, time left.
+    """Yield what tells of progress: how much is done, how fast, and the time left.
+
+    A terminal shows a bar; a file or a pipe gets a line per minute, so that short work leaves none.
 
     Args:
         quiet: whether the user wants silence.
         counted: what the work is counted in.
 
     Yields:
-        A function to hand to ``generate``; None where stderr is no terminal or silence is wanted.
+        A function to hand to ``generate``; None where silence is wanted.
     """
     if quiet:
         from lagbench.store.copy import quietly
@@ -128,7 +135,7 @@ def progress_bar(*, quiet: bool, counted: str = "scenarios") -> Iterator[Callabl
             yield None
         return
     if not sys.stderr.isatty():
-        yield None
+        yield _in_lines(counted)
         return
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
@@ -149,7 +156,26 @@ def progress_bar(*, quiet: bool, counted: str = "scenarios") -> Iterator[Callabl
                 description=news.stage,
                 total=news.total,
                 completed=news.done,
-                count=f"{news.scenarios_done}/{news.scenarios} {counted}, {news.rate:.2f}/s",
+                count=_count(news, counted),
             )
 
         yield draw
+
+
+def _in_lines(counted: str) -> Callable[[State], None]:
+    last = time.monotonic()
+
+    def tell(news: State) -> None:
+        nonlocal last
+        if (now := time.monotonic()) - last < SECONDS_PER_LINE:
+            return
+        last = now
+        left = (news.scenarios - news.scenarios_done) / news.rate if news.rate else math.inf
+        still = f", {spell_seconds(left)} left" if math.isfinite(left) else ""
+        typer.echo(f"{news.stage}: {_count(news, counted)}{still}", err=True)
+
+    return tell
+
+
+def _count(news: State, counted: str) -> str:
+    return f"{news.scenarios_done}/{news.scenarios} {counted}, {news.rate:.2f}/s"
