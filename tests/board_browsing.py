@@ -69,7 +69,8 @@ def seen(page: Page) -> list[list[str]]:
     rows = "section.tab:not([hidden]) tr:is([data-entry], [data-floor]):not([hidden])"
     found: list[list[str]] = page.value(
         f"[...document.querySelectorAll('{rows}')].map(tr =>"
-        " [tr.cells[0], tr.querySelector('.name'), ...tr.querySelectorAll('td:not([hidden]) .n')]"
+        " [tr.cells[0], tr.querySelector('.name'),"
+        " ...[...tr.querySelectorAll('td:not(.rank, [hidden])')].map(td => td.firstChild)]"
         ".map(e => e.textContent))"
     )
     return found

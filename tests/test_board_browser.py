@@ -208,7 +208,8 @@ def test_the_table_needs_no_script(running: Browser, file: Path, page: Page, boa
         f"[...new DOMParser().parseFromString({json.dumps(html)}, 'text/html')"
         ".querySelectorAll('section.tab:not(#overview)')]"
         ".map(tab => [...tab.querySelectorAll('tbody tr:not([hidden])')]"
-        ".map(tr => [tr.cells[0], tr.querySelector('.name'), ...tr.querySelectorAll('td:not([hidden]) .n')]"
+        ".map(tr => [tr.cells[0], tr.querySelector('.name'),"
+        " ...[...tr.querySelectorAll('td:not(.rank, [hidden])')].map(td => td.firstChild)]"
         ".map(e => e.textContent)))"
     )
     assert len(before) == len(board.tabs)

@@ -149,7 +149,7 @@ def lines_of(page: str) -> dict[str, dict[str, str]]:
     """Return name to column to value of the first table's rows, read as text."""
     table = page[page.index('<table class="board"') if '<table class="board"' in page else 0 :]
     table = table[table.index('class="board">') : table.index("</table>")]
-    keys = re.findall(r'<th [^>]*?data-key="([^"]*)"', table)
+    keys = re.findall(r'<button [^>]*?data-sort="([^"]*)"', table)
     found = {}
     for line in re.findall(r"<tr[^>]*>.*?</tr>", table)[1:]:
         cells = re.findall(r"<t[dh]([^>]*)>", line)
@@ -209,8 +209,8 @@ def test_rows_lead_to_code_paper_and_weights(board: Board, page: str) -> None:
 
 def test_costs_are_marked_as_self_reported(board: Board, page: str) -> None:
     """Headings of what nothing can compute again say so; scores do not."""
-    heads = [e for e in read_html(page).named("th") if e.attributes.get("data-key")]
-    marked = {e.attributes["data-key"] for e in heads if "self\u2011reported" in e.text}
+    heads = [e for e in read_html(page).named("button") if e.attributes.get("data-sort")]
+    marked = {e.attributes["data-sort"] for e in heads if "self\u2011reported" in e.text}
     assert marked == {
         *("speed_up", "seconds_per_frame", "solver_seconds_per_frame", "parameters", "device"),
         *("budget", "track", "windows", "epochs", "cpu_hours", "gpu_hours"),
@@ -294,5 +294,5 @@ def test_empty_board_is_a_page() -> None:
 def test_without_skill_there_is_no_such_column(board: Board) -> None:
     """Score files that do not say a skill leave no gap on the page."""
     page = render(make_board((("cavity", "full"),), skill=False))
-    assert 'data-key="skill"' not in page
+    assert 'data-sort="skill"' not in page
     assert read_html(page).faults == []

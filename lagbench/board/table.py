@@ -23,6 +23,9 @@ __all__ = ["EXPLAINED", "draw_table"]
 MEAN_DIGITS = 9
 """Significant digits of means, as in scores.json."""
 
+MOST_REASONS = 4
+"""Reasons of a flag that are told; those of other scenarios say the same with other numbers."""
+
 SHADES = 5
 FEWEST_SHADED = 3
 
@@ -92,7 +95,7 @@ def draw_table(tab: Tab, metrics: Mapping[str, Metric]) -> Markup:
 
 def _heading(key: str, label: object, meaning: str, **attributes: object) -> Markup:
     sorter = tag("button", label, type="button", class_="sorter", data_sort=key, title=meaning)
-    return tag("th", sorter, scope="col", data_key=key, **attributes)
+    return tag("th", sorter, scope="col", **attributes)
 
 
 def _column_heading(column: Column, *, main: bool) -> Markup:
@@ -104,11 +107,10 @@ def _column_heading(column: Column, *, main: bool) -> Markup:
         f"{column.meaning} {REPORTED if column.reported else ''}".strip(),
         class_="words" if column.form == "text" else None,
         hidden=not main,
-        data_label=column.label,
-        data_quantity=column.quantity,
+        data_unit=column.unit or None,
         data_direction=str(column.direction),
-        data_perfect=column.perfect,
-        data_form=column.form,
+        data_perfect=column.perfect if column.direction is Direction.TARGET else None,
+        data_form=None if column.form == "number" else column.form,
     )
 
 
@@ -145,7 +147,7 @@ def _cell(row: Row | Floor, column: Column, shades: _Shades, *, main: bool, rank
     plain = rounded(value, MEAN_DIGITS) if isinstance(value, float) else value
     ends = (found.low, found.high) if found else (math.nan, math.nan)
     bounds = interval(ends)
-    title = [] if not bounds else [f"95 % interval {text(ends[0])} … {text(ends[1])}"]
+    title = [] if not bounds else [f"95 %: {text(ends[0])} … {text(ends[1])}"]
     if found is not None and not math.isnan(found.std):
         title.append(f"± {text(found.std)} over seeds")
     undefined = found.undefined if found else 0
@@ -156,7 +158,7 @@ def _cell(row: Row | Floor, column: Column, shades: _Shades, *, main: bool, rank
     kind = ["words"] if column.form == "text" else []
     return tag(
         "td",
-        tag("span", written(plain, column.form), class_="n"),
+        written(plain, column.form),
         tag("sup", "†") if undefined and known else "",
         bounds if ranks else "",
         class_=" ".join([*kind, *shades.classes(row)]) or None,
@@ -239,5 +241,6 @@ def _explained(flag: Flag) -> tuple[str, str]:
     label, meaning = EXPLAINED.get(flag.name, (flag.name.replace("_", " "), ""))
     if flag.share is not None:
         label = f"{label}: {text(100.0 * flag.share, 2)} %"
-    said = "; ".join(flag.reasons)
+    more = len(flag.reasons) - MOST_REASONS
+    said = "; ".join([*flag.reasons[:MOST_REASONS], *([f"and {more} more such"] if more > 0 else [])])
     return label, " ".join(filter(None, (meaning, f"{said}." if said else "")))

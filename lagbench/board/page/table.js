@@ -11,7 +11,13 @@ function presetsOf(tab) {
 
 /** Return columns by key: place in a row, label, quantity, direction, perfect value, form. */
 function columnsOf(tab) {
-  return (tab.columns ??= Object.fromEntries([...sectionOf(tab).querySelectorAll("thead th")].map((head, place) => [head.dataset.key, { ...head.dataset, place, head }])));
+  const described = (head, place) => {
+    const key = head.querySelector("[data-sort]").dataset.sort;
+    const label = head.querySelector(".metric").textContent;
+    const quantity = head.dataset.unit ? `${label} [${head.dataset.unit}]` : label;
+    return [key, { form: "number", ...head.dataset, key, label, quantity, place, head }];
+  };
+  return (tab.columns ??= Object.fromEntries([...sectionOf(tab).querySelectorAll("thead th")].map(described)));
 }
 
 function columnOf(tab, key) {
@@ -35,7 +41,7 @@ function valueOf(tab, row, key) {
 }
 
 function textOf(tab, row, key) {
-  return cellOf(tab, row, key).querySelector(".n").textContent;
+  return cellOf(tab, row, key).firstChild.textContent;
 }
 
 /** Return a number that is smaller the better it is; NaN for what is not judged. */
