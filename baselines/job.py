@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import platform
-import resource
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -130,8 +130,8 @@ def versions() -> dict[str, str]:
 
 
 def _processor_seconds() -> float:
-    own, children = resource.getrusage(resource.RUSAGE_SELF), resource.getrusage(resource.RUSAGE_CHILDREN)
-    return sum(usage.ru_utime + usage.ru_stime for usage in (own, children))
+    times = os.times()  # of children; of this process it has hundredths only
+    return time.process_time() + times.children_user + times.children_system
 
 
 def default_folder(recipe: Recipe) -> Path:

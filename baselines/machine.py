@@ -13,6 +13,7 @@ from typing import Any
 import torch
 
 from lagbench.errors import UsageError, WorkFailedError
+from lagbench.work.process import available_cores
 
 __all__ = [
     "bound_memory",
@@ -47,7 +48,7 @@ def threads_used(count: int | None, *, processes: int = 1) -> Iterator[None]:
     """Use so many threads for a while."""
     before = torch.get_num_threads()
     asked = os.environ.get("OMP_NUM_THREADS", "")
-    share = max(1, len(os.sched_getaffinity(0)) // processes)
+    share = max(1, available_cores() // processes)
     torch.set_num_threads(count or (max(1, int(asked)) if asked.isdecimal() else share))
     try:
         yield
@@ -66,7 +67,8 @@ def bound_memory() -> None:
 
 def return_memory() -> None:
     """Give freed memory back to the system: blocks of ever new sizes leave holes behind."""
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    # Windows has no library of the process itself; macOS has one without this function.
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if os.name == "posix" else None
     if trim is not None:
         trim(0)
 
@@ -87,7 +89,7 @@ def hardware(device: str = "cpu") -> dict[str, Any]:
     """Return what the machine is, without its name."""
     return {
         "processor": _processor() or architecture(),
-        "cores": len(os.sched_getaffinity(0)),
+        "cores": available_cores(),
         "threads": torch.get_num_threads(),
         "device": torch.cuda.get_device_name() if device == "cuda" else "cpu",
     }

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from lagbench.errors import UsageError, require
-from lagbench.work.pool import available_cores
+from lagbench.work.process import available_cores
 
 from .solver import Device
 

@@ -6,7 +6,7 @@ import functools
 import os
 import secrets
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from .errors import LagbenchError, WorkFailedError
@@ -34,7 +34,7 @@ def atomic_path(target: Path, *, option: str = ROOT_OPTION) -> Iterator[Path]:
         yield temporary
         _flush(temporary)
         temporary.replace(target)
-        _flush(target.parent)
+        _flush_folder(target.parent)
     except LagbenchError:
         raise
     except OSError as error:
@@ -108,8 +108,14 @@ def _discard(path: Path) -> None:
 
 
 def _flush(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
+    # Windows flushes what is open for writing only.
+    descriptor = os.open(path, os.O_RDWR if os.name == "nt" else os.O_RDONLY)
     try:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def _flush_folder(path: Path) -> None:
+    with suppress(PermissionError):  # Windows opens no folder
+        _flush(path)

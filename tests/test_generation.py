@@ -293,6 +293,15 @@ def test_estimates_add_up(unmeasured: Registry) -> None:
     assert expected.seconds(9) == expected.seconds(2)
 
 
+def test_a_few_drawn_scenarios_stand_for_all(unmeasured: Registry) -> None:
+    """Exact where none begins late; a cavity begins 60 to 120 frames before frame 0, so that it is near."""
+    fluid, cavity = unmeasured.size("fluid", "tiny"), unmeasured.size("cavity", "mini")
+    assert estimate(fluid, fluid.scenarios, drawn=1) == estimate(fluid, fluid.scenarios)
+    found, exact = (estimate(cavity, cavity.scenarios, drawn=n) for n in (2, None))
+    assert found.core_seconds == pytest.approx(exact.core_seconds, rel=0.25)
+    assert (found.scenarios, found.bytes, found.frames) == (exact.scenarios, exact.bytes, exact.frames)
+
+
 WORKER = """
 import re, sys
 from pathlib import Path

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import os
-import resource
 import subprocess
 import sys
 import time
@@ -33,6 +32,7 @@ from lagbench.scoring.scenario import FRAMES, PARTICLES, Preview
 from lagbench.scoring.score_file import FILM_RANGE, StoredScores, read_statistics
 from lagbench.scoring.task import ranking_metric
 from lagbench.submission.task_checks import frames_to_predict
+from lagbench.work.process import limit_process
 
 __all__ = ["MAX_SCORE_BYTES", "Stored", "main", "read_stored", "reported_frames", "unreadable_in_child"]
 
@@ -228,9 +228,7 @@ def _asked(paths: Sequence[Path], room: float) -> tuple[list[str | None], str]:
 def main() -> int:
     """Read the files named on stdin under limits: memory [bytes] and computing time [s], the arguments."""
     memory, seconds = int(sys.argv[1]), int(sys.argv[2])
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
-    resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds + 1))
+    limit_process(memory=memory, seconds=seconds)
     for path in json.load(sys.stdin):
         try:
             read_stored(Path(path))

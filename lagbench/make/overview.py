@@ -7,13 +7,15 @@ from pathlib import Path
 
 from lagbench.data.layout import dataset_folder, url_of
 from lagbench.data.registry import Size
-from lagbench.store.copy import remote_manifest
-from lagbench.work.pool import available_cores
+from lagbench.work.process import available_cores
 
 from .cards import PICTURES
 from .plan import estimate, scenario_bytes
 
-__all__ = ["Overview", "available_cores", "overview"]
+__all__ = ["Overview", "overview"]
+
+DRAWN = 2
+"""Scenarios of a size that are drawn to estimate the time: all of them would take seconds."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +59,7 @@ def overview(size: Size, root: Path) -> Overview:
         particles=size.particles,
         frames=sum(map(size.frame_count, ids)),
         bytes=sum(scenario_bytes(size, i) for i in ids),
-        seconds=estimate(size, ids).seconds(available_cores()) if size.simulated else 0.0,
+        seconds=estimate(size, ids, drawn=DRAWN).seconds(available_cores()) if size.simulated else 0.0,
         present=_present(size, root, folder),
         folder=folder,
         picture=next((folder / name for name in PICTURES if (folder / name).is_file()), None),
@@ -72,6 +74,8 @@ def _present(size: Size, root: Path, folder: Path) -> dict[str, int]:
             subset: sum((folder / subset / f"{i:04d}.nc").is_file() for i in ids)
             for subset, ids in size.subsets.items()
         }
+    from lagbench.store.copy import remote_manifest  # what a store takes is not loaded for a folder
+
     found = remote_manifest(size, url)
     named = {entry.scenario for entry in found.files} if found else set()
     return {subset: len(named & {*ids}) for subset, ids in size.subsets.items()}

@@ -14,7 +14,6 @@ from lagbench.data.registry import Registry
 from lagbench.errors import UnreadableFileError, UsageError, nearest
 from lagbench.floors import persistence
 from lagbench.floors.shipped import shipped
-from lagbench.make.overview import available_cores
 from lagbench.metrics.aggregate import Score, aggregate
 from lagbench.metrics.frame import FramePair
 from lagbench.metrics.metric import MINIMUM_NODES, Metric
@@ -23,6 +22,7 @@ from lagbench.submission.findings import Finding, Severity, ValidationResult
 from lagbench.submission.format import Header
 from lagbench.submission.predictions import open_predictions
 from lagbench.submission.validation import validate
+from lagbench.work.process import available_cores
 from lagbench.work.progress import Meter, Progress
 from lagbench.work.run import run_all
 

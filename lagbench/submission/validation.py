@@ -13,7 +13,6 @@ import importlib
 import json
 import math
 import os
-import resource
 import signal
 import subprocess
 import sys
@@ -30,6 +29,7 @@ from lagbench.data.layout import resolve_root
 from lagbench.data.local import RootedRegistry, rooted
 from lagbench.data.registry import Registry, Size
 from lagbench.errors import DataError, UnreadableFileError, UsageError, WorkFailedError, nearest
+from lagbench.work.process import TOO_LONG, limit_process
 
 from .checks import check_domain, check_finite, check_frozen, check_jumps, survey
 from .findings import CHECKS, Finding, Findings, Severity, ValidationResult
@@ -112,7 +112,7 @@ def in_child(
         return Answers(_lines(done.stdout), None)
     if done.returncode == OUT_OF_MEMORY:
         return Answers(_lines(done.stdout), f"more than {memory >> 20} MiB of memory")
-    if done.returncode == -signal.SIGXCPU:
+    if done.returncode == TOO_LONG:
         return Answers(_lines(done.stdout), "no end within the computing time allowed")
     if done.returncode < 0:
         name = signal.strsignal(-done.returncode) or str(-done.returncode)
@@ -138,9 +138,7 @@ def serve() -> None:
     module, _, name = dotted.rpartition(".")
     function: Callable[[Any], object] = getattr(importlib.import_module(module), name)
     seconds = allowed + math.ceil(time.process_time())
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
-    resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds + 1))
+    limit_process(memory=memory, seconds=seconds)
     try:
         for request in json.load(sys.stdin):
             sys.stdout.write(json.dumps(function(request)) + "\n")
@@ -152,10 +150,11 @@ def serve() -> None:
 def seconds_for(path: Path) -> float:
     """Return the time beyond that of a small file that a file is given [s].
 
-    A sparse file claims any length; what it occupies is what has to be read.
+    A sparse file claims any length; what it occupies, where the system tells it, is what has to be read.
     """
     status = path.stat()
-    return min(status.st_size, 512 * status.st_blocks) / BYTES_PER_SECOND
+    blocks: int | None = getattr(status, "st_blocks", None)
+    return (status.st_size if blocks is None else min(status.st_size, 512 * blocks)) / BYTES_PER_SECOND
 
 
 # --- the validation ------------------------------------------------------------------------

@@ -29,18 +29,23 @@ from typing import Any, Self
 
 from lagbench.errors import LagbenchError, UsageError, WorkFailedError
 
+from .process import available_cores
+
 __all__ = [
     "ATTEMPTS",
+    "AVAILABLE",
     "Event",
     "Pool",
     "Report",
     "Task",
-    "available_cores",
     "crashed",
     "serve",
     "worker_count",
 ]
 
+
+AVAILABLE = os.name == "posix"
+"""Whether workers can be started here: they inherit a socket, which Windows cannot hand on."""
 
 ATTEMPTS = 3
 """Times that a task is tried when the worker under it dies."""
@@ -56,11 +61,6 @@ _BOOT = (
     "import sys, json; sys.path[:] = json.loads(sys.argv[2]); "
     "from lagbench.work.pool import serve; serve(int(sys.argv[1]))"
 )
-
-
-def available_cores() -> int:
-    """Return the number of processors that this process may use."""
-    return len(os.sched_getaffinity(0))
 
 
 def worker_count(wanted: int | None, *, default: int | None = None) -> int:
@@ -126,6 +126,8 @@ class Pool:
 
     def __post_init__(self) -> None:
         """Refuse a pool in which no task could ever run."""
+        if not AVAILABLE:
+            raise WorkFailedError("this system cannot start workers", fix="on Windows use WSL")
         self.size = worker_count(self.size)
 
     def __enter__(self) -> Self:

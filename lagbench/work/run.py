@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TypeVar
 
+from . import pool
 from .cluster import Cluster
 from .pool import Pool, Report, Task
 
@@ -36,10 +37,10 @@ def run_all(
     scheduler: str | None = None,
     report: Report = lambda _: None,
 ) -> list[Result]:
-    """Run a function on jobs and return the results in the order of the jobs."""
+    """Run a function on jobs and return the results in the order of the jobs; here where no workers start."""
     if scheduler is not None:
         return _with(Cluster(scheduler), function, jobs, report)
-    if workers > 1 and len(jobs) > 1:
+    if workers > 1 and len(jobs) > 1 and pool.AVAILABLE:
         return _with(Pool(min(workers, len(jobs)), ONE_THREAD), function, jobs, report)
     return [function(job, report) for job in jobs.values()]
 

@@ -1,0 +1,132 @@
+"""What works where modules and functions of Linux are missing, as on Windows and macOS: all but solving."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from score_bench import ScoreBench, bench_of, straight
+
+import lagbench
+from lagbench.data.registry import Registry
+from lagbench.errors import WorkFailedError
+from lagbench.make.generate import GenerationResult
+from lagbench.work import pool, process
+from lagbench.work.run import run_all
+
+LESS = """
+import os, signal, sys
+for name in ("resource", "fcntl", "pwd", "grp", "termios"):
+    sys.modules[name] = None
+for module, names in ((os, ("sched_getaffinity", "fork", "killpg")), (signal, ("SIGXCPU",))):
+    for name in names:
+        delattr(module, name)
+opened = os.open
+def no_folders(path, *rest, **more):
+    if os.path.isdir(path):
+        raise PermissionError(13, "folders cannot be opened", path)
+    return opened(path, *rest, **more)
+os.open = no_folders
+"""
+"""Run as each interpreter starts: what Windows lacks is taken away from Python."""
+
+COMMANDS = """
+import sys
+from typer.testing import CliRunner
+from lagbench.cli.app import app
+for line in sys.stdin.read().splitlines():
+    done = CliRunner().invoke(app, line.split())
+    assert done.exit_code == 0, (line, done.output)
+assert sys.modules["resource"] is sys.modules["fcntl"] is None
+"""
+
+Run = Callable[..., None]
+
+
+@pytest.fixture(scope="module")
+def bench(generated: GenerationResult, unmeasured: Registry) -> ScoreBench:
+    """Tiny curl noise."""
+    return bench_of(generated, unmeasured)
+
+
+@pytest.fixture
+def commands(tmp_path: Path, unmeasured_path: Path, generated: GenerationResult) -> Run:
+    """A function that runs commands in an interpreter, with children, that lacks what others lack."""
+    (tmp_path / "less").mkdir()
+    (tmp_path / "less" / "sitecustomize.py").write_text(LESS)
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([str(tmp_path / "less"), str(Path(lagbench.__file__).parents[1])]),
+        "LAGBENCH_REGISTRY": str(unmeasured_path),
+        "LAGBENCH_ROOT": str(generated.root),
+        "CUDA_VISIBLE_DEVICES": "",
+    }
+
+    def call(*lines: str) -> None:
+        done = subprocess.run(
+            [sys.executable, "-c", COMMANDS],
+            input="\n".join(lines),
+            env=environment,
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
+
+    return call
+
+
+@pytest.mark.usefixtures("as_shipped")
+def test_validating_and_scoring(commands: Run, bench: ScoreBench, tmp_path: Path) -> None:
+    """Scores are those of this system to the last digit, though files are read in children too."""
+    bench.submit(tmp_path / "predictions.nc", straight)
+    commands("list", "info curl-noise", "validate predictions.nc", "score predictions.nc -o less-scores")
+    bench.score(tmp_path / "predictions.nc")
+    found, expected = (
+        json.loads((tmp_path / name).read_bytes()) for name in ("less-scores/scores.json", "scores.json")
+    )
+    assert found == expected
+
+
+@pytest.mark.slow
+def test_training_and_predicting(commands: Run, tmp_path: Path) -> None:
+    """A training of two steps, its rollouts and their score."""
+    commands(
+        "train --baseline mlp --split curl-noise --size tiny --set training.steps=2 -o run",
+        "predict run/weights.pt --no-bench",
+        "score predictions.nc",
+    )
+    assert (tmp_path / "scores.json").is_file()
+
+
+def test_a_system_without_limits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No limit is asked for where there are none."""
+    monkeypatch.setattr(process, "LIMITS", False)
+    monkeypatch.setattr(process.resource, "setrlimit", lambda *_: pytest.fail("a limit"))
+    process.limit_process(memory=1, seconds=1)
+
+
+def test_macos_refuses_a_limit_of_the_address_space(monkeypatch: pytest.MonkeyPatch) -> None:
+    """There only the others are set."""
+    wanted: list[int] = []
+    monkeypatch.setattr(process.sys, "platform", "darwin")
+    monkeypatch.setattr(process.resource, "setrlimit", lambda what, _: wanted.append(what))
+    process.limit_process(memory=1, seconds=1)
+    assert wanted == [process.resource.RLIMIT_CORE, process.resource.RLIMIT_CPU]
+
+
+def test_where_no_workers_start_jobs_run_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scores come all the same; who asks for workers by name is told."""
+    monkeypatch.setattr(pool, "AVAILABLE", False)
+    assert run_all(lambda job, _: (job, os.getpid()), {"a": 1, "b": 2}, workers=2) == [
+        (1, os.getpid()),
+        (2, os.getpid()),
+    ]
+    with pytest.raises(WorkFailedError):
+        pool.Pool(2)
