@@ -20,8 +20,9 @@ from typing import Any, Self
 from torch import Tensor
 
 from lagbench.atomic import write_atomically
+from lagbench.data.hdf5 import check_regular
 from lagbench.data.registry import Registry
-from lagbench.errors import UsageError
+from lagbench.errors import UnreadableFileError, UsageError
 from lagbench.submission.budget import MOST_VALIDATIONS, Budget, track_of
 from lagbench.work.progress import Meter
 
@@ -47,6 +48,9 @@ __all__ = [
 
 STOPPED_EARLY = "stopped early"
 """State of a training whose validations brought nothing new; it is over."""
+
+MOST_RECORD = 4 << 20
+"""Longest training.json that is read [bytes]."""
 
 OVER = ("finished", STOPPED_EARLY)
 """States of a training that is not to be gone on with."""
@@ -207,11 +211,27 @@ class RunFolder:
             + "or train anew with --fresh",
         )
 
+    def unfinished(self, trained: Mapping[str, Any]) -> tuple[int, int] | None:
+        """Return step and steps of a training that is not over, by its record.
+
+        None where it is over, where there is no record, and where the record is that of another recipe
+        than the weights' own.
+
+        Args:
+            trained: what the weights say of their training.
+        """
+        said = self._recorded()
+        step, steps = said.get("step"), said.get("steps")
+        if said.get("state") in OVER or said.get("recipe") != trained.get("recipe"):
+            return None
+        return (step, steps) if isinstance(step, int) and isinstance(steps, int) else None
+
     def _recorded(self) -> dict[str, Any]:
         """Return what training.json says; nothing where it is not there or no record."""
         try:
+            check_regular(self.record, longest=MOST_RECORD)
             said = json.loads(self.record.read_bytes())
-        except (OSError, ValueError, RecursionError):
+        except (UnreadableFileError, OSError, ValueError, RecursionError):
             return {}
         return said if isinstance(said, dict) else {}
 

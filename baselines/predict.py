@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -28,19 +29,24 @@ from .baseline import Baseline, Batch
 from .checkpoint import Checkpoint, check_data, load, restore
 from .facts import Facts
 from .graph import radius_graph
-from .job import parameter_count
+from .job import RunFolder, parameter_count
 from .machine import bound_memory, chosen_device, hardware, memory_errors_told, threads_used
 from .rollout import Rollout, roll_out
 from .windows import scenario_batch, scenario_paths
 
 __all__ = [
     "PredictionResult",
+    "UnfinishedWarning",
     "predict",
 ]
 
 
 SEARCHES = 5
 """Frames of a rollout on which the neighbour search is timed alone."""
+
+
+class UnfinishedWarning(UserWarning):
+    """The weights are those of a training that did not come to its end."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,6 +86,9 @@ def predict(
 ) -> PredictionResult:
     """Predict every test scenario of the data set that a model was trained on.
 
+    Where a training.json beside the checkpoint says that its training is not over, there is an
+    :class:`UnfinishedWarning`.
+
     Args:
         checkpoint: weights.pt or checkpoint.pt of a training.
         output: file to write; ``<name>.json`` beside it says what it cost.
@@ -100,6 +109,7 @@ def predict(
         WorkFailedError: out of memory, or the disk is full.
     """
     found = load(checkpoint)
+    _warn_if_unfinished(Path(checkpoint), found)
     home = resolve_root(root)
     known = rooted(home, registry)
     facts = check_data(found, root=home, registry=known, where=str(checkpoint))
@@ -142,6 +152,18 @@ def predict(
     plain = json.dumps({**asdict(result), "path": result.path.name}, indent=2, sort_keys=True)
     write_atomically(result.path.with_suffix(".json"), plain.encode() + b"\n", option="--output")
     return result
+
+
+def _warn_if_unfinished(path: Path, found: Checkpoint) -> None:
+    # Weights of the best validation say 'running' for good: what became of the training stands beside them.
+    reached = RunFolder(path.parent).unfinished(found.training)
+    if reached is not None:
+        warnings.warn(
+            f"the training behind {path} stands at step {reached[0]} of {reached[1]}; to go on with it"
+            f" give its `lagbench train` command again, with --output {path.parent}",
+            UnfinishedWarning,
+            stacklevel=3,
+        )
 
 
 def _test_files(facts: Facts, root: Path, registry: Registry) -> list[Path]:

@@ -125,6 +125,20 @@ def test_mistakes_of_predict(lagbench: Command, tmp_path: Path) -> None:
     assert "another version" in result.stderr
 
 
+@pytest.mark.filterwarnings("default")
+def test_predicting_before_the_end_is_warned_of(lagbench: Command, tmp_path: Path) -> None:
+    """On stderr, in one line, and only while the training is not over."""
+    lagbench("train", "--baseline", "mlp", *TINY, "--set", "training.steps=2", "-o", "run")
+    predict = ("predict", "run/weights.pt", "--threads", "1", "--no-bench", "--json")
+    assert lagbench(*predict).stderr == ""
+    record = json.loads((tmp_path / "run/training.json").read_text())
+    (tmp_path / "run/training.json").write_text(json.dumps(record | {"state": "interrupted", "step": 1}))
+    done = lagbench(*predict)
+    assert done.stderr.startswith("warning: ")
+    assert done.stderr.count("\n") == 1
+    assert "step 1 of 2" in done.stderr
+
+
 def command(*words: str, threads: int = 1) -> subprocess.CompletedProcess[str]:
     """Run lagbench in a process of its own."""
     environment = {**os.environ, "OMP_NUM_THREADS": str(threads)}

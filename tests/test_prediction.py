@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,7 +21,8 @@ from lagbench.baselines import predict as prediction
 from lagbench.baselines.baseline import Batch
 from lagbench.baselines.checkpoint import Checkpoint, save
 from lagbench.baselines.facts import facts_of
-from lagbench.baselines.predict import PredictionResult, predict
+from lagbench.baselines.job import MOST_RECORD, OVER
+from lagbench.baselines.predict import PredictionResult, UnfinishedWarning, predict
 from lagbench.baselines.rollout import as_published, roll_out, single
 from lagbench.data.registry import Registry
 from lagbench.errors import DataError, UnreadableFileError, UsageError, WorkFailedError
@@ -246,3 +249,45 @@ def test_out_of_memory(run: Predict, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Drift, "advance", full)
     with pytest.raises(WorkFailedError, match="lower --batch"):
         run(name="none.nc")
+
+
+@pytest.mark.parametrize("state", ["running", "interrupted", "failed", "finished", "stopped early"])
+def test_weights_of_an_unfinished_training(run: Predict, tmp_path: Path, state: str) -> None:
+    """The record beside the weights says how far it came: those of the best step say 'running' for good."""
+    recipe = {"name": "curl-noise/tiny", "training": {"seed": 3}}
+    record = {"state": state, "step": 9, "steps": 70, "recipe": recipe}
+    (tmp_path / "training.json").write_text(json.dumps(record))
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        run(training={"state": "running"})
+    if state in OVER:
+        assert not told
+    else:
+        assert [warning.category for warning in told] == [UnfinishedWarning]
+        assert "step 9 of 70" in str(told[0].message)
+
+
+@pytest.mark.parametrize(
+    "record",
+    [
+        None,
+        b"not JSON",
+        b"[" * 100_000,
+        b'{"state": "running", "step": "9", "steps": {}, "recipe": {}}',
+        b'{"state": "running", "step": 9, "steps": 70, "recipe": {"name": "another"}}',
+        b" " * (MOST_RECORD + 1),
+    ],
+)
+def test_what_is_no_record_of_these_weights_is_passed_over(
+    run: Predict, tmp_path: Path, record: bytes | None
+) -> None:
+    """Weights alone, damaged records, those of other weights: predictions come without a warning."""
+    if record is not None:
+        (tmp_path / "training.json").write_bytes(record)
+    assert run(training={"state": "running"}).path.is_file()
+
+
+def test_a_pipe_is_no_record(run: Predict, tmp_path: Path) -> None:
+    """It would wait for ever."""
+    os.mkfifo(tmp_path / "training.json")
+    assert run().path.is_file()
