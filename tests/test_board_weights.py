@@ -141,6 +141,22 @@ def stray(own: BoardBench) -> None:
     (own.folder / "weights/cavity/tiny/other_0.pt").write_bytes(b"1")
 
 
+def lengthen(own: BoardBench) -> None:
+    """Let the record of the training be long."""
+    text = json.dumps({"note": "x" * kept.MOST_RECORD})
+    (own.folder / "weights/cavity/tiny/drift_0.json").write_text(text)
+
+
+def garble(own: BoardBench) -> None:
+    """Let it be no record: nested far deeper than one is."""
+    (own.folder / "weights/cavity/tiny/drift_0.json").write_text("[" * 100_000)
+
+
+def listed(own: BoardBench) -> None:
+    """Let it be JSON, but no record."""
+    (own.folder / "weights/cavity/tiny/drift_0.json").write_text("[1]")
+
+
 def claim(own: BoardBench) -> None:
     """Claim a track."""
     own.edit("drift", lambda held: held["budget"].update(track="converged"))
@@ -154,15 +170,24 @@ def claim_without(own: BoardBench) -> None:
 @pytest.mark.parametrize(
     ("change", "check"),
     [
-        *((change, "weights") for change in (edit, lose, misplace, stray)),
+        *((change, "weights") for change in (edit, lose, misplace, stray, lengthen, garble, listed)),
         *((change, "budget") for change in (claim, claim_without)),
     ],
 )
 def test_what_the_check_finds(own: BoardBench, change: Callable[[BoardBench], None], check: str) -> None:
-    """Weights that are edited, lost, elsewhere or nobody's, and tracks that the record does not give."""
+    """Weights edited, lost, elsewhere or nobody's; records that are none; tracks that no budget gives."""
     submitted(own, trained(own, 0))
     change(own)
     assert found(own) == {check}
+
+
+def test_what_is_no_record_is_not_copied(own: BoardBench) -> None:
+    """The entry does without, as it may."""
+    run = trained(own, 0)
+    (run / "training.json").write_text(json.dumps({"note": "x" * kept.MOST_RECORD}))
+    submitted(own, run)
+    assert [path.suffix for path in (own.folder / "weights").rglob("*.*")] == [".pt"]
+    assert found(own) == set()
 
 
 def test_more_than_git_should_keep(own: BoardBench, monkeypatch: pytest.MonkeyPatch) -> None:

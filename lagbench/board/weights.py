@@ -6,12 +6,14 @@ weights/<split>/<size>/<method>_<seed>.json   what the training recorded, where 
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from lagbench.atomic import write_atomically
 from lagbench.data.checksums import file_sha256
-from lagbench.errors import UsageError, check_installed
+from lagbench.data.hdf5 import check_regular
+from lagbench.errors import UnreadableFileError, UsageError, check_installed
 from lagbench.submission.findings import Finding
 from lagbench.submission.format import Header
 
@@ -23,6 +25,9 @@ __all__ = ["MOST_BYTES", "check_weights", "copy_weights", "named_weights", "requ
 
 MOST_BYTES = 40_000_000
 """All weights of a leaderboard together [bytes]: git keeps every version of them for good."""
+
+MOST_RECORD = 256 << 10
+"""Longest record of a training beside its weights [bytes]; those of ours take 3 kB."""
 
 RECORD = "training.json"
 
@@ -87,14 +92,26 @@ def copy_weights(folder: Folder, named: Sequence[Weights | None], paths: Sequenc
         target, record = folder.path / said.path, path.with_name(RECORD)
         target.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(target, path.read_bytes(), option="--board")
-        if record.is_file():
+        if record.is_file() and unfit_record(record) is None:
             write_atomically(target.with_suffix(".json"), record.read_bytes(), option="--board")
         else:  # that of weights which stood here before
             target.with_suffix(".json").unlink(missing_ok=True)
 
 
+def unfit_record(path: Path) -> str | None:
+    """Return why a file cannot be the record of a training, None if it can."""
+    try:
+        check_regular(path, longest=MOST_RECORD)
+        held = json.loads(path.read_bytes())
+    except UnreadableFileError as error:
+        return f"{error.what}: {error.got}"
+    except (OSError, ValueError, RecursionError):
+        return "no JSON"
+    return None if isinstance(held, dict) else "no JSON object"
+
+
 def check_weights(folder: Folder, entries: Sequence[Entry]) -> Iterator[Finding]:
-    """Yield weights that are missing, edited, out of place, without an entry, or too many."""
+    """Yield weights that are missing, edited, out of place, without an entry, or too many; unfit records."""
     known: set[Path] = set()
     for entry in entries:
         for number, made in enumerate(entry.predictions):
@@ -111,6 +128,7 @@ def check_weights(folder: Folder, entries: Sequence[Entry]) -> Iterator[Finding]
             elif (found := file_sha256(file)) != made.weights.sha256:
                 said = made.weights.sha256[:16]
                 yield finding("weights", path, f"SHA-256 {found[:16]}", expected=f"{said} as the entry says")
+            yield from _check_record(folder, path.with_suffix(".json"))
     held = folder.weight_files()
     for path in held:
         if path not in known:
@@ -120,3 +138,11 @@ def check_weights(folder: Folder, entries: Sequence[Entry]) -> Iterator[Finding]
         fix = "keep larger ones as files of a release, and name them by `weights: https://...` in the entry"
         most = f"at most {MOST_BYTES} bytes in all"
         yield finding("weights", "weights", f"{total} bytes", what="too many", expected=most, fix=fix)
+
+
+def _check_record(folder: Folder, path: Path) -> Iterator[Finding]:
+    """Yield a record that is long or no JSON; its absence is no finding."""
+    file = folder.path / path
+    if file.exists() and folder.link_in(path) is None and (reason := unfit_record(file)) is not None:
+        most = f"a JSON object of at most {MOST_RECORD} bytes, or no file"
+        yield finding("weights", path, reason, what="no record of a training", expected=most)
