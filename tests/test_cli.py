@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
+import subprocess
 import sys
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -187,6 +190,22 @@ def test_cite_names_version_hash_and_works(run: Run) -> None:
     assert "version 2.0.0" in text
     assert "Ghia" in text
     assert json.loads(run("cite", "cavity", "--json").stdout)["licence"] == "CC-BY-4.0"
+
+
+def test_a_tag_names_the_version() -> None:
+    """A release's tag is v and the version of pyproject.toml, which CITATION.cff and README have too."""
+    root = Path(__file__).parents[1]
+    version = tomllib.loads((root / "pyproject.toml").read_text())["project"]["version"]
+    assert yaml.safe_load((root / "CITATION.cff").read_text())["version"] == version
+    assert f"version = {{{version}}}" in (root / "README.md").read_text()
+    # Outside of git, and in an archive that was unpacked in another repository, there are no tags of ours.
+    if not (root / ".git").exists() or shutil.which("git") is None:
+        pytest.skip("no clone")
+    asked = ["git", "-C", str(root), "tag", "--points-at", "HEAD", "--list", "v[0-9]*"]
+    tags = subprocess.run(asked, capture_output=True, text=True, check=False).stdout.split()
+    if not tags:
+        pytest.skip("no tag at HEAD")
+    assert tags == [f"v{version}"]
 
 
 def test_bibtex_is_what_citation_cff_says(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
