@@ -28,7 +28,6 @@ __all__ = [
     "Grid",
     "Placement",
     "Transfer",
-    "central_differences",
     "counted_nodes",
     "differentiable_nodes",
     "divergence",
@@ -212,22 +211,28 @@ def _scatter(x: Floats, u: Floats, grid: Grid) -> tuple[Floats, Floats]:
     u_x, u_y = np.ascontiguousarray(u.T)
 
     sums = np.zeros((3, side * side))
-    weights = np.empty((3, len(corner)))
+    product = np.empty((3, len(corner)))
+    weights, *momenta = product
     for i in range(3):
-        along_x = weight_x[i], weight_x[i] * u_x, weight_x[i] * u_y
         for k in range(3):
+            np.multiply(weight_x[i], weight_y[k], out=weights)
+            for momentum, component in zip(momenta, (u_x, u_y), strict=True):
+                np.multiply(weights, component, out=momentum)
             # node numbers stay those of the corner; its sums are shifted to the node instead
             shift = i * side + k
-            for total, product, factor in zip(sums, weights, along_x, strict=True):
-                np.multiply(factor, weight_y[k], out=product)
-                total[shift:] += np.bincount(corner, product, side * side)[: side * side - shift]
+            for total, summand in zip(sums, product, strict=True):
+                total[shift:] += np.bincount(corner, summand, side * side)[: side * side - shift]
     inner = sums.reshape(3, side, side)[:, _LOW:-_HIGH, _LOW:-_HIGH]
     return inner[0], np.moveaxis(inner[1:], 0, -1)
 
 
 def _spline(s: Floats) -> Floats:
     """Return the weights of the three nodes of each axis, shape [2, node, particle]."""
-    return np.stack([0.5 * (1.5 - s) ** 2, 0.75 - (s - 1.0) ** 2, 0.5 * (s - 0.5) ** 2], axis=1)
+    weights = np.empty((len(s), 3, s.shape[1]))
+    weights[:, 0] = 0.5 * (1.5 - s) ** 2
+    weights[:, 1] = 0.75 - (s - 1.0) ** 2
+    weights[:, 2] = 0.5 * (s - 0.5) ** 2
+    return weights
 
 
 def counted_nodes(weight: Floats, full: float) -> Mask:
@@ -252,17 +257,18 @@ def differentiable_nodes(counted: Mask) -> Mask:
     return inner
 
 
-def central_differences(field: Floats, spacing: float) -> tuple[Floats, Floats]:
-    """Return ``df/dx`` and ``df/dy``, 0 on the rim of the grid where no central difference exists.
+def _along_x(field: Floats, spacing: float) -> Floats:
+    """Return the central difference ``df/dx``, 0 on the rim of the grid where there is none."""
+    slope = np.zeros_like(field)
+    slope[..., 1:-1, :] = (field[..., 2:, :] - field[..., :-2, :]) / (2.0 * spacing)
+    return slope
 
-    Args:
-        field: values at the nodes, shape [..., x node, y node].
-        spacing: distance h between nodes [length].
-    """
-    along_x, along_y = np.zeros_like(field), np.zeros_like(field)
-    along_x[..., 1:-1, :] = (field[..., 2:, :] - field[..., :-2, :]) / (2.0 * spacing)
-    along_y[..., :, 1:-1] = (field[..., :, 2:] - field[..., :, :-2]) / (2.0 * spacing)
-    return along_x, along_y
+
+def _along_y(field: Floats, spacing: float) -> Floats:
+    """Return the central difference ``df/dy``, 0 on the rim of the grid where there is none."""
+    slope = np.zeros_like(field)
+    slope[..., :, 1:-1] = (field[..., :, 2:] - field[..., :, :-2]) / (2.0 * spacing)
+    return slope
 
 
 def vorticity(velocity: Floats, spacing: float) -> Floats:
@@ -272,9 +278,7 @@ def vorticity(velocity: Floats, spacing: float) -> Floats:
         velocity: node velocity, shape [..., x node, y node, 2].
         spacing: distance h between nodes [length].
     """
-    return (
-        central_differences(velocity[..., 1], spacing)[0] - central_differences(velocity[..., 0], spacing)[1]
-    )
+    return _along_x(velocity[..., 1], spacing) - _along_y(velocity[..., 0], spacing)
 
 
 def divergence(velocity: Floats, spacing: float) -> Floats:
@@ -284,6 +288,4 @@ def divergence(velocity: Floats, spacing: float) -> Floats:
         velocity: node velocity, shape [..., x node, y node, 2].
         spacing: distance h between nodes [length].
     """
-    return (
-        central_differences(velocity[..., 0], spacing)[0] + central_differences(velocity[..., 1], spacing)[1]
-    )
+    return _along_x(velocity[..., 0], spacing) + _along_y(velocity[..., 1], spacing)

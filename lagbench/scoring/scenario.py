@@ -8,6 +8,7 @@ The few pictures of a submission that a board page draws, taken while it is scor
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -163,9 +164,12 @@ class ScenarioScores:
     preview: Preview | None  # pictures, if they were asked for
 
 
+_selected = functools.cache(select)  # the search through installed packages takes as long as some frames
+
+
 def score_scenario(job: ScenarioJob, report: Report) -> ScenarioScores:
     """Score one scenario of a submission and of the floors that are to be measured."""
-    metrics = select(job.metrics)
+    metrics = _selected(job.metrics)
     with job.task.opened(job.scenario) as truth, open_predictions(job.predictions) as predictions:
         scenario = truth.scenario
         rows = {SUBMISSION: _predicted(predictions, job.scenario, scenario)}
