@@ -72,10 +72,16 @@ def measured_scatter(methods: dict[str, Floats]) -> Scatter:
             rest = float(np.sum(within**2)) / ((len(values) - 1) * (count - 1))
             rests.append(rest)
             seeds.append(max(0.0, float(np.var(off.mean(axis=1), ddof=1)) - rest / count))
-    best = min((v.mean() for v in methods.values()), default=np.nan)
-    near = [name for name, values in methods.items() if values.mean() < 2.0 * best]
-    pairs = itertools.combinations(near, 2)
-    gaps = [np.var(relative[a].mean(axis=0) - relative[b].mean(axis=0), ddof=1) / 2 for a, b in pairs]
+    near = [
+        (a, b)
+        for a, b in itertools.permutations(methods, 2)
+        if len(methods[a]) > 1 and 0.5 < methods[a].mean() / methods[b].mean() < 2.0
+    ]
+    pairs = {frozenset(pair) for pair in near}
+    gaps = [
+        np.var(relative[a].mean(axis=0) - relative[b].mean(axis=0), ddof=1) / 2
+        for a, b in sorted(map(sorted, pairs))
+    ]
 
     def root(variances: list[float]) -> float:
         return float(np.sqrt(np.mean(variances))) if variances else np.nan
