@@ -78,10 +78,12 @@ def measured_scatter(methods: dict[str, Floats]) -> Scatter:
         if len(methods[a]) > 1 and 0.5 < methods[a].mean() / methods[b].mean() < 2.0
     ]
     pairs = {frozenset(pair) for pair in near}
-    gaps = [
-        np.var(relative[a].mean(axis=0) - relative[b].mean(axis=0), ddof=1) / 2
-        for a, b in sorted(map(sorted, pairs))
-    ]
+    noise = float(np.mean(rests)) if rests else np.nan
+    gaps = []
+    for a, b in sorted(map(sorted, pairs)):
+        apart = float(np.var(relative[a].mean(axis=0) - relative[b].mean(axis=0), ddof=1))
+        of_seeds = noise * (1 / len(methods[a]) + 1 / len(methods[b]))
+        gaps.append(max(0.0, apart - of_seeds) / 2)
 
     def root(variances: list[float]) -> float:
         return float(np.sqrt(np.mean(variances))) if variances else np.nan
@@ -133,7 +135,7 @@ def tables() -> str:
 
 Written by `python benchmarks/power.py --write`: by three assumptions about how much methods and seeds
 scatter, and from the score files of the mini sizes below leaderboard/scores, a row for each data set that
-has two near methods, one of them of several seeds.
+has two near methods, one of them of several seeds (two methods of two seeds each are a rough measure).
 
 The value of seed s in scenario i is read as mean x (1 + scenario + method-in-scenario + seed + rest).
 Two methods share the scenarios; what is left are the three standard deviations below, relative to a
@@ -149,9 +151,9 @@ more seeds. A board that ranks by hundredths ranks by chance.
 
 ## Equal methods that are told apart
 
-Both sides are seeds of one method: at most 5 % may differ. With one seed a side the test is the
-sign-flip test over scenarios. It is right about those weights, and wrong about the method as
-often as the first column says: why such a row says "these weights".
+Both sides are seeds of one method: at most 5 % may differ (give or take 1.4, the error of so many draws).
+With one seed a side the test is the sign-flip test over scenarios. It is right about those weights, and
+wrong about the method as often as the first column says: why such a row says "these weights".
 
 | case | 1 seed a side | 2 | 3 | 5 |
 |---|---|---|---|---|

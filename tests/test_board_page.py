@@ -6,6 +6,7 @@ import base64
 import hashlib
 import json
 import re
+import sys
 from dataclasses import replace
 from typing import Any
 
@@ -13,14 +14,15 @@ import numpy as np
 import pytest
 from board_worlds import make_board, with_entry
 from html_check import read_html
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from lagbench.board.entry import Cost
+from lagbench.board.entry import Cost, Flag
 from lagbench.board.model import Board
 from lagbench.board.page import BUDGET, FEWEST, render
 from lagbench.board.payload import FINENESS, LEVELS, coarse, embedded, pack, pack_film, payload
+from lagbench.board.table import MOST_REASONS
 
 DIGITS = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789-_"
 
@@ -72,6 +74,7 @@ def held_by(page: str) -> Any:
     st.lists(st.floats(-1e6, 1e6, allow_subnormal=False) | st.just(float("nan")), min_size=1, max_size=40),
     st.booleans(),
 )
+@example([sys.float_info.min], True)
 def test_packed_numbers_come_back(values: list[float], log: bool) -> None:
     """Unpacked values lie within half a step, or half a step of the logarithm, and gaps stay gaps."""
     x = np.array(values)
@@ -205,6 +208,23 @@ def test_rows_lead_to_code_paper_and_weights(board: Board, page: str) -> None:
     bad = with_entry(board.tabs[0].rows[0], code="javascript:alert(1)")
     shown = render(replace(board, tabs=(replace(board.tabs[0], rows=(bad,)),)))
     assert 'href="javascript' not in shown
+
+
+def test_a_warning_tells_a_few_reasons_and_a_flag_all(board: Board) -> None:
+    """Scenarios that jump say the same with other numbers; every reason to suspect a copy is another."""
+    reasons = tuple(f"reason {number}" for number in range(9))
+    row = board.tabs[0].rows[0]
+    (file, *_), score = row.entry.score.files, row.entry.score
+    raised = {
+        "flags": (Flag(name="copy_suspect", reasons=reasons),),
+        "warnings": (Flag(name="max_displacement", reasons=reasons),),
+    }
+    files = (file.model_copy(update=raised),)
+    row = with_entry(row, score=score.model_copy(update={"files": files}))
+    page = render(replace(board, tabs=(replace(board.tabs[0], rows=(row,)),)))
+    titles = [e.attributes.get("title", "") for e in read_html(page).named("span")]
+    told = sorted(said.count("reason") for title in titles if (said := title or ""))[-2:]
+    assert told == [MOST_REASONS, len(reasons)]
 
 
 def test_costs_are_marked_as_self_reported(board: Board, page: str) -> None:

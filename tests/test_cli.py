@@ -206,6 +206,8 @@ def test_a_tag_names_the_version() -> None:
     if not tags:
         pytest.skip("no tag at HEAD")
     assert tags == [f"v{version}"]
+    heads = re.findall(r"^## (.*)$", (root / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert version in heads[0]
 
 
 def test_bibtex_is_what_citation_cff_says(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:

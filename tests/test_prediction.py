@@ -32,6 +32,15 @@ from lagbench.submission import validate as examine
 Predict = Callable[..., PredictionResult]
 
 
+UNFINISHED = {
+    "state": "running",
+    "step": 9,
+    "steps": 70,
+    "recipe": {"name": "curl-noise/tiny", "training": {"seed": 3}},
+}
+"""Record of a training whose weights the fixture has, and which goes on."""
+
+
 @pytest.fixture
 def run(
     generated: GenerationResult, unmeasured: Registry, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -254,9 +263,7 @@ def test_out_of_memory(run: Predict, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("state", ["running", "interrupted", "failed", "finished", "stopped early"])
 def test_weights_of_an_unfinished_training(run: Predict, tmp_path: Path, state: str) -> None:
     """The record beside the weights says how far it came: those of the best step say 'running' for good."""
-    recipe = {"name": "curl-noise/tiny", "training": {"seed": 3}}
-    record = {"state": state, "step": 9, "steps": 70, "recipe": recipe}
-    (tmp_path / "training.json").write_text(json.dumps(record))
+    (tmp_path / "training.json").write_text(json.dumps({**UNFINISHED, "state": state}))
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         run(training={"state": "running"})
@@ -273,9 +280,9 @@ def test_weights_of_an_unfinished_training(run: Predict, tmp_path: Path, state: 
         None,
         b"not JSON",
         b"[" * 100_000,
-        b'{"state": "running", "step": "9", "steps": {}, "recipe": {}}',
+        json.dumps({**UNFINISHED, "step": "9", "steps": {}}).encode(),
         b'{"state": "running", "step": 9, "steps": 70, "recipe": {"name": "another"}}',
-        b" " * (MOST_RECORD + 1),
+        json.dumps(UNFINISHED).encode() + b" " * MOST_RECORD,
     ],
 )
 def test_what_is_no_record_of_these_weights_is_passed_over(

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -252,7 +253,8 @@ def pack(values: ArrayLike, *, limits: tuple[float, float] | None = None, log: b
     x = np.asarray(values, np.float64).ravel()
     known = x[np.isfinite(x)]
     low, high = limits or ((float(known.min()), float(known.max())) if known.size else (0.0, 1.0))
-    logarithmic = log and bool(known.size) and low >= 0.0 and high > 0.0
+    # what is smaller still cannot be written with a few digits: its ends may read back as zero
+    logarithmic = log and bool(known.size) and low >= 0.0 and high > sys.float_info.min / DEEPEST
     if logarithmic:
         positive = known[known > DEEPEST * high]
         low = float(positive.min())

@@ -24,7 +24,7 @@ MEAN_DIGITS = 9
 """Significant digits of means, as in scores.json."""
 
 MOST_REASONS = 4
-"""Reasons of a flag that are told; those of other scenarios say the same with other numbers."""
+"""Reasons of a warning that are told; those of other scenarios say the same with other numbers."""
 
 SHADES = 5
 FEWEST_SHADED = 3
@@ -227,7 +227,7 @@ def _chips(row: Row) -> Iterator[Markup]:
         yield _chip("unknown", f"data {entry.dataset.version}", said)
     for kind, flags in (("bad", row.flags), ("warn", row.warnings)):
         for flag in flags:
-            yield _chip(kind, *_explained(flag))
+            yield _chip(kind, *_explained(flag, most=MOST_REASONS if kind == "warn" else len(flag.reasons)))
     if row.diverged:
         yield _chip("warn", "diverged", f"{row.diverged} rollouts are frozen at their last finite frame.")
 
@@ -236,11 +236,11 @@ def _chip(kind: str, label: str, meaning: str) -> Markup:
     return tag("span", label, class_=f"flag {kind}", title=meaning)
 
 
-def _explained(flag: Flag) -> tuple[str, str]:
+def _explained(flag: Flag, *, most: int) -> tuple[str, str]:
     """Return label and meaning of a flag or warning; an unknown one is called as the scorer does."""
     label, meaning = EXPLAINED.get(flag.name, (flag.name.replace("_", " "), ""))
     if flag.share is not None:
         label = f"{label}: {text(100.0 * flag.share, 2)} %"
-    more = len(flag.reasons) - MOST_REASONS
-    said = "; ".join([*flag.reasons[:MOST_REASONS], *([f"and {more} more such"] if more > 0 else [])])
+    more = len(flag.reasons) - most
+    said = "; ".join([*flag.reasons[:most], *([f"and {more} more such"] if more > 0 else [])])
     return label, " ".join(filter(None, (meaning, f"{said}." if said else "")))

@@ -11,7 +11,7 @@ import math
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -172,7 +172,9 @@ def _in_lines(counted: str) -> Callable[[State], None]:
         last = now
         left = (news.scenarios - news.scenarios_done) / news.rate if news.rate else math.inf
         still = f", {spell_seconds(left)} left" if math.isfinite(left) else ""
-        typer.echo(f"{news.stage}: {_count(news, counted)}{still}", err=True)
+        share = f"{news.done / news.total:.0%}, " if news.total else ""
+        with suppress(OSError):  # the work goes on without a reader
+            typer.echo(f"{news.stage}: {share}{_count(news, counted)}{still}", err=True)
 
     return tell
 
