@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from lagbench.data.registry import Registry, default_path, load
 from lagbench.data.writer import ScenarioKey, ScenarioWriter, scenario_path
+from lagbench.data.yamlfile import read_yaml
 from lagbench.submission import PredictionsWriter
 
 __all__ = ["ScoreData", "make_score_data"]
@@ -102,7 +103,7 @@ def _write_truth(path: Path, key: ScenarioKey, frames: int, particles: int) -> s
 
 
 def _write_registry(path: Path, horizon: int, frames: int, hashes: dict[int, str]) -> Path:
-    held = yaml.safe_load(default_path().read_text())
+    held = read_yaml(default_path())
     size = held["splits"]["cavity"]["sizes"]["full"]
     size["task"]["horizon"], size["frames"] = horizon, frames
     held["measured"] = {

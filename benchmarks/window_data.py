@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from lagbench.data.registry import Registry, default_path, load
 from lagbench.data.writer import ScenarioKey, ScenarioWriter, scenario_path
+from lagbench.data.yamlfile import read_yaml
 
 __all__ = ["FRAMES", "PARTICLES", "trajectory", "write_gns_npz", "write_lagrangebench_h5", "write_ours"]
 
@@ -45,7 +46,7 @@ def _rotation(scenario: int) -> Iterator[Frames]:
 
 def write_ours(root: Path, scenarios: int) -> Registry:
     """Write the train subset as lagbench does; return the registry that describes it."""
-    held = yaml.safe_load(default_path().read_text())
+    held = read_yaml(default_path())
     size = held["splits"]["cavity"]["sizes"]["full"]
     size["subsets"] = {"train": f"0-{scenarios - 1}", "valid": f"{scenarios}", "test": f"{scenarios + 1}"}
     held["measured"] = {}

@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
+from filelock import FileLock
 from numpy.typing import NDArray
 
 from lagbench.data.checksums import dataset_hash, subset_hash
 from lagbench.data.registry import Registry, Size, default_path, load
 from lagbench.data.writer import ScenarioKey, ScenarioWriter, scenario_path
+from lagbench.data.yamlfile import read_yaml, spell_yaml
 from lagbench.report import write_report
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.score import score
@@ -61,14 +62,26 @@ class ReportBench:
         return write_report(folder / "report", cards, paths, root=self.root, registry=self.registry)
 
 
-def make_report_bench(folder: Path, split: str) -> ReportBench:
-    """Write the test scenarios of a split and its registry."""
-    plain = load().size(split, "tiny")
-    hashes = {i: _write(folder / "root", plain, i) for i in plain.subsets["test"]}
+def make_report_bench(home: Path, split: str) -> ReportBench:
+    """Write the test scenarios of a split and its registry, once for all processes that share a folder."""
+    folder = home / f"report-{split}"
     path = folder / "datasets.yaml"
-    path.write_text(_registry(plain, hashes))
+    with FileLock(home / f"report-{split}.lock"):
+        if not path.exists():
+            plain = load().size(split, "tiny")
+            hashes = {i: _write(folder / "root", plain, i) for i in plain.subsets["test"]}
+            path.write_text(_registry(plain, hashes))
     registry = load(path)
     return ReportBench(folder / "root", registry, registry.size(split, "tiny"))
+
+
+def page_of(home: Path, split: str) -> Path:
+    """Return the report on two methods of a split, one of a hostile name, made once likewise."""
+    page = home / f"page-{split}" / "report" / "index.html"
+    with FileLock(home / f"page-{split}.lock"):
+        if not page.exists():
+            assert make_report_bench(home, split).report(page.parents[1], METHODS) == page
+    return page
 
 
 def motion(size: Size, scenario: int) -> Floats:
@@ -150,7 +163,7 @@ def _area(size: Size) -> float:
 
 def _registry(size: Size, hashes: Mapping[int, str]) -> str:
     """Return our registry with what would be measured of this data set."""
-    file = yaml.safe_load(default_path().read_text())
+    file = read_yaml(default_path())
     subsets = {"train": "0" * 64, "valid": "1" * 64, "test": subset_hash(hashes)}
     file["measured"] = {
         size.split: {
@@ -163,15 +176,7 @@ def _registry(size: Size, hashes: Mapping[int, str]) -> str:
             }
         }
     }
-    return yaml.dump(file, Dumper=_WithoutAliases)
-
-
-class _WithoutAliases(yaml.SafeDumper):
-    """Writes twice what stands twice; our reader refuses aliases."""
-
-    def ignore_aliases(self, data: object) -> bool:
-        """Return True: no aliases."""
-        return True
+    return spell_yaml(file)
 
 
 def still(truth: Floats, n: int, h: int) -> Floats:
@@ -196,3 +201,9 @@ def runaway(truth: Floats, n: int, h: int) -> Floats:
     guess = np.array(noisy(truth, n, h))
     guess[1:, :5] += 9.0 * 10.0 ** np.linspace(-8.0, 0.0, h - 1)[:, None, None]
     return guess
+
+
+HOSTILE = "<script>console.error(1)</script><img src=http://example.com/x onerror=console.error(2)>"
+
+METHODS: dict[str, Method] = {"GNS & friends": damped, HOSTILE: noisy}
+"""The methods of :func:`page_of`."""

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 from scenario_factory import frames_of, make_key, write_scenario
 
 from lagbench.data.checksums import dataset_hash, subset_hash
 from lagbench.data.registry import Registry, default_path, load
+from lagbench.data.yamlfile import read_yaml, spell_yaml
 from lagbench.submission import ValidationResult, validate, write
 
 TESTS = (3, 4, 5)
@@ -88,7 +88,7 @@ def make_bench(folder: Path) -> Bench:
 
 def _registry(hashes: dict[int, str]) -> str:
     """Return our registry with a smaller cavity tiny and its hashes."""
-    file = yaml.safe_load(default_path().read_text())
+    file = read_yaml(default_path())
     file.pop("measured", None)
     split = file["splits"]["cavity"]
     split["version"] = VERSION
@@ -106,11 +106,4 @@ def _registry(hashes: dict[int, str]) -> str:
         "twin_floor": [],
     }
     file["measured"] = {"cavity": {"tiny": measured}}
-    return yaml.dump(file, Dumper=_WithoutAliases)
-
-
-class _WithoutAliases(yaml.SafeDumper):
-    """Writes twice what stands twice; our reader refuses aliases."""
-
-    def ignore_aliases(self, data: object) -> bool:
-        return True
+    return spell_yaml(file)

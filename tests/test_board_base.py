@@ -32,9 +32,9 @@ def commit(bench: BoardBench) -> None:
 
 
 @pytest.fixture
-def own(tmp_path_factory: pytest.TempPathFactory, tmp_path: Path) -> BoardBench:
+def own(home: Path, tmp_path: Path) -> BoardBench:
     """A copy of the leaderboard in a repository, on a branch that left main."""
-    bench = copied(tmp_path_factory, tmp_path, without=["flipping"])
+    bench = copied(home, tmp_path, without=["flipping"])
     git(tmp_path, "init", "-q")
     (bench.folder / "verified.yaml").write_text("{}\n")
     commit(bench)
@@ -149,12 +149,14 @@ def test_the_base_may_have_gone_on(own: BoardBench) -> None:
     assert touched(own) == {}
 
 
-def test_without_git_it_says_so(own: BoardBench, tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_without_git_it_says_so(
+    own: BoardBench, home: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
     """An unknown revision, and a folder outside any repository, are a matter of usage."""
     with pytest.raises(UsageError) as error:
         check_board(own.folder, registry=own.registry, isolated=False, base="nowhere")
     assert "--base" in str(error.value.where)
-    outside = copied(tmp_path_factory, tmp_path_factory.mktemp("outside"))
+    outside = copied(home, tmp_path_factory.mktemp("outside"))
     with pytest.raises(UsageError):
         check_board(outside.folder, registry=outside.registry, isolated=False, base="main")
 

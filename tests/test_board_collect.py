@@ -27,9 +27,9 @@ from lagbench.scoring.score_file import read_statistics
 
 
 @pytest.fixture(scope="module")
-def bench(tmp_path_factory: pytest.TempPathFactory) -> BoardBench:
+def bench(home: Path) -> BoardBench:
     """The shared leaderboard."""
-    return master(tmp_path_factory)
+    return master(home)
 
 
 @pytest.fixture(scope="module")
@@ -39,9 +39,9 @@ def board(bench: BoardBench) -> Board:
 
 
 @pytest.fixture
-def own(tmp_path_factory: pytest.TempPathFactory, tmp_path: Path) -> BoardBench:
+def own(home: Path, tmp_path: Path) -> BoardBench:
     """A copy that the test may damage."""
-    return copied(tmp_path_factory, tmp_path)
+    return copied(home, tmp_path)
 
 
 @pytest.fixture(scope="module")

@@ -15,11 +15,13 @@ from lagbench.board.check import check_board
 from lagbench.board.score_file import read_stored, unreadable_in_child
 from lagbench.errors import UnreadableFileError
 
+PACKAGE = Path(isolation.__file__).parents[2]
+
 
 @pytest.fixture
-def own(tmp_path_factory: pytest.TempPathFactory, tmp_path: Path) -> BoardBench:
+def own(home: Path, tmp_path: Path) -> BoardBench:
     """A copy of the leaderboard that the test may damage."""
-    return copied(tmp_path_factory, tmp_path, without=["damped"])
+    return copied(home, tmp_path, without=["damped"])
 
 
 def hostile(path: Path, kind: str, secret: Path) -> None:
@@ -95,23 +97,20 @@ def test_the_child_is_limited_and_started_anew(own: BoardBench, monkeypatch: pyt
     program = own.folder.parent / "fake"
     program.mkdir()
     (program / "child_that_stops.py").write_text(
-        "import json, os, sys\n"
-        "for path in json.load(sys.stdin):\n"
-        "    if 'flipping' in path: os.kill(os.getpid(), 11)\n"
-        "    print('null', flush=True)\n"
+        "import os\ndef read(path):\n    if 'flipping' in path: os.kill(os.getpid(), 11)\n"
     )
-    monkeypatch.setenv("PYTHONPATH", str(program))
-    monkeypatch.setattr(isolation, "CHILD", "child_that_stops")
+    monkeypatch.setenv("PYTHONPATH", f"{program}:{PACKAGE}")
+    monkeypatch.setattr(isolation, "READ", "child_that_stops.read")
     stopped = unreadable_in_child([good, bad, good])
     assert set(stopped) == {bad}
     assert "had to be stopped" in stopped[bad]
 
 
 def use_child(monkeypatch: pytest.MonkeyPatch, folder: Path, program: str) -> None:
-    """Put another program in place of the child's."""
+    """Let the child run another program."""
     (folder / "other_child.py").write_text(program)
-    monkeypatch.setenv("PYTHONPATH", str(folder))
-    monkeypatch.setattr(isolation, "CHILD", "other_child")
+    monkeypatch.setenv("PYTHONPATH", f"{folder}:{PACKAGE}")
+    monkeypatch.setattr(isolation, "READ", "other_child.read")
 
 
 def test_many_files_that_stop_the_child_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -123,7 +122,7 @@ def test_many_files_that_stop_the_child_are_bounded(tmp_path: Path, monkeypatch:
     found = unreadable_in_child(files)
     assert Path("starts").read_text() == "xx"
     assert list(found) == files
-    assert ["stopped: exit" in said for said in found.values()] == [True] * 2 + [False] * 7
+    assert ["reading it had to be" in said for said in found.values()] == [True] * 2 + [False] * 7
     assert found[files[-1]] == isolation.UNREAD
 
 

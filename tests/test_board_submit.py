@@ -24,9 +24,9 @@ from lagbench.submission import open_predictions
 
 
 @pytest.fixture
-def own(tmp_path_factory: pytest.TempPathFactory, tmp_path: Path) -> BoardBench:
+def own(home: Path, tmp_path: Path) -> BoardBench:
     """A copy of the leaderboard."""
-    return copied(tmp_path_factory, tmp_path)
+    return copied(home, tmp_path)
 
 
 @pytest.fixture

@@ -28,9 +28,9 @@ BUDGET = Budget(windows=48, epochs=0.5, steps=6, cpu_hours=0.1, gpu_hours=0.0)
 
 
 @pytest.fixture
-def own(tmp_path_factory: pytest.TempPathFactory, tmp_path: Path) -> BoardBench:
+def own(home: Path, tmp_path: Path) -> BoardBench:
     """A copy of the leaderboard."""
-    return copied(tmp_path_factory, tmp_path)
+    return copied(home, tmp_path)
 
 
 def trained(own: BoardBench, seed: int) -> Path:
@@ -72,7 +72,8 @@ def submitted(
 
 def found(own: BoardBench) -> set[str]:
     """Return the names of the checks that find something."""
-    return {one.check for one in check_board(own.folder, registry=own.registry, page=False).findings}
+    result = check_board(own.folder, registry=own.registry, page=False, isolated=False)
+    return {one.check for one in result.findings}
 
 
 def test_weights_lie_beside_their_entry(own: BoardBench) -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from conftest import DRAW
 from hypothesis import given
 from hypothesis import strategies as st
 from swirls import write_swirl
@@ -68,7 +69,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("root")
     size, manifest = make(root)
     assert manifest.complete
-    written = write(root, size, manifest)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cards, "_draw", DRAW)
+        written = write(root, size, manifest)
     folder = dataset_folder(root, "cavity", "tiny", 2)
     assert {p.relative_to(folder).as_posix() for p in written} == {
         "README.md",
@@ -142,8 +145,10 @@ def test_every_picture_of_the_card_is_there(folder: Path) -> None:
     for words, target in links:
         assert len(words) > 10
         assert (folder / target).stat().st_size < 300_000
+        assert (folder / target).read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.usefixtures("as_shipped")
 def test_the_same_manifest_gives_the_same_bytes(tmp_path: Path) -> None:
     """Cards written twice, and by another process at another time, do not differ; no date is in them."""
     size, manifest = make(tmp_path)

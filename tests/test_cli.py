@@ -123,7 +123,7 @@ def test_generate_and_verify(run: Run, tmp_path: Path) -> None:
     made = run("generate", *options)
     assert made.exit_code == 0, made.output
     assert "missing 0-1,3-4: the data set is incomplete" in made.stdout
-    assert made.stderr == ""
+    assert all("scenarios" in line for line in made.stderr.splitlines())  # progress, on a slow machine
     again = json.loads(run("generate", *options, "--json").stdout)
     assert (again["simulated"], again["kept"], again["complete"]) == ([], [2], False)
     assert run("generate", *options, "--quiet").output == ""

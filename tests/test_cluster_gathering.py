@@ -51,9 +51,7 @@ def parts(generated: GenerationResult, unmeasured: Registry, tmp_path: Path) -> 
     )
 
 
-def test_two_processes_and_a_last_call(
-    tmp_path: Path, unmeasured_path: Path, generated: GenerationResult
-) -> None:
+def test_two_processes_and_a_last_call(tmp_path: Path, unmeasured_path: Path) -> None:
     """The recipe for job arrays: what two processes made is the one-machine data set, file for file."""
 
     def start(*options: str) -> subprocess.Popen[str]:
@@ -65,13 +63,14 @@ def test_two_processes_and_a_last_call(
         start("--scenarios", ids, "--root", str(tmp_path / f"part-{k}"), "--workers", "1")
         for k, ids in enumerate(("0-2", "3,4"))
     ]
-    assert [job.communicate()[0] and job.returncode for job in jobs] == [0, 0]
+    jobs.append(start("--root", str(tmp_path / "alone"), "--workers", "1"))
+    assert [job.communicate()[0] and job.returncode for job in jobs] == [0, 0, 0]
     sources = [str(tmp_path / f"part-{k}") for k in range(2)]
     last = start("--gather", sources[0], "--gather", sources[1], "--root", str(tmp_path / "whole"))
     output, _ = last.communicate()
     assert last.returncode == 0
     assert "0 scenarios simulated" in output
-    assert everything(tmp_path / "whole") == everything(generated.root)
+    assert everything(tmp_path / "whole") == everything(tmp_path / "alone")
 
 
 def test_what_no_part_holds_is_simulated(

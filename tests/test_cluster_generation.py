@@ -183,9 +183,9 @@ def test_no_client_is_made_for_what_is_no_address(monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.slow
-def test_mini_on_a_cluster(workers: Any, tmp_path: Path) -> None:
-    """By the command, at mini, one worker killed and one slowed: the hash that datasets.yaml has."""
-    command = [sys.executable, "-m", "lagbench", "generate", "--split", SPLIT, "--size", "mini", "--json"]
+def test_the_command_on_a_cluster(workers: Any, tmp_path: Path) -> None:
+    """By the command, one worker killed and one slowed: the hash that datasets.yaml has."""
+    command = [sys.executable, "-m", "lagbench", "generate", "--split", SPLIT, "--size", SIZE, "--json"]
     options = ["--root", str(tmp_path), "--scheduler", workers.scheduler_address]
     with Sabotage(tmp_path) as sabotage:
         done = subprocess.run([*command, *options], capture_output=True, text=True, check=True)

@@ -16,6 +16,7 @@ from typer.testing import Result
 from lagbench.cli import demo_steps
 from lagbench.cli.machine import SolverBench
 from lagbench.data.registry import Registry, load
+from lagbench.data.yamlfile import read_yaml
 from lagbench.errors import UsageError, WorkFailedError
 from lagbench.floors import floors_of
 
@@ -36,7 +37,7 @@ def run(run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
 @pytest.fixture
 def only_one(run: Run, monkeypatch: pytest.MonkeyPatch, unmeasured_path: Path, tmp_path: Path) -> Registry:
     """A registry of two splits, of which one has a size tiny; the demo's model, quickly trained, is its."""
-    file = yaml.safe_load(unmeasured_path.read_text())
+    file = read_yaml(unmeasured_path)
     small = file["splits"][SPLIT]
     large = {**small, "sizes": {"full": small["sizes"]["full"]}}
     path = tmp_path / "datasets.yaml"

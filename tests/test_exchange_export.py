@@ -258,13 +258,19 @@ def test_a_gns_member_only_rebuilds_arrays(mixed: LocalSplit, tmp_path: Path) ->
     assert _Names.named == {"_reconstruct", "ndarray", "dtype"}
 
 
+@pytest.fixture(scope="module")
+def big(tmp_path_factory: pytest.TempPathFactory) -> LocalSplit:
+    """Ten trajectories of 1.6 MB in train."""
+    folder = tmp_path_factory.mktemp("big")
+    np.save(folder / "runs.npy", np.stack(straight_runs(12, frames=40, particles=5_000)))
+    return adopt(folder / "runs.npy", output=folder / "big", radius=0.02, frame_interval=0.1)
+
+
 @pytest.mark.parametrize(("form", "most"), [("gns-npz", 4.5e6), ("lagrangebench-h5", 1.5e6)])
 def test_memory_is_a_trajectory_or_a_few_frames(
-    mixed: LocalSplit, tmp_path: Path, form: str, most: float
+    mixed: LocalSplit, big: LocalSplit, tmp_path: Path, form: str, most: float
 ) -> None:
-    """Ten trajectories of 1.6 MB take less than three of them, or a few frames, at any time."""
-    np.save(tmp_path / "runs.npy", np.stack(straight_runs(12, frames=40, particles=5_000)))
-    big = adopt(tmp_path / "runs.npy", output=tmp_path / "big", radius=0.02, frame_interval=0.1)
+    """Trajectories take less than three of them, or a few frames, at any time."""
     export(str(mixed.folder), format=form, output=tmp_path / "warm")
     tracemalloc.start()
     export(str(big.folder), format=form, output=tmp_path / "out")

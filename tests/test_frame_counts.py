@@ -1,9 +1,11 @@
 """The frame counts of fluid full follow the rule that datasets.yaml states."""
 
+import random
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scenario_draws import turn
 
 from lagbench.data.registry import Size, load
 from lagbench.generators.batch import Batch, SimulationJob
@@ -29,10 +31,10 @@ def test_counts_sum_to_the_thesis() -> None:
 
 @pytest.mark.slow
 def test_longer_scenarios_are_those_that_still_move() -> None:
-    """More frames never go with a smaller share of kinetic energy left."""
+    """More frames never go with a smaller share of kinetic energy left; a third of train in turn."""
     size = load().size("fluid", "full")
-    ranked = sorted(
-        (i for i in size.subsets["train"] if i not in FIXED), key=lambda i: _share_left(size, i), reverse=True
-    )
+    known = [i for i in size.subsets["train"] if i not in FIXED]
+    judged = random.Random(turn()).sample(known, len(known) // 3)  # other neighbours at every turn
+    ranked = sorted(judged, key=lambda i: _share_left(size, i), reverse=True)
     counts = [size.frame_count(i) for i in ranked]
     assert counts == sorted(counts, reverse=True)

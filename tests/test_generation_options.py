@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from conftest import SIZE, SPLIT
+from conftest import DRAW, SIZE, SPLIT
 
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError, WorkFailedError
-from lagbench.make.cards import PICTURES
+from lagbench.make import cards
 from lagbench.make.generate import generate
 
 
@@ -33,10 +33,13 @@ def test_fewer_than_one_worker_is_refused(workers: int, tmp_path: Path, unmeasur
     assert not (tmp_path / "new").exists()
 
 
-def test_a_registry_of_ones_own_is_all_that_counts(tmp_path: Path, unmeasured: Registry) -> None:
+def test_a_registry_of_ones_own_is_all_that_counts(
+    tmp_path: Path, unmeasured: Registry, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A split that only the given registry knows is generated, drawn and described with its own title."""
+    monkeypatch.setattr(cards, "_draw", DRAW)
     described = unmeasured.split(SPLIT).model_copy(update={"title": "Noise of our own"})
     own = Registry({"own-noise": described}, {})
     result = generate("own-noise", SIZE, scenarios="3", root=tmp_path, workers=1, registry=own)
     assert "# Noise of our own" in (result.folder / "README.md").read_text()
-    assert all((result.folder / name).is_file() for name in PICTURES)
+    assert all((result.folder / name).stat().st_size > 1000 for name in cards.PICTURES)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import os
 import subprocess
 import sys
@@ -71,36 +72,41 @@ def imports(name: str, path: Path) -> Iterator[str]:
         pending += ast.iter_child_nodes(node)
 
 
-GRAPH = {name: set(imports(name, path)) for name, path in modules().items()}
+@functools.cache  # parsed by the test that asks first, not by every process that collects tests
+def graph() -> dict[str, set[str]]:
+    """Return what each module of ours imports."""
+    return {name: set(imports(name, path)) for name, path in modules().items()}
 
 
 def ours(target: str) -> str | None:
     """Return the module of ours that an imported name lives in, if it is one."""
     parts = target.split(".")
     candidates = (".".join(parts[:length]) for length in range(len(parts), 0, -1))
-    return next((name for name in candidates if name in GRAPH), None)
+    return next((name for name in candidates if name in graph()), None)
 
 
-EDGES = {
-    name: {found for target in targets if (found := ours(target)) and found != name}
-    for name, targets in GRAPH.items()
-}
-"""Which module of ours imports which."""
+@functools.cache
+def edges() -> dict[str, set[str]]:
+    """Return which module of ours imports which."""
+    return {
+        name: {found for target in targets if (found := ours(target)) and found != name}
+        for name, targets in graph().items()
+    }
 
 
 def test_the_graph_sees_the_package() -> None:
     """The reader finds modules, relative imports across packages and lazy imports in functions."""
-    assert "lagbench.errors" in EDGES["lagbench.data.registry"]
-    assert "lagbench.data.writer" in EDGES["lagbench.generators.simulate"]
-    assert "lagbench.generators.batch" in EDGES["lagbench.generators.simulate"]
-    assert "lagbench.make.generate" in EDGES["lagbench.cli.data"]
+    assert "lagbench.errors" in edges()["lagbench.data.registry"]
+    assert "lagbench.data.writer" in edges()["lagbench.generators.simulate"]
+    assert "lagbench.generators.batch" in edges()["lagbench.generators.simulate"]
+    assert "lagbench.make.generate" in edges()["lagbench.cli.data"]
 
 
 def test_imports_stay_below() -> None:
     """A module imports from its own layer and those below, and never from what stays apart."""
     floor = {folder: number for number, layer in enumerate(LAYERS) for folder in layer}
     wrong = []
-    for name, targets in EDGES.items():
+    for name, targets in edges().items():
         own = name.split(".")[1:2]
         for target in targets - {"lagbench"}:
             other = target.split(".")[1]
@@ -111,7 +117,7 @@ def test_imports_stay_below() -> None:
 
 def test_no_import_cycle() -> None:
     """Following imports never leads back: modules can be put in a line."""
-    left = {name: set(targets) for name, targets in EDGES.items()}
+    left = {name: set(targets) for name, targets in edges().items()}
     while left:
         free = [name for name, targets in left.items() if not targets & left.keys()]
         assert free, f"a cycle among {sorted(left)}"
@@ -121,7 +127,7 @@ def test_no_import_cycle() -> None:
 
 def test_nobody_imports_the_bare_folders() -> None:
     """The folders are lagbench.generators and lagbench.baselines; the bare names belong to others on PyPI."""
-    for name, targets in GRAPH.items():
+    for name, targets in graph().items():
         bare = [t for t in targets if t.split(".")[0] in {"generators", "baselines", "leaderboard"}]
         assert not bare, name
 

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import gc
 import itertools
 import math
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
 import scipy.stats
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from statsmodels.stats.multitest import multipletests
 
@@ -26,6 +24,7 @@ from lagbench.metrics import (
     sign_flip_p,
     standings,
 )
+from lagbench.metrics.aggregate import quantile
 from lagbench.metrics.significance import mean_loss
 
 DIFFERENCES = st.lists(st.integers(-5, 5).map(float), min_size=1, max_size=9)
@@ -46,7 +45,6 @@ def enumerated(differences: list[float]) -> float:
     return sum(abs(total) >= seen for total in sums) / len(sums)
 
 
-@settings(deadline=None)
 @given(DIFFERENCES)
 def test_p_is_that_of_all_sign_patterns(differences: list[float]) -> None:
     """The sums over two halves count what going through all 2^n patterns counts, ties included."""
@@ -102,6 +100,14 @@ def test_interval_is_scipys_percentile_bootstrap() -> None:
     stretch = math.sqrt(12 / 11) * widening(11)
     expected = [x.mean() + stretch * (bound - x.mean()) for bound in (theirs.low, theirs.high)]
     assert [low, high] == pytest.approx(expected, abs=0.05 * (high - low))
+
+
+@pytest.mark.parametrize("count", [2, 3, 101, 10_000])
+def test_quantiles_are_numpys(count: int) -> None:
+    """To the bit, ends and middle included."""
+    ordered = np.sort(np.random.default_rng(count).normal(size=count))
+    for share in (0.0, 0.025, 0.3, 0.5, 0.975, 1.0):
+        assert quantile(ordered, share) == np.quantile(ordered, share)
 
 
 def test_the_two_way_bootstrap_of_a_closed_case() -> None:
@@ -181,16 +187,6 @@ def test_seeds_of_one_method_seldom_differ() -> None:
     assert told / 400 <= 0.05
 
 
-@pytest.fixture
-def frozen_garbage() -> Iterator[None]:
-    """Nothing that is there is looked at: statsmodels collects garbage at every call, seconds in a suite."""
-    gc.freeze()
-    yield
-    gc.unfreeze()
-
-
-@pytest.mark.usefixtures("frozen_garbage")
-@settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(st.floats(0.0, 1.0), min_size=1, max_size=9))
 def test_holm_is_that_of_statsmodels(p: list[float]) -> None:
     """The corrected p-values are those of statsmodels' step-down method."""

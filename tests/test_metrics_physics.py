@@ -53,6 +53,12 @@ def test_energy_error_has_a_floor() -> None:
     np.testing.assert_allclose(found, [0.5, 0.1])
 
 
+def test_energy_ratio_needs_a_truth_that_moves() -> None:
+    """Energies 0.9 and 1 % of the peak, the peak, then nothing: the second and third frame count."""
+    found = METRICS["energy_ratio"].series(np.array([5.0, 0.03, 9.0, 7.0]), np.array([0.009, 0.01, 1.0, 0.0]))
+    np.testing.assert_allclose(found, [math.nan, 3.0, 9.0, math.nan])
+
+
 def test_energy_of_a_truth_at_rest_is_undefined() -> None:
     """No ratio, retention or error exists where the truth never moves; its frames are counted."""
     x = np.repeat(lattice(10)[None], 5, axis=0)

@@ -61,7 +61,6 @@ def same_bits(one: Tally, two: Tally) -> bool:
     )
 
 
-@settings(deadline=None)
 @given(st.lists(st.integers(0, 6), max_size=4), st.randoms(use_true_random=False))
 def test_chunks_in_any_order_give_the_same_bits(cuts: list[int], random: object) -> None:
     """Frames cut anywhere, measured apart and added in any order, add up to the same bytes."""

@@ -121,6 +121,16 @@ def test_macos_refuses_a_limit_of_the_address_space(monkeypatch: pytest.MonkeyPa
     assert wanted == [process.resource.RLIMIT_CORE, process.resource.RLIMIT_CPU]
 
 
+def test_a_crash_on_windows_is_the_files_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+    """There a process that reads where it may not ends with the code 0xC0000005, not with a signal."""
+    ended = subprocess.CompletedProcess([], 0xC0000005, stdout=b"1\n2", stderr=b"")
+    monkeypatch.setattr(process.subprocess, "run", lambda *_, **__: ended)
+    assert process.in_child("any.function", [0, 0], seconds=1.0, wall=1.0) == (
+        [1],
+        "it ended with exit code 0xc0000005",
+    )
+
+
 def test_where_no_workers_start_jobs_run_here(monkeypatch: pytest.MonkeyPatch) -> None:
     """Scores come all the same; who asks for workers by name is told."""
     monkeypatch.setattr(pool, "AVAILABLE", False)

@@ -14,6 +14,7 @@ import yaml
 from lagbench.data import registry
 from lagbench.data import registry as plugins
 from lagbench.data.registry import Registry, default_path, load
+from lagbench.data.yamlfile import read_yaml
 
 Plug = Callable[..., Registry]
 
@@ -40,7 +41,7 @@ def plugged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Plug]:
 @pytest.fixture
 def theirs(tmp_path: Path) -> str:
     """A datasets.yaml of a split of one's own that also rewrites the cavity and its hash."""
-    data = yaml.safe_load(default_path().read_text())
+    data = read_yaml(default_path())
     splits = {"sloshing": data["splits"]["fluid"], "cavity": data["splits"]["cavity"]}
     splits["cavity"]["title"] = "Hijacked"
     nothing = {"subset_sha256": {}, "scenario_sha256": {}, "statistics": {}, "twin_floor": []}

@@ -10,6 +10,7 @@ import yaml
 
 from lagbench.data.limits import SUBSETS
 from lagbench.data.registry import Size, default_path, load
+from lagbench.data.yamlfile import read_yaml
 from lagbench.errors import UnreadableFileError, UsageError
 
 TIERS = [
@@ -98,7 +99,7 @@ def test_mini_and_tiny_are_small_relatives(split: str) -> None:
 
 def edited(tmp_path: Path, change: object) -> Path:
     """Write a copy of our registry after a function has changed it."""
-    data = yaml.safe_load(default_path().read_text())
+    data = read_yaml(default_path())
     data.pop("measured", None)
     change(data)  # type: ignore[operator]
     path = tmp_path / "datasets.yaml"

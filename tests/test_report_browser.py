@@ -10,11 +10,9 @@ import numpy as np
 import pytest
 from browser import CHROMIUM, Browser, browser
 from PIL import Image
-from report_bench import damped, make_report_bench, noisy
+from report_bench import page_of
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here: apt-get install chromium")
-
-HOSTILE = "<script>console.error(1)</script><img src=http://example.com/x onerror=console.error(2)>"
 
 
 @pytest.fixture(scope="module")
@@ -25,10 +23,9 @@ def running() -> Iterator[Browser]:
 
 
 @pytest.fixture(scope="module", params=["cavity", "multimaterial"])
-def report(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def report(request: pytest.FixtureRequest, home: Path) -> Path:
     """A report on two methods, one of them hostile."""
-    folder = tmp_path_factory.mktemp(request.param)
-    return make_report_bench(folder, request.param).report(folder, {"GNS": damped, HOSTILE: noisy})
+    return page_of(home, request.param)
 
 
 def brightness(png: bytes) -> float:

@@ -78,9 +78,9 @@ def opacity(address: str) -> NDArray[np.float64]:
     return np.where(grey, np.nan, sign * shown[..., 3] / 255.0)[::-1].T
 
 
-def test_maps_show_their_frames(tmp_path: Path) -> None:
+def test_maps_show_their_frames(home: Path, tmp_path: Path) -> None:
     """Each panel of true vorticity holds the field of x(f) - x(f-1) at its frame f, none other."""
-    bench = make_report_bench(tmp_path, "curl-noise")
+    bench = make_report_bench(home, "curl-noise")
     page = bench.report(tmp_path, {"damped": damped}).read_text("utf-8")
     truth = motion(bench.size, bench.size.subsets["test"][0]).astype(np.float32).astype(np.float64)
     grid = Grid(bench.size.task.score_grid.cells)

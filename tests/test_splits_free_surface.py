@@ -39,17 +39,15 @@ def other_value(name: str, value: float) -> float:
     return 1.25 * value if value else 0.1
 
 
-def decided(size: registry.Size) -> list[str]:
-    """Return all that the parameters of a size decide: initial states and solver constants."""
-    states = [digest(draw(size, scenario)) for scenario in size.scenarios]
-    return [*states, repr(importlib.import_module(size.generator).solver_parameters(size))]
-
-
 @pytest.mark.parametrize(("split", "name"), DECLARED)
 def test_every_parameter_decides_bits(split: str, name: str) -> None:
-    """Another value in datasets.yaml gives another state or another solver constant."""
+    """Another value in datasets.yaml gives another solver constant or another initial state."""
     size = registry.load().size(split, "tiny")
-    assert decided(changed(size, **{name: other_value(name, size.value(name))})) != decided(size)
+    other = changed(size, **{name: other_value(name, size.value(name))})
+    constants = importlib.import_module(size.generator).solver_parameters
+    assert repr(constants(other)) != repr(constants(size)) or any(
+        digest(draw(other, i)) != digest(state_of(split, "tiny", i)) for i in size.scenarios
+    )
 
 
 @pytest.mark.parametrize("module", [fluid, multimaterial])

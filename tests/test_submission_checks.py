@@ -19,6 +19,7 @@ from scenario_factory import make_key, write_scenario
 from submission_data import FRAMES, GIVEN, PARTICLES, Bench, make_bench, truth
 
 from lagbench.data.registry import Registry
+from lagbench.data.scenario import ScenarioFile
 from lagbench.data.writer import scenario_path
 from lagbench.errors import ChecksFailedError, DataError, UnreadableFileError
 from lagbench.submission import Severity, ValidationResult, validate
@@ -120,6 +121,20 @@ def test_scanning_the_truth_stops_when_it_knows_enough(bench: Bench) -> None:
     source = Truth(bench.registry.size("cavity", "tiny"), bench.root)
     everything = source.largest_displacement(4, enough=np.inf)
     assert 0 < source.largest_displacement(4, enough=1e-9) <= everything
+
+
+def test_a_sound_file_opens_the_truth_once(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three scenarios whose first frames tell all that the checks ask: three openings."""
+    opened: list[int] = []
+    really = Truth.open
+
+    def counted(self: Truth, scenario: int) -> ScenarioFile:
+        opened.append(scenario)
+        return really(self, scenario)
+
+    monkeypatch.setattr(Truth, "open", counted)
+    result = bench.validate(bench.copy("sound.nc"))
+    assert (result.exit_code, opened) == (0, [3, 4, 5])
 
 
 def test_all_findings_are_reported_together(bench: Bench) -> None:

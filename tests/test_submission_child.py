@@ -10,7 +10,9 @@ from submission_data import Bench, make_bench
 from lagbench.errors import WorkFailedError
 from lagbench.submission import CHECKS, validation
 from lagbench.submission.findings import quoted
-from lagbench.submission.validation import in_child
+from lagbench.work.process import in_child
+
+ROOM = {"seconds": 5.0, "wall": 600.0}
 
 JOBS = """
 import os, signal, sys, time
@@ -26,6 +28,8 @@ def behave(how):
             pass
     elif how == "fill":
         bytearray(1 << 40)
+    elif how == "exit":
+        os._exit(5)
     elif how == "raise":
         raise ValueError("a bug")
     elif how:
@@ -51,7 +55,7 @@ def jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_answers_come_in_the_order_of_requests() -> None:
     """What JSON can hold goes there and back."""
     values = [None, 1.5, {"a": ["é", "\u2028", "line\nbreak"]}, True]
-    assert in_child("jobs.echo", values) == (values, None)
+    assert in_child("jobs.echo", values, **ROOM) == (values, None)
 
 
 @pytest.mark.usefixtures("jobs")
@@ -60,13 +64,14 @@ def test_answers_come_in_the_order_of_requests() -> None:
     [
         ("burn", "no end within the computing time"),
         ("fill", "more than 768 MiB"),
+        ("exit", "exit code 0x5"),
         ("SIGABRT", "crashed: Aborted"),
         ("SIGSEGV", "crashed: Segmentation fault"),
     ],
 )
 def test_what_stops_a_child_leaves_the_answers_before(how: str, said: str) -> None:
     """Two answers, then it ends; the last request is never reached."""
-    values, stopped = in_child("jobs.behave", ["", "", how, ""], seconds=1.0)
+    values, stopped = in_child("jobs.behave", ["", "", how, ""], seconds=1.0, wall=600.0)
     assert values == ["", ""]
     assert said in str(stopped)
 
@@ -74,7 +79,7 @@ def test_what_stops_a_child_leaves_the_answers_before(how: str, said: str) -> No
 @pytest.mark.usefixtures("jobs")
 def test_a_child_that_waits_is_stopped() -> None:
     """By the clock, since it computes nothing; on a busy machine it may not even have begun."""
-    values, stopped = in_child("jobs.behave", ["", "sleep", ""], wall=4.0)
+    values, stopped = in_child("jobs.behave", ["", "sleep", ""], seconds=5.0, wall=4.0)
     assert values in ([], [""])
     assert stopped == "no end after 4 s"
 
@@ -83,13 +88,12 @@ def test_a_child_that_waits_is_stopped() -> None:
 def test_a_fault_of_ours_is_told_as_ours() -> None:
     """A child that raises is exit code 5 and repeats the last line."""
     with pytest.raises(WorkFailedError) as caught:
-        in_child("jobs.behave", ["raise"])
+        in_child("jobs.behave", ["raise"], **ROOM)
     assert "ValueError: a bug" in str(caught.value.got)
 
 
 def test_what_stops_the_child_is_a_finding(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     """The check is `readable`, the exit code 3, and no other check counts as passed."""
-    monkeypatch.setattr(validation, "MEMORY", 1)
     monkeypatch.setattr(validation, "in_child", lambda *_, **__: ([], "a reason"))
     result = bench.validate(bench.valid, isolated=True)
     assert result.errors[0].got == "a reason"

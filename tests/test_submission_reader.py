@@ -142,7 +142,7 @@ def _json(value: object) -> bytes:
 
 
 def test_blocks_cover_a_scenario_in_order_and_in_bounded_memory(tmp_path: Path) -> None:
-    """A scenario of 96 MB in pieces of 4 MiB, read in less than 20 MB."""
+    """A scenario of 96 MB in pieces of 1 MiB, read in less than 20 MB."""
     path = tmp_path / "large.nc"
     frames, particles = 120, 100_000
     with h5py.File(path, "w") as file:

@@ -20,6 +20,7 @@ import lagbench
 from lagbench import torch as lagbench_torch
 from lagbench.baselines.windows import scenario_batch, scenario_paths
 from lagbench.data.registry import Registry, load
+from lagbench.data.yamlfile import read_yaml
 from lagbench.errors import DataError, LagbenchError, UsageError
 from lagbench.make.generate import GenerationResult
 from lagbench.store import frames as frame_store
@@ -48,7 +49,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def registry(tmp_path_factory: pytest.TempPathFactory, unmeasured_path: Path) -> Registry:
     """A registry that describes these scenarios as cavity tiny."""
-    held = yaml.safe_load(unmeasured_path.read_text())
+    held = read_yaml(unmeasured_path)
     tiny = held["splits"]["cavity"]["sizes"]["tiny"]
     tiny["subsets"] = {"train": "0-2", "valid": 3, "test": "4-5"}
     tiny["frames"] = {40: "0", 26: "1,3-5", 31: "2"}

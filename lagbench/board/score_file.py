@@ -3,15 +3,11 @@
 HDF5 lets a file show the bytes of other files as its own (external links, external storage,
 virtual data sets) and unpack a few bytes to gigabytes. Both are refused by looking at the
 headers, before a value is read. HDF5 is also C code that believes what it reads, so strangers'
-files are first read in a child process under limits: this module is the child's program too.
+files are first read in a child process under limits.
 """
 
 from __future__ import annotations
 
-import json
-import os
-import subprocess
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -32,9 +28,9 @@ from lagbench.scoring.scenario import FRAMES, PARTICLES, Preview
 from lagbench.scoring.score_file import FILM_RANGE, StoredScores, read_statistics
 from lagbench.scoring.task import ranking_metric
 from lagbench.submission.task_checks import frames_to_predict
-from lagbench.work.process import limit_process
+from lagbench.work.process import in_child
 
-__all__ = ["MAX_SCORE_BYTES", "Stored", "main", "read_stored", "reported_frames", "unreadable_in_child"]
+__all__ = ["MAX_SCORE_BYTES", "Stored", "read_stored", "reported_frames", "unreadable_in_child"]
 
 MAX_SCORE_BYTES = 1_000_000
 """Longest score file [bytes]."""
@@ -48,11 +44,8 @@ GROUP = "preview"
 STRUCTURE = Structure(members=40, groups=(GROUP,), unpacked=MAX_UNPACKED)
 """What a score file may hold: plain numbers of its own, in one group beside the root."""
 
-MEMORY = 768 << 20
-"""Address space of the child [bytes]."""
-
-CPU_SECONDS = 10
-"""Computing time of the child to start, and for every 50 files [s]."""
+CPU_SECONDS = 10.0
+"""Computing time of the child for every 50 files, its start aside [s]."""
 
 FILES_PER_PART = 50
 
@@ -63,9 +56,6 @@ WALL_SECONDS = 600.0
 """Time for every 50 files together [s]; a busy machine may need minutes."""
 
 UNREAD = "not read, because too many others had to be stopped or took all the time allowed"
-
-CHILD = "lagbench.board.score_file"
-"""The child's program; -P keeps the current folder, where strangers' files may lie, off its path."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -190,55 +180,28 @@ def unreadable_in_child(paths: Sequence[Path]) -> dict[Path, str]:
     """
     found: dict[Path, str] = {}
     left, stops = list(paths), 0
-    end = time.monotonic() + WALL_SECONDS * _parts(paths)
+    parts = 1 + len(paths) // FILES_PER_PART
+    end = time.monotonic() + WALL_SECONDS * parts
     while left:
         if stops == MOST_STOPS or time.monotonic() >= end:
             return found | dict.fromkeys(left, UNREAD)
-        answers, how = _asked(left, end - time.monotonic())
-        found |= {path: str(said) for path, said in zip(left, answers, strict=False) if said is not None}
-        if len(answers) < len(left):
-            found[left[len(answers)]] = f"reading it had to be stopped: {how}"
+        room = end - time.monotonic()
+        said, stopped = in_child(READ, [str(path) for path in left], seconds=CPU_SECONDS * parts, wall=room)
+        found |= {path: why for path, why in zip(left, said, strict=False) if why is not None}
+        if len(said) < len(left):
+            found[left[len(said)]] = f"reading it had to be stopped: {stopped}"
             stops += 1
-        left = left[len(answers) + 1 :]
+        left = left[len(said) + 1 :]
     return found
 
 
-def _parts(paths: Sequence[Path]) -> int:
-    return 1 + len(paths) // FILES_PER_PART
-
-
-def _asked(paths: Sequence[Path], room: float) -> tuple[list[str | None], str]:
-    """Return the child's answers, one line of JSON per file, and how it ended within so many seconds."""
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2"}
+def unreadable(path: str) -> str | None:
+    """Return why a file cannot be read, for a parent; None if it can."""
     try:
-        done = subprocess.run(
-            [sys.executable, "-P", "-m", CHILD, str(MEMORY), str(CPU_SECONDS * _parts(paths))],
-            input=json.dumps([str(path) for path in paths]).encode(),
-            capture_output=True,
-            timeout=room,
-            env=environment,
-            check=False,
-        )
-        output, how = done.stdout, f"exit code {done.returncode}"
-    except subprocess.TimeoutExpired as error:
-        output, how = error.stdout or b"", "no end in time"
-    return [json.loads(line) for line in output.splitlines(keepends=True) if line.endswith(b"\n")], how
+        read_stored(Path(path))
+    except UnreadableFileError as error:
+        return f"{error.what}: {error.got}"
+    return None
 
 
-def main() -> int:
-    """Read the files named on stdin under limits: memory [bytes] and computing time [s], the arguments."""
-    memory, seconds = int(sys.argv[1]), int(sys.argv[2])
-    limit_process(memory=memory, seconds=seconds)
-    for path in json.load(sys.stdin):
-        try:
-            read_stored(Path(path))
-            answer = None
-        except UnreadableFileError as error:
-            answer = f"{error.what}: {error.got}"
-        sys.stdout.write(json.dumps(answer) + "\n")
-        sys.stdout.flush()
-    return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
+READ = f"{__name__}.{unreadable.__name__}"

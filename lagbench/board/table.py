@@ -15,6 +15,7 @@ from lagbench.report.html import MISSING, Markup, interval, join, tag, text
 
 from .columns import Column, columns_of, held, presets_of, value_of, written
 from .entry import Flag
+from .folder import weights_path
 from .model import Floor, Row, Tab
 from .payload import rounded
 
@@ -135,6 +136,8 @@ class _Shades:
         if aside or not math.isfinite(loss) or len(self._known) < 2:
             return
         low, high = self._known[0], self._known[-1]
+        if self._column.key == "skill":  # 0 is nothing learned: no entry looks better for a worse one
+            high = min(high, 0.0)
         if written(value, self._column.form) in self._best:
             yield "best"
         if high > low and len(self._known) >= FEWEST_SHADED:
@@ -188,6 +191,16 @@ def _line(tab: Tab, row: Row | Floor, number: int, cells: Sequence[Markup]) -> M
         tag("a", name, href=address, rel="noopener noreferrer nofollow", target="_blank")
         for name in ("code", "paper", "weights")
         if (address := getattr(entry, name)) and address.startswith(("http://", "https://"))
+    ]
+    kept = [made for made in entry.predictions if made.weights]
+    links += [
+        tag(
+            "a",
+            "weights" if len(kept) == 1 else f"weights {made.seed}",
+            href=weights_path(entry.place, made.seed).as_posix(),
+        )
+        for made in kept
+        if not entry.weights
     ]
     method = tag(
         "th",

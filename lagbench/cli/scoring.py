@@ -154,14 +154,20 @@ def score(
                 validated=validated,
             )
         cards.append(card)
-        if not as_json and not quiet:
-            _scored(card, every=every, floors=floors)
-    if as_json:
-        print_json(cards[0].as_json() if len(cards) == 1 else [card.as_json() for card in cards])
-    if report is not None:
-        from lagbench.report.report import write_report
+    written = None
+    try:
+        if report is not None:  # before a word is printed: a reader such as head may close the pipe
+            from lagbench.report.report import write_report
 
-        say(f"report: {write_report(report, cards, predictions, root=root)}", quiet=quiet or as_json)
+            written = write_report(report, cards, predictions, root=root)
+    finally:
+        if as_json:
+            print_json(cards[0].as_json() if len(cards) == 1 else [card.as_json() for card in cards])
+        elif not quiet:
+            for card in cards:
+                _scored(card, every=every, floors=floors)
+    if written is not None:
+        say(f"report: {written}", quiet=quiet or as_json)
 
 
 def _targets(predictions: Sequence[Path], output: Path | None) -> Sequence[Path | None]:

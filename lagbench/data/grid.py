@@ -189,22 +189,22 @@ def transfer(position: ArrayLike, velocity: ArrayLike, grid: Grid) -> Transfer:
             expected="two arrays of one shape [..., particle, 2]",
             got=f"{x.shape} and {u.shape}",
         )
-    leading = x.shape[:-2]
-    weight = np.empty((*leading, grid.nodes, grid.nodes))
-    momentum = np.empty((*weight.shape, 2))
-    for frame in np.ndindex(leading):  # a frame fits the cache, a batch does not
-        weight[frame], momentum[frame] = _scatter(x[frame], u[frame], grid)
-    return Transfer(weight, momentum)
+    sums = np.empty((*x.shape[:-2], 3, grid.nodes, grid.nodes))
+    for frame in np.ndindex(x.shape[:-2]):  # a frame fits the cache, a batch does not
+        sums[frame] = _scatter(x[frame], u[frame], grid)
+    return Transfer(sums[..., 0, :, :], np.moveaxis(sums[..., 1:, :, :], -3, -1))
 
 
-def _scatter(x: Floats, u: Floats, grid: Grid) -> tuple[Floats, Floats]:
-    """Return ``sum(w)`` and ``sum(w u)`` of one frame."""
-    inside = (x[:, 0] >= 0.0) & (x[:, 0] <= 1.0) & (x[:, 1] >= 0.0) & (x[:, 1] <= 1.0)
-    if not inside.all():
+def _scatter(x: Floats, u: Floats, grid: Grid) -> Floats:
+    """Return ``sum(w)`` and the components of ``sum(w u)`` of one frame, shape [3, x node, y node]."""
+    if not (x.min(initial=0.0) >= 0.0 and x.max(initial=1.0) <= 1.0):  # NaN is not inside either
+        inside = ((x >= 0.0) & (x <= 1.0)).all(axis=1)
         x, u = x[inside], u[inside]
-    s = x.T * grid.cells - grid.origin
+    s = x.T * grid.cells
+    s -= grid.origin
     base = np.floor(s - 0.5)
-    weight_x, weight_y = _spline(s - base)
+    s -= base
+    weight_x, weight_y = _spline(s)
     side = grid.nodes + _LOW + _HIGH
     column, row = base.astype(np.intp) + _LOW
     corner = column * side + row
@@ -212,26 +212,30 @@ def _scatter(x: Floats, u: Floats, grid: Grid) -> tuple[Floats, Floats]:
 
     sums = np.zeros((3, side * side))
     product = np.empty((3, len(corner)))
-    weights, *momenta = product
+    weights, momentum_x, momentum_y = product
     for i in range(3):
         for k in range(3):
             np.multiply(weight_x[i], weight_y[k], out=weights)
-            for momentum, component in zip(momenta, (u_x, u_y), strict=True):
-                np.multiply(weights, component, out=momentum)
+            np.multiply(weights, u_x, out=momentum_x)
+            np.multiply(weights, u_y, out=momentum_y)
             # node numbers stay those of the corner; its sums are shifted to the node instead
             shift = i * side + k
             for total, summand in zip(sums, product, strict=True):
                 total[shift:] += np.bincount(corner, summand, side * side)[: side * side - shift]
-    inner = sums.reshape(3, side, side)[:, _LOW:-_HIGH, _LOW:-_HIGH]
-    return inner[0], np.moveaxis(inner[1:], 0, -1)
+    return sums.reshape(3, side, side)[:, _LOW:-_HIGH, _LOW:-_HIGH]
 
 
 def _spline(s: Floats) -> Floats:
     """Return the weights of the three nodes of each axis, shape [2, node, particle]."""
     weights = np.empty((len(s), 3, s.shape[1]))
-    weights[:, 0] = 0.5 * (1.5 - s) ** 2
-    weights[:, 1] = 0.75 - (s - 1.0) ** 2
-    weights[:, 2] = 0.5 * (s - 0.5) ** 2
+    for node, centre in enumerate((1.5, 1.0, 0.5)):
+        weight = weights[:, node]
+        np.subtract(s, centre, out=weight)
+        np.square(weight, out=weight)
+        if centre == 1.0:
+            np.subtract(0.75, weight, out=weight)
+        else:
+            weight *= 0.5
     return weights
 
 
@@ -257,35 +261,31 @@ def differentiable_nodes(counted: Mask) -> Mask:
     return inner
 
 
-def _along_x(field: Floats, spacing: float) -> Floats:
-    """Return the central difference ``df/dx``, 0 on the rim of the grid where there is none."""
-    slope = np.zeros_like(field)
-    slope[..., 1:-1, :] = (field[..., 2:, :] - field[..., :-2, :]) / (2.0 * spacing)
-    return slope
-
-
-def _along_y(field: Floats, spacing: float) -> Floats:
-    """Return the central difference ``df/dy``, 0 on the rim of the grid where there is none."""
-    slope = np.zeros_like(field)
-    slope[..., :, 1:-1] = (field[..., :, 2:] - field[..., :, :-2]) / (2.0 * spacing)
-    return slope
-
-
 def vorticity(velocity: Floats, spacing: float) -> Floats:
     """Return ``omega = dv/dx - du/dy`` (Eq. 5.19); solid-body rotation Omega gives 2 Omega.
 
+    Central differences, 0 on the rim of the grid where there is none.
+
     Args:
         velocity: node velocity, shape [..., x node, y node, 2].
         spacing: distance h between nodes [length].
     """
-    return _along_x(velocity[..., 1], spacing) - _along_y(velocity[..., 0], spacing)
+    u, v = velocity[..., 0], velocity[..., 1]
+    slope = np.zeros(u.shape)
+    slope[..., 1:-1, :] = (v[..., 2:, :] - v[..., :-2, :]) / (2.0 * spacing)
+    slope[..., 1:-1] -= (u[..., 2:] - u[..., :-2]) / (2.0 * spacing)
+    return slope
 
 
 def divergence(velocity: Floats, spacing: float) -> Floats:
-    """Return ``du/dx + dv/dy``; an incompressible flow gives 0.
+    """Return ``du/dx + dv/dy``; an incompressible flow gives 0. Differences as of the vorticity.
 
     Args:
         velocity: node velocity, shape [..., x node, y node, 2].
         spacing: distance h between nodes [length].
     """
-    return _along_x(velocity[..., 0], spacing) + _along_y(velocity[..., 1], spacing)
+    u, v = velocity[..., 0], velocity[..., 1]
+    slope = np.zeros(u.shape)
+    slope[..., 1:-1, :] = (u[..., 2:, :] - u[..., :-2, :]) / (2.0 * spacing)
+    slope[..., 1:-1] += (v[..., 2:] - v[..., :-2]) / (2.0 * spacing)
+    return slope

@@ -23,6 +23,7 @@ from lagbench.atomic import write_atomically
 from lagbench.data.registry import Size
 from lagbench.errors import DataError
 from lagbench.metrics.aggregate import Score
+from lagbench.metrics.metric import Metric
 from lagbench.metrics.table import available
 
 __all__ = [
@@ -95,11 +96,11 @@ def shipped(size: Size, folder: Path = FOLDER) -> Mapping[str, FloorScores] | No
     held = _held(size, folder)
     if held is None:
         return None
-    frames = range(held["frames"][0], held["frames"][1] + 1)
+    frames, known = range(held["frames"][0], held["frames"][1] + 1), available()
     return {
         name: FloorScores(
             name=name,
-            scores=dict(_scores(said, tuple(held["scenarios"]), frames, held["reported_frames"])),
+            scores=dict(_scores(said, known, tuple(held["scenarios"]), frames, held["reported_frames"])),
             seconds_per_frame=said["seconds_per_frame"],
             correlation=_floats(said["correlation"]),
         )
@@ -124,10 +125,14 @@ def _held(size: Size, folder: Path) -> dict[str, Any] | None:
 
 
 def _scores(
-    said: Mapping[str, Any], scenarios: tuple[int, ...], frames: range, reported: Sequence[int]
+    said: Mapping[str, Any],
+    known: Mapping[str, Metric],
+    scenarios: tuple[int, ...],
+    frames: range,
+    reported: Sequence[int],
 ) -> Iterable[tuple[str, Score]]:
     """Yield the scores of a floor; metrics that are not installed here are left out."""
-    known, none = available(), [0] * len(scenarios)
+    none = [0] * len(scenarios)
     for name, values in said["values"].items():
         if name not in known:
             continue

@@ -31,6 +31,7 @@ __all__ = [
     "bootstrap_interval",
     "mean_over_seeds",
     "measure",
+    "quantile",
     "resample",
     "score",
     "tally",
@@ -169,8 +170,24 @@ class Resampling:
 
         tails = (1.0 - LEVEL) / 2.0, (1.0 + LEVEL) / 2.0
         wider = float(stdtrit(self.freedom, tails[1]) / ndtri(tails[1]))
-        low, high = self.mean + wider * np.quantile(self.deviations, tails)
-        return float(low), float(high)
+        ordered = np.sort(self.deviations)
+        low, high = (self.mean + wider * quantile(ordered, tail) for tail in tails)
+        return low, high
+
+
+def quantile(ordered: Floats, share: float) -> float:
+    """Return a quantile of ascending values, linear between them: the bits of ``np.quantile``.
+
+    NumPy partitions anew and takes several times as long as a sort of ten thousand values.
+
+    Args:
+        ordered: two or more values, shape [value].
+        share: of the values that lie below, from 0 to 1.
+    """
+    place = share * (len(ordered) - 1)
+    below = min(int(place), len(ordered) - 2)
+    part, (low, high) = place - below, ordered[below : below + 2].tolist()
+    return float(low + (high - low) * part if part < 0.5 else high - (high - low) * (1.0 - part))
 
 
 def mean_over_seeds(values: ArrayLike) -> Floats:

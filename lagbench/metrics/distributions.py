@@ -13,7 +13,7 @@ from functools import partial
 
 import numpy as np
 
-from .frame import Floats, FramePair
+from .frame import Floats, FramePair, average
 from .metric import Direction, Metric, at_slow_frames, enough_nodes, metric
 
 __all__ = [
@@ -45,7 +45,7 @@ PSEUDO_COUNT = 0.5
 def normalised(values: Floats) -> Floats:
     """Return ``(|v| + eps) / sum(|v| + eps)`` (Eq. 5.24), shape [node]."""
     magnitude = np.abs(values) + EPSILON
-    return magnitude / np.sum(magnitude)
+    return magnitude / float(magnitude.sum())
 
 
 def kl(p: Floats, q: Floats) -> float:
@@ -54,7 +54,7 @@ def kl(p: Floats, q: Floats) -> float:
     Not symmetric: Q small where P is not costs most. Clipped at 0, below which only
     rounding leads.
     """
-    return max(0.0, float(np.sum(p * np.log(p / q))))
+    return max(0.0, float((p * np.log(p / q)).sum()))
 
 
 def histograms(truth: Floats, prediction: Floats) -> tuple[Floats, Floats] | None:
@@ -63,12 +63,12 @@ def histograms(truth: Floats, prediction: Floats) -> tuple[Floats, Floats] | Non
     The first and last bin are open: what the truth never reaches counts there, so that the
     divergence saturates on wild predictions; :func:`wasserstein1` does not.
     """
-    low, high = np.min(truth), np.max(truth)
+    low, high = truth.min(), truth.max()
     if not low < low + (high - low) / BINS < high:
         return None
 
     def shares(values: Floats) -> Floats:
-        place = (np.clip(values, low, high) - low) / (high - low)
+        place = (np.minimum(np.maximum(values, low), high) - low) / (high - low)
         count = np.bincount(np.minimum((place * BINS).astype(np.intp), BINS - 1), minlength=BINS)
         return np.asarray((count + PSEUDO_COUNT) / (len(values) + BINS * PSEUDO_COUNT), np.float64)
 
@@ -80,7 +80,7 @@ def wasserstein1(x: Floats, y: Floats) -> float:
 
     Equal to ``scipy.stats.wasserstein_distance``; monotone where a divergence saturates.
     """
-    return float(np.mean(np.abs(np.sort(x) - np.sort(y))))
+    return average(np.abs(np.sort(x) - np.sort(y)))
 
 
 def _histogram_kl(truth: Floats, prediction: Floats) -> float:

@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lagbench.data.grid import Fields, Grid, Placement, fields
+from lagbench.data.grid import Fields, Grid, Placement, fields, vorticity
 from lagbench.data.scenario import MATERIALS
 from lagbench.errors import ChecksFailedError, UsageError
 
@@ -31,7 +31,9 @@ __all__ = [
     "Scenario",
     "Setting",
     "Snapshot",
+    "average",
     "dot",
+    "lengths",
     "mean_square",
     "snapshots",
     "sorted_projections",
@@ -55,9 +57,19 @@ PERCENTILES = (5, 25, 50, 75, 95)
 """Percentiles of the vorticity residual that are reported."""
 
 
+def average(values: Floats) -> float:
+    """Return the mean of all values: the bits of ``np.mean``, which takes twice as long on few values."""
+    return float(np.add.reduce(values, axis=None)) / values.size
+
+
 def dot(a: Floats, b: Floats) -> float:
     """Return the sum of products; unlike BLAS's its bits do not depend on the number of threads."""
     return float(np.einsum("i,i->", a, b))
+
+
+def lengths(vectors: Floats) -> Floats:
+    """Return the Euclidean length of vectors, shape [particle]."""
+    return np.asarray(np.sqrt(vectors[:, 0] ** 2 + vectors[:, 1] ** 2), np.float64)
 
 
 def mean_square(vectors: Floats) -> Floats:
@@ -167,6 +179,16 @@ class Snapshot:
         return sum(dot(u, u) for u in self.velocity.T)
 
     @cached_property
+    def speeds(self) -> Floats:
+        """``|u|`` of each particle [length/frame], shape [particle]."""
+        return lengths(self.velocity)
+
+    @cached_property
+    def arms(self) -> Floats:
+        """Positions relative to the centre of the box [length], shape [particle, 2]."""
+        return np.asarray(self.position - np.array(self.scenario.setting.centre), np.float64)
+
+    @cached_property
     def fields(self) -> Fields:
         """Grid fields of these particles [per frame]."""
         return fields(self.position, self.velocity, self.scenario.setting.grid, full=self.scenario.full)
@@ -264,8 +286,9 @@ def snapshots(
     """
     before = scenario.given[-1] if previous is None else previous
     for position in positions:
-        yield scenario.snapshot(position, before)
-        before = position
+        made = scenario.snapshot(position, before)
+        yield made
+        before = made.position
 
 
 @dataclass(frozen=True)
@@ -305,9 +328,13 @@ class FramePair:
     @cached_property
     def outside(self) -> float:
         """Share of predicted particles that are past a wall [1]."""
-        x, (low, high) = self.prediction.position, np.transpose(self.scenario.setting.bounds)
-        past = (x < low - WALL_TOLERANCE) | (x > high + WALL_TOLERANCE)
-        return float(np.mean(past[:, 0] | past[:, 1]))
+        sides = zip(self.prediction.position.T, self.scenario.setting.bounds, strict=True)
+        past = [
+            (x < low - WALL_TOLERANCE) | (x > high + WALL_TOLERANCE)
+            for x, (low, high) in sides
+            if not (x.min() >= low - WALL_TOLERANCE and x.max() <= high + WALL_TOLERANCE)  # NaN too
+        ]
+        return np.count_nonzero(np.logical_or.reduce(past)) / len(self.prediction.position) if past else 0.0
 
     @property
     def nodes(self) -> NDArray[np.bool_]:
@@ -322,12 +349,12 @@ class FramePair:
     @cached_property
     def true_vorticity(self) -> Floats:
         """Omega of the truth at the compared nodes [1/frame], shape [node]."""
-        return self.truth.fields.vorticity[self.nodes]
+        return vorticity(self.truth.fields.velocity, self.scenario.setting.grid.spacing)[self.nodes]
 
     @cached_property
     def predicted_vorticity(self) -> Floats:
         """Omega of the prediction at the compared nodes [1/frame], shape [node]."""
-        return self.predicted_fields.vorticity[self.nodes]
+        return vorticity(self.prediction.fields.velocity, self.scenario.setting.grid.spacing)[self.nodes]
 
     @cached_property
     def vorticity_residual(self) -> Floats:

@@ -16,7 +16,7 @@ import numpy as np
 
 from lagbench.data.scenario import MATERIALS
 
-from .frame import Floats, FramePair
+from .frame import Floats, FramePair, average
 from .metric import Direction, FirstFrames, Metric, last, mean, metric, root_mean_square
 
 __all__ = ["HORIZONS", "METRICS", "attribute_mse", "mean_absolute_error", "mean_squared_error"]
@@ -29,12 +29,12 @@ SQUARED = {"length": "length^2", "length/frame": "length^2/frame^2"}
 
 def mean_squared_error(error: Floats) -> float:
     """Return ``MSE = mean((y - yhat)^2)`` over particles and components (Eq. 3.3)."""
-    return float(np.mean(error**2))
+    return average(error**2)
 
 
 def mean_absolute_error(error: Floats) -> float:
     """Return ``MAE = mean(|y - yhat|)`` over particles and components (Eq. 3.4)."""
-    return float(np.mean(np.abs(error)))
+    return average(np.abs(error))
 
 
 @metric(unit="1", direction=Direction.LOWER, source="Eqs. 4.15, 4.16")
@@ -45,7 +45,7 @@ def attribute_mse(pair: FramePair) -> float:
     in the difference. 0 is perfect; 1 is the error of always predicting the mean of train.
     """
     std = np.array(pair.scenario.setting.attribute_std)
-    return float(np.mean(np.concatenate([pair.position_square, pair.velocity_square]) / std**2))
+    return average(np.concatenate([pair.position_square, pair.velocity_square]) / std**2)
 
 
 def position_error(pair: FramePair) -> Floats:

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.grid import counted_nodes
-from lagbench.metrics.frame import FramePair, Scenario, dot, mean_square
+from lagbench.metrics.frame import FramePair, Scenario, average, dot, mean_square
 from lagbench.metrics.metric import mean
 
 __all__ = [
@@ -86,7 +86,7 @@ class Tracer:
         i = pair.frame - self._first
         true, predicted, error = pair.truth.position, pair.prediction.position, pair.position_error
         series = self._series
-        series["error"][i] = np.mean(pair.position_square)
+        series["error"][i] = average(pair.position_square)
         if self._error is not None:
             series["overlap"][i] = sum(map(dot, error.T, self._error.T)) / error.size
         series["motion"][i] = pair.truth.speed_square / error.size
@@ -94,9 +94,9 @@ class Tracer:
         series["occupancy"][i] = _occupancy(pair)
         series["outside"][i] = pair.outside
         for back, earlier in enumerate(reversed(self._true), start=1):
-            self._shifted[-back][i] = np.mean(mean_square(predicted - earlier))
+            self._shifted[-back][i] = average(mean_square(predicted - earlier))
         for back, earlier in enumerate(reversed(self._predicted), start=1):
-            self._shifted[back][i - back] = np.mean(mean_square(earlier - true))
+            self._shifted[back][i - back] = average(mean_square(earlier - true))
         self._true.append(true)
         self._predicted.append(predicted)
         self._error = error

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -11,7 +13,7 @@ from lagbench.data.registry import Size
 
 from .findings import Findings
 from .predictions import Predictions
-from .start import JUMP
+from .start import JUMP, Start
 from .truth import Truth, squared_steps
 
 __all__ = [
@@ -46,11 +48,16 @@ class Survey:
     farthest: float = 0.0  # largest distance outside the box along an axis [length]
     first_outside: tuple[int, int] | None = None  # frame and particle
     lost: tuple[int, int] | None = None  # frame and particle of the first beyond MAX_DISTANCE
-    jump: float = 0.0  # largest distance of a particle between consecutive frames [length]
-    jump_at: tuple[int, int] | None = None  # frame and particle
+    jump_at: tuple[int, int] | None = None  # frame and particle of the largest jump
     settled: int = 0  # frame that is repeated from there to the end
     _first: tuple[int, NDArray[np.float32]] | None = field(default=None, repr=False)
     _last: NDArray[np.float32] | None = field(default=None, repr=False)
+    _jump_square: float = field(default=0.0, repr=False)
+
+    @property
+    def jump(self) -> float:
+        """Largest distance of a particle between consecutive frames [length]."""
+        return math.sqrt(self._jump_square)
 
     def add(self, first: int, block: NDArray[np.float32], size: Size) -> None:
         """Take in consecutive frames [length], shape [frame, particle, space], the first one by number."""
@@ -67,7 +74,7 @@ class Survey:
             self._add_steps(first, np.concatenate([self._last, block]))
         self._last = block[-1:].copy()
 
-    def follow(self, given: NDArray[np.float32]) -> None:
+    def follow(self, given: NDArray[np.floating]) -> None:
         """Take in the step from the last given frame to the first predicted one."""
         if self._first:
             frame, first = self._first
@@ -106,15 +113,15 @@ class Survey:
             self.settled = first + int(moved[-1])
         self._add_jumps(first, joined)
 
-    def _add_jumps(self, first: int, joined: NDArray[np.float32]) -> None:
+    def _add_jumps(self, first: int, joined: NDArray[np.floating]) -> None:
         """Take in the steps between consecutive frames, of which the first leads to ``first``."""
-        squares = squared_steps(joined)
-        if squares.size and np.isnan(squares.max()):
-            squares = np.nan_to_num(squares)
-        if squares.size and squares.max() > self.jump**2:
-            frame, particle = np.unravel_index(int(squares.argmax()), squares.shape)
-            self.jump = float(np.sqrt(squares.max()))
-            self.jump_at = (first + int(frame), int(particle))
+        for frame in range(len(joined) - 1):  # a frame fits the cache, a block does not
+            (squares,) = squared_steps(joined[frame : frame + 2])
+            if np.isnan(squares.max()):
+                squares = np.nan_to_num(squares)
+            if squares.max() > self._jump_square:
+                self._jump_square = float(squares.max())
+                self.jump_at = (first + frame, int(squares.argmax()))
 
 
 def survey(predictions: Predictions, size: Size) -> tuple[list[Survey], str | None]:
@@ -199,11 +206,12 @@ def check_domain(surveys: list[Survey], size: Size, out: Findings) -> None:
     )
 
 
-def check_jumps(surveys: list[Survey], truth: Truth, out: Findings) -> None:
+def check_jumps(surveys: list[Survey], starts: Mapping[int, Start], truth: Truth, out: Findings) -> None:
     """Flag particles that jump much farther in a frame than any particle of the truth."""
     for one in surveys:
-        one.follow(truth.given(one.scenario)[-1])
-        limit = JUMP * truth.largest_displacement(one.scenario, enough=one.jump / JUMP)
+        start = starts[one.scenario]
+        one.follow(start.given)
+        limit = JUMP * start.largest_step(truth, one.scenario, enough=one.jump / JUMP)
         if one.jump_at and one.jump > limit:
             frame, particle = one.jump_at
             out.warning(

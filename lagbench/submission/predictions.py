@@ -34,7 +34,7 @@ from .format import (
 
 __all__ = ["Predictions", "attach", "open_predictions"]
 
-BLOCK_BYTES = 4 << 20
+BLOCK_BYTES = 1 << 20
 """Blocks have about this size [bytes]."""
 
 
@@ -87,7 +87,7 @@ class Predictions:
         return self._rows(self._row[scenario], first, count)
 
     def blocks(self, scenario: int) -> Iterator[tuple[int, NDArray[np.float32]]]:
-        """Yield a scenario in pieces of about 4 MiB: absolute first frame, positions.
+        """Yield a scenario in pieces of about 1 MiB: absolute first frame, positions.
 
         Raises:
             UsageError: the file has no such scenario.

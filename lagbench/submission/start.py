@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -17,9 +18,9 @@ from numpy.typing import NDArray
 
 from .findings import Findings
 from .predictions import Predictions
-from .truth import Truth
+from .truth import Truth, squared_steps
 
-__all__ = ["JUMP", "Mistake", "Start", "check_start", "mistake", "shift"]
+__all__ = ["JUMP", "Mistake", "Start", "check_start", "mistake", "read_starts", "shift"]
 
 JUMP = 10.0
 """A step is suspect beyond this many of the truth's largest per-frame displacement."""
@@ -53,6 +54,18 @@ class Start:
     horizon: int = 0  # frames to predict
     later: Positions | None = None  # the truth of the second predicted frame, where there is one
 
+    @cached_property
+    def true_step(self) -> float:
+        """Largest distance that a particle of the truth moves between these frames [length]."""
+        frames = [frame for frame in (self.given, self.true, self.later) if frame is not None]
+        return float(np.sqrt(np.max(squared_steps(np.stack(frames)))))
+
+    def largest_step(self, truth: Truth, scenario: int, *, enough: float) -> float:
+        """Return the largest such distance in the scenario, or one that is enough in these frames."""
+        if self.true_step >= enough:
+            return self.true_step
+        return truth.largest_displacement(scenario, enough=enough)
+
 
 class Mistake(NamedTuple):
     """What was mistaken, and how to mend it."""
@@ -62,28 +75,34 @@ class Mistake(NamedTuple):
     everywhere: bool = True  # whether a file that has it has it in most scenarios
 
 
-def check_start(predictions: Predictions, truth: Truth, out: Findings) -> None:
-    """Refuse mistakes that are recognised, and flag predictions that do not follow what was given."""
-    header = predictions.header
-    known = sorted(set(header.scenarios) & set(truth.size.subsets["test"]))
-    starts = {scenario: _start(predictions, truth, scenario) for scenario in known}
+def read_starts(predictions: Predictions, truth: Truth) -> dict[int, Start]:
+    """Return how each known scenario begins, by ascending id."""
+    known = sorted(set(predictions.header.scenarios) & set(truth.size.subsets["test"]))
+    return {scenario: _start(predictions, truth, scenario) for scenario in known}
+
+
+def check_start(starts: Mapping[int, Start], first: int, truth: Truth, out: Findings) -> None:
+    """Refuse mistakes that are recognised, and flag predictions that do not follow what was given.
+
+    ``first`` is the number of the first predicted frame.
+    """
     said = {i: mistake(start, truth.size.bounds, _without(starts, i)) for i, start in starts.items()}
     counts = Counter(found for found in said.values() if found is not None)
     for scenario, start in starts.items():
         found = said[scenario]
         # A bad model may look so in one scenario by chance; what writes a file makes the mistake in all.
         if found is None or (found.everywhere and 2 * counts[found] < len(starts)):
-            _check_continuity(scenario, start, truth, header.frames[0], out)
+            _check_continuity(scenario, start, truth, first, out)
             continue
         out.error(
             "start",
             found.what,
-            where=f"scenario {scenario}, frame {header.frames[0]}",
+            where=f"scenario {scenario}, frame {first}",
             expected="positions that follow the last given frame, particle by particle",
             got=f"root mean square distance to it {_rms(start.first - start.given):.3g}",
             fix=found.fix,
         )
-    _check_shift(starts, header.frames[0], out)
+    _check_shift(starts, first, out)
     out.made("start", "discontinuous_start")
 
 
@@ -102,7 +121,7 @@ def _start(predictions: Predictions, truth: Truth, scenario: int) -> Start:
 def _check_continuity(scenario: int, start: Start, truth: Truth, frame: int, out: Findings) -> None:
     with np.errstate(all="ignore"):
         distance = _rms(start.first - start.given)
-    limit = JUMP * truth.largest_displacement(scenario, enough=distance / JUMP)
+    limit = JUMP * start.largest_step(truth, scenario, enough=distance / JUMP)
     if np.isfinite(distance) and distance > limit:
         out.warning(
             "discontinuous_start",

@@ -167,7 +167,7 @@ class Truth:
         return measured.scenario_sha256.get(scenario, "") if measured else ""
 
 
-def squared_steps(frames: NDArray[np.float32]) -> NDArray[np.float64]:
+def squared_steps(frames: NDArray[np.floating]) -> NDArray[np.float64]:
     """Return the squared distances of particles between frames [length^2], shape [frame - 1, particle]."""
     steps = np.diff(frames.astype(np.float64), axis=0)
     steps *= steps

@@ -2,25 +2,16 @@
 
 HDF5 is C code that parses whatever it is given: of 8000 files with one to eight bytes changed at
 random four made HDF5 2.0 loop. What loops, crashes or asks for too much ends a child process; the
-parent says so and goes on. :func:`in_child` runs any function so; requests and answers are JSON,
-so nothing that a child sends is executed.
+parent says so and goes on.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import importlib
-import json
-import math
-import os
-import signal
-import subprocess
-import sys
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import h5py
 
@@ -28,8 +19,8 @@ from lagbench.data.hdf5 import check_file, opened
 from lagbench.data.layout import resolve_root
 from lagbench.data.local import RootedRegistry, rooted
 from lagbench.data.registry import Registry, Size
-from lagbench.errors import DataError, UnreadableFileError, UsageError, WorkFailedError, nearest
-from lagbench.work.process import TOO_LONG, limit_process
+from lagbench.errors import DataError, UnreadableFileError, UsageError, nearest
+from lagbench.work.process import in_child
 
 from .checks import check_domain, check_finite, check_frozen, check_jumps, survey
 from .findings import CHECKS, Finding, Findings, Severity, ValidationResult
@@ -44,14 +35,11 @@ from .format import (
     refuse_other_kinds,
 )
 from .predictions import attach
-from .start import check_start
+from .start import check_start, read_starts
 from .task_checks import check_dataset, check_frames, check_particles, check_scenarios, check_split
 from .truth import Truth
 
-__all__ = ["CPU_SECONDS", "MEMORY", "WALL_SECONDS", "Answers", "in_child", "seconds_for", "serve", "validate"]
-
-MEMORY = 768 << 20
-"""Address space of a child [bytes]."""
+__all__ = ["CPU_SECONDS", "WALL_SECONDS", "seconds_for", "validate"]
 
 CPU_SECONDS = 5.0
 """Computing time for a small file, the start of the child aside [s]; a sound one takes 2 on a busy core."""
@@ -66,85 +54,9 @@ busy with other work a sound file may take minutes.
 BYTES_PER_SECOND = 20e6
 """Larger files get more time: a slow reader's speed [bytes/s]."""
 
-OUT_OF_MEMORY = 77
-"""Exit code of a child that needed more than it may."""
-
-CHILD = "from lagbench.submission.validation import serve; serve()"
-"""The child's program; -P keeps the current folder, where strangers' files may lie, off its path."""
-
 TRUE = ("start", "discontinuous_start", "max_displacement")
 VALUES = ("finite", "in_domain", *TRUE)
 TASK = ("dataset", "scenarios", "frames", "particles")
-
-
-# --- a child process -----------------------------------------------------------------------
-
-
-class Answers(NamedTuple):
-    """What a child answered, in the order of the requests, and what stopped it, if anything did."""
-
-    values: list[Any]
-    stopped: str | None
-
-
-def in_child(
-    function: str,
-    requests: Sequence[object],
-    *,
-    memory: int = MEMORY,
-    seconds: float = CPU_SECONDS,
-    wall: float = WALL_SECONDS,
-) -> Answers:
-    """Call a function once per request in a child process with limits."""
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2"}
-    try:
-        done = subprocess.run(
-            [sys.executable, "-P", "-c", CHILD, function, str(memory), str(int(seconds))],
-            input=json.dumps(list(requests)).encode(),
-            capture_output=True,
-            timeout=wall,
-            env=environment,
-            check=False,
-        )
-    except subprocess.TimeoutExpired as error:
-        return Answers(_lines(error.stdout), f"no end after {wall:.0f} s")
-    if done.returncode == 0:
-        return Answers(_lines(done.stdout), None)
-    if done.returncode == OUT_OF_MEMORY:
-        return Answers(_lines(done.stdout), f"more than {memory >> 20} MiB of memory")
-    if done.returncode == TOO_LONG:
-        return Answers(_lines(done.stdout), "no end within the computing time allowed")
-    if done.returncode < 0:
-        name = signal.strsignal(-done.returncode) or str(-done.returncode)
-        return Answers(_lines(done.stdout), f"HDF5 crashed: {name}")
-    raise WorkFailedError(
-        "a child process itself failed",
-        where=function,
-        got=ascii(done.stderr.decode("utf-8", "replace").strip().rsplit("\n", 1)[-1][:300]),
-        fix="`lagbench doctor` checks the installation; if it finds nothing, report this with the file",
-    )
-
-
-def _lines(output: bytes | None) -> list[Any]:
-    return [json.loads(line) for line in (output or b"").splitlines(keepends=True) if line.endswith(b"\n")]
-
-
-def serve() -> None:
-    """Answer the requests of stdin, one line each, under the limits that the arguments name.
-
-    What the imports took is not counted: on a busy machine they may take seconds.
-    """
-    dotted, memory, allowed = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
-    module, _, name = dotted.rpartition(".")
-    function: Callable[[Any], object] = getattr(importlib.import_module(module), name)
-    seconds = allowed + math.ceil(time.process_time())
-    limit_process(memory=memory, seconds=seconds)
-    try:
-        for request in json.load(sys.stdin):
-            sys.stdout.write(json.dumps(function(request)) + "\n")
-            sys.stdout.flush()
-    except MemoryError:
-        raise SystemExit(OUT_OF_MEMORY) from None
 
 
 def seconds_for(path: Path) -> float:
@@ -155,9 +67,6 @@ def seconds_for(path: Path) -> float:
     status = path.stat()
     blocks: int | None = getattr(status, "st_blocks", None)
     return (status.st_size if blocks is None else min(status.st_size, 512 * blocks)) / BYTES_PER_SECOND
-
-
-# --- the validation ------------------------------------------------------------------------
 
 
 def validate(
@@ -352,8 +261,9 @@ def _check_values(
             out.skip(f"{error.what} in {truth.root}: {error.fix}", *TRUE)
             return content
         try:
-            check_start(predictions, truth, out)
-            check_jumps(surveys, truth, out)
+            starts = read_starts(predictions, truth)
+            check_start(starts, predictions.header.frames[0], truth, out)
+            check_jumps(surveys, starts, truth, out)
         except DataError as error:
             out.raised("dataset", error)
             out.skip(f"{error.what}: {error.where}", *TRUE)

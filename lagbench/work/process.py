@@ -1,4 +1,8 @@
-"""What this process may use: processors, and limits that it sets itself.
+"""What a process may use: processors, limits that it sets itself, and children that work under them.
+
+A library in C that parses what strangers send may loop, crash or ask for too much: :func:`in_child`
+calls any function in a child with limits. Requests and answers are JSON, so nothing that a child
+sends is executed.
 
 Windows has no limits (no module ``resource``: then ``LIMITS`` is false), macOS refuses one on the
 address space. Nothing stands in for a limit that is not to be had.
@@ -6,9 +10,18 @@ address space. Nothing stands in for a limit that is not to be had.
 
 from __future__ import annotations
 
+import importlib
+import json
+import math
 import os
 import signal
+import subprocess
 import sys
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+from lagbench.errors import WorkFailedError
 
 try:
     import resource
@@ -17,11 +30,19 @@ except ImportError:
 else:
     LIMITS = True
 
-__all__ = ["LIMITS", "TOO_LONG", "available_cores", "limit_process"]
-
+__all__ = ["LIMITS", "MEMORY", "Answers", "available_cores", "in_child", "limit_process", "serve"]
 
 TOO_LONG = -int(getattr(signal, "SIGXCPU", 0)) or None
 """Return code of a process that computed longer than it may; None where there is no such limit."""
+
+OUT_OF_MEMORY = 77
+"""Exit code of a child that needed more than it may."""
+
+MEMORY = 768 << 20
+"""Address space of a child [bytes]."""
+
+CHILD = "from lagbench.work.process import serve; serve()"
+"""The child's program; -P keeps the current folder, where strangers' files may lie, off its path."""
 
 
 def available_cores() -> int:
@@ -44,3 +65,78 @@ def limit_process(*, memory: int, seconds: int) -> None:
     resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds + 1))
     if sys.platform != "darwin":
         resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
+
+
+class Answers(NamedTuple):
+    """What a child answered, in the order of the requests, and what stopped it, if anything did."""
+
+    values: list[Any]
+    stopped: str | None
+
+
+def in_child(
+    function: str, requests: Sequence[object], *, seconds: float, wall: float, memory: int = MEMORY
+) -> Answers:
+    """Call a function once per request in a child process with limits.
+
+    Args:
+        function: its dotted name; it takes a request and returns an answer.
+        requests: what JSON can hold.
+        seconds: processor time for all requests, the start aside [s].
+        wall: time of the clock, the start included [s].
+        memory: address space [bytes].
+
+    Raises:
+        WorkFailedError: an exception in the child, as where the function cannot be imported.
+    """
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2"}
+    try:
+        done = subprocess.run(
+            [sys.executable, "-P", "-c", CHILD, function, str(memory), str(int(seconds))],
+            input=json.dumps(list(requests)).encode(),
+            capture_output=True,
+            timeout=wall,
+            env=environment,
+            check=False,
+        )
+    except subprocess.TimeoutExpired as error:
+        return Answers(_lines(error.stdout), f"no end after {wall:.0f} s")
+    if done.returncode == 0:
+        return Answers(_lines(done.stdout), None)
+    if done.returncode == OUT_OF_MEMORY:
+        return Answers(_lines(done.stdout), f"more than {memory >> 20} MiB of memory")
+    if done.returncode == TOO_LONG:
+        return Answers(_lines(done.stdout), "no end within the computing time allowed")
+    if done.returncode < 0:
+        name = signal.strsignal(-done.returncode) or str(-done.returncode)
+        return Answers(_lines(done.stdout), f"it crashed: {name}")
+    if b"Traceback" not in done.stderr:  # ended by a library: exit(), or a crash on Windows
+        return Answers(_lines(done.stdout), f"it ended with exit code {done.returncode:#x}")
+    raise WorkFailedError(
+        "a child process itself failed",
+        where=function,
+        got=ascii(done.stderr.decode("utf-8", "replace").strip().rsplit("\n", 1)[-1][:300]),
+        fix="`lagbench doctor` checks the installation; if it finds nothing, report this with the file",
+    )
+
+
+def _lines(output: bytes | None) -> list[Any]:
+    return [json.loads(line) for line in (output or b"").splitlines(keepends=True) if line.endswith(b"\n")]
+
+
+def serve() -> None:
+    """Answer the requests of stdin, one line each, under the limits that the arguments name.
+
+    What the imports took is not counted: on a busy machine they may take seconds.
+    """
+    dotted, memory, allowed = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
+    module, _, name = dotted.rpartition(".")
+    function: Callable[[Any], object] = getattr(importlib.import_module(module), name)
+    seconds = allowed + math.ceil(time.process_time())
+    limit_process(memory=memory, seconds=seconds)
+    try:
+        for request in json.load(sys.stdin):
+            sys.stdout.write(json.dumps(function(request)) + "\n")
+            sys.stdout.flush()
+    except MemoryError:
+        raise SystemExit(OUT_OF_MEMORY) from None
