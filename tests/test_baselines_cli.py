@@ -6,9 +6,11 @@ import importlib.util
 import json
 import os
 import pickle
+import socket
 import subprocess
 import sys
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -195,26 +197,49 @@ def test_two_processes_tell_an_error_once(lagbench: Command) -> None:
     assert ended.stderr.count("the loss is not finite") == 1
 
 
-SHARED = ("model.widths=[8]", "training.steps=2", "training.validate_every=0")
+SHARED = ("model.widths=[8]", "model.noise_std=0", "training.steps=8", "training.validate_every=0")
 """A training that takes no time."""
 
 
-def test_two_processes_make_the_step_of_one(lagbench: Command, tmp_path: Path) -> None:
+def launched(*words: str) -> list[subprocess.CompletedProcess[str]]:
+    """Return what two torchrun agents, of one process each, made of a command."""
+    with socket.socket() as held:  # a port that nobody listens on
+        held.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{held.getsockname()[1]}"
+    agent = ["-m", "torch.distributed.run", "--nnodes", "2", "--nproc-per-node", "1", "--rdzv-id", "lagbench"]
+    agent += ["--rdzv-backend", "c10d", "--rdzv-endpoint", address, "-m", "lagbench", *words]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    with ThreadPoolExecutor() as both:
+        pair = [
+            both.submit(
+                subprocess.run, [sys.executable, *agent], env=environment, capture_output=True, text=True
+            )
+            for _ in range(2)
+        ]
+    return [one.result() for one in pair]
+
+
+@pytest.mark.parametrize("nodes", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_two_processes_make_the_weights_of_one(lagbench: Command, tmp_path: Path, nodes: int) -> None:
     """Three windows on each of two gloo processes give the weights of six on one, at twice the rate.
 
-    The gradient is the mean over processes (thesis section 5.7.3).
+    The gradient is the mean over processes (thesis section 5.7.3). They are started by the command on one
+    node, by torchrun on two.
     """
 
     def options(folder: str, batch: int, rate: float) -> tuple[str, ...]:
-        keys = (*SHARED, f"training.batch={batch}", f"training.learning_rate={rate}")
-        settings = [word for key in keys for word in ("--set", key)]
+        keys = (*SHARED, "training.schedule=constant", f"training.batch={batch}")
+        settings = [word for key in (*keys, f"training.learning_rate={rate}") for word in ("--set", key)]
         return "train", "--baseline", "mlp", *TINY, "-o", folder, *settings
 
-    shared = command(*options("shared", 3, 1e-3), "--processes", "2")
-    assert shared.returncode == 0, shared.stderr
-    assert shared.stdout.count("finished, step 2 of 2") == 1
+    together = options("shared", 3, 1e-3)
+    shared = launched(*together) if nodes == 2 else [command(*together, "--processes", "2")]
+    assert [one.returncode for one in shared] == [0] * nodes, [one.stderr for one in shared]
+    assert "".join(one.stdout for one in shared).count("finished, step 8 of 8") == 1
+    assert json.loads((tmp_path / "shared" / "training.json").read_text())["processes"] == 2
     assert lagbench(*options("alone", 6, 2e-3)).exit_code == 0
     one, other = (load(tmp_path / name / "checkpoint.pt").weights for name in ("shared", "alone"))
     assert one.keys() == other.keys()
     for name, value in one.items():
-        assert torch.allclose(value, other[name], rtol=0, atol=1e-6), name
+        # Adam's step where a gradient is nearly nothing follows its rounding: compare norms, not numbers.
+        assert (value - other[name]).norm() <= 1e-4 * value.norm(), name
