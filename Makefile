@@ -1,12 +1,12 @@
 # make demo   from nothing to four verified data sets, a trained model, its scores, a leaderboard page
-# make test   install and run the tests
+# make test   install and run the tests; make test-all: those that are slow too
 PYTHON ?= python3
 VENV ?= .venv
 JOBS ?= 2
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: demo test test-slow lint types bench clean
+.PHONY: demo test test-all lint types bench clean
 
 demo: $(VENV)/.demo
 	$(BIN)/lagbench demo --root demo
@@ -14,8 +14,8 @@ demo: $(VENV)/.demo
 test: $(VENV)/.dev
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n $(JOBS) --dist worksteal -m "not slow"
 
-test-slow: $(VENV)/.dev
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n $(JOBS) --dist worksteal -m slow
+test-all: $(VENV)/.dev
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n $(JOBS) --dist worksteal
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .
