@@ -116,6 +116,48 @@ def test_at_rest_the_residual_slope_is_minus_one() -> None:
     assert math.isnan(r)
 
 
+RELATIVE = tuple(
+    f"vorticity_{name}" for name in ("pearson", "residual_slope", "kl", "kl_hist", "kl_hist_abs")
+)
+FLIGHT = np.array([3.0, -5.0]) * 2.0**-10
+
+
+def flying(turn: float, predicted_turn: float) -> FramePair:
+    """Return particles at float32 positions that all fly by one vector, plus a swirl on either side."""
+    x = lattice(32) + np.random.default_rng(3).integers(-4096, 4096, (1024, 2)) * 2.0**-20
+    before, predicted = (
+        (x - FLIGHT - scale * swirl(x)).astype(np.float32) for scale in (turn, predicted_turn)
+    )
+    return pair_of(x, x - before, x - predicted)
+
+
+def test_a_body_that_only_flies_has_no_pattern_of_vorticity() -> None:
+    """What vorticity there is comes from the order of sums: its pattern says nothing, errors are 0."""
+    pair = flying(0.0, 0.0)
+    assert (pair.truth.velocity == FLIGHT).all()
+    assert 0.0 < np.abs(pair.true_vorticity).max() < 1e-14
+    assert np.isnan(measured(pair, *RELATIVE)).all()
+    assert measured(pair, "vorticity_mae", "vorticity_w1") == pytest.approx([0.0, 0.0], abs=1e-14)
+    beside = measured(flying(0.0, 1e-3), *RELATIVE, "vorticity_mae")
+    assert np.isnan(beside[:-1]).all()
+    assert beside[-1] > 1e-3
+
+
+def test_the_least_swirl_that_positions_can_show_is_compared() -> None:
+    """A swirl of some twenty roundings of float32; the prediction's is twice as fast."""
+    r, tilt, *divergences = measured(flying(1e-6, 2e-6), *RELATIVE)
+    assert r == pytest.approx(1.0, abs=1e-3)
+    assert tilt == pytest.approx(1.0, abs=0.03)
+    assert np.isfinite(divergences).all()
+
+
+def test_a_prediction_that_only_flies_has_no_correlation() -> None:
+    """As one at rest: its residual is minus the truth."""
+    r, tilt = measured(flying(1e-3, 0.0), "vorticity_pearson", "vorticity_residual_slope")
+    assert math.isnan(r)
+    assert tilt == pytest.approx(-1.0)
+
+
 def test_fewer_than_sixteen_nodes_are_undefined() -> None:
     """A blob of 4 x 4 cells with 2 x 2 differentiable nodes has no vorticity metrics, and no divergence."""
     x = 0.3 + 0.4 * lattice(20)

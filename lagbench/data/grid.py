@@ -206,22 +206,23 @@ def _scatter(x: Floats, u: Floats, grid: Grid) -> Floats:
     s -= base
     weight_x, weight_y = _spline(s)
     side = grid.nodes + _LOW + _HIGH
+    size = side * side
     column, row = base.astype(np.intp) + _LOW
-    corner = column * side + row
-    u_x, u_y = np.ascontiguousarray(u.T)
+    # the three sums lie one behind the other, so that one call adds to all of them
+    corner = (column * side + row + size * np.arange(3)[:, None]).ravel()
+    velocity = np.ascontiguousarray(u.T)
 
-    sums = np.zeros((3, side * side))
-    product = np.empty((3, len(corner)))
-    weights, momentum_x, momentum_y = product
+    sums, part = np.zeros((3, size)), np.empty((3, size))
+    product = np.empty((3, len(column)))
     for i in range(3):
         for k in range(3):
-            np.multiply(weight_x[i], weight_y[k], out=weights)
-            np.multiply(weights, u_x, out=momentum_x)
-            np.multiply(weights, u_y, out=momentum_y)
+            np.multiply(weight_x[i], weight_y[k], out=product[0])
+            np.multiply(product[0], velocity, out=product[1:])
+            part[:] = 0.0
+            np.add.at(part.reshape(-1), corner, product.reshape(-1))
             # node numbers stay those of the corner; its sums are shifted to the node instead
             shift = i * side + k
-            for total, summand in zip(sums, product, strict=True):
-                total[shift:] += np.bincount(corner, summand, side * side)[: side * side - shift]
+            sums[:, shift:] += part[:, : size - shift]
     return sums.reshape(3, side, side)[:, _LOW:-_HIGH, _LOW:-_HIGH]
 
 

@@ -36,6 +36,7 @@ __all__ = [
     "quotient",
     "root_mean_square",
     "total",
+    "turning",
 ]
 
 MINIMUM_NODES = 16
@@ -67,6 +68,11 @@ def at_slow_frames(pair: FramePair) -> bool:
 def enough_nodes(pair: FramePair) -> bool:
     """Tell whether there are nodes enough to speak of a vorticity field."""
     return pair.node_count >= MINIMUM_NODES
+
+
+def turning(pair: FramePair) -> bool:
+    """Tell whether there are nodes enough and the truth's vorticity there is more than rounding."""
+    return enough_nodes(pair) and pair.truth_turns
 
 
 def identity(values: Floats) -> Floats:

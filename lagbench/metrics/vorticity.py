@@ -2,7 +2,8 @@
 
 ``omega = dv/dx - du/dy`` (Eq. 5.19) by :mod:`lagbench.data.grid`, per frame. Undefined where
 fewer than 16 nodes can be compared. Pearson and slope are also undefined where a field is
-constant: a prediction at rest has no correlation, neither good nor bad.
+constant: a prediction at rest has no correlation, neither good nor bad. Nor has a field of
+rounding, whose pattern would be that of the order of sums: bodies that only fly have no vorticity.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from functools import partial
 import numpy as np
 
 from .frame import PERCENTILES, Floats, FramePair, average
-from .metric import Direction, Metric, enough_nodes, mean, metric, quotient, root_mean_square
+from .metric import Direction, Metric, enough_nodes, mean, metric, quotient, root_mean_square, turning
 from .pointwise import mean_absolute_error, mean_squared_error
 
 __all__ = ["METRICS", "STABLE_PEARSON", "frames_before_fall", "pearson", "slope"]
@@ -111,9 +112,11 @@ def vorticity_nrmse(mse: Floats, square: Floats) -> Floats:
     return np.sqrt(quotient(mse, np.full(len(mse), mean(square))))
 
 
-@metric(unit="1", direction=Direction.HIGHER, perfect=1.0, source="Eq. 5.21", defined=enough_nodes)
+@metric(unit="1", direction=Direction.HIGHER, perfect=1.0, source="Eq. 5.21", defined=turning)
 def vorticity_pearson(pair: FramePair) -> float:
     """Correlation of predicted and true vorticity."""
+    if not pair.prediction_turns:
+        return math.nan
     return pearson(pair.true_vorticity, pair.predicted_vorticity)
 
 
@@ -152,7 +155,7 @@ def vorticity_residual_max(pair: FramePair) -> float:
     return float(np.abs(pair.vorticity_residual).max())
 
 
-@_towards_zero(unit="1")
+@_towards_zero(unit="1", defined=turning)
 def vorticity_residual_slope(pair: FramePair) -> float:
     """Slope of the residual on the truth: -1 for a prediction at rest."""
     return slope(pair.true_vorticity, pair.vorticity_residual)

@@ -99,7 +99,7 @@ class PreviewRecorder:
         truth, prediction = pair.true_vorticity, pair.predicted_vorticity
         self._vorticity[0, i][pair.nodes] = truth
         self._vorticity[1, i][pair.nodes] = np.clip(prediction, -1e30, 1e30)
-        shares = histograms(truth, prediction)
+        shares = histograms(truth, prediction) if pair.truth_turns else None
         if shares is not None:
             self._histogram[:, i] = shares
             self._range[i] = np.min(truth), np.max(truth)
