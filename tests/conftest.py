@@ -56,6 +56,14 @@ def pytest_collection_finish() -> None:
 
 
 @pytest.fixture(scope="session", autouse=True)
+def own_cache(home: Path) -> Iterator[None]:
+    """Keep out of the user's cache."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("LAGBENCH_CACHE", str(home / "cache"))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
 def lasting_workers() -> Iterator[None]:
     """Simulate in workers that outlive a generation, unless it fails: starting Taichi takes seconds.
 
