@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from browser import Browser, browser
 from exchange_readers import straight_runs
 from filelock import FileLock
 from hypothesis import settings
@@ -89,6 +90,13 @@ def lasting_workers() -> Iterator[None]:
         for module in ("generate", "verify"):
             patch.setattr(f"lagbench.make.{module}.Pool", lasting)
         yield
+
+
+@pytest.fixture(scope="session")
+def running() -> Iterator[Browser]:
+    """One browser for all tests."""
+    with browser() as started:
+        yield started
 
 
 @pytest.fixture(scope="session", autouse=True)
