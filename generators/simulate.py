@@ -17,7 +17,8 @@ trajectories diverge. A prediction that lies below it has seen the answer.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 
@@ -36,6 +37,7 @@ from .split import ClosedBoxParameters, FreeSurfaceParameters, InitialState
 __all__ = [
     "OUTCOMES",
     "Facts",
+    "Pace",
     "Simulated",
     "active_frames",
     "file_parameters",
@@ -53,6 +55,9 @@ STILL = 0.01
 
 OUTCOMES = ("active_frames",)
 """Parameters of a file that follow from its simulation; all others are known before it."""
+
+COMPILING = 2
+"""Frames on the way to which kernels are compiled: one is read out, then one is advanced to."""
 
 _FILE_NAMES = {"reynolds": "reynolds_number"}
 """Drawn parameters that files call by their CF-like long name."""
@@ -75,12 +80,22 @@ class Facts:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Pace:
+    """How long a scenario took for how much, once everything was compiled."""
+
+    seconds: float  # processor time [s]
+    particle_substeps: int  # substeps times particles
+    frames: int  # frames that were advanced to, read out and written
+
+
+@dataclass(frozen=True, kw_only=True)
 class Simulated:
     """A scenario that was simulated and written."""
 
     scenario: int  # its id
     content_sha256: str  # content hash of its file
     facts: dict[str, int | float]  # see Facts, as a plain mapping
+    pace: Pace | None = None  # of a scenario that was simulated alone
 
 
 def scenario_key(size: Size, scenario: int) -> ScenarioKey:
@@ -175,9 +190,15 @@ def _facts(batch: Batch, index: int, energies: list[float]) -> Facts:
     )
 
 
-def simulate(job: SimulationJob, report: Report) -> list[Simulated]:
-    """Simulate the scenarios of a job and write their files, all or none of them."""
-    batch = Batch(job, report)
+def simulate(
+    job: SimulationJob, report: Report, *, clock: Callable[[], float] = time.process_time
+) -> list[Simulated]:
+    """Simulate the scenarios of a job and write their files, all or none of them.
+
+    Kernels compile on the way to the first two frames, so time is taken from there on.
+    """
+    batch, size = Batch(job, report), job.size
+    begun = clock()
     with ExitStack() as stack:
         recordings = [
             _Recording(
@@ -185,17 +206,26 @@ def simulate(job: SimulationJob, report: Report) -> list[Simulated]:
             )
             for scenario, state in zip(job.scenarios, batch.states, strict=True)
         ]
-        for index, _ in batch.recordings():
+        for index, frame in batch.recordings():
             recordings[index].append(*batch.frame(index))
+            if frame == COMPILING - 1:
+                begun = clock()
         if isinstance(batch.solver.parameters, FreeSurfaceParameters):
             for recording in recordings:
                 active = active_frames(recording.energies, job.size.task)
                 recording.writer.state(active_frames=active)
+    timed = size.frame_count(job.scenarios[0]) - COMPILING
+    pace = Pace(
+        seconds=clock() - begun,
+        particle_substeps=timed * size.substeps_per_frame * size.particles,
+        frames=timed,
+    )
     return [
         Simulated(
             scenario=scenario,
             content_sha256=recording.writer.content_sha256,
             facts=asdict(_facts(batch, index, recording.energies)),
+            pace=pace if timed > 0 and len(job.scenarios) == 1 else None,
         )
         for index, (scenario, recording) in enumerate(zip(job.scenarios, recordings, strict=True))
     ]

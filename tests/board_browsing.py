@@ -9,15 +9,6 @@ from browser import Page
 
 from lagbench.board.model import Row
 
-KEYS = {
-    "Enter": (13, "\r"),
-    "Tab": (9, ""),
-    "Escape": (27, ""),
-    "ArrowRight": (39, ""),
-    "End": (35, ""),
-    "/": (191, "/"),
-}
-
 
 def close(page: Page) -> None:
     """Close the tab."""
@@ -39,11 +30,8 @@ def run(page: Page, statement: str) -> None:
 
 
 def press(page: Page, key: str, modifiers: int = 0) -> None:
-    """Press a key and let go of it."""
-    code, text = KEYS[key]
-    about = {"key": key, "windowsVirtualKeyCode": code, "modifiers": modifiers}
-    page.call("Input.dispatchKeyEvent", type="keyDown", text=text, **about)
-    page.call("Input.dispatchKeyEvent", type="keyUp", **about)
+    """Press a key, and wait for what it sets going."""
+    page.press(key, modifiers)
     run(page, "0")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import io
 import json
 import os
 import shutil
@@ -14,6 +15,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from PIL import Image
+
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 """The browser; None where there is none (Debian: apt-get install chromium)."""
 
@@ -22,6 +26,19 @@ FLAGS = (
     *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
     *("--disable-dev-shm-usage", "--hide-scrollbars", "--remote-debugging-pipe"),
 )
+
+
+KEYS = {
+    "Enter": (13, "\r"),
+    "Tab": (9, ""),
+    "Escape": (27, ""),
+    "ArrowRight": (39, ""),
+    "End": (35, ""),
+    "/": (191, "/"),
+}
+
+CLEAR, MARKED = 60, 20
+"""A pixel changes clearly by so many of 255 levels of grey; so many of them are a mark."""
 
 
 @dataclass
@@ -46,6 +63,32 @@ class Page:
     def screenshot(self) -> bytes:
         """Return what is to be seen as PNG."""
         return base64.b64decode(self.call("Page.captureScreenshot")["data"])
+
+    def press(self, key: str, modifiers: int = 0) -> None:
+        """Press a key and let go of it."""
+        code, text = KEYS[key]
+        about = {"key": key, "windowsVirtualKeyCode": code, "modifiers": modifiers}
+        self.call("Input.dispatchKeyEvent", type="keyDown", text=text, **about)
+        self.call("Input.dispatchKeyEvent", type="keyUp", **about)
+
+    def focus_shows(self, selector: str) -> bool:
+        """Return whether focus is to be seen around an element: 20 pixels change clearly.
+
+        The page must know a reader who uses the keyboard: press a key first.
+        """
+        self.value("document.activeElement.blur(), 0")
+        box = self.value(
+            f"(e => {{ e.scrollIntoView({{block: 'center'}}); const b = e.getBoundingClientRect();"
+            " return {x: b.x + scrollX - 6, y: b.y + scrollY - 6, width: b.width + 12, height: b.height + 12}"
+            f" }})(document.querySelector({json.dumps(selector)}))"
+        )
+        pictures = []
+        for _ in range(2):
+            data = self.call("Page.captureScreenshot", clip={**box, "scale": 1})["data"]
+            picture = Image.open(io.BytesIO(base64.b64decode(data))).convert("L")
+            pictures.append(np.asarray(picture, np.int16))
+            self.value(f"document.querySelector({json.dumps(selector)}).focus({{preventScroll: true}}), 0")
+        return bool((abs(pictures[1] - pictures[0]) > CLEAR).sum() >= MARKED)
 
     def pdf(self) -> bytes:
         """Return the page as printed."""

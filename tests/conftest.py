@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from browser import Browser, browser
 from exchange_readers import straight_runs
 from filelock import FileLock
 from hypothesis import settings
@@ -56,6 +57,14 @@ def pytest_collection_finish() -> None:
 
 
 @pytest.fixture(scope="session", autouse=True)
+def own_cache(home: Path) -> Iterator[None]:
+    """Keep out of the user's cache."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("LAGBENCH_CACHE", str(home / "cache"))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
 def lasting_workers() -> Iterator[None]:
     """Simulate in workers that outlive a generation, unless it fails: starting Taichi takes seconds.
 
@@ -81,6 +90,13 @@ def lasting_workers() -> Iterator[None]:
         for module in ("generate", "verify"):
             patch.setattr(f"lagbench.make.{module}.Pool", lasting)
         yield
+
+
+@pytest.fixture(scope="session")
+def running() -> Iterator[Browser]:
+    """One browser for all tests."""
+    with browser() as started:
+        yield started
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from board_browsing import active, close, names, press, restored, run, seen, still, until
 from board_worlds import make_board, with_entry
-from browser import CHROMIUM, Browser, Page, browser
+from browser import CHROMIUM, Browser, Page
 from PIL import Image
 
 from lagbench.board.columns import columns_of, presets_of, value_of, written
@@ -23,13 +23,6 @@ from lagbench.board.page import render
 from lagbench.metrics import METRICS, Direction
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here: apt-get install chromium")
-
-
-@pytest.fixture(scope="module")
-def running() -> Iterator[Browser]:
-    """One browser for all tests."""
-    with browser() as started:
-        yield started
 
 
 @pytest.fixture(scope="module")
@@ -63,10 +56,17 @@ def go(page: Page, tab: Tab) -> None:
     until(page, f"!document.getElementById('{tab.id}').hidden")
 
 
-@pytest.mark.parametrize(("width", "dark"), [(1280, False), (390, True), (320, False)])
-def test_page_opens_in_silence(running: Browser, file: Path, width: int, dark: bool) -> None:
-    """No message, no request but the page itself, no sideways scrolling, its scheme as asked."""
+@pytest.mark.parametrize(
+    ("width", "dark"), [(1280, False), (1280, True), (390, False), (390, True), (320, False)]
+)
+def test_page_opens_in_silence(running: Browser, file: Path, board: Board, width: int, dark: bool) -> None:
+    """The film plays, a dot shows focus; no message, no other request, no sideways scrolling; its scheme."""
     page = running.open(file, width=width, dark=dark)
+    until(page, "Number(document.querySelector('#stage input').value) > 0")
+    go(page, board.tabs[0])
+    press(page, "Tab")
+    assert page.focus_shows("section:not([hidden]) [data-figure=cost] a.dot")
+    run(page, "document.querySelector('.tabs a').click()")
     for opened in (False, True):
         if opened:
             run(page, "document.querySelector('.across td a').click()")

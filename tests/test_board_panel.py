@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from board_browsing import active, close, names, press, restored, run, still, until
 from board_worlds import make_board, with_entry
-from browser import CHROMIUM, Browser, Page, browser
+from browser import CHROMIUM, Browser, Page
 
 from lagbench.board.cost import marks_of
 from lagbench.board.entry import Flag
@@ -22,13 +22,6 @@ from lagbench.board.page import render
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here: apt-get install chromium")
 
 HOSTILE = "</script><script>console.error(1)</script><img src=http://example.com/x onerror=console.error(2)>"
-
-
-@pytest.fixture(scope="module")
-def running() -> Iterator[Browser]:
-    """One browser for all tests."""
-    with browser() as started:
-        yield started
 
 
 @pytest.fixture(scope="module")

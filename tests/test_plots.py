@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from matplotlib.figure import Figure
+from matplotlib.text import Text
 from numpy.typing import NDArray
 from PIL import Image
 from swirls import OMEGA, TOP_TO_THE_RIGHT, write_swirl
@@ -86,13 +88,43 @@ def test_a_data_set_of_several_scenarios_is_refused(swirl: Path, tmp_path: Path)
 
 
 def test_fields_of_solid_body_rotation(swirl: Path) -> None:
-    """The vorticity that is drawn is twice the angular velocity, per frame, at frame 0 and later."""
+    """Vorticity on the grid is twice the angular velocity, per frame, at frame 0 and later."""
     with open_recording(swirl) as recording:
         assert recording.area == pytest.approx(np.pi * 0.4**2)
         for frame in (0, 3):
             fields = recording.scene(frame).fields
             middle = fields.vorticity[3:5, 3:5]  # clear of the rim on the 8 x 8 grid
             np.testing.assert_allclose(middle, 2.0 * OMEGA, rtol=0.02)
+
+
+@pytest.mark.parametrize("split", ["cavity", "multimaterial"])
+def test_a_figure_has_one_unit_of_time(
+    split: str, swirl: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Colour bars are in seconds, as the files' velocity is; so is the number at a moving wall."""
+    said: list[str] = []
+
+    def look(drawn: Figure, output: Path) -> Path:
+        texts = [text.get_text() for text in drawn.findobj(Text)]
+        said.extend(text for text in texts if "/s" in text or "frame]" in text or "/frame" in text)
+        return output
+
+    monkeypatch.setattr("lagbench.draw.plot.save", look)
+    source = swirl if split == "cavity" else write_swirl(tmp_path, split, materials=3, walls=None)
+    plot_frame(source, 2, tmp_path / "all.png", kind="all")
+    units = [text.partition("[")[2].rstrip("]") for text in said if "[" in text]
+    assert sorted(units) == ["1/s", *["length/s"] * (2 if split == "cavity" else 1)]
+    assert not any("/frame" in text for text in said)
+
+
+def test_the_scale_of_vorticity_is_in_its_unit(swirl: Path) -> None:
+    """A disc that turns by OMEGA a frame has twice that vorticity, over the seconds of a frame."""
+    with open_recording(swirl) as recording:
+        scene = recording.scene(3)
+        per_second = 2.0 * OMEGA / recording.size.frame_interval
+        np.testing.assert_allclose(scene.vorticity[3:5, 3:5], per_second, rtol=0.02)
+        held = np.abs(scene.vorticity[scene.fields.differentiable])
+        assert limit_of(Panel.VORTICITY, scene) == pytest.approx(np.percentile(held, 99.0))
 
 
 def test_the_scale_of_speeds_leaves_out_the_extreme_per_cent(swirl: Path) -> None:

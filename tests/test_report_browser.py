@@ -3,23 +3,15 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
-from browser import CHROMIUM, Browser, browser
+from browser import CHROMIUM, Browser
 from PIL import Image
 from report_bench import page_of
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here: apt-get install chromium")
-
-
-@pytest.fixture(scope="module")
-def running() -> Iterator[Browser]:
-    """One browser for all tests."""
-    with browser() as started:
-        yield started
 
 
 @pytest.fixture(scope="module", params=["cavity", "multimaterial"])
@@ -36,7 +28,7 @@ def brightness(png: bytes) -> float:
 @pytest.mark.parametrize("width", [1280, 390, 320])
 @pytest.mark.parametrize("dark", [False, True])
 def test_page_opens_in_silence(running: Browser, report: Path, width: int, dark: bool) -> None:
-    """No message, no request but the page itself, no sideways scrolling, its scheme as asked."""
+    """Focus shows; no message, no request but the page itself, no sideways scrolling, its scheme as asked."""
     page = running.open(report, width=width, dark=dark)
     assert page.value("document.documentElement.scrollWidth") <= width
     assert page.value("document.images.length") > 5
@@ -47,6 +39,8 @@ def test_page_opens_in_silence(running: Browser, report: Path, width: int, dark:
     assert (
         len(np.unique(np.asarray(Image.open(io.BytesIO(picture)).convert("RGB")).reshape(-1, 3), axis=0)) > 50
     )
+    page.press("Tab")
+    assert page.focus_shows("a[href^='#part-']")
     assert page.messages == []
     assert page.requests == [report.absolute().as_uri()]
 

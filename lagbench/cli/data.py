@@ -42,6 +42,10 @@ TITLE = (
     "lagbench: bit-reproducible data sets and benchmarks "
     "for neural surrogates of Lagrangian continuum simulators"
 )
+ESTIMATED = "estimated; measured after the first generate"
+MEASURED = "at the rate measured here"
+"""Where an expected time comes from."""
+
 RELEASED = 2026
 """Year of this version; it and the title as in CITATION.cff."""
 
@@ -99,7 +103,8 @@ def _generated(result: GenerationResult) -> list[str]:
             f"{result.split} {result.size}: {to_do} scenarios to simulate, {len(result.kept)} are there",
             f"  disk    at most {spell_bytes(result.bytes_needed)} ({result.bytes_needed} bytes);"
             f" {spell_bytes(result.bytes_free)} free in {result.root}",
-            f"  time    about {spell_seconds(result.seconds_expected)} with {result.workers} workers",
+            f"  time    about {spell_seconds(result.seconds_expected)} with {result.workers} workers"
+            f" ({MEASURED if result.measured else ESTIMATED})",
         ]
     lines = [
         f"{result.split} {result.size}: {to_do} scenarios simulated in {result.seconds:.1f} s,"
@@ -181,12 +186,23 @@ def list_splits(root: RootOption = None, as_json: JsonFlag = False) -> None:
 
     def listed() -> Iterator[str]:
         print_table("", ("split", "size", *_COLUMNS), [_row(entry) for entry in found])
+        yield from _origin(found)
         yield f"data sets live in {url_of(folder) or folder}"
 
     show({"root": folder, "sizes": found}, listed(), as_json=as_json)
 
 
 _COLUMNS = ("scenarios", "particles", "frames", "disk at most", "time", "here")
+
+
+def _origin(found: list[Overview]) -> list[str]:
+    """Say where the times of a table come from."""
+    timed = [one for one in found if one.seconds]
+    guessed = dict.fromkeys(one.split for one in timed if not one.measured)
+    if not guessed:
+        return [f"time: {MEASURED}"] if timed else []
+    others = "" if all(not one.measured for one in timed) else f" of {', '.join(guessed)}"
+    return [f"time{others}: {ESTIMATED}"]
 
 
 def _row(entry: Overview) -> tuple[object, ...]:
@@ -223,6 +239,7 @@ def info(
     def told() -> Iterator[str]:
         yield f"{entry.title} ({split_name} {entry.version}, {entry.licence})\n{entry.description}\n"
         print_table("Sizes", ("split", "size", *_COLUMNS), [_row(one) for one in found])
+        yield from _origin(found)
         tiers = [registry.size(split_name, one) for one in entry.sizes]
         parameters = [
             (name, *(tier.value(name) for tier in tiers), parameter.unit, parameter.description)

@@ -27,6 +27,7 @@ from lagbench.errors import UsageError
 __all__ = [
     "CACHE_VARIABLE",
     "as_url",
+    "cache_folder",
     "open_copy",
     "url_of",
     "MANIFEST_NAME",
@@ -41,7 +42,7 @@ __all__ = [
 
 
 CACHE_VARIABLE = "LAGBENCH_CACHE"
-"""Environment variable that names the folder of working copies."""
+"""Environment variable that names the folder of working copies and of what this machine measured."""
 
 MARK = "store.json"
 """Name of the file that says what a folder is a working copy of."""
@@ -88,7 +89,7 @@ def url_of(root: Path) -> str | None:
 
 
 def _place(url: str) -> Path:
-    return _cache() / _name(url)
+    return cache_folder("stores") / _name(url)
 
 
 def _name(url: str) -> str:
@@ -101,13 +102,14 @@ def _name(url: str) -> str:
     return f"{words}-{hashlib.sha256(url.encode()).hexdigest()[:8]}"
 
 
-def _cache() -> Path:
+def cache_folder(part: str) -> Path:
+    """Return a folder of the user's cache, or the one that ``LAGBENCH_CACHE`` names for every part."""
     given = os.environ.get(CACHE_VARIABLE)
     if given:
         return Path(given).expanduser().absolute()
     import platformdirs
 
-    return platformdirs.user_cache_path("lagbench", appauthor=False) / "stores"
+    return platformdirs.user_cache_path("lagbench", appauthor=False) / part
 
 
 ROOT_VARIABLE = "LAGBENCH_ROOT"

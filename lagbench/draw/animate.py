@@ -170,7 +170,7 @@ class Painter:
         middle = (np.arange(self._side) + 0.5) / self._side
         index = np.floor(middle * fields.grid.cells - fields.grid.origin + 0.5).astype(np.intp)
         index = np.clip(index, 0, fields.grid.nodes - 1)
-        omega = fields.vorticity.T[::-1][np.ix_(fields.grid.nodes - 1 - index[::-1], index)]
+        omega = scene.vorticity.T[::-1][np.ix_(fields.grid.nodes - 1 - index[::-1], index)]
         defined = np.isfinite(omega) & self._inside
         level = _level(0.5 + 0.5 * np.where(defined, omega, 0.0) / self.limit, len(self._colours))
         return np.where(defined, self._colours[level], self._walls(scene))

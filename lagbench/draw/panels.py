@@ -60,9 +60,10 @@ TITLES = {
 
 UNITS = {
     Panel.SPEED: "speed  [length/s]",
-    Panel.VORTICITY: "vorticity  [1/frame]",
+    Panel.VORTICITY: "vorticity  [1/s]",
     Panel.STREAMLINES: "speed on the grid  [length/s]",
 }
+"""What colour bars say: physical time throughout, as velocity in the files."""
 
 DOT = 1.25
 """Diameter of a drawn particle in particle spacings: neighbours overlap a little."""
@@ -81,7 +82,7 @@ def limit_of(panel: Panel, scene: Scene) -> float:
     if panel is Panel.SPEED:
         values = scene.speed
     elif panel is Panel.VORTICITY:
-        values = np.abs(scene.fields.vorticity[scene.fields.differentiable])
+        values = np.abs(scene.vorticity[scene.fields.differentiable])
     else:
         values = _grid_speed(scene)[scene.fields.counted]
     top = float(np.percentile(values, 99.0)) if values.size else 0.0
@@ -97,7 +98,7 @@ def draw(axes: Axes, panel: Panel, scene: Scene, *, limit: float, detail: float 
     elif panel is Panel.SPEED:
         _draw_dots(axes, scene, scale.to_rgba(scene.speed))
     elif panel is Panel.VORTICITY:
-        _draw_field(axes, scene, scene.fields.vorticity, scale)
+        _draw_field(axes, scene, scene.vorticity, scale)
     else:
         _draw_field(axes, scene, np.where(scene.fields.counted, _grid_speed(scene), np.nan), scale)
         _draw_streamlines(axes, scene, detail)

@@ -61,6 +61,11 @@ class Scene:
         full = grid.full_weight(self.recording.particles, self.recording.area)
         return gridding.fields(self.position, self.displacement, grid, full=full)
 
+    @property
+    def vorticity(self) -> NDArray[np.float64]:
+        """Vorticity at the nodes of the score grid [1/s], shape [x node, y node]."""
+        return self.fields.vorticity / self.recording.size.frame_interval
+
 
 class Recording:
     """A scenario whose frames are read one at a time."""

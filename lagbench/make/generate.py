@@ -32,7 +32,7 @@ from lagbench.data.registry import Registry, Size, Split, spell_ids
 from lagbench.data.statistics import file_moments, round_digits, statistics
 from lagbench.errors import UsageError, check_installed, nearest
 from lagbench.generators.batch import SimulationJob
-from lagbench.generators.simulate import Simulated, scenario_key, simulate, twin_floors, twin_substeps
+from lagbench.generators.simulate import Pace, Simulated, scenario_key, simulate, twin_floors, twin_substeps
 from lagbench.generators.solver import Device
 from lagbench.store.publication import Publication, look_at, publication
 from lagbench.work.cluster import Cluster, await_file
@@ -45,6 +45,7 @@ from .cards import card_texts, write_cards
 from .gather import gather
 from .inventory import Look, compare, look
 from .plan import Estimate, Scenarios, Selection, check_disk, estimate, free_bytes, select
+from .rate import note_pace
 
 __all__ = ["Generation", "GenerationResult", "Progress", "generate"]
 
@@ -83,6 +84,7 @@ class Generation:
         self._meter = meter  # counts the work
         self._split = split  # the split that the size belongs to
         self._promised: list[int] = []
+        self._paces: list[Pace] = []  # how fast scenarios were simulated here
 
     def survey(self, wanted: Sequence[int], *, force: bool = False) -> None:
         """Find out what is there and what is to do; writes nothing."""
@@ -102,7 +104,8 @@ class Generation:
         kept = tuple(e for e in old.files if e.scenario not in bad)
         self.manifest = merged(self.size, old.model_copy(update={"files": kept}), good)
         self.kept = [i for i in wanted if i not in bad and not force]
-        self.to_do = estimate(self.size, [i for i in wanted if i not in self.kept])
+        on_cores = self.device is Device.CPU and self.scheduler is None
+        self.to_do = estimate(self.size, [i for i in wanted if i not in self.kept], on_cores=on_cores)
 
     def run(self, wanted: Sequence[int], *, force: bool = False) -> None:
         """Simulate what is missing or wrong; write the manifest, compare, write cards."""
@@ -118,6 +121,7 @@ class Generation:
         finally:
             # The workers are gone by now; what they had not finished goes too.
             remove_leftovers(folder)
+            note_pace(self.size, self._paces)
         self._record_statistics()
         self.verdict = compare(self.size, self.manifest, promised=self._promised)
         self._write_cards()
@@ -214,6 +218,8 @@ class Generation:
         environment = {**machine, "device": self.device.value}
         if promises_bits(environment):
             self._promised += [outcome.scenario for outcome in outcomes]
+        if self.device is Device.CPU and self.scheduler is None:
+            self._paces += [outcome.pace for outcome in outcomes if outcome.pace]
         for outcome in outcomes:
             await_file(self._path(outcome.scenario))
         entries = [
@@ -291,6 +297,7 @@ class GenerationResult:
     bytes_needed: int  # disk space of 'simulated' before compression [bytes]
     bytes_free: int  # free disk space before the start [bytes]
     seconds_expected: float  # expected time [s], for orientation
+    measured: bool  # whether it is expected at a rate that this machine has measured
     seconds: float = 0.0  # time that it took [s]
     complete: bool = False  # whether train, valid and test are all there
     dataset_sha256: str | None = None  # data set hash, once complete
@@ -388,6 +395,7 @@ def generate(
         bytes_needed=generation.to_do.bytes,
         bytes_free=free,
         seconds_expected=generation.to_do.seconds(cores),
+        measured=generation.to_do.measured,
         seconds=seconds,
         complete=generation.manifest.complete,
         dataset_sha256=generation.manifest.dataset_sha256,

@@ -31,6 +31,7 @@ class Overview:
     bytes: int  # disk space before compression [bytes]
     # time to generate on all cores of this machine [s], for orientation; 0 for what cannot be simulated
     seconds: float
+    measured: bool  # whether that is at a rate that this machine has measured
     # scenario files that are there, by subset; 'lagbench verify' checks them. Of a store
     # what its manifest names.
     present: dict[str, int]
@@ -51,6 +52,7 @@ def overview(size: Size, root: Path) -> Overview:
     """Return what a size is, costs, and has below a root folder."""
     folder = dataset_folder(root, size.split, size.name, size.major)
     ids = size.scenarios
+    expected = estimate(size, ids, drawn=DRAWN) if size.simulated else None
     return Overview(
         split=size.split,
         size=size.name,
@@ -59,7 +61,8 @@ def overview(size: Size, root: Path) -> Overview:
         particles=size.particles,
         frames=sum(map(size.frame_count, ids)),
         bytes=sum(scenario_bytes(size, i) for i in ids),
-        seconds=estimate(size, ids, drawn=DRAWN).seconds(available_cores()) if size.simulated else 0.0,
+        seconds=expected.seconds(available_cores()) if expected else 0.0,
+        measured=expected is not None and expected.measured,
         present=_present(size, root, folder),
         folder=folder,
         picture=next((folder / name for name in PICTURES if (folder / name).is_file()), None),

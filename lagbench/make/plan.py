@@ -14,14 +14,10 @@ from pathlib import Path
 from lagbench.data.registry import Size, parse_ids, spell_ids
 from lagbench.errors import UsageError, WorkFailedError, nearest
 
+from .rate import measured_slowness, orientation
+
 __all__ = ["Estimate", "check_disk", "estimate", "free_bytes", "scenario_bytes", "select"]
 
-
-SECONDS_PER_PARTICLE_SUBSTEP = 45e-9
-"""Orientation for one core [s]; benchmarks/ measures it."""
-
-SECONDS_PER_FRAME = 1.5e-3
-"""Orientation for reading, checking and writing one frame of a scenario [s]."""
 
 BYTES_PER_PARTICLE = 2 * 2 * 4
 """Position and velocity in one frame, two float32 each, before compression [bytes]."""
@@ -72,7 +68,8 @@ class Estimate:
     substeps: tuple[int, ...]  # substeps of each, in the same order
     frames: int  # frames that they record together
     bytes: int  # disk space, before compression [bytes]; files come out a little smaller
-    core_seconds: float  # time on one core [s], for orientation
+    core_seconds: float  # time on one core, twins of test scenarios included [s], for orientation
+    measured: bool  # whether at a rate that this machine has measured
 
     def seconds(self, workers: int) -> float:
         """Return the time with some workers [s]: shared evenly, but never below the longest."""
@@ -87,13 +84,16 @@ def scenario_bytes(size: Size, scenario: int) -> int:
     return size.frame_count(scenario) * size.particles * BYTES_PER_PARTICLE + BYTES_BESIDE_FRAMES
 
 
-def estimate(size: Size, scenarios: Sequence[int], *, drawn: int | None = None) -> Estimate:
+def estimate(
+    size: Size, scenarios: Sequence[int], *, drawn: int | None = None, on_cores: bool = True
+) -> Estimate:
     """Return what simulating these scenarios takes.
 
     Args:
         size: tier of a split.
         scenarios: their ids.
         drawn: draw about so many of them only; the others take what these do per frame. All when None.
+        on_cores: whether cores of this machine simulate, whose rate it may have measured.
     """
     if not size.simulated:
         raise UsageError(
@@ -109,13 +109,23 @@ def estimate(size: Size, scenarios: Sequence[int], *, drawn: int | None = None) 
     per_frame = sum(known.values()) / max(1, sum(map(size.frame_count, known)))
     substeps = tuple(known.get(i) or round(per_frame * size.frame_count(i)) for i in scenarios)
     frames = sum(size.frame_count(i) for i in scenarios)
-    simulating = sum(substeps) * size.particles * SECONDS_PER_PARTICLE_SUBSTEP
+    task, slowness = size.task, measured_slowness(size) if on_cores else None
+    # What a twin does not simulate: the frames behind the horizon.
+    behind = {
+        i: max(0, size.frame_count(i) - task.input_frames - task.horizon)
+        for i in scenarios
+        if size.subset_of(i) == "test"
+    }
+    twins = sum(n for i, n in zip(scenarios, substeps, strict=True) if i in behind)
+    twins -= sum(behind.values()) * size.substeps_per_frame
+    both = frames + sum(map(size.frame_count, behind)) - sum(behind.values())
     return Estimate(
         scenarios=tuple(scenarios),
         substeps=substeps,
         frames=frames,
         bytes=sum(scenario_bytes(size, i) for i in scenarios),
-        core_seconds=simulating + frames * SECONDS_PER_FRAME,
+        core_seconds=(slowness or 1.0) * orientation((sum(substeps) + twins) * size.particles, both),
+        measured=slowness is not None,
     )
 
 

@@ -1,0 +1,178 @@
+"""What this machine's generations measured decides estimates of time, and nothing else does."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import platform
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import Result
+from conftest import SIZE, SPLIT
+
+from lagbench.data.registry import Registry
+from lagbench.generators.batch import SimulationJob
+from lagbench.generators.simulate import Pace, simulate
+from lagbench.make.generate import generate
+from lagbench.make.plan import estimate
+from lagbench.make.rate import measured_slowness, note_pace, orientation
+
+Run = Callable[..., Result]
+
+HERE = {"machine": platform.node()}
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A cache folder of its own, in which nothing is measured yet."""
+    monkeypatch.setenv("LAGBENCH_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def noted(cache: Path, **kinds: Any) -> None:
+    """Write what was measured, as a generation would."""
+    cache.mkdir(exist_ok=True)
+    (cache / "rates.json").write_text(json.dumps(HERE | kinds))
+
+
+WORK = (1_000_000, 100)
+PLAIN = orientation(*WORK)
+GOOD = {"256": [2 * PLAIN, *WORK]}
+
+
+def pace(slowness: float) -> Pace:
+    """Return what so slow a machine measures."""
+    return Pace(seconds=slowness * PLAIN, particle_substeps=WORK[0], frames=WORK[1])
+
+
+def test_a_measured_rate_decides(cache: Path, unmeasured: Registry) -> None:
+    """Whoever took 300 s for three times the work takes 100 s: 2 * 155 * 256 particle substeps, 64 frames."""
+    size = unmeasured.size("fluid", "tiny")
+    assert not estimate(size, (0, 1)).measured
+    noted(cache, free_surface={"256": [300.0, 3 * 2 * 155 * 256, 3 * 64]})
+    found = estimate(size, (0, 1))
+    assert found.measured
+    assert found.core_seconds == pytest.approx(100.0)
+
+
+def test_twins_of_test_scenarios_are_counted(unmeasured: Registry) -> None:
+    """A test scenario is simulated twice, the second time to the end of the horizon: here the whole of it."""
+    size = unmeasured.size("fluid", "tiny")
+    task = size.task
+    train, test = (estimate(size, (size.subsets[name][0],)) for name in ("train", "test"))
+    assert size.frame_count(size.subsets["test"][0]) == size.frame_count(0)
+    share = min(task.input_frames + task.horizon, size.frame_count(0)) / size.frame_count(0)
+    assert test.core_seconds == pytest.approx((1 + share) * train.core_seconds, rel=0.01)
+
+
+def test_the_nearest_number_of_particles_stands_in(cache: Path, unmeasured: Registry) -> None:
+    """By ratio, of the same kind of solver alone; another machine's rates count for nothing."""
+    size = unmeasured.size("fluid", "tiny")
+    assert size.particles == 256
+    slow, slower = [2 * PLAIN, *WORK], [3 * PLAIN, *WORK]
+    noted(cache, free_surface={"100": slow, "600": slower}, closed_box={"256": slow})
+    assert measured_slowness(size) == pytest.approx(3.0)
+    noted(cache, closed_box={"256": slow})
+    assert measured_slowness(size) is None
+    noted(cache, free_surface=GOOD, machine="another " + platform.node())
+    assert measured_slowness(size) is None
+
+
+DAMAGED: dict[str, Any] = {
+    "empty": "",
+    "list": [],
+    "binary": "\udc80",
+    "deep": "[" * 100_000,
+    "long": {**HERE, "free_surface": GOOD, "x": "y" * 1_000_000},
+    "machine": {"free_surface": GOOD},
+    "rows": {**HERE, "free_surface": GOOD["256"]},
+    "nobody": {**HERE, "free_surface": {"-256": GOOD["256"]}},
+    "words": {**HERE, "free_surface": {"many": GOOD["256"]}},
+    "digits": {**HERE, "free_surface": {"9" * 5000: GOOD["256"]}},
+    "void": {**HERE, "free_surface": {"256": []}},
+    "half": {**HERE, "free_surface": {"256": [1.0, 1000]}},
+    "text": {**HERE, "free_surface": {"256": [1.0, 1000, "100"]}},
+    "zero": {**HERE, "free_surface": {"256": [0.0, *WORK]}},
+    "negative": {**HERE, "free_surface": {"256": [1.0, -1000, 100]}},
+    "centuries": {**HERE, "free_surface": {"256": [1e8, *WORK]}},
+    "nan": {**HERE, "free_surface": {"256": [float("nan"), *WORK]}},
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGED)
+def test_damaged_rates_are_passed_over(damage: str, cache: Path, unmeasured: Registry) -> None:
+    """A file that is no rate, or that no machine could have, leaves the estimate; the next note mends it."""
+    size = unmeasured.size("fluid", "tiny")
+    expected = estimate(size, (0,))
+    cache.mkdir()
+    held = DAMAGED[damage]
+    text = held if isinstance(held, str) else json.dumps(held)
+    (cache / "rates.json").write_bytes(text.encode(errors="surrogateescape"))
+    assert estimate(size, (0,)) == expected
+    note_pace(size, [pace(5.0)])
+    assert measured_slowness(size) == pytest.approx(5.0)
+
+
+def test_notes_add_up_and_stay_few(cache: Path, unmeasured: Registry) -> None:
+    """What counts is the sum of seconds over the sum of work; the file stays small whatever is simulated."""
+    size = unmeasured.size("fluid", "tiny")
+    paces = [pace(1.0), pace(3.0)]
+    note_pace(size, paces)
+    assert measured_slowness(size) == pytest.approx(2.0)
+    noted(cache, free_surface={str(n): GOOD["256"] for n in range(1000, 1200)})
+    note_pace(size, paces)
+    held = json.loads((cache / "rates.json").read_text())
+    assert len(held["free_surface"]) <= 32
+    assert held["free_surface"]["256"] == pytest.approx([4 * PLAIN, 2 * WORK[0], 2 * WORK[1]])
+    note_pace(size, [])
+    assert json.loads((cache / "rates.json").read_text()) == held
+
+
+def test_a_worker_measures_what_it_does(tmp_path: Path, unmeasured: Registry) -> None:
+    """The time from the second frame on, when everything is compiled, to the end of the file."""
+    size = unmeasured.size(SPLIT, SIZE)
+    job = SimulationJob(size=size, scenarios=(0,), root=tmp_path)
+    times = itertools.accumulate(itertools.count(10, 10))
+    (outcome,) = simulate(job, lambda _: None, clock=lambda: float(next(times)))
+    steps = size.frame_count(0) - 2
+    substeps = steps * size.substeps_per_frame * size.particles
+    # The clock says 10, 30, 60: before the first frame, after the second, in the end.
+    assert outcome.pace == Pace(seconds=30.0, particle_substeps=substeps, frames=steps)
+
+
+def test_generations_measure(run: Run, cache: Path, tmp_path: Path) -> None:
+    """Before the first one tables say that times are estimated, after it that they are measured here."""
+    root = ("--root", tmp_path)
+    plan = ("generate", SPLIT, "--size", SIZE, *root, "--scenarios", "1", "--dry-run")
+    assert "measured after the first generate" in run(*plan).stdout
+    assert "measured after the first generate" in run("list", *root).stdout
+    assert json.loads(run(*plan, "--json").stdout)["measured"] is False
+    assert not cache.exists()
+    assert run(*plan[:4], *root, "--scenarios", "0").exit_code == 0
+    held = json.loads((cache / "rates.json").read_text())
+    ((particles, (seconds, particle_substeps, frames)),) = held["closed_box"].items()
+    assert held == {**HERE, "closed_box": held["closed_box"]}
+    assert json.loads(run(*plan, "--json").stdout)["measured"] is True
+    assert "measured after the first generate" not in run(*plan).stdout
+    listed = json.loads(run("list", *root, "--json").stdout)["sizes"]
+    assert {one["split"] for one in listed if one["measured"]} == {"cavity", SPLIT}
+    assert json.loads(run("info", SPLIT, *root, "--json").stdout)["sizes"][SIZE]["overview"]["measured"]
+    tiny = next(one for one in listed if (one["split"], one["size"]) == (SPLIT, SIZE))
+    assert int(particles) == tiny["particles"]
+    assert seconds > 0.0
+    assert particle_substeps == frames * 12 * 506
+
+
+def test_a_cache_that_cannot_be_written_is_no_loss(cache: Path, tmp_path: Path, unmeasured: Registry) -> None:
+    """The data set is made all the same, and another device's rate is not taken for this one's."""
+    cache.write_text("a file")
+    result = generate(SPLIT, SIZE, scenarios="0", root=tmp_path / "root", registry=unmeasured)
+    assert result.simulated == (0,)
+    cache.unlink()
+    noted(cache, closed_box=GOOD)
+    options: dict[str, Any] = {"root": tmp_path / "new", "registry": unmeasured, "dry_run": True}
+    assert generate(SPLIT, SIZE, **options).measured
+    assert not generate(SPLIT, SIZE, device="cuda", **options).measured
