@@ -74,11 +74,13 @@ def make_local_split(
     output: str | Path,
     *,
     command: str,
+    counts: Mapping[str, int] | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> LocalSplit:
     """Write a local split of the trajectories of train, valid and test; it appears whole or not at all.
 
-    The last part of ``output`` is the name of the split, ``command`` stands in the head of its description.
+    The last part of ``output`` is the name of the split, ``command`` stands in the head of its description;
+    ``counts`` are the trajectories of each subset, where they are known before.
     """
     folder = Path(os.path.abspath(Path(output).expanduser()))
     if about.name in load().splits:
@@ -94,7 +96,8 @@ def make_local_split(
         building = _Building(about, root)
         for subset in HASHED_SUBSETS:
             before = len(building.entries)
-            meter.begin(f"writing {subset}", total=0, scenarios=0)
+            total = counts[subset] if counts else 0
+            meter.begin(f"writing {subset}", total=total, scenarios=total)
             for trajectory in subsets[subset]:
                 building.add(subset, trajectory)
                 meter.count(1, scenarios=1)
@@ -103,7 +106,7 @@ def make_local_split(
         manifest = building.finish(command)
         size = load(root / about.name / DESCRIPTION).size(about.name, SIZE)
         (root / about.name).replace(folder)
-    counts = sorted(entry.particles for entry in manifest.files)
+    particles = [entry.particles for entry in manifest.files]
     tested = {entry.particles for entry in manifest.files if entry.subset == "test"}
     note = (
         f"test scenarios have {min(tested)} to {max(tested)} particles: the split can be opened and "
@@ -115,7 +118,7 @@ def make_local_split(
         size=SIZE,
         scenarios={name: len(ids) for name, ids in size.subsets.items()},
         frames=sum(entry.frames for entry in manifest.files),
-        particles=(counts[0], counts[-1]),
+        particles=(min(particles), max(particles)),
         input_frames=size.task.input_frames,
         horizon=size.task.horizon,
         spacing=building.spacing,
