@@ -18,14 +18,17 @@ from numpy.typing import NDArray
 
 from lagbench.atomic import temporary_name
 from lagbench.data.checksums import HASHED_SUBSETS
+from lagbench.data.grid import Placement
 from lagbench.data.layout import ScenarioKey, scenario_path
 from lagbench.data.local import DESCRIPTION
 from lagbench.data.manifest import FileEntry, Manifest, describe_file, merge, write_manifest
 from lagbench.data.registry import MAX_ID, NO_GENERATOR, load, spell_ids
+from lagbench.data.scenario import read_scenario
 from lagbench.data.statistics import file_statistics
 from lagbench.data.writer import ScenarioWriter
 from lagbench.data.yamlfile import spell_yaml
 from lagbench.errors import DataError, UsageError, WorkFailedError
+from lagbench.metrics.coverage import Cloud, fitting_cells
 from lagbench.work.machine import environment_of
 from lagbench.work.progress import Meter, Progress
 
@@ -168,7 +171,7 @@ class _Building:
             first = np.asarray(next(trajectory.read())[0])
             self._check(trajectory, 0, about.measure.place(first))
             self.spacing = (about.spacing or estimate_spacing(first, about.radius)) / scale
-        key = ScenarioKey(split=about.name, size=SIZE, version=VERSION, scenario=scenario, subset=subset)
+        key = self._key(scenario, subset)
         walls = None if trajectory.wall_velocity is None else np.asarray(trajectory.wall_velocity) / scale
         with ScenarioWriter(
             scenario_path(self.root, key),
@@ -188,6 +191,11 @@ class _Building:
             for position, velocity in self._frames(trajectory):
                 writer.append(position, velocity)
         self.entries.append(describe_file(self.root, key))
+
+    def _key(self, scenario: int, subset: str) -> ScenarioKey:
+        return ScenarioKey(
+            split=self.about.name, size=SIZE, version=VERSION, scenario=scenario, subset=subset
+        )
 
     def _frames(self, trajectory: Trajectory) -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
         """Yield positions and velocities in the unit box; without own velocities, differences.
@@ -227,10 +235,7 @@ class _Building:
         """Write manifest and description; return the manifest."""
         about, content = self.about, {entry.scenario: entry.content_sha256[:16] for entry in self.entries}
         ids = {name: [e.scenario for e in self.entries if e.subset == name] for name in HASHED_SUBSETS}
-        keys = [
-            ScenarioKey(split=about.name, size=SIZE, version=VERSION, scenario=i, subset="train")
-            for i in ids["train"]
-        ]
+        keys = [self._key(i, "train") for i in ids["train"]]
         manifest = merge(
             None,
             self.entries,
@@ -335,7 +340,6 @@ class _Building:
                 expected=f"together at most {shortest}",
                 got=f"{about.input_frames} and {horizon}",
             )
-        suits = round(1.0 / (PER_CELL * self.spacing))
         interest = sorted(set(about.frames_of_interest or (last,)))
         if not about.input_frames <= interest[0] <= interest[-1] <= last:
             raise UsageError(
@@ -344,13 +348,27 @@ class _Building:
                 expected=f"frames {about.input_frames} to {last}",
                 got=spell_ids(interest) if interest[0] >= 0 else interest,
             )
+        placement = Placement.CELL_CENTRES if about.full_box else Placement.NODES
         return {
             "input_frames": about.input_frames,
             "horizon": horizon,
             "frames_of_interest": interest,
             "score_grid": {
-                "cells": about.cells or min(MOST_CELLS, max(FEWEST_CELLS, suits)),
-                "placement": "cell_centres" if about.full_box else "nodes",
+                "cells": about.cells or self._suitable_cells(placement, (about.input_frames, last)),
+                "placement": placement.value,
             },
             "radius": about.radius / about.measure.scale,
         }
+
+    def _suitable_cells(self, placement: Placement, frames: tuple[int, int]) -> int:
+        """Return cells of some spacings, or as near as test scenarios cover enough nodes in these frames."""
+        suits = min(MOST_CELLS, max(FEWEST_CELLS, round(1.0 / (PER_CELL * self.spacing))))
+        clouds = []
+        for entry in self.entries:
+            if entry.subset == "test":
+                key = self._key(entry.scenario, "test")
+                with read_scenario(scenario_path(self.root, key)) as file:
+                    for frame in frames:
+                        position = file.read("position", slice(frame, frame + 1))[0]
+                        clouds.append(Cloud(position, len(position) * self.spacing**2))
+        return fitting_cells(clouds, placement, near=suits) or suits
