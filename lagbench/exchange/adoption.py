@@ -198,10 +198,14 @@ def _rows(path: Path) -> list[Row]:
     """Return the trajectories of a file, or of the files of a folder by name."""
     if path.is_dir():
         found = _natural([file for file in path.iterdir() if file.suffix in READABLE and file.is_file()])
-        return [row for file in found for row in _rows(file)]
+        if found:
+            return [row for file in found for row in _rows(file)]
     if path.suffix not in READABLE or not path.is_file():
         raise UnreadableFileError(
-            "this is no file of trajectories", where=str(path), expected=f"a folder, or {', '.join(READABLE)}"
+            "no trajectories are there",
+            where=str(path),
+            expected=f"a file {', '.join(READABLE)}, or a folder of them",
+            got="a folder without such files" if path.is_dir() else None,
         )
     if path.suffix != ".npy":
         return [(path, None)]
