@@ -78,7 +78,7 @@ def test_info_shows_parameters_with_units_and_state(run: Run, generated: Generat
     assert by_argument.exit_code == 0
     assert by_argument.stdout == by_option.stdout
     text = by_argument.stdout
-    assert re.search(r"velocity_scale +\S+ +\S+ +\S+ +length/s", text)
+    assert re.search(r"velocity_scale +\S+ +\S+ +\S+ +\[length/s\]", text)
     assert str(generated.folder) in text
     assert "pictures/scenarios.png" in text
     assert "(there: yes)" in text
