@@ -42,7 +42,8 @@ def fitting_cells(clouds: Sequence[Cloud], placement: Placement, *, near: int) -
 
     None where there is none; of two as near the coarser one.
     """
-    for cells in sorted({near, *TRIED}, key=lambda cells: abs(cells - near)):
+    nearest: list[int] = sorted({near, *TRIED}, key=lambda cells: abs(cells - near))
+    for cells in nearest:
         grid = Grid(cells, placement)
         if all(covered_nodes(cloud, grid) >= MINIMUM_NODES for cloud in clouds):
             return cells
