@@ -78,7 +78,7 @@ def test_info_shows_parameters_with_units_and_state(run: Run, generated: Generat
     assert by_argument.exit_code == 0
     assert by_argument.stdout == by_option.stdout
     text = by_argument.stdout
-    assert re.search(r"velocity_scale +\S+ +\S+ +\S+ +length/s", text)
+    assert re.search(r"velocity_scale +\S+ +\S+ +\S+ +\[length/s\]", text)
     assert str(generated.folder) in text
     assert "pictures/scenarios.png" in text
     assert "(there: yes)" in text
@@ -310,3 +310,14 @@ def test_progress_goes_to_a_file_in_lines(
     assert [found and found.groups() for found in counts] == told
     with progress_bar(quiet=True) as silent:
         assert silent is None
+
+
+def test_progress_without_a_known_end(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Trajectories of a file that is read one by one are counted, without a total, share or time left."""
+    monkeypatch.setattr("lagbench.cli.output.SECONDS_PER_LINE", 0.0)
+    with progress_bar(quiet=False) as tell:
+        assert tell is not None
+        tell(Progress(stage="writing train", done=2, total=0, scenarios_done=2, scenarios=0, seconds=1.0))
+    assert capsys.readouterr().err == "writing train: 2 scenarios, 2.00/s\n"

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,12 @@ import h5py
 import pytest
 import typer
 from conftest import SIZE, SPLIT
+from typer.main import get_command
 from typer.testing import Result
 
+import lagbench
 from lagbench import submission
+from lagbench.cli.app import app
 from lagbench.make.generate import GenerationResult
 from lagbench.scoring import score
 from lagbench.submission import validation
@@ -116,16 +120,53 @@ def test_files_of_ours_that_are_no_predictions_are_named(
         assert run("validate", path).exit_code == 3
 
 
+def too_wide(text: str) -> list[str]:
+    """Return lines wider than 80 columns, colours left out, but paths and remarks."""
+    lines = re.sub(r"\x1b\[[0-9;]*m", "", text).split("\n")
+    return [line for line in lines if len(line.rstrip()) > 80 and not re.search(r":|\w/\w+/", line)]
+
+
+@pytest.fixture
+def terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let commands take their output for a terminal of 80 columns."""
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setattr("rich.console.Console.is_terminal", property(lambda _: True))
+
+
+@pytest.mark.usefixtures("terminal")
 def test_tables_fit_eighty_columns(run: Run, predictions: Path) -> None:
     """No line of any table is wider, with every metric and every floor too."""
     run("score", predictions)
+    board = Path(lagbench.__file__).parents[1] / "leaderboard"
     for words in (
+        ("score", predictions),
         ("score", predictions, "--all", "--all-floors"),
         ("compare", predictions.parent, "analog", "--all"),
+        ("list",),
+        ("info", "cavity"),
+        ("info", SPLIT, "--size", SIZE),
+        ("verify", SPLIT, "--size", SIZE),
+        ("leaderboard", "show", "--board", board),
     ):
-        lines = run(*words).stdout.split("\n")
-        wide = [line for line in lines if len(line.rstrip()) > 80 and ":" not in line]
-        assert wide == []
+        result = run(*words)
+        assert result.exit_code == 0, result.output
+        assert result.stdout
+        assert (words, too_wide(result.stdout)) == (words, [])
+
+
+def commands(group: Any, *before: str) -> Iterator[tuple[str, ...]]:
+    """Yield the words of every command below a group."""
+    for name, command in group.commands.items():
+        yield from commands(command, *before, name) if hasattr(command, "commands") else [(*before, name)]
+
+
+@pytest.mark.usefixtures("terminal")
+@pytest.mark.parametrize("words", [(), ("leaderboard",), *commands(get_command(app))], ids=" ".join)
+def test_help_fits_eighty_columns(run: Run, words: tuple[str, ...]) -> None:
+    """The help of each command, and of those above, is told in 80 columns."""
+    result = run(*words, "--help")
+    assert result.exit_code == 0
+    assert [line for line in result.stdout.split("\n") if too_wide(line.replace(":", "."))] == []
 
 
 def test_compare_says_that_two_scenarios_are_few(run: Run, predictions: Path) -> None:

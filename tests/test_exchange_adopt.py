@@ -24,6 +24,7 @@ from lagbench.exchange import adopt, local_split
 from lagbench.exchange.adoption import _by_subset
 from lagbench.exchange.local_split import LocalSplit
 from lagbench.exchange.trajectory import Measure, estimate_spacing
+from lagbench.work.progress import Progress
 
 BASIC: dict[str, Any] = {"radius": 0.1, "frame_interval": 0.25}
 
@@ -108,6 +109,20 @@ def test_a_local_split_is_verified_templated_and_scored(own: LocalSplit, tmp_pat
     assert np.max(floor.per_frame) < 1e-5
     assert np.min(card.scores["persistence"]["position_rmse"].per_frame) > 1e-3
     assert card.header.split == "mine"
+
+
+def test_progress_counts_towards_the_number_of_trajectories(tmp_path: Path) -> None:
+    """Each subset ends with all of its trajectories written, of as many."""
+    told: dict[str, Progress] = {}
+    adopt(
+        save_runs(tmp_path / "in", straight_runs(6)),
+        output=tmp_path / "mine",
+        test=2,
+        progress=lambda news: told.update({news.stage: news}),
+        **BASIC,
+    )
+    counts = {stage: (news.scenarios_done, news.scenarios, news.total) for stage, news in told.items()}
+    assert counts == {"writing train": (3, 3, 3), "writing valid": (1, 1, 1), "writing test": (2, 2, 2)}
 
 
 def test_ten_comes_after_two(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ Commands that say what there is: list, info, cite. Commands that look after the 
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -192,7 +193,7 @@ def list_splits(root: RootOption = None, as_json: JsonFlag = False) -> None:
     show({"root": folder, "sizes": found}, listed(), as_json=as_json)
 
 
-_COLUMNS = ("scenarios", "particles", "frames", "disk at most", "time", "here")
+_COLUMNS = ("scenarios", "particles", "frames", "disk <=", "time", "here")
 
 
 def _origin(found: list[Overview]) -> list[str]:
@@ -237,15 +238,16 @@ def info(
     found = [overview(one, folder) for one in sizes]
 
     def told() -> Iterator[str]:
-        yield f"{entry.title} ({split_name} {entry.version}, {entry.licence})\n{entry.description}\n"
+        text = textwrap.fill(entry.description, 79, break_on_hyphens=False)
+        yield f"{entry.title} ({split_name} {entry.version}, {entry.licence})\n{text}\n"
         print_table("Sizes", ("split", "size", *_COLUMNS), [_row(one) for one in found])
         yield from _origin(found)
         tiers = [registry.size(split_name, one) for one in entry.sizes]
         parameters = [
-            (name, *(tier.value(name) for tier in tiers), parameter.unit, parameter.description)
+            (name, *(tier.value(name) for tier in tiers), f"[{parameter.unit}] {parameter.description}")
             for name, parameter in entry.parameters.items()
         ]
-        print_table("Parameters", ("name", *entry.sizes, "unit", "meaning"), parameters)
+        print_table("Parameters", ("name", *entry.sizes, "[unit] meaning"), parameters)
         for one, tier in zip(found, sizes, strict=True):
             yield from _details(one, tier)
 

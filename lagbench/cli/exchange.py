@@ -245,6 +245,9 @@ def adopt(
     frames_of_interest: InterestOption = None,
     cells: CellsOption = None,
     full_box: FullBoxFlag = None,
+    as_is: Annotated[
+        bool, typer.Option("--as-is", help="Take arrays whose axes or velocities look mistaken.")
+    ] = False,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
@@ -252,7 +255,7 @@ def adopt(
     from lagbench.exchange.adoption import adopt as run
 
     with progress_bar(quiet=quiet) as draw:
-        made = run(sources, output=output, valid=valid, test=test, progress=draw, **_wishes(ctx))
+        made = run(sources, output=output, valid=valid, test=test, as_is=as_is, progress=draw, **_wishes(ctx))
     _made(made, as_json=as_json, quiet=quiet)
 
 

@@ -154,7 +154,7 @@ def progress_bar(*, quiet: bool, counted: str = "scenarios") -> Iterator[Callabl
             bar.update(
                 task,
                 description=news.stage,
-                total=news.total,
+                total=news.total or None,
                 completed=news.done,
                 count=_count(news, counted),
             )
@@ -170,7 +170,8 @@ def _in_lines(counted: str) -> Callable[[State], None]:
         if (now := time.monotonic()) - last < SECONDS_PER_LINE:
             return
         last = now
-        left = (news.scenarios - news.scenarios_done) / news.rate if news.rate else math.inf
+        known = news.scenarios and news.rate
+        left = (news.scenarios - news.scenarios_done) / news.rate if known else math.inf
         still = f", {spell_seconds(left)} left" if math.isfinite(left) else ""
         share = f"{news.done / news.total:.0%}, " if news.total else ""
         with suppress(OSError):  # the work goes on without a reader
@@ -180,4 +181,5 @@ def _in_lines(counted: str) -> Callable[[State], None]:
 
 
 def _count(news: State, counted: str) -> str:
-    return f"{news.scenarios_done}/{news.scenarios} {counted}, {news.rate:.2f}/s"
+    of = f"/{news.scenarios}" if news.scenarios else ""
+    return f"{news.scenarios_done}{of} {counted}, {news.rate:.2f}/s"

@@ -93,6 +93,10 @@ def train(
     from lagbench.baselines.train import train as run
 
     quiet = quiet or is_helper()
+    if not is_helper():
+        _warn_of_scores(
+            chosen(name, split), size, root, validated="training.validate_every=0" not in (settings or ())
+        )
     with _told_once(), progress_bar(quiet=quiet, counted="steps") as draw:
         result = run(
             baseline,
@@ -115,6 +119,22 @@ def train(
         print_json(result)
     else:
         say("\n".join(_trained(result, _where(chosen(name, split), root))), quiet=quiet)
+
+
+def _warn_of_scores(split: str, size: str | None, root: Path | None, *, validated: bool) -> None:
+    """Say on stderr why a user's own data cannot be scored, before a training is spent on them."""
+    from lagbench.data.local import locate
+    from lagbench.scoring.usable import unusable
+
+    tier, home, _ = locate(split, size, root=root)
+    if tier.simulated:
+        return
+    reasons = list(unusable(tier, home, validated=validated))
+    if reasons:
+        typer.echo(
+            "warning: what is trained here cannot be scored as it should\n  " + "\n  ".join(reasons),
+            err=True,
+        )
 
 
 @contextmanager

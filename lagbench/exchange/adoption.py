@@ -21,6 +21,7 @@ from . import gns_npz, lagrangebench_h5
 from .exporting import ENDINGS
 from .local_split import LocalSplit, make_local_split, output_name
 from .metadata import DROP, Format, Source, parse_format, read_source
+from .mistakes import check_meaning
 from .trajectory import Description, Frame, Trajectory, Wishes, check_array, check_inflation
 
 if TYPE_CHECKING:
@@ -42,6 +43,7 @@ def adopt(
     output: str | Path,
     valid: int | None = None,
     test: int | None = None,
+    as_is: bool = False,
     progress: Callable[[Progress], None] | None = None,
     **wishes: Unpack[Wishes],
 ) -> LocalSplit:
@@ -59,6 +61,7 @@ def adopt(
         output: folder to make; its last part is the name of the split.
         valid: trajectories for valid; a tenth, at least one, when None.
         test: trajectories for test; a tenth, at least one, when None.
+        as_is: whether to take arrays that look transposed, and velocities of another frame, axis or unit.
         progress: called as the work advances.
         **wishes: ``radius`` and ``frame_interval``, which must be given, and what else is known,
             see :class:`lagbench.exchange.trajectory.Description`.
@@ -67,7 +70,8 @@ def adopt(
         UsageError: no radius or frame interval, too few trajectories, a folder that is there, a
             task that does not fit the data.
         UnreadableFileError: a file is damaged, pickled, or holds no positions.
-        DataError: positions are not plane, not finite, or outside the unit box.
+        DataError: positions are not plane, not finite, or outside the unit box; another reading explains
+            the axes or the velocities far better.
         WorkFailedError: the disk is full or not writable.
     """
     for name in ("radius", "frame_interval"):
@@ -75,10 +79,12 @@ def adopt(
             raise UsageError(f"the {name.replace('_', ' ')} is not known", fix=f"--{name.replace('_', '-')}")
     given = [Path(sources)] if isinstance(sources, str | Path) else [Path(source) for source in sources]
     files = _by_subset(given, valid=valid, test=test)
-    count = sum(map(len, files.values()))
-    about = Description(name=output_name(output), source=f"{count} trajectories of the user's own", **wishes)
-    subsets = {subset: (_open(path, row) for path, row in rows) for subset, rows in files.items()}
-    return make_local_split(about, subsets, output, command="adopt", progress=progress)
+    counts = {subset: len(rows) for subset, rows in files.items()}
+    source = f"{sum(counts.values())} trajectories of the user's own"
+    about = Description(name=output_name(output), source=source, **wishes)
+    interval = None if as_is else about.frame_interval
+    subsets = {subset: (_open(path, row, interval) for path, row in rows) for subset, rows in files.items()}
+    return make_local_split(about, subsets, output, command="adopt", counts=counts, progress=progress)
 
 
 def import_split(
@@ -192,10 +198,14 @@ def _rows(path: Path) -> list[Row]:
     """Return the trajectories of a file, or of the files of a folder by name."""
     if path.is_dir():
         found = _natural([file for file in path.iterdir() if file.suffix in READABLE and file.is_file()])
-        return [row for file in found for row in _rows(file)]
+        if found:
+            return [row for file in found for row in _rows(file)]
     if path.suffix not in READABLE or not path.is_file():
         raise UnreadableFileError(
-            "this is no file of trajectories", where=str(path), expected=f"a folder, or {', '.join(READABLE)}"
+            "no trajectories are there",
+            where=str(path),
+            expected=f"a file {', '.join(READABLE)}, or a folder of them",
+            got="a folder without such files" if path.is_dir() else None,
         )
     if path.suffix != ".npy":
         return [(path, None)]
@@ -203,17 +213,20 @@ def _rows(path: Path) -> list[Row]:
     return [(path, row) for row in range(shape[0])] if len(shape) == 4 else [(path, None)]
 
 
-def _open(path: Path, row: int | None) -> Trajectory:
-    """Return a trajectory whose arrays are read frame by frame where the file allows it."""
+def _open(path: Path, row: int | None, interval: float | None) -> Trajectory:
+    """Return a trajectory whose arrays are read frame by frame where the file allows it.
+
+    What they mean is looked at where the time between frames is given.
+    """
     if path.suffix == ".npy":
         array = _array(path)
         name = str(path) if row is None else f"{path}, trajectory {row}"
         held = {POSITION: array if row is None else array[row]}
-        return _trajectory(name, held, lambda: _frames(held))
+        return _trajectory(name, held, lambda: _frames(held), interval)
     if path.suffix == ".npz":
         arrays = _arrays(path)
-        return _trajectory(str(path), arrays, lambda: _frames(arrays))
-    return _netcdf(path)
+        return _trajectory(str(path), arrays, lambda: _frames(arrays), interval)
+    return _netcdf(path, interval)
 
 
 def _frames(arrays: Mapping[str, Any]) -> Iterator[Frame]:
@@ -224,8 +237,10 @@ def _frames(arrays: Mapping[str, Any]) -> Iterator[Frame]:
         yield frame, None if velocity is None else np.asarray(velocity[number])
 
 
-def _trajectory(name: str, arrays: Mapping[str, Any], read: Callable[[], Iterator[Frame]]) -> Trajectory:
-    """Return the trajectory of named arrays after a look at their shapes."""
+def _trajectory(
+    name: str, arrays: Mapping[str, Any], read: Callable[[], Iterator[Frame]], interval: float | None
+) -> Trajectory:
+    """Return the trajectory of named arrays after a look at their shapes and, given an interval, meaning."""
     if POSITION not in arrays:
         raise UnreadableFileError(
             "there are no positions", where=name, expected=f"an array {POSITION!r}", got=", ".join(arrays)
@@ -254,6 +269,8 @@ def _trajectory(name: str, arrays: Mapping[str, Any], read: Callable[[], Iterato
             expected="shape (4, 2) or (frame, 4, 2)",
             got=walls.shape,
         )
+    if interval is not None:
+        check_meaning(name, arrays[POSITION], arrays.get(VELOCITY), interval)
     return Trajectory(
         name=name, frames=frames, material=material.astype(np.int8), read=read, wall_velocity=walls
     )
@@ -297,7 +314,7 @@ def _refuse_objects(name: str, stream: IO[bytes]) -> None:
         )
 
 
-def _netcdf(path: Path) -> Trajectory:
+def _netcdf(path: Path, interval: float | None) -> Trajectory:
     import netCDF4
 
     try:
@@ -316,7 +333,10 @@ def _netcdf(path: Path) -> Trajectory:
         except (OSError, RuntimeError) as error:
             raise _unreadable(path, error) from error
 
-    return _trajectory(str(path), held, read)
+    try:
+        return _trajectory(str(path), held, read, interval)
+    except (OSError, RuntimeError) as error:
+        raise _unreadable(path, error) from error
 
 
 def _check_plain(path: Path, file: netCDF4.Dataset) -> None:

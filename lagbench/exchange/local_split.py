@@ -18,14 +18,17 @@ from numpy.typing import NDArray
 
 from lagbench.atomic import temporary_name
 from lagbench.data.checksums import HASHED_SUBSETS
+from lagbench.data.grid import Placement
 from lagbench.data.layout import ScenarioKey, scenario_path
 from lagbench.data.local import DESCRIPTION
 from lagbench.data.manifest import FileEntry, Manifest, describe_file, merge, write_manifest
 from lagbench.data.registry import MAX_ID, NO_GENERATOR, load, spell_ids
+from lagbench.data.scenario import read_scenario
 from lagbench.data.statistics import file_statistics
 from lagbench.data.writer import ScenarioWriter
 from lagbench.data.yamlfile import spell_yaml
 from lagbench.errors import DataError, UsageError, WorkFailedError
+from lagbench.metrics.coverage import Cloud, fitting_cells
 from lagbench.work.machine import environment_of
 from lagbench.work.progress import Meter, Progress
 
@@ -74,11 +77,13 @@ def make_local_split(
     output: str | Path,
     *,
     command: str,
+    counts: Mapping[str, int] | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> LocalSplit:
     """Write a local split of the trajectories of train, valid and test; it appears whole or not at all.
 
-    The last part of ``output`` is the name of the split, ``command`` stands in the head of its description.
+    The last part of ``output`` is the name of the split, ``command`` stands in the head of its description;
+    ``counts`` are the trajectories of each subset, where they are known before.
     """
     folder = Path(os.path.abspath(Path(output).expanduser()))
     if about.name in load().splits:
@@ -94,7 +99,8 @@ def make_local_split(
         building = _Building(about, root)
         for subset in HASHED_SUBSETS:
             before = len(building.entries)
-            meter.begin(f"writing {subset}", total=0, scenarios=0)
+            total = counts[subset] if counts else 0
+            meter.begin(f"writing {subset}", total=total, scenarios=total)
             for trajectory in subsets[subset]:
                 building.add(subset, trajectory)
                 meter.count(1, scenarios=1)
@@ -103,7 +109,7 @@ def make_local_split(
         manifest = building.finish(command)
         size = load(root / about.name / DESCRIPTION).size(about.name, SIZE)
         (root / about.name).replace(folder)
-    counts = sorted(entry.particles for entry in manifest.files)
+    particles = [entry.particles for entry in manifest.files]
     tested = {entry.particles for entry in manifest.files if entry.subset == "test"}
     note = (
         f"test scenarios have {min(tested)} to {max(tested)} particles: the split can be opened and "
@@ -115,7 +121,7 @@ def make_local_split(
         size=SIZE,
         scenarios={name: len(ids) for name, ids in size.subsets.items()},
         frames=sum(entry.frames for entry in manifest.files),
-        particles=(counts[0], counts[-1]),
+        particles=(min(particles), max(particles)),
         input_frames=size.task.input_frames,
         horizon=size.task.horizon,
         spacing=building.spacing,
@@ -165,7 +171,7 @@ class _Building:
             first = np.asarray(next(trajectory.read())[0])
             self._check(trajectory, 0, about.measure.place(first))
             self.spacing = (about.spacing or estimate_spacing(first, about.radius)) / scale
-        key = ScenarioKey(split=about.name, size=SIZE, version=VERSION, scenario=scenario, subset=subset)
+        key = self._key(scenario, subset)
         walls = None if trajectory.wall_velocity is None else np.asarray(trajectory.wall_velocity) / scale
         with ScenarioWriter(
             scenario_path(self.root, key),
@@ -185,6 +191,11 @@ class _Building:
             for position, velocity in self._frames(trajectory):
                 writer.append(position, velocity)
         self.entries.append(describe_file(self.root, key))
+
+    def _key(self, scenario: int, subset: str) -> ScenarioKey:
+        return ScenarioKey(
+            split=self.about.name, size=SIZE, version=VERSION, scenario=scenario, subset=subset
+        )
 
     def _frames(self, trajectory: Trajectory) -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
         """Yield positions and velocities in the unit box; without own velocities, differences.
@@ -224,10 +235,7 @@ class _Building:
         """Write manifest and description; return the manifest."""
         about, content = self.about, {entry.scenario: entry.content_sha256[:16] for entry in self.entries}
         ids = {name: [e.scenario for e in self.entries if e.subset == name] for name in HASHED_SUBSETS}
-        keys = [
-            ScenarioKey(split=about.name, size=SIZE, version=VERSION, scenario=i, subset="train")
-            for i in ids["train"]
-        ]
+        keys = [self._key(i, "train") for i in ids["train"]]
         manifest = merge(
             None,
             self.entries,
@@ -332,7 +340,6 @@ class _Building:
                 expected=f"together at most {shortest}",
                 got=f"{about.input_frames} and {horizon}",
             )
-        suits = round(1.0 / (PER_CELL * self.spacing))
         interest = sorted(set(about.frames_of_interest or (last,)))
         if not about.input_frames <= interest[0] <= interest[-1] <= last:
             raise UsageError(
@@ -341,13 +348,27 @@ class _Building:
                 expected=f"frames {about.input_frames} to {last}",
                 got=spell_ids(interest) if interest[0] >= 0 else interest,
             )
+        placement = Placement.CELL_CENTRES if about.full_box else Placement.NODES
         return {
             "input_frames": about.input_frames,
             "horizon": horizon,
             "frames_of_interest": interest,
             "score_grid": {
-                "cells": about.cells or min(MOST_CELLS, max(FEWEST_CELLS, suits)),
-                "placement": "cell_centres" if about.full_box else "nodes",
+                "cells": about.cells or self._suitable_cells(placement, (about.input_frames, last)),
+                "placement": placement.value,
             },
             "radius": about.radius / about.measure.scale,
         }
+
+    def _suitable_cells(self, placement: Placement, frames: tuple[int, int]) -> int:
+        """Return cells of some spacings, or as near as test scenarios cover enough nodes in these frames."""
+        suits = min(MOST_CELLS, max(FEWEST_CELLS, round(1.0 / (PER_CELL * self.spacing))))
+        clouds = []
+        for entry in self.entries:
+            if entry.subset == "test":
+                key = self._key(entry.scenario, "test")
+                with read_scenario(scenario_path(self.root, key)) as file:
+                    for frame in frames:
+                        position = file.read("position", slice(frame, frame + 1))[0]
+                        clouds.append(Cloud(position, len(position) * self.spacing**2))
+        return fitting_cells(clouds, placement, near=suits) or suits

@@ -17,6 +17,8 @@ from lagbench.data.local import is_name
 from lagbench.data.yamlfile import read_yaml
 from lagbench.errors import DataError, UnreadableFileError, UsageError
 
+from .mistakes import misplaced_axes
+
 __all__ = [
     "FEWEST_CELLS",
     "MOST_CELLS",
@@ -254,11 +256,13 @@ def check_array(name: str, shape: tuple[int, ...], dtype: np.dtype[np.generic]) 
             got=f"{dtype} of shape {shape}",
         )
     if shape[2] != PLANE:
+        turned = misplaced_axes(shape)
         raise DataError(
-            f"positions have {shape[2]} components",
+            turned.what if turned else f"positions have {shape[2]} components",
             where=name,
             expected="2: lagbench holds plane data only",
             got=f"shape {shape}",
+            fix=turned.fix if turned else None,
         )
     if shape[0] < 2 or shape[1] < 1:
         raise DataError("too little for a trajectory", where=name, expected="2 frames, 1 particle", got=shape)

@@ -14,11 +14,10 @@ from lagbench.data.registry import Registry
 from lagbench.errors import UnreadableFileError, UsageError, nearest
 from lagbench.floors import persistence
 from lagbench.floors.shipped import shipped
-from lagbench.metrics.aggregate import Score, aggregate
-from lagbench.metrics.frame import FramePair
-from lagbench.metrics.metric import MINIMUM_NODES, Metric
+from lagbench.metrics.aggregate import Score, Tally, aggregate
+from lagbench.metrics.metric import Metric
 from lagbench.metrics.table import available, select
-from lagbench.submission.findings import Finding, Severity, ValidationResult
+from lagbench.submission.findings import Finding, ValidationResult
 from lagbench.submission.format import Header
 from lagbench.submission.predictions import open_predictions
 from lagbench.submission.validation import validate
@@ -32,6 +31,7 @@ from .floors import measurable
 from .scenario import SUBMISSION, ScenarioJob, ScenarioScores, score_scenario
 from .score_file import NETCDF_NAME, write_statistics
 from .task import ScoredTask, load_scored_task, ranking_metric
+from .usable import OF_NODES, few_nodes
 
 __all__ = [
     "score",
@@ -124,7 +124,7 @@ def score(
         tallies=tallies,
         scores=scores,
         flags=_flags(task, outcomes, scores),
-        warnings=(*result.warnings, *_undefined(task, scores[SUBMISSION])),
+        warnings=(*result.warnings, *_undefined(task, tallies[SUBMISSION])),
         preview=preview,
     )
     return _written(card, folder) if write else card
@@ -160,23 +160,18 @@ def _check_own(path: Path, header: Header) -> None:
         )
 
 
-def _undefined(task: ScoredTask, scores: Mapping[str, Score]) -> Iterator[Finding]:
-    """Warn where nothing of the vorticity is defined, and say how many nodes it would take."""
-    found = scores.get("vorticity_nrmse")
-    if found is None or not np.isnan(found.values).all() or np.isfinite(scores["vorticity_mse"].values).any():
-        return
-    with task.opened(task.scenarios[0]) as truth:
-        true = next(truth.snapshots())
-        nodes = FramePair(truth.scenario, task.setting.predicted_frames[0], true, true).node_count
-    yield Finding(
-        check="undefined",
-        severity=Severity.WARNING,
-        what="the vorticity has no value in any frame",
-        where=f"score grid of {task.setting.grid.cells} cells",
-        expected=f"{MINIMUM_NODES} nodes with particles enough around them",
-        got=f"{nodes} of {MINIMUM_NODES} nodes counted in the first frame",
-        fix="a coarser score grid: lagbench adopt --cells, or lagbench import --cells",
-    )
+def _undefined(task: ScoredTask, held: Mapping[int, Tally]) -> Iterator[Finding]:
+    """Warn where the vorticity of all scenarios, or of any where it ranks, has too few nodes throughout."""
+    lost = [i for i, tally in held.items() if not _has_nodes(tally)]
+    if lost and (ranking_metric(task.size) == OF_NODES or len(lost) == len(held)):
+        yield few_nodes(task, lost)
+
+
+def _has_nodes(tally: Tally) -> bool:
+    """Tell whether the vorticity was compared in any frame, if it was measured."""
+    if "vorticity_mse" not in tally.names:
+        return True
+    return bool(tally.weight[tally.names.index("vorticity_mse")].any())
 
 
 def _written(card: ScoreCard, folder: Path) -> ScoreCard:

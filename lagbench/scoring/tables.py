@@ -159,6 +159,8 @@ def flag_lines(card: ScoreCard) -> Iterator[str]:
         yield f"flag {flag.name}: {word}{reasons}"
     for warning in card.warnings:
         yield f"warning [{warning.check}] {warning.what}: {warning.got}"
+        if warning.fix:
+            yield f"  fix: {warning.fix}"
 
 
 def _against(card: ScoreCard, row: str) -> str:

@@ -15,9 +15,9 @@ class Progress:
 
     stage: str  # what happens now, in a word or two
     done: int  # units of work done: substeps, summed over scenarios, or files
-    total: int  # units to do
+    total: int  # units to do; 0 where nobody knows
     scenarios_done: int  # scenarios that are finished
-    scenarios: int  # scenarios to finish
+    scenarios: int  # scenarios to finish; 0 where nobody knows
     seconds: float  # time since the start [s]
     before: int = 0  # scenarios that an earlier run had finished; they took none of that time
 

@@ -1,0 +1,184 @@
+"""Arrays that were meant otherwise: axes transposed, velocities of another frame, axis or unit.
+
+Each mistake is undone and compared. A trajectory is refused only where another reading explains it
+far better than the one taken: what is noisy, at rest or random is nobody's mistake.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagbench.errors import DataError
+from lagbench.submission.start import NEARER, Mistake
+
+__all__ = ["check_meaning", "misplaced_axes"]
+
+STRETCH = 4
+"""Neighbours along an axis that are looked at together: two second differences, a step and its neighbours."""
+
+STRETCHES = 64, 200
+"""Stretches of frames and of particles that are looked at, evenly spaced over each axis."""
+
+ROUGH = 0.5
+"""Change of a step, as a share of the step, from which on frames do not resolve the motion."""
+
+EXPLAINED = 0.5
+"""Share of the velocities' variance that motion must leave, or another reading take away, to count."""
+
+FACTOR = 1.5
+"""Velocities that differ by more from the motion have another unit; those of our coarsest data do by 1.3."""
+
+SHIFTED = 0.4
+"""Share of the misfit that a shift by a frame must leave: velocities of a solver may lag by a tenth."""
+
+FEWEST = 8
+"""Steps below which chance may look like anything."""
+
+Block = NDArray[np.float64]
+"""Some values of a trajectory, of shape [stretch of frames, frame, stretch of particles, particle, 2]."""
+
+
+def misplaced_axes(shape: tuple[int, ...]) -> Mistake | None:
+    """Return what is wrong with a shape whose components do not come last; None where they do."""
+    if len(shape) != 3 or shape[2] == 2 or 2 not in shape[:2]:
+        return None
+    found, place = ("(frames, 2, particles)", 1) if shape[1] == 2 else ("(2, frames, particles)", 0)
+    return Mistake(_axes(found), f"np.moveaxis(array, {place}, 2)")
+
+
+def _axes(found: str) -> str:
+    return f"axes: {found} where (frames, particles, 2) was expected"
+
+
+def check_meaning(name: str, position: Any, velocity: Any, interval: float) -> None:  # noqa: ANN401 (arrays, also netCDF's)
+    """Refuse a trajectory that another reading of its axes or velocities explains far better.
+
+    Args:
+        name: what to call it.
+        position: [frame, particle, 2], in memory or in a file [length].
+        velocity: of the same shape, or None [length/s].
+        interval: time between frames [s].
+
+    Raises:
+        DataError: names the mistakes and how to mend them.
+    """
+    if position.shape[0] < STRETCH:
+        return
+    with np.errstate(all="ignore"):  # what is not finite is no mistake of meaning, and found elsewhere
+        moved = _block(position)
+        if _is_transposed(moved):
+            found = [Mistake(_axes("(particles, frames, 2)"), "array.swapaxes(0, 1)")]
+        elif velocity is not None:
+            found = list(_of_velocities(moved, _block(velocity), interval))
+        else:
+            return
+    if found:
+        raise DataError(
+            "; ".join(mistake.what for mistake in found),
+            where=name,
+            expected="position[f, p] and velocity[f, p] of particle p in frame f, x first, per second",
+            fix="; ".join(mistake.fix for mistake in found) + "; or, if the data are right, --as-is",
+        )
+
+
+def _block(array: Any) -> Block:  # noqa: ANN401
+    """Return evenly spaced stretches of an array, of which a frame at a time is in memory."""
+    frames, particles = (_stretches(n, most) for n, most in zip(array.shape[:2], STRETCHES, strict=True))
+    rows = [np.asarray(array[int(frame)], np.float64)[particles] for frame in frames.flat]
+    return np.stack(rows).reshape(*frames.shape, *particles.shape, 2)
+
+
+def _stretches(count: int, most: int) -> NDArray[np.int_]:
+    """Return indices of shape [stretch, neighbour]."""
+    length = min(STRETCH, count)
+    first = np.unique(np.linspace(0, count - length, most).astype(int))
+    found: NDArray[np.int_] = first[:, None] + np.arange(length)
+    return found
+
+
+def _is_transposed(moved: Block) -> bool:
+    """Tell whether positions jump from row to row but not from column to column.
+
+    Particles are distinct places in any order, moments of one particle a smooth curve.
+    """
+    if moved.shape[3] < STRETCH:
+        return False
+    (step, change), (other_step, other_change) = (
+        (_length(np.diff(moved, axis=axis)), _length(np.diff(moved, n=2, axis=axis))) for axis in (1, 3)
+    )
+    jumps = change >= ROUGH * step > 0.0
+    # Jitter about a smooth row of particles at rest jumps from row to row, and as much along the row.
+    return bool(
+        jumps and other_change * step <= NEARER * change * other_step and other_change <= NEARER * change
+    )
+
+
+def _of_velocities(moved: Block, velocity: Block, interval: float) -> Iterator[Mistake]:
+    """Yield the mistakes in velocities, each after the ones before are undone."""
+    steps = np.diff(moved, axis=1)
+    step = steps[:, 1]
+    if step[..., 0].size < FEWEST:
+        return
+    (left, _), (swapped, _) = _multiple(step, velocity), _multiple(step, velocity[..., ::-1])
+    if swapped <= EXPLAINED * left:
+        yield Mistake("x and y of the velocity are swapped", "velocity[..., ::-1]")
+        velocity = velocity[..., ::-1]
+    if _length(np.diff(steps, axis=1)) > ROUGH * _length(step):
+        return
+    left, rate = _multiple(step, velocity)
+    factor = rate * interval
+    if left <= EXPLAINED and not 1.0 / FACTOR <= factor <= FACTOR:
+        per_frame = abs(factor / interval - 1.0) <= 0.1
+        if per_frame:
+            yield Mistake("velocities are per frame, not per second", "divide them by the frame interval")
+        else:
+            what = f"velocities are {factor:.3g} times what the positions move per second"
+            yield Mistake(what, f"divide them by it, or --frame-interval {interval / factor:.3g}")
+        interval = 1.0 if per_frame else interval / factor
+    yield from _shifted(step, velocity * interval)
+
+
+def _own(velocity: Block) -> tuple[Block, Block, Block]:
+    """Return what may be the mean over a step: the velocity before it, after it, or of both moments."""
+    return velocity[:, 1], velocity[:, 2], (velocity[:, 1] + velocity[:, 2]) / 2.0
+
+
+def _multiple(step: Block, velocity: Block) -> tuple[float, float]:
+    """Return which share of the velocities' variance no multiple of the steps explains, and the multiple.
+
+    The share is 1 where nothing moves.
+    """
+    found = []
+    for mean in _own(velocity):
+        squares, both = np.sum(step * step), np.sum(step * mean)
+        share = 1.0 - both**2 / (squares * np.sum(mean * mean))
+        found.append((float(share), float(both / squares)) if np.isfinite(share) else (1.0, 0.0))
+    return min(found)
+
+
+def _shifted(step: Block, velocity: Block) -> Iterator[Mistake]:
+    """Yield whether velocities [length/frame] explain the step before or after better than their own.
+
+    A velocity may be that of its moment, or the difference to the frame before or after.
+    """
+
+    def apart(*readings: Block) -> float:
+        return min(_length(step - reading) for reading in readings)
+
+    own = min(apart(*_own(velocity)), _length(step))
+    before, start, end, after = (velocity[:, frame] for frame in range(STRETCH))
+    for reading, inner, what, fix in (
+        (after, end, "late", "velocity[1:] belongs to position[:-1]"),
+        (before, start, "early", "velocity[:-1] belongs to position[1:]"),
+    ):
+        if own > 0.0 and apart(reading, (reading + inner) / 2.0) <= SHIFTED * own:
+            yield Mistake(f"velocities are one frame {what}", fix)
+
+
+def _length(vectors: Block) -> float:
+    """Return the mean length of vectors: less than their mean square it heeds the few that collide."""
+    return float(np.hypot(vectors[..., 0], vectors[..., 1]).mean())

@@ -1,0 +1,112 @@
+"""Whether a data set can be scored: what the metric that ranks needs of it, and how to mend it.
+
+Our own splits can be. Those that users bring may have too few particles for their score grid, test
+scenarios that differ in particles, or a truth at rest, beside which there is no skill.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from lagbench.data.local import DESCRIPTION
+from lagbench.data.registry import Size
+from lagbench.errors import DataError
+from lagbench.metrics.coverage import Cloud, covered_nodes, fitting_cells
+from lagbench.metrics.metric import MINIMUM_NODES
+from lagbench.submission.findings import Finding, Severity
+
+from .task import ScoredTask, load_scored_task, ranking_metric
+
+__all__ = ["few_nodes", "unusable"]
+
+OF_NODES = "vorticity_nrmse"
+"""The ranking metric that needs nodes."""
+
+
+def few_nodes(task: ScoredTask, scenarios: Collection[int]) -> Finding:
+    """Return what is to be said of scenarios whose vorticity has no value in any frame.
+
+    It counts nodes, and names a grid of which all scenarios cover enough, where there is one.
+    """
+    setting = task.setting
+    first = {i: _clouds(task, i)[0] for i in scenarios}
+    counts = [covered_nodes(cloud, setting.grid) for cloud in first.values()]
+    every = [cloud for i in task.scenarios for cloud in _clouds(task, i)]
+    cells = fitting_cells(every, setting.grid.placement, near=setting.grid.cells)
+    least, most = min(counts), max(counts)
+    return Finding(
+        check="undefined",
+        severity=Severity.WARNING,
+        what="the vorticity has no value in any frame",
+        where=f"score grid of {setting.grid.cells} cells",
+        expected=f"{MINIMUM_NODES} nodes with particles enough around them",
+        got=f"{len(counts)} of {len(task.scenarios)} {task.truth.subset} scenarios undefined:"
+        f" {least if least == most else f'{least} to {most}'} nodes counted, {MINIMUM_NODES} needed",
+        fix=_regrid(task, cells),
+    )
+
+
+def _regrid(task: ScoredTask, cells: int | None) -> str:
+    if cells is None:
+        return "more particles: they cover enough nodes of no grid"
+    word = "coarser" if cells < task.setting.grid.cells else "finer"
+    described = Path(task.size.split) / DESCRIPTION  # no path of this machine: scores.json repeats it
+    local = (task.truth.root / described).is_file()
+    here = f"cells: {cells} under score_grid in {described.as_posix()}, or " if local else ""
+    return f"a {word} grid: {here}--cells {cells} of lagbench adopt and import"
+
+
+def _clouds(task: ScoredTask, scenario: int) -> tuple[Cloud, Cloud]:
+    """Return the particles of the first and the last predicted frame."""
+    frames = task.setting.predicted_frames
+    with task.opened(scenario) as opened:
+        first, last = (opened.file.read("position", slice(f, f + 1))[0] for f in (frames[0], frames[-1]))
+        return Cloud(first, opened.scenario.area), Cloud(last, opened.scenario.area)
+
+
+def unusable(size: Size, root: Path, *, validated: bool = True) -> Iterator[str]:
+    """Yield why predictions of a data set could not be scored or validated, with what mends it.
+
+    Only the first and last frames that are to be predicted are read, beside what checks the files.
+
+    Args:
+        size: the split and size.
+        root: folder of all data sets.
+        validated: whether a training is validated on ``valid``.
+    """
+    for subset in ("test", "valid")[: 1 + validated]:
+        try:
+            task = load_scored_task(size, root, subset=subset)
+            yield from _faults(task)
+        except DataError as error:
+            fix = f"; {error.fix}" if error.fix else ""
+            yield f"{error.what}: expected {error.expected}, got {error.got}{fix}"
+
+
+def _faults(task: ScoredTask) -> Iterator[str]:
+    subset, counts, moves = task.truth.subset, set(), False
+    sparse = []
+    for i in task.scenarios:
+        with task.opened(i) as opened:
+            before = opened.scenario.last_given.position
+        clouds = _clouds(task, i)
+        counts.add(len(before))
+        moves |= any(not np.array_equal(before, np.asarray(cloud.position)) for cloud in clouds)
+        if all(covered_nodes(cloud, task.setting.grid) < MINIMUM_NODES for cloud in clouds):
+            sparse.append(i)
+    if len(counts) > 1 and subset == "test":
+        yield (
+            f"test scenarios have {min(counts)} to {max(counts)} particles: predictions need one number;"
+            " put those of one number into test: lagbench adopt with folders train, valid and test"
+        )
+    if not moves:
+        yield (
+            f"nothing moves in {subset}: no floor has an error to be better than; other trajectories"
+            f" for {subset}: lagbench adopt with folders train, valid and test"
+        )
+    elif sparse and ranking_metric(task.size) == OF_NODES:
+        found = few_nodes(task, sparse)
+        yield f"{found.got}; {found.fix}"
