@@ -245,13 +245,7 @@ def nudge(size: Size, scenario: int) -> NDArray[np.float32]:
 
 def twin_substeps(size: Size, scenario: int) -> int:
     """Return how many substeps a scenario's twin takes."""
-    unused = size.frame_count(scenario) - _last_frame(size, scenario) - 1
-    return substeps_of(size, scenario) - unused * size.substeps_per_frame
-
-
-def _last_frame(size: Size, scenario: int) -> int:
-    last = size.task.input_frames + size.task.horizon - 1
-    return min(last, size.frame_count(scenario) - 1)
+    return substeps_of(size, scenario) - size.frames_behind(scenario) * size.substeps_per_frame
 
 
 def twin_floors(job: SimulationJob, report: Report) -> dict[int, tuple[float, ...]]:
@@ -269,7 +263,7 @@ def twin_floors(job: SimulationJob, report: Report) -> dict[int, tuple[float, ..
         WorkFailedError: a twin blew up.
     """
     size = job.size
-    counts = [_last_frame(size, scenario) + 1 for scenario in job.scenarios]
+    counts = [size.frame_count(i) - size.frames_behind(i) for i in job.scenarios]
     batch = Batch(job, report, frames=counts)
     offsets = np.zeros((len(counts), size.particles, 2), dtype=np.float32)
     floors: list[list[float]] = [[] for _ in counts]

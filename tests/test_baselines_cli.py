@@ -212,7 +212,12 @@ def launched(*words: str) -> list[subprocess.CompletedProcess[str]]:
     with ThreadPoolExecutor() as both:
         pair = [
             both.submit(
-                subprocess.run, [sys.executable, *agent], env=environment, capture_output=True, text=True
+                subprocess.run,
+                [sys.executable, *agent],
+                env=environment,
+                capture_output=True,
+                text=True,
+                timeout=300,
             )
             for _ in range(2)
         ]

@@ -91,6 +91,25 @@ def test_other_units_are_named(ours: list[Any]) -> None:
         assert "3 times" in caught.value.what
 
 
+def test_backward_velocities_are_named(ours: list[Any]) -> None:
+    """Turned round, of any size; no frame interval mends them."""
+    for position, _, interval in ours[:2]:
+        for factor in (-1, -3):
+            with pytest.raises(DataError) as caught:
+                check_meaning("runs.npy", position, factor * differences(position, interval), interval)
+            assert "backwards" in caught.value.what
+            assert "--frame-interval" not in str(caught.value.fix)
+
+
+@pytest.mark.parametrize("shape", [(2, 40, 3), (50, 2, 3)])
+def test_data_in_space_are_not_called_transposed(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    """Three components are refused as such, whatever else has length two."""
+    np.save(tmp_path / "runs.npy", np.zeros((3, *shape)))
+    with pytest.raises(DataError) as caught:
+        adopt(tmp_path / "runs.npy", output=tmp_path / "own", radius=0.1, frame_interval=0.1)
+    assert "moveaxis" not in str(caught.value)
+
+
 @pytest.mark.parametrize("split", ["fluid", "multimaterial"])
 def test_shifted_velocities_are_named(split: str, tiny_split: Callable[..., GenerationResult]) -> None:
     """By one frame, late and early, in most scenarios whose velocities are those of the motion.
@@ -148,13 +167,23 @@ ODD: dict[str, Callable[[np.random.Generator], tuple[Array, Array]]] = {
         rng.random((300, 2)) * 0.1 + 0.02 * np.arange(20)[:, None, None] * np.array([1, 1]),
         np.full((20, 300, 2), 0.2),
     ),
+    "flight along the diagonal, exactly": lambda rng: _diagonal(rng, 1.0),
+    "flight along the other diagonal, exactly": lambda rng: _diagonal(rng, -1.0),
     "wheel that turns by half a radian per frame": lambda rng: _wheel(rng.random(300), 0.5),
     "wheel that turns nearly round per frame": lambda rng: _wheel(rng.random(300), 2.5),
     "filament that turns": lambda rng: _wheel(np.zeros(300), 0.3),
+    "filament that turns by much": lambda rng: _wheel(np.zeros(300), 0.7),
     "one particle": lambda rng: (rng.random((20, 1, 2)), rng.normal(size=(20, 1, 2))),
     "three frames": lambda rng: (rng.random((3, 300, 2)), rng.normal(size=(3, 300, 2))),
     "not finite": lambda rng: (np.full((20, 300, 2), np.nan), np.full((20, 300, 2), np.inf)),
 }
+
+
+def _diagonal(rng: np.random.Generator, side: float) -> tuple[Array, Array]:
+    """Return particles that fly together, all numbers powers of two apart: nothing is rounded."""
+    velocity = np.array([1.0, side]) / 8
+    place = rng.integers(0, 64, (300, 2)) / 64 + np.arange(20)[:, None, None] * velocity / 8
+    return place, np.broadcast_to(velocity / 8 / 0.1, place.shape)
 
 
 def _wheel(turn: Array, speed: float) -> tuple[Array, Array]:

@@ -151,6 +151,16 @@ def test_the_least_swirl_that_positions_can_show_is_compared() -> None:
     assert np.isfinite(divergences).all()
 
 
+def test_a_particle_flung_far_away_hides_no_swirl() -> None:
+    """What counts is the speed at the compared nodes."""
+    x = lattice(32)
+    velocity = FLIGHT + 1e-3 * swirl(x)
+    place, speed = x.copy(), velocity.copy()
+    place[0] = speed[0] = 1e12
+    pair = pair_of(x, velocity, speed, predicted_position=place)
+    assert measured(pair, "vorticity_pearson")[0] > 0.9
+
+
 def test_a_prediction_that_only_flies_has_no_correlation() -> None:
     """As one at rest: its residual is minus the truth."""
     r, tilt = measured(flying(1e-3, 0.0), "vorticity_pearson", "vorticity_residual_slope")

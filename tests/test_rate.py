@@ -17,8 +17,7 @@ from lagbench.data.registry import Registry
 from lagbench.generators.batch import SimulationJob
 from lagbench.generators.simulate import Pace, simulate
 from lagbench.make.generate import generate
-from lagbench.make.plan import estimate
-from lagbench.make.rate import measured_slowness, note_pace, orientation
+from lagbench.make.plan import estimate, measured_ratio, note_pace, reference_seconds
 
 Run = Callable[..., Result]
 
@@ -39,7 +38,7 @@ def noted(cache: Path, **kinds: Any) -> None:
 
 
 WORK = (1_000_000, 100)
-PLAIN = orientation(*WORK)
+PLAIN = reference_seconds(*WORK)
 GOOD = {"256": [2 * PLAIN, *WORK]}
 
 
@@ -74,11 +73,11 @@ def test_the_nearest_number_of_particles_stands_in(cache: Path, unmeasured: Regi
     assert size.particles == 256
     slow, slower = [2 * PLAIN, *WORK], [3 * PLAIN, *WORK]
     noted(cache, free_surface={"100": slow, "600": slower}, closed_box={"256": slow})
-    assert measured_slowness(size) == pytest.approx(3.0)
+    assert measured_ratio(size) == pytest.approx(3.0)
     noted(cache, closed_box={"256": slow})
-    assert measured_slowness(size) is None
+    assert measured_ratio(size) is None
     noted(cache, free_surface=GOOD, machine="another " + platform.node())
-    assert measured_slowness(size) is None
+    assert measured_ratio(size) is None
 
 
 DAMAGED: dict[str, Any] = {
@@ -113,7 +112,7 @@ def test_damaged_rates_are_passed_over(damage: str, cache: Path, unmeasured: Reg
     (cache / "rates.json").write_bytes(text.encode(errors="surrogateescape"))
     assert estimate(size, (0,)) == expected
     note_pace(size, [pace(5.0)])
-    assert measured_slowness(size) == pytest.approx(5.0)
+    assert measured_ratio(size) == pytest.approx(5.0)
 
 
 def test_notes_add_up_and_stay_few(cache: Path, unmeasured: Registry) -> None:
@@ -121,7 +120,7 @@ def test_notes_add_up_and_stay_few(cache: Path, unmeasured: Registry) -> None:
     size = unmeasured.size("fluid", "tiny")
     paces = [pace(1.0), pace(3.0)]
     note_pace(size, paces)
-    assert measured_slowness(size) == pytest.approx(2.0)
+    assert measured_ratio(size) == pytest.approx(2.0)
     noted(cache, free_surface={str(n): GOOD["256"] for n in range(1000, 1200)})
     note_pace(size, paces)
     held = json.loads((cache / "rates.json").read_text())

@@ -143,7 +143,10 @@ def test_training_says_so_first(
 
     monkeypatch.setattr("lagbench.baselines.train.train", begin)
     made = own_split(tmp_path, runs(12), cells=cells, full_box=True)
-    done = CliRunner().invoke(app, ["train", "--baseline", "var-1", "--split", str(made.folder)])
+    recipe = tmp_path / "own.yaml"
+    recipe.write_text(f"format: 1\nrecipes:\n  '*/{made.size}': {{}}\n")
+    words = ["train", "--baseline", "mlp", "--split", str(made.folder), "--recipe", str(recipe)]
+    done = CliRunner().invoke(app, words)
     before, begun, _ = done.stderr.partition("lagbench: begun")
     assert begun
     assert before.count("warning:") == warned

@@ -94,9 +94,7 @@ def train(
 
     quiet = quiet or is_helper()
     if not is_helper():
-        _warn_of_scores(
-            chosen(name, split), size, root, validated="training.validate_every=0" not in (settings or ())
-        )
+        _warn_of_scores(chosen(name, split), size, root, baseline, recipe, tuple(settings or ()))
     with _told_once(), progress_bar(quiet=quiet, counted="steps") as draw:
         result = run(
             baseline,
@@ -121,15 +119,25 @@ def train(
         say("\n".join(_trained(result, _where(chosen(name, split), root))), quiet=quiet)
 
 
-def _warn_of_scores(split: str, size: str | None, root: Path | None, *, validated: bool) -> None:
+def _warn_of_scores(
+    split: str,
+    size: str | None,
+    root: Path | None,
+    baseline: str,
+    variant: str | None,
+    settings: tuple[str, ...],
+) -> None:
     """Say on stderr why a user's own data cannot be scored, before a training is spent on them."""
+    from lagbench.baselines.catalogue import find
+    from lagbench.baselines.recipe import recipe_for
     from lagbench.data.local import locate
     from lagbench.scoring.usable import unusable
 
     tier, home, _ = locate(split, size, root=root)
     if tier.simulated:
         return
-    reasons = list(unusable(tier, home, validated=validated))
+    plan = recipe_for(find(baseline), tier.split, tier.name, variant=variant, settings=settings)
+    reasons = list(unusable(tier, home, validated=plan.training.validate_every != 0))
     if reasons:
         typer.echo(
             "warning: what is trained here cannot be scored as it should\n  " + "\n  ".join(reasons),

@@ -334,6 +334,10 @@ class Size(BaseModel):
             return self.frames
         return next(count for count, ids in self.frames.items() if scenario in ids)
 
+    def frames_behind(self, scenario: int) -> int:
+        """Return how many of a scenario's frames lie behind the horizon of the task."""
+        return max(0, self.frame_count(scenario) - self.task.input_frames - self.task.horizon)
+
 
 class Split(_Strict):
     """A named data set: version, provenance, parameters, sizes, and base URLs of its mirrors."""

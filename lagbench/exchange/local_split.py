@@ -363,12 +363,14 @@ class _Building:
     def _suitable_cells(self, placement: Placement, frames: tuple[int, int]) -> int:
         """Return cells of some spacings, or as near as test scenarios cover enough nodes in these frames."""
         suits = min(MOST_CELLS, max(FEWEST_CELLS, round(1.0 / (PER_CELL * self.spacing))))
-        clouds = []
-        for entry in self.entries:
-            if entry.subset == "test":
-                key = self._key(entry.scenario, "test")
-                with read_scenario(scenario_path(self.root, key)) as file:
-                    for frame in frames:
-                        position = file.read("position", slice(frame, frame + 1))[0]
-                        clouds.append(Cloud(position, len(position) * self.spacing**2))
+
+        def clouds() -> Iterator[Cloud]:
+            for entry in self.entries:
+                if entry.subset == "test":
+                    key = self._key(entry.scenario, "test")
+                    with read_scenario(scenario_path(self.root, key)) as file:
+                        for frame in frames:
+                            position = file.read("position", slice(frame, frame + 1))[0]
+                            yield Cloud(position, len(position) * self.spacing**2)
+
         return fitting_cells(clouds, placement, near=suits) or suits

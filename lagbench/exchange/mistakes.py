@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.errors import DataError
-from lagbench.submission.start import NEARER, Mistake
+from lagbench.submission.start import Mistake
 
 __all__ = ["check_meaning", "misplaced_axes"]
 
@@ -25,6 +25,15 @@ STRETCHES = 64, 200
 
 ROUGH = 0.5
 """Change of a step, as a share of the step, from which on frames do not resolve the motion."""
+
+JUMPS = 1.0
+"""The same share for what jumps: places drawn at random have 1.7, what turns by a radian per frame 0.96."""
+
+SMOOTHER = 0.25
+"""Share of the jumps that the other axis may have to be the smooth one."""
+
+ROUNDED = 1e-6
+"""Share of a variance that rounding may leave."""
 
 EXPLAINED = 0.5
 """Share of the velocities' variance that motion must leave, or another reading take away, to count."""
@@ -44,8 +53,8 @@ Block = NDArray[np.float64]
 
 def misplaced_axes(shape: tuple[int, ...]) -> Mistake | None:
     """Return what is wrong with a shape whose components do not come last; None where they do."""
-    if len(shape) != 3 or shape[2] == 2 or 2 not in shape[:2]:
-        return None
+    if len(shape) != 3 or shape[2] in (2, 3) or 2 not in shape[:2]:
+        return None  # with three components it is data in space
     found, place = ("(frames, 2, particles)", 1) if shape[1] == 2 else ("(2, frames, particles)", 0)
     return Mistake(_axes(found), f"np.moveaxis(array, {place}, 2)")
 
@@ -110,10 +119,10 @@ def _is_transposed(moved: Block) -> bool:
     (step, change), (other_step, other_change) = (
         (_length(np.diff(moved, axis=axis)), _length(np.diff(moved, n=2, axis=axis))) for axis in (1, 3)
     )
-    jumps = change >= ROUGH * step > 0.0
+    jumps = change >= JUMPS * step > 0.0
     # Jitter about a smooth row of particles at rest jumps from row to row, and as much along the row.
     return bool(
-        jumps and other_change * step <= NEARER * change * other_step and other_change <= NEARER * change
+        jumps and other_change * step <= SMOOTHER * change * other_step and other_change <= SMOOTHER * change
     )
 
 
@@ -124,7 +133,7 @@ def _of_velocities(moved: Block, velocity: Block, interval: float) -> Iterator[M
     if step[..., 0].size < FEWEST:
         return
     (left, _), (swapped, _) = _multiple(step, velocity), _multiple(step, velocity[..., ::-1])
-    if swapped <= EXPLAINED * left:
+    if left > ROUNDED and swapped <= EXPLAINED * left:
         yield Mistake("x and y of the velocity are swapped", "velocity[..., ::-1]")
         velocity = velocity[..., ::-1]
     if _length(np.diff(steps, axis=1)) > ROUGH * _length(step):
@@ -133,6 +142,9 @@ def _of_velocities(moved: Block, velocity: Block, interval: float) -> Iterator[M
     factor = rate * interval
     if left <= EXPLAINED and not 1.0 / FACTOR <= factor <= FACTOR:
         per_frame = abs(factor / interval - 1.0) <= 0.1
+        if factor < 0.0:
+            yield Mistake("velocities point backwards", "-velocity")
+            return
         if per_frame:
             yield Mistake("velocities are per frame, not per second", "divide them by the frame interval")
         else:
@@ -171,12 +183,14 @@ def _shifted(step: Block, velocity: Block) -> Iterator[Mistake]:
 
     own = min(apart(*_own(velocity)), _length(step))
     before, start, end, after = (velocity[:, frame] for frame in range(STRETCH))
-    for reading, inner, what, fix in (
-        (after, end, "late", "velocity[1:] belongs to position[:-1]"),
-        (before, start, "early", "velocity[:-1] belongs to position[1:]"),
-    ):
-        if own > 0.0 and apart(reading, (reading + inner) / 2.0) <= SHIFTED * own:
-            yield Mistake(f"velocities are one frame {what}", fix)
+    late, early = apart(after, (after + end) / 2.0), apart(before, (before + start) / 2.0)
+    if own > 0.0 and min(late, early) <= SHIFTED * own:
+        what, fix = (
+            ("late", "velocity[1:] belongs to position[:-1]")
+            if late <= early
+            else ("early", "velocity[:-1] belongs to position[1:]")
+        )
+        yield Mistake(f"velocities are one frame {what}", fix)
 
 
 def _length(vectors: Block) -> float:

@@ -44,8 +44,7 @@ from lagbench.work.run import ONE_THREAD, read_many
 from .cards import card_texts, write_cards
 from .gather import gather
 from .inventory import Look, compare, look
-from .plan import Estimate, Scenarios, Selection, check_disk, estimate, free_bytes, select
-from .rate import note_pace
+from .plan import Estimate, Scenarios, Selection, check_disk, estimate, free_bytes, note_pace, select
 
 __all__ = ["Generation", "GenerationResult", "Progress", "generate"]
 
@@ -121,7 +120,7 @@ class Generation:
         finally:
             # The workers are gone by now; what they had not finished goes too.
             remove_leftovers(folder)
-            note_pace(self.size, self._paces)
+        note_pace(self.size, self._paces)
         self._record_statistics()
         self.verdict = compare(self.size, self.manifest, promised=self._promised)
         self._write_cards()
@@ -296,7 +295,7 @@ class GenerationResult:
     missing: tuple[int, ...]  # ids of the size that are still not there
     bytes_needed: int  # disk space of 'simulated' before compression [bytes]
     bytes_free: int  # free disk space before the start [bytes]
-    seconds_expected: float  # expected time [s], for orientation
+    seconds_expected: float  # expected time [s], for reference_seconds
     measured: bool  # whether it is expected at a rate that this machine has measured
     seconds: float = 0.0  # time that it took [s]
     complete: bool = False  # whether train, valid and test are all there

@@ -1,23 +1,71 @@
 """What a generation will simulate, and the bytes and time that it takes.
 
-Nothing here writes; drawing the initial states tells how many substeps lie ahead.
+Drawing the initial states tells how many substeps lie ahead. How fast this machine is, its own
+generations measured: ``rates.json`` in the user's cache holds it by kind of solver and number of
+particles. It enters estimates of time and nothing else: a file that is missing, damaged or another
+machine's counts for nothing.
 """
 
 from __future__ import annotations
 
+import json
+import math
 import os
+import platform
 import shutil
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import astuple, dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from lagbench.atomic import write_atomically
+from lagbench.data.layout import CACHE_VARIABLE, cache_folder
+from lagbench.data.limits import NEEDED, Limit
 from lagbench.data.registry import Size, parse_ids, spell_ids
 from lagbench.errors import UsageError, WorkFailedError, nearest
 
-from .rate import measured_slowness, orientation
+if TYPE_CHECKING:
+    from lagbench.generators.simulate import Pace
 
-__all__ = ["Estimate", "check_disk", "estimate", "free_bytes", "scenario_bytes", "select"]
+    Row = tuple[float, int, int]  # seconds, particle substeps and frames, as in Pace
 
+__all__ = [
+    "Estimate",
+    "check_disk",
+    "estimate",
+    "free_bytes",
+    "measured_ratio",
+    "note_pace",
+    "reference_seconds",
+    "scenario_bytes",
+    "select",
+]
+
+
+RATES = "rates.json"
+"""File of the measured rates, in the user's cache."""
+
+MOST_BYTES = 1 << 16
+"""A longer file of rates is not ours [bytes]."""
+
+MOST_ROWS = 32
+"""Numbers of particles per kind of solver that are kept, the latest ones."""
+
+SECONDS = Limit(low=0, high=1e9, open_low=True)
+"""Processor time of the generations behind a rate [s]."""
+
+COUNT = Limit(low=1, high=1 << 60, whole=True)
+"""Particle substeps, and frames."""
+
+RATIO = Limit(low=1e-3, high=1e4)
+"""Time over that of the reference machine, one core of an EPYC server."""
+
+SECONDS_PER_PARTICLE_SUBSTEP = 45e-9
+"""Time of one particle's substep on the reference machine [s]; ``benchmarks/test_solver_throughput.py``."""
+
+SECONDS_PER_FRAME = 2.3e-3
+"""Starting the kernels, reading out, checking and writing one frame there [s], of generations of mini."""
 
 BYTES_PER_PARTICLE = 2 * 2 * 4
 """Position and velocity in one frame, two float32 each, before compression [bytes]."""
@@ -109,23 +157,20 @@ def estimate(
     per_frame = sum(known.values()) / max(1, sum(map(size.frame_count, known)))
     substeps = tuple(known.get(i) or round(per_frame * size.frame_count(i)) for i in scenarios)
     frames = sum(size.frame_count(i) for i in scenarios)
-    task, slowness = size.task, measured_slowness(size) if on_cores else None
-    # What a twin does not simulate: the frames behind the horizon.
     behind = {
-        i: max(0, size.frame_count(i) - task.input_frames - task.horizon)
-        for i in scenarios
-        if size.subset_of(i) == "test"
-    }
+        i: size.frames_behind(i) for i in scenarios if size.subset_of(i) == "test"
+    }  # not those of twins
     twins = sum(n for i, n in zip(scenarios, substeps, strict=True) if i in behind)
     twins -= sum(behind.values()) * size.substeps_per_frame
     both = frames + sum(map(size.frame_count, behind)) - sum(behind.values())
+    ratio = measured_ratio(size) if on_cores else None
     return Estimate(
         scenarios=tuple(scenarios),
         substeps=substeps,
         frames=frames,
         bytes=sum(scenario_bytes(size, i) for i in scenarios),
-        core_seconds=(slowness or 1.0) * orientation((sum(substeps) + twins) * size.particles, both),
-        measured=slowness is not None,
+        core_seconds=(ratio or 1.0) * reference_seconds((sum(substeps) + twins) * size.particles, both),
+        measured=ratio is not None,
     )
 
 
@@ -159,3 +204,75 @@ def check_disk(root: Path, needed: int) -> None:
             got=f"{free} bytes free",
             fix="free disk space, name another folder with --root, or fewer scenarios with --scenarios",
         )
+
+
+def reference_seconds(particle_substeps: int, frames: int) -> float:
+    """Return about what one core of the reference machine takes [s]."""
+    return particle_substeps * SECONDS_PER_PARTICLE_SUBSTEP + frames * SECONDS_PER_FRAME
+
+
+def measured_ratio(size: Size) -> float | None:
+    """Return what this machine took over the reference machine; None where it never timed that solver.
+
+    Of several numbers of particles the nearest counts: the reference tells small work from large.
+    """
+    rows = _read().get(_kind(size))
+    if not rows:
+        return None
+    seconds, *work = rows[min(rows, key=lambda particles: abs(math.log(particles / size.particles)))]
+    return seconds / reference_seconds(*work)
+
+
+def note_pace(size: Size, paces: Sequence[Pace]) -> None:
+    """Note how fast a generation was; nothing where none was timed or the cache cannot be written."""
+    if not paces:
+        return
+    row = tuple(sum(column) for column in zip(*map(astuple, paces), strict=True))
+    held, kind = _read(), _kind(size)
+    rows = {n: old for n, old in held.get(kind, {}).items() if n != size.particles} | {size.particles: row}
+    held[kind] = dict(list(rows.items())[-MOST_ROWS:])
+    text = json.dumps({"machine": platform.node(), **held}, indent=1) + "\n"
+    with suppress(WorkFailedError, RuntimeError):  # a home that is not known is a RuntimeError
+        write_atomically(_path(), text.encode(), option=CACHE_VARIABLE)
+
+
+def _path() -> Path:
+    return cache_folder("rates") / RATES
+
+
+def _kind(size: Size) -> str:
+    """Return which of the solvers a size is simulated with."""
+    from lagbench.generators.batch import solver_constants
+    from lagbench.generators.split import ClosedBoxParameters
+
+    return "closed_box" if isinstance(solver_constants(size), ClosedBoxParameters) else "free_surface"
+
+
+def _read() -> dict[str, dict[int, Row]]:
+    """Return what this machine noted: by kind and number of particles; nothing of what is damaged."""
+    try:
+        with _path().open("rb") as stream:
+            data = stream.read(MOST_BYTES + 1)
+        if len(data) > MOST_BYTES:
+            return {}
+        held = json.loads(data)
+        if held["machine"] != platform.node():
+            return {}
+        return {
+            kind: dict(_checked(int(n), *row) for n, row in held.get(kind, {}).items())
+            for kind in ("closed_box", "free_surface")
+        }
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, RuntimeError):
+        return {}
+
+
+def _checked(particles: int, seconds: float, particle_substeps: int, frames: int) -> tuple[int, Row]:
+    if not (
+        NEEDED["particles"].holds(particles)
+        and SECONDS.holds(seconds)
+        and COUNT.holds(particle_substeps)
+        and COUNT.holds(frames)
+        and RATIO.holds(seconds / reference_seconds(particle_substeps, frames))
+    ):
+        raise ValueError(f"no machine takes {seconds} s for that")
+    return particles, (seconds, particle_substeps, frames)

@@ -5,11 +5,12 @@ A grid that is too fine has nodes without particles, one that is too coarse too 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import NDArray
 
 from lagbench.data.grid import Grid, Placement, fields
 
@@ -25,7 +26,7 @@ TRIED = range(4, 129)
 class Cloud:
     """Particles of one frame."""
 
-    position: ArrayLike  # [length], shape [particle, 2]
+    position: NDArray[np.floating[Any]]  # [length], shape [particle, 2]
     area: float  # that they cover at first [length^2]
 
 
@@ -37,14 +38,14 @@ def covered_nodes(cloud: Cloud, grid: Grid) -> int:
     return int(np.count_nonzero(found.differentiable))
 
 
-def fitting_cells(clouds: Sequence[Cloud], placement: Placement, *, near: int) -> int | None:
+def fitting_cells(clouds: Callable[[], Iterable[Cloud]], placement: Placement, *, near: int) -> int | None:
     """Return the cells across, nearest to a number, of a grid of which each cloud covers enough nodes.
 
-    None where there is none; of two as near the coarser one.
+    None where there is none; of two as near the coarser one. Clouds are asked for anew for each grid that
+    is tried, so that one is in memory at a time.
     """
-    nearest: list[int] = sorted({near, *TRIED}, key=lambda cells: abs(cells - near))
-    for cells in nearest:
+    for cells in sorted({near, *TRIED}, key=lambda cells: (abs(cells - near), cells)):
         grid = Grid(cells, placement)
-        if all(covered_nodes(cloud, grid) >= MINIMUM_NODES for cloud in clouds):
+        if all(covered_nodes(cloud, grid) >= MINIMUM_NODES for cloud in clouds()):
             return cells
     return None

@@ -55,7 +55,7 @@ ELASTIC = ("jelly", "rope")
 """Materials whose bodies return to their shape."""
 
 ROUNDING = 1e-12
-"""Share of the RMS speed below which vorticity times spacing is nothing but rounding.
+"""Share of the greatest nodal velocity below which vorticity times spacing is nothing but rounding.
 
 Where n particles around a node move alike, ``sum(w u) / sum(w)`` is off by up to n 2^-52 of u in double
 precision, and omega h, half of four such velocities, by n 2^-51: 1e-13 for 225 particles. What turns lies
@@ -376,8 +376,8 @@ class FramePair:
         return self._turns(self.predicted_vorticity, self.prediction)
 
     def _turns(self, omega: Floats, snapshot: Snapshot) -> bool:
-        speed = math.sqrt(snapshot.speed_square / len(snapshot.velocity))
-        greatest = max(omega.max(), -omega.min()) * self.scenario.setting.grid.spacing
+        speed = np.abs(snapshot.fields.velocity[self.nodes]).max(initial=0.0)
+        greatest = np.abs(omega).max(initial=0.0) * self.scenario.setting.grid.spacing
         return bool(greatest > ROUNDING * speed)
 
     @cached_property

@@ -13,7 +13,7 @@ import numpy as np
 
 from lagbench.data.local import DESCRIPTION
 from lagbench.data.registry import Size
-from lagbench.errors import DataError
+from lagbench.errors import LagbenchError
 from lagbench.metrics.coverage import Cloud, covered_nodes, fitting_cells
 from lagbench.metrics.metric import MINIMUM_NODES
 from lagbench.submission.findings import Finding, Severity
@@ -32,9 +32,11 @@ def few_nodes(task: ScoredTask, scenarios: Collection[int]) -> Finding:
     It counts nodes, and names a grid of which all scenarios cover enough, where there is one.
     """
     setting = task.setting
-    first = {i: _clouds(task, i)[0] for i in scenarios}
-    counts = [covered_nodes(cloud, setting.grid) for cloud in first.values()]
-    every = [cloud for i in task.scenarios for cloud in _clouds(task, i)]
+    counts = [covered_nodes(_clouds(task, i)[0], setting.grid) for i in scenarios]
+
+    def every() -> Iterator[Cloud]:
+        return (cloud for i in task.scenarios for cloud in _clouds(task, i))
+
     cells = fitting_cells(every, setting.grid.placement, near=setting.grid.cells)
     least, most = min(counts), max(counts)
     return Finding(
@@ -77,11 +79,11 @@ def unusable(size: Size, root: Path, *, validated: bool = True) -> Iterator[str]
         root: folder of all data sets.
         validated: whether a training is validated on ``valid``.
     """
-    for subset in ("test", "valid")[: 1 + validated]:
+    for subset in ("test", "valid") if validated else ("test",):
         try:
             task = load_scored_task(size, root, subset=subset)
             yield from _faults(task)
-        except DataError as error:
+        except LagbenchError as error:  # the training itself may do without what is missing here
             fix = f"; {error.fix}" if error.fix else ""
             yield f"{error.what}: expected {error.expected}, got {error.got}{fix}"
 
@@ -94,7 +96,7 @@ def _faults(task: ScoredTask) -> Iterator[str]:
             before = opened.scenario.last_given.position
         clouds = _clouds(task, i)
         counts.add(len(before))
-        moves |= any(not np.array_equal(before, np.asarray(cloud.position)) for cloud in clouds)
+        moves |= any(not np.array_equal(before, cloud.position) for cloud in clouds)
         if all(covered_nodes(cloud, task.setting.grid) < MINIMUM_NODES for cloud in clouds):
             sparse.append(i)
     if len(counts) > 1 and subset == "test":
