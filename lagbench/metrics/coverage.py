@@ -44,7 +44,8 @@ def fitting_cells(clouds: Callable[[], Iterable[Cloud]], placement: Placement, *
     None where there is none; of two as near the coarser one. Clouds are asked for anew for each grid that
     is tried, so that one is in memory at a time.
     """
-    for cells in sorted({near, *TRIED}, key=lambda cells: (abs(cells - near), cells)):
+    tried: list[int] = sorted({near, *TRIED}, key=lambda cells: (abs(cells - near), cells))
+    for cells in tried:
         grid = Grid(cells, placement)
         if all(covered_nodes(cloud, grid) >= MINIMUM_NODES for cloud in clouds()):
             return cells
