@@ -57,7 +57,7 @@ def test_a_strangers_path(run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: P
     assert "error [page]" in stale.stderr
     built = run("leaderboard", "build")
     assert built.exit_code == 0, built.output
-    assert re.search(r"index.html: 1 entry, 1 tabs, .* written", built.stdout)
+    assert re.search(r"index.html: 1 entry, 1 tab, .* written", built.stdout)
     assert run("leaderboard", "build", "--check").exit_code == 0
     checked = run("leaderboard", "check", "--page", "--predictions", "predictions.nc")
     assert checked.exit_code == 0, checked.output

@@ -106,6 +106,9 @@ def _submitted(result: SubmitResult, *, quiet: bool) -> None:
     say(f"{result.method} on {result.split} {result.size}: {result.ranking} {mean}{spread}", quiet=quiet)
     for flag in result.flags:
         say(f"flag {flag}: raised", quiet=quiet)
+    if result.size == "tiny" and result.board == BOARD and not quiet:
+        advice = "it is for trying out: --board trial --new-board"
+        typer.echo(f"warning: tiny has too few scenarios to rank anything; {advice}", err=True)
     say("written: " + ", ".join(str(path) for path in result.files), quiet=quiet)
     where = "" if result.board == BOARD else f" --board {result.board}"
     say(
@@ -134,7 +137,8 @@ def build(
         print_json(result)
         return
     state = "written" if result.page in result.written else "up to date"
-    what = f"{_entries(result.rows)}, {result.tabs} tabs, {spell_bytes(result.bytes)}"
+    tabs = f"{result.tabs} {'tab' if result.tabs == 1 else 'tabs'}"
+    what = f"{_entries(result.rows)}, {tabs}, {spell_bytes(result.bytes)}"
     say(f"{result.page}: {what}, {state}", quiet=quiet)
 
 

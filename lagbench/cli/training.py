@@ -87,6 +87,7 @@ def train(
 
     if baseline is None:
         raise UsageError("no model is named", where="--baseline", fix="name one, as in --baseline gns")
+    split = chosen(name, split)
     for module in ("torch", "torch_geometric", "pytorch_lightning"):
         check_installed(module, extra=EXTRA)
     from lagbench.baselines.machine import is_helper
@@ -94,11 +95,11 @@ def train(
 
     quiet = quiet or is_helper()
     if not is_helper():
-        _warn_of_scores(chosen(name, split), size, root, baseline, recipe, tuple(settings or ()))
+        _warn_of_scores(split, size, root, baseline, recipe, tuple(settings or ()))
     with _told_once(), progress_bar(quiet=quiet, counted="steps") as draw:
         result = run(
             baseline,
-            chosen(name, split),
+            split,
             size,
             recipe=recipe,
             settings=tuple(settings or ()),
@@ -116,7 +117,7 @@ def train(
     if as_json and not is_helper():
         print_json(result)
     else:
-        say("\n".join(_trained(result, _where(chosen(name, split), root))), quiet=quiet)
+        say("\n".join(_trained(result, _where(split, root))), quiet=quiet)
 
 
 def _warn_of_scores(
