@@ -13,9 +13,9 @@ import pytest
 from click.testing import Result
 from conftest import SIZE, SPLIT
 
-from lagbench.data.registry import Registry
-from lagbench.generators.batch import SimulationJob
-from lagbench.generators.simulate import Pace, simulate
+from lagbench.data.registry import Registry, load
+from lagbench.generators.batch import SimulationJob, substeps_of
+from lagbench.generators.simulate import Pace, simulate, twin_substeps
 from lagbench.make.generate import generate
 from lagbench.make.plan import estimate, measured_ratio, note_pace, reference_seconds
 
@@ -57,14 +57,16 @@ def test_a_measured_rate_decides(cache: Path, unmeasured: Registry) -> None:
     assert found.core_seconds == pytest.approx(100.0)
 
 
-def test_twins_of_test_scenarios_are_counted(unmeasured: Registry) -> None:
-    """A test scenario is simulated twice, the second time to the end of the horizon: here the whole of it."""
-    size = unmeasured.size("fluid", "tiny")
-    task = size.task
-    train, test = (estimate(size, (size.subsets[name][0],)) for name in ("train", "test"))
-    assert size.frame_count(size.subsets["test"][0]) == size.frame_count(0)
-    share = min(task.input_frames + task.horizon, size.frame_count(0)) / size.frame_count(0)
-    assert test.core_seconds == pytest.approx((1 + share) * train.core_seconds, rel=0.01)
+def test_twins_of_test_scenarios_are_counted() -> None:
+    """What generating simulates: every substep of scenarios and of twins, which end with the horizon."""
+    size = load().size("cavity", "mini")
+    test = size.subsets["test"]
+    twins = [twin_substeps(size, i) for i in test]
+    alone = [substeps_of(size, i) for i in test]
+    assert sum(twins) < sum(alone)
+    frames = sum(map(size.frame_count, test)) + len(test) * (size.task.input_frames + size.task.horizon)
+    expected = reference_seconds((sum(alone) + sum(twins)) * size.particles, frames)
+    assert estimate(size, test).core_seconds == pytest.approx(expected)
 
 
 def test_the_nearest_number_of_particles_stands_in(cache: Path, unmeasured: Registry) -> None:

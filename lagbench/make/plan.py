@@ -157,9 +157,8 @@ def estimate(
     per_frame = sum(known.values()) / max(1, sum(map(size.frame_count, known)))
     substeps = tuple(known.get(i) or round(per_frame * size.frame_count(i)) for i in scenarios)
     frames = sum(size.frame_count(i) for i in scenarios)
-    behind = {
-        i: size.frames_behind(i) for i in scenarios if size.subset_of(i) == "test"
-    }  # not those of twins
+    # twins of test scenarios are simulated too, but for the frames behind the horizon
+    behind = {i: size.frames_behind(i) for i in scenarios if size.subset_of(i) == "test"}
     twins = sum(n for i, n in zip(scenarios, substeps, strict=True) if i in behind)
     twins -= sum(behind.values()) * size.substeps_per_frame
     both = frames + sum(map(size.frame_count, behind)) - sum(behind.values())
