@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
+from statistics import fmean
 
 from lagbench.metrics.metric import Direction, Metric
 from lagbench.report.html import Markup, clipped, escaped, join, tag, text, words
@@ -77,7 +78,7 @@ def empty(board: Board) -> Markup:
 
 
 def overview(board: Board) -> Markup:
-    """Return one row per method over all splits: its skill where that is known, and its rank."""
+    """Return one row per method over all splits, by its mean skill: skill where that is known, and rank."""
     if not board.tabs:
         return Markup("")
     rows: dict[str, dict[str, Row]] = {}
@@ -86,12 +87,13 @@ def overview(board: Board) -> Markup:
             if row.rank is not None:
                 rows.setdefault(row.id, {})[tab.id] = row
     ranked = {tab.id: sum(row.rank is not None for row in tab.rows) for tab in board.tabs}
+    skills = {
+        method: [row.skill.mean for row in held.values() if row.skill and math.isfinite(row.skill.mean)]
+        for method, held in rows.items()
+    }
 
-    def order(method: str) -> tuple[float, float, str]:
-        held = rows[method].values()
-        skills = [row.skill.mean for row in held if row.skill and math.isfinite(row.skill.mean)]
-        standing = [(row.rank or 0) / ranked[tab] for tab, row in rows[method].items()]
-        return (-sum(skills) / len(skills) if skills else math.inf, sum(standing) / len(standing), method)
+    def order(method: str) -> tuple[float, str]:
+        return (-fmean(skills[method]) if skills[method] else math.inf, method)
 
     heads = [
         tag("th", tag("a", f"{tab.size.split} {tab.size.name}", href=f"#{tab.id}"), scope="col")
@@ -101,14 +103,17 @@ def overview(board: Board) -> Markup:
     for method in sorted(rows, key=order):
         name = next(iter(rows[method].values())).entry.name
         cells = [_summary(rows[method].get(tab.id), tab, ranked[tab.id]) for tab in board.tabs]
-        lines.append(tag("tr", tag("th", clipped(name, 60), scope="row", class_="method"), *cells))
+        head = tag("th", clipped(name, 60), scope="row", class_="method")
+        lines.append(tag("tr", head, _mean_skill(skills[method]), *cells))
     caption = (
         "Skill on every data set (0: the best floor, 1: perfect) where it is known, and rank; bold leads."
+        " Methods stand in the order of the first column, their mean skill over the data sets that they have."
     )
+    first = [tag("th", "method", scope="col", class_="method"), tag("th", "mean skill", scope="col")]
     table = tag(
         "table",
         tag("caption", caption, class_="unseen"),
-        tag("thead", tag("tr", tag("th", "method", scope="col", class_="method"), *heads)),
+        tag("thead", tag("tr", *first, *heads)),
         tag("tbody", *lines),
         class_="board across",
     )
@@ -120,6 +125,13 @@ def overview(board: Board) -> Markup:
         id="overview",
         class_="tab",
     )
+
+
+def _mean_skill(skills: Sequence[float]) -> Markup:
+    if not skills:
+        return tag("td", tag("span", text(math.nan), class_="n"))
+    many = f"of {len(skills)} data set{'s' if len(skills) > 1 else ''}"
+    return tag("td", tag("span", text(fmean(skills)), class_="n"), tag("span", many, class_="ci"))
 
 
 def _summary(row: Row | None, tab: Tab, of: int) -> Markup:
