@@ -197,9 +197,7 @@ def _trained(result: TrainingResult, where: str) -> list[str]:
     )
     lines.append(f"  weights    {result.weights}")
     if result.size == "tiny":
-        lines.append(
-            "hint: tiny is for tests: no model learns much from so little; try --size mini"
-        )
+        lines.append("hint: tiny is for tests: no model learns much from so little; try --size mini")
     return [*lines, f"next: lagbench predict {result.weights}{where} -o predictions.nc"]
 
 
