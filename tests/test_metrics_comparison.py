@@ -135,15 +135,14 @@ def test_intervals_repeat_and_scale() -> None:
         assert all(math.isnan(bound) for bound in bootstrap_interval(few))
 
 
-def test_differ_is_a_t_test_of_seeds_where_scenarios_do_not_matter() -> None:
-    """Methods whose seeds alone scatter: Welch's test of their means, by SciPy."""
+def test_differ_is_a_t_test() -> None:
+    """Methods whose seeds alone scatter: Welch's test of their means, by SciPy.
+
+    Three equal seeds of each: SciPy's paired test over scenarios.
+    """
     a, b = np.array([1.0, 1.2, 1.5]), np.array([2.0, 2.6, 2.1, 2.9])
     ours = differ(np.repeat(a[:, None], 12, axis=1), np.repeat(b[:, None], 12, axis=1))
     assert ours == pytest.approx(scipy.stats.ttest_ind(a, b, equal_var=False).pvalue)
-
-
-def test_differ_is_a_paired_t_test_where_seeds_agree() -> None:
-    """Three equal seeds of each: SciPy's paired test over scenarios."""
     a, b = np.random.default_rng(3).gamma(3.0, size=(2, 9))
     ours = differ(np.tile(a, (3, 1)), np.tile(b, (3, 1)))
     assert ours == pytest.approx(scipy.stats.ttest_rel(a, b).pvalue)
@@ -197,11 +196,18 @@ def test_comparison_over_common_scenarios() -> None:
 
 
 def test_direction_decides_who_is_better() -> None:
-    """A higher correlation and an energy ratio nearer 1 are smaller losses."""
+    """A higher correlation and an energy ratio nearer 1 are smaller losses.
+
+    Nothing is won by divergence of its own, and metrics do not mix.
+    """
     higher = compare(*(score_of(v, v, metric="vorticity_pearson") for v in (0.9, 0.8)))
     nearer = compare(*(score_of(v, v, metric="energy_ratio") for v in (0.9, 1.3)))
     assert higher.difference == pytest.approx(-0.1)
     assert nearer.difference == pytest.approx(-0.2)
+    with pytest.raises(UsageError):
+        compare(score_of(1.0, metric="energy_true"), score_of(1.0, metric="energy_true"))
+    with pytest.raises(UsageError):
+        compare(score_of(1.0), score_of(1.0, metric="vorticity_mae"))
 
 
 def test_ranks_are_numbers_in_order() -> None:
@@ -243,11 +249,3 @@ def test_seeds_of_a_method_are_compared_together() -> None:
     values = [score.values for score in seeds]
     assert found.p == differ(values, other.values)
     assert found.interval == bootstrap_interval(values, minus=other.values)
-
-
-def test_observables_and_different_metrics_are_not_compared() -> None:
-    """Nothing is won by divergence of its own, and metrics do not mix."""
-    with pytest.raises(UsageError):
-        compare(score_of(1.0, metric="energy_true"), score_of(1.0, metric="energy_true"))
-    with pytest.raises(UsageError):
-        compare(score_of(1.0), score_of(1.0, metric="vorticity_mae"))

@@ -152,15 +152,14 @@ def test_a_horizon_beyond_the_series_is_undefined() -> None:
     assert FirstFrames(2, last)(np.arange(3.0)) == 1.0
 
 
-def test_a_frame_measured_twice_keeps_its_value() -> None:
-    """A worker that was taken for lost and comes back adds weight, not error."""
+def test_tallies_add() -> None:
+    """A worker that was taken for lost and comes back adds weight, not error.
+
+    Other frames or statistics are refused, and so is a value without a place.
+    """
     twice = tallied() + tallied()
     for name in twice.names:
         np.testing.assert_array_equal(twice.series(name), tallied().series(name))
-
-
-def test_tallies_of_different_things_do_not_add() -> None:
-    """Other frames or statistics are refused, and so is a value without a place."""
     with pytest.raises(UsageError):
         of_pearson(0.1) + of_pearson(0.1, 0.2)
     with pytest.raises(UsageError):
@@ -295,15 +294,14 @@ def test_a_bad_entry_point_is_named(monkeypatch: pytest.MonkeyPatch, name: str) 
 
 
 def test_selection_brings_what_a_metric_follows_from() -> None:
-    """RMSE needs MSE, the energy ratio both energies; unknown names list the nearest."""
+    """RMSE needs MSE, the energy ratio both energies; unknown names list the nearest.
+
+    Neither a statistic nor a source of one, or a target without a value, is a mistake.
+    """
     found = {m.name for m in select(["vorticity_rmse", "energy_ratio"])}
     assert found == {"vorticity_mse", "vorticity_rmse", "energy_predicted", "energy_true", "energy_ratio"}
     with pytest.raises(UsageError, match="did you mean 'vorticity_rmse'"):
         select(["vorticity_rmsee"])
-
-
-def test_metrics_that_say_nothing_are_refused() -> None:
-    """Neither a statistic nor a source of one, or a target without a value, is a mistake."""
     for changes in ({"statistic": None, "of": ()}, {"direction": Direction.TARGET, "perfect": None}):
         with pytest.raises(UsageError):
             replace(OTHERS, **changes)

@@ -67,16 +67,15 @@ def test_taylor_green_vorticity_follows_its_closed_form() -> None:
 
 
 def test_correlation_and_slope_are_scipys() -> None:
-    """Eq. 5.21 is scipy.stats.pearsonr, the slope that of linregress."""
+    """Eq. 5.21 is scipy.stats.pearsonr, the slope that of linregress.
+
+    Of 1 2 3 and 1 3 2: covariance 1, both sums of squares 2, so r = 1/2.
+    """
     pair = swirls(0.7, noise=0.003)
     x, y = pair.true_vorticity, pair.predicted_vorticity
     r, tilt = measured(pair, "vorticity_pearson", "vorticity_residual_slope")
     assert r == pytest.approx(scipy.stats.pearsonr(x, y).statistic, rel=1e-12)
     assert tilt == pytest.approx(scipy.stats.linregress(x, y - x).slope, rel=1e-9)
-
-
-def test_correlation_by_hand() -> None:
-    """Of 1 2 3 and 1 3 2: covariance 1, both sums of squares 2, so r = 1/2."""
     assert pearson(np.array([1.0, 2.0, 3.0]), np.array([1.0, 3.0, 2.0])) == pytest.approx(0.5)
     assert slope(np.array([1.0, 2.0, 3.0]), np.array([2.0, 4.0, 6.0])) == pytest.approx(2.0)
 
@@ -163,14 +162,13 @@ def test_fewer_than_sixteen_nodes_are_undefined() -> None:
 
 
 def test_divergence_per_node_is_scipys_entropy() -> None:
-    """Eqs. 5.23-5.25: scipy.stats.entropy normalises its arguments itself."""
+    """Eqs. 5.23-5.25: scipy.stats.entropy normalises its arguments itself.
+
+    P = (1/4, 3/4), Q = (1/2, 1/2): ln(1/2)/4 + 3 ln(3/2)/4 = 0.130812.
+    """
     pair = swirls(0.8, noise=0.002)
     p, q = (np.abs(w) + 1e-10 for w in (pair.true_vorticity, pair.predicted_vorticity))
     assert measured(pair, "vorticity_kl") == pytest.approx([scipy.stats.entropy(p, q)], rel=1e-9)
-
-
-def test_divergence_by_hand() -> None:
-    """P = (1/4, 3/4), Q = (1/2, 1/2): ln(1/2)/4 + 3 ln(3/2)/4 = 0.130812."""
     p, q = normalised(np.array([-1.0, 3.0])), normalised(np.array([2.0, -2.0]))
     assert kl(p, q) == pytest.approx(0.130812, abs=1e-6)
 
@@ -199,14 +197,6 @@ def test_values_on_an_edge_belong_to_the_bin_above() -> None:
     assert math.isnan(measured(pair_of(x, 0 * x, 0.01 * swirl(x)), "vorticity_kl_hist")[0])
 
 
-def test_mirrored_flow_keeps_its_histogram() -> None:
-    """How much rotation there is does not change in a mirror, where it is does."""
-    values = np.array([0.1, 0.4, 0.2, 0.8, 0.3, 0.7] * 5)
-    assert kl(*histograms(values, values[::-1])) == 0.0  # type: ignore[misc]
-    assert wasserstein1(values, values[::-1]) == 0.0
-    assert kl(normalised(values), normalised(values[::-1])) > 0.1
-
-
 @settings(deadline=None)
 @given(VALUES, VALUES)
 def test_wasserstein_is_scipys(x: np.ndarray, y: np.ndarray) -> None:
@@ -215,12 +205,19 @@ def test_wasserstein_is_scipys(x: np.ndarray, y: np.ndarray) -> None:
 
 
 def test_wasserstein_grows_where_the_histogram_saturates() -> None:
-    """Ten and a hundred times too fast fall into the same open bins; W1 tells them apart."""
+    """Ten and a hundred times too fast fall into the same open bins; W1 tells them apart.
+
+    How much rotation there is does not change in a mirror, where it is does.
+    """
     near, far = swirls(10.0), swirls(100.0)
     names = ("vorticity_kl_hist", "vorticity_w1")
     (kl_near, w_near), (kl_far, w_far) = (measured(pair, *names) for pair in (near, far))
     assert kl_far < 1.2 * kl_near
     assert w_far > 5 * w_near
+    values = np.array([0.1, 0.4, 0.2, 0.8, 0.3, 0.7] * 5)
+    assert kl(*histograms(values, values[::-1])) == 0.0  # type: ignore[misc]
+    assert wasserstein1(values, values[::-1]) == 0.0
+    assert kl(normalised(values), normalised(values[::-1])) > 0.1
 
 
 @pytest.mark.parametrize(
