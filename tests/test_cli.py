@@ -27,18 +27,17 @@ from lagbench.work.progress import Progress
 Run = Callable[..., Result]
 
 
-def test_help_lists_the_commands_in_the_order_of_use(run: Run) -> None:
-    """Every command stands in the help, from looking around to cleaning up."""
+def test_help_lists_commands_in_the_order_of_use_with_examples_that_parse(run: Run) -> None:
+    """Every command stands in the help, from looking around to cleaning up.
+
+    The help of a command ends with an example whose words the command accepts.
+    """
     text = run("--help").stdout
     names = ["list", "info", "generate", "verify", "plot", "animate", "cite", "doctor", "clean"]
     places = [re.search(rf"^\W*{name} ", text, re.MULTILINE) for name in names]
     starts = [place.start() for place in places if place]
     assert len(starts) == len(names)
     assert starts == sorted(starts)
-
-
-def test_every_command_has_an_example_that_parses(run: Run) -> None:
-    """The help of a command ends with an example whose words the command accepts."""
     commands = dict(get_command(app).commands)  # type: ignore[attr-defined]
     board = commands.pop("leaderboard").commands
     for name in (*commands, *(f"leaderboard {name}" for name in board)):

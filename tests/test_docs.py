@@ -1,4 +1,4 @@
-"""Docs agree with the code: programs of README, docs and notebook, tables, the packages of docs/examples."""
+"""Docs agree with the code: programs, tables, the packages of docs/examples; the site needs no network."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from html.parser import HTMLParser
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
@@ -111,7 +112,7 @@ def test_the_readme_is_short_and_its_links_lead_somewhere() -> None:
             assert "://" in target or (page.parent / target).exists(), f"{page.name}: {target}"
 
 
-TEXT = (Path(__file__).parent.parent / "docs" / "scoring.md").read_text()
+TEXT = (CLONE / "docs" / "scoring.md").read_text()
 
 
 def test_every_metric_stands_in_the_table() -> None:
@@ -188,3 +189,62 @@ def test_sage_is_a_baseline_and_enstrophy_a_metric(
     predicted = predict(trained.weights, tmp_path / "predictions.nc", **options)
     assert predicted.method == "GNS + SAGEConv"
     assert (tmp_path / "predictions.nc").is_file()
+
+
+LOADED = {"script": "src", "img": "src", "link": "href", "iframe": "src", "source": "src"}
+"""What a browser fetches by itself, and the attribute that says where from."""
+
+
+class Fetched(HTMLParser):
+    """Collect what a page makes a browser fetch."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.addresses: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        """Keep the address of an element that loads; `canonical` and the like are only names."""
+        held = dict(attrs)
+        names_only = tag == "link" and held.get("rel") not in {"stylesheet", "icon", "preload"}
+        if tag in LOADED and not names_only and (address := held.get(LOADED[tag])):
+            self.addresses.append(address)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The site, built as CI does: warnings are errors."""
+    pytest.importorskip("mkdocs")
+    folder = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(folder)]
+    where = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
+    done = subprocess.run(command, cwd=CLONE, env=where, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+@pytest.mark.slow
+def test_nothing_comes_from_the_network(site: Path) -> None:
+    """All that pages and style sheets load is a file of the site."""
+    pages = sorted(site.rglob("*.html"))
+    assert len(pages) > 15
+    for page in pages:
+        reader = Fetched()
+        reader.feed(page.read_text())
+        assert reader.addresses
+        for address in reader.addresses:
+            assert not re.match(r"(\w+:)?//", address), f"{page.name}: {address}"
+            base = site if address.startswith("/") else page.parent
+            assert (base / address.lstrip("/").partition("?")[0]).is_file(), f"{page.name}: {address}"
+    sheets = "".join(sheet.read_text() for sheet in site.rglob("*.css"))
+    assert not re.search(r"url\([\"']?(https?:)?//|@import", sheets)
+
+
+@pytest.mark.slow
+def test_the_public_names_are_described(site: Path) -> None:
+    """Every name of `lagbench.__all__` and of `lagbench.torch` that pages use has an entry with its text."""
+    text = (site / "api.html").read_text()
+    functions = set(lagbench.__all__) - {"__version__", "submission"}
+    names = {f"lagbench.{name}" for name in functions} | {"lagbench.submission.write"}
+    names |= {f"lagbench.torch.{name}" for name in ("WindowDataset", "WindowSampler", "collate", "Batch")}
+    for name in names:
+        assert f'id="{name}"' in text, name

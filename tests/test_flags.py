@@ -98,8 +98,11 @@ def test_copy_suspect_by_hand(trace: Trace, reason: str | None) -> None:
         assert reason in flag.reasons[0]
 
 
-def test_twin_floor_counts_regular_frames() -> None:
-    """Below the twin in frames 0 and 3; at frame 3 the twin is past a tenth of persistence: 1 of 3 counts."""
+def test_twin_floor_and_physics_by_hand() -> None:
+    """Below the twin in frames 0 and 3; at frame 3 the twin is past a tenth of persistence: 1 of 3 counts.
+
+    A prediction at rest and one of twenty times the energy are raised, one of twice is not.
+    """
     twin = [1e-6, 1e-5, 1e-4, 0.5]
     persistence = np.array([0.01, 0.1, 0.5, 1.0])
     flag = below_twin_floor(np.array([5e-7, 1e-3, 1e-2, 0.4]), persistence, twin)
@@ -110,10 +113,6 @@ def test_twin_floor_counts_regular_frames() -> None:
     assert below_twin_floor(persistence, persistence, ()).raised is None
     trace = pickle.loads(pickle.dumps(trace_of(rollout(), rollout(speed=0.012))))  # as workers send it
     assert set(trace.shifted) == set(SHIFTS)
-
-
-def test_physics_by_hand() -> None:
-    """A prediction at rest and one of twenty times the energy are raised, one of twice is not."""
     rest = made([1, 2, 3])
     for factor, raised in ((0.0, True), (0.5, False), (2.0, False), (20.0, True)):
         assert physics([replace(rest, predicted_motion=factor * rest.motion)]).raised == raised
