@@ -61,9 +61,15 @@ def commands(tmp_path: Path, unmeasured_path: Path, generated: GenerationResult)
     }
 
     def call(*lines: str) -> None:
-        command, text = [sys.executable, "-c", COMMANDS], "\n".join(lines)
-        where = {"env": environment, "cwd": tmp_path}
-        done = subprocess.run(command, input=text, **where, capture_output=True, text=True, check=False)
+        done = subprocess.run(
+            [sys.executable, "-c", COMMANDS],
+            input="\n".join(lines),
+            env=environment,
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
         assert done.returncode == 0, done.stderr
 
     return call
@@ -92,30 +98,38 @@ def test_training_and_predicting(commands: Run, tmp_path: Path) -> None:
     assert (tmp_path / "scores.json").is_file()
 
 
-def test_limits_go_by_the_system(monkeypatch: pytest.MonkeyPatch) -> None:
-    """On macOS, which refuses one of the address space, only others are set; where none are, none is."""
+def test_a_system_without_limits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No limit is asked for where there are none."""
+    monkeypatch.setattr(process, "LIMITS", False)
+    monkeypatch.setattr(process.resource, "setrlimit", lambda *_: pytest.fail("a limit"))
+    process.limit_process(memory=1, seconds=1)
+
+
+def test_macos_refuses_a_limit_of_the_address_space(monkeypatch: pytest.MonkeyPatch) -> None:
+    """There only the others are set."""
     wanted: list[int] = []
     monkeypatch.setattr(process.sys, "platform", "darwin")
     monkeypatch.setattr(process.resource, "setrlimit", lambda what, _: wanted.append(what))
     process.limit_process(memory=1, seconds=1)
     assert wanted == [process.resource.RLIMIT_CORE, process.resource.RLIMIT_CPU]
-    monkeypatch.setattr(process, "LIMITS", False)
-    process.limit_process(memory=1, seconds=1)
-    assert len(wanted) == 2
 
 
 def test_a_crash_on_windows_is_the_files_fault(monkeypatch: pytest.MonkeyPatch) -> None:
     """There a process that reads where it may not ends with the code 0xC0000005, not with a signal."""
     ended = subprocess.CompletedProcess([], 0xC0000005, stdout=b"1\n2", stderr=b"")
     monkeypatch.setattr(process.subprocess, "run", lambda *_, **__: ended)
-    found = process.in_child("any.function", [0, 0], seconds=1.0, wall=1.0)
-    assert found == ([1], "it ended with exit code 0xc0000005")
+    assert process.in_child("any.function", [0, 0], seconds=1.0, wall=1.0) == (
+        [1],
+        "it ended with exit code 0xc0000005",
+    )
 
 
 def test_where_no_workers_start_jobs_run_here(monkeypatch: pytest.MonkeyPatch) -> None:
     """Scores come all the same; who asks for workers by name is told."""
     monkeypatch.setattr(pool, "AVAILABLE", False)
-    found = run_all(lambda job, _: (job, os.getpid()), {"a": 1, "b": 2}, workers=2)
-    assert found == [(1, os.getpid()), (2, os.getpid())]
+    assert run_all(lambda job, _: (job, os.getpid()), {"a": 1, "b": 2}, workers=2) == [
+        (1, os.getpid()),
+        (2, os.getpid()),
+    ]
     with pytest.raises(WorkFailedError):
         pool.Pool(2)
