@@ -13,7 +13,7 @@ from typing import Any
 import torch
 
 from lagbench.errors import UsageError, WorkFailedError
-from lagbench.work.process import available_cores
+from lagbench.work.machine import available_cores
 
 __all__ = [
     "bound_memory",

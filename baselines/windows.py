@@ -11,7 +11,7 @@ from lagbench.data.local import locate
 from lagbench.data.registry import Registry
 from lagbench.data.scenario import read_scenario
 from lagbench.errors import UsageError
-from lagbench.store.frames import sources_of
+from lagbench.store.copy import scenario_files
 from lagbench.store.windows import window_of
 from lagbench.torch import Batch, Window, collate, tensors
 
@@ -36,7 +36,7 @@ def scenario_paths(
 ) -> dict[int, Path]:
     """Return the files of a subset by scenario id; all of them exist."""
     entry, folder, _ = locate(split, size, root=root, registry=registry)
-    return {i: source.path for i, source in sources_of(entry, (subset,), folder).items()}
+    return scenario_files(entry, folder, (subset,))
 
 
 def _read(path: Path, frames: slice) -> Window:

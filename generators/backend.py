@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from lagbench.errors import UsageError, require
-from lagbench.work.process import available_cores
+from lagbench.work.machine import available_cores
 
 from .solver import Device
 
@@ -57,7 +57,24 @@ def start(device: Device, *, scenarios: int = 1, threads: int | None = None) -> 
         )
     on_gpu = device is Device.CUDA
     if not _started:
-        _initialise(on_gpu, max(2, available_cores(), threads or 0))
+        size, greeting = max(2, available_cores(), threads or 0), io.StringIO()
+        try:
+            with contextlib.redirect_stdout(greeting), _only_harmless_variables():
+                ti.init(
+                    arch=ti.cuda if on_gpu else ti.cpu,
+                    default_fp=ti.f32,
+                    default_ip=ti.i32,
+                    fast_math=False,
+                    cpu_max_num_threads=size,
+                    offline_cache=True,
+                    enable_fallback=False,
+                    log_level=ti.ERROR,
+                )
+        except RuntimeError as error:
+            raise UsageError(
+                "Taichi cannot use this device", where="cuda" if on_gpu else "cpu", got=error
+            ) from error
+        _started.append((on_gpu, size))
     running_on_gpu, pool = _started[0]
     if running_on_gpu != on_gpu or (threads or 1) > pool:
         raise UsageError(
@@ -78,27 +95,6 @@ def _only_harmless_variables() -> Iterator[None]:
         yield
     finally:
         os.environ.update(hidden)
-
-
-def _initialise(on_gpu: bool, pool: int) -> None:
-    greeting = io.StringIO()
-    try:
-        with contextlib.redirect_stdout(greeting), _only_harmless_variables():
-            ti.init(
-                arch=ti.cuda if on_gpu else ti.cpu,
-                default_fp=ti.f32,
-                default_ip=ti.i32,
-                fast_math=False,
-                cpu_max_num_threads=pool,
-                offline_cache=True,
-                enable_fallback=False,
-                log_level=ti.ERROR,
-            )
-    except RuntimeError as error:
-        raise UsageError(
-            "Taichi cannot use this device", where="cuda" if on_gpu else "cpu", got=error
-        ) from error
-    _started.append((on_gpu, pool))
 
 
 def place(*groups: tuple[tuple[int, ...], Sequence[Any]]) -> Any:  # noqa: ANN401 (Taichi is untyped)

@@ -70,24 +70,14 @@ def split_module(size: Size) -> Split:
 
 
 def solver_constants(size: Size) -> ClosedBoxParameters | FreeSurfaceParameters:
-    """Return the constants of the solver of a size.
-
-    Raises:
-        UsageError: the split's module cannot be imported.
-        UnreadableFileError: a parameter is missing or impossible; names file, key and value.
-    """
+    """Return the constants of the solver of a size; an impossible parameter is an UnreadableFileError."""
     module = split_module(size)
     with blamed_on_parameters(size, "choosing the solver's constants"):
         return module.solver_parameters(size)
 
 
 def draw(size: Size, scenario: int) -> InitialState:
-    """Return a scenario before its first substep.
-
-    Raises:
-        WorkFailedError: the parameters lead to values that cannot be drawn.
-        UnreadableFileError: the split's module cannot use a parameter, or misses one.
-    """
+    """Return a scenario before its first substep; what cannot be drawn is a WorkFailedError."""
     rng, module = generator(size.split, size.name, size.major, scenario), split_module(size)
     try:
         with blamed_on_parameters(size, f"drawing scenario {scenario}"):

@@ -105,21 +105,17 @@ def _block(values: Measured) -> Iterator[str]:
     for name, row in values.statistics.items():
         yield f"  {name}: [{', '.join(map(_number, row))}]"
     yield "twin_floor:"
-    yield from _wrapped([_number(value) for value in values.twin_floor])
+    # A flow sequence in lines of equal counts.
+    numbers = [_number(value) for value in values.twin_floor]
+    per_line = (_WIDTH - 10) // (len("-1.00000000e-05, "))
+    rows = [", ".join(numbers[k : k + per_line]) for k in range(0, len(numbers), per_line)]
+    for k, row in enumerate(rows):
+        yield ("  [" if k == 0 else "   ") + row + ("]" if k == len(rows) - 1 else ",")
 
 
 def _number(value: float) -> str:
     """Return nine digits in the one form that YAML 1.1 reads as a float."""
     return f"{value:.8e}"
-
-
-def _wrapped(numbers: Sequence[str]) -> Iterator[str]:
-    """Yield a flow sequence in lines of equal counts."""
-    per_line = (_WIDTH - 10) // (len("-1.00000000e-05, "))
-    rows = [", ".join(numbers[k : k + per_line]) for k in range(0, len(numbers), per_line)]
-    for k, row in enumerate(rows):
-        opening = "  [" if k == 0 else "   "
-        yield opening + row + ("]" if k == len(rows) - 1 else ",")
 
 
 def replace_measured(text: str, measured: Mapping[str, Mapping[str, Measured]]) -> str:
@@ -156,7 +152,8 @@ def record(size: Size, manifest: Manifest, *, registry: Path, released: Path | N
     return values
 
 
-def _parser() -> argparse.ArgumentParser:
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line of this module; return its exit code."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -166,18 +163,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--registry", type=Path, default=default_path().resolve())
     parser.add_argument("--released", type=Path)
     parser.add_argument("--allow-change", action="store_true")
-    return parser
-
-
-def _released(registry: Path, given: Path | None) -> Path | None:
-    """Return the list of released hashes: the one given, else that of a source checkout."""
-    beside = registry.parent / "tests" / "data" / "released_hashes.json"
-    return given or (beside if (registry.parent / "tests").is_dir() else None)
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line of this module; return its exit code."""
-    options = _parser().parse_args(arguments)
+    options = parser.parse_args(arguments)
     root = resolve_root(options.root)
     try:
         size = load(options.registry).size(options.split, options.size)
@@ -186,14 +172,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if manifest is None:
             raise DataError("the data set has no manifest", where=str(folder))
         check_files(folder, manifest)
-        released = _released(options.registry, options.released)
-        values = record(
-            size,
-            with_statistics(folder, manifest),
-            registry=options.registry,
-            released=released,
-            allow=options.allow_change,
-        )
+        released, checkout = options.released, options.registry.parent / "tests"
+        if released is None and checkout.is_dir():
+            released = checkout / "data" / "released_hashes.json"
+        manifest = with_statistics(folder, manifest)
+        allow = options.allow_change
+        values = record(size, manifest, registry=options.registry, released=released, allow=allow)
     except LagbenchError as error:
         sys.stderr.write(f"record: {error}\n")
         return error.exit_code

@@ -25,9 +25,9 @@ from dataclasses import asdict, dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.data.layout import ScenarioKey, scenario_path
+from lagbench.data.layout import scenario_path
 from lagbench.data.registry import Size, Task
-from lagbench.data.scenario import ScenarioFile, read_scenario
+from lagbench.data.scenario import read_scenario
 from lagbench.data.writer import ScenarioWriter
 
 from .batch import Batch, Report, SimulationJob, split_module, substeps_of
@@ -41,7 +41,6 @@ __all__ = [
     "Simulated",
     "active_frames",
     "file_parameters",
-    "scenario_key",
     "scenario_writer",
     "simulate",
     "nudge",
@@ -98,17 +97,6 @@ class Simulated:
     pace: Pace | None = None  # of a scenario that was simulated alone
 
 
-def scenario_key(size: Size, scenario: int) -> ScenarioKey:
-    """Return what names a scenario of a size."""
-    return ScenarioKey(
-        split=size.split,
-        size=size.name,
-        version=size.version,
-        scenario=scenario,
-        subset=size.subset_of(scenario),
-    )
-
-
 def _particle_mass(size: Size, state: InitialState) -> float:
     return float(size.value("density")) * state.area / size.particles
 
@@ -122,9 +110,12 @@ def file_parameters(size: Size, state: InitialState) -> dict[str, object]:
 
 def scenario_writer(job: SimulationJob, scenario: int, state: InitialState) -> ScenarioWriter:
     """Return the writer of a scenario's file, with all that is known before it runs."""
-    size = job.size
-    key = scenario_key(size, scenario)
-    closed = isinstance(split_module(size).solver_parameters(size), ClosedBoxParameters)
+    size, walls = job.size, None
+    key = size.key(scenario)
+    if isinstance(split_module(size).solver_parameters(size), ClosedBoxParameters):
+        # of each wall towards each recorded frame [length/s], shape [frame, 4, 2]
+        frames = range(state.start_frame, state.start_frame + size.frame_count(scenario))
+        walls = np.stack([state.walls_towards(frame) for frame in frames])
     return ScenarioWriter(
         scenario_path(job.root, key),
         key,
@@ -133,18 +124,12 @@ def scenario_writer(job: SimulationJob, scenario: int, state: InitialState) -> S
         frame_interval=size.frame_interval,
         material=state.material,
         particle_mass=_particle_mass(size, state),
-        wall_velocity=_recorded_walls(size, scenario, state) if closed else None,
+        wall_velocity=walls,
         parameters=file_parameters(size, state),
         seed=seed_text(size.split, size.name, size.major, scenario),
         device=job.device.value,
         generator=size.generator,
     )
-
-
-def _recorded_walls(size: Size, scenario: int, state: InitialState) -> NDArray[np.float64]:
-    """Return the velocity of each wall towards each recorded frame [length/s], shape [frame, 4, 2]."""
-    frames = range(state.start_frame, state.start_frame + size.frame_count(scenario))
-    return np.stack([state.walls_towards(frame) for frame in frames])
 
 
 def active_frames(energies: Sequence[float], task: Task) -> int:
@@ -249,26 +234,15 @@ def twin_substeps(size: Size, scenario: int) -> int:
 
 
 def twin_floors(job: SimulationJob, report: Report) -> dict[int, tuple[float, ...]]:
-    """Simulate the twins of a job's scenarios beside their files.
-
-    Args:
-        job: scenarios whose files exist.
-        report: told the substeps done.
-
-    Returns:
-        For each scenario the RMSE per predicted frame [length].
-
-    Raises:
-        DataError: a scenario's file is missing or damaged.
-        WorkFailedError: a twin blew up.
-    """
+    """Simulate twins of scenarios beside their files; return the RMSE of each predicted frame [length]."""
     size = job.size
     counts = [size.frame_count(i) - size.frames_behind(i) for i in job.scenarios]
     batch = Batch(job, report, frames=counts)
     offsets = np.zeros((len(counts), size.particles, 2), dtype=np.float32)
     floors: list[list[float]] = [[] for _ in counts]
     with ExitStack() as stack:
-        truths = [stack.enter_context(_open_truth(job, scenario)) for scenario in job.scenarios]
+        paths = [scenario_path(job.root, size.key(scenario)) for scenario in job.scenarios]
+        truths = [stack.enter_context(read_scenario(path)) for path in paths]
         for index, frame in batch.recordings():
             if frame == size.task.input_frames - 1:
                 offsets[:] = 0.0
@@ -276,14 +250,6 @@ def twin_floors(job: SimulationJob, report: Report) -> dict[int, tuple[float, ..
                 batch.displace(offsets)
             elif frame >= size.task.input_frames:
                 truth = truths[index].read("position", slice(frame, frame + 1))[0]
-                floors[index].append(_rmse(batch.frame(index)[0], truth))
+                error = batch.frame(index)[0].astype(np.float64) - truth.astype(np.float64)
+                floors[index].append(math.sqrt(math.fsum((error * error).ravel().tolist()) / error.size))
     return {scenario: tuple(floor) for scenario, floor in zip(job.scenarios, floors, strict=True)}
-
-
-def _open_truth(job: SimulationJob, scenario: int) -> ScenarioFile:
-    return read_scenario(scenario_path(job.root, scenario_key(job.size, scenario)))
-
-
-def _rmse(twin: NDArray[np.float32], truth: NDArray[np.float32]) -> float:
-    error = twin.astype(np.float64) - truth.astype(np.float64)
-    return math.sqrt(math.fsum((error * error).ravel().tolist()) / error.size)

@@ -24,9 +24,8 @@ from torch.utils.data import Dataset, Sampler
 
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
-from lagbench.store.frames import CACHE_BYTES
+from lagbench.store.windows import CACHE_BYTES, WindowReader
 from lagbench.store.windows import Window as Arrays
-from lagbench.store.windows import WindowReader
 
 __all__ = [
     "POOL_BYTES",

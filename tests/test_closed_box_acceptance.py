@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from lagbench.generators.acceptance.cases import CHECK_EVERY, Result, run
-from lagbench.generators.acceptance.experiment import Case, plan
+from lagbench.generators.acceptance.experiment import CHECK_EVERY, Case, Result, plan, run
 
 pytestmark = pytest.mark.slow
 

@@ -14,7 +14,7 @@ from lagbench.generators.free_surface import FreeSurface
 from lagbench.generators.shapes import Disc, Rectangle
 from lagbench.generators.solver import Device, build
 from lagbench.generators.split import InitialState, Material
-from lagbench.work.process import available_cores
+from lagbench.work.machine import available_cores
 
 CONSTANTS = parameters()
 SQUARE = Rectangle(0.2, 0.2)

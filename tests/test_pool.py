@@ -13,8 +13,8 @@ import pool_tasks
 import pytest
 
 from lagbench.errors import DataError, UsageError, WorkFailedError
+from lagbench.work.machine import available_cores
 from lagbench.work.pool import ATTEMPTS, Pool, Task, worker_count
-from lagbench.work.process import available_cores
 
 HERE = str(Path(__file__).parent)
 

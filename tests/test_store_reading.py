@@ -22,11 +22,10 @@ from lagbench.data.registry import Registry
 from lagbench.errors import DataError
 from lagbench.exchange import export
 from lagbench.make.generate import GenerationResult
-from lagbench.make.overview import overview
+from lagbench.make.inventory import overview
 from lagbench.make.verify import verify
 from lagbench.store import copy
 from lagbench.store.fetch import partial_name
-from lagbench.store.frames import sources_of
 from lagbench.store.objects import WrongContentError, WrongLengthError
 from lagbench.submission import template
 
@@ -114,8 +113,8 @@ def test_baselines_read_from_a_store(url: str, generated: GenerationResult, tiny
     """Facts and training files are those of the folder."""
     assert facts_of(SPLIT, SIZE, root=url) == facts_of(SPLIT, SIZE, root=generated.root)
     assert here(url) == ["manifest.json", "train/0000.nc"]
-    found = sources_of(tiny.size(SPLIT, SIZE), ("train", "valid"), resolve_root(url))
-    assert [source.path.read_bytes() for source in found.values()] == [
+    found = copy.scenario_files(tiny.size(SPLIT, SIZE), resolve_root(url), ("train", "valid"))
+    assert [path.read_bytes() for path in found.values()] == [
         (generated.folder / name).read_bytes() for name in ("train/0000.nc", "train/0001.nc", "valid/0002.nc")
     ]
 

@@ -10,7 +10,7 @@ from submission_data import Bench, make_bench
 from lagbench.errors import WorkFailedError
 from lagbench.submission import CHECKS, validation
 from lagbench.submission.findings import quoted
-from lagbench.work.process import in_child
+from lagbench.work.machine import in_child
 
 ROOM = {"seconds": 5.0, "wall": 600.0}
 

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from lagbench.errors import UsageError
-from lagbench.generators.acceptance import __main__, diagnostics, experiment, ghia
-from lagbench.generators.acceptance import diagnostics as profiles
+from lagbench.generators.acceptance import __main__, diagnostics, experiment
 from lagbench.generators.acceptance.experiment import Case, plan
 
 BOX = diagnostics.Box(low=0.0625, high=0.9375, cells=35)
@@ -22,16 +21,16 @@ BOX = diagnostics.Box(low=0.0625, high=0.9375, cells=35)
 
 def _tabulated(reynolds: int, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return ascending abscissae and values of one profile, walls included, misprints left out."""
-    lines = ghia.centre_lines(reynolds)
+    lines = diagnostics.centre_lines(reynolds)
     assert lines is not None
-    points, values, lid = (ghia.Y, lines.u, 1.0) if name == "u" else (ghia.X, lines.v, 0.0)
+    points, values, lid = (diagnostics.Y, lines.u, 1.0) if name == "u" else (diagnostics.X, lines.v, 0.0)
     known = ~np.isnan(values)
     abscissae = np.concatenate([[0.0], np.array(points)[known][::-1], [1.0]])
     return abscissae, np.concatenate([[0.0], values[known][::-1], [lid]])
 
 
 @pytest.mark.parametrize("name", ["u", "v"])
-@pytest.mark.parametrize("reynolds", ghia.REYNOLDS)
+@pytest.mark.parametrize("reynolds", diagnostics.REYNOLDS)
 def test_no_net_flow_crosses_a_centre_line(reynolds: int, name: str) -> None:
     """Mass is conserved in a closed box: each tabulated profile integrates to nearly 0.
 
@@ -41,7 +40,7 @@ def test_no_net_flow_crosses_a_centre_line(reynolds: int, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["u", "v"])
-@pytest.mark.parametrize("reynolds", ghia.REYNOLDS)
+@pytest.mark.parametrize("reynolds", diagnostics.REYNOLDS)
 def test_tabulated_profiles_are_smooth_near_the_walls(reynolds: int, name: str) -> None:
     """Among the points 0.008 apart, each lies within 0.006 of a spline through the others."""
     abscissae, values = _tabulated(reynolds, name)
@@ -56,17 +55,17 @@ def test_misprints_are_left_out() -> None:
     """The two misprints are NaN, everything else is a number, and Re 7 is not tabulated."""
     missing = {
         (reynolds, name, int(index))
-        for reynolds in ghia.REYNOLDS
+        for reynolds in diagnostics.REYNOLDS
         for name in ("u", "v")
-        for index in np.flatnonzero(np.isnan(getattr(ghia.centre_lines(reynolds), name)))
+        for index in np.flatnonzero(np.isnan(getattr(diagnostics.centre_lines(reynolds), name)))
     }
-    assert missing == {(400, "v", ghia.X.index(0.9063)), (3200, "u", ghia.Y.index(0.4531))}
-    assert ghia.centre_lines(7.0) is None
+    assert missing == {(400, "v", diagnostics.X.index(0.9063)), (3200, "u", diagnostics.Y.index(0.4531))}
+    assert diagnostics.centre_lines(7.0) is None
 
 
 def test_deviation_skips_what_is_not_tabulated() -> None:
     """Differences 3 and 4 beside a NaN: RMSE sqrt(25/2), maximum 4."""
-    found = ghia.deviation(np.array([3.0, 9.0, -4.0]), np.array([0.0, np.nan, 0.0]))
+    found = diagnostics.deviation(np.array([3.0, 9.0, -4.0]), np.array([0.0, np.nan, 0.0]))
     assert found.rmse == pytest.approx(math.sqrt(12.5))
     assert found.maximum == 4.0
 
@@ -120,8 +119,8 @@ def test_profiles_reproduce_a_polynomial_flow(cells: int) -> None:
     s = (box.nodes - box.low) / box.width
     x, y = np.meshgrid(s, s, indexing="ij")
     u, v = 4.0 * x * (1.0 - x) * y**3, 16.0 * y * (1.0 - y) * x * (1.0 - x) * (1.0 - 2.0 * x)
-    found = profiles.extract(0.2 * _nodal(u, v), box, 0.2).at_reference_points()
-    heights, abscissae = np.array(ghia.Y), np.array(ghia.X)
+    found = diagnostics.extract(0.2 * _nodal(u, v), box, 0.2).at_reference_points()
+    heights, abscissae = np.array(diagnostics.Y), np.array(diagnostics.X)
     assert found.u == pytest.approx(heights**3, abs=1e-12)
     assert found.v == pytest.approx(4.0 * abscissae * (1 - abscissae) * (1 - 2 * abscissae), abs=1e-12)
 
@@ -223,7 +222,7 @@ def test_validate_reports_what_it_measured(written: list[Path]) -> None:
     """Ghia's points with his values, errors that follow from them, checks, energy that grows."""
     found = json.loads((written[0] / "result.json").read_text())
     lines = found["centre_lines"]
-    assert [point["y"] for point in lines["u"]] == list(ghia.Y)
+    assert [point["y"] for point in lines["u"]] == list(diagnostics.Y)
     assert lines["v"][0]["ghia"] == -0.05906
     squares = [(point["u"] - point["ghia"]) ** 2 for point in lines["u"]]
     assert found["ghia"]["u_rmse"] == pytest.approx(math.sqrt(sum(squares) / 15))

@@ -7,6 +7,7 @@ import pickle
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import h5py
@@ -24,8 +25,7 @@ from lagbench.data.registry import Registry, load
 from lagbench.data.yamlfile import read_yaml
 from lagbench.errors import DataError, LagbenchError, UsageError
 from lagbench.make.generate import GenerationResult
-from lagbench.store import frames as frame_store
-from lagbench.store.frames import Source
+from lagbench.store import windows as store_windows
 from lagbench.torch import Batch, Window, WindowDataset, WindowSampler, collate, predict, roll_out
 
 FRAMES = {0: 40, 1: 26, 2: 31}
@@ -218,7 +218,7 @@ def test_open_files_are_bounded(train: Open, monkeypatch: pytest.MonkeyPatch) ->
         return {path for path in held if path.resolve().suffix == ".nc"}
 
     before = open_scenarios()
-    monkeypatch.setattr(frame_store, "OPEN_FILES", 1)
+    monkeypatch.setattr(store_windows, "OPEN_FILES", 1)
     data = train(cache_bytes=0)
     for i in (0, 40, 60, 0, 40, 60):
         assert data[i].scenario == data.place(i)[0]
@@ -317,13 +317,13 @@ def test_a_pool_shares_its_frames(train: Open, monkeypatch: pytest.MonkeyPatch) 
     data = train(cache_bytes=3 * 14 * 11 * 8)
     monkeypatch.setattr(lagbench_torch, "POOL_BYTES", 3 * 14 * data.frame_bytes)
     read: list[int] = []
-    inner = frame_store.FrameStore._read
+    inner = store_windows.FrameStore._read
 
-    def counted(store: frame_store.FrameStore, scenario: int, first: int, last: int) -> object:
+    def counted(store: store_windows.FrameStore, scenario: int, first: int, last: int) -> object:
         read.extend(range(first, last))
         return inner(store, scenario, first, last)
 
-    monkeypatch.setattr(frame_store.FrameStore, "_read", counted)
+    monkeypatch.setattr(store_windows.FrameStore, "_read", counted)
     order = list(WindowSampler(data, seed=0))
     assert sorted(order) == list(range(WINDOWS))
     assert all(len({data.place(i)[0] for i in order[k : k + 24]}) <= 3 for k in range(0, WINDOWS, 24))
@@ -422,10 +422,9 @@ def test_another_scenario_under_its_name_is_refused(tmp_path: Path, train: Open)
 
 def test_another_content_hash_is_refused(root: Path, registry: Registry) -> None:
     """A file whose values are not those that the registry's hash names is a data error."""
-    source = Source(
-        path=next(root.rglob("0000.nc")), key=make_key(0, subset="train"), frames=40, digest="0" * 16
-    )
-    store = frame_store.FrameStore({0: source})
+    measured = SimpleNamespace(scenario_sha256={0: "0" * 16})
+    size = registry.size("cavity", "tiny").model_copy(update={"measured": measured})
+    store = store_windows.FrameStore(size, {0: next(root.rglob("0000.nc"))})
     with pytest.raises(DataError, match=r"(?s)not that of the registry.*content hash 0{16}"):
         store.frames(0, 0, 2)
 

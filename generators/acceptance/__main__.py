@@ -29,10 +29,8 @@ from rich.progress import Progress
 from lagbench.errors import LagbenchError, UsageError, WorkFailedError
 from lagbench.generators.solver import Device
 
-from . import ghia
-from .cases import Result, run
-from .diagnostics import box_of, draw
-from .experiment import Case, Experiment, plan, solver_parameters
+from .diagnostics import X, Y, box_of, centre_lines, draw
+from .experiment import Case, Experiment, Result, plan, run, solver_parameters
 
 __all__ = ["document", "main", "parser", "settings"]
 
@@ -53,12 +51,7 @@ def parser() -> argparse.ArgumentParser:
     add = made.add_argument
     add("--case", type=Case, choices=list(Case), required=True, help="which closed box")
     add("--json", type=Path, metavar="FILE", help="results")
-    add(
-        "--re",
-        type=float,
-        metavar="R",
-        help="Reynolds number; curl-noise is inviscid without it",
-    )
+    add("--re", type=float, metavar="R", help="Reynolds number; curl-noise is inviscid without it")
     add("--grid", type=int, default=40, metavar="N", help="cells across the unit box (default 40)")
     add("--particles", type=int, metavar="P", help="particles (default 8192 (N/40)^2, curl-noise 8096)")
     add("--substeps", type=int, metavar="K", help="solver steps (default 100000, curl-noise 600 frames)")
@@ -98,25 +91,21 @@ def check_outputs(given: argparse.Namespace) -> None:
             "not a picture format", where="--profiles", expected=".png, .pdf or .svg", got=given.profiles
         )
     for flag, path in (("--json", given.json), ("--profiles", given.profiles)):
-        if path is not None:
-            _probe(flag, path)
-
-
-def _probe(flag: str, path: Path) -> None:
-    """Open a file for writing without changing it; create its folder."""
-    fresh = not path.exists()
-    try:
-        path.absolute().parent.mkdir(parents=True, exist_ok=True)
-        path.open("ab").close()
-    except OSError as error:
-        raise UsageError(
-            "the file cannot be written",
-            where=f"{flag} {path}",
-            expected="a file in a folder that you may write to",
-            got=error.strerror,
-        ) from error
-    if fresh:
-        path.unlink()
+        if path is None:
+            continue
+        fresh = not path.exists()
+        try:
+            path.absolute().parent.mkdir(parents=True, exist_ok=True)
+            path.open("ab").close()
+        except OSError as error:
+            raise UsageError(
+                "the file cannot be written",
+                where=f"{flag} {path}",
+                expected="a file in a folder that you may write to",
+                got=error.strerror,
+            ) from error
+        if fresh:
+            path.unlink()
 
 
 def rounded(value: object) -> object:
@@ -136,6 +125,11 @@ def document(result: Result) -> JSON:
     parameters = solver_parameters(e)
     box = box_of(parameters)
     work = e.particles * e.substeps
+    apart = result.deviations()
+    against = None
+    if apart is not None:
+        u, v = apart
+        against = {"u_rmse": u.rmse, "v_rmse": v.rmse, "u_max": u.maximum, "v_max": v.maximum}
     found: JSON = {
         "format": 1,
         "case": e.case.value,
@@ -144,7 +138,7 @@ def document(result: Result) -> JSON:
         "box": [box.low, box.high],
         "time": e.substeps * e.dt,
         "centre_lines": _centre_lines(result),
-        "ghia": _ghia(result),
+        "ghia": against,
         "jacobian": {
             "min": min(c.jacobian_min for c in checks),
             "max": max(c.jacobian_max for c in checks),
@@ -170,11 +164,11 @@ def _centre_lines(result: Result) -> JSON | None:
     if result.profiles is None:
         return None
     found = result.profiles.at_reference_points()
-    reference = ghia.centre_lines(result.experiment.reynolds or 0.0)
+    reference = centre_lines(result.experiment.reynolds or 0.0)
     return {
         "averaged_substeps": [result.averaged_from, result.experiment.substeps],
-        "u": _points("y", ghia.Y, "u", found.u, None if reference is None else reference.u),
-        "v": _points("x", ghia.X, "v", found.v, None if reference is None else reference.v),
+        "u": _points("y", Y, "u", found.u, None if reference is None else reference.u),
+        "v": _points("x", X, "v", found.v, None if reference is None else reference.v),
     }
 
 
@@ -190,14 +184,6 @@ def _points(
         {along: x, name: float(value), "ghia": float(known)}
         for x, value, known in zip(abscissae, values, tabulated, strict=True)
     ]
-
-
-def _ghia(result: Result) -> JSON | None:
-    found = result.deviations()
-    if found is None:
-        return None
-    u, v = found
-    return {"u_rmse": u.rmse, "v_rmse": v.rmse, "u_max": u.maximum, "v_max": v.maximum}
 
 
 def summary(found: JSON) -> str:
@@ -237,7 +223,7 @@ def perform(given: argparse.Namespace) -> JSON:
     if given.profiles is not None and result.profiles is not None:
         e = experiment
         title = f"Re {e.reynolds:g}, {e.grid} x {e.grid}, {e.substeps} substeps"
-        draw(result.profiles, ghia.centre_lines(experiment.reynolds or 0.0), title, given.profiles)
+        draw(result.profiles, centre_lines(experiment.reynolds or 0.0), title, given.profiles)
     return found
 
 

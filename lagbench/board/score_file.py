@@ -28,7 +28,7 @@ from lagbench.scoring.scenario import FRAMES, PARTICLES, Preview
 from lagbench.scoring.score_file import FILM_RANGE, StoredScores, read_statistics
 from lagbench.scoring.task import ranking_metric
 from lagbench.submission.task_checks import frames_to_predict
-from lagbench.work.process import in_child
+from lagbench.work.machine import in_child
 
 __all__ = ["MAX_SCORE_BYTES", "Stored", "read_stored", "reported_frames", "unreadable_in_child"]
 

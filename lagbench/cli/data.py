@@ -34,7 +34,7 @@ from .output import print_json, print_table, progress_bar, say, show, spell_byte
 if TYPE_CHECKING:
     from lagbench.data.registry import Registry, Size
     from lagbench.make.generate import GenerationResult
-    from lagbench.make.overview import Overview
+    from lagbench.make.inventory import Overview
     from lagbench.make.verify import VerificationResult
 
 __all__ = ["cite", "clean", "doctor", "generate", "info", "list_splits", "verify"]
@@ -173,7 +173,7 @@ def list_splits(root: RootOption = None, as_json: JsonFlag = False) -> None:
     from lagbench.data.layout import resolve_root, url_of
     from lagbench.data.local import rooted
     from lagbench.data.registry import load
-    from lagbench.make.overview import overview
+    from lagbench.make.inventory import overview
 
     folder = resolve_root(root)
     registry = rooted(folder, load())
@@ -221,7 +221,7 @@ def info(
 ) -> None:
     """Show a split: parameters with units, sizes in bytes, time to generate, local state."""
     from lagbench.data.local import home
-    from lagbench.make.overview import overview
+    from lagbench.make.inventory import overview
 
     split_name, folder, registry = home(chosen(name, split), root=root)
     entry = registry.split(split_name)

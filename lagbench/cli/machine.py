@@ -18,8 +18,8 @@ from lagbench.data.layout import resolve_root
 from lagbench.data.registry import load
 from lagbench.errors import LagbenchError, check_installed
 from lagbench.make.plan import free_bytes
+from lagbench.work.machine import available_cores
 from lagbench.work.pool import Pool, Report, Task
-from lagbench.work.process import available_cores
 
 __all__ = ["Check", "Diagnosis", "SolverBench", "bench_apart", "bench_solver", "doctor"]
 

@@ -33,6 +33,7 @@ from pydantic import (
 
 from lagbench.errors import LagbenchError, UnreadableFileError, UsageError, nearest
 
+from .layout import ScenarioKey
 from .limits import check_frames, check_parameters, check_subsets
 from .yamlfile import read_yaml
 
@@ -326,6 +327,13 @@ class Size(BaseModel):
             f"no scenario {scenario}",
             where=f"{self.split} {self.name}",
             expected=", ".join(f"{subset} {spell_ids(ids)}" for subset, ids in self.subsets.items()),
+        )
+
+    def key(self, scenario: int) -> ScenarioKey:
+        """Return what names a scenario."""
+        subset = self.subset_of(scenario)
+        return ScenarioKey(
+            split=self.split, size=self.name, version=self.version, scenario=scenario, subset=subset
         )
 
     def frame_count(self, scenario: int) -> int:

@@ -7,7 +7,7 @@ import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, Unpack
+from typing import IO, Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,15 +24,12 @@ from .metadata import DROP, Format, Source, parse_format, read_source
 from .mistakes import check_meaning
 from .trajectory import Description, Frame, Trajectory, Wishes, check_array, check_inflation
 
-if TYPE_CHECKING:
-    import netCDF4
-
 __all__ = ["adopt", "import_split"]
 
 READABLE = (".npy", ".npz", ".nc")
 """Files that are adopted: an array, named arrays, netCDF."""
 
-POSITION, VELOCITY, MATERIAL, WALLS = "position", "velocity", "material", "wall_velocity"
+ARRAYS = POSITION, VELOCITY, MATERIAL, WALLS = "position", "velocity", "material", "wall_velocity"
 
 Read = Callable[[str], NDArray[Any]]
 
@@ -126,12 +123,17 @@ def import_split(
     files = {subset: folder / f"{subset}{ENDINGS[form]}" for subset in HASHED_SUBSETS}
     missing = [path.name for path in files.values() if not path.is_file()]
     if missing:
+        there = (
+            f"the folder holds {HASHED_SUBSETS[0]}{ending}: --format {other.value}"
+            for other, ending in ENDINGS.items()
+            if all((folder / f"{subset}{ending}").is_file() for subset in HASHED_SUBSETS)
+        )
         raise UnreadableFileError(
             "files are missing",
             where=str(folder),
             expected=", ".join(p.name for p in files.values()),
             got=f"no {', no '.join(missing)}",
-            fix=_other_format(folder, form),
+            fix=next(there, None),
         )
     if form is Format.GNS_NPZ and not allow_pickle:
         next(gns_npz.trajectories(files["train"], allow_pickle=False, kinds={}))
@@ -224,7 +226,18 @@ def _open(path: Path, row: int | None, interval: float | None) -> Trajectory:
         held = {POSITION: array if row is None else array[row]}
         return _trajectory(name, held, lambda: _frames(held), interval)
     if path.suffix == ".npz":
-        arrays = _arrays(path)
+        try:
+            with zipfile.ZipFile(path) as archive:
+                for member in archive.infolist():
+                    name = f"{path}, {member.filename}"
+                    check_inflation(name, packed=member.compress_size, unpacked=member.file_size)
+                    if member.filename.removesuffix(".npy") in ARRAYS:
+                        with archive.open(member) as stream:
+                            _refuse_objects(name, stream)
+            with np.load(path, allow_pickle=False) as file:
+                arrays = {name: file[name] for name in ARRAYS if name in file}
+        except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+            raise _unreadable(path, error) from error
         return _trajectory(str(path), arrays, lambda: _frames(arrays), interval)
     return _netcdf(path, interval)
 
@@ -287,22 +300,6 @@ def _array(path: Path) -> NDArray[Any]:
     return array
 
 
-def _arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """Return the arrays of a .npz file that a trajectory may have."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            for member in archive.infolist():
-                name = f"{path}, {member.filename}"
-                check_inflation(name, packed=member.compress_size, unpacked=member.file_size)
-                if member.filename.removesuffix(".npy") in (POSITION, VELOCITY, MATERIAL, WALLS):
-                    with archive.open(member) as stream:
-                        _refuse_objects(name, stream)
-        with np.load(path, allow_pickle=False) as held:
-            return {name: held[name] for name in (POSITION, VELOCITY, MATERIAL, WALLS) if name in held}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise _unreadable(path, error) from error
-
-
 def _refuse_objects(name: str, stream: IO[bytes]) -> None:
     _, _, dtype = gns_npz.read_header(stream)
     if dtype.hasobject:
@@ -322,10 +319,17 @@ def _netcdf(path: Path, interval: float | None) -> Trajectory:
     except (OSError, RuntimeError) as error:
         raise _unreadable(path, error) from error
     file.set_auto_maskandscale(False)
-    _check_plain(path, file)
-    held = {
-        name: file.variables[name] for name in (POSITION, VELOCITY, MATERIAL, WALLS) if name in file.variables
-    }
+    # Values that stand for others are refused: they are read as they are stored.
+    for name in (POSITION, VELOCITY, WALLS):
+        packed = name in file.variables and {"scale_factor", "add_offset"} & set(file[name].ncattrs())
+        if packed:
+            raise UnreadableFileError(
+                "the values are packed",
+                where=f"{path}, {name}, {', '.join(sorted(packed))}",
+                expected="positions as they are, float32 or float64",
+                fix="write them again without scale_factor and add_offset",
+            )
+    held = {name: file.variables[name] for name in ARRAYS if name in file.variables}
 
     def read() -> Iterator[Frame]:
         try:
@@ -339,19 +343,6 @@ def _netcdf(path: Path, interval: float | None) -> Trajectory:
         raise _unreadable(path, error) from error
 
 
-def _check_plain(path: Path, file: netCDF4.Dataset) -> None:
-    """Refuse values that stand for others: they are read as they are stored."""
-    for name in (POSITION, VELOCITY, WALLS):
-        packed = name in file.variables and {"scale_factor", "add_offset"} & set(file[name].ncattrs())
-        if packed:
-            raise UnreadableFileError(
-                "the values are packed",
-                where=f"{path}, {name}, {', '.join(sorted(packed))}",
-                expected="positions as they are, float32 or float64",
-                fix="write them again without scale_factor and add_offset",
-            )
-
-
 def _unreadable(path: Path, error: Exception) -> UnreadableFileError:
     return UnreadableFileError(
         "cannot read the file",
@@ -359,14 +350,6 @@ def _unreadable(path: Path, error: Exception) -> UnreadableFileError:
         expected="arrays of numbers",
         got=f"{type(error).__name__}: {error}",
     )
-
-
-def _other_format(folder: Path, form: Format) -> str | None:
-    """Return the format that the files of a folder do have, as a remedy; None where none fits."""
-    for other, ending in ENDINGS.items():
-        if other is not form and all((folder / f"{subset}{ending}").is_file() for subset in HASHED_SUBSETS):
-            return f"the folder holds {HASHED_SUBSETS[0]}{ending}: --format {other.value}"
-    return None
 
 
 def _stated(stated: Source, wishes: Wishes) -> dict[str, Any]:

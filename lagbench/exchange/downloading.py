@@ -22,18 +22,12 @@ from lagbench.data.manifest import (
 )
 from lagbench.data.registry import Registry, Size, spell_ids
 from lagbench.errors import DataError, UsageError, WorkFailedError
-from lagbench.generators.simulate import scenario_key
 from lagbench.make.cards import write_cards
 from lagbench.make.generate import generate
 from lagbench.make.inventory import State, compare, examine
 from lagbench.make.plan import Scenarios, Selection, check_disk, scenario_bytes, select
 from lagbench.store.archive import RELEASES, RELEASES_VARIABLE, fetch_archive, releases
-from lagbench.store.copy import (
-    MANIFEST_LIMIT,
-    address_of,
-    parse_manifest,
-    refuse_strangers,
-)
+from lagbench.store.copy import MANIFEST_LIMIT, address_of, parse_manifest, refuse_strangers
 from lagbench.store.fetch import CONNECTIONS, Wanted, fetch_scenarios, fetch_text
 from lagbench.store.objects import NotInStoreError, StoreUnreachableError
 from lagbench.store.publication import publication
@@ -211,17 +205,20 @@ class _Download:
     def _fetch_from(self, url: str) -> NotInStoreError | None:
         """Fetch what one store has; return the error of the last file that it has not."""
         check_disk(self.root, sum(scenario_bytes(self.size, i) for i in self.missing))
-        claims = self._claims(url)
-        if claims is None:
-            with suppress(NotInStoreError):
-                self._fetch_archive(url)
-                return None
-            claims = {}
-        wanted = {i: self._wanted(url, i, claims.get(i)) for i in self.missing}
+        claims, last = self._claims(url), None
+        wanted = {i: self._wanted(url, i, (claims or {}).get(i)) for i in self.missing}
         total = sum(one.length or scenario_bytes(self.size, i) for i, one in wanted.items())
         self._meter.begin("downloading", total=total, scenarios=len(wanted))
-        last: NotInStoreError | None = None
         try:
+            if claims is None:  # it may have the archive of the data set instead
+                limit = sum(map(self._limit, self.size.scenarios)) + MANIFEST_LIMIT
+                archive = fetch_archive(self.size, url, wanted, self._count, limit=limit, remedy=REMEDY)
+                with suppress(NotInStoreError), closing(archive) as arrived:
+                    for claim in arrived:
+                        self._take(url, claim.scenario, claim)
+                    return None
+                claims = {}
+                wanted = {i: one for i, one in wanted.items() if i not in self.downloaded}
             with closing(fetch_scenarios(wanted, self._count, connections=self._connections)) as arrivals:
                 for scenario, absent in arrivals:
                     if absent is None:
@@ -230,21 +227,6 @@ class _Download:
         finally:
             self.missing = [i for i in self.missing if i not in self.downloaded]
         return last
-
-    def _fetch_archive(self, url: str) -> None:
-        """Fetch what is missing from the archive of the data set in a store."""
-        wanted = {i: self._wanted(url, i, None) for i in self.missing}
-        total = sum(scenario_bytes(self.size, i) for i in wanted)
-        self._meter.begin("downloading", total=total, scenarios=len(wanted))
-        limit = sum(self._limit(i) for i in self.size.scenarios) + MANIFEST_LIMIT
-        try:
-            with closing(
-                fetch_archive(self.size, url, wanted, self._count, limit=limit, remedy=REMEDY)
-            ) as arrivals:
-                for claim in arrivals:
-                    self._take(url, claim.scenario, claim)
-        finally:
-            self.missing = [i for i in self.missing if i not in self.downloaded]
 
     def _claims(self, url: str) -> dict[int, FileEntry] | None:
         """Return what the store's manifest says of the files that datasets.yaml means; None without one."""
@@ -260,7 +242,7 @@ class _Download:
         return found
 
     def _wanted(self, url: str, scenario: int, claim: FileEntry | None) -> Wanted:
-        key = scenario_key(self.size, scenario)
+        key = self.size.key(scenario)
         return Wanted(
             url=address_of(self.size, url, f"{key.subset}/{scenario:04d}.nc"),
             target=scenario_path(self.root, key),
@@ -277,7 +259,7 @@ class _Download:
 
     def _take(self, url: str, scenario: int, claim: FileEntry | None) -> None:
         """Note a new file; what cannot be told from it is the store's word."""
-        entry = describe_file(self.root, scenario_key(self.size, scenario))
+        entry = describe_file(self.root, self.size.key(scenario))
         if claim is not None:
             entry = entry.model_copy(update={"facts": claim.facts, "twin_floor": claim.twin_floor})
         self._entries.append(entry)

@@ -13,15 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.checksums import HASHED_SUBSETS
-from lagbench.data.layout import scenario_path
 from lagbench.data.local import locate, remedy
 from lagbench.data.manifest import read_manifest
-from lagbench.data.registry import Registry, Size, spell_ids
+from lagbench.data.registry import Registry, Size
 from lagbench.data.scenario import ScenarioFile, read_scenario
 from lagbench.errors import DataError, UsageError
 from lagbench.generators.batch import solver_constants
-from lagbench.generators.simulate import scenario_key
-from lagbench.store.copy import bring
+from lagbench.store.copy import scenario_files
 from lagbench.work.progress import Meter, Progress
 
 from . import gns_npz, lagrangebench_h5
@@ -99,9 +97,10 @@ def export(
     tier, home, splits = locate(split, size, root=root, registry=registry)
     folder, ending = Path(output), ENDINGS[form]
     _check_target(folder, [f"{subset}{ending}" for subset in HASHED_SUBSETS], force=force)
-    bring(tier, home, [i for subset in HASHED_SUBSETS for i in tier.subsets[subset]])
+    frames_of: dict[str, dict[Path, int]] = {subset: {} for subset in HASHED_SUBSETS}
+    for scenario, path in sorted(scenario_files(tier, home, HASHED_SUBSETS).items()):
+        frames_of[tier.subset_of(scenario)][path] = _frames(tier, scenario, path)
     statistics, digest = _recorded(tier, home)
-    frames_of = {subset: _files(tier, home, subset) for subset in HASHED_SUBSETS}
     with read_scenario(next(iter(frames_of["train"]))) as file:
         spacing = math.sqrt(float(file.read("particle_mass")) / float(tier.value("density")))
         closed = "wall_velocity" in file.variables
@@ -285,32 +284,19 @@ def _recorded(size: Size, root: Path) -> tuple[dict[str, tuple[float, ...]], str
     return dict(manifest.statistics), manifest.dataset_sha256
 
 
-def _files(size: Size, root: Path, subset: str) -> dict[Path, int]:
-    """Return the files of a subset by id and the frames of each, after a look at its header."""
-    ids = sorted(size.subsets[subset])
-    paths = [scenario_path(root, scenario_key(size, i)) for i in ids]
-    missing = [i for i, path in zip(ids, paths, strict=True) if not path.is_file()]
-    if missing:
+def _frames(size: Size, scenario: int, path: Path) -> int:
+    """Return the frames of a scenario after a look at its header."""
+    with read_scenario(path) as file:
+        found = file.header
+    known = size.measured.scenario_sha256.get(scenario) if size.measured else None
+    if (found.key.major, found.key.scenario) != (size.major, scenario) or not (
+        found.content_sha256.startswith(known or "")
+    ):
         raise DataError(
-            f"{len(missing)} of {len(ids)} scenarios of {subset} are not there",
-            where=str(paths[0].parent),
-            got=f"missing: {spell_ids(missing)}",
-            fix=remedy(size, f"--subset {subset}", root=root),
+            "a scenario is not that of the registry",
+            where=str(path),
+            expected=f"scenario {scenario}, content hash {known or 'any'}",
+            got=f"scenario {found.key.scenario}, content hash {found.content_sha256[:16]}",
+            fix=f"lagbench verify --split {size.split} --size {size.name}",
         )
-    known = size.measured.scenario_sha256 if size.measured else {}
-    frames = {}
-    for scenario, path in zip(ids, paths, strict=True):
-        with read_scenario(path) as file:
-            found = file.header
-        if (found.key.major, found.key.scenario) != (size.major, scenario) or not (
-            found.content_sha256.startswith(known.get(scenario, ""))
-        ):
-            raise DataError(
-                "a scenario is not that of the registry",
-                where=str(path),
-                expected=f"scenario {scenario}, content hash {known.get(scenario, 'any')}",
-                got=f"scenario {found.key.scenario}, content hash {found.content_sha256[:16]}",
-                fix=f"lagbench verify --split {size.split} --size {size.name}",
-            )
-        frames[path] = found.frames
-    return frames
+    return found.frames

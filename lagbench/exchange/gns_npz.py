@@ -140,13 +140,19 @@ def _load(archive: zipfile.ZipFile, member: str, name: str) -> NDArray[Any]:
             shape, fortran, dtype = read_header(stream)
             if not dtype.hasobject:
                 return np.frombuffer(stream.read(), dtype).reshape(shape, order="F" if fortran else "C")
-            _check_program(stream)
+            # A pickle can make the unpickler reserve far more memory than the file holds. Reading it as text
+            # finds lengths beyond the end; a memo is reserved up to its highest index; and a byte is
+            # enough to make an empty list.
+            for step, (code, argument, place) in enumerate(pickletools.genops(stream)):
+                if step > _MOST_STEPS:
+                    raise pickle.UnpicklingError(f"the pickle has more than {_MOST_STEPS} steps")
+                if code.name.endswith("PUT") and isinstance(argument, int) and argument > (place or 0):
+                    raise pickle.UnpicklingError("the pickle wants a memo larger than itself")
         with archive.open(member) as stream:
             read_header(stream)
             found = _Arrays(stream, encoding="latin1").load()
         if not isinstance(found, _Array):
-            message = f"the pickle holds a {type(found).__name__}"
-            raise pickle.UnpicklingError(message)
+            raise pickle.UnpicklingError(f"the pickle holds a {type(found).__name__}")
         return found.value().reshape(shape)
     except Exception as error:  # damaged pickles and zip files raise nearly any type
         raise UnreadableFileError(
@@ -164,21 +170,6 @@ def read_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]
     return read(stream)
 
 
-def _check_program(stream: IO[bytes]) -> None:
-    """Refuse a pickle that makes the unpickler reserve far more memory than the file holds.
-
-    Reading it as text finds lengths beyond the end; a memo is reserved up to its highest index; and
-    a byte is enough to make an empty list.
-    """
-    for step, (code, argument, place) in enumerate(pickletools.genops(stream)):
-        if step > _MOST_STEPS:
-            message = f"the pickle has more than {_MOST_STEPS} steps"
-            raise pickle.UnpicklingError(message)
-        if code.name.endswith("PUT") and isinstance(argument, int) and argument > (place or 0):
-            message = "the pickle wants a memo larger than itself"
-            raise pickle.UnpicklingError(message)
-
-
 class _Type:
     """What a pickle says of a type: its code and its order of bytes; never its flags."""
 
@@ -191,8 +182,7 @@ class _Type:
     def numbers(self) -> np.dtype[Any]:
         """Return the type where it is one of numbers."""
         if not _NUMBERS.fullmatch(self.code) or self.order not in ("<", ">", "|", "="):
-            message = f"the pickle holds values of type {self.code!r}"
-            raise pickle.UnpicklingError(message)
+            raise pickle.UnpicklingError(f"the pickle holds values of type {self.code!r}")
         return np.dtype(self.order + self.code)
 
 
@@ -210,44 +200,35 @@ class _Array:
         """Return the array, made once however often it is named."""
         if self._value is None:
             shape, kind, fortran, data = self._state
-            flat = _objects(data, depth) if kind.code.startswith("O") else _numbers(data, kind)
+            if kind.code.startswith("O"):  # NumPy pickles the elements as a list
+                if not isinstance(data, list):
+                    found = type(data).__name__
+                    raise pickle.UnpicklingError(f"the pickle has a {found} for the objects of an array")
+                flat = np.empty(len(data), dtype=object)
+                for number, item in enumerate(data):
+                    flat[number] = _resolved(item, depth - 1)
+            else:
+                # Python 2 pickled raw values as text, a letter for a byte.
+                raw = data.encode("latin1") if isinstance(data, str) else data
+                if not isinstance(raw, bytes):
+                    found = type(data).__name__
+                    raise pickle.UnpicklingError(f"the pickle has a {found} for the values of an array")
+                flat = np.frombuffer(raw, kind.numbers())
             self._value = flat.reshape(shape, order="F" if fortran else "C")
         return self._value
-
-
-def _objects(items: object, depth: int) -> NDArray[Any]:
-    """Return the elements of an object array, which NumPy pickles as a list."""
-    if not isinstance(items, list):
-        message = f"the pickle has a {type(items).__name__} for the objects of an array"
-        raise pickle.UnpicklingError(message)
-    flat = np.empty(len(items), dtype=object)
-    for number, item in enumerate(items):
-        flat[number] = _resolved(item, depth - 1)
-    return flat
-
-
-def _numbers(data: object, kind: _Type) -> NDArray[Any]:
-    """Return raw values; Python 2 pickled them as text, a letter for a byte."""
-    raw = data.encode("latin1") if isinstance(data, str) else data
-    if not isinstance(raw, bytes):
-        message = f"the pickle has a {type(data).__name__} for the values of an array"
-        raise pickle.UnpicklingError(message)
-    return np.frombuffer(raw, kind.numbers())
 
 
 def _resolved(item: object, depth: int) -> object:
     """Return an element of an object array: an array, a number, or a few of both."""
     if depth < 0:
-        message = "the pickle holds arrays in arrays without end"
-        raise pickle.UnpicklingError(message)
+        raise pickle.UnpicklingError("the pickle holds arrays in arrays without end")
     if isinstance(item, _Array):
         return item.value(depth)
     if isinstance(item, tuple | list) and len(item) <= _PARTS:
         return tuple(_resolved(part, depth - 1) for part in item)
     if isinstance(item, int | float):
         return item
-    message = f"the pickle holds a {type(item).__name__}"
-    raise pickle.UnpicklingError(message)
+    raise pickle.UnpicklingError(f"the pickle holds a {type(item).__name__}")
 
 
 class _Maker:
@@ -260,13 +241,11 @@ class _Maker:
 
     def __call__(self, *arguments: Any) -> object:  # noqa: ANN401
         if self._kind is None:
-            message = "the pickle wants to make an array by itself"
-            raise pickle.UnpicklingError(message)
+            raise pickle.UnpicklingError("the pickle wants to make an array by itself")
         return self._kind(*arguments)
 
     def __setstate__(self, state: object) -> None:
-        message = "the pickle wants to change a function"
-        raise pickle.UnpicklingError(message)
+        raise pickle.UnpicklingError("the pickle wants to change a function")
 
 
 class _Arrays(pickle.Unpickler):
@@ -277,5 +256,4 @@ class _Arrays(pickle.Unpickler):
             return _Maker(_Array)
         if module == "numpy" and name in ("ndarray", "dtype"):
             return _Maker(_Type if name == "dtype" else None)  # ndarray is named, and never called
-        message = f"the pickle wants to call {module}.{name}"
-        raise pickle.UnpicklingError(message)
+        raise pickle.UnpicklingError(f"the pickle wants to call {module}.{name}")

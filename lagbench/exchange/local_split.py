@@ -277,38 +277,23 @@ class _Building:
         cells = task["score_grid"]["cells"]  # type: ignore[index]
         counts = {entry.particles for entry in tested}
         particles = counts.pop() if len(counts) == 1 else max(entry.particles for entry in self.entries)
+        most = "particles in one test scenario; the most of any where they differ"
+        origin = "length of the source"
         parameters = {
-            "particles": (
-                particles,
-                "1",
-                "particles in one test scenario; the most of any where they differ",
-            ),
+            "particles": (particles, "1", most),
             "grid": (cells, "1", "cells across the unit box; predictions may leave the bounds by one"),
             "substeps_per_frame": (1, "1", "solver steps between recorded frames, 1 where they are unknown"),
             "frame_rate": (about.rate, "1/s", "recorded frames per second"),
             "density": (about.density, "mass/length^2", "rest density"),
             "spacing": (self.spacing, "length", "distance of neighbouring particles at first"),
-            "source_scale": (
-                about.measure.scale,
-                "length of the source",
-                "what a unit of length is in the source",
-            ),
-            "source_x": (
-                about.measure.corner[0],
-                "length of the source",
-                "x in the source of the lower left corner",
-            ),
-            "source_y": (
-                about.measure.corner[1],
-                "length of the source",
-                "y in the source of the lower left corner",
-            ),
+            "source_scale": (about.measure.scale, origin, "what a unit of length is in the source"),
+            "source_x": (about.measure.corner[0], origin, "x in the source of the lower left corner"),
+            "source_y": (about.measure.corner[1], origin, "y in the source of the lower left corner"),
         }
+        spelled = {count: spell_ids(frames[count]) for count in sorted(frames)}
         size = {
             "subsets": {name: spell_ids(scenarios) for name, scenarios in ids.items()},
-            "frames": next(iter(frames))
-            if len(frames) == 1
-            else {count: spell_ids(frames[count]) for count in sorted(frames)},
+            "frames": next(iter(frames)) if len(frames) == 1 else spelled,
             "bounds": [[float(low), float(high)] for low, high in bounds],
             "parameters": {},
             "task": task,

@@ -164,9 +164,8 @@ class Hints(BaseModel):
 
     origin: Pair = (0.0, 0.0)  # what was taken off every position [length]
     bounds: tuple[Pair, Pair] | None = None  # walls before that [length]
-    spacing: Annotated[float, Field(gt=0)] | None = (
-        None  # distance of neighbouring particles at first [length]
-    )
+    # distance of neighbouring particles at first [length]
+    spacing: Annotated[float, Field(gt=0)] | None = None
     density: Annotated[float, Field(gt=0)] | None = None  # rest density [mass/length^2]
     input_frames: Annotated[int, Field(gt=1)] | None = None  # frames given
     horizon: Annotated[int, Field(gt=0)] | None = None  # frames to predict
@@ -214,11 +213,14 @@ def describe(
     the thickness of wall particles where there are some [length].
     """
     task, grid = size.task, size.task.score_grid
+    short = {"vel": "velocity", "acc": "acceleration"}
     common = {
         "bounds": [[low - o, high - o] for (low, high), o in zip(size.bounds, origin, strict=True)],
         "default_connectivity_radius": task.radius,
         "dim": 2,
-        **_normalisation(statistics),
+        **{f"{s}_mean": list(statistics[f"{name}_mean"]) for s, name in short.items()},
+        # Models divide by a deviation: 0 becomes 1.
+        **{f"{s}_std": [v or 1.0 for v in statistics[f"{name}_std"]] for s, name in short.items()},
     }
     own = {
         "split": size.split,
@@ -242,7 +244,30 @@ def describe(
         shortest = min(frames for subset in shapes.values() for frames, _ in subset)
         special: dict[str, object] = {"sequence_length": shortest, "dt": size.frame_interval}
     else:
-        special = _of_lagrangebench(size, shapes, spacing=spacing, free_slip=free_slip)
+        parameters = {name: parameter.value for name, parameter in size.parameters.items()}
+        frames_of = {subset: rows[0][0] for subset, rows in shapes.items()}
+        special = {
+            "case": size.split.upper(),
+            "solver": "MPM" if size.simulated else "unknown",
+            "density_evolution": False,
+            "dx": spacing,
+            "dt": size.dt,  # of the solver
+            "write_every": size.substeps_per_frame,
+            "t_end": (max(frames_of.values()) - 1) * size.frame_interval,
+            "viscosity": parameters.get("liquid_viscosity"),
+            "p_bg_factor": 0.0,
+            "g_ext_magnitude": parameters.get("gravity", 0.0),
+            "artificial_alpha": 0.0,
+            "free_slip": free_slip,
+            "is_bc_trick": False,
+            # One less than frames: the last one is a target only, as in the data sets of that code base.
+            "sequence_length_train": frames_of["train"] - 1,
+            "sequence_length_test": frames_of["test"] - 1,
+            "num_trajs_train": len(shapes["train"]),
+            "num_trajs_test": len(shapes["test"]),
+            "num_particles_max": max(n for rows in shapes.values() for _, n in rows),
+            "periodic_boundary_conditions": [False, False],
+        }
         # Its cell lists start at 0 and are as long as the bounds are apart: particles beyond the
         # difference would lose their neighbours.
         if wall is not None:
@@ -252,42 +277,6 @@ def describe(
         elif not any(origin):
             special["bounds"] = [[0.0, 1.0], [0.0, 1.0]]
     return {**common, **special, OWN_KEY: own}
-
-
-def _normalisation(statistics: Mapping[str, tuple[float, ...]]) -> dict[str, list[float]]:
-    """Return means and deviations; a deviation of 0 would be divided by, so it becomes 1."""
-    names = {"vel": "velocity", "acc": "acceleration"}
-    means = {f"{short}_mean": list(statistics[f"{name}_mean"]) for short, name in names.items()}
-    stds = {f"{short}_std": [v or 1.0 for v in statistics[f"{name}_std"]] for short, name in names.items()}
-    return {**means, **stds}
-
-
-def _of_lagrangebench(size: Size, shapes: Shapes, *, spacing: float, free_slip: bool) -> dict[str, object]:
-    """Return the keys that only lagrangebench-h5 has; its ``dt`` is that of the solver."""
-    parameters = {name: parameter.value for name, parameter in size.parameters.items()}
-    frames = {subset: rows[0][0] for subset, rows in shapes.items()}
-    return {
-        "case": size.split.upper(),
-        "solver": "MPM" if size.simulated else "unknown",
-        "density_evolution": False,
-        "dx": spacing,
-        "dt": size.dt,
-        "write_every": size.substeps_per_frame,
-        "t_end": (max(frames.values()) - 1) * size.frame_interval,
-        "viscosity": parameters.get("liquid_viscosity"),
-        "p_bg_factor": 0.0,
-        "g_ext_magnitude": parameters.get("gravity", 0.0),
-        "artificial_alpha": 0.0,
-        "free_slip": free_slip,
-        "is_bc_trick": False,
-        # One less than frames: the last one is a target only, as in the data sets of that code base.
-        "sequence_length_train": frames["train"] - 1,
-        "sequence_length_test": frames["test"] - 1,
-        "num_trajs_train": len(shapes["train"]),
-        "num_trajs_test": len(shapes["test"]),
-        "num_particles_max": max(n for rows in shapes.values() for _, n in rows),
-        "periodic_boundary_conditions": [False, False],
-    }
 
 
 def write_metadata(folder: Path, metadata: Mapping[str, object]) -> Path:
@@ -300,7 +289,22 @@ def write_metadata(folder: Path, metadata: Mapping[str, object]) -> Path:
 def read_source(folder: Path, form: Format) -> Source:
     """Return what a metadata.json says; what is missing, no JSON or incomplete is an UnreadableFileError."""
     path = folder / NAME
-    values = _values(path)
+    try:
+        with path.open("rb") as stream:
+            text = stream.read(MAX_BYTES + 1)
+        if len(text) > MAX_BYTES:
+            raise UnreadableFileError(
+                "the file is too large", where=str(path), expected=f"<= {MAX_BYTES} bytes"
+            )
+        values = json.loads(text)
+    except (OSError, ValueError, RecursionError) as error:
+        raise UnreadableFileError(
+            "cannot read the metadata", where=str(path), expected="a JSON object", got=error
+        ) from error
+    if not isinstance(values, dict):
+        raise UnreadableFileError(
+            "the metadata are no JSON object", where=str(path), got=type(values).__name__
+        )
     # Newer GNS programs keep one block for training and one for rollouts.
     block = values.get("train")
     values = block if isinstance(block, dict) else values
@@ -323,27 +327,14 @@ def read_source(folder: Path, form: Format) -> Source:
             }
         )
     except ValidationError as error:
-        raise _mistaken(path, error) from None
-
-
-def _values(path: Path) -> dict[str, object]:
-    try:
-        with path.open("rb") as stream:
-            text = stream.read(MAX_BYTES + 1)
-        if len(text) > MAX_BYTES:
-            raise UnreadableFileError(
-                "the file is too large", where=str(path), expected=f"<= {MAX_BYTES} bytes"
-            )
-        values = json.loads(text)
-    except (OSError, ValueError, RecursionError) as error:
+        first = error.errors()[0]
+        name, *inner = map(str, first["loc"] or ("frame_interval",))
         raise UnreadableFileError(
-            "cannot read the metadata", where=str(path), expected="a JSON object", got=error
-        ) from error
-    if not isinstance(values, dict):
-        raise UnreadableFileError(
-            "the metadata are no JSON object", where=str(path), got=type(values).__name__
-        )
-    return values
+            "the metadata lack what a split needs, or state it otherwise",
+            where=f"{path}, key {'.'.join((_KEYS.get(name, name), *inner))}",
+            expected=first["msg"],
+            got=first["input"],
+        ) from None
 
 
 _KEYS = {
@@ -354,14 +345,3 @@ _KEYS = {
     "hints": OWN_KEY,
 }
 """Key of what :class:`Source` holds, where it has another name."""
-
-
-def _mistaken(path: Path, error: ValidationError) -> UnreadableFileError:
-    first = error.errors()[0]
-    name, *inner = map(str, first["loc"] or ("frame_interval",))
-    return UnreadableFileError(
-        "the metadata lack what a split needs, or state it otherwise",
-        where=f"{path}, key {'.'.join((_KEYS.get(name, name), *inner))}",
-        expected=first["msg"],
-        got=first["input"],
-    )

@@ -66,14 +66,8 @@ def _axes(found: str) -> str:
 def check_meaning(name: str, position: Any, velocity: Any, interval: float) -> None:  # noqa: ANN401 (arrays, also netCDF's)
     """Refuse a trajectory that another reading of its axes or velocities explains far better.
 
-    Args:
-        name: what to call it.
-        position: [frame, particle, 2], in memory or in a file [length].
-        velocity: of the same shape, or None [length/s].
-        interval: time between frames [s].
-
-    Raises:
-        DataError: names the mistakes and how to mend them.
+    Positions [length] and velocities [length/s], or None, are [frame, particle, 2], in memory or in a file;
+    ``interval`` is the time between frames [s]. The DataError names the mistakes and how to mend them.
     """
     if position.shape[0] < STRETCH:
         return

@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import importlib.util
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 from lagbench.atomic import write_atomically
 from lagbench.data.layout import dataset_folder
-from lagbench.data.manifest import FileEntry, Manifest
+from lagbench.data.manifest import Manifest
 from lagbench.data.registry import Registry, Size, Split, spell_ids
 from lagbench.draw.markdown import escape, table
 
@@ -77,39 +77,7 @@ def croissant_json(size: Size, split: Split, manifest: Manifest) -> str:
 
 def describe_dataset(size: Size, split: Split, manifest: Manifest) -> dict[str, object]:
     """Return the Croissant document as plain values."""
-    return {
-        "@context": dict(_CONTEXT),
-        "@type": "sc:Dataset",
-        "name": f"lagbench-{size.split}-{size.name}",
-        "description": f"{split.title}, size {size.name}. {split.description}",
-        "conformsTo": CONFORMS_TO,
-        "citeAs": split.citation,
-        "creator": {"@type": "sc:Organization", "name": "The lagbench authors"},
-        "isLiveDataset": False,
-        "keywords": list(KEYWORDS),
-        "license": LICENCES.get(split.licence, split.licence),
-        "version": manifest.version,
-        "distribution": [_file_object(entry) for entry in manifest.files],
-        "recordSet": [_record_set(manifest.files)],
-    }
-
-
-def _file_object(entry: FileEntry) -> dict[str, object]:
-    return {
-        "@type": "cr:FileObject",
-        "@id": entry.path,
-        "name": entry.path,
-        "description": f"scenario {entry.scenario} of {entry.subset}: {entry.frames} frames, netCDF4",
-        "contentUrl": entry.path,
-        "contentSize": f"{entry.bytes} B",
-        "encodingFormat": NETCDF,
-        "sha256": entry.file_sha256,
-    }
-
-
-def _record_set(files: Sequence[FileEntry]) -> dict[str, object]:
-    """Return the table of scenarios as a record set that holds its own data."""
-    return {
+    scenarios = {  # a table that holds its own data
         "@type": "cr:RecordSet",
         "@id": "scenarios",
         "name": "scenarios",
@@ -125,7 +93,34 @@ def _record_set(files: Sequence[FileEntry]) -> dict[str, object]:
             }
             for name, (kind, description) in _FIELDS.items()
         ],
-        "data": [{f"scenarios/{name}": getattr(entry, name) for name in _FIELDS} for entry in files],
+        "data": [{f"scenarios/{name}": getattr(entry, name) for name in _FIELDS} for entry in manifest.files],
+    }
+    return {
+        "@context": dict(_CONTEXT),
+        "@type": "sc:Dataset",
+        "name": f"lagbench-{size.split}-{size.name}",
+        "description": f"{split.title}, size {size.name}. {split.description}",
+        "conformsTo": CONFORMS_TO,
+        "citeAs": split.citation,
+        "creator": {"@type": "sc:Organization", "name": "The lagbench authors"},
+        "isLiveDataset": False,
+        "keywords": list(KEYWORDS),
+        "license": LICENCES.get(split.licence, split.licence),
+        "version": manifest.version,
+        "distribution": [
+            {
+                "@type": "cr:FileObject",
+                "@id": entry.path,
+                "name": entry.path,
+                "description": f"scenario {entry.scenario} of {entry.subset}: {entry.frames} frames, netCDF4",
+                "contentUrl": entry.path,
+                "contentSize": f"{entry.bytes} B",
+                "encodingFormat": NETCDF,
+                "sha256": entry.file_sha256,
+            }
+            for entry in manifest.files
+        ],
+        "recordSet": [scenarios],
     }
 
 
@@ -174,6 +169,10 @@ VARIABLES = (
 )
 
 
+BITWISE = "The files hold the same bits on every x86-64 Linux machine, with any number of workers."
+TOLERANCE = "Some files come from a device that does not promise equal bits: they agree to a tolerance."
+
+
 def write_cards(root: Path, size: Size, split: Split, manifest: Manifest) -> list[Path]:
     """Write README.md, croissant.json and, with matplotlib, the pictures; return their paths.
 
@@ -183,7 +182,8 @@ def write_cards(root: Path, size: Size, split: Split, manifest: Manifest) -> lis
     folder = dataset_folder(root, size.split, size.name, size.major)
     texts = {folder / name: text for name, text in card_texts(size, split, manifest).items()}
     drawn = [folder / name for name in _pictures(manifest)]
-    if not _are_there(texts, drawn):
+    there = all(path.is_file() for path in (*texts, *drawn))
+    if not there or any(path.read_bytes() != text for path, text in texts.items()):
         if drawn:
             _draw(root, size, split, manifest)
         for path, text in texts.items():
@@ -203,12 +203,6 @@ def _pictures(manifest: Manifest) -> list[str]:
     return list(PICTURES) if manifest.files and importlib.util.find_spec("matplotlib") else []
 
 
-def _are_there(texts: Mapping[Path, bytes], pictures: Sequence[Path]) -> bool:
-    """Tell whether all files of a card are on disk, with these texts."""
-    found = all(path.is_file() for path in (*texts, *pictures))
-    return found and all(path.read_bytes() == text for path, text in texts.items())
-
-
 def _draw(root: Path, size: Size, split: Split, manifest: Manifest) -> None:
     """Draw the pictures of the card."""
     from lagbench.draw.plot import contact_sheet, plot_frame
@@ -224,8 +218,25 @@ def _draw(root: Path, size: Size, split: Split, manifest: Manifest) -> None:
 
 def dataset_card(size: Size, split: Split, manifest: Manifest, *, pictures: list[str]) -> str:
     """Return the card of a data set as Markdown with a YAML head."""
+    head = {  # JSON strings and lists are YAML
+        "pretty_name": f"{split.title} ({size.split} {size.name})",
+        "license": split.licence.lower(),
+        "tags": list(KEYWORDS),
+        "size_categories": ["n<1K" if len(manifest.files) < 1000 else "1K<n<10K"],
+        "version": manifest.version,
+    }
+    statistics = (
+        "## Statistics of train",
+        "With the frame as unit of time: velocity is x(f) - x(f-1), acceleration its difference.",
+        table(("", "x", "y"), [(name.replace("_", " "), *row) for name, row in manifest.statistics.items()]),
+    )
+    parameters = [
+        (f"`{name}`", f"{p.value:g}" if isinstance(p.value, float) else p.value, p.unit, p.description)
+        for name, p in size.parameters.items()
+    ]
+    options = f"--split {size.split} --size {size.name}"
     parts = [
-        _head(size, split, manifest),
+        "\n".join(["---", *(f"{k}: {json.dumps(v, ensure_ascii=False)}" for k, v in head.items()), "---"]),
         f"# {escape(split.title)} · {size.split} {size.name}",
         escape(split.description),
         *([escape(NOTES[size.split])] if size.split in NOTES else []),
@@ -235,34 +246,33 @@ def dataset_card(size: Size, split: Split, manifest: Manifest, *, pictures: list
         "## Subsets",
         _subsets(size, manifest),
         "## Reading",
-        _reading(size),
+        "One netCDF4 file per scenario, which `xarray.open_dataset` reads without lagbench. "
+        "Lengths are in units of the unit box, time in seconds. Frame 0 is the state when recording starts.",
+        "```python\n"
+        "import lagbench\n\n"
+        f'data = lagbench.open_split("{size.split}", subset="train", size="{size.name}")\n'
+        'position = data["position"]  # (scenario, frame, particle, space), read when computed\n'
+        "```",
+        table(("variable", "dimensions", "type", "unit", "meaning"), VARIABLES),
         "## Task",
         _task(size, manifest),
-        *_statistics(manifest),
+        *(statistics if manifest.statistics else ()),
         "## Parameters",
-        _parameters(size),
+        table(("parameter", "value", "unit", "meaning"), parameters),
         "## Regenerate and verify",
-        _commands(size, manifest),
+        BITWISE if manifest.identity == "bitwise" else TOLERANCE,
+        "```sh\n"
+        "pip install 'lagbench[generate]'\n"
+        f"lagbench generate {options}\n"
+        f"lagbench verify {options}                 # re-hash every file\n"
+        f"lagbench verify {options} --regenerate 2  # simulate two scenarios again and compare\n"
+        "```",
         "## Scenarios",
         _scenarios(manifest),
         "## Licence and citation",
         f"{escape(split.licence)}. {escape(split.citation)}.",
     ]
     return "\n\n".join(parts) + "\n"
-
-
-def _head(size: Size, split: Split, manifest: Manifest) -> str:
-    """Return the YAML head; JSON strings and lists are YAML."""
-    count = len(manifest.files)
-    lines = {
-        "pretty_name": f"{split.title} ({size.split} {size.name})",
-        "license": split.licence.lower(),
-        "tags": list(KEYWORDS),
-        "size_categories": ["n<1K" if count < 1000 else "1K<n<10K"],
-        "version": manifest.version,
-    }
-    body = [f"{key}: {json.dumps(value, ensure_ascii=False)}" for key, value in lines.items()]
-    return "\n".join(["---", *body, "---"])
 
 
 def _facts(size: Size, manifest: Manifest) -> str:
@@ -308,21 +318,6 @@ def _subsets(size: Size, manifest: Manifest) -> str:
     return table(("subset", "ids", "scenarios", "frames", "bytes", "hash"), rows)
 
 
-def _reading(size: Size) -> str:
-    code = (
-        "```python\n"
-        "import lagbench\n\n"
-        f'data = lagbench.open_split("{size.split}", subset="train", size="{size.name}")\n'
-        'position = data["position"]  # (scenario, frame, particle, space), read when computed\n'
-        "```"
-    )
-    plain = (
-        "One netCDF4 file per scenario, which `xarray.open_dataset` reads without lagbench. "
-        "Lengths are in units of the unit box, time in seconds. Frame 0 is the state when recording starts."
-    )
-    return f"{plain}\n\n{code}\n\n{table(('variable', 'dimensions', 'type', 'unit', 'meaning'), VARIABLES)}"
-
-
 def _task(size: Size, manifest: Manifest) -> str:
     task = size.task
     grid = f"{task.score_grid.cells} cells a side, {task.score_grid.placement.replace('_', ' ')}"
@@ -332,54 +327,13 @@ def _task(size: Size, manifest: Manifest) -> str:
         ("frames of interest", ", ".join(map(str, task.frames_of_interest))),
         ("score grid", grid),
         ("radius for graph models", f"{task.radius:g}"),
-        *_twin_floor(manifest),
     ]
-    return table(("", ""), rows)
-
-
-def _twin_floor(manifest: Manifest) -> Iterator[tuple[str, str]]:
-    """Yield how far a twin that starts 2^-20 away drifts, where that was measured."""
     floors = [entry.twin_floor for entry in manifest.files if entry.twin_floor]
     if floors:
         first, last = (sum(floor[i] for floor in floors) / len(floors) for i in (0, -1))
         text = f"position RMSE {first:.3g} at the first predicted frame, {last:.3g} at the last"
-        yield ("twin that starts 2^-20 away", text)
-
-
-def _statistics(manifest: Manifest) -> Iterator[str]:
-    """Yield the statistics of train where there are any."""
-    if manifest.statistics:
-        yield "## Statistics of train"
-        yield "With the frame as unit of time: velocity is x(f) - x(f-1), acceleration its difference."
-        yield table(
-            ("", "x", "y"), [(name.replace("_", " "), *row) for name, row in manifest.statistics.items()]
-        )
-
-
-def _parameters(size: Size) -> str:
-    rows = [
-        (f"`{name}`", f"{p.value:g}" if isinstance(p.value, float) else p.value, p.unit, p.description)
-        for name, p in size.parameters.items()
-    ]
-    return table(("parameter", "value", "unit", "meaning"), rows)
-
-
-def _commands(size: Size, manifest: Manifest) -> str:
-    options = f"--split {size.split} --size {size.name}"
-    promise = (
-        "The files hold the same bits on every x86-64 Linux machine, with any number of workers."
-        if manifest.identity == "bitwise"
-        else "Some files come from a device that does not promise equal bits: they agree to a tolerance."
-    )
-    return (
-        f"{promise}\n\n"
-        "```sh\n"
-        "pip install 'lagbench[generate]'\n"
-        f"lagbench generate {options}\n"
-        f"lagbench verify {options}                 # re-hash every file\n"
-        f"lagbench verify {options} --regenerate 2  # simulate two scenarios again and compare\n"
-        "```"
-    )
+        rows.append(("twin that starts 2^-20 away", text))
+    return table(("", ""), rows)
 
 
 def _scenarios(manifest: Manifest) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,7 @@ from lagbench.atomic import SUFFIX
 from lagbench.data.layout import MANIFEST_NAME, NOTES_NAME, dataset_folder
 from lagbench.data.local import DESCRIPTION, locate
 from lagbench.data.lock import LOCK_NAME, dataset_lock
-from lagbench.data.registry import Registry, Size
+from lagbench.data.registry import Registry
 from lagbench.errors import WorkFailedError
 
 from .cards import CARD_NAME, CROISSANT_NAME, PICTURES
@@ -60,42 +59,24 @@ def clean(
     if not folder.is_dir():
         return CleanResult(removed=(), bytes=0, dry_run=dry_run)
     with nullcontext() if dry_run else dataset_lock(home, tier.split, tier.name, tier.major, timeout=0):
-        found = tuple(_leftovers(folder) if leftovers else _generated(folder, tier))
+        found = set(folder.rglob(f".*{SUFFIX}"))
+        if not leftovers:
+            ours = {folder / subset / f"{i:04d}.nc" for subset, ids in tier.subsets.items() for i in ids}
+            ours |= {folder / name for name in CARDS}
+            if not tier.simulated:  # the description of a local split says nothing without its data
+                ours.add(folder.parents[1] / DESCRIPTION)
+            found |= {path for path in ours if path.is_file()}
         length = sum(path.stat().st_size for path in found)
-        if not dry_run:
-            _remove(found)
+        for path in () if dry_run else found:
+            try:
+                path.unlink(missing_ok=True)
+            except OSError as error:
+                raise WorkFailedError("cannot remove a file", where=str(path), got=error.strerror) from error
     if not dry_run and not leftovers:
-        _remove_empty(folder, stop=home)
-    return CleanResult(removed=found, bytes=length, dry_run=dry_run)
-
-
-def _leftovers(folder: Path) -> list[Path]:
-    return sorted(folder.rglob(f".*{SUFFIX}"))
-
-
-def _generated(folder: Path, size: Size) -> list[Path]:
-    """Return the files that lagbench wrote; nobody else's."""
-    scenarios = [folder / subset / f"{i:04d}.nc" for subset, ids in size.subsets.items() for i in ids]
-    cards = [folder / name for name in CARDS]
-    if not size.simulated:  # the description of a local split says nothing without its data
-        cards.append(folder.parents[1] / DESCRIPTION)
-    return sorted({path for path in (*scenarios, *cards, *_leftovers(folder)) if path.is_file()})
-
-
-def _remove(paths: Iterable[Path]) -> None:
-    for path in paths:
-        try:
-            path.unlink(missing_ok=True)
-        except OSError as error:
-            raise WorkFailedError("cannot remove a file", where=str(path), got=error.strerror) from error
-
-
-def _remove_empty(folder: Path, *, stop: Path) -> None:
-    """Remove folders that hold nothing any more, up to the root folder."""
-    for name in (LOCK_NAME, NOTES_NAME):
-        (folder / name).unlink(missing_ok=True)
-    for place in (*(child for child in folder.iterdir() if child.is_dir()), folder, *folder.parents):
-        if place == stop or any(place.iterdir()):
-            continue
-        if stop in place.parents:
-            place.rmdir()
+        for name in (LOCK_NAME, NOTES_NAME):
+            (folder / name).unlink(missing_ok=True)
+        # Folders that hold nothing any more go too, up to the root folder.
+        for place in (*(child for child in folder.iterdir() if child.is_dir()), folder, *folder.parents):
+            if home in place.parents and not any(place.iterdir()):
+                place.rmdir()
+    return CleanResult(removed=tuple(sorted(found)), bytes=length, dry_run=dry_run)

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from lagbench.atomic import remove_leftovers
 from lagbench.data.layout import MANIFEST_NAME, dataset_folder, scenario_path
@@ -32,17 +32,17 @@ from lagbench.data.registry import Registry, Size, Split, spell_ids
 from lagbench.data.statistics import file_moments, round_digits, statistics
 from lagbench.errors import UsageError, check_installed, nearest
 from lagbench.generators.batch import SimulationJob
-from lagbench.generators.simulate import Pace, Simulated, scenario_key, simulate, twin_floors, twin_substeps
+from lagbench.generators.simulate import Pace, Simulated, simulate, twin_floors, twin_substeps
 from lagbench.generators.solver import Device
+from lagbench.store.copy import gather
 from lagbench.store.publication import Publication, look_at, publication
 from lagbench.work.cluster import Cluster, await_file
 from lagbench.work.machine import environment_of, promises_bits
-from lagbench.work.pool import Event, Pool, Report, Task, worker_count
+from lagbench.work.pool import Pool, Report, Task, worker_count
 from lagbench.work.progress import Meter, Progress
 from lagbench.work.run import ONE_THREAD, read_many
 
 from .cards import card_texts, write_cards
-from .gather import gather
 from .inventory import Look, compare, look
 from .plan import Estimate, Scenarios, Selection, check_disk, estimate, free_bytes, note_pace, select
 
@@ -72,6 +72,7 @@ class Generation:
         sources: Sequence[Path] = (),
     ) -> None:
         self.size, self.root, self.device = size, root, device
+        self.folder = dataset_folder(root, size.split, size.name, size.major)
         self.workers, self.scheduler = workers, scheduler  # processes here, or a Dask scheduler's workers
         self.sources = sources  # other root folders to take finished scenarios from
         # the store that the root folder is a working copy of; None for a plain folder
@@ -90,7 +91,10 @@ class Generation:
         old = read_or_empty(self.size, self.root)
         held = self.store.held if self.store else {}
         local = [i for i in self.size.scenarios if i not in held]
-        suspects = [i for i in local if i in wanted or self._has_changed(i, old)]
+        # A file that came, went, or has another length than the manifest says is looked at too.
+        lengths = {i: path.stat().st_size for i in local if (path := self._path(i)).exists()}
+        stated = {entry.scenario: entry.bytes for entry in old.files}
+        suspects = [i for i in local if i in wanted or lengths.get(i) != stated.get(i)]
         self._meter.begin("checking", total=len(suspects), scenarios=len(suspects))
         looks = {
             f"scenario {i}": Look(root=self.root, size=self.size, scenario=i, manifest=old.only(i))
@@ -108,8 +112,7 @@ class Generation:
 
     def run(self, wanted: Sequence[int], *, force: bool = False) -> None:
         """Simulate what is missing or wrong; write the manifest, compare, write cards."""
-        folder = dataset_folder(self.root, self.size.split, self.size.name, self.size.major)
-        remove_leftovers(folder)
+        remove_leftovers(self.folder)
         for source in self.sources:
             self._keep(gather(self.size, self.root, source, read_or_empty(self.size, self.root)))
         self.survey(wanted, force=force)
@@ -119,11 +122,18 @@ class Generation:
             self._simulate()
         finally:
             # The workers are gone by now; what they had not finished goes too.
-            remove_leftovers(folder)
+            remove_leftovers(self.folder)
         note_pace(self.size, self._paces)
         self._record_statistics()
         self.verdict = compare(self.size, self.manifest, promised=self._promised)
-        self._write_cards()
+        self._meter.begin("cards", total=1, scenarios=len(self.manifest.files))
+        texts = card_texts(self.size, self._split, self.manifest)
+        if self.store and self.store.is_settled(self.manifest, texts):
+            return
+        self._bring(self.size.scenarios)
+        cards = write_cards(self.root, self.size, self._split, self.manifest)
+        if self.store:
+            self.store.finish(self.manifest, cards)
 
     def missing(self) -> tuple[int, ...]:
         """Return the ids of the size that the manifest does not hold."""
@@ -143,77 +153,63 @@ class Generation:
         )
 
     def _path(self, scenario: int) -> Path:
-        return scenario_path(self.root, scenario_key(self.size, scenario))
-
-    def _has_changed(self, scenario: int, old: Manifest) -> bool:
-        """Return whether a file came, went, or has another length than the manifest says."""
-        entry, path = old.entry(scenario), self._path(scenario)
-        return (path.stat().st_size if path.exists() else None) != (entry.bytes if entry else None)
+        return scenario_path(self.root, self.size.key(scenario))
 
     def _simulate(self) -> None:
         """Run everything that is to do in workers, and the twins of test scenarios."""
         with_twin = {entry.scenario for entry in self.manifest.files if entry.twin_floor}
         twins = [i for i in self.kept if self._is_test(i) and i not in with_twin]
         self._bring(twins)
-        tasks = [*self._tasks(), *(self._twin(i) for i in twins)]
+        costs = dict(zip(self.to_do.scenarios, self.to_do.substeps, strict=True))
+        # Scenarios of similar length share a batch.
+        longest_first = sorted(costs, key=lambda i: (-costs[i], i))
+        width = 1 if self.device is Device.CPU else max(1, BATCH_PARTICLES // self.size.particles)
+        batches = [tuple(longest_first[k : k + width]) for k in range(0, len(longest_first), width)]
+        tasks = [
+            self._task(f"scenario {spell_ids(batch)}", simulate, batch, sum(costs[i] for i in batch))
+            for batch in batches
+        ]
+        tasks += map(self._twin, twins)
         if not tasks:
             return
         total = round(sum(task.cost for task in tasks))
         total += sum(twin_substeps(self.size, i) for i in self.to_do.scenarios if self._is_test(i))
         self._meter.begin("simulating", total=total, scenarios=len(self.to_do.scenarios))
-        folder = dataset_folder(self.root, self.size.split, self.size.name, self.size.major)
         environment = ONE_THREAD if self.device is Device.CPU else {}
         here = Pool(min(self.workers, len(tasks)), environment)
-        with here if self.scheduler is None else Cluster(self.scheduler, folder=folder) as team:
+        with here if self.scheduler is None else Cluster(self.scheduler, folder=self.folder) as team:
             for task in tasks:
                 team.submit(task)
             for event in team.events():
-                self._take(event, team)
+                if event.kind == "progress":
+                    self._meter.count(event.value)
+                elif event.kind == "lost":
+                    self._meter.count(-event.value)
+                elif event.task.function is simulate:
+                    self._take(event.value, team, event.machine or environment_of(self.device))
+                else:
+                    floors = {i: tuple(map(round_digits, floor)) for i, floor in event.value.items()}
+                    entries = [
+                        entry.model_copy(update={"twin_floor": floors[entry.scenario]})
+                        for entry in self.manifest.files
+                        if entry.scenario in floors
+                    ]
+                    self._keep(merged(self.size, self.manifest, entries))
 
-    def _tasks(self) -> list[Task]:
-        """Return one task per batch of scenarios of similar length."""
-        costs = dict(zip(self.to_do.scenarios, self.to_do.substeps, strict=True))
-        longest_first = sorted(costs, key=lambda i: (-costs[i], i))
-        width = 1 if self.device is Device.CPU else max(1, BATCH_PARTICLES // self.size.particles)
-        batches = [tuple(longest_first[k : k + width]) for k in range(0, len(longest_first), width)]
-        return [
-            Task(
-                name=f"{self.size.split} {self.size.name}, scenario {spell_ids(batch)}",
-                function=simulate,
-                arguments=(self._job(batch),),
-                cost=sum(costs[i] for i in batch),
-            )
-            for batch in batches
-        ]
+    def _task(self, what: str, function: Callable[..., Any], scenarios: tuple[int, ...], cost: float) -> Task:
+        job = SimulationJob(size=self.size, scenarios=scenarios, root=self.root, device=self.device)
+        name = f"{self.size.split} {self.size.name}, {what}"
+        return Task(name=name, function=function, arguments=(job,), cost=cost)
 
     def _twin(self, scenario: int) -> Task:
-        return Task(
-            name=f"{self.size.split} {self.size.name}, twin of scenario {scenario}",
-            function=twin_floors,
-            arguments=(self._job((scenario,)),),
-            cost=twin_substeps(self.size, scenario),
-        )
-
-    def _job(self, scenarios: tuple[int, ...]) -> SimulationJob:
-        return SimulationJob(size=self.size, scenarios=scenarios, root=self.root, device=self.device)
+        what, cost = f"twin of scenario {scenario}", twin_substeps(self.size, scenario)
+        return self._task(what, twin_floors, (scenario,), cost)
 
     def _is_test(self, scenario: int) -> bool:
         return self.size.subset_of(scenario) == "test"
 
-    def _take(self, event: Event, team: Pool | Cluster) -> None:
-        """Act on news from a worker."""
-        if event.kind == "progress":
-            self._meter.count(event.value)
-        elif event.kind == "lost":
-            self._meter.count(-event.value)
-        elif event.task.function is simulate:
-            self._take_outcomes(event.value, team, event.machine or environment_of(self.device))
-        else:
-            self._take_floors(event.value)
-
-    def _take_outcomes(
-        self, outcomes: Sequence[Simulated], team: Pool | Cluster, machine: Mapping[str, str]
-    ) -> None:
+    def _take(self, outcomes: Sequence[Simulated], team: Pool | Cluster, machine: Mapping[str, str]) -> None:
+        """Note simulated scenarios whose files are there, and send the twins of those of test after them."""
         environment = {**machine, "device": self.device.value}
         if promises_bits(environment):
             self._promised += [outcome.scenario for outcome in outcomes]
@@ -222,29 +218,18 @@ class Generation:
         for outcome in outcomes:
             await_file(self._path(outcome.scenario))
         entries = [
-            describe_file(self.root, scenario_key(self.size, outcome.scenario), outcome.facts)
-            for outcome in outcomes
+            describe_file(self.root, self.size.key(outcome.scenario), outcome.facts) for outcome in outcomes
         ]
         tested = [outcome for outcome in outcomes if self._is_test(outcome.scenario)]
-        folder = dataset_folder(self.root, self.size.split, self.size.name, self.size.major)
-        note(folder, {self._path(outcome.scenario): outcome.content_sha256 for outcome in tested})
+        note(self.folder, {self._path(outcome.scenario): outcome.content_sha256 for outcome in tested})
         self._keep(merged(self.size, self.manifest, entries, environment))
         self._meter.count(scenarios=len(entries))
         for outcome in tested:
             team.submit(self._twin(outcome.scenario))
 
-    def _take_floors(self, floors: dict[int, tuple[float, ...]]) -> None:
-        entries = [
-            entry.model_copy(update={"twin_floor": tuple(map(round_digits, floors[entry.scenario]))})
-            for entry in self.manifest.files
-            if entry.scenario in floors
-        ]
-        self._keep(merged(self.size, self.manifest, entries))
-
     def _keep(self, manifest: Manifest) -> None:
         self.manifest = manifest
-        folder = dataset_folder(self.root, self.size.split, self.size.name, self.size.major)
-        if manifest.files or (folder / MANIFEST_NAME).exists():
+        if manifest.files or (self.folder / MANIFEST_NAME).exists():
             write_manifest(self.root, manifest)
             if self.store:
                 self.store.follow(manifest)
@@ -266,17 +251,6 @@ class Generation:
             moments = self._read(file_moments, paths, paths.values())
             manifest = manifest.model_copy(update={"statistics": statistics(moments)})
         self._keep(manifest)
-
-    def _write_cards(self) -> None:
-        self._meter.begin("cards", total=1, scenarios=len(self.manifest.files))
-        if self.store and self.store.is_settled(
-            self.manifest, card_texts(self.size, self._split, self.manifest)
-        ):
-            return
-        self._bring(self.size.scenarios)
-        cards = write_cards(self.root, self.size, self._split, self.manifest)
-        if self.store:
-            self.store.finish(self.manifest, cards)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -379,13 +353,12 @@ def generate(
             publication(tier, folder) as generation.store,
         ):
             generation.run(wanted, force=force)
-    seconds = time.monotonic() - started
     return GenerationResult(
         split=tier.split,
         size=tier.name,
         version=tier.version,
         root=folder,
-        folder=dataset_folder(folder, tier.split, tier.name, tier.major),
+        folder=generation.folder,
         device=target.value,
         workers=cores,
         simulated=generation.to_do.scenarios,
@@ -395,7 +368,7 @@ def generate(
         bytes_free=free,
         seconds_expected=generation.to_do.seconds(cores),
         measured=generation.to_do.measured,
-        seconds=seconds,
+        seconds=time.monotonic() - started,
         complete=generation.manifest.complete,
         dataset_sha256=generation.manifest.dataset_sha256,
         verdict=generation.verdict,

@@ -1,4 +1,4 @@
-"""Which scenarios of a data set are on disk, and whether their content is right, hash by hash.
+"""What a size of a split costs, which scenarios are on disk, and whether they are right, hash by hash.
 
 Right means: the file says what it is in the place where it stands, its parameters are those
 of the registry, its values have the hash that it states, and that hash is the one in
@@ -14,19 +14,23 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lagbench.data.checksums import file_sha256, plain
-from lagbench.data.layout import dataset_folder, scenario_path
+from lagbench.data.layout import dataset_folder, scenario_path, url_of
 from lagbench.data.local import DESCRIPTION
 from lagbench.data.manifest import FileEntry, Manifest, describe_file
 from lagbench.data.registry import Size, spell_ids
 from lagbench.data.scenario import ScenarioHeader, check_scenario, read_scenario
 from lagbench.errors import DataError
 from lagbench.generators.batch import draw
-from lagbench.generators.simulate import OUTCOMES, file_parameters, scenario_key
-from lagbench.work.machine import may_differ
+from lagbench.generators.simulate import OUTCOMES, file_parameters
+from lagbench.work.machine import available_cores, may_differ
+
+from .cards import PICTURES
+from .plan import estimate, scenario_bytes
 
 __all__ = [
     "Finding",
     "Look",
+    "Overview",
     "State",
     "compare",
     "examine",
@@ -34,11 +38,16 @@ __all__ = [
     "hash_verdict",
     "look",
     "other_bits",
+    "overview",
     "record_of",
     "recorded_hash",
     "unlike",
     "unlike_measures",
 ]
+
+
+DRAWN = 2
+"""Scenarios of a size that are drawn to estimate the time: all of them would take seconds."""
 
 
 class State(enum.StrEnum):
@@ -47,6 +56,65 @@ class State(enum.StrEnum):
     GOOD = "good"
     MISSING = "missing"
     WRONG = "wrong"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Overview:
+    """What tables say about one size of a split."""
+
+    split: str  # name of the split
+    size: str  # name of the size
+    version: str  # semantic version
+    scenarios: dict[str, int]  # number of scenarios by subset
+    particles: int  # particles in one scenario
+    frames: int  # recorded frames of all scenarios
+    bytes: int  # disk space before compression [bytes]
+    # time to generate on all cores of this machine [s], for orientation; 0 for what cannot be simulated
+    seconds: float
+    measured: bool  # whether that is at a rate that this machine has measured
+    # scenario files that are there, by subset; 'lagbench verify' checks them. Of a store
+    # what its manifest names.
+    present: dict[str, int]
+    folder: Path  # where they are, or would be
+    picture: Path | None  # picture of the data set once it is generated
+    dataset_sha256: str | None  # data set hash as datasets.yaml has it
+
+    @property
+    def state(self) -> str:
+        """Whether it is on this machine: "yes", "no" or how much of it."""
+        there, wanted = sum(self.present.values()), sum(self.scenarios.values())
+        if there == wanted:
+            return "yes"
+        return f"{there} of {wanted}" if there else "no"
+
+
+def overview(size: Size, root: Path) -> Overview:
+    """Return what a size is, costs, and has below a root folder or in its store, read from names alone."""
+    folder = dataset_folder(root, size.split, size.name, size.major)
+    ids, url = size.scenarios, url_of(root)
+    expected = estimate(size, ids, drawn=DRAWN) if size.simulated else None
+    if url is None:
+        there = {i for i in ids if scenario_path(root, size.key(i)).is_file()}
+    else:
+        from lagbench.store.copy import remote_manifest  # what a store takes is not loaded for a folder
+
+        found = remote_manifest(size, url)
+        there = {entry.scenario for entry in found.files} if found else set()
+    return Overview(
+        split=size.split,
+        size=size.name,
+        version=size.version,
+        scenarios={subset: len(ids) for subset, ids in size.subsets.items()},
+        particles=size.particles,
+        frames=sum(map(size.frame_count, ids)),
+        bytes=sum(scenario_bytes(size, i) for i in ids),
+        seconds=expected.seconds(available_cores()) if expected else 0.0,
+        measured=expected is not None and expected.measured,
+        present={subset: len(there & {*ids}) for subset, ids in size.subsets.items()},
+        folder=folder,
+        picture=next((folder / name for name in PICTURES if (folder / name).is_file()), None),
+        dataset_sha256=size.measured.dataset_sha256 if size.measured else None,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,11 +138,11 @@ def examine(
     root: Path, size: Size, scenario: int, *, manifest: Manifest | None = None, quick: bool = False
 ) -> Finding:
     """Look at the file of one scenario."""
-    key = scenario_key(size, scenario)
+    key = size.key(scenario)
     path = scenario_path(root, key)
     if not path.exists():
         return Finding(scenario=scenario, state=State.MISSING)
-    claim = manifest.entry(scenario) if manifest else None
+    claim, recorded = manifest.entry(scenario) if manifest else None, recorded_hash(size, scenario)
     try:
         digest = file_sha256(path) if quick else None
         with read_scenario(path) as file:
@@ -83,17 +151,35 @@ def examine(
             if unchanged:
                 file.check_attributes()
         content = claim.content_sha256 if claim and unchanged else check_scenario(path)
-        recorded = recorded_hash(size, scenario)
-        tolerated = _check_known(path, content, recorded, claim, manifest, record=record_of(size))
+        expected = recorded or (claim.content_sha256 if claim else None)
+        differs = expected is not None and not content.startswith(expected)
+        if differs and not (
+            manifest is not None
+            and manifest.identity == "tolerance"
+            and claim is not None
+            and claim.content_sha256 == content
+            and may_differ(claim.device, manifest.environments)
+        ):
+            raise DataError(
+                "the file has another content hash",
+                where=str(path),
+                expected=f"{expected} of {record_of(size) if recorded else 'the manifest'}",
+                got=content,
+            )
         entry = describe_file(root, key, digest=digest) if digest and not unchanged else claim
     except (DataError, OSError) as error:
-        return Finding(scenario=scenario, state=State.WRONG, problem=_spelled(error, path))
+        if isinstance(error, DataError):
+            # How to mend it depends on the split, and is said once for all files.
+            problem = str(DataError(error.what, where=error.where, expected=error.expected, got=error.got))
+        else:
+            problem = f"cannot read {path}: {error.strerror}"
+        return Finding(scenario=scenario, state=State.WRONG, problem=problem)
     return Finding(
         scenario=scenario,
         state=State.GOOD,
         content_sha256=content,
         entry=entry if quick else None,
-        tolerated=tolerated,
+        tolerated=differs,
     )
 
 
@@ -112,13 +198,6 @@ def look(order: Look, report: Callable[[int], None]) -> Finding:
     finding = examine(order.root, order.size, order.scenario, manifest=order.manifest, quick=True)
     report(1)
     return finding
-
-
-def _spelled(error: DataError | OSError, path: Path) -> str:
-    if not isinstance(error, DataError):
-        return f"cannot read {path}: {error.strerror}"
-    # How to mend it depends on the split, and is said once for all files.
-    return str(DataError(error.what, where=error.where, expected=error.expected, got=error.got))
 
 
 def extra_files(root: Path, size: Size) -> dict[str, list[str]]:
@@ -152,35 +231,6 @@ def _check_header(path: Path, header: ScenarioHeader, size: Size, scenario: int)
             where=f"{path}, attributes {', '.join(names)}",
             expected="those of datasets.yaml",
         )
-
-
-def _check_known(
-    path: Path,
-    content: str,
-    recorded: str | None,
-    claim: FileEntry | None,
-    manifest: Manifest | None,
-    *,
-    record: str,
-) -> bool:
-    """Compare a content hash with what is known; return whether its being another is tolerated."""
-    expected = recorded or (claim.content_sha256 if claim else None)
-    if expected is None or content.startswith(expected):
-        return False
-    if (
-        manifest is not None
-        and manifest.identity == "tolerance"
-        and claim is not None
-        and claim.content_sha256 == content
-        and may_differ(claim.device, manifest.environments)
-    ):
-        return True
-    raise DataError(
-        "the file has another content hash",
-        where=str(path),
-        expected=f"{expected} of {record if recorded else 'the manifest'}",
-        got=content,
-    )
 
 
 def record_of(size: Size) -> str:

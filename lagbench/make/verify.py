@@ -130,8 +130,23 @@ def verify(
     if regenerate:
         check_installed("taichi", extra="generate")
     bring(tier, folder, ids, thoroughly=True)
-    manifest, warnings = _manifest(folder, tier)
-    findings = _examine_all(folder, tier, ids, manifest, meter)
+    manifest: Manifest | None = None
+    warnings: list[str] = []
+    try:
+        manifest = read_manifest(folder, tier.split, tier.name, tier.major)
+        if manifest is None:
+            warnings.append(f"there is no manifest: {remedy(tier, root=folder)}")
+        elif manifest.identity == "tolerance":
+            warnings.append(
+                "identity: tolerance - a device wrote these files that does not promise equal bits"
+            )
+    except DataError as error:
+        warnings.append(str(error))
+    meter.begin("hashing", total=len(ids), scenarios=len(ids))
+    findings = {}
+    for scenario in ids:
+        findings[scenario] = examine(folder, tier, scenario, manifest=manifest)
+        meter.count(1, scenarios=1)
     # Which test files are right is noted, so that the scorer need not hash their values again.
     there = dataset_folder(folder, tier.split, tier.name, tier.major)
     hashed = {i: findings[i].content_sha256 for i in tier.subsets["test"] if i in findings}
@@ -144,11 +159,16 @@ def verify(
     alone = unstored(tier, folder, [i for i in ids if findings[i].state is State.GOOD])
     problems += [f"scenario {i} is in the working copy alone, not in the store" for i in alone]
     reports = _reports(folder, tier, ids, findings)
-    whole, verdict = _whole(tier, findings)
-    wrong = unlike(tier)
+    digests = {name: _subset_digest(tier, name, findings) for name in HASHED_SUBSETS}
+    known = {name: digest for name, digest in digests.items() if digest is not None}
+    whole = dataset_hash(tier.split, tier.name, tier.major, known) if len(known) == len(digests) else None
+    recorded = tier.measured.dataset_sha256 if tier.measured else None
+    tolerated = [i for i, finding in findings.items() if finding.tolerated]
+    verdict, wrong = hash_verdict(tier, whole, recorded, tolerated=bool(tolerated)), unlike(tier)
     problems += [f"{r.name}: its hash is {wrong}" for r in reports if r.verdict == wrong]
     problems += [f"the data set hash is {wrong}"] if verdict == wrong else []
-    gaps = [f"{r.name} lacks {spell_ids(r.missing)}" for r in reports if r.missing]
+    gaps = [f"scenarios {spell_ids(tolerated)} have {other_bits(tier)}"] if tolerated else []
+    gaps += [f"{r.name} lacks {spell_ids(r.missing)}" for r in reports if r.missing]
     gaps += [f"{r.name} has files of no scenario: {', '.join(r.extra)}" for r in reports if r.extra]
     return VerificationResult(
         split=tier.split,
@@ -182,28 +202,6 @@ def evenly_spaced(ids: Sequence[int], count: int) -> tuple[int, ...]:
         return tuple(ids[:count])
     last = len(ids) - 1
     return tuple(ids[(2 * k * last + count - 1) // (2 * (count - 1))] for k in range(count))
-
-
-def _examine_all(
-    root: Path, size: Size, ids: Sequence[int], manifest: Manifest | None, meter: Meter
-) -> dict[int, Finding]:
-    meter.begin("hashing", total=len(ids), scenarios=len(ids))
-    findings = {}
-    for scenario in ids:
-        findings[scenario] = examine(root, size, scenario, manifest=manifest)
-        meter.count(1, scenarios=1)
-    return findings
-
-
-def _manifest(root: Path, size: Size) -> tuple[Manifest | None, list[str]]:
-    try:
-        manifest = read_manifest(root, size.split, size.name, size.major)
-    except DataError as error:
-        return None, [str(error)]
-    if manifest is None:
-        return None, [f"there is no manifest: {remedy(size, root=root)}"]
-    tolerance = "identity: tolerance - a device wrote these files that does not promise equal bits"
-    return manifest, [tolerance] if manifest.identity == "tolerance" else []
 
 
 def _regenerate(size: Size, ids: Sequence[int], workers: int, meter: Meter) -> dict[int, str]:
@@ -271,24 +269,12 @@ def _subset_digest(size: Size, name: str, findings: Mapping[int, Finding]) -> st
     return subset_hash(known) if len(known) == len(size.subsets[name]) else None
 
 
-def _whole(size: Size, findings: Mapping[int, Finding]) -> tuple[str | None, str]:
-    """Return the data set hash, where it can be told, and how it compares."""
-    digests = {name: _subset_digest(size, name, findings) for name in HASHED_SUBSETS}
-    known = {name: digest for name, digest in digests.items() if digest is not None}
-    whole = dataset_hash(size.split, size.name, size.major, known) if len(known) == len(digests) else None
-    recorded = size.measured.dataset_sha256 if size.measured else None
-    tolerated = any(finding.tolerated for finding in findings.values())
-    return whole, hash_verdict(size, whole, recorded, tolerated=tolerated)
-
-
 def _notes(size: Size, manifest: Manifest | None, findings: Mapping[int, Finding]) -> list[str]:
-    """Return how files that are right differ from datasets.yaml, and the manifest from both."""
-    tolerated = [i for i, finding in findings.items() if finding.tolerated]
-    notes = [f"scenarios {spell_ids(tolerated)} have {other_bits(size)}"] if tolerated else []
+    """Return how the manifest differs from files that are right, and from datasets.yaml."""
     if manifest is None:
-        return notes
+        return []
     entries = {entry.scenario: entry.content_sha256 for entry in manifest.files}
     others = [i for i, f in findings.items() if i in entries and f.content_sha256 not in (None, entries[i])]
-    notes += [f"the manifest has other hashes of {spell_ids(others)}"] if others else []
+    notes = [f"the manifest has other hashes of {spell_ids(others)}"] if others else []
     names = unlike_measures(size, manifest)
     return notes + ([f"the manifest has another {', '.join(names)} than {record_of(size)}"] if names else [])

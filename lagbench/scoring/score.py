@@ -21,7 +21,7 @@ from lagbench.submission.findings import Finding, ValidationResult
 from lagbench.submission.format import Header
 from lagbench.submission.predictions import open_predictions
 from lagbench.submission.validation import validate
-from lagbench.work.process import available_cores
+from lagbench.work.machine import available_cores
 from lagbench.work.progress import Meter, Progress
 from lagbench.work.run import run_all
 

@@ -1,4 +1,4 @@
-"""Bring scenarios of a store into its working copy, so that they can be read as files.
+"""Bring scenarios from elsewhere: from a store into its working copy, from other root folders into one.
 
 The store's manifest says what is there; each object is fetched and gets its name once its content
 hash is that of datasets.yaml, or of the manifest where datasets.yaml has none. What is in the
@@ -7,21 +7,33 @@ working copy and is what the manifest says is not fetched again.
 
 from __future__ import annotations
 
+import contextlib
+import os
+import shutil
 import sys
 import time
-from collections.abc import Collection, Iterable, Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextvars import ContextVar
 from pathlib import Path
 
 from pydantic import ValidationError
 
+from lagbench.atomic import atomic_path
 from lagbench.data.checksums import file_sha256
-from lagbench.data.layout import MANIFEST_NAME, dataset_folder, url_of
+from lagbench.data.layout import MANIFEST_NAME, dataset_folder, scenario_path, url_of
+from lagbench.data.local import remedy as remedy_of
 from lagbench.data.lock import dataset_lock
-from lagbench.data.manifest import FileEntry, Manifest, merged, read_or_empty, write_manifest
+from lagbench.data.manifest import (
+    FileEntry,
+    Manifest,
+    merged,
+    read_manifest,
+    read_or_empty,
+    write_manifest,
+)
 from lagbench.data.registry import Size, spell_ids
-from lagbench.errors import DataError
+from lagbench.data.scenario import check_scenario
+from lagbench.errors import DataError, UsageError, nearest
 from lagbench.work.machine import may_differ
 
 from .fetch import Wanted, fetch_scenarios, fetch_text
@@ -32,6 +44,7 @@ __all__ = [
     "bring",
     "fetch_entries",
     "folder_of",
+    "gather",
     "is_here",
     "is_right",
     "join",
@@ -39,6 +52,7 @@ __all__ = [
     "quietly",
     "refuse_strangers",
     "remote_manifest",
+    "scenario_files",
     "unstored",
     "with_local",
     "writing",
@@ -95,25 +109,32 @@ def refuse_strangers(found: Manifest, strangers: Collection[int], *, where: str,
         )
 
 
+def scenario_files(size: Size, root: Path, subsets: Sequence[str]) -> dict[int, Path]:
+    """Return the files of subsets by id, brought from the store that a root is a copy of; all are there."""
+    for subset in subsets:
+        if subset not in size.subsets:
+            where = f"{size.split} {size.name}"
+            raise UsageError(f"no subset {subset!r}", where=where, fix=nearest(subset, size.subsets))
+    paths = {i: scenario_path(root, size.key(i)) for subset in subsets for i in size.subsets[subset]}
+    bring(size, root, paths)
+    missing = [i for i, path in paths.items() if not path.is_file()]
+    if missing:
+        option = (f"--subset {subsets[0]}",) if len(subsets) == 1 else ()
+        raise DataError(
+            f"{len(missing)} of {len(paths)} scenarios are not there",
+            where=str(dataset_folder(root, size.split, size.name, size.major)),
+            got=f"missing: {spell_ids(missing)}",
+            fix=remedy_of(size, *option, root=root),
+        )
+    return paths
+
+
 def bring(size: Size, root: Path, scenarios: Iterable[int] = (), *, thoroughly: bool = False) -> bool:
-    """Bring a data set's manifest and some scenarios where the root is a store's working copy.
+    """Bring manifest and some scenarios where the root is a store's working copy; say whether any came.
 
-    A scenario that the store does not have is left to the caller, who misses its file.
-
-    Args:
-        size: tier of a split.
-        root: folder of all data sets; nothing is done for one that is no working copy.
-        scenarios: ids.
-        thoroughly: whether to hash files that are there, and not only look at their lengths; and
-            to look whether the store has all that its manifest names.
-
-    Returns:
-        Whether anything came.
-
-    Raises:
-        DataError: the store has no such bucket, or sent what is no data or has other content.
-        WorkFailedError: the store refuses or does not answer, or the disk is full.
-        UsageError: what reads this kind of address is not installed.
+    A scenario that the store does not have is left to the caller, who misses its file. ``thoroughly``
+    hashes files that are there, and does not only look at their lengths, and looks whether the store has
+    all that its manifest names. Lies of the store are DataErrors, its silence is a WorkFailedError.
     """
     url, scenarios = url_of(root), tuple(scenarios)
     if url is None or root in _written:
@@ -123,8 +144,15 @@ def bring(size: Size, root: Path, scenarios: Iterable[int] = (), *, thoroughly: 
         found = remote_manifest(size, url, fresh=0.0)  # it may have come just now
     if found is None:
         return False
-    if thoroughly:
-        _check_objects(size, url, found)
+    if thoroughly and not url.startswith(HTTP):  # which lists nothing
+        there = Objects(url, folder_of(size)).sizes()
+        wrong = [entry.scenario for entry in found.files if there.get(entry.path) != entry.bytes]
+        if wrong:
+            raise DataError(
+                "the store's manifest names objects that are not there, or of another length",
+                where=f"{address_of(size, url, MANIFEST_NAME)}, scenarios {spell_ids(wrong)}",
+                fix=_remedy(size, url),
+            )
     named = [e for i in scenarios if (e := found.entry(i))]
     strangers = [e.scenario for e in named if not is_right(e, size, found)]
     where = address_of(size, url, MANIFEST_NAME)
@@ -198,20 +226,6 @@ def join(size: Size, base: Manifest, other: Manifest, files: Collection[FileEntr
     return joined.model_copy(update={"statistics": other.statistics})
 
 
-def _check_objects(size: Size, url: str, found: Manifest) -> None:
-    """Refuse a manifest that names what is not there, or of another length."""
-    if url.startswith(HTTP):  # which lists nothing
-        return
-    there = Objects(url, folder_of(size)).sizes()
-    wrong = [entry.scenario for entry in found.files if there.get(entry.path) != entry.bytes]
-    if wrong:
-        raise DataError(
-            "the store's manifest names objects that are not there, or of another length",
-            where=f"{address_of(size, url, MANIFEST_NAME)}, scenarios {spell_ids(wrong)}",
-            fix=_remedy(size, url),
-        )
-
-
 def is_here(entry: FileEntry, size: Size, root: Path, trusted: Manifest | None = None) -> bool:
     """Return whether the working copy holds what an entry describes; what is trusted is not hashed."""
     path = dataset_folder(root, size.split, size.name, size.major) / entry.path
@@ -242,7 +256,7 @@ def fetch_entries(size: Size, root: Path, url: str, entries: Collection[FileEntr
     }
     with (
         _Ticker(url, len(entries), sum(entry.bytes for entry in entries)) as told,
-        closing(fetch_scenarios(wanted, told.count)) as arrivals,
+        contextlib.closing(fetch_scenarios(wanted, told.count)) as arrivals,
     ):
         for _, absent in arrivals:
             if absent is not None:
@@ -250,7 +264,41 @@ def fetch_entries(size: Size, root: Path, url: str, entries: Collection[FileEntr
             told.finished += 1
 
 
-@contextmanager
+def gather(size: Size, root: Path, source: Path, manifest: Manifest) -> Manifest:
+    """Take over what another root folder has finished and this one's manifest does not hold; return both's.
+
+    Each job of an array generates some scenarios into a root folder of its own. The whole is then
+    what one call would have left.
+    """
+    there = dataset_folder(source, size.split, size.name, size.major)
+    here = dataset_folder(root, size.split, size.name, size.major)
+    found = read_manifest(source, size.split, size.name, size.major)
+    if found is None or there.resolve() == here.resolve():
+        raise UsageError(
+            "nothing can be gathered from a folder",
+            where=str(source),
+            expected=f"a root folder with {size.split} {size.name} of another call of lagbench generate",
+            got="the folder to write to" if found else "no manifest of that data set",
+        )
+    taken = []
+    for entry in found.files:
+        old = manifest.entry(entry.scenario)
+        if old is None or (not old.twin_floor and old.content_sha256 == entry.content_sha256):
+            taken.append(entry)
+            if (here / entry.path).exists():
+                continue
+            check_scenario(there / entry.path, entry.content_sha256)
+            with atomic_path(here / entry.path) as temporary:
+                try:  # files are only ever replaced, so a shared one cannot change
+                    os.link(there / entry.path, temporary)
+                except OSError:
+                    shutil.copyfile(there / entry.path, temporary)
+    for environment in found.environments:
+        manifest = merged(size, manifest, environment=environment)
+    return merged(size, manifest, taken)
+
+
+@contextlib.contextmanager
 def writing(root: Path) -> Iterator[None]:
     """Bring nothing into a working copy from which this process writes to the store."""
     _written.add(root)
@@ -261,7 +309,7 @@ def writing(root: Path) -> Iterator[None]:
         _asked.clear()
 
 
-@contextmanager
+@contextlib.contextmanager
 def quietly() -> Iterator[None]:
     """Say nothing on stderr about what is fetched."""
     token = _quiet.set(True)

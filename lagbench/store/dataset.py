@@ -6,16 +6,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lagbench.data import registry
-from lagbench.data.layout import ScenarioKey, dataset_folder, scenario_path
+from lagbench.data.layout import dataset_folder
 from lagbench.data.local import locate, remedy
-from lagbench.data.registry import spell_ids
-from lagbench.errors import DataError, UsageError, nearest
+from lagbench.errors import DataError
 
 if TYPE_CHECKING:
     import xarray as xr
 
+    from lagbench.data.layout import ScenarioKey
     from lagbench.data.manifest import Manifest
-    from lagbench.data.registry import Size
 
 __all__ = ["list_splits", "load_manifest", "open_split"]
 
@@ -88,66 +87,13 @@ def open_split(
     """
     import xarray as xr
 
-    from .copy import bring
+    from .copy import scenario_files
 
     entry, folder, _ = locate(split, size, root=root)
-    if subset not in entry.subsets:
-        where = f"{split} {entry.name}"
-        raise UsageError(f"no subset {subset!r}", where=where, fix=nearest(subset, entry.subsets))
-    ids = entry.subsets[subset]
-    bring(entry, folder, ids)
-    keys = [
-        ScenarioKey(split=entry.split, size=entry.name, version=entry.version, scenario=i, subset=subset)
-        for i in ids
-    ]
-    _require(entry, folder, keys)
-    scenarios = [_open_scenario(scenario_path(folder, key), key, remedy(entry, root=folder)) for key in keys]
-    return _join(scenarios, xr.Variable("scenario", list(ids), {"long_name": "scenario id", "units": "1"}))
-
-
-def _require(size: Size, root: Path, keys: list[ScenarioKey]) -> None:
-    """Say which scenarios are missing and what makes them."""
-    missing = [key.scenario for key in keys if not scenario_path(root, key).is_file()]
-    if missing:
-        raise DataError(
-            f"{len(missing)} of {len(keys)} scenarios are not there",
-            where=str(scenario_path(root, keys[0]).parent),
-            got=f"missing: {spell_ids(missing)}",
-            fix=remedy(size, f"--subset {keys[0].subset}", root=root),
-        )
-
-
-def _open_scenario(path: Path, key: ScenarioKey, fix: str) -> xr.Dataset:
-    """Open one file lazily and check that it is the scenario that its path says."""
-    import xarray as xr
-
-    try:
-        stored = xr.open_dataset(path, engine="netcdf4", cache=False)
-        frame_bytes = stored["position"].dtype.itemsize * stored.sizes["particle"] * stored.sizes["space"]
-        scenario = stored.chunk(frame=max(1, CHUNK_BYTES // frame_bytes), particle=-1, space=-1)
-        scenario.set_close(stored.close)
-        found = {name: scenario.attrs[name] for name in ("split", "size", "scenario", "version")}
-    except Exception as error:  # HDF5 on damaged bytes raises nearly any type
-        raise DataError(
-            "a scenario file is damaged or not one of lagbench",
-            where=str(path),
-            got=f"{type(error).__name__}: {error}",
-            fix=fix,
-        ) from error
-    same_major = str(found["version"]).split(".")[0] == str(key.major)
-    if not same_major or (found["split"], found["size"], int(found["scenario"])) != (
-        key.split,
-        key.size,
-        key.scenario,
-    ):
-        raise DataError("a scenario file is another scenario", where=str(path), expected=key, got=found)
-    return scenario
-
-
-def _join(scenarios: list[xr.Dataset], ids: xr.Variable) -> xr.Dataset:
-    """Stack scenarios of unequal lengths along a new first dimension."""
-    import xarray as xr
-
+    paths, fix = scenario_files(entry, folder, (subset,)), remedy(entry, root=folder)
+    scenarios = [_open_scenario(path, entry.key(i), fix) for i, path in paths.items()]
+    ids = xr.Variable("scenario", list(paths), {"long_name": "scenario id", "units": "1"})
+    # Scenarios of unequal lengths are stacked along a new first dimension.
     frames = [scenario.sizes["frame"] for scenario in scenarios]
     particles = [scenario.sizes["particle"] for scenario in scenarios]
     longest = scenarios[frames.index(max(frames))]
@@ -171,3 +117,27 @@ def _join(scenarios: list[xr.Dataset], ids: xr.Variable) -> xr.Dataset:
 
     joined.set_close(close)
     return joined
+
+
+def _open_scenario(path: Path, key: ScenarioKey, fix: str) -> xr.Dataset:
+    """Open one file lazily and check that it is the scenario that its path says."""
+    import xarray as xr
+
+    try:
+        stored = xr.open_dataset(path, engine="netcdf4", cache=False)
+        frame_bytes = stored["position"].dtype.itemsize * stored.sizes["particle"] * stored.sizes["space"]
+        scenario = stored.chunk(frame=max(1, CHUNK_BYTES // frame_bytes), particle=-1, space=-1)
+        scenario.set_close(stored.close)
+        found = {name: scenario.attrs[name] for name in ("split", "size", "scenario", "version")}
+    except Exception as error:  # HDF5 on damaged bytes raises nearly any type
+        raise DataError(
+            "a scenario file is damaged or not one of lagbench",
+            where=str(path),
+            got=f"{type(error).__name__}: {error}",
+            fix=fix,
+        ) from error
+    same_major = str(found["version"]).split(".")[0] == str(key.major)
+    named = (found["split"], found["size"], int(found["scenario"]))
+    if not same_major or named != (key.split, key.size, key.scenario):
+        raise DataError("a scenario file is another scenario", where=str(path), expected=key, got=found)
+    return scenario

@@ -176,23 +176,18 @@ def _refusal_of_status(error: urllib.error.HTTPError, url: str, offset: int, rem
     return BrokenError(refused) if code in _BUSY else refused
 
 
-def _build_opener() -> urllib.request.OpenerDirector:
-    """Return an opener for http and https alone: a redirection leads to no file of this machine."""
-    opener = urllib.request.OpenerDirector()
-    for handler in (
-        urllib.request.ProxyHandler(),
-        urllib.request.HTTPHandler(),
-        urllib.request.HTTPSHandler(),
-        urllib.request.HTTPRedirectHandler(),
-        urllib.request.HTTPDefaultErrorHandler(),
-        urllib.request.HTTPErrorProcessor(),
-        urllib.request.UnknownHandler(),
-    ):
-        opener.add_handler(handler)
-    return opener
-
-
-_OPENER = _build_opener()
+# For http and https alone: a redirection leads to no file of this machine.
+_OPENER = urllib.request.OpenerDirector()
+for _handler in (
+    urllib.request.ProxyHandler,
+    urllib.request.HTTPHandler,
+    urllib.request.HTTPSHandler,
+    urllib.request.HTTPRedirectHandler,
+    urllib.request.HTTPDefaultErrorHandler,
+    urllib.request.HTTPErrorProcessor,
+    urllib.request.UnknownHandler,
+):
+    _OPENER.add_handler(_handler())
 
 
 def _open_fsspec(url: str, offset: int, remedy: str) -> Answer:
@@ -327,19 +322,12 @@ def _refusal(error: Exception, url: str) -> LagbenchError:
         return UsageError("this kind of address needs another package", where=url, got=got, fix=str(error))
     if isinstance(error, FileNotFoundError):
         return DataError("there is no such bucket", where=url, got=_bucket(url), fix=FIX_BUCKET)
-    if isinstance(error, (PermissionError, *_credential_errors(url))):
+    rights: tuple[type[Exception], ...] = (PermissionError,)
+    if url.startswith(S3):
+        from botocore import exceptions as boto  # type: ignore[import-untyped]
+
+        rights += (boto.NoCredentialsError, boto.PartialCredentialsError)
+        rights += (boto.ProfileNotFound, boto.TokenRetrievalError)
+    if isinstance(error, rights):
         return StoreUnreachableError("the store refuses", where=url, got=got, fix=FIX_RIGHTS)
     return StoreUnreachableError("the store does not answer or fails", where=url, got=got, fix=FIX_LINE)
-
-
-def _credential_errors(url: str) -> tuple[type[Exception], ...]:
-    if not url.startswith(S3):
-        return ()
-    from botocore import exceptions as boto  # type: ignore[import-untyped]
-
-    return (
-        boto.NoCredentialsError,
-        boto.PartialCredentialsError,
-        boto.ProfileNotFound,
-        boto.TokenRetrievalError,
-    )

@@ -2,28 +2,179 @@
 
 from __future__ import annotations
 
+import os
 from bisect import bisect_right
-from collections.abc import Sequence
-from itertools import accumulate
+from collections import OrderedDict
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import accumulate, groupby
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.data.local import locate
-from lagbench.data.registry import Registry
-from lagbench.errors import UsageError
+from lagbench.data.layout import major_of
+from lagbench.data.local import locate, remedy
+from lagbench.data.registry import Registry, Size
+from lagbench.errors import DataError, LagbenchError, UsageError
 
-from .frames import CACHE_BYTES, FrameStore, sources_of
+from .copy import scenario_files
 
-__all__ = [
-    "Window",
-    "WindowReader",
-    "Windows",
-    "window_of",
-    "windows",
-]
+if TYPE_CHECKING:
+    import h5py
+
+__all__ = ["CACHE_BYTES", "FrameStore", "Window", "WindowReader", "Windows", "window_of", "windows"]
+
+Floats = NDArray[np.float32]
+
+CACHE_BYTES = 256 << 20
+"""Frames kept decompressed, by default [bytes]."""
+
+OPEN_FILES = 32
+"""Files kept open in one process, about 0.6 MB each."""
+
+
+@dataclass(frozen=True)
+class _Open:
+    """An open file with what is the same in all its windows."""
+
+    file: h5py.File
+    position: h5py.Dataset
+    material: NDArray[np.int8]
+    wall_velocity: Floats | None
+
+
+class FrameStore:
+    """Read frames of scenario files; those used last stay in memory, up to a fixed number of bytes.
+
+    Files are opened by the process that reads them and never written, so a store may be sent to
+    worker processes: each has a cache of its own.
+    """
+
+    def __init__(self, size: Size, paths: Mapping[int, Path], *, cache_bytes: int = CACHE_BYTES) -> None:
+        self._size, self._paths, self.cache_bytes = size, dict(paths), cache_bytes
+        self._forget()
+
+    def _forget(self) -> None:
+        self._process = os.getpid()
+        self._open: OrderedDict[int, _Open] = OrderedDict()
+        self._frames: OrderedDict[tuple[int, int], Floats] = OrderedDict()
+        self.cached_bytes = 0
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave open files and cached frames behind when sent to another process."""
+        return {"size": self._size, "paths": self._paths, "cache_bytes": self.cache_bytes}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Start with nothing open and nothing cached."""
+        self.__init__(**state)  # type: ignore[misc]
+
+    def frames(self, scenario: int, start: int, stop: int) -> list[Floats]:
+        """Return positions of consecutive frames [length], each of shape [particle, 2].
+
+        The arrays are those of the cache: copy them, never write to them.
+        """
+        self._own()
+        found = {frame: self._frames.get((scenario, frame)) for frame in range(start, stop)}
+        lacking = [frame for frame, values in found.items() if values is None]
+        # Consecutive frames, which are equally far from their places in the list, are read at once.
+        for _, run in groupby(enumerate(lacking), lambda item: item[1] - item[0]):
+            numbers = [frame for _, frame in run]
+            found.update(self._read(scenario, numbers[0], numbers[-1] + 1))
+        held = {frame: values for frame, values in found.items() if values is not None}
+        for frame, values in held.items():
+            if (scenario, frame) not in self._frames:
+                self._frames[scenario, frame] = values
+                self.cached_bytes += values.nbytes
+            self._frames.move_to_end((scenario, frame))
+        while self.cached_bytes > self.cache_bytes:
+            self.cached_bytes -= self._frames.popitem(last=False)[1].nbytes
+        return list(held.values())
+
+    def constants(self, scenario: int) -> tuple[NDArray[np.int8], Floats | None]:
+        """Return material, shape [particle], and wall velocity [length/s], [frame, wall, 2].
+
+        Material is 0, liquid, in files without it; wall velocity is None where no wall moves.
+        """
+        self._own()
+        opened = self._opened(scenario)
+        return opened.material, opened.wall_velocity
+
+    def _own(self) -> None:
+        """Reopen files after a fork: HDF5 handles do not survive one."""
+        if os.getpid() != self._process:
+            self._forget()
+
+    def _read(self, scenario: int, first: int, last: int) -> Iterator[tuple[int, Floats]]:
+        with self._naming(scenario):
+            values = self._opened(scenario).position[first:last]
+        # Copies, so that each frame's memory is free when it leaves the cache.
+        return ((first + i, frame.copy()) for i, frame in enumerate(values))
+
+    def _opened(self, scenario: int) -> _Open:
+        """Return an open file that is what the registry says; of too many the longest unused is closed."""
+        if scenario not in self._open:
+            with self._naming(scenario):
+                self._open[scenario] = self._checked(scenario)
+            if len(self._open) > OPEN_FILES:
+                self._open.popitem(last=False)[1].file.close()
+        self._open.move_to_end(scenario)
+        return self._open[scenario]
+
+    def _checked(self, scenario: int) -> _Open:
+        """Open a file; refuse one of another scenario, version or content."""
+        import h5py
+
+        size, path = self._size, self._paths[scenario]
+        if not path.is_file():
+            raise DataError("a scenario file is missing", where=str(path), fix=self._remedy(scenario))
+        # Frames are cached here: HDF5 need not keep chunks too.
+        file = h5py.File(path, "r", rdcc_nbytes=0)
+        held, position = file.attrs, file["position"]
+        # netCDF4 stores ASCII text as bytes.
+        split, tier, version, content = (
+            value.decode() if isinstance(value := held[name], bytes) else str(value)
+            for name in ("split", "size", "version", "content_sha256")
+        )
+        found = (split, tier, major_of(version), int(np.asarray(held["scenario"]).item()), len(position))
+        expected = (size.split, size.name, size.major, scenario, size.frame_count(scenario))
+        digest = size.measured.scenario_sha256.get(scenario, "") if size.measured else ""
+        if found != expected or not content.startswith(digest):
+            file.close()
+            raise DataError(
+                "a scenario file is not that of the registry",
+                where=str(path),
+                expected=f"(split, size, version, id, frames) = {expected}, content hash {digest or 'any'}",
+                got=f"{found}, content hash {content[:16]}",
+                fix=self._remedy(scenario),
+            )
+        material, walls = file.get("material"), file.get("wall_velocity")
+        return _Open(
+            file,
+            position,
+            np.zeros(position.shape[1], np.int8) if material is None else material[...],
+            None if walls is None else walls[...],
+        )
+
+    @contextmanager
+    def _naming(self, scenario: int) -> Iterator[None]:
+        """Turn whatever HDF5 raises on damaged bytes into a DataError naming the file."""
+        try:
+            yield
+        except LagbenchError:
+            raise
+        except Exception as error:  # no list of types holds: damage surfaces as nearly any of them
+            raise DataError(
+                "a scenario file is damaged or not one of lagbench",
+                where=str(self._paths[scenario]),
+                got=f"{type(error).__name__}: {error}",
+                fix=self._remedy(scenario),
+            ) from error
+
+    def _remedy(self, scenario: int) -> str:
+        return remedy(self._size, f"--subset {self._size.subset_of(scenario)}")
 
 
 class Window(NamedTuple):
@@ -60,14 +211,15 @@ class WindowReader:
     ) -> None:
         entry, folder, _ = locate(split, size, root=root, registry=registry)
         names = (subset,) if isinstance(subset, str) else tuple(subset)
-        sources = sources_of(entry, names, folder)
+        paths = scenario_files(entry, folder, names)
         self.size = entry  # what the registry publishes: bounds, task, parameters, statistics of train
         self.history = entry.task.input_frames if history is None else history  # frames that a model is given
         self.future = future  # frames after them
         self.length = self.history + future  # frames in a window
-        self.scenarios = tuple(sources)
+        self.scenarios = tuple(paths)
         self.frame_bytes = 8 * entry.particles
-        counts = [max(0, source.frames - self.length + 1) for source in sources.values()]
+        frames = [entry.frame_count(i) for i in paths]
+        counts = [max(0, count - self.length + 1) for count in frames]
         # number of the first window of each scenario, and the number of all windows
         self.starts = (0, *accumulate(counts))
         where = f"{split} {entry.name}, {', '.join(names)}"
@@ -80,15 +232,14 @@ class WindowReader:
                 fix=f"leave history out for the task's {entry.task.input_frames}",
             )
         if not len(self):
-            longest = max(source.frames for source in sources.values())
             raise UsageError(
                 "no scenario is as long as a window",
                 where=where,
-                expected=f"at most {longest} frames",
+                expected=f"at most {max(frames)} frames",
                 got=f"{self.length}: history {self.history}, future {future}",
                 fix="ask for fewer frames",
             )
-        self.store = FrameStore(sources, cache_bytes=cache_bytes)
+        self.store = FrameStore(entry, paths, cache_bytes=cache_bytes)
 
     def __len__(self) -> int:
         """Return the number of windows."""

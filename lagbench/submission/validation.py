@@ -20,7 +20,7 @@ from lagbench.data.layout import resolve_root
 from lagbench.data.local import RootedRegistry, rooted
 from lagbench.data.registry import Registry, Size
 from lagbench.errors import DataError, UnreadableFileError, UsageError, nearest
-from lagbench.work.process import in_child
+from lagbench.work.machine import in_child
 
 from .checks import check_domain, check_finite, check_frozen, check_jumps, survey
 from .findings import CHECKS, Finding, Findings, Severity, ValidationResult

@@ -1,22 +1,67 @@
-"""Which machines promise equal bits.
+"""The machine at hand: whether it promises equal bits, what a process may use of it, children under limits.
 
 The promise of docs/determinism.md holds on x86-64 Linux CPUs. A GPU, an ARM CPU or another
 system may keep it too, but nothing shows that before its hashes are those of datasets.yaml.
+
+A library in C that parses what strangers send may loop, crash or ask for too much: :func:`in_child`
+calls any function in a child with limits. Requests and answers are JSON, so nothing that a child
+sends is executed. Windows has no limits (no module ``resource``: then ``LIMITS`` is false), macOS
+refuses one on the address space. Nothing stands in for a limit that is not to be had.
 """
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
+import json
+import math
+import os
 import platform
-from collections.abc import Iterable, Mapping
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib.metadata import version
+from typing import Any, NamedTuple
 
-__all__ = ["environment_of", "may_differ", "promises_bits"]
+from lagbench.errors import WorkFailedError
 
+try:
+    import resource
+except ImportError:
+    LIMITS = False
+else:
+    LIMITS = True
+
+__all__ = [
+    "LIMITS",
+    "MEMORY",
+    "Answers",
+    "available_cores",
+    "environment_of",
+    "in_child",
+    "limit_process",
+    "may_differ",
+    "promises_bits",
+    "serve",
+]
 
 _MACHINES = {"x86_64", "amd64"}
 _DEVICES = {"cpu", "parallel"}
 _LIBRARIES = ("lagbench", "numpy", "netCDF4", "taichi")
+
+TOO_LONG = -int(getattr(signal, "SIGXCPU", 0)) or None
+"""Return code of a process that computed longer than it may; None where there is no such limit."""
+
+OUT_OF_MEMORY = 77
+"""Exit code of a child that needed more than it may."""
+
+MEMORY = 768 << 20
+"""Address space of a child [bytes]."""
+
+CHILD = "from lagbench.work.machine import serve; serve()"
+"""The child's program; -P keeps the current folder, where strangers' files may lie, off its path."""
 
 
 def environment_of(device: str) -> dict[str, str]:
@@ -42,3 +87,89 @@ def promises_bits(environment: Mapping[str, str]) -> bool:
 def may_differ(device: str, environments: Iterable[Mapping[str, str]]) -> bool:
     """Return whether a file of a device may come from a machine that promises no equal bits."""
     return any(e.get("device") == device and not promises_bits(e) for e in environments)
+
+
+def available_cores() -> int:
+    """Return the number of processors that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def limit_process(*, memory: int, seconds: int) -> None:
+    """Bound address space [bytes] and processor time [s] of this process, as far as the system can."""
+    if not LIMITS:
+        return
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds + 1))
+    if sys.platform != "darwin":
+        resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
+
+
+class Answers(NamedTuple):
+    """What a child answered, in the order of the requests, and what stopped it, if anything did."""
+
+    values: list[Any]
+    stopped: str | None
+
+
+def in_child(
+    function: str, requests: Sequence[object], *, seconds: float, wall: float, memory: int = MEMORY
+) -> Answers:
+    """Call a function, named by a dotted name, once per request (what JSON can hold) in a child with limits.
+
+    Processor time is that of all requests, the start aside, the clock's includes it [s]; ``memory`` is the
+    address space [bytes]. An exception in the child, as where it cannot import the function, is a
+    WorkFailedError.
+    """
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2"}
+    try:
+        done = subprocess.run(
+            [sys.executable, "-P", "-c", CHILD, function, str(memory), str(int(seconds))],
+            input=json.dumps(list(requests)).encode(),
+            capture_output=True,
+            timeout=wall,
+            env=environment,
+            check=False,
+        )
+    except subprocess.TimeoutExpired as error:
+        return Answers(_lines(error.stdout), f"no end after {wall:.0f} s")
+    if done.returncode == 0:
+        return Answers(_lines(done.stdout), None)
+    if done.returncode == OUT_OF_MEMORY:
+        return Answers(_lines(done.stdout), f"more than {memory >> 20} MiB of memory")
+    if done.returncode == TOO_LONG:
+        return Answers(_lines(done.stdout), "no end within the computing time allowed")
+    if done.returncode < 0:
+        name = signal.strsignal(-done.returncode) or str(-done.returncode)
+        return Answers(_lines(done.stdout), f"it crashed: {name}")
+    if b"Traceback" not in done.stderr:  # ended by a library: exit(), or a crash on Windows
+        return Answers(_lines(done.stdout), f"it ended with exit code {done.returncode:#x}")
+    raise WorkFailedError(
+        "a child process itself failed",
+        where=function,
+        got=ascii(done.stderr.decode("utf-8", "replace").strip().rsplit("\n", 1)[-1][:300]),
+        fix="`lagbench doctor` checks the installation; if it finds nothing, report this with the file",
+    )
+
+
+def _lines(output: bytes | None) -> list[Any]:
+    return [json.loads(line) for line in (output or b"").splitlines(keepends=True) if line.endswith(b"\n")]
+
+
+def serve() -> None:
+    """Answer the requests of stdin, one line each, under the limits that the arguments name.
+
+    What the imports took is not counted: on a busy machine they may take seconds.
+    """
+    dotted, memory, allowed = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
+    module, _, name = dotted.rpartition(".")
+    function: Callable[[Any], object] = getattr(importlib.import_module(module), name)
+    seconds = allowed + math.ceil(time.process_time())
+    limit_process(memory=memory, seconds=seconds)
+    try:
+        for request in json.load(sys.stdin):
+            sys.stdout.write(json.dumps(function(request)) + "\n")
+            sys.stdout.flush()
+    except MemoryError:
+        raise SystemExit(OUT_OF_MEMORY) from None

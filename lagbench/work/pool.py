@@ -29,7 +29,7 @@ from typing import Any, Self
 
 from lagbench.errors import LagbenchError, UsageError, WorkFailedError
 
-from .process import available_cores
+from .machine import available_cores
 
 __all__ = [
     "ATTEMPTS",
@@ -138,8 +138,14 @@ class Pool:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Let idle workers end by themselves, then kill; after an error kill at once."""
-        if error is None:
-            self._dismiss()
+        if error is None:  # Taichi saves what it compiled as its process exits
+            idle = [worker for worker in self._workers if worker.attempt is None]
+            for worker in idle:
+                with contextlib.suppress(OSError):  # it died while idle
+                    worker.channel.send_bytes(_FAREWELL)
+            for worker in idle:
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    worker.process.wait(_PATIENCE)
         self.close()
 
     def submit(self, task: Task) -> None:
@@ -150,8 +156,10 @@ class Pool:
         """Run every queued task and yield news until all are done."""
         while self._waiting or any(worker.attempt for worker in self._workers):
             self._assign()
-            for worker in self._ready():
-                if worker.attempt is not None:
+            busy = [worker for worker in self._workers if worker.attempt]
+            news = wait([worker.channel for worker in busy])  # one that died has some too
+            for worker in busy:
+                if worker.channel in news and worker.attempt is not None:
                     yield self._receive(worker, worker.attempt)
 
     def process_ids(self) -> list[int]:
@@ -166,16 +174,6 @@ class Pool:
         for worker in workers:
             worker.process.wait()
             worker.channel.close()
-
-    def _dismiss(self) -> None:
-        """Ask idle workers to end: Taichi saves what it compiled as its process exits."""
-        idle = [worker for worker in self._workers if worker.attempt is None]
-        for worker in idle:
-            with contextlib.suppress(OSError):  # it died while idle
-                worker.channel.send_bytes(_FAREWELL)
-        for worker in idle:
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                worker.process.wait(_PATIENCE)
 
     def _queue(self, attempt: _Attempt) -> None:
         heapq.heappush(self._waiting, (-attempt.task.cost, next(self._number), attempt))
@@ -207,12 +205,6 @@ class Pool:
         self._workers.append(worker)
         return worker
 
-    def _ready(self) -> list[_Worker]:
-        """Wait until a busy worker has news; one that died has some too."""
-        busy = [worker for worker in self._workers if worker.attempt]
-        ready = wait([worker.channel for worker in busy])
-        return [worker for worker in busy if worker.channel in ready]
-
     def _receive(self, worker: _Worker, attempt: _Attempt) -> Event:
         try:
             kind, value = worker.channel.recv()
@@ -237,16 +229,11 @@ class Pool:
             raise WorkFailedError(
                 f"a worker process died {ATTEMPTS} times",
                 where=again.task.name,
-                got=_last_words(code),
+                got=f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit status {code}",
                 fix="free memory or take fewer workers: --workers 1",
             )
         self._queue(again)
         return Event(task=again.task, kind="lost", value=worker.progress)
-
-
-def _last_words(code: int) -> str:
-    """Return how a process ended, in words."""
-    return f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit status {code}"
 
 
 def crashed(error: Exception) -> WorkFailedError:
@@ -263,17 +250,13 @@ def serve(descriptor: int) -> None:
     threading.Thread(target=_listen, args=(channel, inbox), daemon=True).start()
     while (message := inbox.get()) != _FAREWELL:
         try:
-            reply = ("done", _run(channel, message))
+            function, arguments = pickle.loads(message)
+            reply = ("done", function(*arguments, lambda units: channel.send(("progress", units))))
         except LagbenchError as error:
             reply = ("error", error)
         except Exception as error:
             reply = ("error", crashed(error))
         channel.send(reply)
-
-
-def _run(channel: Connection, message: bytes) -> Any:  # noqa: ANN401
-    function, arguments = pickle.loads(message)
-    return function(*arguments, lambda units: channel.send(("progress", units)))
 
 
 def _listen(channel: Connection, inbox: queue.SimpleQueue[bytes]) -> None:
