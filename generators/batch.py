@@ -126,7 +126,13 @@ class Batch:
 
     def recordings(self) -> Iterator[tuple[int, int]]:
         """Yield (index in the batch, frame) whenever the solver stands at that frame."""
-        for substep, due in groupby(self._schedule(), key=lambda entry: entry[0]):
+        interval = self.job.size.substeps_per_frame
+        schedule = sorted(
+            ((state.start_frame + frame) * interval, index, frame)
+            for index, (state, count) in enumerate(zip(self.states, self._frames, strict=True))
+            for frame in range(count)
+        )
+        for substep, due in groupby(schedule, key=lambda entry: entry[0]):
             self._advance_to(substep)
             self._position = self.solver.position()
             self._velocity = self.solver.velocity()
@@ -145,14 +151,6 @@ class Batch:
         self.solver.displace(offset)
         self._displaced.append((self._now, offset.copy()))
 
-    def _schedule(self) -> list[tuple[int, int, int]]:
-        interval = self.job.size.substeps_per_frame
-        return sorted(
-            ((state.start_frame + frame) * interval, index, frame)
-            for index, (state, count) in enumerate(zip(self.states, self._frames, strict=True))
-            for frame in range(count)
-        )
-
     def _advance_to(self, substep: int) -> None:
         while self._now < substep:
             count = min(self._stride, substep - self._now)
@@ -163,7 +161,17 @@ class Batch:
                     self._replay(count)
                     raise
             self._now += count
-            self._account(count)
+            # Extremes are those of the scenarios that still record, and so is the work.
+            interval, running = self.job.size.substeps_per_frame, 0
+            for index, health in enumerate(self.solver.health()):
+                last = self.states[index].start_frame + self._frames[index] - 1
+                if self._now <= last * interval:
+                    running += 1
+                    widest = self.extremes[index]
+                    widest.max_speed = max(widest.max_speed, health.max_speed)
+                    widest.jacobian_min = min(widest.jacobian_min, health.jacobian_min)
+                    widest.jacobian_max = max(widest.jacobian_max, health.jacobian_max)
+            self._report(count * running)
 
     def _replay(self, count: int) -> None:
         """Repeat everything up to here, then single substeps, to learn which one breaks first.
@@ -181,20 +189,6 @@ class Batch:
                 self.solver.displace(offset)
         for _ in range(count):
             self.solver.advance(1)
-
-    def _account(self, count: int) -> None:
-        """Widen the extremes of the scenarios that still record, and report the work."""
-        interval = self.job.size.substeps_per_frame
-        running = 0
-        for index, health in enumerate(self.solver.health()):
-            last = self.states[index].start_frame + self._frames[index] - 1
-            if self._now <= last * interval:
-                running += 1
-                widest = self.extremes[index]
-                widest.max_speed = max(widest.max_speed, health.max_speed)
-                widest.jacobian_min = min(widest.jacobian_min, health.jacobian_min)
-                widest.jacobian_max = max(widest.jacobian_max, health.jacobian_max)
-        self._report(count * running)
 
     @contextmanager
     def _naming(self) -> Iterator[None]:

@@ -51,14 +51,7 @@ class Kernels(Protocol):
 
 
 class Driver(ABC, Generic[Parameters]):
-    """A solver around kernels; see :class:`.Solver` for what callers may expect.
-
-    Args:
-        parameters: constants that the scenarios share.
-        device: where to run.
-        scenarios: scenarios advanced together.
-        threads: threads of ``Device.PARALLEL``; all that the process may use by default.
-    """
+    """A solver around kernels; see :func:`.build` for its arguments and :class:`.Solver` for what it does."""
 
     def __init__(
         self,
@@ -93,12 +86,7 @@ class Driver(ABC, Generic[Parameters]):
         """Return the bounds of this formulation that a scenario has left, and what it reached."""
 
     def load(self, states: Sequence[InitialState]) -> None:
-        """Start one scenario per state.
-
-        Raises:
-            UsageError: another number of states or particles than the solver was built for.
-            WorkFailedError: a state outside the bounds within which the solver is valid.
-        """
+        """Start one scenario per state; one outside the solver's bounds is a WorkFailedError."""
         if len(states) != self.scenarios:
             raise UsageError("wrong number of scenarios", expected=self.scenarios, got=len(states))
         for index, state in enumerate(states):
@@ -109,28 +97,21 @@ class Driver(ABC, Generic[Parameters]):
         self._kernels.restart_extremes()
 
     def advance(self, substeps: int) -> None:
-        """Advance every scenario.
-
-        Raises:
-            WorkFailedError: a scenario left the bounds within which the solver is valid.
-        """
+        """Advance every scenario; one that leaves the solver's bounds is a WorkFailedError."""
         if substeps == 0:
             return
         self._kernels.restart_extremes()
         end = self._substeps + substeps
         while self._substeps < end:
             until = self._drive(end)
-            self._run(until - self._substeps)
+            if self.device is Device.CPU:
+                self._kernels.run_serially(until - self._substeps)
+            else:
+                for _ in range(until - self._substeps):
+                    self._kernels.run_in_parallel()
             self._substeps = until
         for index, health in enumerate(self.health()):
             self._check_health(index, health, substeps)
-
-    def _run(self, substeps: int) -> None:
-        if self.device is Device.CPU:
-            self._kernels.run_serially(substeps)
-        else:
-            for _ in range(substeps):
-                self._kernels.run_in_parallel()
 
     def _drive(self, end: int) -> int:
         """Set what acts from outside now; return the substep up to which it does, ``end`` at most."""

@@ -50,10 +50,8 @@ class Solver(Protocol):
     def advance(self, substeps: int) -> None:
         """Advance every scenario.
 
-        Raises:
-            WorkFailedError: a scenario left the bounds within which the solver is valid; names
-                the scenario's index, the range of substeps (for a single one its number, from
-                1), the broken bounds and the values that broke them.
+        One that leaves the bounds within which the solver is valid is a WorkFailedError, which names its
+        index, the range of substeps (for a single one its number, from 1), the broken bounds and the values.
         """
 
     def position(self) -> NDArray[np.float32]:
@@ -82,16 +80,10 @@ def build(
     scenarios: int = 1,
     threads: int | None = None,
 ) -> Solver:
-    """Compile the solver that belongs to the parameters.
+    """Compile the solver that belongs to the parameters, whose type chooses the formulation.
 
-    Args:
-        parameters: constants of the solver; their type chooses the formulation.
-        device: where to run.
-        scenarios: scenarios advanced together; ``Device.CPU`` takes one.
-        threads: threads of ``Device.PARALLEL``; all that the process may use by default.
-
-    Raises:
-        UsageError: a device that this process cannot use, or a scenario count it cannot take.
+    ``scenarios`` advance together, one on ``Device.CPU``; ``threads`` are those of ``Device.PARALLEL``, by
+    default all that the process may use. A device or count that cannot be is a UsageError.
     """
     module, name = _IMPLEMENTATIONS[type(parameters)]
     package = __name__.rpartition(".")[0]

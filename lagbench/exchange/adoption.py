@@ -138,10 +138,29 @@ def import_split(
     if form is Format.GNS_NPZ and not allow_pickle:
         next(gns_npz.trajectories(files["train"], allow_pickle=False, kinds={}))
     stated = read_source(folder, form)
+    hints = stated.hints
+    if wishes.keys() & {"input_frames", "horizon"}:  # the frames belong to the exported task
+        hints = hints.model_copy(update={"frames_of_interest": None})
+    # What the metadata say, over it what our own exports add, over both what the user says.
+    facts: dict[str, Any] = {
+        "radius": stated.radius,
+        "frame_interval": stated.frame_interval,
+        "bounds": hints.bounds or stated.bounds,
+        "spacing": hints.spacing or stated.spacing,
+        "density": hints.density,
+        "input_frames": hints.input_frames,
+        "horizon": hints.horizon,
+        "frames_of_interest": hints.frames_of_interest,
+        "cells": hints.cells,
+        "full_box": hints.placement == "cell_centres",
+        **wishes,
+    }
+    if facts["frame_interval"] is None:
+        raise UsageError("the metadata state no time between frames", fix="say it: --frame-interval SECONDS")
     about = Description(
         name=output_name(output),
         source=f"{form.value}: " + ", ".join(f"{p.name} {file_sha256(p)[:16]}" for p in files.values()),
-        **_stated(stated, wishes),
+        **{name: value for name, value in facts.items() if value is not None},
     )
     walls = dict.fromkeys(stated.hints.wall_particle_type, DROP)
     given = {**walls, **(kinds or {})}
@@ -350,29 +369,6 @@ def _unreadable(path: Path, error: Exception) -> UnreadableFileError:
         expected="arrays of numbers",
         got=f"{type(error).__name__}: {error}",
     )
-
-
-def _stated(stated: Source, wishes: Wishes) -> dict[str, Any]:
-    """Return the facts of the metadata, those of our own exports, and over both the user's."""
-    hints = stated.hints
-    if wishes.keys() & {"input_frames", "horizon"}:  # the frames belong to the exported task
-        hints = hints.model_copy(update={"frames_of_interest": None})
-    found: dict[str, Any] = {
-        "radius": stated.radius,
-        "frame_interval": stated.frame_interval,
-        "bounds": hints.bounds or stated.bounds,
-        "spacing": hints.spacing or stated.spacing,
-        "density": hints.density,
-        "input_frames": hints.input_frames,
-        "horizon": hints.horizon,
-        "frames_of_interest": hints.frames_of_interest,
-        "cells": hints.cells,
-        "full_box": hints.placement == "cell_centres",
-        **wishes,
-    }
-    if found["frame_interval"] is None:
-        raise UsageError("the metadata state no time between frames", fix="say it: --frame-interval SECONDS")
-    return {name: value for name, value in found.items() if value is not None}
 
 
 def _unbroken(trajectory: Trajectory, stated: Source) -> Trajectory:

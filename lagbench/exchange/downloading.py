@@ -206,7 +206,18 @@ class _Download:
         """Fetch what one store has; return the error of the last file that it has not."""
         check_disk(self.root, sum(scenario_bytes(self.size, i) for i in self.missing))
         claims, last = self._claims(url), None
-        wanted = {i: self._wanted(url, i, (claims or {}).get(i)) for i in self.missing}
+        wanted = {}
+        for i in self.missing:
+            key, claim = self.size.key(i), (claims or {}).get(i)
+            wanted[i] = Wanted(
+                url=address_of(self.size, url, f"{key.subset}/{i:04d}.nc"),
+                target=scenario_path(self.root, key),
+                limit=self._limit(i),
+                content_sha256=self._recorded[i],
+                length=claim.bytes if claim else None,
+                file_sha256=claim.file_sha256 if claim else None,
+                remedy=REMEDY,
+            )
         total = sum(one.length or scenario_bytes(self.size, i) for i, one in wanted.items())
         self._meter.begin("downloading", total=total, scenarios=len(wanted))
         try:
@@ -240,18 +251,6 @@ class _Download:
         other = [i for i in self.missing if i in found and not found[i].has_hash(self._recorded[i])]
         refuse_strangers(manifest, other, where=place, remedy=REMEDY)
         return found
-
-    def _wanted(self, url: str, scenario: int, claim: FileEntry | None) -> Wanted:
-        key = self.size.key(scenario)
-        return Wanted(
-            url=address_of(self.size, url, f"{key.subset}/{scenario:04d}.nc"),
-            target=scenario_path(self.root, key),
-            limit=self._limit(scenario),
-            content_sha256=self._recorded[scenario],
-            length=claim.bytes if claim else None,
-            file_sha256=claim.file_sha256 if claim else None,
-            remedy=REMEDY,
-        )
 
     def _limit(self, scenario: int) -> int:
         """Return the bytes beyond which no file of a scenario goes."""

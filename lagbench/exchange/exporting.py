@@ -104,7 +104,14 @@ def export(
     with read_scenario(next(iter(frames_of["train"]))) as file:
         spacing = math.sqrt(float(file.read("particle_mass")) / float(tier.value("density")))
         closed = "wall_velocity" in file.variables
-    walls = _walls(tier, spacing, form, closed=closed, from_walls=from_walls) if wall_particles else None
+    walls = None
+    if wall_particles:
+        if not closed:
+            raise UsageError("the box has no walls that could move", where="--wall-particles", got=tier.split)
+        if from_walls is False and form is Format.LAGRANGEBENCH_H5:
+            what = "wall particles lie outside the unit box's bounds"
+            raise UsageError(what, where="--wall-particles and --unit-box", fix="leave out --unit-box")
+        walls = WallParticles(tier.bounds, spacing)
     origin = _origin(tier, form, walls, from_walls=closed if from_walls is None else from_walls)
     with contextlib.suppress(OSError):  # written last, it says that an export is whole
         (folder / NAME).unlink()
@@ -193,20 +200,6 @@ class WallParticles:
             [np.where(axis == 0, along, self._across), np.where(axis == 0, self._across, along)]
         )
         return places.T.astype(np.float32)
-
-
-def _walls(
-    size: Size, spacing: float, form: Format, *, closed: bool, from_walls: bool | None
-) -> WallParticles:
-    if not closed:
-        raise UsageError("the box has no walls that could move", where="--wall-particles", got=size.split)
-    if from_walls is False and form is Format.LAGRANGEBENCH_H5:
-        raise UsageError(
-            "wall particles lie outside the unit box's bounds",
-            where="--wall-particles and --unit-box",
-            fix="leave out --unit-box",
-        )
-    return WallParticles(size.bounds, spacing)
 
 
 def _origin(

@@ -124,7 +124,16 @@ class Generation:
             # The workers are gone by now; what they had not finished goes too.
             remove_leftovers(self.folder)
         note_pace(self.size, self._paces)
-        self._record_statistics()
+        manifest, train, measured = self.manifest, self.size.subsets["train"], self.size.measured
+        # Statistics of other bits differ from datasets.yaml by right.
+        doubted = measured and manifest.identity == "bitwise" and manifest.statistics != measured.statistics
+        if "train" in manifest.subset_sha256 and (doubted or not manifest.statistics):
+            self._bring(train)
+            self._meter.begin("statistics", total=len(train), scenarios=len(train))
+            paths = {f"scenario {i}": self._path(i) for i in train}
+            moments = self._read(file_moments, paths, paths.values())
+            manifest = manifest.model_copy(update={"statistics": statistics(moments)})
+        self._keep(manifest)
         self.verdict = compare(self.size, self.manifest, promised=self._promised)
         self._meter.begin("cards", total=1, scenarios=len(self.manifest.files))
         texts = card_texts(self.size, self._split, self.manifest)
@@ -238,19 +247,6 @@ class Generation:
         """Have files of scenarios here that only the store holds."""
         if self.store:
             self.store.bring(scenarios)
-
-    def _record_statistics(self) -> None:
-        """Bring the statistics of train up to date and write the manifest."""
-        manifest, train, measured = self.manifest, self.size.subsets["train"], self.size.measured
-        # Those of other bits differ from datasets.yaml by right.
-        doubted = measured and manifest.identity == "bitwise" and manifest.statistics != measured.statistics
-        if "train" in manifest.subset_sha256 and (doubted or not manifest.statistics):
-            self._bring(train)
-            self._meter.begin("statistics", total=len(train), scenarios=len(train))
-            paths = {f"scenario {i}": self._path(i) for i in train}
-            moments = self._read(file_moments, paths, paths.values())
-            manifest = manifest.model_copy(update={"statistics": statistics(moments)})
-        self._keep(manifest)
 
 
 @dataclass(frozen=True, kw_only=True)

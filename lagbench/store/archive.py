@@ -82,13 +82,7 @@ def write_archive(
     root: str | Path | None = None,
     registry: Registry | None = None,
 ) -> Path:
-    """Write the archive of a complete data set into a folder, every file checked; return its path.
-
-    Raises:
-        UsageError: unknown split or size.
-        DataError: the data set is not complete, damaged, or of another hash than the recorded one.
-        WorkFailedError: the disk is full or not writable.
-    """
+    """Write the archive of a complete data set into a folder, every file checked; return its path."""
     tier, home, _ = locate(split, size, root=root, registry=registry)
     target = Path(output) / archive_name(tier)
     bring(tier, home, tier.scenarios)

@@ -258,11 +258,7 @@ class WindowReader:
         return None if stated is None or stated.value is None else float(stated.value)
 
     def place(self, index: int) -> tuple[int, int]:
-        """Return scenario id and first frame of a window.
-
-        Raises:
-            IndexError: there is no such window.
-        """
+        """Return scenario id and first frame of a window."""
         if not -len(self) <= index < len(self):
             message = f"no window {index} among {len(self)}"
             raise IndexError(message)
