@@ -13,6 +13,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from lagbench.data.layout import NOTES_NAME
+
 TESTS = Path(__file__).parent
 
 ALONE = """
@@ -53,6 +55,12 @@ def scheduler_process() -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
         assert process.stdout is not None
         yield process.stdout.readline().decode().strip(), process
         process.kill()
+
+
+def everything(folder: Path) -> dict[str, bytes]:
+    """Return path and bytes of every file of a data set but its lock and notes of this machine."""
+    found = {str(path.relative_to(folder)): path for path in folder.rglob("*") if path.is_file()}
+    return {name: path.read_bytes() for name, path in found.items() if name not in (".lock", NOTES_NAME)}
 
 
 def writers(root: Path) -> dict[int, Path]:

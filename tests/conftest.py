@@ -242,6 +242,15 @@ def copied(generated: GenerationResult, tmp_path: Path) -> Callable[[], Path]:
 
 
 @pytest.fixture(scope="module")
+def s3() -> Iterator[str]:
+    """The URL of a bucket of an S3 server in this process."""
+    from object_stores import s3_server  # its libraries take a second to load
+
+    with s3_server() as url:
+        yield url
+
+
+@pytest.fixture(scope="module")
 def original(tmp_path_factory: pytest.TempPathFactory) -> LocalSplit:
     """A data set of four files of about 40 kB."""
     folder = tmp_path_factory.mktemp("original")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 Trajectory = tuple[NDArray[Any], NDArray[Any]]
-WINDOW = 7
-"""Frames that readers of gns-npz take at once: six given, one to predict."""
 
 
 def read_gns(path: Path) -> list[Trajectory]:
@@ -21,13 +19,6 @@ def read_gns(path: Path) -> list[Trajectory]:
     with np.load(path, allow_pickle=True) as file:
         items = list(file["gns_data"]) if "gns_data" in file else [file[key] for key in file.files]
     return [(item[0], np.full(item[0].shape[1], item[1], dtype=int)) for item in items]
-
-
-def gns_windows(trajectories: Sequence[Trajectory]) -> Iterator[NDArray[Any]]:
-    """Yield every window of 6 + 1 frames, shape [particle, frame, space]."""
-    for position, _ in trajectories:
-        for start in range(len(position) - WINDOW + 1):
-            yield np.transpose(position[start : start + WINDOW], (1, 0, 2))
 
 
 def read_h5(path: Path) -> list[Trajectory]:

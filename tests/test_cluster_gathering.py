@@ -10,22 +10,15 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from cluster_bench import everything
 from conftest import SIZE, SPLIT
 
-from lagbench.data.layout import NOTES_NAME
 from lagbench.data.manifest import merge, read_manifest, write_manifest
 from lagbench.data.registry import Registry
 from lagbench.errors import DataError, UsageError
 from lagbench.make.generate import GenerationResult, generate
 
 FOLDER = Path(SPLIT) / SIZE / "v2"
-
-
-def everything(root: Path) -> dict[str, bytes]:
-    """Return path and bytes of every file of the tiny data set but its lock and notes of this machine."""
-    folder = root / FOLDER
-    found = {str(path.relative_to(folder)): path for path in folder.rglob("*") if path.is_file()}
-    return {name: path.read_bytes() for name, path in found.items() if name not in (".lock", NOTES_NAME)}
 
 
 def part(generated: GenerationResult, root: Path, registry: Registry, ids: tuple[int, ...]) -> Path:
@@ -70,7 +63,7 @@ def test_two_processes_and_a_last_call(tmp_path: Path, unmeasured_path: Path) ->
     output, _ = last.communicate()
     assert last.returncode == 0
     assert "0 scenarios simulated" in output
-    assert everything(tmp_path / "whole") == everything(tmp_path / "alone")
+    assert everything(tmp_path / "whole" / FOLDER) == everything(tmp_path / "alone" / FOLDER)
 
 
 def test_what_no_part_holds_is_simulated(
@@ -102,7 +95,7 @@ def test_a_copy_where_nothing_can_be_linked(
     for root in parts:
         shutil.rmtree(root)
     assert result.simulated == ()
-    assert everything(tmp_path / "whole") == everything(generated.root)
+    assert everything(tmp_path / "whole" / FOLDER) == everything(generated.folder)
 
 
 def test_a_damaged_part_is_named(

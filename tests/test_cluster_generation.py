@@ -14,11 +14,10 @@ from threading import Timer
 from typing import Any
 
 import pytest
-from cluster_bench import Sabotage, gone, local_cluster, scheduler_process, writers
+from cluster_bench import Sabotage, everything, gone, local_cluster, scheduler_process, writers
 from conftest import SIZE, SPLIT
 from spread_jobs import report_for_ever
 
-from lagbench.data.layout import NOTES_NAME
 from lagbench.data.lock import Holder, read_holder
 from lagbench.data.manifest import read_manifest
 from lagbench.data.registry import Registry
@@ -38,12 +37,6 @@ def workers() -> Iterator[Any]:
     """A Dask cluster of two worker processes."""
     with local_cluster() as running:
         yield running
-
-
-def everything(folder: Path) -> dict[str, bytes]:
-    """Return path and bytes of every file of a data set but its lock and notes of this machine."""
-    found = {str(path.relative_to(folder)): path for path in folder.rglob("*") if path.is_file()}
-    return {name: path.read_bytes() for name, path in found.items() if name not in (".lock", NOTES_NAME)}
 
 
 def test_a_worker_killed_and_one_slowed(

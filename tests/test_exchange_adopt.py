@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from typer.testing import CliRunner
 import lagbench
 from lagbench.cli.app import app
 from lagbench.data.checksums import dataset_hash, subset_hash
-from lagbench.data.layout import ScenarioKey, scenario_path
+from lagbench.data.layout import scenario_path
 from lagbench.data.local import locate
 from lagbench.data.scenario import check_scenario, read_scenario
 from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError, WorkFailedError
@@ -41,9 +42,7 @@ def save_runs(folder: Path, runs: list[NDArray[np.float32]]) -> list[Path]:
 def scenario(made: LocalSplit, number: int) -> Path:
     """Return the file of a scenario."""
     size, root, _ = locate(str(made.folder))
-    subset = size.subset_of(number)
-    key = ScenarioKey(split=made.name, size="full", version="1.0.0", scenario=number, subset=subset)
-    return scenario_path(root, key)
+    return scenario_path(root, size.key(number))
 
 
 @pytest.fixture(scope="module")
@@ -154,14 +153,20 @@ def test_named_arrays(tmp_path: Path, runs: list[NDArray[np.float32]]) -> None:
         np.testing.assert_array_equal(file.read("wall_velocity")[5], walls)
 
 
+def variable(file: netCDF4.Dataset, shape: tuple[int, ...], kind: str) -> netCDF4.Variable:
+    """Return a new variable for positions."""
+    names = ("time", "point", "axis")
+    for name, length in zip(names, shape, strict=True):
+        file.createDimension(name, length)
+    return file.createVariable("position", kind, names)
+
+
 def test_netcdf(tmp_path: Path, runs: list[NDArray[np.float32]]) -> None:
     """NetCDF files of double precision in subset folders are read frame by frame, rounded once."""
     for number, subset in enumerate(("train", "valid", "test")):
         (tmp_path / "in" / subset).mkdir(parents=True)
         with netCDF4.Dataset(tmp_path / "in" / subset / "a.nc", "w") as file:
-            for name, length in zip(("time", "point", "axis"), runs[0].shape, strict=True):
-                file.createDimension(name, length)
-            file.createVariable("position", "f8", ("time", "point", "axis"))[:] = runs[number] + 1e-9
+            variable(file, runs[0].shape, "f8")[:] = runs[number] + 1e-9
     made = adopt(tmp_path / "in", output=tmp_path / "mine", **BASIC)
     assert made.scenarios == {"train": 1, "valid": 1, "test": 1}
     with read_scenario(scenario(made, 2)) as file:
@@ -173,9 +178,7 @@ def test_packed_netcdf_is_refused(tmp_path: Path, runs: list[NDArray[np.float32]
     """Values that stand for others by scale_factor would be taken for positions: the file is named."""
     for number, run in enumerate(runs[:3]):
         with netCDF4.Dataset(tmp_path / f"{number}.nc", "w") as file:
-            for name, length in zip(("time", "point", "axis"), run.shape, strict=True):
-                file.createDimension(name, length)
-            position = file.createVariable("position", "f4", ("time", "point", "axis"))
+            position = variable(file, run.shape, "f4")
             position.scale_factor = 2.0
             position[:] = run
     with pytest.raises(UnreadableFileError, match="packed"):
@@ -257,52 +260,31 @@ def test_the_spacing_of_a_lattice_is_found() -> None:
     assert math.isclose(estimate_spacing(lattice, 0.015), 0.01, rel_tol=0.05)
 
 
-def broken(kind: str) -> NDArray[Any]:
-    """Return an array that is no trajectory in one way."""
-    run = straight_runs(1)[0]
-    match kind:
-        case "flat":
-            return run[0]
-        case "space":
-            return np.concatenate([run, run[..., :1]], axis=-1)
-        case "integer":
-            return run.astype(np.int32)
-        case "single":
-            return run[:1]
-        case "missing":
-            run[3, 5, 0] = np.nan
-        case "missing at once":
-            run[0, 5, 0] = np.nan
-        case "beyond float32":
-            return run.astype(np.float64) * 1e300
-        case "outside":
-            run[3, 5, 0] = 1.5
-        case "objects":
-            return np.array([run, None], dtype=object)
+def holed(run: NDArray[np.float32], frame: int, value: float) -> NDArray[np.float32]:
+    """Return a trajectory with another number in one place."""
+    run[frame, 5, 0] = value
     return run
 
 
-@pytest.mark.parametrize(
-    ("kind", "error", "words"),
-    [
-        ("flat", UnreadableFileError, "no positions"),
-        ("space", DataError, "3 components"),
-        ("integer", UnreadableFileError, "no positions"),
-        ("single", DataError, "too little"),
-        ("missing", DataError, "not finite"),
-        ("missing at once", DataError, "not finite"),
-        ("beyond float32", DataError, "not finite"),
-        ("outside", DataError, "outside the unit box"),
-        ("objects", UnreadableFileError, "pickled"),
-    ],
-)
-def test_what_is_no_trajectory_leaves_nothing(
-    tmp_path: Path, kind: str, error: type[LagbenchError], words: str
-) -> None:
+BROKEN: dict[str, tuple[Callable[[NDArray[np.float32]], NDArray[Any]], type[LagbenchError], str]] = {
+    "flat": (lambda run: run[0], UnreadableFileError, "no positions"),
+    "space": (lambda run: np.concatenate([run, run[..., :1]], axis=-1), DataError, "3 components"),
+    "integer": (lambda run: run.astype(np.int32), UnreadableFileError, "no positions"),
+    "single": (lambda run: run[:1], DataError, "too little"),
+    "missing": (lambda run: holed(run, 3, np.nan), DataError, "not finite"),
+    "missing at once": (lambda run: holed(run, 0, np.nan), DataError, "not finite"),
+    "beyond float32": (lambda run: run.astype(np.float64) * 1e300, DataError, "not finite"),
+    "outside": (lambda run: holed(run, 3, 1.5), DataError, "outside the unit box"),
+    "objects": (lambda run: np.array([run, None], dtype=object), UnreadableFileError, "pickled"),
+}
+
+
+@pytest.mark.parametrize("kind", BROKEN)
+def test_what_is_no_trajectory_leaves_nothing(tmp_path: Path, kind: str) -> None:
     """Each fault has its message, which names the file, and no folder is made."""
-    runs = straight_runs(3)
-    paths = save_runs(tmp_path / "in", runs)
-    np.save(paths[2], broken(kind), allow_pickle=True)
+    broken, error, words = BROKEN[kind]
+    paths = save_runs(tmp_path / "in", straight_runs(3))
+    np.save(paths[2], broken(straight_runs(1)[0]), allow_pickle=True)
     with pytest.raises(error, match=words) as caught:
         adopt(paths, output=tmp_path / "mine", **BASIC)
     assert "run2.npy" in str(caught.value)
@@ -357,17 +339,8 @@ def test_a_file_describes_the_data_and_options_win(tmp_path: Path) -> None:
     """Keys of `--describe` count where no option says otherwise; unknown keys and wrong types are refused."""
     paths = save_runs(tmp_path / "in", straight_runs(4))
     told = tmp_path / "data.yaml"
-    words = [
-        "adopt",
-        *map(str, paths),
-        "-o",
-        str(tmp_path / "mine"),
-        "--describe",
-        str(told),
-        "--free-surface",
-        "--horizon",
-        "3",
-    ]
+    options = ["-o", str(tmp_path / "mine"), "--describe", str(told), "--free-surface", "--horizon", "3"]
+    words = ["adopt", *map(str, paths), *options]
     for line in ("colour: red", "radius: far", "- radius"):
         told.write_text(line)
         assert CliRunner().invoke(app, words).exit_code == 2

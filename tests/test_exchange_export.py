@@ -14,10 +14,8 @@ import h5py
 import numpy as np
 import pytest
 from exchange_readers import (
-    WINDOW,
     Trajectory,
     frame_statistics,
-    gns_windows,
     read_gns,
     read_h5,
     read_metadata,
@@ -52,17 +50,9 @@ def flows(
 ) -> dict[str, Path]:
     """The generated tiny curl-noise data set in both formats."""
     folder = tmp_path_factory.mktemp("flows")
-    made = {}
-    for form in ("gns-npz", "lagrangebench-h5"):
-        made[form] = folder / form
-        export(
-            generated.split,
-            "tiny",
-            format=form,
-            output=made[form],
-            root=generated.root,
-            registry=unmeasured,
-        )
+    made = {form: folder / form for form in ("gns-npz", "lagrangebench-h5")}
+    for form, output in made.items():
+        export("curl-noise", "tiny", format=form, output=output, root=generated.root, registry=unmeasured)
     return made
 
 
@@ -127,14 +117,6 @@ def test_gns_metadata(flows: dict[str, Path]) -> None:
     assert metadata["default_connectivity_radius"] == 0.062
 
 
-def test_gns_windows(flows: dict[str, Path], generated: GenerationResult) -> None:
-    """A GNS reader gets T - 6 windows of each trajectory, [particle, frame, space], bit for bit."""
-    truth = stored(generated.split, generated.root, "tiny")["train"]
-    windows = list(gns_windows(read_gns(flows["gns-npz"] / "train.npz")))
-    assert len(windows) == sum(len(run) - 6 for run in truth)
-    np.testing.assert_array_equal(windows[21], np.moveaxis(truth[1][1 : 1 + WINDOW], 0, 1))
-
-
 def test_lagrangebench_metadata(flows: dict[str, Path]) -> None:
     """Every key is there; dt is the solver's, and dt times write_every the frame interval."""
     metadata = read_metadata(flows["lagrangebench-h5"])
@@ -154,15 +136,8 @@ def test_lagrangebench_bounds(
     generated: GenerationResult, unmeasured: Registry, tmp_path: Path, from_walls: bool | None
 ) -> None:
     """Cells counted from 0 hold every particle, no bit is lost; a closed box has its walls as bounds."""
-    export(
-        generated.split,
-        "tiny",
-        format="lagrangebench-h5",
-        output=tmp_path,
-        root=generated.root,
-        from_walls=from_walls,
-        registry=unmeasured,
-    )
+    options: dict[str, Any] = {"root": generated.root, "registry": unmeasured, "from_walls": from_walls}
+    export("curl-noise", "tiny", format="lagrangebench-h5", output=tmp_path, **options)
     metadata = read_metadata(tmp_path)
     bounds = np.array(metadata["bounds"])
     np.testing.assert_allclose(bounds, [[0.0, 1.0 if from_walls is False else 0.9]] * 2, atol=1e-6)
@@ -350,15 +325,8 @@ def test_wall_particles_do_not_come_back(lid: LocalSplit, tmp_path: Path, form: 
 
 def test_walls_at_rest_are_solid(generated: GenerationResult, unmeasured: Registry, tmp_path: Path) -> None:
     """A simulated box with slip walls gets particles of the kind that does not move."""
-    export(
-        generated.split,
-        "tiny",
-        format="lagrangebench-h5",
-        output=tmp_path,
-        root=generated.root,
-        wall_particles=True,
-        registry=unmeasured,
-    )
+    options: dict[str, Any] = {"root": generated.root, "registry": unmeasured, "wall_particles": True}
+    export("curl-noise", "tiny", format="lagrangebench-h5", output=tmp_path, **options)
     position, kinds = read_h5(tmp_path / "test.h5")[0]
     assert {*kinds[506:].tolist()} == {1}
     assert (position[:, 506:] == position[0, 506:]).all()
@@ -367,14 +335,13 @@ def test_walls_at_rest_are_solid(generated: GenerationResult, unmeasured: Regist
 
 def test_wall_particles_need_walls(mixed: LocalSplit, lid: LocalSplit, tmp_path: Path) -> None:
     """Data without walls have none to export, and bounds of the unit box hold none."""
-    with pytest.raises(UsageError):
-        export(str(mixed.folder), format="gns-npz", output=tmp_path, wall_particles=True)
-    with pytest.raises(UsageError):
-        export(
-            str(lid.folder), format="lagrangebench-h5", output=tmp_path, wall_particles=True, from_walls=False
-        )
-    with pytest.raises(UsageError):
-        export(str(lid.folder), format="gns-npz", output=tmp_path, from_walls=True)
+    for made, form, options in (
+        (mixed, "gns-npz", {"wall_particles": True}),
+        (lid, "lagrangebench-h5", {"wall_particles": True, "from_walls": False}),
+        (lid, "gns-npz", {"from_walls": True}),
+    ):
+        with pytest.raises(UsageError):
+            export(str(made.folder), format=form, output=tmp_path, **options)
 
 
 def test_a_program_beside_the_data_is_refused(mixed: LocalSplit, tmp_path: Path) -> None:
@@ -387,11 +354,8 @@ def test_a_program_beside_the_data_is_refused(mixed: LocalSplit, tmp_path: Path)
 
 def test_missing_and_foreign_scenarios_are_told(tmp_path: Path) -> None:
     """A scenario that is not there, and one put in another's place, stop the export with their ids."""
-    paths = []
-    for number, run in enumerate(straight_runs(4)):
-        paths.append(tmp_path / f"{number}.npy")
-        np.save(paths[-1], run)
-    made = adopt(paths, output=tmp_path / "own", radius=0.1, frame_interval=0.1)
+    np.save(tmp_path / "runs.npy", np.stack(straight_runs(4)))
+    made = adopt(tmp_path / "runs.npy", output=tmp_path / "own", radius=0.1, frame_interval=0.1)
     train = made.folder / "full" / "v1" / "train"
     (train / "0000.nc").write_bytes((train / "0001.nc").read_bytes())
     with pytest.raises(DataError, match="not that of the registry"):

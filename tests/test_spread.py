@@ -15,11 +15,10 @@ from score_bench import ScoreBench, bench_of, straight
 from spread_jobs import Deadly, double, sit_after_dying_once, take_worker_along, time_out
 
 from lagbench.data.registry import Registry
-from lagbench.errors import UsageError, WorkFailedError
+from lagbench.errors import WorkFailedError
 from lagbench.make.generate import GenerationResult
 from lagbench.scoring import score
 from lagbench.scoring.scenario import ScenarioJob, ScenarioScores
-from lagbench.work import cluster as clusters
 from lagbench.work import run
 from lagbench.work.pool import Report
 
@@ -67,15 +66,6 @@ def test_results_come_in_order(workers: int) -> None:
     units: list[int] = []
     assert run.run_all(double, JOBS, workers=workers, report=units.append) == [0, 2, 4, 6, 8, 10]
     assert sum(units) == 6
-
-
-def test_an_address_that_nobody_answers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An unreachable scheduler fails the work; an address of no known kind is a usage error."""
-    monkeypatch.setattr(clusters, "CONNECT_SECONDS", 0.5)
-    with pytest.raises(WorkFailedError, match="cannot reach the Dask scheduler"):
-        run.run_all(double, JOBS, scheduler="tcp://127.0.0.1:9")
-    with pytest.raises(UsageError, match="tcp://"):
-        run.run_all(double, JOBS, scheduler="carrier-pigeon://roof")
 
 
 @pytest.mark.slow

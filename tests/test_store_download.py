@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from exchange_readers import straight_runs
 from lying_server import Mirror, serving
-from object_stores import Store, holding, s3_server
+from object_stores import Store, holding
 from typer.testing import CliRunner
 
 import lagbench
@@ -28,13 +28,6 @@ FIRST = "train/0000.nc"
 def _impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Do not pause between attempts."""
     monkeypatch.setattr(fetch, "PAUSE", 0.0)
-
-
-@pytest.fixture(scope="module")
-def s3() -> Iterator[str]:
-    """An S3 server."""
-    with s3_server() as url:
-        yield url
 
 
 @pytest.fixture(params=("http", "file", "s3"))

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import xarray as xr
 from conftest import SIZE, SPLIT
-from object_stores import Store, files, holding, machine, s3_server
+from object_stores import Store, files, holding, machine
 from typer.testing import CliRunner
 
 import lagbench
@@ -38,13 +38,6 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Be a machine of its own, that asks for the manifest each time."""
     monkeypatch.setattr(copy, "FRESH", 0.0)
     return machine(monkeypatch, tmp_path / "cache")
-
-
-@pytest.fixture(scope="module")
-def s3() -> Iterator[str]:
-    """An S3 server."""
-    with s3_server() as url:
-        yield url
 
 
 @pytest.fixture(params=("http", "file", "s3"))

@@ -8,24 +8,17 @@ from pathlib import Path
 
 import pytest
 from conftest import SIZE, SPLIT
-from object_stores import files, machine, s3_server
+from object_stores import files, machine
 from typer.testing import CliRunner
 
 import lagbench
 from lagbench.cli.app import app
-from lagbench.errors import DataError, UsageError, WorkFailedError
+from lagbench.errors import DataError, LagbenchError, UsageError, WorkFailedError
 from lagbench.make.generate import generate
 from lagbench.make.verify import verify
 from lagbench.store import copy
 
 Use = Callable[[str], object]
-
-
-@pytest.fixture(scope="module")
-def s3() -> Iterator[str]:
-    """An S3 server."""
-    with s3_server() as url:
-        yield url
 
 
 @pytest.fixture(autouse=True)
@@ -46,42 +39,49 @@ def use(request: pytest.FixtureRequest) -> Use:
     return lambda url: action(SPLIT, SIZE, root=url)
 
 
+def lacking_credentials(patch: pytest.MonkeyPatch) -> None:
+    """Have none, neither in variables nor in files."""
+    for name in ("AWS_SHARED_CREDENTIALS_FILE", "AWS_CONFIG_FILE"):
+        patch.setenv(name, "/nowhere/none")
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        patch.delenv(name)
+
+
+def wrong_credentials(patch: pytest.MonkeyPatch) -> None:
+    """Have a key that the server does not know."""
+    patch.setattr("moto.core.responses.settings.INITIAL_NO_AUTH_ACTION_COUNT", 0)
+    patch.setenv("AWS_ACCESS_KEY_ID", "wrong")
+
+
+REFUSALS: dict[str, tuple[Callable[[pytest.MonkeyPatch], None], type[LagbenchError], str]] = {
+    "none": (lacking_credentials, WorkFailedError, r"NoCredentials(.*\n)*.*AWS_ACCESS_KEY_ID"),
+    "wrong": (wrong_credentials, WorkFailedError, r"refuses\n(.*\n)*.*PermissionError"),
+    "no answer": (
+        lambda patch: patch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9"),
+        WorkFailedError,
+        r"does not answer(.*\n)*.*127\.0\.0\.1:9",
+    ),
+    "no s3fs": (
+        lambda patch: patch.setitem(sys.modules, "s3fs", None),
+        UsageError,
+        r"s3fs is not installed(.*\n)*.*lagbench\[s3\]",
+    ),
+}
+
+
+@pytest.mark.parametrize("why", REFUSALS)
+def test_refusals(s3: str, use: Use, monkeypatch: pytest.MonkeyPatch, why: str) -> None:
+    """No or wrong credentials, no answer, no library: what is missing, and where to put it, is said."""
+    harm, error, words = REFUSALS[why]
+    harm(monkeypatch)
+    with pytest.raises(error, match=words):
+        use(s3)
+
+
 def test_no_bucket(s3: str, use: Use) -> None:
     """The bucket is named."""
     with pytest.raises(DataError, match=r"no such bucket(.*\n)*.*got: elsewhere\n  fix: create"):
         use("s3://elsewhere/data")
-
-
-def test_no_credentials(s3: str, use: Use, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """The variables that name them are said."""
-    monkeypatch.setenv("AWS_SHARED_CREDENTIALS_FILE", str(tmp_path / "none"))
-    monkeypatch.setenv("AWS_CONFIG_FILE", str(tmp_path / "none"))
-    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
-        monkeypatch.delenv(name)
-    with pytest.raises(WorkFailedError, match=r"NoCredentials(.*\n)*.*AWS_ACCESS_KEY_ID"):
-        use(s3)
-
-
-def test_wrong_credentials(s3: str, use: Use, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A refusal is one, and not tried again."""
-    monkeypatch.setattr("moto.core.responses.settings.INITIAL_NO_AUTH_ACTION_COUNT", 0)
-    monkeypatch.setenv("AWS_ACCESS_KEY_ID", "wrong")
-    with pytest.raises(WorkFailedError, match=r"refuses\n(.*\n)*.*PermissionError"):
-        use(s3)
-
-
-def test_no_answer(s3: str, use: Use, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The address is named."""
-    monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
-    with pytest.raises(WorkFailedError, match=r"does not answer(.*\n)*.*127\.0\.0\.1:9"):
-        use(s3)
-
-
-def test_no_s3fs(s3: str, use: Use, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The command that installs it is said."""
-    monkeypatch.setitem(sys.modules, "s3fs", None)
-    with pytest.raises(UsageError, match=r"s3fs is not installed(.*\n)*.*lagbench\[s3\]"):
-        use(s3)
 
 
 def test_no_such_kind(use: Use) -> None:

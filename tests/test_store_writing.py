@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from conftest import SIZE, SPLIT
 from exchange_readers import straight_runs
-from object_stores import files, fill, machine, objects, put, remove, s3_server
+from object_stores import files, fill, machine, objects, put, remove
 
 from lagbench.atomic import write_atomically
 from lagbench.data.checksums import file_sha256
@@ -31,13 +31,6 @@ MANIFEST = f"{FOLDER}/manifest.json"
 Fill = Callable[[str], str]
 Run = Callable[..., GenerationResult]
 Wrote = list[tuple[str, dict[str, bytes]]]
-
-
-@pytest.fixture(scope="module")
-def s3() -> Iterator[str]:
-    """An S3 server."""
-    with s3_server() as url:
-        yield url
 
 
 @pytest.fixture(params=("file", "s3"))

@@ -276,11 +276,3 @@ def test_validate_refuses_bad_options(
     assert "Traceback" not in told.err
     assert told.out == ""
     assert not list(tmp_path.iterdir())
-
-
-def test_validate_refuses_words_for_numbers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The parser itself exits with 2 and names the option."""
-    with pytest.raises(SystemExit) as caught:
-        __main__.main([*_arguments(tmp_path), "--re", "fast"])
-    assert caught.value.code == 2
-    assert "--re" in capsys.readouterr().err

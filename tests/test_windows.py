@@ -150,16 +150,6 @@ def test_what_is_published_comes_along(
     assert (splash.history, splash.gravity, splash.viscosity) == (2, 2.5, 1e-3)
 
 
-def test_a_loader_shuffles(train: Open) -> None:
-    """PyTorch's own shuffling, with workers, draws every window once."""
-    generator = torch.Generator().manual_seed(0)
-    loader = DataLoader(train(), 4, shuffle=True, generator=generator, collate_fn=collate, num_workers=2)
-    drawn = [place for batch in loader for place in zip(batch.scenario, batch.frame, strict=True)]
-    places = [(int(scenario), int(frame)) for scenario, frame in drawn]
-    assert places != sorted(places)
-    assert sorted(places) == [train().place(i) for i in range(WINDOWS)]
-
-
 def test_collate_puts_windows_side_by_side(train: Open) -> None:
     """Windows of 8 and 11 particles make one row; each keeps its number, scenario and first frame."""
     data = train()
