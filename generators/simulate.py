@@ -241,7 +241,7 @@ def twin_floors(job: SimulationJob, report: Report) -> dict[int, tuple[float, ..
     offsets = np.zeros((len(counts), size.particles, 2), dtype=np.float32)
     floors: list[list[float]] = [[] for _ in counts]
     with ExitStack() as stack:
-        paths = [scenario_path(job.root, size.key(scenario)) for scenario in job.scenarios]
+        paths = [size.path(job.root, scenario) for scenario in job.scenarios]
         truths = [stack.enter_context(read_scenario(path)) for path in paths]
         for index, frame in batch.recordings():
             if frame == size.task.input_frames - 1:

@@ -17,7 +17,6 @@ from typer.testing import CliRunner
 import lagbench
 from lagbench.cli.app import app
 from lagbench.data.checksums import dataset_hash, subset_hash
-from lagbench.data.layout import scenario_path
 from lagbench.data.local import locate
 from lagbench.data.scenario import check_scenario, read_scenario
 from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError, WorkFailedError
@@ -42,7 +41,7 @@ def save_runs(folder: Path, runs: list[NDArray[np.float32]]) -> list[Path]:
 def scenario(made: LocalSplit, number: int) -> Path:
     """Return the file of a scenario."""
     size, root, _ = locate(str(made.folder))
-    return scenario_path(root, size.key(number))
+    return size.path(root, number)
 
 
 @pytest.fixture(scope="module")

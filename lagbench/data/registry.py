@@ -33,7 +33,7 @@ from pydantic import (
 
 from lagbench.errors import LagbenchError, UnreadableFileError, UsageError, nearest
 
-from .layout import ScenarioKey
+from .layout import ScenarioKey, dataset_folder, scenario_path
 from .limits import check_frames, check_parameters, check_subsets
 from .yamlfile import read_yaml
 
@@ -335,6 +335,14 @@ class Size(BaseModel):
         return ScenarioKey(
             split=self.split, size=self.name, version=self.version, scenario=scenario, subset=subset
         )
+
+    def folder(self, root: Path) -> Path:
+        """Return the folder of the data set below a root folder."""
+        return dataset_folder(root, self.split, self.name, self.major)
+
+    def path(self, root: Path, scenario: int) -> Path:
+        """Return the file of a scenario below a root folder."""
+        return scenario_path(root, self.key(scenario))
 
     def frame_count(self, scenario: int) -> int:
         """Return how many frames a scenario records."""

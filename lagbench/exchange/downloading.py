@@ -8,7 +8,7 @@ from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from lagbench.data.layout import MANIFEST_NAME, dataset_folder, scenario_path
+from lagbench.data.layout import MANIFEST_NAME, scenario_path
 from lagbench.data.local import locate_new
 from lagbench.data.lock import dataset_lock
 from lagbench.data.manifest import (
@@ -148,7 +148,7 @@ def download(
     return DownloadResult(
         split=tier.split,
         size=tier.name,
-        folder=dataset_folder(folder, tier.split, tier.name, tier.major),
+        folder=tier.folder(folder),
         mirror=work.url,
         downloaded=tuple(sorted(work.downloaded)),
         kept=tuple(sorted((*held, *work.kept))),

@@ -14,7 +14,6 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from lagbench.atomic import write_atomically
-from lagbench.data.layout import dataset_folder
 from lagbench.data.manifest import Manifest
 from lagbench.data.registry import Registry, Size, Split, spell_ids
 from lagbench.draw.markdown import escape, table
@@ -179,7 +178,7 @@ def write_cards(root: Path, size: Size, split: Split, manifest: Manifest) -> lis
     Each file appears whole or not at all. Where the text is already there and the pictures
     too, nothing is written: the card names every content hash, so the data are the same.
     """
-    folder = dataset_folder(root, size.split, size.name, size.major)
+    folder = size.folder(root)
     texts = {folder / name: text for name, text in card_texts(size, split, manifest).items()}
     drawn = [folder / name for name in _pictures(manifest)]
     there = all(path.is_file() for path in (*texts, *drawn))
@@ -208,7 +207,7 @@ def _draw(root: Path, size: Size, split: Split, manifest: Manifest) -> None:
     from lagbench.draw.plot import contact_sheet, plot_frame
 
     splits = Registry({size.split: split}, {})
-    folder = dataset_folder(root, size.split, size.name, size.major)
+    folder = size.folder(root)
     sheet, single = PICTURES
     contact_sheet(size.split, size.name, folder / sheet, root=root, registry=splits)
     shown = next((e for e in manifest.files if e.subset == "test"), manifest.files[0])

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lagbench.atomic import SUFFIX
-from lagbench.data.layout import MANIFEST_NAME, NOTES_NAME, dataset_folder
+from lagbench.data.layout import MANIFEST_NAME, NOTES_NAME
 from lagbench.data.local import DESCRIPTION, locate
 from lagbench.data.lock import LOCK_NAME, dataset_lock
 from lagbench.data.registry import Registry
@@ -55,7 +55,7 @@ def clean(
         WorkFailedError: another process writes the data set, or a file cannot be removed.
     """
     tier, home, _ = locate(split, size, root=root, registry=registry)
-    folder = dataset_folder(home, tier.split, tier.name, tier.major)
+    folder = tier.folder(home)
     if not folder.is_dir():
         return CleanResult(removed=(), bytes=0, dry_run=dry_run)
     with nullcontext() if dry_run else dataset_lock(home, tier.split, tier.name, tier.major, timeout=0):

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from lagbench.atomic import remove_leftovers
-from lagbench.data.layout import MANIFEST_NAME, dataset_folder, scenario_path
+from lagbench.data.layout import MANIFEST_NAME
 from lagbench.data.local import locate_new
 from lagbench.data.lock import dataset_lock
 from lagbench.data.manifest import (
@@ -72,7 +72,7 @@ class Generation:
         sources: Sequence[Path] = (),
     ) -> None:
         self.size, self.root, self.device = size, root, device
-        self.folder = dataset_folder(root, size.split, size.name, size.major)
+        self.folder = size.folder(root)
         self.workers, self.scheduler = workers, scheduler  # processes here, or a Dask scheduler's workers
         self.sources = sources  # other root folders to take finished scenarios from
         # the store that the root folder is a working copy of; None for a plain folder
@@ -162,7 +162,7 @@ class Generation:
         )
 
     def _path(self, scenario: int) -> Path:
-        return scenario_path(self.root, self.size.key(scenario))
+        return self.size.path(self.root, scenario)
 
     def _simulate(self) -> None:
         """Run everything that is to do in workers, and the twins of test scenarios."""
@@ -327,7 +327,7 @@ def generate(
         raise UsageError(f"no device {device!r}", where="--device", fix=nearest(device, devices))
     target = Device(device)
     cores = worker_count(workers, default=None if target.value == "cpu" else 1)
-    free = free_bytes(dataset_folder(folder, tier.split, tier.name, tier.major))
+    free = free_bytes(tier.folder(folder))
     generation = Generation(
         tier,
         folder,

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lagbench.data.checksums import file_sha256, plain
-from lagbench.data.layout import dataset_folder, scenario_path, url_of
+from lagbench.data.layout import scenario_path, url_of
 from lagbench.data.local import DESCRIPTION
 from lagbench.data.manifest import FileEntry, Manifest, describe_file
 from lagbench.data.registry import Size, spell_ids
@@ -90,11 +90,11 @@ class Overview:
 
 def overview(size: Size, root: Path) -> Overview:
     """Return what a size is, costs, and has below a root folder or in its store, read from names alone."""
-    folder = dataset_folder(root, size.split, size.name, size.major)
+    folder = size.folder(root)
     ids, url = size.scenarios, url_of(root)
     expected = estimate(size, ids, drawn=DRAWN) if size.simulated else None
     if url is None:
-        there = {i for i in ids if scenario_path(root, size.key(i)).is_file()}
+        there = {i for i in ids if size.path(root, i).is_file()}
     else:
         from lagbench.store.copy import remote_manifest  # what a store takes is not loaded for a folder
 
@@ -202,7 +202,7 @@ def look(order: Look, report: Callable[[int], None]) -> Finding:
 
 def extra_files(root: Path, size: Size) -> dict[str, list[str]]:
     """Return, by subset folder, the names of files that no scenario of the size has."""
-    folder = dataset_folder(root, size.split, size.name, size.major)
+    folder = size.folder(root)
     known = {(subset, f"{i:04d}.nc") for subset, ids in size.subsets.items() for i in ids}
     extra: dict[str, list[str]] = {}
     for path in sorted(folder.glob("*/*.nc")):

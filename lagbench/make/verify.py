@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lagbench.data.checksums import HASHED_SUBSETS, dataset_hash, subset_hash
-from lagbench.data.layout import dataset_folder
 from lagbench.data.local import locate, remedy
 from lagbench.data.manifest import Manifest, note, read_manifest
 from lagbench.data.registry import Registry, Size, spell_ids
@@ -148,7 +147,7 @@ def verify(
         findings[scenario] = examine(folder, tier, scenario, manifest=manifest)
         meter.count(1, scenarios=1)
     # Which test files are right is noted, so that the scorer need not hash their values again.
-    there = dataset_folder(folder, tier.split, tier.name, tier.major)
+    there = tier.folder(folder)
     hashed = {i: findings[i].content_sha256 for i in tier.subsets["test"] if i in findings}
     note(there, {there / "test" / f"{i:04d}.nc": content for i, content in hashed.items() if content})
     anew = _regenerate(tier, evenly_spaced(ids, regenerate), cores, meter)

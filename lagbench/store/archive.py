@@ -19,7 +19,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from lagbench.atomic import atomic_path
-from lagbench.data.layout import MANIFEST_NAME, dataset_folder
+from lagbench.data.layout import MANIFEST_NAME
 from lagbench.data.local import locate, remedy
 from lagbench.data.manifest import FileEntry, Manifest, read_manifest
 from lagbench.data.registry import Registry, Size
@@ -86,7 +86,7 @@ def write_archive(
     tier, home, _ = locate(split, size, root=root, registry=registry)
     target = Path(output) / archive_name(tier)
     bring(tier, home, tier.scenarios)
-    folder = dataset_folder(home, tier.split, tier.name, tier.major)
+    folder = tier.folder(home)
     manifest = read_manifest(home, tier.split, tier.name, tier.major)
     recorded = tier.measured.dataset_sha256 if tier.measured else None
     whole = manifest is not None and [entry.scenario for entry in manifest.files] == list(tier.scenarios)

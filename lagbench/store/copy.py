@@ -20,7 +20,7 @@ from pydantic import ValidationError
 
 from lagbench.atomic import atomic_path
 from lagbench.data.checksums import file_sha256
-from lagbench.data.layout import MANIFEST_NAME, dataset_folder, scenario_path, url_of
+from lagbench.data.layout import MANIFEST_NAME, url_of
 from lagbench.data.local import remedy as remedy_of
 from lagbench.data.lock import dataset_lock
 from lagbench.data.manifest import (
@@ -76,7 +76,7 @@ def address_of(size: Size, url: str, name: str) -> str:
 
 def folder_of(size: Size) -> str:
     """Return the folder of a data set below the root of a store."""
-    return dataset_folder(Path(), size.split, size.name, size.major).as_posix()
+    return size.folder(Path()).as_posix()
 
 
 def _remedy(size: Size, url: str) -> str:
@@ -115,14 +115,14 @@ def scenario_files(size: Size, root: Path, subsets: Sequence[str]) -> dict[int, 
         if subset not in size.subsets:
             where = f"{size.split} {size.name}"
             raise UsageError(f"no subset {subset!r}", where=where, fix=nearest(subset, size.subsets))
-    paths = {i: scenario_path(root, size.key(i)) for subset in subsets for i in size.subsets[subset]}
+    paths = {i: size.path(root, i) for subset in subsets for i in size.subsets[subset]}
     bring(size, root, paths)
     missing = [i for i, path in paths.items() if not path.is_file()]
     if missing:
         option = (f"--subset {subsets[0]}",) if len(subsets) == 1 else ()
         raise DataError(
             f"{len(missing)} of {len(paths)} scenarios are not there",
-            where=str(dataset_folder(root, size.split, size.name, size.major)),
+            where=str(size.folder(root)),
             got=f"missing: {spell_ids(missing)}",
             fix=remedy_of(size, *option, root=root),
         )
@@ -210,7 +210,7 @@ def is_right(entry: FileEntry, size: Size, manifest: Manifest) -> bool:
 
 def with_local(size: Size, root: Path, found: Manifest) -> Manifest:
     """Return the store's manifest with what only the working copy holds."""
-    folder, local = dataset_folder(root, size.split, size.name, size.major), read_or_empty(size, root)
+    folder, local = size.folder(root), read_or_empty(size, root)
     ours = [e for e in local.files if found.entry(e.scenario) is None and is_right(e, size, local)]
     return join(size, found, local, [entry for entry in ours if (folder / entry.path).is_file()])
 
@@ -228,7 +228,7 @@ def join(size: Size, base: Manifest, other: Manifest, files: Collection[FileEntr
 
 def is_here(entry: FileEntry, size: Size, root: Path, trusted: Manifest | None = None) -> bool:
     """Return whether the working copy holds what an entry describes; what is trusted is not hashed."""
-    path = dataset_folder(root, size.split, size.name, size.major) / entry.path
+    path = size.folder(root) / entry.path
     if not path.is_file() or path.stat().st_size != entry.bytes:
         return False
     known = trusted.entry(entry.scenario) if trusted else None
@@ -241,7 +241,7 @@ def fetch_entries(size: Size, root: Path, url: str, entries: Collection[FileEntr
     """Fetch objects into the working copy, whose lock is held; each appears whole and right."""
     if not entries:
         return
-    folder = dataset_folder(root, size.split, size.name, size.major)
+    folder = size.folder(root)
     wanted = {
         entry.scenario: Wanted(
             url=address_of(size, url, entry.path),
@@ -270,8 +270,8 @@ def gather(size: Size, root: Path, source: Path, manifest: Manifest) -> Manifest
     Each job of an array generates some scenarios into a root folder of its own. The whole is then
     what one call would have left.
     """
-    there = dataset_folder(source, size.split, size.name, size.major)
-    here = dataset_folder(root, size.split, size.name, size.major)
+    there = size.folder(source)
+    here = size.folder(root)
     found = read_manifest(source, size.split, size.name, size.major)
     if found is None or there.resolve() == here.resolve():
         raise UsageError(

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lagbench.data import registry
-from lagbench.data.layout import dataset_folder
 from lagbench.data.local import locate, remedy
 from lagbench.errors import DataError
 
@@ -53,7 +52,7 @@ def load_manifest(split: str, *, size: str | None = None, root: str | Path | Non
     if manifest is None:
         raise DataError(
             "the data set has no manifest",
-            where=str(dataset_folder(folder, entry.split, entry.name, entry.major)),
+            where=str(entry.folder(folder)),
             fix=remedy(entry, root=folder),
         )
     return manifest

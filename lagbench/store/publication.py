@@ -15,7 +15,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from lagbench.data.checksums import file_sha256
-from lagbench.data.layout import MANIFEST_NAME, dataset_folder, url_of
+from lagbench.data.layout import MANIFEST_NAME, url_of
 from lagbench.data.manifest import FileEntry, Manifest, merged, write_manifest
 from lagbench.data.registry import Size
 from lagbench.errors import DataError, LagbenchError
@@ -43,7 +43,7 @@ class Publication:
 
     def __init__(self, size: Size, root: Path, url: str) -> None:
         self._size, self._root = size, root
-        self._folder = dataset_folder(root, size.split, size.name, size.major)
+        self._folder = size.folder(root)
         self._objects = Objects(url, folder_of(size))
         lengths = self._objects.sizes()
         self._named = self._latest = self._read_manifest()
