@@ -21,8 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .constants import closed_box_walls, constants, interval
-from .draws import RandomSource, choice, log_uniform, quantise, uniform
-from .lattice import fill
+from .draws import RandomSource, choice, fill, log_uniform, quantise, uniform
 from .split import WALLS, ClosedBoxParameters, InitialState, Material
 
 if TYPE_CHECKING:

@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 from lagbench.errors import UsageError
 
 from .constants import closed_box_walls, constants
-from .draws import RandomSource, quantise
-from .lattice import fill_grid
+from .draws import RandomSource, fill_grid, quantise
 from .noise import Jet, coordinates, gradients, noise, ramp
 from .split import ClosedBoxParameters, InitialState, Material
 

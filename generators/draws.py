@@ -4,6 +4,8 @@ Two rules keep them so. Random bits come only from ``Generator.random``, the one
 of NumPy that never changes for PCG64. What is done with them is + - * / sqrt, floor and
 comparison, which IEEE 754 rounds in one way only, or ``decimal``, whose ``exp`` and ``ln`` are
 correctly rounded by its specification; ``exp``, ``log`` and ``pow`` of a C library are not.
+
+Jittered lattices fill a square box with particles (thesis Eq. 5.44).
 """
 
 from __future__ import annotations
@@ -24,6 +26,8 @@ __all__ = [
     "choice",
     "direction",
     "entropy",
+    "fill",
+    "fill_grid",
     "generator",
     "log_uniform",
     "normal",
@@ -137,3 +141,45 @@ def direction(rng: RandomSource) -> tuple[float, float]:
         if 2.0**-20 <= square <= 1.0:
             length = math.sqrt(square)
             return x / length, y / length
+
+
+def fill(rng: RandomSource, count: int, *, low: float, high: float, jitter: float) -> NDArray[np.float64]:
+    """Fill a square with any number of particles, in columns of nearly equal counts.
+
+    The columns number floor(sqrt(count)), their counts differ by one at the most, and each
+    spreads its own particles evenly over the height. ``low`` and ``high`` are coordinates of the
+    walls [length], ``jitter`` is the width of the uniform displacement, in spacings [1]. Positions
+    [length] are multiples of 2^-20, shape [particle, 2].
+    """
+    columns = math.isqrt(count)
+    ends = [count * column // columns for column in range(columns + 1)]
+    sizes = np.diff(ends)
+    column = np.repeat(np.arange(columns), sizes)
+    row = np.arange(count) - np.repeat(ends[:-1], sizes)
+    cell = np.stack([column, row], axis=-1)
+    cells = np.stack([np.full(count, columns), np.repeat(sizes, sizes)], axis=-1)
+    return _place(rng, cell, cells, low=low, high=high, jitter=jitter)
+
+
+def fill_grid(
+    rng: RandomSource, columns: int, rows: int, *, low: float, high: float, jitter: float
+) -> NDArray[np.float64]:
+    """Fill a square with columns x rows particles; arguments as in :func:`fill`."""
+    index = np.arange(columns * rows)
+    cell = np.stack([index // rows, index % rows], axis=-1)
+    cells = np.broadcast_to(np.array([columns, rows]), cell.shape)
+    return _place(rng, cell, cells, low=low, high=high, jitter=jitter)
+
+
+def _place(
+    rng: RandomSource,
+    cell: NDArray[np.integer],
+    cells: NDArray[np.integer],
+    *,
+    low: float,
+    high: float,
+    jitter: float,
+) -> NDArray[np.float64]:
+    """Put a particle near the middle of its cell: base position + (r - 1/2) jitter spacing."""
+    displacement = (rng.random(cell.shape) - 0.5) * jitter
+    return quantise(low + (high - low) * (cell + 0.5 + displacement) / cells)

@@ -14,7 +14,7 @@ from scipy.interpolate import CubicHermiteSpline
 
 from lagbench.data import registry
 from lagbench.errors import UsageError
-from lagbench.generators import draws, lattice
+from lagbench.generators import draws
 from lagbench.generators.cavity import is_classic
 from lagbench.generators.split import WALLS
 
@@ -96,7 +96,7 @@ def test_one_cavity_in_eight_is_the_classic(size: str, expected: int) -> None:
 def test_lattice_fills_the_box_evenly(count: int, scenario: int) -> None:
     """Any particle count: columns differ by one particle, no gap and no clump."""
     rng = draws.generator("cavity", "test", 1, scenario)
-    position = lattice.fill(rng, count, low=0.0625, high=0.9375, jitter=0.25)
+    position = draws.fill(rng, count, low=0.0625, high=0.9375, jitter=0.25)
     columns = math.isqrt(count)
     held = Counter(np.floor((position[:, 0] - 0.0625) / 0.875 * columns).astype(int).tolist())
     assert len(held) == columns

@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 from lagbench.data import registry
 from lagbench.errors import UsageError
 from lagbench.generators import cavity, curl_noise
-from lagbench.generators.draws import quantise
-from lagbench.generators.lattice import fill
+from lagbench.generators.draws import fill, quantise
 from lagbench.generators.noise import gradients
 from lagbench.generators.solver import Device, build
 from lagbench.generators.split import WALLS, ClosedBoxParameters, InitialState, Material
