@@ -136,11 +136,11 @@ class Generation:
         self._keep(manifest)
         self.verdict = compare(self.size, self.manifest, promised=self._promised)
         self._meter.begin("cards", total=1, scenarios=len(self.manifest.files))
-        texts = card_texts(self.size, self._split, self.manifest)
-        if self.store and self.store.is_settled(self.manifest, texts):
+        described = self.size, self._split, self.manifest
+        if self.store and self.store.is_settled(self.manifest, card_texts(*described)):
             return
         self._bring(self.size.scenarios)
-        cards = write_cards(self.root, self.size, self._split, self.manifest)
+        cards = write_cards(self.root, *described)
         if self.store:
             self.store.finish(self.manifest, cards)
 
