@@ -38,8 +38,7 @@ __all__ = [
     "substeps_of",
 ]
 
-STRIDE = 4_000_000
-"""Particle-substeps between two reports: about a tenth of a second on a core."""
+STRIDE = 4_000_000  # particle-substeps between two reports: about a tenth of a second on a core
 
 Report = Callable[[int], None]
 """Called with the substeps done since the last call, summed over scenarios."""

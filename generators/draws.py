@@ -36,9 +36,7 @@ __all__ = [
     "uniform",
 ]
 
-QUANTUM = 2.0**-20
-"""Grain of everything that enters the solver; multiples below 16 are exact in float32."""
-
+QUANTUM = 2.0**-20  # grain of everything that enters the solver; multiples below 16 are exact in float32
 _LARGEST = 16.0
 _PRECISE = Context(prec=50)
 

@@ -37,9 +37,7 @@ __all__ = [
     "with_statistics",
 ]
 
-MARKER = "\nmeasured:"
-"""Where the generated part of datasets.yaml begins."""
-
+MARKER = "\nmeasured:"  # where the generated part of datasets.yaml begins
 _NOTICE = "# Written by `python -m lagbench.generators.record`; do not edit below this line."
 _SHORT = 16
 _WIDTH = 110

@@ -49,17 +49,12 @@ __all__ = [
 ]
 
 
-STILL = 0.01
-"""Share of its greatest kinetic energy from which on a free surface moves."""
-
+STILL = 0.01  # share of its greatest kinetic energy from which on a free surface moves
 OUTCOMES = ("active_frames",)
 """Parameters of a file that follow from its simulation; all others are known before it."""
 
-COMPILING = 2
-"""Frames on the way to which kernels are compiled: one is read out, then one is advanced to."""
-
-_FILE_NAMES = {"reynolds": "reynolds_number"}
-"""Drawn parameters that files call by their CF-like long name."""
+COMPILING = 2  # frames on the way to which kernels are compiled: one is read out, then one is advanced to
+_FILE_NAMES = {"reynolds": "reynolds_number"}  # drawn parameters that files call by their CF-like long name
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -216,8 +211,7 @@ def simulate(
     ]
 
 
-_STREAM = 1
-"""Appended to a scenario's seed: the nudge has a random stream of its own."""
+_STREAM = 1  # appended to a scenario's seed: the nudge has a random stream of its own
 
 
 def nudge(size: Size, scenario: int) -> NDArray[np.float32]:

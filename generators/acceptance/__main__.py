@@ -35,9 +35,7 @@ from .experiment import Case, Experiment, Result, plan, run, solver_parameters
 __all__ = ["document", "main", "parser", "settings"]
 
 
-DIGITS = 9
-"""Significant digits of the numbers in the JSON file: fewer than libraries differ in."""
-
+DIGITS = 9  # significant digits of the numbers in the JSON file: fewer than libraries differ in
 JSON = dict[str, Any]
 
 

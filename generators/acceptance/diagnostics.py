@@ -45,8 +45,7 @@ __all__ = [
 ]
 
 
-CORNER_CELLS = 5
-"""Extent of the regions under the two ends of the lid, where J is far from 1 [cells]."""
+CORNER_CELLS = 5  # extent of the regions under the two ends of the lid, where J is far from 1 [cells]
 
 Reals = NDArray[np.floating]
 
@@ -198,8 +197,7 @@ _V = {
     ),
 }  # fmt: skip
 
-REYNOLDS = tuple(_U)
-"""Reynolds numbers U L / nu that are tabulated here."""
+REYNOLDS = tuple(_U)  # Reynolds numbers U L / nu that are tabulated here
 
 
 @dataclass(frozen=True)

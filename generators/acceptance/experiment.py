@@ -55,9 +55,7 @@ _LEAST_GRID = 16
 _VISCOUS_LIMIT = 0.2
 _ACOUSTIC_LIMIT = 0.5
 _MACH_LIMIT = 1.0 / 3.0
-_LARGEST_FREQUENCY = 14
-"""Beyond it velocity gradients outgrow what :func:`.draws.quantise` holds."""
-
+_LARGEST_FREQUENCY = 14  # beyond it velocity gradients outgrow what :func:`.draws.quantise` holds
 _DEFAULT_LID_SPEED = 0.15
 _DEFAULT_FREQUENCY = 4
 
@@ -228,11 +226,8 @@ def _root_mean_square_speed(state: InitialState) -> float:
     return float(np.sqrt(np.mean(np.sum(state.velocity**2, axis=-1))))
 
 
-CHECK_EVERY = 10_000
-"""Substeps between two checks."""
-
-AVERAGED = 3000
-"""Substeps at the end over which the nodal velocity is averaged, at most a quarter of the run."""
+CHECK_EVERY = 10_000  # substeps between two checks
+AVERAGED = 3000  # substeps at the end over which the nodal velocity is averaged, at most a quarter of the run
 
 Report = Callable[[int], None]
 

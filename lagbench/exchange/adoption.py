@@ -26,9 +26,7 @@ from .trajectory import Description, Frame, Trajectory, Wishes, check_array, che
 
 __all__ = ["adopt", "import_split"]
 
-READABLE = (".npy", ".npz", ".nc")
-"""Files that are adopted: an array, named arrays, netCDF."""
-
+READABLE = (".npy", ".npz", ".nc")  # files that are adopted: an array, named arrays, netCDF
 ARRAYS = POSITION, VELOCITY, MATERIAL, WALLS = "position", "velocity", "material", "wall_velocity"
 
 Read = Callable[[str], NDArray[Any]]

@@ -35,9 +35,7 @@ from lagbench.work.progress import Meter, Progress
 
 __all__ = ["CONNECTIONS", "DownloadResult", "download"]
 
-SLACK = 1.25
-"""Share by which a compressed file may be longer than its values."""
-
+SLACK = 1.25  # share by which a compressed file may be longer than its values
 REMEDY = "try again; if it stays so, name another store: --from"
 
 Reason = DataError | WorkFailedError | UsageError

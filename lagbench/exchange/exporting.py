@@ -30,11 +30,8 @@ __all__ = ["ENDINGS", "ExportResult", "export"]
 
 ENDINGS = {Format.GNS_NPZ: gns_npz.ENDING, Format.LAGRANGEBENCH_H5: lagrangebench_h5.ENDING}
 
-LAYERS = 3
-"""Layers of particles of a wall, as LagrangeBench's own lid-driven cavity has them."""
-
-ALONG = (1, 1, 0, 0)
-"""Axis along each wall: left, right, bottom, top."""
+LAYERS = 3  # layers of particles of a wall, as LagrangeBench's own lid-driven cavity has them
+ALONG = (1, 1, 0, 0)  # axis along each wall: left, right, bottom, top
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -31,23 +31,16 @@ from .trajectory import Trajectory, check_array, check_inflation
 __all__ = ["ENDING", "read_header", "trajectories", "write"]
 
 ENDING = ".npz"
-JOINT = "gns_data"
-"""Key under which some files hold all trajectories together."""
-
+JOINT = "gns_data"  # key under which some files hold all trajectories together
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 """Time of every member: the earliest that zip knows, so that equal data give equal bytes."""
 
-_NUMBERS = re.compile("[iu][1248]|f[248]|b1")
-"""Codes of the types of numbers that may be in a file."""
-
+_NUMBERS = re.compile("[iu][1248]|f[248]|b1")  # codes of the types of numbers that may be in a file
 _MOST_STEPS = 1 << 18
 """Steps of a pickle at the most; NumPy takes about fifty for a trajectory, each makes one object."""
 
-_PARTS = 3
-"""Parts of a trajectory at the most: positions, kinds, a material property."""
-
-_DEPTH = 3
-"""How deep arrays may lie in each other: trajectories in a joint array, parts, and a spare."""
+_PARTS = 3  # parts of a trajectory at the most: positions, kinds, a material property
+_DEPTH = 3  # how deep arrays may lie in each other: trajectories in a joint array, parts, and a spare
 
 
 def write(path: Path, runs: Iterable[tuple[NDArray[np.float32], NDArray[np.int64]]]) -> None:

@@ -25,16 +25,14 @@ from .trajectory import Frame, Trajectory, check_array
 __all__ = ["ENDING", "FORCE", "trajectories", "write"]
 
 ENDING = ".h5"
-FORCE = "force.py"
-"""Name of the program that the other side would run."""
+FORCE = "force.py"  # name of the program that the other side would run
 
 Run = tuple[int, Callable[[int], NDArray[np.float32]], NDArray[np.int64]]
 """Frames of a trajectory, what returns the positions of one of them, and the kind of each particle."""
 
 _LEVEL = 1
 
-MOST_TRAJECTORIES = 100_000
-"""Most trajectories of a file that are looked at."""
+MOST_TRAJECTORIES = 100_000  # most trajectories of a file that are looked at
 
 
 def write(path: Path, runs: Iterable[Run], *, length: int, origin: Sequence[float]) -> list[tuple[int, int]]:

@@ -36,9 +36,7 @@ from .trajectory import FEWEST_CELLS, MOST_CELLS, Description, Trajectory, estim
 
 __all__ = ["LocalSplit", "make_local_split", "output_name"]
 
-SIZE = "full"
-"""Size of every local split."""
-
+SIZE = "full"  # size of every local split
 VERSION = "1.0.0"
 DEVICE = "cpu"
 HEAD = '# A local split of lagbench, written by `lagbench {}`; its hashes stand under "measured".\n'

@@ -80,12 +80,8 @@ MEANINGS: Mapping[Format, Mapping[int, str]] = {
 }
 """What numbers without a material mean."""
 
-PADDING = -1
-"""Number of particles that are not there (lagrangebench-h5)."""
-
-DROP = "drop"
-"""What a number is mapped to whose particles are left out."""
-
+PADDING = -1  # number of particles that are not there (lagrangebench-h5)
+DROP = "drop"  # what a number is mapped to whose particles are left out
 _DROPPED = -1
 
 

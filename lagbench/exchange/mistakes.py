@@ -20,21 +20,13 @@ __all__ = ["check_meaning", "misplaced_axes"]
 STRETCH = 4
 """Neighbours along an axis that are looked at together: two second differences, a step and its neighbours."""
 
-STRETCHES = 64, 200
-"""Stretches of frames and of particles that are looked at, evenly spaced over each axis."""
-
-ROUGH = 0.5
-"""Change of a step, as a share of the step, from which on frames do not resolve the motion."""
-
+STRETCHES = 64, 200  # stretches of frames and of particles that are looked at, evenly spaced over each axis
+ROUGH = 0.5  # change of a step, as a share of the step, from which on frames do not resolve the motion
 JUMPS = 1.0
 """The same share for what jumps: places drawn at random have 1.7, what turns by a radian per frame 0.96."""
 
-SMOOTHER = 0.25
-"""Share of the jumps that the other axis may have to be the smooth one."""
-
-ROUNDED = 1e-6
-"""Share of a variance that rounding may leave."""
-
+SMOOTHER = 0.25  # share of the jumps that the other axis may have to be the smooth one
+ROUNDED = 1e-6  # share of a variance that rounding may leave
 EXPLAINED = 0.5
 """Share of the velocities' variance that motion must leave, or another reading take away, to count."""
 
@@ -44,8 +36,7 @@ FACTOR = 1.5
 SHIFTED = 0.4
 """Share of the misfit that a shift by a frame must leave: velocities of a solver may lag by a tenth."""
 
-FEWEST = 8
-"""Steps below which chance may look like anything."""
+FEWEST = 8  # steps below which chance may look like anything
 
 Block = NDArray[np.float64]
 """Some values of a trajectory, of shape [stretch of frames, frame, stretch of particles, particle, 2]."""

@@ -41,14 +41,9 @@ Frame = tuple[Array, Array | None]
 Box = tuple[tuple[float, float], tuple[float, float]]
 """Low and high walls along x and y."""
 
-PLANE = 2
-"""Components of a position."""
-
-HARMLESS = 1 << 28
-"""Bytes that may come of anything."""
-
-MOST_INFLATION = 200
-"""Times its own length that a larger array may unpack to."""
+PLANE = 2  # components of a position
+HARMLESS = 1 << 28  # bytes that may come of anything
+MOST_INFLATION = 200  # times its own length that a larger array may unpack to
 
 LEAST, MOST = 1e-30, 1e30
 """Least and greatest number that a length, a time or a density may be: squares of them are floats."""
@@ -56,8 +51,7 @@ LEAST, MOST = 1e-30, 1e30
 FEWEST_CELLS, MOST_CELLS = 4, 4096
 """Cells across of a score grid."""
 
-WIDE = 3.0
-"""Radii within which neighbours are counted to estimate the spacing."""
+WIDE = 3.0  # radii within which neighbours are counted to estimate the spacing
 
 
 @dataclass(frozen=True, kw_only=True)

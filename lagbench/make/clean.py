@@ -18,8 +18,7 @@ from .cards import CARD_NAME, CROISSANT_NAME, PICTURES
 __all__ = ["CleanResult", "clean"]
 
 
-CARDS = (MANIFEST_NAME, CARD_NAME, CROISSANT_NAME, *PICTURES)
-"""What lagbench writes beside the subsets."""
+CARDS = (MANIFEST_NAME, CARD_NAME, CROISSANT_NAME, *PICTURES)  # what lagbench writes beside the subsets
 
 
 @dataclass(frozen=True, kw_only=True)

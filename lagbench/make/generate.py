@@ -52,8 +52,7 @@ __all__ = ["Generation", "GenerationResult", "Progress", "generate"]
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
-BATCH_PARTICLES = 1 << 19
-"""Particles that a parallel device advances together at the most."""
+BATCH_PARTICLES = 1 << 19  # particles that a parallel device advances together at the most
 
 
 class Generation:

@@ -46,8 +46,7 @@ __all__ = [
 ]
 
 
-DRAWN = 2
-"""Scenarios of a size that are drawn to estimate the time: all of them would take seconds."""
+DRAWN = 2  # scenarios of a size that are drawn to estimate the time: all of them would take seconds
 
 
 class State(enum.StrEnum):

@@ -50,8 +50,7 @@ __all__ = [
 RELEASES = "https://lagbench.invalid/releases"
 """Folder of the released archives; a placeholder as long as its host is .invalid (RFC 2606)."""
 
-RELEASES_VARIABLE = "LAGBENCH_RELEASES"
-"""Environment variable that names another such folder."""
+RELEASES_VARIABLE = "LAGBENCH_RELEASES"  # environment variable that names another such folder
 
 
 def releases(size: Size) -> tuple[str, ...]:

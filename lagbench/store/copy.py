@@ -58,11 +58,8 @@ __all__ = [
     "writing",
 ]
 
-FRESH = 30.0
-"""How long a store's manifest is not asked for again by this process [s]."""
-
-MANIFEST_LIMIT = 64 << 20
-"""Longest manifest that is read [bytes]."""
+FRESH = 30.0  # how long a store's manifest is not asked for again by this process [s]
+MANIFEST_LIMIT = 64 << 20  # longest manifest that is read [bytes]
 
 _asked: dict[str, tuple[float, Manifest | None]] = {}
 _written: set[Path] = set()

@@ -18,11 +18,8 @@ if TYPE_CHECKING:
 __all__ = ["list_splits", "load_manifest", "open_split"]
 
 
-CHUNK_BYTES = 4 << 20
-"""Dask reads position and velocity in chunks of about this size [bytes]."""
-
-PADDING = -1
-"""Material of particles that a scenario does not have."""
+CHUNK_BYTES = 4 << 20  # Dask reads position and velocity in chunks of about this size [bytes]
+PADDING = -1  # material of particles that a scenario does not have
 
 
 def list_splits() -> tuple[str, ...]:

@@ -49,27 +49,13 @@ __all__ = [
     "saving",
 ]
 
-CONNECTIONS = 4
-"""Objects that are fetched side by side."""
-
-BLOCK = 1 << 18
-"""Bytes read at a time."""
-
-LEAST_RATE = 4096.0
-"""Bytes per second below which a store is refused, each object by itself."""
-
-PATIENCE = 60.0
-"""Seconds of waiting over which the rate is measured."""
-
-ATTEMPTS = 5
-"""Attempts in a row that bring nothing before we give up."""
-
-MOST_ATTEMPTS = 100
-"""Attempts at one object at all, however little each brings."""
-
-PAUSE = 0.5
-"""Pause after the first failed attempt [s]; it doubles."""
-
+CONNECTIONS = 4  # objects that are fetched side by side
+BLOCK = 1 << 18  # bytes read at a time
+LEAST_RATE = 4096.0  # bytes per second below which a store is refused, each object by itself
+PATIENCE = 60.0  # seconds of waiting over which the rate is measured
+ATTEMPTS = 5  # attempts in a row that bring nothing before we give up
+MOST_ATTEMPTS = 100  # attempts at one object at all, however little each brings
+PAUSE = 0.5  # pause after the first failed attempt [s]; it doubles
 FIX_LINE = "the same command goes on where it stopped"
 
 T = TypeVar("T")

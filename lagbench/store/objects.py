@@ -39,9 +39,7 @@ __all__ = [
     "open_object",
 ]
 
-TIMEOUT = 30.0
-"""How long a store may be silent [s]."""
-
+TIMEOUT = 30.0  # how long a store may be silent [s]
 HTTP = ("http://", "https://")
 S3 = ("s3://", "s3a://")
 LOCAL = ("file://", "local://")

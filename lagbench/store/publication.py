@@ -34,8 +34,7 @@ from .objects import NotDataError, Objects
 
 __all__ = ["Publication", "look_at", "publication"]
 
-EVERY = 10.0
-"""Least time between two manifests while scenarios are being finished [s]."""
+EVERY = 10.0  # least time between two manifests while scenarios are being finished [s]
 
 
 class Publication:

@@ -29,11 +29,8 @@ __all__ = ["CACHE_BYTES", "FrameStore", "Window", "WindowReader", "Windows", "wi
 
 Floats = NDArray[np.float32]
 
-CACHE_BYTES = 256 << 20
-"""Frames kept decompressed, by default [bytes]."""
-
-OPEN_FILES = 32
-"""Files kept open in one process, about 0.6 MB each."""
+CACHE_BYTES = 256 << 20  # frames kept decompressed, by default [bytes]
+OPEN_FILES = 32  # files kept open in one process, about 0.6 MB each
 
 
 @dataclass(frozen=True)

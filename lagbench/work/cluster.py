@@ -35,30 +35,14 @@ from .pool import Event, Task, crashed
 
 __all__ = ["Client", "Cluster", "Mark", "await_file", "marked", "run_task"]
 
-PATIENCE = 30.0
-"""How long a file of another machine may take to appear [s]."""
-
-PAUSE = 0.1
-"""Pause between two looks for a file [s]."""
-
-TELL_SECONDS = 0.5
-"""Time between two events that tell how far a task is [s]."""
-
-CONNECT_SECONDS = 20
-"""How long a Dask scheduler may take to answer."""
-
-POLL_SECONDS = 0.02
-"""Pause between two looks at the tasks [s]."""
-
-LOOK_SECONDS = 1.0
-"""Pause between two looks at the workers [s]."""
-
-LOST_SECONDS = 60.0
-"""How long a Dask cluster may be without any worker."""
-
-STOP_SECONDS = 5
-"""How long to wait for the workers to hear that they shall stop."""
-
+PATIENCE = 30.0  # how long a file of another machine may take to appear [s]
+PAUSE = 0.1  # pause between two looks for a file [s]
+TELL_SECONDS = 0.5  # time between two events that tell how far a task is [s]
+CONNECT_SECONDS = 20  # how long a Dask scheduler may take to answer
+POLL_SECONDS = 0.02  # pause between two looks at the tasks [s]
+LOOK_SECONDS = 1.0  # pause between two looks at the workers [s]
+LOST_SECONDS = 60.0  # how long a Dask cluster may be without any worker
+STOP_SECONDS = 5  # how long to wait for the workers to hear that they shall stop
 WORKERS = "dask worker ADDRESS --nworkers -1 --nthreads 1"
 """The command that starts workers as they must be: one a core, each with one thread."""
 
@@ -134,8 +118,7 @@ def _look_again(folder: Path) -> None:
 
 # --- in a worker ---------------------------------------------------------------------------
 
-_STOPPED: set[str] = set()
-"""Clients whose tasks are void."""
+_STOPPED: set[str] = set()  # clients whose tasks are void
 
 
 @dataclass(frozen=True)

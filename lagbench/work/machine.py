@@ -54,12 +54,8 @@ _LIBRARIES = ("lagbench", "numpy", "netCDF4", "taichi")
 TOO_LONG = -int(getattr(signal, "SIGXCPU", 0)) or None
 """Return code of a process that computed longer than it may; None where there is no such limit."""
 
-OUT_OF_MEMORY = 77
-"""Exit code of a child that needed more than it may."""
-
-MEMORY = 768 << 20
-"""Address space of a child [bytes]."""
-
+OUT_OF_MEMORY = 77  # exit code of a child that needed more than it may
+MEMORY = 768 << 20  # address space of a child [bytes]
 CHILD = "from lagbench.work.machine import serve; serve()"
 """The child's program; -P keeps the current folder, where strangers' files may lie, off its path."""
 

@@ -47,16 +47,13 @@ __all__ = [
 AVAILABLE = os.name == "posix"
 """Whether workers can be started here: they inherit a socket, which Windows cannot hand on."""
 
-ATTEMPTS = 3
-"""Times that a task is tried when the worker under it dies."""
+ATTEMPTS = 3  # times that a task is tried when the worker under it dies
 
 Report = Callable[[int], None]
 """What a task calls to say how many units of work it has done since it last called."""
 
 _FAREWELL = b""
-_PATIENCE = 20.0
-"""How long a worker may take to end by itself [s]."""
-
+_PATIENCE = 20.0  # how long a worker may take to end by itself [s]
 _BOOT = (
     "import sys, json; sys.path[:] = json.loads(sys.argv[2]); "
     "from lagbench.work.pool import serve; serve(int(sys.argv[1]))"

@@ -19,9 +19,7 @@ __all__ = ["ONE_THREAD", "read_many", "run_all"]
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
-WORTH_WORKERS = 1 << 30
-"""Bytes of files below which starting processes to read them costs more than it gains."""
-
+WORTH_WORKERS = 1 << 30  # bytes of files below which starting processes to read them costs more than it gains
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 """Environment of workers: threads of NumPy and HDF5 would only take the cores from the others.
 
