@@ -17,7 +17,7 @@ import lagbench
 from lagbench.cli.app import app
 from lagbench.data.local import locate
 from lagbench.data.registry import Registry
-from lagbench.errors import DataError, UnreadableFileError, UsageError
+from lagbench.errors import DataError, UnreadableFileError
 from lagbench.exchange import export, import_split
 from lagbench.make.generate import GenerationResult
 
@@ -59,14 +59,6 @@ def test_imported_data_equal_the_source(tmp_path: Path, form: str) -> None:
     np.testing.assert_array_equal(positions(made.folder), [run for run, _ in read])
     interval = 0.01 if gns else 0.05
     assert locate(str(made.folder)).size.frame_interval == pytest.approx(interval)
-
-
-def test_pickles_are_refused_unless_allowed(tmp_path: Path) -> None:
-    """Without --allow-pickle nothing of gns-npz is read; the message names the flag."""
-    source = write_gns(tmp_path / "in", straight_runs(3))
-    with pytest.raises(UsageError, match="--allow-pickle"):
-        import_split(source, format="gns-npz", output=tmp_path / "own")
-    assert not (tmp_path / "own").exists()
 
 
 def test_another_horizon_drops_the_frames_of_the_exported_task(tmp_path: Path) -> None:

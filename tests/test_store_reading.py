@@ -25,7 +25,6 @@ from lagbench.make.generate import GenerationResult
 from lagbench.make.inventory import overview
 from lagbench.make.verify import verify
 from lagbench.store import copy
-from lagbench.store.fetch import partial_name
 from lagbench.store.objects import WrongContentError, WrongLengthError
 from lagbench.submission import template
 
@@ -189,18 +188,6 @@ def test_another_data_set_is_refused(folder: Store) -> None:
     with pytest.raises(WrongContentError):
         lagbench.open_split(SPLIT, size=SIZE, root=folder.url)
     assert here(folder.url) == []
-
-
-def test_fetching_goes_on_where_it_stopped(store: Store, tiny: Registry, generated: GenerationResult) -> None:
-    """Half a file under its temporary name is completed from there."""
-    whole = (generated.folder / "test/0003.nc").read_bytes()
-    half = partial_name(resolve_root(store.url) / FOLDER / "test/0003.nc")
-    half.parent.mkdir(parents=True)
-    half.write_bytes(whole[: len(whole) // 2])
-    lagbench.open_split(SPLIT, size=SIZE, root=store.url).close()
-    assert here(store.url) == ["manifest.json", "test/0003.nc", "test/0004.nc"]
-    if store.server:
-        assert (f"/{FOLDER}/test/0003.nc", f"bytes={len(whole) // 2}-") in store.server.asked
 
 
 def test_who_watches_is_told_how_far_it_is(

@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 import lagbench
 from lagbench.cli.app import app
 from lagbench.errors import DataError, LagbenchError, UsageError, WorkFailedError
+from lagbench.exchange import download
 from lagbench.make.generate import generate
 from lagbench.make.verify import verify
 from lagbench.store import copy
@@ -30,11 +31,13 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     assert files(folder) == {}
 
 
-@pytest.fixture(params=["generate", "open_split", "verify"])
+@pytest.fixture(params=["generate", "open_split", "verify", "download"])
 def use(request: pytest.FixtureRequest) -> Use:
     """Something that is done with a root."""
     if request.param == "open_split":
         return lambda url: lagbench.open_split(SPLIT, size=SIZE, root=url)
+    if request.param == "download":
+        return lambda url: download(SPLIT, SIZE, root=url, or_generate=False)
     action = {"generate": generate, "verify": verify}[request.param]
     return lambda url: action(SPLIT, SIZE, root=url)
 
