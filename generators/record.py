@@ -106,9 +106,9 @@ def _block(values: Measured) -> Iterator[str]:
     # A flow sequence in lines of equal counts.
     numbers = [_number(value) for value in values.twin_floor]
     per_line = (_WIDTH - 10) // (len("-1.00000000e-05, "))
-    rows = [", ".join(numbers[k : k + per_line]) for k in range(0, len(numbers), per_line)]
-    for k, row in enumerate(rows):
-        yield ("  [" if k == 0 else "   ") + row + ("]" if k == len(rows) - 1 else ",")
+    lines = [", ".join(numbers[k : k + per_line]) for k in range(0, len(numbers), per_line)]
+    for k, line in enumerate(lines):
+        yield ("  [" if k == 0 else "   ") + line + ("]" if k == len(lines) - 1 else ",")
 
 
 def _number(value: float) -> str:
