@@ -61,10 +61,7 @@ def elsewhere(root: Path, machine: str = "aarch64") -> None:
 
 @pytest.mark.parametrize(
     ("change", "named"),
-    [
-        ({"dataset_sha256": "0" * 64}, "data set"),
-        ({"subset_sha256": {"train": "0" * 64}}, "train"),
-    ],
+    [({"dataset_sha256": "0" * 64}, "data set"), ({"subset_sha256": {"train": "0" * 64}}, "train")],
 )
 def test_data_set_and_subset_hashes_are_compared(
     change: dict[str, object], named: str, copied: Copy, unmeasured: Registry, right: Measured

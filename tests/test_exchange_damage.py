@@ -79,10 +79,7 @@ MANY = [np.zeros(1)] * 4
             ),
             "bytes for the objects",
         ),
-        (
-            _Reduced(np.float64(0).__reduce__()[0], (OBJECTS_WITHOUT_FLAGS, ADDRESSES[:8])),
-            "wants to call",
-        ),
+        (_Reduced(np.float64(0).__reduce__()[0], (OBJECTS_WITHOUT_FLAGS, ADDRESSES[:8])), "wants to call"),
         (_Reduced(np.ndarray, ((1 << 45,), np.dtype("f8"))), "make an array by itself"),
         (_Reduced(codecs.encode, ("x", "punycode")), "wants to call"),
         ("text", "holds a str"),

@@ -13,14 +13,7 @@ from typing import Any, ClassVar
 import h5py
 import numpy as np
 import pytest
-from exchange_readers import (
-    Trajectory,
-    frame_statistics,
-    read_gns,
-    read_h5,
-    read_metadata,
-    straight_runs,
-)
+from exchange_readers import Trajectory, frame_statistics, read_gns, read_h5, read_metadata, straight_runs
 from typer.testing import CliRunner
 
 import lagbench

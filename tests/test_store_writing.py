@@ -143,11 +143,7 @@ def test_what_is_there_is_neither_simulated_nor_fetched(
 
 
 def test_the_manifest_comes_last(
-    url: str,
-    run: Run,
-    simulated_here: Fill,
-    wrote: Wrote,
-    monkeypatch: pytest.MonkeyPatch,
+    url: str, run: Run, simulated_here: Fill, wrote: Wrote, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At no time does it name an object that is not there; after the cards it is put once more."""
     monkeypatch.setattr(publication, "EVERY", 0.0)
@@ -160,11 +156,7 @@ def test_the_manifest_comes_last(
 
 
 def test_a_fault_in_the_middle_leaves_whole_objects(
-    url: str,
-    run: Run,
-    simulated_here: Fill,
-    generated: GenerationResult,
-    wrote: Wrote,
+    url: str, run: Run, simulated_here: Fill, generated: GenerationResult, wrote: Wrote
 ) -> None:
     """The manifest names what had been put; the next call puts the rest and nothing twice."""
     simulated_here(url)
@@ -180,11 +172,7 @@ def test_a_fault_in_the_middle_leaves_whole_objects(
 
 
 def test_a_damaged_object_is_replaced_and_not_named_meanwhile(
-    full: str,
-    run: Run,
-    generated: GenerationResult,
-    simulated_here: Fill,
-    wrote: Wrote,
+    full: str, run: Run, generated: GenerationResult, simulated_here: Fill, wrote: Wrote
 ) -> None:
     """The manifest lets go of it, then it is put, then it is named again."""
     put(full, f"{FOLDER}/train/0001.nc", b"half")

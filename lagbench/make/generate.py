@@ -20,14 +20,7 @@ from lagbench.atomic import remove_leftovers
 from lagbench.data.layout import MANIFEST_NAME
 from lagbench.data.local import locate_new
 from lagbench.data.lock import dataset_lock
-from lagbench.data.manifest import (
-    Manifest,
-    describe_file,
-    merged,
-    note,
-    read_or_empty,
-    write_manifest,
-)
+from lagbench.data.manifest import Manifest, describe_file, merged, note, read_or_empty, write_manifest
 from lagbench.data.registry import Registry, Size, Split, spell_ids
 from lagbench.data.statistics import file_moments, round_digits, statistics
 from lagbench.errors import UsageError, check_installed, nearest

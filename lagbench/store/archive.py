@@ -38,14 +38,7 @@ from .objects import (
     open_object,
 )
 
-__all__ = [
-    "RELEASES",
-    "RELEASES_VARIABLE",
-    "archive_name",
-    "fetch_archive",
-    "releases",
-    "write_archive",
-]
+__all__ = ["RELEASES", "RELEASES_VARIABLE", "archive_name", "fetch_archive", "releases", "write_archive"]
 
 RELEASES = "https://lagbench.invalid/releases"
 """Folder of the released archives; a placeholder as long as its host is .invalid (RFC 2606)."""

@@ -23,14 +23,7 @@ from lagbench.data.checksums import file_sha256
 from lagbench.data.layout import MANIFEST_NAME, url_of
 from lagbench.data.local import remedy as remedy_of
 from lagbench.data.lock import dataset_lock
-from lagbench.data.manifest import (
-    FileEntry,
-    Manifest,
-    merged,
-    read_manifest,
-    read_or_empty,
-    write_manifest,
-)
+from lagbench.data.manifest import FileEntry, Manifest, merged, read_manifest, read_or_empty, write_manifest
 from lagbench.data.registry import Size, spell_ids
 from lagbench.data.scenario import check_scenario
 from lagbench.errors import DataError, UsageError, nearest

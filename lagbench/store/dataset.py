@@ -48,19 +48,13 @@ def load_manifest(split: str, *, size: str | None = None, root: str | Path | Non
     manifest = read_manifest(folder, entry.split, entry.name, entry.major)
     if manifest is None:
         raise DataError(
-            "the data set has no manifest",
-            where=str(entry.folder(folder)),
-            fix=remedy(entry, root=folder),
+            "the data set has no manifest", where=str(entry.folder(folder)), fix=remedy(entry, root=folder)
         )
     return manifest
 
 
 def open_split(
-    split: str,
-    *,
-    subset: str = "test",
-    size: str | None = None,
-    root: str | Path | None = None,
+    split: str, *, subset: str = "test", size: str | None = None, root: str | Path | None = None
 ) -> xr.Dataset:
     """Open one subset of a generated data set; arrays are read when computed.
 

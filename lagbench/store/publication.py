@@ -20,16 +20,7 @@ from lagbench.data.manifest import FileEntry, Manifest, merged, write_manifest
 from lagbench.data.registry import Size
 from lagbench.errors import DataError, LagbenchError
 
-from .copy import (
-    fetch_entries,
-    folder_of,
-    is_here,
-    is_right,
-    join,
-    remote_manifest,
-    with_local,
-    writing,
-)
+from .copy import fetch_entries, folder_of, is_here, is_right, join, remote_manifest, with_local, writing
 from .objects import NotDataError, Objects
 
 __all__ = ["Publication", "look_at", "publication"]

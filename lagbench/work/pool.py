@@ -31,17 +31,7 @@ from lagbench.errors import LagbenchError, UsageError, WorkFailedError
 
 from .machine import available_cores
 
-__all__ = [
-    "ATTEMPTS",
-    "AVAILABLE",
-    "Event",
-    "Pool",
-    "Report",
-    "Task",
-    "crashed",
-    "serve",
-    "worker_count",
-]
+__all__ = ["ATTEMPTS", "AVAILABLE", "Event", "Pool", "Report", "Task", "crashed", "serve", "worker_count"]
 
 
 AVAILABLE = os.name == "posix"
