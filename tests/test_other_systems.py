@@ -15,7 +15,7 @@ from score_bench import ScoreBench, straight
 import lagbench
 from lagbench.errors import WorkFailedError
 from lagbench.make.generate import GenerationResult
-from lagbench.work import pool, process
+from lagbench.work import machine, pool
 from lagbench.work.run import run_all
 
 LESS = """
@@ -100,25 +100,25 @@ def test_training_and_predicting(commands: Run, tmp_path: Path) -> None:
 
 def test_a_system_without_limits(monkeypatch: pytest.MonkeyPatch) -> None:
     """No limit is asked for where there are none."""
-    monkeypatch.setattr(process, "LIMITS", False)
-    monkeypatch.setattr(process.resource, "setrlimit", lambda *_: pytest.fail("a limit"))
-    process.limit_process(memory=1, seconds=1)
+    monkeypatch.setattr(machine, "LIMITS", False)
+    monkeypatch.setattr(machine.resource, "setrlimit", lambda *_: pytest.fail("a limit"))
+    machine.limit_process(memory=1, seconds=1)
 
 
 def test_macos_refuses_a_limit_of_the_address_space(monkeypatch: pytest.MonkeyPatch) -> None:
     """There only the others are set."""
     wanted: list[int] = []
-    monkeypatch.setattr(process.sys, "platform", "darwin")
-    monkeypatch.setattr(process.resource, "setrlimit", lambda what, _: wanted.append(what))
-    process.limit_process(memory=1, seconds=1)
-    assert wanted == [process.resource.RLIMIT_CORE, process.resource.RLIMIT_CPU]
+    monkeypatch.setattr(machine.sys, "platform", "darwin")
+    monkeypatch.setattr(machine.resource, "setrlimit", lambda what, _: wanted.append(what))
+    machine.limit_process(memory=1, seconds=1)
+    assert wanted == [machine.resource.RLIMIT_CORE, machine.resource.RLIMIT_CPU]
 
 
 def test_a_crash_on_windows_is_the_files_fault(monkeypatch: pytest.MonkeyPatch) -> None:
     """There a process that reads where it may not ends with the code 0xC0000005, not with a signal."""
     ended = subprocess.CompletedProcess([], 0xC0000005, stdout=b"1\n2", stderr=b"")
-    monkeypatch.setattr(process.subprocess, "run", lambda *_, **__: ended)
-    assert process.in_child("any.function", [0, 0], seconds=1.0, wall=1.0) == (
+    monkeypatch.setattr(machine.subprocess, "run", lambda *_, **__: ended)
+    assert machine.in_child("any.function", [0, 0], seconds=1.0, wall=1.0) == (
         [1],
         "it ended with exit code 0xc0000005",
     )
