@@ -36,9 +36,8 @@ from lagbench.data.hdf5 import check_regular
 from lagbench.data.registry import Registry
 from lagbench.errors import DataError, LagbenchError, UnreadableFileError, WorkFailedError
 
-from .baseline import Baseline
+from .baseline import Baseline, Facts, facts_of
 from .catalogue import find
-from .facts import Facts, facts_of
 
 __all__ = [
     "check_footprint",

@@ -27,8 +27,7 @@ from torch import Tensor, nn
 from lagbench.errors import DataError
 
 from . import baseline
-from .baseline import Baseline, Batch
-from .facts import Facts
+from .baseline import Baseline, Batch, Facts
 
 __all__ = [
     "FEATURES",

@@ -27,7 +27,7 @@ from torch import Tensor, nn
 
 from lagbench.errors import UsageError
 
-from .facts import Facts, Pair
+from .baseline import Facts, Pair
 
 __all__ = [
     "radius_graph",

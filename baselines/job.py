@@ -26,12 +26,10 @@ from lagbench.errors import UnreadableFileError, UsageError
 from lagbench.submission.budget import MOST_VALIDATIONS, Budget, track_of
 from lagbench.work.progress import Meter
 
-from .baseline import Baseline
+from .baseline import Baseline, Facts
 from .checkpoint import Checkpoint, load
-from .facts import Facts
 from .machine import hardware
 from .recipe import Recipe
-from .windows import scenario_paths
 
 __all__ = [
     "OVER",
@@ -278,13 +276,6 @@ class TrainingJob:
     processes: int = 1  # processes that share the training
     workers: int = 0  # processes that read windows ahead
     meter: Meter = field(default_factory=Meter)  # counts steps
-
-    def files(self, subset: str) -> dict[int, Path]:
-        """Return the scenario files of a subset by id."""
-        facts = self.facts
-        return scenario_paths(
-            facts.split, subset=subset, size=facts.size, root=self.root, registry=self.registry
-        )
 
     def ledger(self) -> TrainingRecord:
         """Return the ledger that goes on where an earlier run ended, in the state that it ended in."""

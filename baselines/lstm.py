@@ -11,8 +11,7 @@ from torch import Tensor, nn
 
 from lagbench.data.grid import Grid, Placement
 
-from .baseline import Batch
-from .facts import Facts
+from .baseline import Batch, Facts
 from .frame_model import FrameNetwork, FrameNetworkOptions, FrameWindow, squared_errors
 from .mlp import Activation, dense
 from .torch_grid import transfer

@@ -22,12 +22,10 @@ from torch.nn.functional import gelu
 
 from lagbench.errors import DataError, UsageError
 
-from .baseline import Baseline, Batch, Options
-from .facts import Facts
+from .augmentation import Symmetry, draw, image, noisy
+from .baseline import Baseline, Batch, Facts, Options
 from .graph import MATERIALS
-from .particle_grid import ParticleGrid, Stencil
-from .seeding import noisy
-from .symmetry import Symmetry, draw, image
+from .torch_grid import ParticleGrid, Stencil
 
 __all__ = ["NeuralMPM", "NeuralMPMOptions", "UNet"]
 

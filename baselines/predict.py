@@ -25,14 +25,12 @@ from lagbench.submission.budget import budget_in
 from lagbench.submission.writer import PredictionsWriter
 from lagbench.work.progress import Meter, Progress
 
-from .baseline import Baseline, Batch
+from .baseline import Baseline, Batch, Facts
 from .checkpoint import Checkpoint, check_data, load, restore
-from .facts import Facts
 from .graph import radius_graph
 from .job import RunFolder, parameter_count
 from .machine import bound_memory, chosen_device, hardware, memory_errors_told, threads_used
-from .rollout import Rollout, roll_out
-from .windows import scenario_batch, scenario_paths
+from .rollout import Rollout, roll_out, scenario_batch, scenario_paths
 
 __all__ = [
     "PredictionResult",

@@ -1,26 +1,53 @@
 """Rollouts: a model fed with its own predictions, frozen where it ceases to be finite or leaves for far.
 
 One function serves validation during training and the predictions that are scored.
+
+Whole scenarios as batches, for rollouts and validation; training windows are `lagbench.torch`'s.
+
+Validation: rollouts of every scenario of ``valid`` while a model is trained, by the metric that ranks.
+
+The files, the metric and its rounding are the scorer's: were ``valid`` the test subset, the score card
+would have the same digits. ``test`` is never read.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, replace
+from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
+from lagbench.data.local import locate
+from lagbench.data.registry import Registry
+from lagbench.data.scenario import read_scenario
+from lagbench.errors import UsageError
+from lagbench.metrics.aggregate import Tally, score, tally
+from lagbench.metrics.frame import FramePair, snapshots
+from lagbench.metrics.table import METRICS, select
+from lagbench.scoring.scenario import as_stored
+from lagbench.scoring.task import ScoredTask, load_scored_task, ranking_metric
+from lagbench.store.frames import sources_of
+from lagbench.store.windows import window_of
 from lagbench.submission.checks import MAX_DISTANCE
+from lagbench.torch import Window, collate, tensors
 
 from .baseline import Baseline, Batch
+from .job import TrainingJob
 
 __all__ = [
     "Rollout",
-    "roll_out",
-    "single",
+    "Validation",
     "as_published",
+    "roll_out",
+    "scenario_batch",
+    "scenario_paths",
+    "single",
+    "validation_of",
 ]
 
 
@@ -120,3 +147,102 @@ def as_published(model: nn.Module) -> Iterator[None]:
         with torch.no_grad():
             for tensor, value in kept:
                 tensor.copy_(value)
+
+
+def scenario_batch(paths: Path | Sequence[Path], frames: slice = slice(None)) -> Batch:
+    """Return the same frames of one or several whole scenarios, for rollouts and validation."""
+    return collate([_read(path, frames) for path in ([paths] if isinstance(paths, Path) else paths)])
+
+
+def scenario_paths(
+    split: str,
+    *,
+    subset: str = "test",
+    size: str | None = None,
+    root: str | Path | None = None,
+    registry: Registry | None = None,
+) -> dict[int, Path]:
+    """Return the files of a subset by scenario id; all of them exist."""
+    entry, folder, _ = locate(split, size, root=root, registry=registry)
+    return {i: source.path for i, source in sources_of(entry, (subset,), folder).items()}
+
+
+def _read(path: Path, frames: slice) -> Window:
+    """Read frames of one file without a cache."""
+    with read_scenario(path) as file:
+        numbers = range(file.header.frames)[frames]
+        if not numbers or numbers.step != 1:
+            raise UsageError(
+                "no consecutive frames",
+                where=str(path),
+                expected=f"frames of 0:{file.header.frames}",
+                got=frames,
+            )
+        run = slice(numbers.start, numbers.stop)
+        held = file.variables
+        position = file.read("position", run)
+        material = file.read("material") if "material" in held else np.zeros(position.shape[1], np.int8)
+        # The forcing is given for all frames, so that a rollout from these knows what comes.
+        walls = file.read("wall_velocity", slice(run.start, None)) if "wall_velocity" in held else None
+        return tensors(window_of(list(position), material, walls, file.header.key.scenario, numbers.start))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Validation:
+    """The scenarios that a training is validated on; calling it validates."""
+
+    task: ScoredTask  # the valid subset
+    frames: Mapping[int, int]  # frames to predict, by scenario id: later ones do not count
+    compiled: bool = False  # whether the training compiles layers
+
+    @property
+    def metric(self) -> str:
+        """Name of the metric that ranks; lower is better."""
+        return ranking_metric(self.task.size)
+
+    def __call__(self, model: Baseline) -> float:
+        """Return the metric, the mean over scenarios; NaN where it is undefined.
+
+        The model is rolled out with its weights rounded to bfloat16, as predictions use them, on a CPU
+        one scenario after the other, as predictions are. A rollout that diverges counts with its frozen
+        frames.
+        """
+        device = next((p.device for p in model.parameters()), torch.device("cpu"))
+        ids = list(self.frames)
+        groups = [[i] for i in ids] if device.type == "cpu" else [ids]
+        tallies: dict[int, Tally] = {}
+        # A rollout needs no gradients: its layers would be compiled anew.
+        stance = torch.compiler.set_stance("force_eager") if self.compiled else nullcontext()
+        with as_published(model), stance:
+            for group in groups:
+                paths = [self.task.truth.path(i) for i in group]
+                given = scenario_batch(paths, slice(0, self.task.setting.input_frames)).to(device)
+                for rollout in roll_out(model, given, max(self.frames[i] for i in group)):
+                    tallies[rollout.scenario] = self._measured(rollout)
+        found = score(METRICS[self.metric], tallies)
+        return math.nan if found is None else found.mean
+
+    def _measured(self, rollout: Rollout) -> Tally:
+        """Return the statistics of a rollout, rounded as score files hold them."""
+        metrics = select([self.metric])
+        with self.task.opened(rollout.scenario) as truth:
+            scenario, frames = truth.scenario, self.task.setting.predicted_frames
+            predicted = snapshots(scenario, rollout.position.numpy())
+            states = zip(frames, predicted, truth.snapshots(), strict=False)
+            pairs = (FramePair(scenario, frame, true, guess) for frame, guess, true in states)
+            return as_stored(tally(pairs, metrics, frames))
+
+
+def validation_of(job: TrainingJob) -> Validation | None:
+    """Return the validation of a training; None where the recipe wants none."""
+    options, facts = job.recipe.training, job.facts
+    if options.validate_every == 0:
+        return None
+    task = load_scored_task(job.registry.size(facts.split, facts.size), job.root, subset="valid")
+    horizon = min(options.validation_frames or facts.horizon, facts.horizon)
+    task = replace(task, setting=replace(task.setting, horizon=horizon))
+    frames = {}
+    for i in task.scenarios[: options.validation_scenarios]:
+        with task.opened(i) as opened:
+            frames[i] = len(opened.scenario.active)
+    return Validation(task=task, frames=frames, compiled=options.compile)

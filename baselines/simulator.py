@@ -23,13 +23,11 @@ from lagbench.baselines.operators.operator import Losses, Operator
 from lagbench.data.grid import Grid, Placement
 from lagbench.errors import UsageError
 
-from .baseline import Baseline, Batch, Options
-from .facts import Facts
+from .augmentation import Symmetry, draw, image, noisy
+from .baseline import Baseline, Batch, Facts, Options
 from .graph import EDGE_FEATURES, NodeFeatures, Scale, edge_features, radius_graph
 from .loss import LossNorm, Motion, Scales, State, integrate, loss_terms
 from .network import EncodeProcessDecode
-from .seeding import noisy
-from .symmetry import Symmetry, draw, image
 
 __all__ = ["GraphNetwork", "GraphNetworkOptions", "LossWeights", "Target"]
 

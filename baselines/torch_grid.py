@@ -5,6 +5,14 @@ positions and velocities. Arrays of particles have shape [..., particle, 2] and 
 [..., x node, y node]; or windows lie side by side in one row, as in
 :class:`~lagbench.baselines.baseline.Batch`: particles then have shape [particle, 2] and `sample`
 says which window each belongs to, fields have shape [window, x node, y node].
+
+Particles to nodes and back by quadratic B-splines, on the grid of a network.
+
+    spread:  g_ij = sum_p b(x_p - x_i) b(y_p - y_j) v_p        (P2G)
+    gather:  v_p  = sum_ij b(x_p - x_i) b(y_p - y_j) g_ij      (G2P)
+
+with the b of :mod:`lagbench.data.grid`. Both share one :class:`Stencil` and have gradients to
+positions and values.
 """
 
 from __future__ import annotations
@@ -12,16 +20,21 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from lagbench.data.grid import COUNTED_SHARE, EMPTY_SHARE, Grid
 from lagbench.errors import UsageError
 
+from .baseline import Pair
+
 __all__ = [
     "Fields",
+    "ParticleGrid",
+    "Stencil",
     "Transfer",
     "central_differences",
     "counted_nodes",
@@ -32,7 +45,6 @@ __all__ = [
     "transfer",
     "vorticity",
 ]
-
 
 _LOW, _HIGH = 1, 2  # rows that the stencil of a particle in the unit box can reach past the grid
 
@@ -232,3 +244,107 @@ def divergence(velocity: Tensor, spacing: float) -> Tensor:
     """
     u, v = velocity.unbind(dim=-1)
     return central_differences(u, spacing)[0] + central_differences(v, spacing)[1]
+
+
+class Stencil(NamedTuple):
+    """The nine nodes around each particle."""
+
+    weight: Tensor  # of each node [1], shape [particle, 9]; they sum to 1
+    node: Tensor  # number of the node among those of all layers, int64, shape [particle * 9]
+
+
+class ParticleGrid(nn.Module):
+    """Square cells that lie in a box as its images do: walls between two nodes, the centre in the middle.
+
+    Particles that do not mix, those of several windows or materials, each have a layer of nodes.
+
+    Args:
+        bounds: box (low, high) along x and y [length]; particles lie in it.
+        cells: cells across the wider side of the box.
+        multiple: number that divides the nodes of each axis.
+    """
+
+    axis_x: Tensor
+    axis_y: Tensor
+    low: Tensor
+    high: Tensor
+
+    def __init__(self, bounds: tuple[Pair, Pair], cells: int, *, multiple: int = 1) -> None:
+        super().__init__()
+        self.spacing = max(high - low for low, high in bounds) / cells
+        for name, (low, high) in zip(("axis_x", "axis_y"), bounds, strict=True):
+            nodes = math.ceil((high - low) / self.spacing - 1e-6) + 2
+            nodes += -nodes % multiple
+            places = (torch.arange(nodes, dtype=torch.float64) - (nodes - 1) / 2) * self.spacing
+            axis = ((low + high) / 2 + places).to(torch.float32)
+            self.register_buffer(name, axis, persistent=False)
+        self.register_buffer("low", torch.tensor(bounds)[:, 0], persistent=False)
+        self.register_buffer("high", torch.tensor(bounds)[:, 1], persistent=False)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Nodes along x and y."""
+        return len(self.axis_x), len(self.axis_y)
+
+    def stencil(self, position: Tensor, layer: Tensor) -> Stencil:
+        """Return the nodes around particles.
+
+        Args:
+            position: particle positions [length], shape [particle, 2].
+            layer: layer of each particle, int64, shape [particle].
+        """
+        columns, rows = self.shape
+        s = (position - torch.stack([self.axis_x[0], self.axis_y[0]])) / self.spacing
+        # On the far wall the third node has weight 0 and may not exist; NaN must not become an index.
+        last = s.new_tensor([columns - 3, rows - 3])
+        base = torch.floor(s.detach() - 0.5).nan_to_num(0.0).clamp(min=0.0).minimum(last)
+        f = s - base
+        b = torch.stack([0.5 * (1.5 - f) ** 2, 0.75 - (f - 1.0) ** 2, 0.5 * (f - 0.5) ** 2], dim=1)
+        weight = b[:, :, None, 0] * b[:, None, :, 1]
+        column, row = base.long().unbind(dim=1)
+        three = torch.arange(3, device=position.device)
+        corner = (layer * columns + column) * rows + row
+        node = corner[:, None, None] + (three[:, None] * rows + three)
+        return Stencil(weight.flatten(1), node.flatten())
+
+    def spread(self, stencil: Stencil, value: Tensor, layers: int) -> Tensor:
+        """Return the sums at the nodes, shape [layer, channel, x node, y node].
+
+        Args:
+            stencil: what :meth:`stencil` returned.
+            value: values of the particles, shape [particle, channel].
+            layers: number of layers.
+        """
+        columns, rows = self.shape
+        parts = (stencil.weight[:, :, None] * value[:, None]).flatten(0, 1)
+        sums = value.new_zeros(layers * columns * rows, value.shape[1]).index_add(0, stencil.node, parts)
+        return sums.view(layers, columns, rows, -1).permute(0, 3, 1, 2)
+
+    def gather(self, stencil: Stencil, field: Tensor) -> Tensor:
+        """Return a field at the particles, shape [particle, channel].
+
+        Args:
+            stencil: what :meth:`stencil` returned.
+            field: values at the nodes, shape [layer, channel, x node, y node].
+        """
+        channels = field.shape[1]
+        nodes = field.permute(0, 2, 3, 1).reshape(-1, channels).index_select(0, stencil.node)
+        return (stencil.weight[:, :, None] * nodes.view(-1, 9, channels)).sum(dim=1)
+
+    def wall_distance(self, reach: float) -> Tensor:
+        """Return the distances to left, right, bottom and top wall over a reach, within [-1, 1].
+
+        Args:
+            reach: distance beyond which a wall looks like one at it [length].
+
+        Returns:
+            Negative outside the box, shape [wall, x node, y node].
+        """
+        (left, bottom), (right, top) = self.low, self.high
+        x, y = (self.axis_x[:, None].expand(self.shape), self.axis_y.expand(self.shape))
+        distance = torch.stack([x - left, right - x, y - bottom, top - y])
+        return (distance / reach).clamp(-1.0, 1.0)
+
+    def beside_walls(self) -> Tensor:
+        """Return 1 at the two rows of nodes beside each wall, else 0, shape [wall, x node, y node]."""
+        return (self.wall_distance(self.spacing).abs() < 1.0).to(torch.float32)

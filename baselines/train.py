@@ -32,11 +32,10 @@ from lagbench.submission.budget import Track, track_of
 from lagbench.torch import Window, WindowDataset, WindowSampler, collate
 from lagbench.work.progress import Meter, Progress
 
-from .baseline import Baseline
-from .callback import TrainingCallback
+from .augmentation import check_symmetry
+from .baseline import Baseline, Facts, facts_of
 from .catalogue import find
 from .checkpoint import Checkpoint, load_weights, rounded_weights, save
-from .facts import Facts, facts_of
 from .job import STOPPED_EARLY, RunFolder, TrainingJob, TrainingRecord, default_folder, parameter_count
 from .machine import (
     bound_memory,
@@ -46,12 +45,9 @@ from .machine import (
     multiplies_bfloat16,
     threads_used,
 )
-from .module import TrainingModule
+from .module import TrainingCallback, TrainingModule, generators_kept, reseed, seed_of
 from .recipe import recipe_for
-from .seeding import generators_kept, reseed, seed_of
-from .symmetry import check_symmetry
-from .validation import validation_of
-from .windows import scenario_batch
+from .rollout import scenario_batch, scenario_paths, validation_of
 
 __all__ = [
     "TrainingResult",
@@ -428,7 +424,12 @@ def fit(job: TrainingJob, model: Baseline) -> tuple[TrainingRecord, int]:
 
 def _scenarios(job: TrainingJob) -> Iterator[NDArray[np.float32]]:
     """Yield the positions of every scenario to fit, shape [frame, particle, 2]."""
-    paths = [path for subset in job.recipe.training.windows for path in job.files(subset).values()]
+    facts, where = job.facts, {"root": job.root, "registry": job.registry}
+    paths = [
+        path
+        for subset in job.recipe.training.windows
+        for path in scenario_paths(facts.split, subset=subset, size=facts.size, **where).values()
+    ]
     job.meter.begin("fitting", total=len(paths) + 1, scenarios=len(paths))
     for path in paths:
         yield scenario_batch(path).position.transpose(0, 1).numpy()

@@ -11,8 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lagbench.baselines.baseline import Baseline, Batch
-from lagbench.baselines.facts import Facts
+from lagbench.baselines.baseline import Baseline, Batch, Facts
 
 Floats = NDArray[np.float32]
 

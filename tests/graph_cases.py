@@ -10,8 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from lagbench.baselines.baseline import Batch
-from lagbench.baselines.facts import Facts
+from lagbench.baselines.baseline import Batch, Facts
 from lagbench.baselines.loss import State
 from lagbench.baselines.operators.gns import GNS
 from lagbench.baselines.simulator import GraphNetwork

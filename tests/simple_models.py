@@ -11,9 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from lagbench.baselines import catalogue
-from lagbench.baselines.baseline import Baseline, Batch
+from lagbench.baselines.baseline import Baseline, Batch, Facts
 from lagbench.baselines.baseline import Options as Base
-from lagbench.baselines.facts import Facts
 
 State = tuple[Tensor, Tensor, int]
 

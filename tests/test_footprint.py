@@ -9,9 +9,9 @@ import pytest
 import torch
 from simple_models import FACTS, Drift, install
 
+from lagbench.baselines.baseline import Facts
 from lagbench.baselines.catalogue import find, names
 from lagbench.baselines.checkpoint import Checkpoint, restore
-from lagbench.baselines.facts import Facts
 from lagbench.errors import UnreadableFileError
 
 KNOWN = ("position_mean", "position_std", "velocity_mean", "velocity_std")

@@ -9,9 +9,8 @@ import pytest
 import torch
 from graph_cases import SMALL, batch, facts, jittered, network, oracle, rolled, swirl
 
-from lagbench.baselines.baseline import Batch
+from lagbench.baselines.baseline import Batch, facts_of
 from lagbench.baselines.catalogue import find
-from lagbench.baselines.facts import facts_of
 from lagbench.baselines.loss import TERMS, Motion, Scales, State, loss_terms
 from lagbench.baselines.operators.supergat import SuperGAT
 from lagbench.baselines.recipe import recipe_for

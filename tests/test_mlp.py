@@ -13,8 +13,8 @@ from frame_cases import batch_of, facts_of, rollout, rotations, share_of_persist
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from lagbench.baselines.baseline import Facts
 from lagbench.baselines.catalogue import find
-from lagbench.baselines.facts import Facts
 from lagbench.baselines.frame_model import FrameState
 from lagbench.baselines.mlp import MLP
 from lagbench.baselines.recipe import recipe_for

@@ -11,9 +11,16 @@ import torch
 from operator_graphs import OPERATORS, graph
 from torch import Tensor, nn
 
-from lagbench.baselines import layers
-from lagbench.baselines.layers import EdgeMLP, LayerNorm, Linear, linear, mlp
-from lagbench.baselines.network import EncodeProcessDecode, ProcessorLayer
+from lagbench.baselines import network as layers
+from lagbench.baselines.network import (
+    EdgeMLP,
+    EncodeProcessDecode,
+    LayerNorm,
+    Linear,
+    ProcessorLayer,
+    linear,
+    mlp,
+)
 from lagbench.baselines.operators.gns import GNS
 from lagbench.baselines.operators.operator import Losses, Operator
 from lagbench.baselines.operators.supergat import SuperGAT

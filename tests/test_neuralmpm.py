@@ -12,10 +12,10 @@ import torch
 from graph_cases import batch, facts, jittered, rolled, swirl
 from torch import Tensor, nn
 
+from lagbench.baselines.augmentation import image
 from lagbench.baselines.catalogue import find
 from lagbench.baselines.neuralmpm import NeuralMPM
 from lagbench.baselines.recipe import recipe_for, recipe_names
-from lagbench.baselines.symmetry import image
 from lagbench.data.registry import load
 from lagbench.errors import DataError, UsageError
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from lagbench.baselines.particle_grid import ParticleGrid
+from lagbench.baselines.torch_grid import ParticleGrid
 from lagbench.data.grid import Grid, transfer
 
 BOX = ((0.0625, 0.9375), (0.0625, 0.9375))

@@ -18,9 +18,8 @@ from simple_models import FACTS, Bursting, Drift, State, install
 from torch import Tensor
 
 from lagbench.baselines import predict as prediction
-from lagbench.baselines.baseline import Batch
+from lagbench.baselines.baseline import Batch, facts_of
 from lagbench.baselines.checkpoint import Checkpoint, save
-from lagbench.baselines.facts import facts_of
 from lagbench.baselines.job import MOST_RECORD, OVER
 from lagbench.baselines.predict import PredictionResult, UnfinishedWarning, predict
 from lagbench.baselines.rollout import as_published, roll_out, single

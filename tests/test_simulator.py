@@ -11,11 +11,11 @@ import torch
 from graph_cases import RADIUS, SMALL, batch, facts, jittered, network, oracle, rolled, swirl
 from pydantic import ValidationError
 
+from lagbench.baselines.augmentation import image
 from lagbench.baselines.loss import State, integrate
 from lagbench.baselines.operators.gat import GAT
 from lagbench.baselines.operators.gns import GNS
 from lagbench.baselines.simulator import GraphNetwork
-from lagbench.baselines.symmetry import image
 from lagbench.errors import UsageError
 
 

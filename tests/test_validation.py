@@ -14,12 +14,12 @@ import pytest
 import torch
 from simple_models import Drift, install
 
+from lagbench.baselines.baseline import facts_of
 from lagbench.baselines.checkpoint import load, restore
-from lagbench.baselines.facts import facts_of
 from lagbench.baselines.predict import predict
 from lagbench.baselines.recipe import TrainingOptions
+from lagbench.baselines.rollout import Validation
 from lagbench.baselines.train import TrainingResult, train
-from lagbench.baselines.validation import Validation
 from lagbench.data.registry import Registry
 from lagbench.errors import DataError
 from lagbench.make.generate import GenerationResult

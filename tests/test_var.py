@@ -12,9 +12,8 @@ from frame_cases import batch_of, facts_of, rollout, rotations, share_of_persist
 from numpy.typing import NDArray
 from statsmodels.tsa.api import VAR as StatsmodelsVAR
 
-from lagbench.baselines.least_squares import principal_directions, solve
 from lagbench.baselines.reproduce import var_protocol
-from lagbench.baselines.var import BLOCK, VAR, LaggedRows, StableVAR
+from lagbench.baselines.var import BLOCK, VAR, LaggedRows, StableVAR, principal_directions, solve
 from lagbench.errors import WorkFailedError
 from lagbench.make.generate import GenerationResult
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from lagbench.baselines.layers import Linear
+from lagbench.baselines.network import Linear
 
 from .operator import Losses, Operator
 

@@ -23,9 +23,9 @@ from lagbench.errors import LagbenchError, UsageError, nearest
 
 from .catalogue import FIGURES
 from .evidence import WEIGHTS
-from .mlp_studies import TABLES, make_studies
 from .runs import Plan, budget, make_run, outlook, score_committed
 from .sheet import Figure, write_sheet
+from .tables import TABLES, make_studies
 from .thesis import EXPECTED, ROSTER, Model, label
 
 __all__ = ["main", "rehearse", "reproduce"]

@@ -37,8 +37,7 @@ from .sheet import Figure, Sheet, number
 from .thesis import SECTION_4_8_3
 
 if TYPE_CHECKING:
-    from lagbench.baselines.least_squares import LeastSquares
-    from lagbench.baselines.var import LaggedRows
+    from lagbench.baselines.var import LaggedRows, LeastSquares
 
 __all__ = ["FILE", "ProtocolResult", "beside_thesis", "draw", "forecast_errors", "measure", "table"]
 
@@ -79,8 +78,7 @@ def measure(
 ) -> ProtocolResult:
     """Fit a VAR of so many lags and forecast by the thesis's protocol."""
     # torch is loaded here, so that pages of results are written without it
-    from lagbench.baselines.least_squares import solve
-    from lagbench.baselines.var import LaggedRows
+    from lagbench.baselines.var import LaggedRows, solve
 
     states = _all_states(split, size, root)
     train = int(TRAIN * len(states))
@@ -112,7 +110,7 @@ def measure(
 
 def _all_states(split: str, size: str, root: str | Path | None) -> States:
     """Return the standardised states of all frames, shape [frame, feature]."""
-    from lagbench.baselines.windows import scenario_paths
+    from lagbench.baselines.rollout import scenario_paths
 
     paths: dict[int, Path] = {}
     for subset in ("train", "valid", "test"):
