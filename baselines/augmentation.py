@@ -1,14 +1,13 @@
-"""Symmetries of the box: training windows mirrored and turned, walls and all.
+"""What training adds to its windows: images of the box's symmetries, and random-walk noise.
 
 The flow in a square box without gravity looks the same from its eight sides; with gravity a
 mirror image in x remains. A model that is trained on random images of its windows sees more
 flows than there are scenarios. The stored data and the windows stay as they are.
 
-Random-walk noise on training windows: a model learns to undo its own rollout errors.
-
-Sanchez-Gonzalez et al. (2020): the velocities of the given frames are moved by a random walk,
-the positions by its sum. The frames to predict move with the last given position, so that the
-target is the true next velocity, and the acceleration that leads to it undoes the noise.
+With noise a model learns to undo its own rollout errors (Sanchez-Gonzalez et al. 2020): the
+velocities of the given frames are moved by a random walk, the positions by its sum. The frames to
+predict move with the last given position, so that the target is the true next velocity, and the
+acceleration that leads to it undoes the noise.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from lagbench.errors import UsageError
 
 from .baseline import Batch, Pair
 
-__all__ = ["Symmetry", "check_symmetry", "draw", "image", "noisy", "random_walk"]
+__all__ = ["Symmetry", "check_symmetry"]
 
 _NORMALS = torch.tensor([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])
 """Outward normals of the walls left, right, bottom, top."""
@@ -70,16 +69,7 @@ def draw(symmetry: Symmetry, windows: int, generator: torch.Generator) -> Tensor
 
 
 def image(batch: Batch, matrix: Tensor, bounds: tuple[Pair, Pair]) -> Batch:
-    """Return each window's image about the middle of the box.
-
-    Args:
-        batch: windows; left unchanged.
-        matrix: signed permutation of the axes for each window, shape [window, 2, 2].
-        bounds: box (low, high) along x and y [length].
-
-    Raises:
-        UsageError: x and y change places in a box that is no square.
-    """
+    """Return each window's image about the middle of the box, by a signed permutation of its axes each."""
     sides = [high - low for low, high in bounds]
     if abs(sides[0] - sides[1]) > 1e-6 and bool((matrix[:, 0, 1] != 0.0).any()):
         raise UsageError(
@@ -92,7 +82,14 @@ def image(batch: Batch, matrix: Tensor, bounds: tuple[Pair, Pair]) -> Batch:
     matrix = matrix.to(batch.position)
     centre = batch.position.new_tensor([(low + high) / 2 for low, high in bounds])
     position = _turned(matrix[batch.sample][:, None], batch.position - centre) + centre
-    return replace(batch, position=position, wall_velocity=_walls(batch.wall_velocity, matrix))
+    walls = batch.wall_velocity
+    if walls is not None:  # wall k becomes the one that the image of its normal points at
+        normals = _NORMALS.to(matrix)
+        images = _turned(matrix[:, None], normals)  # of window and wall
+        origin = (images[:, None] * normals[:, None]).sum(dim=-1).argmax(dim=2)
+        walls = _turned(matrix[:, None, None], walls)
+        walls = walls.gather(2, origin[:, None, :, None].expand_as(walls))
+    return replace(batch, position=position, wall_velocity=walls)
 
 
 def _turned(matrix: Tensor, vector: Tensor) -> Tensor:
@@ -100,31 +97,11 @@ def _turned(matrix: Tensor, vector: Tensor) -> Tensor:
     return (matrix * vector.unsqueeze(-2)).sum(dim=-1)
 
 
-def _walls(velocity: Tensor | None, matrix: Tensor) -> Tensor | None:
-    """Return the walls' velocities in the image: wall k becomes the one that its normal points at."""
-    if velocity is None:
-        return None
-    normals = _NORMALS.to(matrix)
-    images = _turned(matrix[:, None], normals)  # of window and wall
-    origin = (images[:, None] * normals[:, None]).sum(dim=-1).argmax(dim=2)
-    turned = _turned(matrix[:, None, None], velocity)
-    return turned.gather(2, origin[:, None, :, None].expand_as(turned))
-
-
 def random_walk(particles: int, frames: int, std: float, generator: torch.Generator) -> Tensor:
-    """Return position noise whose last velocity has the given deviation.
+    """Return position noise [length], shape [particle, frame, 2], with the last velocity's deviation.
 
     The velocity noise is a walk of ``frames - 1`` steps of ``std / sqrt(frames - 1)`` each; the
     position noise is its sum, 0 in the first frame.
-
-    Args:
-        particles: particles P.
-        frames: frames F of the history, at least 2.
-        std: standard deviation of the last velocity, per component [length/frame].
-        generator: source of randomness; the noise is drawn on its device.
-
-    Returns:
-        Position noise [length], shape [P, F, 2].
     """
     steps = frames - 1
     shape = (particles, steps, 2)
@@ -134,14 +111,24 @@ def random_walk(particles: int, frames: int, std: float, generator: torch.Genera
 
 
 def noisy(position: Tensor, history: int, std: float, generator: torch.Generator) -> Tensor:
-    """Return windows with noise on their history; the frames after it move along.
-
-    Args:
-        position: positions of the window [length], shape [particle, frame, 2]; left unchanged.
-        history: frames given to the model, the first ones of the window.
-        std: standard deviation of the last given velocity, per component [length/frame].
-        generator: source of randomness; equal seeds give equal noise on every device.
-    """
+    """Return the positions of windows with noise on their history; the frames after it move along."""
     walk = random_walk(len(position), history, std, generator).to(position)
     after = walk[:, -1:].expand(-1, position.shape[1] - history, -1)
     return position + torch.cat([walk, after], dim=1)
+
+
+def disturbed(
+    batch: Batch,
+    generator: torch.Generator,
+    *,
+    symmetry: Symmetry,
+    bounds: tuple[Pair, Pair],
+    history: int,
+    noise_std: float,
+) -> Batch:
+    """Return the batch as its random image, with noise."""
+    if symmetry is not Symmetry.NONE:
+        batch = image(batch, draw(symmetry, batch.windows, generator), bounds)
+    if noise_std > 0.0:
+        batch = replace(batch, position=noisy(batch.position, history, noise_std, generator))
+    return batch

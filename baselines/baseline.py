@@ -21,14 +21,14 @@ from torch import Tensor, nn
 
 from lagbench.data.layout import dataset_folder
 from lagbench.data.local import locate, remedy
-from lagbench.data.manifest import Manifest, read_manifest
-from lagbench.data.registry import Registry, Size
+from lagbench.data.manifest import read_manifest
+from lagbench.data.registry import Registry
 from lagbench.data.scenario import read_scenario
 from lagbench.errors import DataError, UsageError
 from lagbench.store.copy import bring
 from lagbench.torch import Batch
 
-__all__ = ["Baseline", "Batch", "Facts", "Options", "facts_of"]
+__all__ = ["Baseline", "Batch", "Facts", "Options", "check_moving_walls", "facts_of", "last_velocities"]
 
 
 class Options(BaseModel):
@@ -111,6 +111,32 @@ class Baseline(nn.Module):
         """Advance by one frame: the next state and positions [length], shape [particle, 2]."""
 
 
+def last_velocities(position: Tensor, count: int) -> Tensor:
+    """Return the last velocities [length/frame], shape [particle, count, 2], oldest first, of given frames.
+
+    Where the frames are few, the first velocity repeats.
+    """
+    velocity = position[:, -count - 1 :].diff(dim=1)
+    if not velocity.shape[1]:
+        raise UsageError(
+            "too few frames to start from", expected=f"2 or more, {count + 1} for all", got=position.shape[1]
+        )
+    missing = count - velocity.shape[1]
+    return torch.cat([velocity[:, :1].expand(-1, missing, -1), velocity], dim=1)
+
+
+def check_moving_walls(asked: bool, facts: Facts) -> None:
+    """Refuse a model that wants the velocities of walls where none moves."""
+    if asked and not facts.moving_walls:
+        raise UsageError(
+            f"the walls of {facts.split} do not move",
+            where="model.wall_velocity",
+            expected=False,
+            got=True,
+            fix="leave the option out",
+        )
+
+
 # Checked where facts are read from a file, which may be a stranger's: names are no paths.
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -154,17 +180,34 @@ def facts_of(
     split: str, size: str | None = None, *, root: str | Path | None = None, registry: Registry | None = None
 ) -> Facts:
     """Return the public figures of a generated data set."""
-    tier, folder, _ = locate(split, size, root=root, registry=registry)
-    bring(tier, folder)
-    manifest = read_manifest(folder, tier.split, tier.name, tier.major)
+    tier, home, _ = locate(split, size, root=root, registry=registry)
+    folder = dataset_folder(home, tier.split, tier.name, tier.major)
+
+    def absent(what: str) -> DataError:
+        return DataError(what, where=str(folder), fix=remedy(tier, root=home))
+
+    bring(tier, home)
+    manifest = read_manifest(home, tier.split, tier.name, tier.major)
     if manifest is None:
-        raise _absent(tier, folder, "the data set is not generated")
-    task = tier.task
+        raise absent("the data set is not generated")
+    # what is here; where some subset is missing, what was recorded
+    task, measured = tier.task, tier.measured
+    known = manifest.dataset_sha256 or (measured.dataset_sha256 if measured else None)
+    statistics = manifest.statistics or (measured.statistics if measured else {})
+    if known is None:
+        raise absent("the data set is not complete")
+    if not manifest.files:
+        raise absent("the data set is empty")
+    if not statistics:
+        raise absent("the subset train is not complete, its statistics are unknown")
+    bring(tier, home, [manifest.files[0].scenario])
+    with read_scenario(folder / manifest.files[0].path) as file:
+        moving_walls = "wall_velocity" in file.variables
     return Facts(
         split=tier.split,
         size=tier.name,
         version=tier.version,
-        dataset_sha256=_hash(tier, manifest, folder),
+        dataset_sha256=known,
         particles=tier.particles,
         bounds=tier.bounds,
         radius=task.radius,
@@ -173,41 +216,6 @@ def facts_of(
         score_cells=task.score_grid.cells,
         score_placement=task.score_grid.placement,
         frame_interval=tier.frame_interval,
-        moving_walls=_moving_walls(tier, manifest, folder),
-        statistics=_statistics(tier, manifest, folder),
+        moving_walls=moving_walls,
+        statistics={name: (float(x), float(y)) for name, (x, y) in statistics.items()},
     )
-
-
-def _absent(size: Size, root: Path, what: str) -> DataError:
-    return DataError(
-        what,
-        where=str(dataset_folder(root, size.split, size.name, size.major)),
-        fix=remedy(size, root=root),
-    )
-
-
-def _hash(size: Size, manifest: Manifest, root: Path) -> str:
-    """Return the hash of what is here; where some subset is missing, the recorded one."""
-    recorded = size.measured.dataset_sha256 if size.measured else None
-    known = manifest.dataset_sha256 or recorded
-    if known is None:
-        raise _absent(size, root, "the data set is not complete")
-    return known
-
-
-def _statistics(size: Size, manifest: Manifest, root: Path) -> dict[str, Pair]:
-    """Return mean and std over train: measured here, else the recorded ones."""
-    recorded = size.measured.statistics if size.measured else {}
-    found = manifest.statistics or recorded
-    if not found:
-        raise _absent(size, root, "the subset train is not complete, its statistics are unknown")
-    return {name: (float(x), float(y)) for name, (x, y) in found.items()}
-
-
-def _moving_walls(size: Size, manifest: Manifest, root: Path) -> bool:
-    if not manifest.files:
-        raise _absent(size, root, "the data set is empty")
-    folder = dataset_folder(root, size.split, size.name, size.major)
-    bring(size, root, [manifest.files[0].scenario])
-    with read_scenario(folder / manifest.files[0].path) as file:
-        return "wall_velocity" in file.variables

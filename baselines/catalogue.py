@@ -19,10 +19,9 @@ from lagbench.errors import LagbenchError, UsageError, nearest
 
 from .baseline import Baseline
 
-__all__ = ["GROUP", "Entry", "every_entry", "find", "names"]
+__all__ = ["Entry", "find", "names"]
 
 GROUP = "lagbench.baselines"
-"""Entry points of this group name a baseline and its class; ours register the same way."""
 
 OWN = "lagbench.baselines."
 RECIPES = Path(__file__).parent / "recipes"

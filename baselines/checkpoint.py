@@ -5,10 +5,9 @@ A file of ``torch.save`` with plain entries: ``lagbench_checkpoint`` (format num
 and, for resuming, ``optimizer``. It is read with ``weights_only=True``: a file with any other
 object in it, which unpickling would run, is refused.
 
-How large a model would be, told before it takes any memory.
-
 Options come with a checkpoint, which may be a stranger's: a few bytes of text can ask for a model
-of any size. Built on torch's device ``meta``, it has shapes and no numbers.
+of any size. How large it would be is told before it takes any memory: built on torch's device
+``meta``, it has shapes and no numbers.
 """
 
 from __future__ import annotations
@@ -39,16 +38,7 @@ from lagbench.errors import DataError, LagbenchError, UnreadableFileError, WorkF
 from .baseline import Baseline, Facts, facts_of
 from .catalogue import find
 
-__all__ = [
-    "check_footprint",
-    "Checkpoint",
-    "check_data",
-    "load",
-    "load_weights",
-    "restore",
-    "rounded_weights",
-    "save",
-]
+__all__ = ["Checkpoint", "check_data", "load", "load_weights", "restore", "rounded_weights", "save"]
 
 
 SPARE = 2**20
@@ -70,11 +60,15 @@ def check_footprint(
 
     A model that cannot be built without numbers, as a stranger's baseline may be, passes.
     """
-    held = _bytes_held(weights)
+    stored = {  # tensors that share their bytes count once
+        value.untyped_storage().data_ptr(): value.untyped_storage().nbytes() // value.element_size()
+        for value in weights.values()
+    }
+    held = sum(stored.values())
     try:
         with _parts_bound(len(weights) + PARTS), torch.device("meta"):
             built = model.build(options, facts)
-        asked = _numbers(built)
+        asked = sum(one.numel() for one in chain(built.parameters(), built.buffers()) if not is_lazy(one))
     except _TooManyPartsError as error:
         raise _too_large(where, f"weights for {len(weights)} tensors", f"options for {error}") from None
     except (RuntimeError, TypeError) as error:
@@ -87,20 +81,6 @@ def check_footprint(
 
 class _TooManyPartsError(Exception):
     """More parameters than the file has tensors."""
-
-
-def _bytes_held(weights: Mapping[str, Tensor]) -> int:
-    """Return how many numbers a file holds: tensors that share their bytes count once."""
-    stored = {
-        value.untyped_storage().data_ptr(): value.untyped_storage().nbytes() // value.element_size()
-        for value in weights.values()
-    }
-    return sum(stored.values())
-
-
-def _numbers(model: nn.Module) -> int:
-    tensors = chain(model.parameters(), model.buffers())
-    return sum(tensor.numel() for tensor in tensors if not is_lazy(tensor))
 
 
 @contextmanager
@@ -189,7 +169,15 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
     if checkpoint.optimizer is not None:
         content["optimizer"] = dict(checkpoint.optimizer)
     with atomic_path(path, option="--output") as temporary:
-        _write(temporary, content, path)
+        try:
+            torch.save(content, temporary)
+        except RuntimeError as error:  # torch's name for whatever the operating system refuses
+            raise WorkFailedError(
+                "cannot write there",
+                where=str(path),
+                got=str(error).split("\n")[0][:200],
+                fix="free disk space, or name a folder that you may write to: --output",
+            ) from error
 
 
 def load(path: str | Path) -> Checkpoint:
@@ -201,16 +189,29 @@ def load(path: str | Path) -> Checkpoint:
             raise _unfit(file, f"format {FORMAT}", f"format {content[KEY]!r}")
         about = json.loads(content["about"])
         _Training.model_validate(about["training"])
+        weights = content["weights"]
+        if not isinstance(weights, Mapping):
+            raise TypeError("weights are no mapping")
+        for name, value in weights.items():
+            if not isinstance(name, str) or not isinstance(value, Tensor) or not _is_plain(value):
+                raise TypeError(f"weight {name!r} is no tensor of plain numbers that the file holds")
         return Checkpoint(
             baseline=str(about["baseline"]),
             options=dict(about["options"]),
             facts=Facts.from_json(about["facts"]),
-            weights=_tensors(content["weights"]),
+            weights=dict(weights),
             training=dict(about["training"]),
             optimizer=content.get("optimizer"),
         )
     except (KeyError, TypeError, ValueError, RecursionError) as error:
         raise _unfit(file, SAFE, f"{type(error).__name__}: {' '.join(str(error).split())[:200]}") from None
+
+
+def _is_plain(value: Tensor) -> bool:
+    """Tell whether a tensor is dense and real, and no larger than the bytes behind it."""
+    if value.layout is not torch.strided or value.is_quantized or value.is_complex() or value.is_meta:
+        return False
+    return value.numel() * value.element_size() <= value.untyped_storage().nbytes()
 
 
 def restore(checkpoint: Checkpoint, *, where: str = "the checkpoint") -> Baseline:
@@ -327,34 +328,6 @@ def _content(file: Path) -> dict[str, Any]:
     if not isinstance(content, dict) or KEY not in content:
         raise _unfit(file, SAFE, type(content).__name__)
     return content
-
-
-def _write(path: Path, content: Mapping[str, Any], target: Path) -> None:
-    try:
-        torch.save(content, path)
-    except RuntimeError as error:  # torch's name for whatever the operating system refuses
-        raise WorkFailedError(
-            "cannot write there",
-            where=str(target),
-            got=str(error).split("\n")[0][:200],
-            fix="free disk space, or name a folder that you may write to: --output",
-        ) from error
-
-
-def _tensors(values: object) -> dict[str, Tensor]:
-    if not isinstance(values, Mapping):
-        raise TypeError("weights are no mapping")
-    for name, value in values.items():
-        if not isinstance(name, str) or not isinstance(value, Tensor) or not _held(value):
-            raise TypeError(f"weight {name!r} is no tensor of plain numbers that the file holds")
-    return dict(values)
-
-
-def _held(value: Tensor) -> bool:
-    """Tell whether a tensor is dense and real, and no larger than the bytes behind it."""
-    if value.layout is not torch.strided or value.is_quantized or value.is_complex() or value.is_meta:
-        return False
-    return value.numel() * value.element_size() <= value.untyped_storage().nbytes()
 
 
 def _unfit(file: Path, expected: str, got: str) -> LagbenchError:

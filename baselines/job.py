@@ -33,13 +33,12 @@ from .recipe import Recipe
 
 __all__ = [
     "OVER",
-    "STOPPED_EARLY",
-    "TrainingRecord",
-    "versions",
     "RunFolder",
+    "STOPPED_EARLY",
+    "TrainingJob",
+    "TrainingRecord",
     "default_folder",
     "first_difference",
-    "TrainingJob",
     "parameter_count",
 ]
 
@@ -172,51 +171,44 @@ class RunFolder:
         left = [file for file in (self.checkpoint, self.weights, self.record) if file.exists()]
         if fresh or not left:
             return None
+        where, asked = str(self.path), recipe.as_json()
+        taken = UsageError(
+            "the folder holds a training",
+            where=where,
+            fix="go on with --resume, train anew with --fresh, or name another --output",
+        )
         if self.checkpoint not in left:
-            if resume and self.weights not in left:  # it failed before there was anything to keep
+            if not resume:
+                raise taken
+            if self.weights not in left:  # it failed before there was anything to keep
                 return None
-            raise self._without_checkpoint(recipe) if resume else self._taken()
+            said = self._recorded()  # no training can go on from these weights, and none may replace them
+            over = said.get("recipe") == asked and said.get("state") in OVER
+            instead = "predict from its weights" if over else "name another folder with --output"
+            lacking = "the folder holds weights, and no checkpoint to go on from"
+            raise UsageError(
+                "the training is finished" if over else lacking,
+                where=where,
+                got=f"{self.weights.name} without {self.checkpoint.name}",
+                fix=f"{instead}, or train anew with --fresh",
+            )
         found = load(self.checkpoint)
-        if found.training.get("recipe") != recipe.as_json():
+        if found.training.get("recipe") != asked:
             raise UsageError(
                 "the folder holds a training with another recipe",
-                where=str(self.path),
-                expected=first_difference(recipe.as_json(), found.training.get("recipe")),
+                where=where,
+                expected=first_difference(asked, found.training.get("recipe")),
                 fix="name another folder with --output, or train anew with --fresh",
             )
         if not resume:
-            raise self._taken()
+            raise taken
         return found
-
-    def _taken(self) -> UsageError:
-        return UsageError(
-            "the folder holds a training",
-            where=str(self.path),
-            fix="go on with --resume, train anew with --fresh, or name another --output",
-        )
-
-    def _without_checkpoint(self, recipe: Recipe) -> UsageError:
-        """Return the error for weights that no training can go on from, and that none may replace."""
-        said = self._recorded()
-        over = said.get("recipe") == recipe.as_json() and said.get("state") in OVER
-        return UsageError(
-            "the training is finished"
-            if over
-            else "the folder holds weights, and no checkpoint to go on from",
-            where=str(self.path),
-            got=f"{self.weights.name} without {self.checkpoint.name}",
-            fix=("predict from its weights, " if over else "name another folder with --output, ")
-            + "or train anew with --fresh",
-        )
 
     def unfinished(self, trained: Mapping[str, Any]) -> tuple[int, int] | None:
         """Return step and steps of a training that is not over, by its record.
 
         None where it is over, where there is no record, and where the record is that of another recipe
-        than the weights' own.
-
-        Args:
-            trained: what the weights say of their training.
+        than the one that the weights say they were trained by.
         """
         said = self._recorded()
         step, steps = said.get("step"), said.get("steps")

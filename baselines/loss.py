@@ -20,18 +20,7 @@ from lagbench.data.grid import Grid
 
 from .torch_grid import Fields, counted_nodes, fields, node_velocity, transfer
 
-__all__ = [
-    "Motion",
-    "State",
-    "integrate",
-    "GRID_TERMS",
-    "PARTICLE_TERMS",
-    "TERMS",
-    "LossNorm",
-    "Scales",
-    "loss_terms",
-    "mean_norm",
-]
+__all__ = ["LossNorm", "Motion", "Scales", "State", "integrate", "loss_terms"]
 
 
 class Motion(NamedTuple):
@@ -66,16 +55,7 @@ class State:
 
 
 def integrate(position: Tensor, velocity: Tensor, acceleration: Tensor) -> tuple[Tensor, Tensor]:
-    """Advance by semi-implicit Euler: ``v' = v + a, x' = x + v'``, time in frames.
-
-    Args:
-        position: x [length], shape [particle, 2].
-        velocity: v [length/frame], shape [particle, 2].
-        acceleration: a [length/frame^2], shape [particle, 2].
-
-    Returns:
-        x' and v'.
-    """
+    """Return x' and v' after a step of semi-implicit Euler: ``v' = v + a, x' = x + v'``, time in frames."""
     velocity = velocity + acceleration
     return position + velocity, velocity
 
@@ -107,12 +87,9 @@ class Scales(NamedTuple):
 
 
 def mean_norm(error: Tensor, norm: LossNorm, count: Tensor | int | None = None) -> Tensor:
-    """Return ``(1/N) sum_i ||e_i||_p``, 0 = perfect; components are summed (Eqs. 5.29-5.34).
+    """Return ``(1/N) sum_i ||e_i||_p`` of normalised errors, shape [..., component] (Eqs. 5.29-5.34).
 
-    Args:
-        error: normalised errors [1], shape [..., component].
-        norm: L2 squares, L1 takes absolute values.
-        count: particles or nodes N; those of the array by default.
+    0 is perfect; N counts particles or nodes, by default those of the array.
     """
     each = error**2 if norm is LossNorm.L2 else error.abs()
     return each.sum() / (each[..., 0].numel() if count is None else count)
@@ -128,36 +105,12 @@ def loss_terms(
     norm: LossNorm,
     weights: Mapping[str, float],
 ) -> dict[str, Tensor]:
-    """Return the six terms, raw; those of weight 0 without a graph.
-
-    Args:
-        predicted: predicted frame.
-        target: true frame.
-        sample: window of each particle, ascending, int64, shape [particle].
-        grid: grid of density, divergence and vorticity.
-        scales: deviations that make the errors dimensionless.
-        norm: L1 or L2.
-        weights: weight of each term; missing ones are 1.
-    """
+    """Return the six terms, raw; those of weight 0 without a graph. Missing weights are 1."""
     terms = {}
     for name in PARTICLE_TERMS:
         with _graph(weights, name):
             error = getattr(predicted, name) - getattr(target, name)
             terms[name] = mean_norm(error / getattr(scales, name), norm)
-    with _graph(weights, *GRID_TERMS):
-        true, own = _fields(predicted, target, sample, grid)
-    with _graph(weights, "density"):
-        terms["density"] = mean_norm((own.density - true.density).unsqueeze(-1), norm)
-    count = true.differentiable.sum().clamp(min=1)
-    for name in ("divergence", "vorticity"):
-        with _graph(weights, name):
-            error = (getattr(own, name) - getattr(true, name)) / scales.speed
-            terms[name] = mean_norm(error.unsqueeze(-1), norm, count)
-    return terms
-
-
-def _fields(predicted: Motion, target: Motion, sample: Tensor, grid: Grid) -> tuple[Fields, Fields]:
-    """Return the fields of truth and prediction, both at the nodes that count in the truth."""
     windows = int(sample[-1]) + 1
     with torch.no_grad():
         sums = transfer(target.position, target.velocity, grid, sample=sample, windows=windows)
@@ -166,16 +119,24 @@ def _fields(predicted: Motion, target: Motion, sample: Tensor, grid: Grid) -> tu
         full = float((sums.weight**2).sum() / sums.weight.sum())
         velocity = node_velocity(sums, full)
         true = Fields(grid, sums.weight, velocity, counted_nodes(sums.weight, full), full)
-    own = fields(
-        predicted.position,
-        predicted.velocity,
-        grid,
-        full=full,
-        sample=sample,
-        windows=windows,
-        counted=true.counted,
-    )
-    return true, own
+    with _graph(weights, *GRID_TERMS):  # the prediction's fields at the nodes that count in the truth
+        own = fields(
+            predicted.position,
+            predicted.velocity,
+            grid,
+            full=full,
+            sample=sample,
+            windows=windows,
+            counted=true.counted,
+        )
+    with _graph(weights, "density"):
+        terms["density"] = mean_norm((own.density - true.density).unsqueeze(-1), norm)
+    count = true.differentiable.sum().clamp(min=1)
+    for name in ("divergence", "vorticity"):
+        with _graph(weights, name):
+            error = (getattr(own, name) - getattr(true, name)) / scales.speed
+            terms[name] = mean_norm(error.unsqueeze(-1), norm, count)
+    return terms
 
 
 def _graph(weights: Mapping[str, float], *names: str) -> torch.set_grad_enabled:

@@ -1,11 +1,8 @@
-"""A baseline as pytorch-lightning trains it: one loss, one optimiser, seeded steps.
+"""A baseline as pytorch-lightning trains it: seeded steps, and what happens between them.
 
-What happens between the steps of a training: look, validate, store, stop.
-
-Random numbers of a training as a function of seed, step and process, and of nothing else.
-
-No state of any generator has to be stored: a training that was interrupted draws, at every
-step, what an uninterrupted one draws there, whatever happened in between.
+Random numbers are a function of seed, step and process, and of nothing else, so that no state of
+any generator has to be stored: a training that was interrupted draws, at every step, what an
+uninterrupted one draws there, whatever happened in between.
 """
 
 from __future__ import annotations
@@ -37,15 +34,7 @@ from .machine import return_memory
 from .recipe import TrainingOptions
 from .rollout import Validation
 
-__all__ = [
-    "TOTAL",
-    "TrainingCallback",
-    "TrainingModule",
-    "generators_kept",
-    "reseed",
-    "seed_of",
-    "weighted_sum",
-]
+__all__ = ["TrainingCallback", "TrainingModule", "generators_kept", "reseed", "seed_of"]
 
 TOTAL = "total"
 """Name of the weighted sum among the loss terms."""
@@ -199,11 +188,20 @@ class TrainingCallback(Callback):
         self.ledger.stepped(step, batch=recipe.batch * trainer.world_size, windows=self.windows)
         last = step >= steps
         if last or step % recipe.log_every == 0 or step == 1:
-            self._log(trainer, trained)
+            terms = self.ledger.loss = {name: float(value) for name, value in trained.terms.items()}
+            if not math.isfinite(terms[TOTAL]) and trainer.world_size == 1:
+                raise trained.not_finite()
+            self.job.meter.stage = f"loss {terms[TOTAL]:.3g}"
+            if trainer.logger is not None:
+                values = {f"loss/{name}": value for name, value in terms.items()}
+                trainer.logger.log_metrics({**values, "learning_rate": trained.learning_rate}, step=step)
             return_memory()
         self.job.meter.count(1, scenarios=1)
-        if self.validation is not None and self._is_due(trained, self.validation):
-            self._validate(trainer, trained, self.validation)
+        if self.validation is not None:
+            predicted = recipe.batch * trained.model.future, sum(self.validation.frames.values())
+            count = recipe.validations(steps, trained=predicted[0], rolled=predicted[1])
+            if recipe.is_validated(step, steps=steps, validations=count):
+                self._validate(trainer, trained, self.validation)
         stop = trainer.strategy.reduce_boolean_decision(self._interrupted, all=False)
         if stop or trainer.should_stop or last:
             over = last or self.ledger.state == STOPPED_EARLY
@@ -233,22 +231,6 @@ class TrainingCallback(Callback):
         if self._interrupted:
             raise KeyboardInterrupt
         self._interrupted = True
-
-    def _log(self, trainer: Trainer, module: TrainingModule) -> None:
-        self.ledger.loss = {name: float(value) for name, value in module.terms.items()}
-        if not math.isfinite(self.ledger.loss[TOTAL]) and trainer.world_size == 1:
-            raise module.not_finite()
-        self.job.meter.stage = f"loss {self.ledger.loss[TOTAL]:.3g}"
-        if trainer.logger is not None:
-            values = {f"loss/{name}": value for name, value in self.ledger.loss.items()}
-            trainer.logger.log_metrics({**values, "learning_rate": module.learning_rate}, step=module.step)
-
-    def _is_due(self, module: TrainingModule, validation: Validation) -> bool:
-        """Return whether the step is followed by a validation."""
-        recipe, model = module.recipe, module.model
-        trained, rolled = recipe.batch * model.future, sum(validation.frames.values())
-        count = recipe.validations(self.steps, trained=trained, rolled=rolled)
-        return recipe.is_validated(module.step, steps=self.steps, validations=count)
 
     def _validate(self, trainer: Trainer, module: TrainingModule, validation: Validation) -> None:
         """Validate in the first process; all act on what it finds."""

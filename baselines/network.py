@@ -16,17 +16,7 @@ from torch import Tensor, nn
 
 from lagbench.baselines.operators.operator import Losses, Operator, summed
 
-__all__ = [
-    "EdgeMLP",
-    "EncodeProcessDecode",
-    "LayerNorm",
-    "Linear",
-    "ProcessorLayer",
-    "Recomputed",
-    "edge_map",
-    "linear",
-    "mlp",
-]
+__all__ = ["EdgeMLP", "EncodeProcessDecode", "Linear"]
 
 
 class ProcessorLayer(nn.Module):
@@ -55,14 +45,7 @@ class ProcessorLayer(nn.Module):
     def forward(
         self, node: Tensor, edge_index: Tensor, edge: Tensor, generator: torch.Generator | None = None
     ) -> tuple[Tensor, Tensor, Losses]:
-        """Return updated nodes and edges and the operator's own losses.
-
-        Args:
-            node: node latents, shape [particle, latent].
-            edge_index: senders and receivers, shape [2, edge].
-            edge: edge latents, shape [edge, latent].
-            generator: source of whatever the operator draws.
-        """
+        """Return updated nodes and edges and the operator's own losses."""
         message = self.message(edge, node, edge_index)
         given = node
         if self.sum_messages and self.operator.reads_nodes:
@@ -112,17 +95,7 @@ class EncodeProcessDecode(nn.Module):
     def forward(
         self, node: Tensor, edge_index: Tensor, edge: Tensor, generator: torch.Generator | None = None
     ) -> tuple[Tensor, Losses]:
-        """Return the prediction and the operators' own losses, layer means.
-
-        Args:
-            node: particle features, shape [particle, node_features].
-            edge_index: senders and receivers, shape [2, edge].
-            edge: edge features, shape [edge, edge_features].
-            generator: source of whatever the operators draw in training.
-
-        Returns:
-            Prediction, shape [particle, outputs]; losses by name, empty for most operators.
-        """
+        """Return the prediction, shape [particle, outputs], and the operators' own losses, layer means."""
         given = node.dtype
         node, edge = self.node_encoder(node), self.edge_encoder(edge)
         losses: list[Losses] = []
@@ -165,13 +138,7 @@ def _product(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
 
 
 def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
-    r"""Return :math:`x W^T + b`, as ``torch.nn.functional.linear`` does.
-
-    Args:
-        x: rows, shape [row, input].
-        weight: shape [output, input].
-        bias: shape [output].
-    """
+    """Return ``x W^T + b``, as ``torch.nn.functional.linear`` does; shapes [row, input], [output, input]."""
     if _fast(x, weight):
         product: Tensor = _OneDNNLinear.apply(x, weight, bias)  # type: ignore[no-untyped-call]
         return product
@@ -221,15 +188,10 @@ PIECE = 8192
 def edge_map(
     rest: nn.Module, edge_index: Tensor, edge: Tensor, sender: Tensor, receiver: Tensor, weight: Tensor
 ) -> Tensor:
-    r"""Return :math:`f(s_j + r_i + W_e e_{ij})`, shape [edge, output].
+    """Return ``f(s_j + r_i + W_e e_ij)``, shape [edge, output].
 
-    Args:
-        rest: f, from the first hidden layer on.
-        edge_index: senders and receivers, shape [2, edge].
-        edge: edge latents, shape [edge, latent].
-        sender: first layer of each particle as a sender, shape [particle, hidden].
-        receiver: first layer of each particle as a receiver, shape [particle, hidden].
-        weight: W_e, shape [hidden, latent].
+    f is the rest of an MLP from its first hidden layer on; s and r, shape [particle, hidden], are that
+    layer of each particle as a sender and as a receiver.
     """
     hidden = _gathered(edge_index, sender, receiver)
     hidden += linear(edge, weight)  # In place: an edge tensor of a full scenario is 32 MB.
@@ -318,24 +280,14 @@ class EdgeMLP(nn.Module):
         self.rest = nn.Sequential(nn.ReLU(inplace=True), *mlp([hidden, hidden, latent]))
 
     def forward(self, edge: Tensor, node: Tensor, edge_index: Tensor) -> Tensor:
-        """Return the update of each edge, shape [edge, latent].
-
-        Args:
-            edge: edge latents, shape [edge, latent].
-            node: node latents, shape [particle, latent].
-            edge_index: senders and receivers, shape [2, edge].
-        """
+        """Return the update of each edge, shape [edge, latent]."""
         of_edge, of_receiver, of_sender = self.first.weight.tensor_split(3, dim=1)
         ends = linear(node, of_sender), linear(node, of_receiver, self.first.bias)
-        large = edge.device.type == "cpu" and self._bytes(edge) > LARGEST_KEPT
-        if large and not torch.compiler.is_compiling():
+        mixed = torch.is_autocast_enabled(edge.device.type)
+        dtype = torch.get_autocast_dtype(edge.device.type) if mixed else edge.dtype
+        kept = len(edge) * self.first.out_features * dtype.itemsize
+        if edge.device.type == "cpu" and kept > LARGEST_KEPT and not torch.compiler.is_compiling():
             tensors = edge_index, edge, *ends, of_edge, *self.rest.parameters()
             update: Tensor = Recomputed.apply(self.rest, *tensors)  # type: ignore[no-untyped-call]
             return update
         return edge_map(self.rest, edge_index, edge, *ends, of_edge)
-
-    def _bytes(self, edge: Tensor) -> int:
-        device = edge.device.type
-        mixed = torch.is_autocast_enabled(device)
-        dtype = torch.get_autocast_dtype(device) if mixed else edge.dtype
-        return len(edge) * self.first.out_features * dtype.itemsize

@@ -1,13 +1,9 @@
 """Rollouts: a model fed with its own predictions, frozen where it ceases to be finite or leaves for far.
 
-One function serves validation during training and the predictions that are scored.
-
-Whole scenarios as batches, for rollouts and validation; training windows are `lagbench.torch`'s.
-
-Validation: rollouts of every scenario of ``valid`` while a model is trained, by the metric that ranks.
-
-The files, the metric and its rounding are the scorer's: were ``valid`` the test subset, the score card
-would have the same digits. ``test`` is never read.
+One function serves the predictions that are scored and validation while a model is trained: rollouts
+of every scenario of ``valid`` by the metric that ranks. Files, metric and its rounding are the
+scorer's: were ``valid`` the test subset, the score card would have the same digits. ``test`` is
+never read. Scenarios come whole, as batches; training windows are `lagbench.torch`'s.
 """
 
 from __future__ import annotations
@@ -39,16 +35,7 @@ from lagbench.torch import Window, collate, tensors
 from .baseline import Baseline, Batch
 from .job import TrainingJob
 
-__all__ = [
-    "Rollout",
-    "Validation",
-    "as_published",
-    "roll_out",
-    "scenario_batch",
-    "scenario_paths",
-    "single",
-    "validation_of",
-]
+__all__ = ["Rollout", "Validation", "roll_out", "scenario_batch", "scenario_paths", "validation_of"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,13 +58,18 @@ def roll_out(model: Baseline, given: Batch, frames: int) -> list[Rollout]:
     was_training = model.training
     model.eval()
     try:
-        found = _together(model, given, frames)
-        if found is None:
-            parts = [single(given, window) for window in range(given.windows)]
-            return [_alone(model, part, frames) for part in parts]
-        return found
+        if given.windows == 1:
+            return [_alone(model, given, frames)]
+        predicted, finite = _advance(model, given, frames)
+        if finite < frames:
+            return [_alone(model, single(given, window), frames) for window in range(given.windows)]
     finally:
         model.train(was_training)
+    sample = given.sample.cpu()
+    return [
+        Rollout(scenario=int(scenario), position=predicted[:, sample == window], diverged_at=None)
+        for window, scenario in enumerate(given.scenario)
+    ]
 
 
 def single(batch: Batch, window: int) -> Batch:
@@ -92,20 +84,6 @@ def single(batch: Batch, window: int) -> Batch:
         scenario=batch.scenario[window : window + 1],
         frame=batch.frame[window : window + 1],
     )
-
-
-def _together(model: Baseline, given: Batch, frames: int) -> list[Rollout] | None:
-    """Return the rollouts of all windows; None where one of several diverges."""
-    if given.windows == 1:
-        return [_alone(model, given, frames)]
-    predicted, finite = _advance(model, given, frames)
-    if finite < frames:
-        return None
-    sample = given.sample.cpu()
-    return [
-        Rollout(scenario=int(scenario), position=predicted[:, sample == window], diverged_at=None)
-        for window, scenario in enumerate(given.scenario)
-    ]
 
 
 def _alone(model: Baseline, given: Batch, frames: int) -> Rollout:
@@ -150,8 +128,27 @@ def as_published(model: nn.Module) -> Iterator[None]:
 
 
 def scenario_batch(paths: Path | Sequence[Path], frames: slice = slice(None)) -> Batch:
-    """Return the same frames of one or several whole scenarios, for rollouts and validation."""
-    return collate([_read(path, frames) for path in ([paths] if isinstance(paths, Path) else paths)])
+    """Return the same frames of one or several whole scenarios, read without a cache."""
+    windows: list[Window] = []
+    for path in [paths] if isinstance(paths, Path) else paths:
+        with read_scenario(path) as file:
+            numbers = range(file.header.frames)[frames]
+            if not numbers or numbers.step != 1:
+                raise UsageError(
+                    "no consecutive frames",
+                    where=str(path),
+                    expected=f"frames of 0:{file.header.frames}",
+                    got=frames,
+                )
+            run = slice(numbers.start, numbers.stop)
+            held = file.variables
+            position = file.read("position", run)
+            material = file.read("material") if "material" in held else np.zeros(position.shape[1], np.int8)
+            # The forcing is given for all frames, so that a rollout from these knows what comes.
+            walls = file.read("wall_velocity", slice(run.start, None)) if "wall_velocity" in held else None
+            scenario = file.header.key.scenario
+            windows.append(tensors(window_of(list(position), material, walls, scenario, numbers.start)))
+    return collate(windows)
 
 
 def scenario_paths(
@@ -165,26 +162,6 @@ def scenario_paths(
     """Return the files of a subset by scenario id; all of them exist."""
     entry, folder, _ = locate(split, size, root=root, registry=registry)
     return {i: source.path for i, source in sources_of(entry, (subset,), folder).items()}
-
-
-def _read(path: Path, frames: slice) -> Window:
-    """Read frames of one file without a cache."""
-    with read_scenario(path) as file:
-        numbers = range(file.header.frames)[frames]
-        if not numbers or numbers.step != 1:
-            raise UsageError(
-                "no consecutive frames",
-                where=str(path),
-                expected=f"frames of 0:{file.header.frames}",
-                got=frames,
-            )
-        run = slice(numbers.start, numbers.stop)
-        held = file.variables
-        position = file.read("position", run)
-        material = file.read("material") if "material" in held else np.zeros(position.shape[1], np.int8)
-        # The forcing is given for all frames, so that a rollout from these knows what comes.
-        walls = file.read("wall_velocity", slice(run.start, None)) if "wall_velocity" in held else None
-        return tensors(window_of(list(position), material, walls, file.header.key.scenario, numbers.start))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -218,19 +195,15 @@ class Validation:
                 paths = [self.task.truth.path(i) for i in group]
                 given = scenario_batch(paths, slice(0, self.task.setting.input_frames)).to(device)
                 for rollout in roll_out(model, given, max(self.frames[i] for i in group)):
-                    tallies[rollout.scenario] = self._measured(rollout)
+                    with self.task.opened(rollout.scenario) as truth:
+                        scenario, frames = truth.scenario, self.task.setting.predicted_frames
+                        predicted = snapshots(scenario, rollout.position.numpy())
+                        states = zip(frames, predicted, truth.snapshots(), strict=False)
+                        pairs = (FramePair(scenario, frame, true, guess) for frame, guess, true in states)
+                        measured = tally(pairs, select([self.metric]), frames)
+                        tallies[rollout.scenario] = as_stored(measured)  # rounded as score files hold them
         found = score(METRICS[self.metric], tallies)
         return math.nan if found is None else found.mean
-
-    def _measured(self, rollout: Rollout) -> Tally:
-        """Return the statistics of a rollout, rounded as score files hold them."""
-        metrics = select([self.metric])
-        with self.task.opened(rollout.scenario) as truth:
-            scenario, frames = truth.scenario, self.task.setting.predicted_frames
-            predicted = snapshots(scenario, rollout.position.numpy())
-            states = zip(frames, predicted, truth.snapshots(), strict=False)
-            pairs = (FramePair(scenario, frame, true, guess) for frame, guess, true in states)
-            return as_stored(tally(pairs, metrics, frames))
 
 
 def validation_of(job: TrainingJob) -> Validation | None:

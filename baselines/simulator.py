@@ -21,15 +21,14 @@ from torch import Tensor, nn
 
 from lagbench.baselines.operators.operator import Losses, Operator
 from lagbench.data.grid import Grid, Placement
-from lagbench.errors import UsageError
 
-from .augmentation import Symmetry, draw, image, noisy
-from .baseline import Baseline, Batch, Facts, Options
+from .augmentation import Symmetry, disturbed
+from .baseline import Baseline, Batch, Facts, Options, check_moving_walls, last_velocities
 from .graph import EDGE_FEATURES, NodeFeatures, Scale, edge_features, radius_graph
 from .loss import LossNorm, Motion, Scales, State, integrate, loss_terms
 from .network import EncodeProcessDecode
 
-__all__ = ["GraphNetwork", "GraphNetworkOptions", "LossWeights", "Target"]
+__all__ = ["GraphNetwork"]
 
 
 class Target(enum.StrEnum):
@@ -98,7 +97,7 @@ class GraphNetwork(Baseline):
 
     def __init__(self, options: GraphNetworkOptions, facts: Facts) -> None:
         super().__init__(options, facts)
-        self._check()
+        check_moving_walls(options.wall_velocity, facts)
         noise, statistics = options.noise_std, facts.statistics
         self.radius = facts.radius if options.radius is None else options.radius
         self.grid = Grid(facts.score_cells, Placement(facts.score_placement))
@@ -125,16 +124,6 @@ class GraphNetwork(Baseline):
         )
         for parameter in self.network.decoder[-1].parameters():
             nn.init.zeros_(parameter)
-
-    def _check(self) -> None:
-        if self.options.wall_velocity and not self.facts.moving_walls:
-            raise UsageError(
-                f"the walls of {self.facts.split} do not move",
-                where="model.wall_velocity",
-                expected=False,
-                got=True,
-                fix="leave the option out",
-            )
 
     @classmethod
     def with_operator(cls, operator: type[Operator]) -> type[GraphNetwork]:
@@ -169,28 +158,40 @@ class GraphNetwork(Baseline):
 
     def forward(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """Return the six terms of Eq. 5.35 and the operator's own, raw, means over the steps."""
-        batch = batch if generator is None else self._disturbed(batch, generator)
+        options = self.options
+        if generator is not None:
+            batch = disturbed(
+                batch,
+                generator,
+                symmetry=options.symmetry,
+                bounds=self.facts.bounds,
+                history=self.history,
+                noise_std=options.noise_std,
+            )
+            if options.noise_std > 0.0:
+                batch = replace(batch, position=self._inside(batch.position))
         state = self.start(batch.part(slice(self.history)))
-        if generator is not None and self.options.forgetful > 0.0:
+        if generator is not None and options.forgetful > 0.0:
             state = self._forgetful(state, batch.windows, generator)
         steps = []
         for frame in range(self.history, self.history + self.future):
             following, own = self.step(state, generator)
             target = batch.position[:, frame]
             velocity = target - batch.position[:, frame - 1]
-            steps.append(self._loss(state, following, target, velocity) | dict(own))
+            # both accelerations start from the state's velocity
+            last, predicted = state.velocity[:, -1], following.velocity[:, -1]
+            terms = loss_terms(
+                Motion(following.position, predicted, predicted - last),
+                Motion(target, velocity, velocity - last),
+                state.sample,
+                grid=self.grid,
+                scales=Scales(self.position.std, self.velocity.std, self.acceleration.std),
+                norm=options.loss_norm,
+                weights=self.weights,
+            )
+            steps.append(terms | dict(own))
             state = following
         return {name: torch.stack([terms[name] for terms in steps]).mean() for name in steps[0]}
-
-    def _disturbed(self, batch: Batch, generator: torch.Generator) -> Batch:
-        """Return the batch as its random image, with noise."""
-        if self.options.symmetry is not Symmetry.NONE:
-            matrix = draw(self.options.symmetry, batch.windows, generator)
-            batch = image(batch, matrix, self.facts.bounds)
-        if self.options.noise_std > 0.0:
-            position = noisy(batch.position, self.history, self.options.noise_std, generator)
-            batch = replace(batch, position=self._inside(position))
-        return batch
 
     def _forgetful(self, state: State, windows: int, generator: torch.Generator) -> State:
         """Return a state in which some windows know their last velocities only; the first one repeats."""
@@ -201,42 +202,15 @@ class GraphNetwork(Baseline):
         index = torch.arange(count, device=first.device).expand(len(first), -1).clamp(min=first[:, None])
         return replace(state, velocity=state.velocity.gather(1, index[..., None].expand(-1, -1, 2)))
 
-    def _loss(self, state: State, following: State, position: Tensor, velocity: Tensor) -> dict[str, Tensor]:
-        """Return the six terms of one step; both accelerations start from the state's velocity."""
-        last = state.velocity[:, -1]
-        predicted = following.velocity[:, -1]
-        return loss_terms(
-            Motion(following.position, predicted, predicted - last),
-            Motion(position, velocity, velocity - last),
-            state.sample,
-            grid=self.grid,
-            scales=Scales(self.position.std, self.velocity.std, self.acceleration.std),
-            norm=self.options.loss_norm,
-            weights=self.weights,
-        )
-
     def start(self, given: Batch) -> State:
-        """Return the state after the given frames.
-
-        Where they are few, the first velocity repeats.
-        """
-        if given.frames < 2:
-            raise UsageError(
-                "too few frames to start from",
-                expected=f"2 or more, {self.history} for all",
-                got=given.frames,
-            )
-        position = given.position[:, -self.history :]
-        velocity = position.diff(dim=1)
-        missing = self.options.velocities - velocity.shape[1]
-        velocity = torch.cat([velocity[:, :1].expand(-1, missing, -1), velocity], dim=1)
+        """Return the state after the given frames; where they are few, the first velocity repeats."""
         walls = None
         if self.options.wall_velocity and given.wall_velocity is not None:
             known = given.wall_velocity.shape[1]
             walls = given.wall_velocity[:, min(given.frames, known - 1) :] * self.facts.frame_interval
         return State(
-            position=position[:, -1],
-            velocity=velocity,
+            position=given.position[:, -1],
+            velocity=last_velocities(given.position, self.options.velocities),
             material=given.material,
             sample=given.sample,
             wall_velocity=walls,

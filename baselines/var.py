@@ -1,8 +1,7 @@
-"""Vector autoregression of whole frames (thesis section 4.8.3).
+"""Vector autoregression of whole frames (thesis section 4.8.3), by least squares in small memory.
 
-Linear least squares by the Gram matrix, refined once: small memory, nearly full accuracy.
-
-For regressors X [row, regressor] and responses Y [row, response], with G = X'X + r I
+Least squares by the Gram matrix, refined once, are nearly of full accuracy. For regressors X [row,
+regressor] and responses Y [row, response], with G = X'X + r I
 
     B = G^-1 X'Y,   then   B <- B + G^-1 X'(Y - X B),
 
@@ -11,9 +10,8 @@ from X itself, so the loss of digits in squaring X is undone while cond(X)^2 is 
 pass through in blocks; four square matrices are all that is held. With fewer rows than regressors the
 solution of least norm comes from the Gram matrix of the rows, B = X' (X X')^-1 Y.
 
-Leading principal directions of many long rows, by randomised subspace iteration.
-
-Halko, Martinsson, Tropp, SIAM Review 53 (2011) 217: a random subspace somewhat larger than
+Leading principal directions of many long rows come from randomised subspace iteration
+(Halko, Martinsson, Tropp, SIAM Review 53 (2011) 217): a random subspace somewhat larger than
 wanted is multiplied by X'X a few times, then rotated so that X'X is diagonal in it (Rayleigh and
 Ritz). Rows pass through in blocks; nothing as large as X'X is formed.
 """
@@ -39,16 +37,7 @@ from . import baseline
 from .baseline import Facts
 from .frame_model import FrameModel, FrameWindow
 
-__all__ = [
-    "Blocks",
-    "Fitted",
-    "LaggedRows",
-    "LeastSquares",
-    "StableVAR",
-    "VAR",
-    "principal_directions",
-    "solve",
-]
+__all__ = ["LaggedRows", "LeastSquares", "StableVAR", "VAR", "solve"]
 
 BLOCK = 1024
 """Most rows that are held at a time."""
@@ -61,11 +50,9 @@ Sequences = Sequence[NDArray[np.float32]]
 
 
 class LaggedRows:
-    """Regressors ``(1, z(f-1), ..., z(f-p))`` and responses ``z(f)`` of several sequences.
+    """Regressors ``(1, z(f-1), ..., z(f-p))`` and responses ``z(f)`` of several sequences, p the lags.
 
-    Args:
-        sequences: states, shape [frame, feature]; no row reaches from one into the next.
-        lags: p.
+    No row reaches from one sequence of states, shape [frame, feature], into the next.
     """
 
     def __init__(self, sequences: Sequences, *, lags: int) -> None:
@@ -76,16 +63,14 @@ class LaggedRows:
     def __iter__(self) -> Iterator[tuple[Matrix, Matrix]]:
         """Yield regressors and responses, at most :data:`BLOCK` rows at a time."""
         for states in self.sequences:
+            features = states.shape[1]
             for first in range(self.lags, len(states), BLOCK):
-                yield self._block(states, first, min(first + BLOCK, len(states)))
-
-    def _block(self, states: NDArray[np.float32], first: int, last: int) -> tuple[Matrix, Matrix]:
-        features = states.shape[1]
-        regressors = np.ones((last - first, 1 + self.lags * features))
-        for lag in range(1, self.lags + 1):
-            column = 1 + (lag - 1) * features
-            regressors[:, column : column + features] = states[first - lag : last - lag]
-        return regressors, states[first:last].astype(np.float64)
+                last = min(first + BLOCK, len(states))
+                regressors = np.ones((last - first, 1 + self.lags * features))
+                for lag in range(1, self.lags + 1):
+                    column = 1 + (lag - 1) * features
+                    regressors[:, column : column + features] = states[first - lag : last - lag]
+                yield regressors, states[first:last].astype(np.float64)
 
 
 class Fitted(FrameModel):
@@ -99,12 +84,7 @@ class Fitted(FrameModel):
 
     @abstractmethod
     def fit(self, scenarios: Iterable[NDArray[np.float32]]) -> Mapping[str, float]:
-        """Set the coefficients and return what is worth logging.
-
-        Args:
-            scenarios: positions [length], one array of shape [frame, particle, 2] per scenario;
-                iterated once.
-        """
+        """Set the coefficients from positions, [frame, particle, 2] per scenario; return what to log."""
 
     def states(self, position: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return standardised states [1], shape [frame - 1, feature].
@@ -213,7 +193,12 @@ class StableVAR(Fitted):
         rows = LaggedRows([self.states(position) for position in scenarios], lags=1)
         if not rows.rows:
             raise WorkFailedError("nothing to fit", expected="scenarios of 3 frames or more", got="none")
-        mean, drift, spread = self._moments(rows)
+        mean, drift, squares = np.zeros(self.features), np.zeros(self.features), 0.0
+        for x, y in rows:
+            mean += x[:, 1:].sum(0) / rows.rows
+            drift += (y - x[:, 1:]).sum(0) / rows.rows
+            squares += float(np.square(x[:, 1:]).sum())
+        spread = squares - rows.rows * float(mean @ mean)
 
         def centred() -> Iterator[Matrix]:
             return (x[:, 1:] - mean for x, _ in rows)
@@ -228,15 +213,6 @@ class StableVAR(Fitted):
         for name, value in found.items():
             getattr(self, name).copy_(torch.from_numpy(value))
         return {"variance": float(eigenvalues.sum() / spread), "rows": rows.rows}
-
-    def _moments(self, rows: LaggedRows) -> tuple[Matrix, Matrix, float]:
-        """Return the mean state, the mean change, and the sum of squares about the mean."""
-        mean, change, squares = np.zeros(self.features), np.zeros(self.features), 0.0
-        for x, y in rows:
-            mean += x[:, 1:].sum(0) / rows.rows
-            change += (y - x[:, 1:]).sum(0) / rows.rows
-            squares += float(np.square(x[:, 1:]).sum())
-        return mean, change, squares - rows.rows * float(mean @ mean)
 
     def next_state(self, window: FrameWindow) -> Tensor:
         """Return the next standardised state [1], shape [window, particle, 4]."""
@@ -292,28 +268,22 @@ def solve(blocks: Blocks) -> LeastSquares:
     shape = next(((x.shape[1], y.shape[1]) for x, y in blocks), None)
     if shape is None:
         raise WorkFailedError("nothing to fit", expected="scenarios longer than the lags", got="no rows")
-    return _tall(blocks, shape) if blocks.rows >= shape[0] else _wide(blocks)
+    if blocks.rows >= shape[0]:  # the Gram matrix of the regressors, by blocks of rows
+        factor = _factor(lambda: _gram((x for x, _ in blocks), shape[0]))
+        found = factor.divide(_products(blocks, shape))
 
+        def residual(x: Matrix, y: Matrix) -> Matrix:  # Y - X B of one block, C-ordered
+            transposed: Matrix = blas.dgemm(-1.0, found, x.T, trans_a=True, beta=1.0, c=y.T)
+            return transposed.T
 
-def _tall(blocks: Blocks, shape: tuple[int, int]) -> LeastSquares:
-    """Solve with the Gram matrix of the regressors, by blocks of rows."""
-    factor = _factor(lambda: _gram((x for x, _ in blocks), shape[0]))
-    solution = factor.divide(_products(blocks, shape))
-    solution += factor.divide(_products(((x, _residual(x, y, solution)) for x, y in blocks), shape))
-    return LeastSquares(
-        coefficients=solution, condition=factor.condition, floor=factor.floor, rows=blocks.rows
-    )
-
-
-def _wide(blocks: Blocks) -> LeastSquares:
-    """Solve with the Gram matrix of the rows, which all fit."""
-    x, y = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
-    factor = _factor(lambda: _gram([np.ascontiguousarray(x.T)], len(x)))
-    dual = factor.divide(np.asfortranarray(y))
-    dual += factor.divide(np.asfortranarray(y - x @ (x.T @ dual)))
-    return LeastSquares(
-        coefficients=x.T @ dual, condition=factor.condition, floor=factor.floor, rows=blocks.rows
-    )
+        found += factor.divide(_products(((x, residual(x, y)) for x, y in blocks), shape))
+    else:  # the Gram matrix of the rows, which all fit
+        x, y = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
+        factor = _factor(lambda: _gram([np.ascontiguousarray(x.T)], len(x)))
+        dual = factor.divide(np.asfortranarray(y))
+        dual += factor.divide(np.asfortranarray(y - x @ (x.T @ dual)))
+        found = x.T @ dual
+    return LeastSquares(coefficients=found, condition=factor.condition, floor=factor.floor, rows=blocks.rows)
 
 
 def _gram(blocks: Iterable[Matrix], size: int) -> Matrix:
@@ -332,12 +302,6 @@ def _products(blocks: Iterable[tuple[Matrix, Matrix]], shape: tuple[int, int]) -
     return total
 
 
-def _residual(x: Matrix, y: Matrix, solution: Matrix) -> Matrix:
-    """Return Y - X B of one block, C-ordered."""
-    transposed: Matrix = blas.dgemm(-1.0, solution, x.T, trans_a=True, beta=1.0, c=y.T)
-    return transposed.T
-
-
 def _factor(gram: Callable[[], Matrix]) -> _Factor:
     """Return the Cholesky factor, of the matrix with a floor under it if it is singular to rounding."""
     matrix = gram()
@@ -353,14 +317,13 @@ def _factor(gram: Callable[[], Matrix]) -> _Factor:
             upper, _ = cho_factor(matrix, overwrite_a=True, check_finite=False)
         except LinAlgError:
             continue
-        return _Factor(upper, _condition(largest, upper), floor)
+
+        def inverse(v: Matrix) -> Matrix:
+            return np.asarray(cho_solve((upper, False), v, check_finite=False))  # noqa: B023 (called here)
+
+        condition = float(np.sqrt(largest * _largest_eigenvalue(inverse, size)))
+        return _Factor(upper, condition, floor)
     raise WorkFailedError("the Gram matrix has no Cholesky factor", where="rows to fit")
-
-
-def _condition(largest: float, upper: Matrix) -> float:
-    """Return the condition number of X from the largest eigenvalue and the factor of X'X."""
-    inverse = _largest_eigenvalue(lambda v: cho_solve((upper, False), v, check_finite=False), len(upper))
-    return float(np.sqrt(largest * inverse))
 
 
 def _largest_eigenvalue(product: Callable[[Matrix], Matrix], size: int) -> float:
@@ -382,15 +345,9 @@ ITERATIONS = 8
 def principal_directions(
     blocks: Callable[[], Iterable[Matrix]], features: int, *, rank: int
 ) -> tuple[Matrix, Matrix]:
-    """Return orthonormal directions of largest X'X and their eigenvalues, the largest first.
+    """Return orthonormal directions of largest X'X, shape [feature, rank], and their eigenvalues.
 
-    Args:
-        blocks: returns the rows of X in blocks of shape [row, feature], centred; called ten times.
-        features: columns of X.
-        rank: directions wanted, at most `features`.
-
-    Returns:
-        Directions, shape [feature, rank], and eigenvalues, shape [rank].
+    The largest come first. ``blocks`` returns the rows of X in blocks, centred; it is called ten times.
     """
     width = min(features, rank + OVERSAMPLING)
     basis = np.random.default_rng(0).normal(size=(features, width))

@@ -11,10 +11,7 @@ from torch_geometric.nn import GATConv, GATv2Conv
 
 from .operator import Losses, Operator
 
-__all__ = [
-    "GAT",
-    "GATv2",
-]
+__all__ = ["GAT", "GATv2"]
 
 
 class GAT(Operator):

@@ -10,7 +10,7 @@ from torch_geometric.nn import SuperGATConv
 
 from .operator import Losses, Operator
 
-__all__ = ["SuperGAT", "SuperGATDot", "unlinked_pairs"]
+__all__ = ["SuperGAT", "SuperGATDot"]
 
 
 START = 4.0

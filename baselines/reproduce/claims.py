@@ -22,17 +22,7 @@ from .evidence import Evidence, ordered
 from .sheet import number
 from .thesis import FRAME_MODELS, OPERATORS, key_frame, label
 
-__all__ = [
-    "CLAIMS",
-    "Claim",
-    "Compared",
-    "Verdict",
-    "answer",
-    "claim_rows",
-    "compared",
-    "comparison_table",
-    "floors_ahead",
-]
+__all__ = ["CLAIMS", "answer", "claim_rows", "compared", "comparison_table", "floors_ahead"]
 
 
 @dataclass(frozen=True, kw_only=True)

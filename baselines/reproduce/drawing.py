@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Picture
 
-__all__ = ["QUIVER", "TRUTH", "Rollouts", "charts", "opened", "panel_rows", "png", "tidy"]
+__all__ = ["Rollouts", "TRUTH", "charts", "opened", "panel_rows", "png", "tidy"]
 
 Floats = NDArray[np.float64]
 

@@ -31,7 +31,7 @@ from lagbench.scoring.score_file import NETCDF_NAME, read_statistics
 from lagbench.scoring.skill import best_floor
 from lagbench.scoring.task import ranking_metric
 
-__all__ = ["BOARD", "WEIGHTS", "Cost", "Evidence", "Method", "Seeded", "Sources", "ordered", "read_json"]
+__all__ = ["BOARD", "Evidence", "Method", "Sources", "WEIGHTS", "ordered", "read_json"]
 
 BOARD = Path("leaderboard")
 WEIGHTS = BOARD / "weights"
