@@ -275,32 +275,6 @@ def check_data(checkpoint: Checkpoint, *, root: Path, registry: Registry | None 
     return here
 
 
-def _check_archive(file: Path) -> None:
-    """Refuse what is no archive as torch writes them, before anything in it is unpickled.
-
-    Members are stored as they are, so all of them together are no longer than the file, and each
-    has the checksum that it states: nothing unpacks to more, and no damaged byte is read.
-    """
-    inside = f"name the file: {file / 'weights.pt'}" if file.is_dir() else None
-    length = check_regular(file, fix=inside)
-    if not zipfile.is_zipfile(file):
-        with file.open("rb") as stream:
-            head = stream.read(2)
-        if head in {b"\x80" + bytes([protocol]) for protocol in range(2, 6)}:
-            raise _unsafe(file, "a pickle of something else")
-        raise _unfit(file, SAFE, "something else")
-    with zipfile.ZipFile(file) as archive:
-        members = archive.infolist()
-        packed = [one.filename for one in members if one.compress_type != zipfile.ZIP_STORED]
-        total = sum(max(one.file_size, one.compress_size) for one in members)
-        if packed or total > length or len({one.filename for one in members}) < len(members):
-            got = f"{packed[0][:100]!a} is compressed" if packed else f"members of {total} bytes in {length}"
-            raise _unfit(file, "an archive whose members are stored as they are, each once", got)
-        broken = archive.testzip()
-    if broken is not None:
-        raise _unfit(file, SAFE, f"{broken[:100]!a} has another checksum than it states")
-
-
 def _unsafe(file: Path, got: str) -> LagbenchError:
     return UnreadableFileError(
         "the file holds more than tensors and plain values, and was not opened",
@@ -312,8 +286,34 @@ def _unsafe(file: Path, got: str) -> LagbenchError:
 
 
 def _content(file: Path) -> dict[str, Any]:
+    """Read what is an archive as torch writes them; what is none is refused before it is unpickled.
+
+    Members are stored as they are, so all of them together are no longer than the file, and each
+    has the checksum that it states: nothing unpacks to more, and no damaged byte is read.
+    """
     try:
-        _check_archive(file)
+        inside = f"name the file: {file / 'weights.pt'}" if file.is_dir() else None
+        length = check_regular(file, fix=inside)
+        if not zipfile.is_zipfile(file):
+            with file.open("rb") as stream:
+                head = stream.read(2)
+            if head in {b"\x80" + bytes([protocol]) for protocol in range(2, 6)}:
+                raise _unsafe(file, "a pickle of something else")
+            raise _unfit(file, SAFE, "something else")
+        with zipfile.ZipFile(file) as archive:
+            members = archive.infolist()
+            packed = [one.filename for one in members if one.compress_type != zipfile.ZIP_STORED]
+            total = sum(max(one.file_size, one.compress_size) for one in members)
+            if packed or total > length or len({one.filename for one in members}) < len(members):
+                got = (
+                    f"{packed[0][:100]!a} is compressed"
+                    if packed
+                    else f"members of {total} bytes in {length}"
+                )
+                raise _unfit(file, "an archive whose members are stored as they are, each once", got)
+            broken = archive.testzip()
+        if broken is not None:
+            raise _unfit(file, SAFE, f"{broken[:100]!a} has another checksum than it states")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             content = torch.load(file, map_location="cpu", weights_only=True)

@@ -30,12 +30,7 @@ class PointNet(Operator):
         self.local = nn.Sequential(nn.ReLU(inplace=True), Linear(hidden, latent))
 
     def forward(
-        self,
-        node: Tensor,
-        edge_index: Tensor,
-        edge: Tensor,
-        *,
-        generator: torch.Generator | None = None,
+        self, node: Tensor, edge_index: Tensor, edge: Tensor, *, generator: torch.Generator | None = None
     ) -> tuple[Tensor, Losses]:
         """Return what each node gathers."""
         sender, receiver = edge_index

@@ -71,12 +71,7 @@ class SuperGAT(Operator):
         self.conv = SuperGATConv(inputs, latent, attention_type=self.attention)
 
     def forward(
-        self,
-        node: Tensor,
-        edge_index: Tensor,
-        edge: Tensor,
-        *,
-        generator: torch.Generator | None = None,
+        self, node: Tensor, edge_index: Tensor, edge: Tensor, *, generator: torch.Generator | None = None
     ) -> tuple[Tensor, Losses]:
         """Return what each node gathers, and the link loss in training."""
         node = node / self.scale

@@ -1,7 +1,4 @@
-"""Pictures of frames: maps, particles, arrows, streamlines; histograms and residuals of the vorticity.
-
-Curves: errors and energy over the frames of a rollout, losses over the steps of a training.
-"""
+"""Pictures of frames, histograms and residuals of the vorticity; curves over frames, losses over steps."""
 
 from __future__ import annotations
 
@@ -21,7 +18,7 @@ from lagbench.metrics.table import METRICS
 from lagbench.scoring.tables import Table
 
 from .claims import compared, comparison_table
-from .drawing import TRUTH, Rollouts, charts, opened, panel_rows, png, tidy
+from .drawing import TRUTH, charts, opened, panel_rows, png, tidy
 from .evidence import read_json
 from .runs import Plan
 from .sheet import Figure, Sheet, number
@@ -55,13 +52,15 @@ def panels(plan: Plan, figure: Figure) -> Sheet:
     size = evidence.size
     cases = {case: ours for case in figure.cases if (ours := scenario_of(size, case)) is not None}
     frames = _frames(size, figure)
+    # the number of a case in a full box, its id on the free surface
+    called = {case: str(ours) if size.split in TABLE_4_8 else f"T{case}" for case, ours in cases.items()}
     with ExitStack() as stack:
         shown = {
             case: stack.enter_context(opened(plan, figure.split, ours, figure.models))
             for case, ours in cases.items()
         }
         rows = [
-            (label(name) if len(shown) == 1 else f"{_case(size, case)}, {label(name)}", rollouts, name)
+            (label(name) if len(shown) == 1 else f"{called[case]}, {label(name)}", rollouts, name)
             for case, rollouts in shown.items()
             for name in (None, *rollouts.predictions)
         ]
@@ -88,11 +87,6 @@ def _frames(size: Size, figure: Figure) -> tuple[int, ...]:
     if figure.whole:
         return tuple(first + round(i * (last - first) / (TIMES - 1)) for i in range(TIMES))
     return predicted(size, figure.frames or (key_frame(size),))
-
-
-def _case(size: Size, case: int) -> str:
-    """Return what rows call a case of the thesis: its number in a full box, its id on the free surface."""
-    return str(scenario_of(size, case)) if size.split in TABLE_4_8 else f"T{case}"
 
 
 def _errors(plan: Plan, figure: Figure, frames: Sequence[int], cases: Mapping[int, int]) -> Table:
@@ -124,24 +118,22 @@ def histograms(plan: Plan, figure: Figure) -> Sheet:
         charts(len(frames), columns, width=width, height=2.8) as drawn,
     ):
         for axes, frame in zip(drawn, frames, strict=True):
-            _draw_histograms(axes, rollouts, frame, legend=frame == frames[0])
+            truth = rollouts.snapshot(None, frame).fields
+            true = truth.vorticity[truth.differentiable]
+            low, high = np.quantile(true, [0.0, 1.0])
+            margin = 0.15 * (high - low) or 1.0
+            edges = np.linspace(low - margin, high + margin, BINS + 1)
+            axes.stairs(np.histogram(true, edges)[0], edges, color=TRUTH, lw=1.8, label="truth")
+            for name in rollouts.predictions:
+                # what the truth never reaches is counted in the outermost bins
+                held = np.clip(rollouts.pair(name, frame).predicted_vorticity, edges[0], edges[-1])
+                axes.stairs(
+                    np.histogram(held, edges)[0], edges, color=colour(name), lw=1.0, label=label(name)
+                )
+            tidy(axes, f"frame {frame}, T0", "vorticity [1/frame]", "nodes", legend=frame == frames[0])
         picture = png(drawn)
     table = _errors(plan, figure, frames, {0: case})
     return Sheet(notes=(figure.said,), tables=(table,), pictures={"": picture})
-
-
-def _draw_histograms(axes: Axes, rollouts: Rollouts, frame: int, *, legend: bool) -> None:
-    truth = rollouts.snapshot(None, frame).fields
-    true = truth.vorticity[truth.differentiable]
-    low, high = np.quantile(true, [0.0, 1.0])
-    margin = 0.15 * (high - low) or 1.0
-    edges = np.linspace(low - margin, high + margin, BINS + 1)
-    axes.stairs(np.histogram(true, edges)[0], edges, color=TRUTH, lw=1.8, label="truth")
-    for name in rollouts.predictions:
-        # what the truth never reaches is counted in the outermost bins
-        held = np.clip(rollouts.pair(name, frame).predicted_vorticity, edges[0], edges[-1])
-        axes.stairs(np.histogram(held, edges)[0], edges, color=colour(name), lw=1.0, label=label(name))
-    tidy(axes, f"frame {frame}, T0", "vorticity [1/frame]", "nodes", legend=legend)
 
 
 def residuals(plan: Plan, figure: Figure) -> Sheet:

@@ -1,11 +1,10 @@
-"""Tables and bars: solver times, rollouts, statistics of train, vorticity of six operators.
+"""Tables and bars: solver times, MLPs, rollouts, statistics of train, vorticity of six operators.
 
-Tables 4.2 to 4.5: activations, widths, depths and more data for an MLP from frame to frame.
-
-Errors are Eq. 4.16 after one step from true frames, over train and over valid. At size ``full`` every
-row has its own recipe, with the thesis's epochs and batch; smaller sizes take a share of the epochs,
-and batches that leave some steps in an epoch, the same for all rows of a table. More data (``extra``,
-Table 4.5) exist at full only.
+Tables 4.2 to 4.5 are activations, widths, depths and more data for an MLP from frame to frame: errors
+are Eq. 4.16 after one step from true frames, over train and over valid. At size ``full`` every row has
+its own recipe, with the thesis's epochs and batch; smaller sizes take a share of the epochs, and batches
+that leave some steps in an epoch, the same for all rows of a table. More data (``extra``, Table 4.5)
+exist at full only.
 """
 
 from __future__ import annotations
@@ -131,7 +130,14 @@ def vorticity(plan: Plan, figure: Figure) -> Sheet:
     evidence = plan.evidence(figure.split)
     frame, first = key_frame(evidence.size), scenario_of(evidence.size, 0)
     names = [name for name in figure.models if name in evidence.methods]
-    cubic = {i: _by_cubic(plan, figure, i, frame) for i in plan.test_subset(figure.split).scenarios}
+    cubic: dict[int, dict[str, Mapping[str, float]]] = {}  # errors by scenario and model, the thesis's way
+    for i in plan.test_subset(figure.split).scenarios:
+        with opened(plan, figure.split, i, figure.models) as shown:
+            found = {}
+            for name in (None, *shown.predictions):
+                held = shown.snapshot(name, frame)
+                found[name] = cubic_vorticity(held.position, held.velocity, shown.recording.size.bounds)
+            cubic[i] = {name: cubic_errors(found[None], found[name]) for name in shown.predictions}
 
     def scored(model: str, measure: str, scenario: int | None) -> float:
         return evidence.methods[model].at(f"vorticity_{measure}", frame, scenario)
@@ -163,16 +169,6 @@ def vorticity(plan: Plan, figure: Figure) -> Sheet:
         tables.append(Table(title, ("model", *heads), tuple(rows)))
     note = f"Frame {frame}; T0 is our test scenario {first}. {figure.said}"
     return Sheet(notes=(note,), tables=tuple(tables))
-
-
-def _by_cubic(plan: Plan, figure: Figure, scenario: int, frame: int) -> Mapping[str, Mapping[str, float]]:
-    """Return the errors of each model at a frame of a scenario, by the thesis's way."""
-    with opened(plan, figure.split, scenario, figure.models) as rollouts:
-        fields = {}
-        for name in (None, *rollouts.predictions):
-            held = rollouts.snapshot(name, frame)
-            fields[name] = cubic_vorticity(held.position, held.velocity, rollouts.recording.size.bounds)
-        return {name: cubic_errors(fields[None], fields[name]) for name in rollouts.predictions}
 
 
 def cubic_vorticity(
