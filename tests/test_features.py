@@ -7,9 +7,8 @@ import pytest
 import torch
 from graph_cases import RADIUS, batch, facts, jittered, swirl
 
-from lagbench.baselines.augmentation import Symmetry, draw, image
+from lagbench.baselines.augmentation import Symmetry, draw, image, noisy, random_walk
 from lagbench.baselines.graph import NodeFeatures, Scale, edge_features, radius_graph, wall_distance
-from lagbench.baselines.seeding import noisy, random_walk
 from lagbench.errors import UsageError
 
 BOUNDS = facts().bounds
