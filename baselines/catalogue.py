@@ -25,8 +25,7 @@ GROUP = "lagbench.baselines"
 
 OWN = "lagbench.baselines."
 RECIPES = Path(__file__).parent / "recipes"
-OPERATOR_RECIPES = "gns"
-"""Recipe file that all operators share, so that they differ in the operator only."""
+OPERATOR_RECIPES = "gns"  # recipe file that all operators share, so that they differ in the operator only
 
 
 @dataclass(frozen=True, kw_only=True)

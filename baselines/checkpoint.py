@@ -41,11 +41,8 @@ from .catalogue import find
 __all__ = ["Checkpoint", "check_data", "load", "load_weights", "restore", "rounded_weights", "save"]
 
 
-SPARE = 2**20
-"""Numbers that a model may have beside those of its file: buffers that are not stored."""
-
-PARTS = 1000
-"""Tensors that it may have beside those of its file."""
+SPARE = 2**20  # numbers that a model may have beside those of its file: buffers that are not stored
+PARTS = 1000  # tensors that it may have beside those of its file
 
 
 def check_footprint(
@@ -115,8 +112,7 @@ FORMAT = 1
 KEY = "lagbench_checkpoint"
 SAFE = "a checkpoint that lagbench train wrote"
 
-_FOREIGN = re.compile(r"GLOBAL ([\w.]+)")
-"""How torch's refusal names what a pickle would call."""
+_FOREIGN = re.compile(r"GLOBAL ([\w.]+)")  # how torch's refusal names what a pickle would call
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -27,13 +27,12 @@ from torch import Tensor, nn
 from lagbench.errors import DataError
 
 from . import baseline
-from .baseline import Baseline, Batch, Facts
+from .baseline import MATERIALS, Baseline, Batch, Facts
 
 __all__ = ["FrameModel", "FrameNetwork", "FrameNetworkOptions", "FrameWindow", "squared_errors"]
 
 
-FEATURES = 4
-"""x, y and the two components of the velocity per frame."""
+FEATURES = 4  # x, y and the two components of the velocity per frame
 
 
 class FrameState(nn.Module):
@@ -161,10 +160,6 @@ class FrameModel(Baseline):
         new = self.next_state(state)
         window = FrameWindow(torch.cat([state.state[:, 1:], new.unsqueeze(1)], dim=1), state.material)
         return window, self.frame_state.position(new).flatten(0, 1).to(torch.float32)
-
-
-MATERIALS = 4
-"""Materials that datasets.yaml knows: 0 liquid, 1 jelly, 2 snow, 3 rope."""
 
 
 class Target(enum.StrEnum):

@@ -27,19 +27,16 @@ from torch import Tensor, nn
 
 from lagbench.errors import UsageError
 
-from .baseline import Facts, Pair
+from .baseline import MATERIALS, Facts, Pair
 
-__all__ = ["EDGE_FEATURES", "MATERIALS", "NodeFeatures", "Scale", "edge_features", "radius_graph"]
+__all__ = ["EDGE_FEATURES", "NodeFeatures", "Scale", "edge_features", "radius_graph"]
 
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-MARGIN = 1e-6
-"""Cells are wider than the radius by this share, more than rounding can move a particle."""
-
-FAR = 1 << 20
-"""Cells that are told apart on either side of the origin; what lies beyond shares the last."""
+MARGIN = 1e-6  # cells are wider than the radius by this share, more than rounding can move a particle
+FAR = 1 << 20  # cells that are told apart on either side of the origin; what lies beyond shares the last
 
 
 @torch.no_grad()
@@ -152,15 +149,8 @@ def _graph_torch(position: Tensor, radius: float, sample: Tensor | None, self_ed
     return torch.stack([sorted_edges & 0xFFFFFFFF, sorted_edges >> 32])
 
 
-MATERIALS = 4
-"""Liquid, jelly, snow, rope."""
-
-EMBEDDING = 16
-"""Numbers that a material is embedded in."""
-
-EDGE_FEATURES = 3
-"""Displacement over radius along x and y, distance over radius."""
-
+EMBEDDING = 16  # numbers that a material is embedded in
+EDGE_FEATURES = 3  # displacement over radius along x and y, distance over radius
 _WALLS = 4  # left, right, bottom, top, the order of wall_velocity in scenario files
 
 

@@ -43,14 +43,9 @@ __all__ = [
 ]
 
 
-STOPPED_EARLY = "stopped early"
-"""State of a training whose validations brought nothing new; it is over."""
-
-MOST_RECORD = 4 << 20
-"""Longest training.json that is read [bytes]."""
-
-OVER = ("finished", STOPPED_EARLY)
-"""States of a training that is not to be gone on with."""
+STOPPED_EARLY = "stopped early"  # state of a training whose validations brought nothing new; it is over
+MOST_RECORD = 4 << 20  # longest training.json that is read [bytes]
+OVER = ("finished", STOPPED_EARLY)  # states of a training that is not to be gone on with
 
 
 @dataclass

@@ -62,8 +62,7 @@ def integrate(position: Tensor, velocity: Tensor, acceleration: Tensor) -> tuple
 
 PARTICLE_TERMS = ("acceleration", "velocity", "position")
 GRID_TERMS = ("density", "divergence", "vorticity")
-TERMS = PARTICLE_TERMS + GRID_TERMS
-"""The terms of Eq. 5.35, in its order but for positions."""
+TERMS = PARTICLE_TERMS + GRID_TERMS  # the terms of Eq. 5.35, in its order but for positions
 
 
 class LossNorm(enum.StrEnum):

@@ -36,8 +36,7 @@ from .rollout import Validation
 
 __all__ = ["TrainingCallback", "TrainingModule", "generators_kept", "reseed", "seed_of"]
 
-TOTAL = "total"
-"""Name of the weighted sum among the loss terms."""
+TOTAL = "total"  # name of the weighted sum among the loss terms
 
 
 def weighted_sum(terms: Mapping[str, Tensor], weights: Mapping[str, float]) -> Tensor:

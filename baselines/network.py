@@ -181,8 +181,7 @@ class LayerNorm(nn.LayerNorm):
         return torch.addcmul(self.bias.to(input.dtype), normal, self.weight.to(input.dtype))
 
 
-PIECE = 8192
-"""Edges at a time: a hidden layer of 128 then has 4 MB and stays in the cache."""
+PIECE = 8192  # edges at a time: a hidden layer of 128 then has 4 MB and stays in the cache
 
 
 def edge_map(
@@ -247,8 +246,7 @@ class Recomputed(torch.autograd.Function):
         return None, None, of_edge, of_sender, of_receiver, *of_weights
 
 
-LARGEST_KEPT = 24e6
-"""Edge tensors above this size on a CPU are recomputed, not kept [byte]."""
+LARGEST_KEPT = 24e6  # edge tensors above this size on a CPU are recomputed, not kept [byte]
 
 
 def mlp(widths: list[int], *, norm: bool = True) -> nn.Sequential:

@@ -23,20 +23,14 @@ from torch.nn.functional import gelu
 from lagbench.errors import DataError, UsageError
 
 from .augmentation import Symmetry, disturbed
-from .baseline import Baseline, Batch, Facts, Options, check_moving_walls, last_velocities
-from .graph import MATERIALS
+from .baseline import MATERIALS, Baseline, Batch, Facts, Options, check_moving_walls, last_velocities
 from .torch_grid import ParticleGrid, Stencil
 
 __all__ = ["NeuralMPM"]
 
-EMPTY = 1e-3
-"""Below this weight, in units of particles a radius apart, a node's velocity fades to 0."""
-
-REACH = 4
-"""Cells over which the U-Net sees how far a wall is."""
-
-COARSEST = 4
-"""Nodes of the U-Net's finest level to one of its coarsest, along each axis."""
+EMPTY = 1e-3  # below this weight, in units of particles a radius apart, a node's velocity fades to 0
+REACH = 4  # cells over which the U-Net sees how far a wall is
+COARSEST = 4  # nodes of the U-Net's finest level to one of its coarsest, along each axis
 
 
 class NeuralMPMOptions(Options):

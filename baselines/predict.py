@@ -34,8 +34,7 @@ from .rollout import Rollout, roll_out, scenario_batch, scenario_paths
 __all__ = ["PredictionResult", "UnfinishedWarning", "predict"]
 
 
-SEARCHES = 5
-"""Frames of a rollout on which the neighbour search is timed alone."""
+SEARCHES = 5  # frames of a rollout on which the neighbour search is timed alone
 
 
 class UnfinishedWarning(UserWarning):

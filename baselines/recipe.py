@@ -73,8 +73,7 @@ def _named(value: object) -> object:
     return {"kind": value} if isinstance(value, str) else value
 
 
-VALIDATION_SHARE = 0.15
-"""Share of a training's processor time that validations may take."""
+VALIDATION_SHARE = 0.15  # share of a training's processor time that validations may take
 
 STEP_COST = 1.5
 """Processor time to train on a frame over that to roll one out.

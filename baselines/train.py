@@ -317,8 +317,7 @@ def quiet() -> Iterator[None]:
                 logger.setLevel(level)
 
 
-STEPS = 1
-"""A closed form counts as one step."""
+STEPS = 1  # a closed form counts as one step
 
 
 def fit(job: TrainingJob, model: Baseline) -> tuple[TrainingRecord, int]:

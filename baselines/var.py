@@ -39,11 +39,8 @@ from .frame_model import FrameModel, FrameWindow
 
 __all__ = ["LaggedRows", "LeastSquares", "StableVAR", "VAR", "solve"]
 
-BLOCK = 1024
-"""Most rows that are held at a time."""
-
-EPSILON = 1e-12
-"""Least ridge: directions without any variance stay as they are."""
+BLOCK = 1024  # most rows that are held at a time
+EPSILON = 1e-12  # least ridge: directions without any variance stay as they are
 
 Matrix = NDArray[np.float64]
 Sequences = Sequence[NDArray[np.float32]]
@@ -223,8 +220,7 @@ class StableVAR(Fitted):
 
 Matrix = NDArray[np.float64]
 
-TOLERANCE = 1e-3
-"""Relative accuracy of the condition number's two eigenvalues."""
+TOLERANCE = 1e-3  # relative accuracy of the condition number's two eigenvalues
 
 
 class Blocks(Protocol):
@@ -335,11 +331,8 @@ def _largest_eigenvalue(product: Callable[[Matrix], Matrix], size: int) -> float
     return float(eigsh(operator, 1, which="LA", tol=TOLERANCE, v0=start, return_eigenvectors=False)[0])
 
 
-OVERSAMPLING = 20
-"""Directions beyond those wanted, which the last wanted ones need to converge."""
-
-ITERATIONS = 8
-"""Multiplications by X'X; ratios of neighbouring eigenvalues count to twice this power."""
+OVERSAMPLING = 20  # directions beyond those wanted, which the last wanted ones need to converge
+ITERATIONS = 8  # multiplications by X'X; ratios of neighbouring eigenvalues count to twice this power
 
 
 def principal_directions(

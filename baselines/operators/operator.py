@@ -11,8 +11,7 @@ from torch import Tensor, nn
 
 __all__ = ["Losses", "Operator", "summed"]
 
-Losses = Mapping[str, Tensor]
-"""Losses of an operator's own by name, each a scalar."""
+Losses = Mapping[str, Tensor]  # losses of an operator's own by name, each a scalar
 
 
 class Operator(nn.Module):

@@ -24,16 +24,13 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Picture
 
-__all__ = ["Rollouts", "TRUTH", "charts", "opened", "panel_rows", "png", "tidy"]
+__all__ = ["TRUTH", "charts", "opened", "panel_rows", "png", "tidy"]
 
 Floats = NDArray[np.float64]
 
 TRUTH = INK
-LEVELS = 96
-"""Colours of a chart's file."""
-
-QUIVER = "quiver"
-"""A kind of panel of our own: arrows at the nodes, coloured by speed as streamlines are."""
+LEVELS = 96  # colours of a chart's file
+QUIVER = "quiver"  # a kind of panel of our own: arrows at the nodes, coloured by speed as streamlines are
 
 SIDE, GAP, TOP, LEFT, BOTTOM = 1.5, 0.08, 0.34, 0.75, 0.62  # [inch]
 

@@ -40,8 +40,7 @@ __all__ = [
     "study_losses",
 ]
 
-TIMES = 6
-"""Columns of a picture that shows a whole rollout."""
+TIMES = 6  # columns of a picture that shows a whole rollout
 
 BINS = 40
 

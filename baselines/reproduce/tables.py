@@ -246,8 +246,7 @@ TABLES: Mapping[str, tuple[str, str]] = {
 SHARES: Mapping[str, tuple[float, int]] = {"mini": (0.1, 16), "tiny": (0.01, 64)}
 """Share of the thesis's epochs, and what its batch is divided by, by size."""
 
-WINDOWS = 4096
-"""Most windows of a subset that an error is measured over, evenly spaced."""
+WINDOWS = 4096  # most windows of a subset that an error is measured over, evenly spaced
 
 FILE = "errors.json"
 

@@ -133,8 +133,7 @@ TABLE_5_4: Mapping[str, Mapping[str, float]] = MappingProxyType(
 of the cavity at frame 54. MAE and RMSE [1/frame], divergence of the magnitudes per node [nat],
 correlation."""
 
-OPERATORS = tuple(TABLE_5_4)
-"""The six operators."""
+OPERATORS = tuple(TABLE_5_4)  # the six operators
 
 STATISTICS: Mapping[str, Mapping[str, tuple[float, float]]] = MappingProxyType(
     {
@@ -169,8 +168,7 @@ LOSS_SNAPSHOTS: Mapping[str, Mapping[str, float]] = MappingProxyType(
 )
 """Raw terms of the loss on curl-noise (section 5.9.3, Fig. 5.21); the total rises: no yardstick."""
 
-SIZES = ("mini", "full")
-"""Sizes that are reported; ``tiny`` is for tests."""
+SIZES = ("mini", "full")  # sizes that are reported; ``tiny`` is for tests
 
 
 @dataclass(frozen=True)
@@ -228,8 +226,7 @@ _MODELS = (
     Model("var-stable", "stable VAR", "#b0569a"),
 )
 
-ROSTER: Mapping[str, Model] = MappingProxyType({model.name: model for model in _MODELS})
-"""Models by name."""
+ROSTER: Mapping[str, Model] = MappingProxyType({model.name: model for model in _MODELS})  # models by name
 
 _EVERYWHERE = ("neuralmpm", *OPERATORS, *FRAME_MODELS, "var", "var-stable")
 _ABLATIONS = ("supergat-unlinked", "supergat-unsummed", "gns-novorticity")
