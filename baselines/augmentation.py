@@ -21,8 +21,9 @@ from torch import Tensor
 
 from lagbench.data.registry import Size
 from lagbench.errors import UsageError
+from lagbench.torch import Batch
 
-from .baseline import Batch, Pair
+from .graph import Bounds
 
 __all__ = ["Symmetry", "check_symmetry"]
 
@@ -68,7 +69,7 @@ def draw(symmetry: Symmetry, windows: int, generator: torch.Generator) -> Tensor
     return torch.where(swap.bool()[:, None, None], matrix.flip(2), matrix)
 
 
-def image(batch: Batch, matrix: Tensor, bounds: tuple[Pair, Pair]) -> Batch:
+def image(batch: Batch, matrix: Tensor, bounds: Bounds) -> Batch:
     """Return each window's image about the middle of the box, by a signed permutation of its axes each."""
     sides = [high - low for low, high in bounds]
     if abs(sides[0] - sides[1]) > 1e-6 and bool((matrix[:, 0, 1] != 0.0).any()):
@@ -122,7 +123,7 @@ def disturbed(
     generator: torch.Generator,
     *,
     symmetry: Symmetry,
-    bounds: tuple[Pair, Pair],
+    bounds: Bounds,
     history: int,
     noise_std: float,
 ) -> Batch:

@@ -28,19 +28,7 @@ from lagbench.errors import DataError, UsageError
 from lagbench.store.copy import bring
 from lagbench.torch import Batch
 
-__all__ = [
-    "MATERIALS",
-    "Baseline",
-    "Batch",
-    "Facts",
-    "Options",
-    "check_moving_walls",
-    "facts_of",
-    "last_velocities",
-]
-
-
-MATERIALS = 4  # that datasets.yaml knows: 0 liquid, 1 jelly, 2 snow, 3 rope
+__all__ = ["Baseline", "Batch", "Facts", "Options", "check_moving_walls", "facts_of", "last_velocities"]
 
 
 class Options(BaseModel):

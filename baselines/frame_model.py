@@ -27,7 +27,8 @@ from torch import Tensor, nn
 from lagbench.errors import DataError
 
 from . import baseline
-from .baseline import MATERIALS, Baseline, Batch, Facts
+from .baseline import Baseline, Batch, Facts
+from .graph import MATERIALS
 
 __all__ = ["FrameModel", "FrameNetwork", "FrameNetworkOptions", "FrameWindow", "squared_errors"]
 

@@ -27,11 +27,10 @@ from torch import Tensor, nn
 
 from lagbench.errors import UsageError
 
-from .baseline import MATERIALS, Facts, Pair
-
 __all__ = ["EDGE_FEATURES", "NodeFeatures", "Scale", "edge_features", "radius_graph"]
 
 
+Bounds = tuple[tuple[float, float], tuple[float, float]]
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
@@ -149,6 +148,7 @@ def _graph_torch(position: Tensor, radius: float, sample: Tensor | None, self_ed
     return torch.stack([sorted_edges & 0xFFFFFFFF, sorted_edges >> 32])
 
 
+MATERIALS = 4  # that datasets.yaml knows: 0 liquid, 1 jelly, 2 snow, 3 rope
 EMBEDDING = 16  # numbers that a material is embedded in
 EDGE_FEATURES = 3  # displacement over radius along x and y, distance over radius
 _WALLS = 4  # left, right, bottom, top, the order of wall_velocity in scenario files
@@ -176,7 +176,7 @@ class Scale(nn.Module):
         return standardised * self.std + self.mean
 
 
-def wall_distance(position: Tensor, bounds: tuple[Pair, Pair], reach: float) -> Tensor:
+def wall_distance(position: Tensor, bounds: Bounds, reach: float) -> Tensor:
     """Return the distances to left, right, bottom and top wall over the reach [length], clipped to [-1, 1].
 
     A wall farther away than the reach looks like one at it; outside the box they are negative.
@@ -209,7 +209,7 @@ class NodeFeatures(nn.Module):
 
     def __init__(
         self,
-        facts: Facts,
+        bounds: Bounds,
         velocity: Scale,
         acceleration: Scale,
         reach: float,
@@ -221,7 +221,7 @@ class NodeFeatures(nn.Module):
         self.velocities = velocities  # last per-frame velocities that a particle shows
         self.velocity = velocity
         self.acceleration = acceleration
-        self.bounds = facts.bounds
+        self.bounds = bounds  # of the box, (low, high) along x and y [length]
         self.reach = reach  # how far a wall is seen [length]
         self.moving_walls = moving_walls  # whether the velocities of the walls are features too
         self.embedding = nn.Embedding(MATERIALS, EMBEDDING)

@@ -23,7 +23,8 @@ from torch.nn.functional import gelu
 from lagbench.errors import DataError, UsageError
 
 from .augmentation import Symmetry, disturbed
-from .baseline import MATERIALS, Baseline, Batch, Facts, Options, check_moving_walls, last_velocities
+from .baseline import Baseline, Batch, Facts, Options, check_moving_walls, last_velocities
+from .graph import MATERIALS
 from .torch_grid import ParticleGrid, Stencil
 
 __all__ = ["NeuralMPM"]

@@ -32,8 +32,8 @@ from lagbench.store.windows import window_of
 from lagbench.submission.checks import MAX_DISTANCE
 from lagbench.torch import Window, collate, tensors
 
-from .baseline import Baseline, Batch
-from .job import TrainingJob
+from .baseline import Baseline, Batch, Facts
+from .recipe import TrainingOptions
 
 __all__ = ["Rollout", "Validation", "roll_out", "scenario_batch", "scenario_paths", "validation_of"]
 
@@ -206,12 +206,13 @@ class Validation:
         return math.nan if found is None else found.mean
 
 
-def validation_of(job: TrainingJob) -> Validation | None:
+def validation_of(
+    options: TrainingOptions, facts: Facts, *, root: Path, registry: Registry
+) -> Validation | None:
     """Return the validation of a training; None where the recipe wants none."""
-    options, facts = job.recipe.training, job.facts
     if options.validate_every == 0:
         return None
-    task = load_scored_task(job.registry.size(facts.split, facts.size), job.root, subset="valid")
+    task = load_scored_task(registry.size(facts.split, facts.size), root, subset="valid")
     horizon = min(options.validation_frames or facts.horizon, facts.horizon)
     task = replace(task, setting=replace(task.setting, horizon=horizon))
     frames = {}

@@ -26,9 +26,10 @@ from torch.nn.functional import pad
 from lagbench.data.grid import COUNTED_SHARE, EMPTY_SHARE, Grid
 from lagbench.errors import UsageError
 
-from .baseline import Pair
+from .graph import Bounds
 
 __all__ = ["Fields", "ParticleGrid", "Stencil", "counted_nodes", "fields", "node_velocity", "transfer"]
+
 
 _LOW, _HIGH = 1, 2  # rows that the stencil of a particle in the unit box can reach past the grid
 
@@ -198,7 +199,7 @@ class ParticleGrid(nn.Module):
     low: Tensor
     high: Tensor
 
-    def __init__(self, bounds: tuple[Pair, Pair], cells: int, *, multiple: int = 1) -> None:
+    def __init__(self, bounds: Bounds, cells: int, *, multiple: int = 1) -> None:
         super().__init__()
         self.spacing = max(high - low for low, high in bounds) / cells
         for name, (low, high) in zip(("axis_x", "axis_y"), bounds, strict=True):

@@ -271,7 +271,8 @@ def descend(job: TrainingJob, model: Baseline) -> tuple[TrainingRecord, int]:
         step=ledger.step,
         optimizer=earlier.optimizer if earlier else None,
     )
-    keeper = TrainingCallback(job, ledger, validation=validation_of(job), steps=steps, windows=len(data))
+    validation = validation_of(options, facts, root=job.root, registry=job.registry)
+    keeper = TrainingCallback(job, ledger, validation=validation, steps=steps, windows=len(data))
     half = options.precision == "auto" and multiplies_bfloat16(job.device)
     with quiet():
         trainer = Trainer(
@@ -350,7 +351,7 @@ def fit(job: TrainingJob, model: Baseline) -> tuple[TrainingRecord, int]:
     figures = model.fit(scenarios())  # type: ignore[operator]
     ledger.step, ledger.loss = STEPS, {name: float(value) for name, value in figures.items()}
     ledger.epochs = 1.0
-    validation = validation_of(job)
+    validation = validation_of(job.recipe.training, job.facts, root=job.root, registry=job.registry)
     if validation is not None:
         with ledger.validating(device=job.device):
             value = validation(model)

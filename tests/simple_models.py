@@ -18,7 +18,6 @@ from torch import Tensor, nn
 from lagbench.baselines import catalogue
 from lagbench.baselines.baseline import Baseline, Batch, Facts
 from lagbench.baselines.baseline import Options as Base
-from lagbench.baselines.loss import State as Moving
 from lagbench.baselines.operators.gat import GAT, GATv2
 from lagbench.baselines.operators.gns import GNS
 from lagbench.baselines.operators.operator import Operator
@@ -26,6 +25,7 @@ from lagbench.baselines.operators.pointnet import PointNet
 from lagbench.baselines.operators.supergat import SuperGAT, SuperGATDot
 from lagbench.baselines.operators.transformer import Transformer
 from lagbench.baselines.simulator import GraphNetwork
+from lagbench.baselines.simulator import State as Moving
 from lagbench.data.registry import Registry
 
 Floats = NDArray[np.float32]

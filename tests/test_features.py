@@ -26,7 +26,7 @@ def node_features(**options: bool) -> NodeFeatures:
     velocity, acceleration = (
         Scale(statistics[f"{name}_mean"], statistics[f"{name}_std"]) for name in ("velocity", "acceleration")
     )
-    return NodeFeatures(facts(), velocity, acceleration, RADIUS, **options)
+    return NodeFeatures(BOUNDS, velocity, acceleration, RADIUS, **options)
 
 
 def test_noise_widens_the_deviation_of_the_data() -> None:

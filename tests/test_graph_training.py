@@ -15,10 +15,18 @@ from simple_models import SMALL, batch, facts, jittered, network, oracle, rolled
 
 from lagbench.baselines.baseline import Batch, facts_of
 from lagbench.baselines.catalogue import find
-from lagbench.baselines.loss import GRID_TERMS, TERMS, LossNorm, Motion, Scales, State, loss_terms
 from lagbench.baselines.operators.supergat import SuperGAT
 from lagbench.baselines.recipe import recipe_for
-from lagbench.baselines.simulator import GraphNetwork
+from lagbench.baselines.simulator import (
+    GRID_TERMS,
+    TERMS,
+    GraphNetwork,
+    LossNorm,
+    Motion,
+    Scales,
+    State,
+    loss_terms,
+)
 from lagbench.data import grid as scoring
 from lagbench.data.registry import Registry
 from lagbench.make.generate import GenerationResult

@@ -11,9 +11,8 @@ import torch
 from simple_models import RADIUS, SMALL, batch, facts, jittered, network, oracle, rolled, swirl
 
 from lagbench.baselines.augmentation import image
-from lagbench.baselines.loss import State
 from lagbench.baselines.operators.gns import GNS
-from lagbench.baselines.simulator import GraphNetwork
+from lagbench.baselines.simulator import GraphNetwork, State
 from lagbench.errors import UsageError
 
 

@@ -21,9 +21,9 @@ from lagbench.data.registry import Registry, load
 from lagbench.errors import LagbenchError, UsageError, nearest
 
 from .catalogue import FIGURES
+from .drawing import Figure, write_sheet
 from .evidence import WEIGHTS
 from .runs import Plan, budget, make_run, outlook, score_committed
-from .sheet import Figure, write_sheet
 from .tables import TABLES, make_studies
 from .thesis import EXPECTED, ROSTER, Model, label
 

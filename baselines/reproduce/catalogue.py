@@ -7,7 +7,7 @@ from dataclasses import replace
 from types import MappingProxyType
 
 from . import figures, tables, var_protocol
-from .sheet import Figure
+from .drawing import Figure
 from .thesis import FRAME_MODELS, OPERATORS
 
 __all__ = ["FIGURES"]

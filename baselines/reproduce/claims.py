@@ -19,8 +19,7 @@ from lagbench.metrics.table import CHOSEN
 from lagbench.scoring.tables import Table
 
 from .evidence import Evidence, ordered
-from .sheet import number
-from .thesis import FRAME_MODELS, OPERATORS, key_frame, label
+from .thesis import FRAME_MODELS, OPERATORS, key_frame, label, number
 
 __all__ = ["CLAIMS", "answer", "claim_rows", "compared", "comparison_table", "floors_ahead"]
 

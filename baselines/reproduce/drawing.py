@@ -1,21 +1,29 @@
-"""Truth and predictions of a scenario, and charts and rows of panels drawn from them in one style."""
+"""Truth and predictions of a scenario, and charts and rows of panels drawn from them in one style.
+
+What the thesis shows (a figure) and what stands beside it (a sheet); sheets as Markdown, CSV and PNG.
+"""
 
 from __future__ import annotations
 
+import csv
 import io
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.atomic import write_atomically
 from lagbench.data.scenario import ScenarioFile
+from lagbench.draw.markdown import table
 from lagbench.draw.panels import Panel, colour_bar, colour_scale, draw, draw_walls, limit_of
 from lagbench.draw.recording import Recording, Scene, open_recording
 from lagbench.draw.style import INK, figure, pixels_of, png_bytes
 from lagbench.metrics.frame import FramePair, Scenario, Snapshot
+from lagbench.scoring.tables import Table
 from lagbench.submission.predictions import Predictions, open_predictions
 
 from .runs import Plan
@@ -24,7 +32,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Picture
 
-__all__ = ["TRUTH", "charts", "opened", "panel_rows", "png", "tidy"]
+__all__ = ["Figure", "Sheet", "TRUTH", "charts", "opened", "panel_rows", "png", "tidy", "write_sheet"]
 
 Floats = NDArray[np.float64]
 
@@ -180,3 +188,62 @@ def _draw_arrows(axes: Axes, scene: Scene, limit: float) -> None:
         width=0.006,
         zorder=2,
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Figure:
+    """A figure, table or section of the thesis: one row of the catalogue."""
+
+    name: str  # as in fig_5_10 or table_5_4
+    title: str  # what it shows
+    draw: Callable[[Plan, Figure], Sheet]
+    needs: Mapping[str, tuple[str, ...]] = field(
+        default_factory=dict
+    )  # models whose scored runs it shows, by split
+    studies: str = ""  # table of MLPs whose trainings it shows
+    cases: tuple[int, ...] = (0,)  # scenarios of the thesis: T0, T1, ...; ids on the free surface
+    frames: tuple[int, ...] = ()  # absolute; empty for the frame at which the thesis compares models
+    whole: bool = False  # show the whole rollout: pictures spread over it, errors over the horizon
+    panels: tuple[str, ...] = ()  # kinds of picture, one each
+    metrics: tuple[
+        str, ...
+    ] = ()  # of its table; of curves: the models', the truth's own, then means over the horizon
+    said: str = ""  # what the thesis says of it
+
+    @property
+    def split(self) -> str:
+        """The split that it is about, the first of several."""
+        return next(iter(self.needs))
+
+    @property
+    def models(self) -> tuple[str, ...]:
+        """The models that it shows on that split."""
+        return self.needs[self.split]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sheet:
+    """One table or figure of the thesis, ours beside it."""
+
+    notes: tuple[str, ...] = ()  # sentences; one paragraph each
+    tables: tuple[Table, ...] = ()
+    pictures: Mapping[str, bytes] = field(default_factory=dict)  # PNG files by what is added to their name
+
+
+def write_sheet(sheet: Sheet, folder: Path, name: str, head: str) -> str:
+    """Write ``<name>.md``, ``<name>[-n].csv`` and pictures; return the Markdown, which the head opens."""
+    parts = [head, *sheet.notes]
+    for count, held in enumerate(sheet.tables, start=1):
+        parts += [f"**{held.title}**"] if held.title else []
+        parts.append(table(held.columns, held.rows))
+        ending = f"-{count}" if len(sheet.tables) > 1 else ""
+        with io.StringIO() as buffer:
+            csv.writer(buffer, lineterminator="\n").writerows([held.columns, *held.rows])
+            write_atomically(folder / f"{name}{ending}.csv", buffer.getvalue().encode(), option="--output")
+    for what, picture in sheet.pictures.items():
+        path = folder / (f"{name}-{what}.png" if what else f"{name}.png")
+        write_atomically(path, picture, option="--output")
+        parts.append(f"![{name} {what}]({path.name})")
+    text = "\n\n".join(parts) + "\n"
+    write_atomically(folder / f"{name}.md", text.encode(), option="--output")
+    return text

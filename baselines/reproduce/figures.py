@@ -18,12 +18,11 @@ from lagbench.metrics.table import METRICS
 from lagbench.scoring.tables import Table
 
 from .claims import compared, comparison_table
-from .drawing import TRUTH, charts, opened, panel_rows, png, tidy
+from .drawing import TRUTH, Figure, Sheet, charts, opened, panel_rows, png, tidy
 from .evidence import read_json
 from .runs import Plan
-from .sheet import Figure, Sheet, number
 from .tables import FILE, study_folder, study_rows
-from .thesis import LOSS_SNAPSHOTS, TABLE_4_8, colour, key_frame, label, predicted, scenario_of
+from .thesis import LOSS_SNAPSHOTS, TABLE_4_8, colour, key_frame, label, number, predicted, scenario_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -27,9 +27,20 @@ from lagbench.scoring.tables import ARROWS, Table
 from .claims import CLAIMS, answer, claim_rows, comparison_table, floors_ahead
 from .evidence import BOARD, WEIGHTS, Evidence, Method, Sources, read_json
 from .runs import budget, hardware
-from .sheet import interval, number
 from .tables import rollout_table
-from .thesis import EXPECTED, OPERATORS, ROSTER, SIZES, TABLE_4_8, TABLE_5_4, key_frame, label, scenario_of
+from .thesis import (
+    EXPECTED,
+    OPERATORS,
+    ROSTER,
+    SIZES,
+    TABLE_4_8,
+    TABLE_5_4,
+    interval,
+    key_frame,
+    label,
+    number,
+    scenario_of,
+)
 from .var_protocol import FILE, beside_thesis
 
 __all__ = ["agreement", "main", "render"]

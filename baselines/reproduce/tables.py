@@ -24,10 +24,9 @@ from lagbench.metrics.distributions import kl, normalised
 from lagbench.metrics.table import METRICS
 from lagbench.scoring.tables import Table
 
-from .drawing import charts, opened, png, tidy
+from .drawing import Figure, Sheet, charts, opened, png, tidy
 from .evidence import RECORD_NAME, Evidence, read_json
 from .runs import Plan, budget, check_training, make_training
-from .sheet import Figure, Sheet, number
 from .thesis import (
     FRAME_MODELS,
     OPERATORS,
@@ -42,6 +41,7 @@ from .thesis import (
     colour,
     key_frame,
     label,
+    number,
     scenario_of,
 )
 

@@ -1,4 +1,4 @@
-"""Numbers that the thesis prints, models that results speak of, and our scenarios that stand for its own.
+"""Numbers that the thesis prints, models that results speak of, our scenarios that stand for its own.
 
 D. Dharma, PhD thesis, University of Leeds, 2025. Models have our names: ``supergat`` is the thesis's own
 model ("OURS"), ``transformer`` its graph transformer. Where the thesis contradicts itself, the reading that
@@ -7,12 +7,14 @@ holds here is said beside the number.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
 from lagbench.data.registry import Size
 from lagbench.draw.style import MUTED
+from lagbench.metrics.aggregate import Score
 
 __all__ = [
     "EXPECTED",
@@ -31,8 +33,10 @@ __all__ = [
     "TABLE_4_8",
     "TABLE_5_4",
     "colour",
+    "interval",
     "key_frame",
     "label",
+    "number",
     "predicted",
     "scenario_of",
 ]
@@ -287,3 +291,19 @@ def predicted(size: Size, frames: Iterable[int]) -> tuple[int, ...]:
     """Return those absolute frames that are predicted; the last predicted one if none is."""
     first, last = size.task.input_frames, size.task.input_frames + size.task.horizon - 1
     return tuple(frame for frame in frames if first <= frame <= last) or (last,)
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """Return a number with so many digits, a dash where there is none.
+
+    >>> number(0.00012345), number(None), number(12345678.0)
+    ('0.000123', '-', '1.23e+07')
+    """
+    return "-" if value is None or math.isnan(value) else f"{value:.{digits}g}"
+
+
+def interval(score: Score) -> str:
+    """Return mean and 95 % interval over scenarios, as in "0.12 (0.1 to 0.15)"."""
+    low, high = score.interval
+    bounds = "" if math.isnan(low) else f" ({number(low)} to {number(high)})"
+    return f"{number(score.mean)}{bounds}"

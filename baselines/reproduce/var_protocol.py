@@ -32,9 +32,9 @@ from lagbench.data.scenario import read_scenario
 from lagbench.draw.markdown import table as markdown_table
 from lagbench.scoring.tables import Table
 
+from .drawing import Figure, Sheet
 from .runs import Plan
-from .sheet import Figure, Sheet, number
-from .thesis import SECTION_4_8_3
+from .thesis import SECTION_4_8_3, number
 
 if TYPE_CHECKING:
     pass
