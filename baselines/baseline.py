@@ -2,9 +2,8 @@
 
 A baseline is one file: a subclass of :class:`Baseline` with its options, named by an entry
 point of the group ``lagbench.baselines``. Training, checkpoints, rollouts, predictions and
-scores then work without another line.
-
-What a baseline may know of a data set: public figures of datasets.yaml, never a test scenario.
+scores then work without another line. It may know a data set's public figures, of datasets.yaml,
+and never a test scenario.
 """
 
 from __future__ import annotations

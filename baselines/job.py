@@ -37,7 +37,6 @@ __all__ = [
     "STOPPED_EARLY",
     "TrainingJob",
     "TrainingRecord",
-    "default_folder",
     "first_difference",
     "parameter_count",
 ]
@@ -119,47 +118,20 @@ class TrainingRecord:
         return sum(step > (self.best_step or 0) for step in steps)
 
 
-def versions() -> dict[str, str]:
-    """Return the versions of the libraries that decide the result."""
-    packages = ("lagbench", "torch", "torch-geometric", "pytorch-lightning", "numpy", "scipy")
-    return {"python": platform.python_version(), **{name: version(name) for name in packages}}
-
-
 def _processor_seconds() -> float:
     times = os.times()  # of children; of this process it has hundredths only
     return time.process_time() + times.children_user + times.children_system
 
 
-def default_folder(recipe: Recipe) -> Path:
-    """Return ``runs/<split>/<size>/<baseline>-<seed>`` in the present folder."""
-    return Path("runs") / recipe.name / f"{recipe.baseline}-{recipe.training.seed}"
-
-
-@dataclass(frozen=True)
 class RunFolder:
     """Paths of a training's files, and what an earlier run left there."""
 
-    path: Path
-
-    @property
-    def checkpoint(self) -> Path:
-        """The last state, to go on from."""
-        return self.path / "checkpoint.pt"
-
-    @property
-    def weights(self) -> Path:
-        """The best weights in bfloat16, to predict from."""
-        return self.path / "weights.pt"
-
-    @property
-    def record(self) -> Path:
-        """What the training did and cost, as JSON."""
-        return self.path / "training.json"
-
-    @property
-    def logs(self) -> Path:
-        """Folder of TensorBoard's files."""
-        return self.path / "tensorboard"
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.checkpoint = path / "checkpoint.pt"  # the last state, to go on from
+        self.weights = path / "weights.pt"  # the best weights in bfloat16, to predict from
+        self.record = path / "training.json"  # what the training did and cost
+        self.logs = path / "tensorboard"  # folder of TensorBoard's files
 
     def earlier(self, recipe: Recipe, *, resume: bool, fresh: bool) -> Checkpoint | None:
         """Return the checkpoint to go on from; None for a training from the start."""
@@ -247,6 +219,8 @@ def first_difference(wanted: dict[str, Any], found: object, path: str = "") -> s
 
 
 FORMAT = 1
+# whose versions decide the result
+LIBRARIES = ("lagbench", "torch", "torch-geometric", "pytorch-lightning", "numpy", "scipy")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -332,7 +306,7 @@ class TrainingJob:
             "parameters": parameter_count(model),
             "processes": self.processes,
             "hardware": hardware(self.device),
-            "versions": versions(),
+            "versions": {"python": platform.python_version(), **{name: version(name) for name in LIBRARIES}},
             "budget": budget.model_dump(mode="json"),
             "track": track_of(facts.size, budget),
             **more,

@@ -1,9 +1,7 @@
-"""Encode, process, decode: the graph network that all six operators share.
+"""Encode, process, decode: the graph network that all six operators share, and its layers.
 
-Layers of the graph networks: perceptrons of nodes and edges, fast and exact on CPUs.
-
-Products go to oneDNN, normalising layers learn in bfloat16 too, and large edge updates keep no hidden
-layer: the backward pass computes them again.
+They are fast and exact on CPUs: products go to oneDNN, normalising layers learn in bfloat16 too, and
+large edge updates keep no hidden layer: the backward pass computes them again.
 """
 
 from __future__ import annotations

@@ -35,7 +35,7 @@ from .augmentation import check_symmetry
 from .baseline import Baseline, facts_of
 from .catalogue import find
 from .checkpoint import load_weights, rounded_weights, save
-from .job import STOPPED_EARLY, RunFolder, TrainingJob, TrainingRecord, default_folder, parameter_count
+from .job import STOPPED_EARLY, RunFolder, TrainingJob, TrainingRecord, parameter_count
 from .machine import (
     bound_memory,
     chosen_device,
@@ -136,7 +136,8 @@ def train(
     plan = recipe_for(entry, tier.split, tier.name, variant=recipe, settings=settings, seed=seed)
     check_symmetry(plan.model.get("symmetry"), tier)
     facts = facts_of(tier.split, tier.name, root=home, registry=known)
-    folder = RunFolder(Path(output) if output else default_folder(plan))
+    own = Path("runs") / plan.name / f"{plan.baseline}-{plan.training.seed}"
+    folder = RunFolder(Path(output) if output else own)
     check_writable(folder.path, option="--output")
     shared = int(os.environ.get("WORLD_SIZE", processes))
     earlier = folder.earlier(plan, resume=resume, fresh=fresh)

@@ -1,7 +1,4 @@
-"""Checkpoints: what comes back, what is refused, and that nothing in a file is run.
-
-Models that a checkpoint asks for: those that its weights fill are built, larger ones are refused.
-"""
+"""Checkpoints: what comes back; what is refused, larger models too; and that nothing in a file is run."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""The six loss terms against a NumPy route through the scorer's grid, and by hand.
-
-Training steps of graph networks: the rollout's own step, noise, weights, gradients.
-"""
+"""Training of graph networks: the six loss terms against NumPy, own steps, noise, weights, gradients."""
 
 from __future__ import annotations
 

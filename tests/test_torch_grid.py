@@ -1,7 +1,4 @@
-"""The differentiable grid fields are those of lagbench.data.grid, and their gradients are right.
-
-Particles to nodes and back, against closed forms and the scorer's transfer.
-"""
+"""The differentiable grids: fields are the scorer's, particles go to nodes and back, gradients are right."""
 
 from __future__ import annotations
 

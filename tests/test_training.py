@@ -1,7 +1,4 @@
-"""Training: what it converges to, how it goes on after an interrupt, and how it stops.
-
-How a training ends: early, for good; and on a full disk or with a model that memory cannot hold.
-"""
+"""Training: what it converges to, how it goes on after an interrupt, how it stops and ends."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Truth and predictions of a scenario, and charts and rows of panels drawn from them in one style.
-
-What the thesis shows (a figure) and what stands beside it (a sheet); sheets as Markdown, CSV and PNG.
-"""
+"""Figures of the thesis and the sheets beside them; rollouts, charts and rows of panels in one style."""
 
 from __future__ import annotations
 
