@@ -243,9 +243,10 @@ class NodeFeatures(nn.Module):
         changes = self.acceleration(velocity.diff(dim=1)).flatten(1)
         kind = self.embedding(material).to(position.dtype)
         parts = [self.velocity(velocity[:, -1]), changes, distance, kind]
-        if self.moving_walls and wall_velocity is None:
-            parts.append(distance.new_zeros(len(distance), 2 * _WALLS))
-        elif self.moving_walls:
-            nearness = 1.0 - distance.clamp(min=0.0)
-            parts.append((nearness.unsqueeze(-1) * wall_velocity / self.velocity.std).flatten(1))
+        if self.moving_walls:
+            felt = distance.new_zeros(len(distance), _WALLS, 2)
+            if wall_velocity is not None:
+                nearness = 1.0 - distance.clamp(min=0.0)
+                felt = nearness.unsqueeze(-1) * wall_velocity / self.velocity.std
+            parts.append(felt.flatten(1))
         return torch.cat(parts, dim=1)

@@ -69,10 +69,6 @@ class Schedule(_Strict):
         return rise * (self.floor + (1 - self.floor) * (1 + math.cos(math.pi * done)) / 2)
 
 
-def _named(value: object) -> object:
-    return {"kind": value} if isinstance(value, str) else value
-
-
 VALIDATION_SHARE = 0.15  # share of a training's processor time that validations may take
 
 STEP_COST = 1.5
@@ -93,7 +89,9 @@ class TrainingOptions(_Strict):
     learning_rate: float = Field(default=1e-4, gt=0, allow_inf_nan=False)
     # decoupled (AdamW) where it is above 0
     weight_decay: float = Field(default=0.0, ge=0, allow_inf_nan=False)
-    schedule: Annotated[Schedule, BeforeValidator(_named)] = Schedule()  # the rate over the steps
+    schedule: Annotated[
+        Schedule, BeforeValidator(lambda value: {"kind": value} if isinstance(value, str) else value)
+    ] = Schedule()  # the rate over the steps
     warmup_steps: int = Field(default=0, ge=0)  # steps over which the rate rises from 0
     # largest norm of the gradient; None clips nothing
     clip: float | None = Field(default=None, gt=0, allow_inf_nan=False)

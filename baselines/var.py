@@ -218,8 +218,6 @@ class StableVAR(Fitted):
         return state + change.view(state.shape)
 
 
-Matrix = NDArray[np.float64]
-
 TOLERANCE = 1e-3  # relative accuracy of the condition number's two eigenvalues
 
 

@@ -258,9 +258,6 @@ def test_closed_forms_go_through_the_same_door(run: Run) -> None:
     assert result.checkpoint.stat().st_mtime_ns == stamp
 
 
-Run = Callable[..., TrainingResult]
-
-
 def test_weights_without_a_checkpoint_are_not_replaced(run: Run) -> None:
     """Going on is refused where only weights are left: it is said whether that training is finished."""
     first = run("drift", "steps=1")
