@@ -21,8 +21,8 @@ from lagbench.baselines.reproduce.claims import (
     compared,
     floors_ahead,
 )
+from lagbench.baselines.reproduce.drawing import SMOOTHED, loss_over_steps, smoothed
 from lagbench.baselines.reproduce.evidence import Evidence, Method, Seeded, Sources
-from lagbench.baselines.reproduce.figures import SMOOTHED, loss_over_steps, smoothed
 from lagbench.baselines.reproduce.results import agreement
 from lagbench.baselines.reproduce.tables import cubic_errors, cubic_vorticity, rollout_table
 from lagbench.data.registry import load

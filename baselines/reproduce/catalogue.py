@@ -14,7 +14,7 @@ __all__ = ["FIGURES"]
 
 # what several figures share; each row below holds only how it differs
 _STUDY = Figure(name="", title="", draw=tables.studies, needs={"fluid": ()})
-_LOSSES = replace(_STUDY, draw=figures.study_losses)
+_LOSSES = replace(_STUDY, draw=tables.study_losses)
 _ROLLOUTS = Figure(
     name="", title="Rollouts, scene by scene", draw=tables.rollouts, needs={"fluid": FRAME_MODELS}
 )

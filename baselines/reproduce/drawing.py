@@ -19,6 +19,7 @@ from lagbench.draw.markdown import table
 from lagbench.draw.panels import Panel, colour_bar, colour_scale, draw, draw_walls, limit_of
 from lagbench.draw.recording import Recording, Scene, open_recording
 from lagbench.draw.style import INK, figure, pixels_of, png_bytes
+from lagbench.errors import require
 from lagbench.metrics.frame import FramePair, Scenario, Snapshot
 from lagbench.scoring.tables import Table
 from lagbench.submission.predictions import Predictions, open_predictions
@@ -29,13 +30,29 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Picture
 
-__all__ = ["Figure", "Sheet", "TRUTH", "charts", "opened", "panel_rows", "png", "tidy", "write_sheet"]
+__all__ = [
+    "Figure",
+    "SMOOTHED",
+    "Sheet",
+    "TRUTH",
+    "charts",
+    "loss_over_steps",
+    "plot_losses",
+    "opened",
+    "panel_rows",
+    "png",
+    "tidy",
+    "write_sheet",
+]
 
 Floats = NDArray[np.float64]
 
 TRUTH = INK
 LEVELS = 96  # colours of a chart's file
 QUIVER = "quiver"  # a kind of panel of our own: arrows at the nodes, coloured by speed as streamlines are
+
+SMOOTHED = 25
+"""Entries of the log that a drawn point is the mean of, as many before it as after; fewer at both ends."""
 
 SIDE, GAP, TOP, LEFT, BOTTOM = 1.5, 0.08, 0.34, 0.75, 0.62  # [inch]
 
@@ -244,3 +261,35 @@ def write_sheet(sheet: Sheet, folder: Path, name: str, head: str) -> str:
     text = "\n\n".join(parts) + "\n"
     write_atomically(folder / f"{name}.md", text.encode(), option="--output")
     return text
+
+
+def plot_losses(axes: Axes, curves: Mapping[str, tuple[str | None, Floats, Floats]]) -> None:
+    """Plot smoothed losses by name: colour, steps and loss of each."""
+    for name, (line, steps, loss) in curves.items():
+        if loss.size:
+            axes.plot(steps, smoothed(loss), lw=1.1, label=name, color=line)
+            axes.set_yscale("log")
+    tidy(axes, f"mean of {SMOOTHED} entries", "optimiser step", "training loss")
+
+
+def loss_over_steps(folder: Path, term: str = "total") -> tuple[Floats, Floats]:
+    """Return steps and loss of a training as TensorBoard was told; empty where it left no log."""
+    logs, tag = folder / "tensorboard", f"loss/{term}"
+    if not logs.is_dir():
+        return np.empty(0), np.empty(0)
+    module = require("tensorboard.backend.event_processing.event_accumulator", extra="baselines")
+    held = module.EventAccumulator(str(logs), size_guidance={"scalars": 0}).Reload()
+    if tag not in held.Tags()["scalars"]:
+        return np.empty(0), np.empty(0)
+    # a training that went on repeats steps; what was told last holds
+    entries = sorted({entry.step: entry.value for entry in held.Scalars(tag)}.items())
+    return np.array([step for step, _ in entries], float), np.array([loss for _, loss in entries])
+
+
+def smoothed(values: Floats) -> Floats:
+    """Return the mean of each value and its neighbours, :data:`SMOOTHED` in all where there are."""
+    total = np.concatenate([[0.0], np.cumsum(values)])
+    place = np.arange(len(values))
+    reach = np.minimum(SMOOTHED // 2, np.minimum(place, place[::-1]))
+    found: Floats = (total[place + reach + 1] - total[place - reach]) / (2 * reach + 1)
+    return found

@@ -4,39 +4,44 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.registry import Size
-from lagbench.errors import require
 from lagbench.metrics.aggregate import Score
 from lagbench.metrics.metric import mean
 from lagbench.metrics.table import METRICS
 from lagbench.scoring.tables import Table
 
 from .claims import compared, comparison_table
-from .drawing import TRUTH, Figure, Sheet, charts, opened, panel_rows, png, tidy
-from .evidence import read_json
+from .drawing import (
+    SMOOTHED,
+    TRUTH,
+    Figure,
+    Sheet,
+    charts,
+    loss_over_steps,
+    opened,
+    panel_rows,
+    plot_losses,
+    png,
+    tidy,
+)
 from .runs import Plan
-from .tables import FILE, study_folder, study_rows
 from .thesis import LOSS_SNAPSHOTS, TABLE_4_8, colour, key_frame, label, number, predicted, scenario_of
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+    pass
 
 __all__ = [
     "case_curves",
     "histograms",
-    "loss_over_steps",
     "losses",
     "model_curves",
     "panels",
     "residuals",
-    "smoothed",
-    "study_losses",
 ]
 
 TIMES = 6  # columns of a picture that shows a whole rollout
@@ -166,9 +171,6 @@ Floats = NDArray[np.float64]
 BOUNDS = {40: 0.0002, 80: 0.0004}
 """What the thesis says that SuperGAT's vorticity MSE stays below up to a frame [1/frame^2]."""
 
-SMOOTHED = 25
-"""Entries of the log that a drawn point is the mean of, as many before it as after; fewer at both ends."""
-
 
 def model_curves(plan: Plan, figure: Figure) -> Sheet:
     """Return a metric over the frames, one curve per model: for T0 and in the mean over scenarios."""
@@ -241,7 +243,7 @@ def losses(plan: Plan, figure: Figure) -> Sheet:
         for (split, name), folder in folders.items()
     }
     with charts(1, 1, width=5.6, height=3.2) as drawn:
-        _plot_losses(drawn[0], curves)
+        plot_losses(drawn[0], curves)
         picture = png(drawn)
     heads: tuple[str, ...]
     rows: list[tuple[str, ...]] = []
@@ -262,62 +264,5 @@ def losses(plan: Plan, figure: Figure) -> Sheet:
     )
 
 
-def study_losses(plan: Plan, figure: Figure) -> Sheet:
-    """Return the losses of the rows of Table 4.2 or 4.3, and the final errors over train and valid."""
-    studies = study_rows(figure.studies)
-    names = [s.activation if s.table == "4.2" else f"3 x {s.widths[0]}" for s in studies]
-    folders = [study_folder(plan, figure.studies, study) for study in studies]
-    errors = [read_json(folder / FILE) for folder in folders]
-    curves = {name: (None, *loss_over_steps(folder)) for name, folder in zip(names, folders, strict=True)}
-    with charts(2, 2) as drawn:
-        over_steps, after = drawn
-        _plot_losses(over_steps, curves)
-        place = np.arange(len(studies))
-        for shift, subset in ((-0.2, "train"), (0.2, "valid")):
-            values = [float(held.get(subset, np.nan)) for held in errors]
-            after.bar(place + shift, values, 0.4, label=subset)
-        after.set_xticks(place, names)
-        tidy(after, "after training", "", "MSE of one step [standardised^2]")
-        picture = png(drawn)
-    rows = [
-        (name, number(s.train, 4), number(e.get("train")), number(s.valid, 4), number(e.get("valid")))
-        for name, s, e in zip(names, studies, errors, strict=True)
-    ]
-    heads = ("network", "train, thesis", "train, ours", "valid, thesis", "valid, ours")
-    return Sheet(notes=(figure.said,), tables=(Table("", heads, tuple(rows)),), pictures={"": picture})
-
-
-def _plot_losses(axes: Axes, curves: Mapping[str, tuple[str | None, Floats, Floats]]) -> None:
-    """Plot smoothed losses by name: colour, steps and loss of each."""
-    for name, (line, steps, loss) in curves.items():
-        if loss.size:
-            axes.plot(steps, smoothed(loss), lw=1.1, label=name, color=line)
-            axes.set_yscale("log")
-    tidy(axes, f"mean of {SMOOTHED} entries", "optimiser step", "training loss")
-
-
 def _end(loss: Floats) -> str:
     return number(float(loss[-SMOOTHED:].mean()) if loss.size else None)
-
-
-def loss_over_steps(folder: Path, term: str = "total") -> tuple[Floats, Floats]:
-    """Return steps and loss of a training as TensorBoard was told; empty where it left no log."""
-    logs, tag = folder / "tensorboard", f"loss/{term}"
-    if not logs.is_dir():
-        return np.empty(0), np.empty(0)
-    module = require("tensorboard.backend.event_processing.event_accumulator", extra="baselines")
-    held = module.EventAccumulator(str(logs), size_guidance={"scalars": 0}).Reload()
-    if tag not in held.Tags()["scalars"]:
-        return np.empty(0), np.empty(0)
-    # a training that went on repeats steps; what was told last holds
-    entries = sorted({entry.step: entry.value for entry in held.Scalars(tag)}.items())
-    return np.array([step for step, _ in entries], float), np.array([loss for _, loss in entries])
-
-
-def smoothed(values: Floats) -> Floats:
-    """Return the mean of each value and its neighbours, :data:`SMOOTHED` in all where there are."""
-    total = np.concatenate([[0.0], np.cumsum(values)])
-    place = np.arange(len(values))
-    reach = np.minimum(SMOOTHED // 2, np.minimum(place, place[::-1]))
-    found: Floats = (total[place + reach + 1] - total[place - reach]) / (2 * reach + 1)
-    return found

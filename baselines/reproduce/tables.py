@@ -24,7 +24,7 @@ from lagbench.metrics.distributions import kl, normalised
 from lagbench.metrics.table import METRICS
 from lagbench.scoring.tables import Table
 
-from .drawing import Figure, Sheet, charts, opened, png, tidy
+from .drawing import Figure, Sheet, charts, loss_over_steps, opened, plot_losses, png, tidy
 from .evidence import RECORD_NAME, Evidence, read_json
 from .runs import Plan, budget, check_training, make_training
 from .thesis import (
@@ -54,6 +54,7 @@ __all__ = [
     "rollouts",
     "statistics",
     "studies",
+    "study_losses",
     "study_folder",
     "study_rows",
     "times",
@@ -351,3 +352,28 @@ def studies(plan: Plan, figure: Figure) -> Sheet:
         " compare orders."
     )
     return Sheet(notes=(note,), tables=(Table("", heads, tuple(rows)),))
+
+
+def study_losses(plan: Plan, figure: Figure) -> Sheet:
+    """Return the losses of the rows of Table 4.2 or 4.3, and the final errors over train and valid."""
+    studies = study_rows(figure.studies)
+    names = [s.activation if s.table == "4.2" else f"3 x {s.widths[0]}" for s in studies]
+    folders = [study_folder(plan, figure.studies, study) for study in studies]
+    errors = [read_json(folder / FILE) for folder in folders]
+    curves = {name: (None, *loss_over_steps(folder)) for name, folder in zip(names, folders, strict=True)}
+    with charts(2, 2) as drawn:
+        over_steps, after = drawn
+        plot_losses(over_steps, curves)
+        place = np.arange(len(studies))
+        for shift, subset in ((-0.2, "train"), (0.2, "valid")):
+            values = [float(held.get(subset, np.nan)) for held in errors]
+            after.bar(place + shift, values, 0.4, label=subset)
+        after.set_xticks(place, names)
+        tidy(after, "after training", "", "MSE of one step [standardised^2]")
+        picture = png(drawn)
+    rows = [
+        (name, number(s.train, 4), number(e.get("train")), number(s.valid, 4), number(e.get("valid")))
+        for name, s, e in zip(names, studies, errors, strict=True)
+    ]
+    heads = ("network", "train, thesis", "train, ours", "valid, thesis", "valid, ours")
+    return Sheet(notes=(figure.said,), tables=(Table("", heads, tuple(rows)),), pictures={"": picture})
