@@ -117,7 +117,7 @@ def test_what_a_training_says(run: Run) -> None:
     """Record, weights and result tell windows, epochs, times, machine, and the best validation."""
     settings = ("steps=8", "batch=3", "validate_every=2", "model.start=1.0")
     result = run("drift", *settings, "learning_rate=0.5")
-    record = json.loads((result.folder / "json").read_text())
+    record = json.loads((result.folder / "training.json").read_text())
     stored = load(result.weights).training
     assert record["budget"] == stored["budget"]
     budget = record["budget"]
@@ -137,7 +137,7 @@ def test_what_a_training_says(run: Run) -> None:
 def test_long_records_are_thinned(run: Run) -> None:
     """Of 22 validations a budget tells at most 20, the last one among them."""
     result = run("drift", "steps=22", "validate_every=1", "validation_frames=2")
-    told = json.loads((result.folder / "json").read_text())["budget"]["validations"]
+    told = json.loads((result.folder / "training.json").read_text())["budget"]["validations"]
     assert len(told) <= 20
     assert told[-1][0] == 22
 
