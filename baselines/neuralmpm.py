@@ -25,7 +25,7 @@ from lagbench.errors import DataError, UsageError
 from .augmentation import Symmetry, disturbed
 from .baseline import Baseline, Batch, Facts, Options, check_moving_walls, last_velocities
 from .graph import MATERIALS
-from .torch_grid import ParticleGrid, Stencil
+from .particle_grid import ParticleGrid, Stencil
 
 __all__ = ["NeuralMPM"]
 

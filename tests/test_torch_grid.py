@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lagbench.baselines import torch_grid
-from lagbench.baselines.torch_grid import ParticleGrid
+from lagbench.baselines.particle_grid import ParticleGrid
 from lagbench.data import grid as reference
 from lagbench.data.grid import Grid, Placement, transfer
 from lagbench.errors import UsageError

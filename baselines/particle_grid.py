@@ -1,0 +1,120 @@
+"""Particles to nodes and back by quadratic B-splines, on the grid of a network.
+
+    spread:  g_ij = sum_p b(x_p - x_i) b(y_p - y_j) v_p        (P2G)
+    gather:  v_p  = sum_ij b(x_p - x_i) b(y_p - y_j) g_ij      (G2P)
+
+with the b of :mod:`lagbench.data.grid`. Both share one :class:`Stencil` and have gradients to
+positions and values.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from .graph import Bounds
+from .torch_grid import nine_nodes, spline_weights
+
+__all__ = ["ParticleGrid", "Stencil"]
+
+
+class Stencil(NamedTuple):
+    """The nine nodes around each particle."""
+
+    weight: Tensor  # of each node [1], shape [particle, 9]; they sum to 1
+    node: Tensor  # number of the node among those of all layers, int64, shape [particle * 9]
+
+
+class ParticleGrid(nn.Module):
+    """Square cells that lie in a box as its images do: walls between two nodes, the centre in the middle.
+
+    Particles that do not mix, those of several windows or materials, each have a layer of nodes.
+
+    Args:
+        bounds: box (low, high) along x and y [length]; particles lie in it.
+        cells: cells across the wider side of the box.
+        multiple: number that divides the nodes of each axis.
+    """
+
+    axis_x: Tensor
+    axis_y: Tensor
+    low: Tensor
+    high: Tensor
+
+    def __init__(self, bounds: Bounds, cells: int, *, multiple: int = 1) -> None:
+        super().__init__()
+        self.spacing = max(high - low for low, high in bounds) / cells
+        for name, (low, high) in zip(("axis_x", "axis_y"), bounds, strict=True):
+            nodes = math.ceil((high - low) / self.spacing - 1e-6) + 2
+            nodes += -nodes % multiple
+            places = (torch.arange(nodes, dtype=torch.float64) - (nodes - 1) / 2) * self.spacing
+            axis = ((low + high) / 2 + places).to(torch.float32)
+            self.register_buffer(name, axis, persistent=False)
+        self.register_buffer("low", torch.tensor(bounds)[:, 0], persistent=False)
+        self.register_buffer("high", torch.tensor(bounds)[:, 1], persistent=False)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Nodes along x and y."""
+        return len(self.axis_x), len(self.axis_y)
+
+    def stencil(self, position: Tensor, layer: Tensor) -> Stencil:
+        """Return the nodes around particles.
+
+        Args:
+            position: particle positions [length], shape [particle, 2].
+            layer: layer of each particle, int64, shape [particle].
+        """
+        columns, rows = self.shape
+        s = (position - torch.stack([self.axis_x[0], self.axis_y[0]])) / self.spacing
+        # On the far wall the third node has weight 0 and may not exist; NaN must not become an index.
+        last = s.new_tensor([columns - 3, rows - 3])
+        base = torch.floor(s.detach() - 0.5).nan_to_num(0.0).clamp(min=0.0).minimum(last)
+        column, row = base.long().unbind(dim=1)
+        node = nine_nodes(layer, column, row, self.shape)
+        return Stencil(spline_weights(s - base).flatten(1), node.flatten())
+
+    def spread(self, stencil: Stencil, value: Tensor, layers: int) -> Tensor:
+        """Return the sums at the nodes, shape [layer, channel, x node, y node].
+
+        Args:
+            stencil: what :meth:`stencil` returned.
+            value: values of the particles, shape [particle, channel].
+            layers: number of layers.
+        """
+        columns, rows = self.shape
+        parts = (stencil.weight[:, :, None] * value[:, None]).flatten(0, 1)
+        sums = value.new_zeros(layers * columns * rows, value.shape[1]).index_add(0, stencil.node, parts)
+        return sums.view(layers, columns, rows, -1).permute(0, 3, 1, 2)
+
+    def gather(self, stencil: Stencil, field: Tensor) -> Tensor:
+        """Return a field at the particles, shape [particle, channel].
+
+        Args:
+            stencil: what :meth:`stencil` returned.
+            field: values at the nodes, shape [layer, channel, x node, y node].
+        """
+        channels = field.shape[1]
+        nodes = field.permute(0, 2, 3, 1).reshape(-1, channels).index_select(0, stencil.node)
+        return (stencil.weight[:, :, None] * nodes.view(-1, 9, channels)).sum(dim=1)
+
+    def wall_distance(self, reach: float) -> Tensor:
+        """Return the distances to left, right, bottom and top wall over a reach, within [-1, 1].
+
+        Args:
+            reach: distance beyond which a wall looks like one at it [length].
+
+        Returns:
+            Negative outside the box, shape [wall, x node, y node].
+        """
+        (left, bottom), (right, top) = self.low, self.high
+        x, y = (self.axis_x[:, None].expand(self.shape), self.axis_y.expand(self.shape))
+        distance = torch.stack([x - left, right - x, y - bottom, top - y])
+        return (distance / reach).clamp(-1.0, 1.0)
+
+    def beside_walls(self) -> Tensor:
+        """Return 1 at the two rows of nodes beside each wall, else 0, shape [wall, x node, y node]."""
+        return (self.wall_distance(self.spacing).abs() < 1.0).to(torch.float32)
