@@ -2,29 +2,32 @@
 
 A baseline is one file: a subclass of :class:`Baseline` with its options, named by an entry
 point of the group ``lagbench.baselines``. Training, checkpoints, rollouts, predictions and
-scores then work without another line.
+scores then work without another line. It may know a data set's public figures, of datasets.yaml,
+and never a test scenario.
 """
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping
-from typing import Any, ClassVar, Self
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Self
 
 import torch
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 from torch import Tensor, nn
 
-from lagbench.errors import UsageError
+from lagbench.data.layout import dataset_folder
+from lagbench.data.local import locate, remedy
+from lagbench.data.manifest import read_manifest
+from lagbench.data.registry import Registry
+from lagbench.data.scenario import read_scenario
+from lagbench.errors import DataError, UsageError
+from lagbench.store.copy import bring
 from lagbench.torch import Batch
 
-from .facts import Facts
-
-__all__ = [
-    "Batch",
-    "Baseline",
-    "Options",
-]
+__all__ = ["Baseline", "Batch", "Facts", "Options", "check_moving_walls", "facts_of", "last_velocities"]
 
 
 class Options(BaseModel):
@@ -105,3 +108,113 @@ class Baseline(nn.Module):
     @abstractmethod
     def advance(self, state: Any) -> tuple[Any, Tensor]:  # noqa: ANN401
         """Advance by one frame: the next state and positions [length], shape [particle, 2]."""
+
+
+def last_velocities(position: Tensor, count: int) -> Tensor:
+    """Return the last velocities [length/frame], shape [particle, count, 2], oldest first, of given frames.
+
+    Where the frames are few, the first velocity repeats.
+    """
+    velocity = position[:, -count - 1 :].diff(dim=1)
+    if not velocity.shape[1]:
+        raise UsageError(
+            "too few frames to start from", expected=f"2 or more, {count + 1} for all", got=position.shape[1]
+        )
+    missing = count - velocity.shape[1]
+    return torch.cat([velocity[:, :1].expand(-1, missing, -1), velocity], dim=1)
+
+
+def check_moving_walls(asked: bool, facts: Facts) -> None:
+    """Refuse a model that wants the velocities of walls where none moves."""
+    if asked and not facts.moving_walls:
+        raise UsageError(
+            f"the walls of {facts.split} do not move",
+            where="model.wall_velocity",
+            expected=False,
+            got=True,
+            fix="leave the option out",
+        )
+
+
+# Checked where facts are read from a file, which may be a stranger's: names are no paths.
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Count = Annotated[int, Field(gt=0)]
+Pair = tuple[Finite, Finite]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Facts:
+    """Public figures of one size of a split; they travel in every checkpoint."""
+
+    split: Name  # name of the split
+    size: Name  # name of the size
+    version: str  # semantic version of the split
+    dataset_sha256: str  # hash of the data set
+    particles: Count  # particles in one scenario
+    bounds: tuple[Pair, Pair]  # box that holds the particles, (low, high) along x and y [length]
+    radius: Positive  # connectivity radius [length]
+    input_frames: Count  # frames given at the start of a test scenario
+    horizon: Count  # frames to predict after them
+    score_cells: Count  # cells across of the scorer's grid
+    score_placement: str  # 'cell_centres' or 'nodes', where that grid's nodes lie
+    frame_interval: Positive  # time between frames [s]
+    moving_walls: bool  # whether scenario files hold wall_velocity
+    # over train: position_mean, position_std [length], velocity_mean, velocity_std [length/frame],
+    # acceleration_mean, acceleration_std [length/frame^2], one (x, y) pair each
+    statistics: Mapping[str, Pair]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return plain values, as checkpoints hold them."""
+        return asdict(self)
+
+    @classmethod
+    def from_json(cls, values: object) -> Self:
+        """Return the facts that :meth:`as_json` gave."""
+        return TypeAdapter(cls).validate_python(values)
+
+
+def facts_of(
+    split: str, size: str | None = None, *, root: str | Path | None = None, registry: Registry | None = None
+) -> Facts:
+    """Return the public figures of a generated data set."""
+    tier, home, _ = locate(split, size, root=root, registry=registry)
+    folder = dataset_folder(home, tier.split, tier.name, tier.major)
+
+    def absent(what: str) -> DataError:
+        return DataError(what, where=str(folder), fix=remedy(tier, root=home))
+
+    bring(tier, home)
+    manifest = read_manifest(home, tier.split, tier.name, tier.major)
+    if manifest is None:
+        raise absent("the data set is not generated")
+    # what is here; where some subset is missing, what was recorded
+    task, measured = tier.task, tier.measured
+    known = manifest.dataset_sha256 or (measured.dataset_sha256 if measured else None)
+    statistics = manifest.statistics or (measured.statistics if measured else {})
+    if known is None:
+        raise absent("the data set is not complete")
+    if not manifest.files:
+        raise absent("the data set is empty")
+    if not statistics:
+        raise absent("the subset train is not complete, its statistics are unknown")
+    bring(tier, home, [manifest.files[0].scenario])
+    with read_scenario(folder / manifest.files[0].path) as file:
+        moving_walls = "wall_velocity" in file.variables
+    return Facts(
+        split=tier.split,
+        size=tier.name,
+        version=tier.version,
+        dataset_sha256=known,
+        particles=tier.particles,
+        bounds=tier.bounds,
+        radius=task.radius,
+        input_frames=task.input_frames,
+        horizon=task.horizon,
+        score_cells=task.score_grid.cells,
+        score_placement=task.score_grid.placement,
+        frame_interval=tier.frame_interval,
+        moving_walls=moving_walls,
+        statistics={name: (float(x), float(y)) for name, (x, y) in statistics.items()},
+    )

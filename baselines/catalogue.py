@@ -19,15 +19,13 @@ from lagbench.errors import LagbenchError, UsageError, nearest
 
 from .baseline import Baseline
 
-__all__ = ["GROUP", "Entry", "every_entry", "find", "names"]
+__all__ = ["Entry", "find", "names"]
 
 GROUP = "lagbench.baselines"
-"""Entry points of this group name a baseline and its class; ours register the same way."""
 
 OWN = "lagbench.baselines."
 RECIPES = Path(__file__).parent / "recipes"
-OPERATOR_RECIPES = "gns"
-"""Recipe file that all operators share, so that they differ in the operator only."""
+OPERATOR_RECIPES = "gns"  # recipe file that all operators share, so that they differ in the operator only
 
 
 @dataclass(frozen=True, kw_only=True)

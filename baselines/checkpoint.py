@@ -5,10 +5,9 @@ A file of ``torch.save`` with plain entries: ``lagbench_checkpoint`` (format num
 and, for resuming, ``optimizer``. It is read with ``weights_only=True``: a file with any other
 object in it, which unpickling would run, is refused.
 
-How large a model would be, told before it takes any memory.
-
 Options come with a checkpoint, which may be a stranger's: a few bytes of text can ask for a model
-of any size. Built on torch's device ``meta``, it has shapes and no numbers.
+of any size. How large it would be is told before it takes any memory: built on torch's device
+``meta``, it has shapes and no numbers.
 """
 
 from __future__ import annotations
@@ -36,27 +35,14 @@ from lagbench.data.hdf5 import check_regular
 from lagbench.data.registry import Registry
 from lagbench.errors import DataError, LagbenchError, UnreadableFileError, WorkFailedError
 
-from .baseline import Baseline
+from .baseline import Baseline, Facts, facts_of
 from .catalogue import find
-from .facts import Facts, facts_of
 
-__all__ = [
-    "check_footprint",
-    "Checkpoint",
-    "check_data",
-    "load",
-    "load_weights",
-    "restore",
-    "rounded_weights",
-    "save",
-]
+__all__ = ["Checkpoint", "check_data", "load", "load_weights", "restore", "rounded_weights", "save"]
 
 
-SPARE = 2**20
-"""Numbers that a model may have beside those of its file: buffers that are not stored."""
-
-PARTS = 1000
-"""Tensors that it may have beside those of its file."""
+SPARE = 2**20  # numbers that a model may have beside those of its file: buffers that are not stored
+PARTS = 1000  # tensors that it may have beside those of its file
 
 
 def check_footprint(
@@ -71,11 +57,15 @@ def check_footprint(
 
     A model that cannot be built without numbers, as a stranger's baseline may be, passes.
     """
-    held = _bytes_held(weights)
+    stored = {  # tensors that share their bytes count once
+        value.untyped_storage().data_ptr(): value.untyped_storage().nbytes() // value.element_size()
+        for value in weights.values()
+    }
+    held = sum(stored.values())
     try:
         with _parts_bound(len(weights) + PARTS), torch.device("meta"):
             built = model.build(options, facts)
-        asked = _numbers(built)
+        asked = sum(one.numel() for one in chain(built.parameters(), built.buffers()) if not is_lazy(one))
     except _TooManyPartsError as error:
         raise _too_large(where, f"weights for {len(weights)} tensors", f"options for {error}") from None
     except (RuntimeError, TypeError) as error:
@@ -88,20 +78,6 @@ def check_footprint(
 
 class _TooManyPartsError(Exception):
     """More parameters than the file has tensors."""
-
-
-def _bytes_held(weights: Mapping[str, Tensor]) -> int:
-    """Return how many numbers a file holds: tensors that share their bytes count once."""
-    stored = {
-        value.untyped_storage().data_ptr(): value.untyped_storage().nbytes() // value.element_size()
-        for value in weights.values()
-    }
-    return sum(stored.values())
-
-
-def _numbers(model: nn.Module) -> int:
-    tensors = chain(model.parameters(), model.buffers())
-    return sum(tensor.numel() for tensor in tensors if not is_lazy(tensor))
 
 
 @contextmanager
@@ -136,8 +112,7 @@ FORMAT = 1
 KEY = "lagbench_checkpoint"
 SAFE = "a checkpoint that lagbench train wrote"
 
-_FOREIGN = re.compile(r"GLOBAL ([\w.]+)")
-"""How torch's refusal names what a pickle would call."""
+_FOREIGN = re.compile(r"GLOBAL ([\w.]+)")  # how torch's refusal names what a pickle would call
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -190,7 +165,15 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
     if checkpoint.optimizer is not None:
         content["optimizer"] = dict(checkpoint.optimizer)
     with atomic_path(path, option="--output") as temporary:
-        _write(temporary, content, path)
+        try:
+            torch.save(content, temporary)
+        except RuntimeError as error:  # torch's name for whatever the operating system refuses
+            raise WorkFailedError(
+                "cannot write there",
+                where=str(path),
+                got=str(error).split("\n")[0][:200],
+                fix="free disk space, or name a folder that you may write to: --output",
+            ) from error
 
 
 def load(path: str | Path) -> Checkpoint:
@@ -202,16 +185,29 @@ def load(path: str | Path) -> Checkpoint:
             raise _unfit(file, f"format {FORMAT}", f"format {content[KEY]!r}")
         about = json.loads(content["about"])
         _Training.model_validate(about["training"])
+        weights = content["weights"]
+        if not isinstance(weights, Mapping):
+            raise TypeError("weights are no mapping")
+        for name, value in weights.items():
+            if not isinstance(name, str) or not isinstance(value, Tensor) or not _is_plain(value):
+                raise TypeError(f"weight {name!r} is no tensor of plain numbers that the file holds")
         return Checkpoint(
             baseline=str(about["baseline"]),
             options=dict(about["options"]),
             facts=Facts.from_json(about["facts"]),
-            weights=_tensors(content["weights"]),
+            weights=dict(weights),
             training=dict(about["training"]),
             optimizer=content.get("optimizer"),
         )
     except (KeyError, TypeError, ValueError, RecursionError) as error:
         raise _unfit(file, SAFE, f"{type(error).__name__}: {' '.join(str(error).split())[:200]}") from None
+
+
+def _is_plain(value: Tensor) -> bool:
+    """Tell whether a tensor is dense and real, and no larger than the bytes behind it."""
+    if value.layout is not torch.strided or value.is_quantized or value.is_complex() or value.is_meta:
+        return False
+    return value.numel() * value.element_size() <= value.untyped_storage().nbytes()
 
 
 def restore(checkpoint: Checkpoint, *, where: str = "the checkpoint") -> Baseline:
@@ -275,32 +271,6 @@ def check_data(checkpoint: Checkpoint, *, root: Path, registry: Registry | None 
     return here
 
 
-def _check_archive(file: Path) -> None:
-    """Refuse what is no archive as torch writes them, before anything in it is unpickled.
-
-    Members are stored as they are, so all of them together are no longer than the file, and each
-    has the checksum that it states: nothing unpacks to more, and no damaged byte is read.
-    """
-    inside = f"name the file: {file / 'weights.pt'}" if file.is_dir() else None
-    length = check_regular(file, fix=inside)
-    if not zipfile.is_zipfile(file):
-        with file.open("rb") as stream:
-            head = stream.read(2)
-        if head in {b"\x80" + bytes([protocol]) for protocol in range(2, 6)}:
-            raise _unsafe(file, "a pickle of something else")
-        raise _unfit(file, SAFE, "something else")
-    with zipfile.ZipFile(file) as archive:
-        members = archive.infolist()
-        packed = [one.filename for one in members if one.compress_type != zipfile.ZIP_STORED]
-        total = sum(max(one.file_size, one.compress_size) for one in members)
-        if packed or total > length or len({one.filename for one in members}) < len(members):
-            got = f"{packed[0][:100]!a} is compressed" if packed else f"members of {total} bytes in {length}"
-            raise _unfit(file, "an archive whose members are stored as they are, each once", got)
-        broken = archive.testzip()
-    if broken is not None:
-        raise _unfit(file, SAFE, f"{broken[:100]!a} has another checksum than it states")
-
-
 def _unsafe(file: Path, got: str) -> LagbenchError:
     return UnreadableFileError(
         "the file holds more than tensors and plain values, and was not opened",
@@ -312,8 +282,34 @@ def _unsafe(file: Path, got: str) -> LagbenchError:
 
 
 def _content(file: Path) -> dict[str, Any]:
+    """Read what is an archive as torch writes them; what is none is refused before it is unpickled.
+
+    Members are stored as they are, so all of them together are no longer than the file, and each
+    has the checksum that it states: nothing unpacks to more, and no damaged byte is read.
+    """
     try:
-        _check_archive(file)
+        inside = f"name the file: {file / 'weights.pt'}" if file.is_dir() else None
+        length = check_regular(file, fix=inside)
+        if not zipfile.is_zipfile(file):
+            with file.open("rb") as stream:
+                head = stream.read(2)
+            if head in {b"\x80" + bytes([protocol]) for protocol in range(2, 6)}:
+                raise _unsafe(file, "a pickle of something else")
+            raise _unfit(file, SAFE, "something else")
+        with zipfile.ZipFile(file) as archive:
+            members = archive.infolist()
+            packed = [one.filename for one in members if one.compress_type != zipfile.ZIP_STORED]
+            total = sum(max(one.file_size, one.compress_size) for one in members)
+            if packed or total > length or len({one.filename for one in members}) < len(members):
+                got = (
+                    f"{packed[0][:100]!a} is compressed"
+                    if packed
+                    else f"members of {total} bytes in {length}"
+                )
+                raise _unfit(file, "an archive whose members are stored as they are, each once", got)
+            broken = archive.testzip()
+        if broken is not None:
+            raise _unfit(file, SAFE, f"{broken[:100]!a} has another checksum than it states")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             content = torch.load(file, map_location="cpu", weights_only=True)
@@ -328,34 +324,6 @@ def _content(file: Path) -> dict[str, Any]:
     if not isinstance(content, dict) or KEY not in content:
         raise _unfit(file, SAFE, type(content).__name__)
     return content
-
-
-def _write(path: Path, content: Mapping[str, Any], target: Path) -> None:
-    try:
-        torch.save(content, path)
-    except RuntimeError as error:  # torch's name for whatever the operating system refuses
-        raise WorkFailedError(
-            "cannot write there",
-            where=str(target),
-            got=str(error).split("\n")[0][:200],
-            fix="free disk space, or name a folder that you may write to: --output",
-        ) from error
-
-
-def _tensors(values: object) -> dict[str, Tensor]:
-    if not isinstance(values, Mapping):
-        raise TypeError("weights are no mapping")
-    for name, value in values.items():
-        if not isinstance(name, str) or not isinstance(value, Tensor) or not _held(value):
-            raise TypeError(f"weight {name!r} is no tensor of plain numbers that the file holds")
-    return dict(values)
-
-
-def _held(value: Tensor) -> bool:
-    """Tell whether a tensor is dense and real, and no larger than the bytes behind it."""
-    if value.layout is not torch.strided or value.is_quantized or value.is_complex() or value.is_meta:
-        return False
-    return value.numel() * value.element_size() <= value.untyped_storage().nbytes()
 
 
 def _unfit(file: Path, expected: str, got: str) -> LagbenchError:

@@ -27,25 +27,13 @@ from torch import Tensor, nn
 from lagbench.errors import DataError
 
 from . import baseline
-from .baseline import Baseline, Batch
-from .facts import Facts
+from .baseline import Baseline, Batch, Facts
+from .graph import MATERIALS
 
-__all__ = [
-    "FEATURES",
-    "FrameState",
-    "side_by_side",
-    "FrameModel",
-    "FrameWindow",
-    "squared_errors",
-    "FrameNetwork",
-    "FrameNetworkOptions",
-    "Target",
-    "material_feature",
-]
+__all__ = ["FrameModel", "FrameNetwork", "FrameNetworkOptions", "FrameWindow", "squared_errors"]
 
 
-FEATURES = 4
-"""x, y and the two components of the velocity per frame."""
+FEATURES = 4  # x, y and the two components of the velocity per frame
 
 
 class FrameState(nn.Module):
@@ -63,14 +51,7 @@ class FrameState(nn.Module):
         self.register_buffer("std", torch.tensor(std, dtype=torch.float64), persistent=False)
 
     def of(self, position: Tensor) -> Tensor:
-        """Return the states of consecutive frames [1], shape [..., frame, particle, 4].
-
-        Args:
-            position: positions of two frames or more [length], shape [..., frame, particle, 2].
-
-        Raises:
-            DataError: fewer than two frames, so that there is no velocity.
-        """
+        """Return the states [1], shape [..., frame, particle, 4], of two consecutive frames or more."""
         if position.shape[-3] < 2:
             raise DataError("a velocity needs two frames", expected="2 or more", got=position.shape[-3])
         later = position[..., 1:, :, :] - position[..., :-1, :, :]
@@ -84,19 +65,7 @@ class FrameState(nn.Module):
 
 
 def side_by_side(batch: Batch, particles: int) -> tuple[Tensor, Tensor]:
-    """Return positions and materials window by window.
-
-    Args:
-        batch: windows with the same particles each.
-        particles: particles in one scenario.
-
-    Returns:
-        Positions [length], shape [window, frame, particle, 2], and materials, shape
-        [window, particle].
-
-    Raises:
-        DataError: a window with another number of particles: these models know no other.
-    """
+    """Return positions [length], shape [window, frame, particle, 2], and materials, [window, particle]."""
     count = torch.bincount(batch.sample, minlength=batch.windows)
     if not bool((count == particles).all()):
         got = ", ".join(map(str, sorted(set(count.tolist()))))
@@ -162,9 +131,9 @@ class FrameModel(Baseline):
 
     def forward(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """Return the mean squared errors of position and velocity after one step [1]."""
-        return squared_errors(*self._one_step(batch, generator))
+        return squared_errors(*self.one_step(batch, generator))
 
-    def _one_step(self, batch: Batch, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
+    def one_step(self, batch: Batch, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
         """Return the true and the predicted state of the last frame."""
         window = self._states(batch)
         given = self.disturbed(window.state[:, -1 - self.inputs : -1], generator)
@@ -192,10 +161,6 @@ class FrameModel(Baseline):
         new = self.next_state(state)
         window = FrameWindow(torch.cat([state.state[:, 1:], new.unsqueeze(1)], dim=1), state.material)
         return window, self.frame_state.position(new).flatten(0, 1).to(torch.float32)
-
-
-MATERIALS = 4
-"""Materials that datasets.yaml knows: 0 liquid, 1 jelly, 2 snow, 3 rope."""
 
 
 class Target(enum.StrEnum):
@@ -234,7 +199,12 @@ class FrameNetwork(FrameModel):
     def __init__(self, options: FrameNetworkOptions, facts: Facts) -> None:
         super().__init__(options, facts)
         self.input_features = FEATURES + options.material
-        self.register_buffer("typical_change", _typical_change(facts), persistent=False)
+        # the standard deviation of a state's change per frame [standardised]
+        known = facts.statistics
+        moved = zip(known["velocity_std"], known["position_std"], strict=True)
+        pushed = zip(known["acceleration_std"], known["velocity_std"], strict=True)
+        typical = torch.tensor([change / spread for change, spread in (*moved, *pushed)])
+        self.register_buffer("typical_change", typical, persistent=False)
 
     def disturbed(self, state: Tensor, generator: torch.Generator | None) -> Tensor:
         """Return the states with independent normal noise; unchanged without a generator."""
@@ -255,11 +225,3 @@ class FrameNetwork(FrameModel):
         last = window.state[:, -1]
         output = output.view(last.shape).to(last.dtype)
         return output if self.options.target is Target.STATE else last + self.typical_change * output
-
-
-def _typical_change(facts: Facts) -> Tensor:
-    """Return the standard deviation of a state's change per frame [standardised], shape [4]."""
-    known = facts.statistics
-    moved = zip(known["velocity_std"], known["position_std"], strict=True)
-    pushed = zip(known["acceleration_std"], known["velocity_std"], strict=True)
-    return torch.tensor([change / spread for change, spread in (*moved, *pushed)])

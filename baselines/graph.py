@@ -27,77 +27,43 @@ from torch import Tensor, nn
 
 from lagbench.errors import UsageError
 
-from .facts import Facts, Pair
-
-__all__ = [
-    "radius_graph",
-    "EDGE_FEATURES",
-    "MATERIALS",
-    "NodeFeatures",
-    "Scale",
-    "edge_features",
-    "wall_distance",
-]
+__all__ = ["EDGE_FEATURES", "NodeFeatures", "Scale", "edge_features", "radius_graph"]
 
 
+Bounds = tuple[tuple[float, float], tuple[float, float]]
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-MARGIN = 1e-6
-"""Cells are wider than the radius by this share, more than rounding can move a particle."""
-
-FAR = 1 << 20
-"""Cells that are told apart on either side of the origin; what lies beyond shares the last."""
+MARGIN = 1e-6  # cells are wider than the radius by this share, more than rounding can move a particle
+FAR = 1 << 20  # cells that are told apart on either side of the origin; what lies beyond shares the last
 
 
 @torch.no_grad()
 def radius_graph(
     position: Tensor, radius: float, sample: Tensor | None = None, *, self_edges: bool = False
 ) -> Tensor:
-    """Connect all pairs of particles within a radius, without a cap on neighbours.
+    """Connect all pairs of particles within a radius, itself included, without a cap on neighbours.
 
-    Args:
-        position: particle positions [length], shape [particle, 2].
-        radius: largest distance of a pair [length], itself included.
-        sample: window of each particle, ascending, int64, shape [particle]; particles of
-            different windows are never connected. One window by default.
-        self_edges: whether a particle is connected to itself too.
-
-    Returns:
-        ``edge_index``, int64, shape [2, edge]: senders and receivers, both directions of every
-        pair, sorted by receiver, then sender. Particles whose position is no finite number have
-        no edges.
-
-    Raises:
-        UsageError: a shape does not fit, `sample` descends, or the radius is no positive number.
+    Return senders and receivers, int64, shape [2, edge]: both directions of every pair, sorted by receiver,
+    then sender. Particles of different windows, which `sample` names in ascending order, are never
+    connected, and those whose position is no finite number have no edges.
     """
-    _check(position, radius, sample)
-    if position.device.type == "cpu":
-        return _graph_numpy(position, radius, sample, self_edges)
-    return _graph_torch(position, radius, sample, self_edges)
-
-
-def _check(position: Tensor, radius: float, sample: Tensor | None) -> None:
+    where = "radius_graph"
     if position.ndim != 2 or position.shape[1] != 2:
-        raise UsageError(
-            "positions have the wrong shape",
-            where="radius_graph",
-            expected="[particle, 2]",
-            got=tuple(position.shape),
-        )
+        got = tuple(position.shape)
+        raise UsageError("positions have the wrong shape", where=where, expected="[particle, 2]", got=got)
     if not (math.isfinite(radius) and radius > 0.0):
-        raise UsageError(
-            "the radius is no length", where="radius_graph", expected="a positive number", got=radius
-        )
-    if sample is None:
-        return
-    if sample.shape != position.shape[:1] or bool((sample[1:] < sample[:-1]).any()):
+        raise UsageError("the radius is no length", where=where, expected="a positive number", got=radius)
+    fits = sample is None or (sample.shape == position.shape[:1] and bool((sample[1:] >= sample[:-1]).all()))
+    if sample is not None and not fits:
         raise UsageError(
             "windows do not fit the particles",
             where="radius_graph, sample",
             expected=f"{len(position)} ascending numbers",
             got=f"shape {tuple(sample.shape)}",
         )
+    search = _graph_numpy if position.device.type == "cpu" else _graph_torch
+    return search(position, radius, sample, self_edges)
 
 
 def _graph_numpy(position: Tensor, radius: float, sample: Tensor | None, self_edges: bool) -> Tensor:
@@ -148,35 +114,20 @@ def _pairs_numpy(x: Floats, key: Ints, stride: int, radius: float) -> tuple[Ints
 
 
 def _graph_torch(position: Tensor, radius: float, sample: Tensor | None, self_edges: bool) -> Tensor:
-    """Search with torch operations alone, on any device."""
+    """Search as :func:`_graph_numpy`, with torch operations alone, on any device."""
     x = position.detach().double()
     kept = x.isfinite().all(dim=1).nonzero().squeeze(1)
     window = x.new_zeros(len(x), dtype=torch.int64) if sample is None else sample
-    key, stride = _cells_torch(x[kept], window[kept], radius)
+    x, key = x[kept], window[kept]
+    stride: Tensor | int = 0
+    if len(x):
+        cell = (x * (1.0 / (radius * (1.0 + MARGIN)))).floor().clamp(-FAR, FAR).long()
+        cell = cell - cell.amin(dim=0)
+        columns, rows = cell.amax(dim=0)
+        stride = rows + 2  # stays on the device
+        key = (key * (columns + 2) + cell[:, 0]) * stride + cell[:, 1]
     key, order = key.sort()
-    particle = kept[order]
-    i, j = _pairs_torch(x[particle], key, stride, radius)
-    i, j = particle[i], particle[j]
-    edges = [(i << 32) | j, (j << 32) | i]
-    if self_edges:
-        edges.append((kept << 32) | kept)
-    sorted_edges = torch.cat(edges).sort().values
-    return torch.stack([sorted_edges & 0xFFFFFFFF, sorted_edges >> 32])
-
-
-def _cells_torch(x: Tensor, window: Tensor, radius: float) -> tuple[Tensor, Tensor | int]:
-    """Return what :func:`_cells_numpy` returns; the step stays on the device."""
-    if not len(x):
-        return window, 0
-    cell = (x * (1.0 / (radius * (1.0 + MARGIN)))).floor().clamp(-FAR, FAR).long()
-    cell = cell - cell.amin(dim=0)
-    columns, rows = cell.amax(dim=0)
-    stride = rows + 2
-    return (window * (columns + 2) + cell[:, 0]) * stride + cell[:, 1], stride
-
-
-def _pairs_torch(x: Tensor, key: Tensor, stride: Tensor | int, radius: float) -> tuple[Tensor, Tensor]:
-    """Return what :func:`_pairs_numpy` returns."""
+    x, particle = x[order], kept[order]
     own = torch.arange(len(x), device=x.device)
     above = torch.searchsorted(key, key + 2)
     beside = torch.searchsorted(key, key + (stride - 1))
@@ -189,18 +140,17 @@ def _pairs_torch(x: Tensor, key: Tensor, stride: Tensor | int, radius: float) ->
     x_0, x_1 = x.T.contiguous()
     dx, dy = x_0[i] - x_0[j], x_1[i] - x_1[j]
     near = (dx * dx + dy * dy <= radius * radius).nonzero().squeeze(1)
-    return i[near], j[near]
+    i, j = particle[i[near]], particle[j[near]]
+    edges = [(i << 32) | j, (j << 32) | i]
+    if self_edges:
+        edges.append((kept << 32) | kept)
+    sorted_edges = torch.cat(edges).sort().values
+    return torch.stack([sorted_edges & 0xFFFFFFFF, sorted_edges >> 32])
 
 
-MATERIALS = 4
-"""Liquid, jelly, snow, rope."""
-
-EMBEDDING = 16
-"""Numbers that a material is embedded in."""
-
-EDGE_FEATURES = 3
-"""Displacement over radius along x and y, distance over radius."""
-
+MATERIALS = 4  # that datasets.yaml knows: 0 liquid, 1 jelly, 2 snow, 3 rope
+EMBEDDING = 16  # numbers that a material is embedded in
+EDGE_FEATURES = 3  # displacement over radius along x and y, distance over radius
 _WALLS = 4  # left, right, bottom, top, the order of wall_velocity in scenario files
 
 
@@ -226,16 +176,10 @@ class Scale(nn.Module):
         return standardised * self.std + self.mean
 
 
-def wall_distance(position: Tensor, bounds: tuple[Pair, Pair], reach: float) -> Tensor:
-    """Return the distances to the four walls over the reach, clipped to [-1, 1].
+def wall_distance(position: Tensor, bounds: Bounds, reach: float) -> Tensor:
+    """Return the distances to left, right, bottom and top wall over the reach [length], clipped to [-1, 1].
 
-    Args:
-        position: particle positions [length], shape [particle, 2].
-        bounds: box (low, high) along x and y [length].
-        reach: how far a wall is seen [length]; one farther away looks like one at it.
-
-    Returns:
-        Left, right, bottom, top; negative outside the box; shape [particle, 4].
+    A wall farther away than the reach looks like one at it; outside the box they are negative.
     """
     (left, right), (bottom, top) = bounds
     x, y = position.unbind(dim=-1)
@@ -244,16 +188,7 @@ def wall_distance(position: Tensor, bounds: tuple[Pair, Pair], reach: float) -> 
 
 
 def edge_features(position: Tensor, edge_index: Tensor, radius: float) -> Tensor:
-    """Return displacement and distance from receiver to sender over the radius.
-
-    Args:
-        position: particle positions [length], shape [particle, 2].
-        edge_index: senders and receivers, int64, shape [2, edge].
-        radius: connectivity radius [length].
-
-    Returns:
-        ``((x_s - x_r) / radius, (y_s - y_r) / radius, distance / radius)``, shape [edge, 3].
-    """
+    """Return ``((x_s - x_r) / radius, (y_s - y_r) / radius, distance / radius)``, shape [edge, 3]."""
     sender, receiver = edge_index
     displacement = (position.index_select(0, sender) - position.index_select(0, receiver)) / radius
     # The gradient of a norm is NaN at 0, where two particles coincide; that of this root is 0.
@@ -270,19 +205,11 @@ class NodeFeatures(nn.Module):
 
     Moving walls: the per-frame velocity of each wall over the velocity scale, times
     ``1 - distance / reach`` (0 beyond the reach), so that it acts where the wall is near.
-
-    Args:
-        facts: public figures of the data set.
-        velocity: standardisation of per-frame velocities.
-        acceleration: standardisation of their changes.
-        reach: how far a wall is seen [length].
-        velocities: last per-frame velocities that a particle shows.
-        moving_walls: whether the velocities of the walls are features too.
     """
 
     def __init__(
         self,
-        facts: Facts,
+        bounds: Bounds,
         velocity: Scale,
         acceleration: Scale,
         reach: float,
@@ -291,12 +218,12 @@ class NodeFeatures(nn.Module):
         moving_walls: bool = False,
     ) -> None:
         super().__init__()
-        self.velocities = velocities
+        self.velocities = velocities  # last per-frame velocities that a particle shows
         self.velocity = velocity
         self.acceleration = acceleration
-        self.bounds = facts.bounds
-        self.reach = reach
-        self.moving_walls = moving_walls
+        self.bounds = bounds  # of the box, (low, high) along x and y [length]
+        self.reach = reach  # how far a wall is seen [length]
+        self.moving_walls = moving_walls  # whether the velocities of the walls are features too
         self.embedding = nn.Embedding(MATERIALS, EMBEDDING)
 
     @property
@@ -309,24 +236,17 @@ class NodeFeatures(nn.Module):
     ) -> Tensor:
         """Return the features of each particle, shape [particle, count].
 
-        Args:
-            position: last positions [length], shape [particle, 2].
-            velocity: last velocities, oldest first [length/frame], shape [particle, velocities, 2].
-            material: material of each particle, int64, shape [particle].
-            wall_velocity: velocity of the walls as each particle sees them [length/frame], shape
-                [particle, 4, 2]; None counts as walls at rest.
+        Velocities, oldest first, have shape [particle, velocities, 2]; those of the walls as each particle
+        sees them shape [particle, 4, 2], and None counts as walls at rest.
         """
         distance = wall_distance(position, self.bounds, self.reach)
         changes = self.acceleration(velocity.diff(dim=1)).flatten(1)
         kind = self.embedding(material).to(position.dtype)
         parts = [self.velocity(velocity[:, -1]), changes, distance, kind]
         if self.moving_walls:
-            parts.append(self._near_walls(distance, wall_velocity).flatten(1))
+            felt = distance.new_zeros(len(distance), _WALLS, 2)
+            if wall_velocity is not None:
+                nearness = 1.0 - distance.clamp(min=0.0)
+                felt = nearness.unsqueeze(-1) * wall_velocity / self.velocity.std
+            parts.append(felt.flatten(1))
         return torch.cat(parts, dim=1)
-
-    def _near_walls(self, distance: Tensor, wall_velocity: Tensor | None) -> Tensor:
-        """Return the walls' velocities, faded out over the reach [1], shape [particle, 4, 2]."""
-        if wall_velocity is None:
-            return distance.new_zeros(len(distance), _WALLS, 2)
-        nearness = 1.0 - distance.clamp(min=0.0)
-        return nearness.unsqueeze(-1) * wall_velocity / self.velocity.std

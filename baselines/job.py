@@ -26,34 +26,25 @@ from lagbench.errors import UnreadableFileError, UsageError
 from lagbench.submission.budget import MOST_VALIDATIONS, Budget, track_of
 from lagbench.work.progress import Meter
 
-from .baseline import Baseline
+from .baseline import Baseline, Facts
 from .checkpoint import Checkpoint, load
-from .facts import Facts
 from .machine import hardware
 from .recipe import Recipe
-from .windows import scenario_paths
 
 __all__ = [
     "OVER",
-    "STOPPED_EARLY",
-    "TrainingRecord",
-    "versions",
     "RunFolder",
-    "default_folder",
-    "first_difference",
+    "STOPPED_EARLY",
     "TrainingJob",
+    "TrainingRecord",
+    "first_difference",
     "parameter_count",
 ]
 
 
-STOPPED_EARLY = "stopped early"
-"""State of a training whose validations brought nothing new; it is over."""
-
-MOST_RECORD = 4 << 20
-"""Longest training.json that is read [bytes]."""
-
-OVER = ("finished", STOPPED_EARLY)
-"""States of a training that is not to be gone on with."""
+STOPPED_EARLY = "stopped early"  # state of a training whose validations brought nothing new; it is over
+MOST_RECORD = 4 << 20  # longest training.json that is read [bytes]
+OVER = ("finished", STOPPED_EARLY)  # states of a training that is not to be gone on with
 
 
 @dataclass
@@ -127,98 +118,64 @@ class TrainingRecord:
         return sum(step > (self.best_step or 0) for step in steps)
 
 
-def versions() -> dict[str, str]:
-    """Return the versions of the libraries that decide the result."""
-    packages = ("lagbench", "torch", "torch-geometric", "pytorch-lightning", "numpy", "scipy")
-    return {"python": platform.python_version(), **{name: version(name) for name in packages}}
-
-
 def _processor_seconds() -> float:
     times = os.times()  # of children; of this process it has hundredths only
     return time.process_time() + times.children_user + times.children_system
 
 
-def default_folder(recipe: Recipe) -> Path:
-    """Return ``runs/<split>/<size>/<baseline>-<seed>`` in the present folder."""
-    return Path("runs") / recipe.name / f"{recipe.baseline}-{recipe.training.seed}"
-
-
-@dataclass(frozen=True)
 class RunFolder:
     """Paths of a training's files, and what an earlier run left there."""
 
-    path: Path
-
-    @property
-    def checkpoint(self) -> Path:
-        """The last state, to go on from."""
-        return self.path / "checkpoint.pt"
-
-    @property
-    def weights(self) -> Path:
-        """The best weights in bfloat16, to predict from."""
-        return self.path / "weights.pt"
-
-    @property
-    def record(self) -> Path:
-        """What the training did and cost, as JSON."""
-        return self.path / "training.json"
-
-    @property
-    def logs(self) -> Path:
-        """Folder of TensorBoard's files."""
-        return self.path / "tensorboard"
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.checkpoint = path / "checkpoint.pt"  # the last state, to go on from
+        self.weights = path / "weights.pt"  # the best weights in bfloat16, to predict from
+        self.record = path / "training.json"  # what the training did and cost
+        self.logs = path / "tensorboard"  # folder of TensorBoard's files
 
     def earlier(self, recipe: Recipe, *, resume: bool, fresh: bool) -> Checkpoint | None:
         """Return the checkpoint to go on from; None for a training from the start."""
         left = [file for file in (self.checkpoint, self.weights, self.record) if file.exists()]
         if fresh or not left:
             return None
+        where, asked = str(self.path), recipe.as_json()
+        taken = UsageError(
+            "the folder holds a training",
+            where=where,
+            fix="go on with --resume, train anew with --fresh, or name another --output",
+        )
         if self.checkpoint not in left:
-            if resume and self.weights not in left:  # it failed before there was anything to keep
+            if not resume:
+                raise taken
+            if self.weights not in left:  # it failed before there was anything to keep
                 return None
-            raise self._without_checkpoint(recipe) if resume else self._taken()
+            said = self._recorded()  # no training can go on from these weights, and none may replace them
+            over = said.get("recipe") == asked and said.get("state") in OVER
+            instead = "predict from its weights" if over else "name another folder with --output"
+            lacking = "the folder holds weights, and no checkpoint to go on from"
+            raise UsageError(
+                "the training is finished" if over else lacking,
+                where=where,
+                got=f"{self.weights.name} without {self.checkpoint.name}",
+                fix=f"{instead}, or train anew with --fresh",
+            )
         found = load(self.checkpoint)
-        if found.training.get("recipe") != recipe.as_json():
+        if found.training.get("recipe") != asked:
             raise UsageError(
                 "the folder holds a training with another recipe",
-                where=str(self.path),
-                expected=first_difference(recipe.as_json(), found.training.get("recipe")),
+                where=where,
+                expected=first_difference(asked, found.training.get("recipe")),
                 fix="name another folder with --output, or train anew with --fresh",
             )
         if not resume:
-            raise self._taken()
+            raise taken
         return found
-
-    def _taken(self) -> UsageError:
-        return UsageError(
-            "the folder holds a training",
-            where=str(self.path),
-            fix="go on with --resume, train anew with --fresh, or name another --output",
-        )
-
-    def _without_checkpoint(self, recipe: Recipe) -> UsageError:
-        """Return the error for weights that no training can go on from, and that none may replace."""
-        said = self._recorded()
-        over = said.get("recipe") == recipe.as_json() and said.get("state") in OVER
-        return UsageError(
-            "the training is finished"
-            if over
-            else "the folder holds weights, and no checkpoint to go on from",
-            where=str(self.path),
-            got=f"{self.weights.name} without {self.checkpoint.name}",
-            fix=("predict from its weights, " if over else "name another folder with --output, ")
-            + "or train anew with --fresh",
-        )
 
     def unfinished(self, trained: Mapping[str, Any]) -> tuple[int, int] | None:
         """Return step and steps of a training that is not over, by its record.
 
         None where it is over, where there is no record, and where the record is that of another recipe
-        than the weights' own.
-
-        Args:
-            trained: what the weights say of their training.
+        than the one that the weights say they were trained by.
         """
         said = self._recorded()
         step, steps = said.get("step"), said.get("steps")
@@ -262,6 +219,8 @@ def first_difference(wanted: dict[str, Any], found: object, path: str = "") -> s
 
 
 FORMAT = 1
+# whose versions decide the result
+LIBRARIES = ("lagbench", "torch", "torch-geometric", "pytorch-lightning", "numpy", "scipy")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -278,13 +237,6 @@ class TrainingJob:
     processes: int = 1  # processes that share the training
     workers: int = 0  # processes that read windows ahead
     meter: Meter = field(default_factory=Meter)  # counts steps
-
-    def files(self, subset: str) -> dict[int, Path]:
-        """Return the scenario files of a subset by id."""
-        facts = self.facts
-        return scenario_paths(
-            facts.split, subset=subset, size=facts.size, root=self.root, registry=self.registry
-        )
 
     def ledger(self) -> TrainingRecord:
         """Return the ledger that goes on where an earlier run ended, in the state that it ended in."""
@@ -354,7 +306,7 @@ class TrainingJob:
             "parameters": parameter_count(model),
             "processes": self.processes,
             "hardware": hardware(self.device),
-            "versions": versions(),
+            "versions": {"python": platform.python_version(), **{name: version(name) for name in LIBRARIES}},
             "budget": budget.model_dump(mode="json"),
             "track": track_of(facts.size, budget),
             **more,

@@ -11,8 +11,7 @@ from torch import Tensor, nn
 
 from lagbench.data.grid import Grid, Placement
 
-from .baseline import Batch
-from .facts import Facts
+from .baseline import Batch, Facts
 from .frame_model import FrameNetwork, FrameNetworkOptions, FrameWindow, squared_errors
 from .mlp import Activation, dense
 from .torch_grid import transfer
@@ -70,19 +69,13 @@ class LSTM(FrameNetwork):
 
     def forward(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """Return the errors of position and velocity, and that of the density map [1]."""
-        truth, predicted = self._one_step(batch, generator)
-        return {**squared_errors(truth, predicted), "density": self._density_error(truth, predicted)}
-
-    def _density_error(self, truth: Tensor, predicted: Tensor) -> Tensor:
-        """Return ``sum (d' - d)^2 / sum d^2`` over the nodes of the scorer's grid: 1 for an empty map."""
-        density, guess = (self._density(state) for state in (truth, predicted))
-        return (guess - density).square().sum() / density.square().sum()
-
-    def _density(self, state: Tensor) -> Tensor:
-        """Return the particles' weight at every node, shape [window, x node, y node]."""
-        position = self.frame_state.position(state)
+        truth, predicted = self.one_step(batch, generator)
         grid = Grid(self.facts.score_cells, Placement(self.facts.score_placement))
-        return transfer(position, torch.zeros_like(position), grid).weight
+        places = (self.frame_state.position(state) for state in (truth, predicted))
+        density, guess = (transfer(x, torch.zeros_like(x), grid).weight for x in places)
+        # over the nodes of the scorer's grid: 1 for an empty map
+        error = (guess - density).square().sum() / density.square().sum()
+        return {**squared_errors(truth, predicted), "density": error}
 
     def next_state(self, window: FrameWindow) -> Tensor:
         """Return the next standardised state [1], shape [window, particle, 4]."""

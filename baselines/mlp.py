@@ -9,7 +9,7 @@ from itertools import pairwise
 from pydantic import PositiveInt
 from torch import Tensor, nn
 
-from .facts import Facts
+from .baseline import Facts
 from .frame_model import FrameNetwork, FrameNetworkOptions, FrameWindow
 
 __all__ = ["Activation", "MLP", "dense"]

@@ -1,13 +1,25 @@
-"""A baseline as pytorch-lightning trains it: one loss, one optimiser, seeded steps."""
+"""A baseline as pytorch-lightning trains it: seeded steps, and what happens between them.
+
+Random numbers are a function of seed, step and process, and of nothing else, so that no state of
+any generator has to be stored: a training that was interrupted draws, at every step, what an
+uninterrupted one draws there, whatever happened in between.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+import random
+import signal
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from types import FrameType
 from typing import Any
 
+import numpy as np
 import torch
-from pytorch_lightning import LightningModule
+from pytorch_lightning import Callback, LightningModule, Trainer
 from torch import Tensor
 from torch.optim import AdamW, Optimizer
 from torch.utils.data import DataLoader
@@ -16,13 +28,15 @@ from lagbench.errors import WorkFailedError
 from lagbench.torch import Window
 
 from .baseline import Baseline, Batch
+from .checkpoint import load, rounded_weights, save
+from .job import STOPPED_EARLY, TrainingJob, TrainingRecord
+from .machine import return_memory
 from .recipe import TrainingOptions
-from .seeding import reseed, seed_of
+from .rollout import Validation
 
-__all__ = ["TOTAL", "TrainingModule", "weighted_sum"]
+__all__ = ["TrainingCallback", "TrainingModule", "generators_kept", "reseed", "seed_of"]
 
-TOTAL = "total"
-"""Name of the weighted sum among the loss terms."""
+TOTAL = "total"  # name of the weighted sum among the loss terms
 
 
 def weighted_sum(terms: Mapping[str, Tensor], weights: Mapping[str, float]) -> Tensor:
@@ -131,3 +145,160 @@ class TrainingModule(LightningModule):
             fix="lower training.learning_rate or set training.clip=1;"
             " checkpoint.pt holds the last good weights",
         )
+
+
+class TrainingCallback(Callback):
+    """Logs, validates and stores a training, and stops it early or when a user interrupts.
+
+    An interrupt lets the running step end and stores the state; a second one stops at once.
+    """
+
+    def __init__(
+        self,
+        job: TrainingJob,
+        ledger: TrainingRecord,
+        *,
+        validation: Validation | None,
+        steps: int,
+        windows: int,
+    ) -> None:
+        self.job = job  # the training that was asked for
+        self.ledger = ledger  # what it has done so far
+        self.validation = validation  # None validates never
+        self.steps = steps  # of the whole training
+        self.windows = windows  # of the training subsets
+        self._interrupted = False
+        self._handlers: dict[int, Any] = {}
+
+    def on_train_start(self, trainer: Trainer, module: LightningModule) -> None:
+        """Listen to interrupts; begin to count."""
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self._handlers[number] = signal.signal(number, self._interrupt)
+        steps = self.steps
+        self.job.meter.begin("training", total=steps, scenarios=steps, done=_of(module).step)
+
+    def on_train_batch_end(
+        self, trainer: Trainer, module: LightningModule, outputs: object, batch: object, batch_idx: int
+    ) -> None:
+        """Do what is due after a step."""
+        trained = _of(module)
+        step, steps, recipe = trained.step, self.steps, trained.recipe
+        self.ledger.stepped(step, batch=recipe.batch * trainer.world_size, windows=self.windows)
+        last = step >= steps
+        if last or step % recipe.log_every == 0 or step == 1:
+            terms = self.ledger.loss = {name: float(value) for name, value in trained.terms.items()}
+            if not math.isfinite(terms[TOTAL]) and trainer.world_size == 1:
+                raise trained.not_finite()
+            self.job.meter.stage = f"loss {terms[TOTAL]:.3g}"
+            if trainer.logger is not None:
+                values = {f"loss/{name}": value for name, value in terms.items()}
+                trainer.logger.log_metrics({**values, "learning_rate": trained.learning_rate}, step=step)
+            return_memory()
+        self.job.meter.count(1, scenarios=1)
+        if self.validation is not None:
+            predicted = recipe.batch * trained.model.future, sum(self.validation.frames.values())
+            count = recipe.validations(steps, trained=predicted[0], rolled=predicted[1])
+            if recipe.is_validated(step, steps=steps, validations=count):
+                self._validate(trainer, trained, self.validation)
+        stop = trainer.strategy.reduce_boolean_decision(self._interrupted, all=False)
+        if stop or trainer.should_stop or last:
+            over = last or self.ledger.state == STOPPED_EARLY
+            self.ledger.state = "interrupted" if stop and not over else self.ledger.state
+            trainer.should_stop = True
+        if trainer.should_stop or step % (recipe.checkpoint_every or max(1, steps // 20)) == 0:
+            self._store(trainer, trained)
+
+    def on_train_end(self, trainer: Trainer, module: LightningModule) -> None:
+        """Give the signals back."""
+        self._release()
+
+    def on_exception(self, trainer: Trainer, module: LightningModule, exception: BaseException) -> None:
+        """Give the signals back; enter the failure. The checkpoint stays as it is."""
+        self._release()
+        if trainer.is_global_zero and isinstance(exception, Exception):
+            self.ledger.state = "failed"
+            self._write_record(trainer, _of(module))
+
+    def _release(self) -> None:
+        for number, handler in self._handlers.items():
+            signal.signal(number, handler)
+        self._handlers = {}
+
+    def _interrupt(self, number: int, frame: FrameType | None) -> None:
+        """Note the first interrupt; let a second one through."""
+        if self._interrupted:
+            raise KeyboardInterrupt
+        self._interrupted = True
+
+    def _validate(self, trainer: Trainer, module: TrainingModule, validation: Validation) -> None:
+        """Validate in the first process; all act on what it finds."""
+        value = 0.0
+        with self.ledger.validating(trainer.world_size, device=self.job.device):
+            if trainer.is_global_zero:
+                value = validation(module.model)
+            value = float(trainer.strategy.broadcast(value))
+        better = self.ledger.validated(validation.metric, value)
+        if trainer.logger is not None:
+            trainer.logger.log_metrics({f"validation/{validation.metric}": value}, step=module.step)
+        if better and trainer.is_global_zero:
+            save(self.job.folder.weights, self.job.checkpoint(self.ledger, rounded_weights(module.model)))
+        patience = module.recipe.patience
+        if patience is not None and self.ledger.since_best() >= patience and module.step < module.steps:
+            self.ledger.state = STOPPED_EARLY
+            trainer.should_stop = True
+
+    def _store(self, trainer: Trainer, module: TrainingModule) -> None:
+        """Write checkpoint and record; a model whose weights are not finite is not stored."""
+        if self.ledger.state == "running" and module.step >= module.steps:
+            self.ledger.state = "finished"
+        if not trainer.is_global_zero:
+            return
+        state = module.model.state_dict()
+        if not all(bool(torch.isfinite(value).all()) for value in state.values()):
+            raise module.not_finite()
+        self._write_record(trainer, module)
+        folder = self.job.folder
+        optimizer = trainer.optimizers[0].state_dict()
+        save(folder.checkpoint, self.job.checkpoint(self.ledger, state, optimizer))
+        if self.ledger.best_step is None or not folder.weights.exists():
+            save(folder.weights, self.job.checkpoint(self.ledger, rounded_weights(module.model)))
+        else:  # the weights stay those of the best step, their budget is that of the training
+            best = load(folder.weights)
+            budget = self.job.budget(self.ledger).model_dump(mode="json")
+            save(folder.weights, replace(best, training={**best.training, "budget": budget}))
+
+    def _write_record(self, trainer: Trainer, module: TrainingModule) -> None:
+        self.ledger.read_clocks(trainer.world_size, device=self.job.device)
+        more = {"steps": self.steps, "windows": self.windows}
+        self.job.folder.write_record(self.job.record(module.model, self.ledger, **more))
+
+
+def _of(module: LightningModule) -> TrainingModule:
+    if not isinstance(module, TrainingModule):
+        raise TypeError(type(module).__name__)
+    return module
+
+
+def seed_of(seed: int, *place: int) -> int:
+    """Return a seed of 63 bits for a place in a training, such as (step, process)."""
+    return int(np.random.SeedSequence((seed, *place)).generate_state(1, np.uint64)[0] >> np.uint64(1))
+
+
+def reseed(seed: int) -> None:
+    """Set the global generators of Python, NumPy and torch, which layers of others draw from."""
+    random.seed(seed)
+    np.random.seed(seed % 2**32)  # noqa: NPY002 (what PyTorch Geometric may draw from)
+    torch.manual_seed(seed)
+
+
+@contextmanager
+def generators_kept() -> Iterator[None]:
+    """Give the caller's global generators back as they were."""
+    python, numpy = random.getstate(), np.random.get_state()  # noqa: NPY002 (the global one)
+    with torch.random.fork_rng():
+        try:
+            yield
+        finally:
+            random.setstate(python)
+            np.random.set_state(numpy)  # noqa: NPY002

@@ -1,15 +1,20 @@
-"""Encode, process, decode: the graph network that all six operators share."""
+"""Encode, process, decode: the graph network that all six operators share, and its layers.
+
+They are fast and exact on CPUs: products go to oneDNN, normalising layers learn in bfloat16 too, and
+large edge updates keep no hidden layer: the backward pass computes them again.
+"""
 
 from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from lagbench.baselines.operators.operator import Losses, Operator, summed
 
-from .layers import EdgeMLP, mlp
-
-__all__ = ["EncodeProcessDecode", "ProcessorLayer"]
+__all__ = ["EdgeMLP", "EncodeProcessDecode", "Linear"]
 
 
 class ProcessorLayer(nn.Module):
@@ -38,14 +43,7 @@ class ProcessorLayer(nn.Module):
     def forward(
         self, node: Tensor, edge_index: Tensor, edge: Tensor, generator: torch.Generator | None = None
     ) -> tuple[Tensor, Tensor, Losses]:
-        """Return updated nodes and edges and the operator's own losses.
-
-        Args:
-            node: node latents, shape [particle, latent].
-            edge_index: senders and receivers, shape [2, edge].
-            edge: edge latents, shape [edge, latent].
-            generator: source of whatever the operator draws.
-        """
+        """Return updated nodes and edges and the operator's own losses."""
         message = self.message(edge, node, edge_index)
         given = node
         if self.sum_messages and self.operator.reads_nodes:
@@ -95,17 +93,7 @@ class EncodeProcessDecode(nn.Module):
     def forward(
         self, node: Tensor, edge_index: Tensor, edge: Tensor, generator: torch.Generator | None = None
     ) -> tuple[Tensor, Losses]:
-        """Return the prediction and the operators' own losses, layer means.
-
-        Args:
-            node: particle features, shape [particle, node_features].
-            edge_index: senders and receivers, shape [2, edge].
-            edge: edge features, shape [edge, edge_features].
-            generator: source of whatever the operators draw in training.
-
-        Returns:
-            Prediction, shape [particle, outputs]; losses by name, empty for most operators.
-        """
+        """Return the prediction, shape [particle, outputs], and the operators' own losses, layer means."""
         given = node.dtype
         node, edge = self.node_encoder(node), self.edge_encoder(edge)
         losses: list[Losses] = []
@@ -116,3 +104,186 @@ class EncodeProcessDecode(nn.Module):
         # Three digits of bfloat16 are too few for what is added to velocities every frame.
         with torch.autocast(node.device.type, enabled=False):
             return self.decoder(node.to(given)), means
+
+
+class _OneDNNLinear(torch.autograd.Function):
+    """A product by oneDNN, whose kernels go by what a CPU can do.
+
+    MKL, which torch calls for float32, keeps to AVX2 on CPUs that are not Intel's: half as fast.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:  # noqa: ANN401
+        ctx.save_for_backward(x, weight)
+        return _product(x, weight, bias)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:  # noqa: ANN401
+        (grad,), (x, weight) = grads, ctx.saved_tensors
+        of_x, of_weight, of_bias = ctx.needs_input_grad
+        return (
+            _product(grad, weight.t(), None) if of_x else None,
+            grad.t() @ x if of_weight else None,
+            grad.sum(dim=0) if of_bias else None,
+        )
+
+
+def _product(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
+    # Views of wider matrices would take a path a thousand times slower.
+    x, weight = x.contiguous(), weight.contiguous()
+    product: Tensor = torch.ops.mkldnn._linear_pointwise(x, weight, bias, "none", [], "")
+    return product
+
+
+def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
+    """Return ``x W^T + b``, as ``torch.nn.functional.linear`` does; shapes [row, input], [output, input]."""
+    if _fast(x, weight):
+        product: Tensor = _OneDNNLinear.apply(x, weight, bias)  # type: ignore[no-untyped-call]
+        return product
+    return nn.functional.linear(x, weight, bias)
+
+
+def _fast(x: Tensor, weight: Tensor) -> bool:
+    """Return whether oneDNN can and should do it: rows of float32 on a CPU."""
+    return (
+        x.device.type == "cpu"
+        and x.dim() == 2
+        and x.numel() > 0
+        and x.dtype == weight.dtype == torch.float32
+        and not torch.is_autocast_enabled("cpu")
+        and not torch.compiler.is_compiling()
+        and hasattr(torch.ops.mkldnn, "_linear_pointwise")
+    )
+
+
+class Linear(nn.Linear):
+    """A linear layer by :func:`linear`; its weights are those of torch's."""
+
+    def forward(self, input: Tensor) -> Tensor:
+        """Return the product, shape [row, output]."""
+        return linear(input, self.weight, self.bias)
+
+
+class LayerNorm(nn.LayerNorm):
+    """A LayerNorm whose weights learn in bfloat16 too.
+
+    On CPUs, torch sums their gradients over the rows in bfloat16: 5,000 ones sum to 512. Here
+    they are those of a product and a sum, which torch adds up in float32.
+    """
+
+    def forward(self, input: Tensor) -> Tensor:
+        """Return rows of mean 0 and deviation 1, times weight, plus bias."""
+        if input.device.type != "cpu" or input.dtype != torch.bfloat16:
+            return super().forward(input)
+        normal = nn.functional.layer_norm(input, self.normalized_shape, eps=self.eps)
+        return torch.addcmul(self.bias.to(input.dtype), normal, self.weight.to(input.dtype))
+
+
+PIECE = 8192  # edges at a time: a hidden layer of 128 then has 4 MB and stays in the cache
+
+
+def edge_map(
+    rest: nn.Module, edge_index: Tensor, edge: Tensor, sender: Tensor, receiver: Tensor, weight: Tensor
+) -> Tensor:
+    """Return ``f(s_j + r_i + W_e e_ij)``, shape [edge, output].
+
+    f is the rest of an MLP from its first hidden layer on; s and r, shape [particle, hidden], are that
+    layer of each particle as a sender and as a receiver.
+    """
+    hidden = _gathered(edge_index, sender, receiver)
+    hidden += linear(edge, weight)  # In place: an edge tensor of a full scenario is 32 MB.
+    update: Tensor = rest(hidden)
+    return update
+
+
+def _gathered(edge_index: Tensor, sender: Tensor, receiver: Tensor) -> Tensor:
+    both = receiver.index_select(0, edge_index[1])
+    both += sender.index_select(0, edge_index[0])
+    return both
+
+
+def _pieces(edges: int) -> list[slice]:
+    return [slice(start, start + PIECE) for start in range(0, edges, PIECE)]
+
+
+class Recomputed(torch.autograd.Function):
+    """:func:`edge_map` by pieces of edges, which keeps its arguments only."""
+
+    @staticmethod
+    def forward(ctx: Any, rest: nn.Module, *tensors: Tensor) -> Tensor:  # noqa: ANN401
+        """Return the update of each edge; arguments are those of :func:`edge_map` and f's parameters."""
+        ctx.save_for_backward(*tensors)
+        ctx.rest = rest
+        ctx.autocast = torch.is_autocast_enabled("cpu"), torch.get_autocast_dtype("cpu")
+        edge_index, edge, sender, receiver, weight = tensors[:5]
+        updates = [
+            edge_map(rest, edge_index[:, piece], edge[piece], sender, receiver, weight)
+            for piece in _pieces(len(edge))
+        ]
+        return torch.cat(updates)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:  # noqa: ANN401
+        """Return the gradients of all tensors."""
+        edge_index, edge, sender, receiver, weight, *parameters = ctx.saved_tensors
+        of_edge = torch.empty_like(edge)
+        of_sender, of_receiver = torch.zeros_like(sender), torch.zeros_like(receiver)
+        of_weights = [torch.zeros_like(weight) for weight in (weight, *parameters)]
+        enabled, dtype = ctx.autocast
+        for piece in _pieces(len(edge)):
+            index = edge_index[:, piece]
+            with torch.enable_grad(), torch.autocast("cpu", dtype, enabled=enabled):
+                some = edge[piece].detach().requires_grad_()
+                hidden = _gathered(index, sender.detach(), receiver.detach()).requires_grad_()
+                update = ctx.rest(hidden + linear(some, weight))
+            wanted = [hidden, some, weight, *parameters]
+            of_hidden, of_edge[piece], *own = torch.autograd.grad(update, wanted, grads[0][piece])
+            of_sender.index_add_(0, index[0], of_hidden)
+            of_receiver.index_add_(0, index[1], of_hidden)
+            torch._foreach_add_(of_weights, own)
+        return None, None, of_edge, of_sender, of_receiver, *of_weights
+
+
+LARGEST_KEPT = 24e6  # edge tensors above this size on a CPU are recomputed, not kept [byte]
+
+
+def mlp(widths: list[int], *, norm: bool = True) -> nn.Sequential:
+    """Return linear layers with ReLU between them, LayerNorm after the last."""
+    layers: list[nn.Module] = []
+    for width, following in pairwise(widths):
+        layers += [Linear(width, following), nn.ReLU(inplace=True)]
+    layers[-1:] = [LayerNorm(widths[-1])] if norm else []
+    return nn.Sequential(*layers)
+
+
+class EdgeMLP(nn.Module):
+    r"""An MLP of an edge and its two ends, with a first layer per node.
+
+    .. math:: m_{ij} = f(W_e e_{ij} + (W_r x_i + b) + W_s x_j)
+
+    The first layer of an MLP on the concatenation :math:`[e_{ij}, x_i, x_j]` is linear in
+    each part, so the products with nodes are taken once per node, not once per edge.
+
+    Where one edge tensor on a CPU has more than 24 MB (a full scenario in float32), hidden
+    layers are computed again in the backward pass, edges by pieces that fit the cache: a
+    little time for half of the memory. Above 32 MB, glibc would also hand every tensor back to
+    the system and pay for its pages again.
+    """
+
+    def __init__(self, latent: int, hidden: int) -> None:
+        super().__init__()
+        self.first = nn.Linear(3 * latent, hidden)
+        self.rest = nn.Sequential(nn.ReLU(inplace=True), *mlp([hidden, hidden, latent]))
+
+    def forward(self, edge: Tensor, node: Tensor, edge_index: Tensor) -> Tensor:
+        """Return the update of each edge, shape [edge, latent]."""
+        of_edge, of_receiver, of_sender = self.first.weight.tensor_split(3, dim=1)
+        ends = linear(node, of_sender), linear(node, of_receiver, self.first.bias)
+        mixed = torch.is_autocast_enabled(edge.device.type)
+        dtype = torch.get_autocast_dtype(edge.device.type) if mixed else edge.dtype
+        kept = len(edge) * self.first.out_features * dtype.itemsize
+        if edge.device.type == "cpu" and kept > LARGEST_KEPT and not torch.compiler.is_compiling():
+            tensors = edge_index, edge, *ends, of_edge, *self.rest.parameters()
+            update: Tensor = Recomputed.apply(self.rest, *tensors)  # type: ignore[no-untyped-call]
+            return update
+        return edge_map(self.rest, edge_index, edge, *ends, of_edge)

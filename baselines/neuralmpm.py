@@ -22,23 +22,16 @@ from torch.nn.functional import gelu
 
 from lagbench.errors import DataError, UsageError
 
-from .baseline import Baseline, Batch, Options
-from .facts import Facts
+from .augmentation import Symmetry, disturbed
+from .baseline import Baseline, Batch, Facts, Options, check_moving_walls, last_velocities
 from .graph import MATERIALS
 from .particle_grid import ParticleGrid, Stencil
-from .seeding import noisy
-from .symmetry import Symmetry, draw, image
 
-__all__ = ["NeuralMPM", "NeuralMPMOptions", "UNet"]
+__all__ = ["NeuralMPM"]
 
-EMPTY = 1e-3
-"""Below this weight, in units of particles a radius apart, a node's velocity fades to 0."""
-
-REACH = 4
-"""Cells over which the U-Net sees how far a wall is."""
-
-COARSEST = 4
-"""Nodes of the U-Net's finest level to one of its coarsest, along each axis."""
+EMPTY = 1e-3  # below this weight, in units of particles a radius apart, a node's velocity fades to 0
+REACH = 4  # cells over which the U-Net sees how far a wall is
+COARSEST = 4  # nodes of the U-Net's finest level to one of its coarsest, along each axis
 
 
 class NeuralMPMOptions(Options):
@@ -153,7 +146,15 @@ class NeuralMPM(Baseline):
 
     def __init__(self, options: NeuralMPMOptions, facts: Facts) -> None:
         super().__init__(options, facts)
-        self._check()
+        check_moving_walls(options.wall_velocity, facts)
+        known = set(options.materials)
+        if not known or len(known) < len(options.materials) or not known <= set(range(MATERIALS)):
+            raise UsageError(
+                "materials are named once each",
+                where="model.materials",
+                expected=f"some of {list(range(MATERIALS))}",
+                got=list(options.materials),
+            )
         self.grid = ParticleGrid(facts.bounds, options.cells, multiple=COARSEST)
         self.unit = (self.grid.spacing / facts.radius) ** 2
         # One scale for x and y: a model that is trained on turned windows must not tell them apart.
@@ -173,28 +174,6 @@ class NeuralMPM(Baseline):
         forcing = 2 * frames * options.wall_velocity
         self.network = UNet(seen + forcing + options.context, 2 * kinds * frames, options.width)
 
-    def _check(self) -> None:
-        materials = self.options.materials
-        if self.options.wall_velocity and not self.facts.moving_walls:
-            raise UsageError(
-                f"the walls of {self.facts.split} do not move",
-                where="model.wall_velocity",
-                expected=False,
-                got=True,
-                fix="leave the option out",
-            )
-        if (
-            not materials
-            or len(set(materials)) < len(materials)
-            or not set(materials) <= set(range(MATERIALS))
-        ):
-            raise UsageError(
-                "materials are named once each",
-                where="model.materials",
-                expected=f"some of {list(range(MATERIALS))}",
-                got=list(materials),
-            )
-
     @property
     def history(self) -> int:
         """One frame more than the velocities that the U-Net sees."""
@@ -206,45 +185,31 @@ class NeuralMPM(Baseline):
         return self.options.bundle * self.options.calls
 
     def forward(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
-        """Return the squared error of velocity over the acceleration's deviation, mean over the frames [1].
-
-        Args:
-            batch: windows of ``history + future`` frames; left unchanged.
-            generator: source of noise and images; without one there is neither.
-        """
-        batch = batch if generator is None else self._disturbed(batch, generator)
+        """Return the squared error of velocity over the deviation of accelerations, mean over frames [1]."""
+        options = self.options
+        if generator is not None:
+            batch = disturbed(
+                batch,
+                generator,
+                symmetry=options.symmetry,
+                bounds=self.facts.bounds,
+                history=self.history,
+                noise_std=options.noise_std,
+            )
         state = self.start(batch.part(slice(self.history)))
         target = batch.position[:, self.history - 1 :].diff(dim=1)
         errors: list[Tensor] = []
-        for _ in range(self.options.calls):
+        for _ in range(options.calls):
             state, frames = self.call(state)
             for _, velocity in frames:
                 error = (velocity - target[:, len(errors)]) / self.change
                 errors.append(error.square().mean())
         return {"velocity": torch.stack(errors).mean()}
 
-    def _disturbed(self, batch: Batch, generator: torch.Generator) -> Batch:
-        """Return the batch as its random image, with noise."""
-        if self.options.symmetry is not Symmetry.NONE:
-            matrix = draw(self.options.symmetry, batch.windows, generator)
-            batch = image(batch, matrix, self.facts.bounds)
-        if self.options.noise_std > 0.0:
-            position = noisy(batch.position, self.history, self.options.noise_std, generator)
-            batch = replace(batch, position=position)
-        return batch
-
     def start(self, given: Batch) -> GridState:
-        """Return the state after the given frames; where they are few, the first velocity repeats.
-
-        Raises:
-            UsageError: fewer than two frames.
-            DataError: a particle of a material that the model does not know.
-        """
-        count = self.options.velocities
-        if given.frames < 2:
-            raise UsageError(
-                "too few frames to start from", expected=f"2 or more, {count + 1} for all", got=given.frames
-            )
+        """Return the state after the given frames; where they are few, the first velocity repeats."""
+        position = given.position[:, -self.history :].clamp(self.grid.low, self.grid.high)
+        velocity = last_velocities(position, self.options.velocities)
         slot = self.slot[given.material]
         if bool((slot < 0).any()):
             raise DataError(
@@ -253,10 +218,6 @@ class NeuralMPM(Baseline):
                 expected=list(self.options.materials),
                 got=sorted(set(given.material.tolist())),
             )
-        position = given.position[:, -count - 1 :].clamp(self.grid.low, self.grid.high)
-        velocity = position.diff(dim=1)
-        missing = count - velocity.shape[1]
-        velocity = torch.cat([velocity[:, :1].expand(-1, missing, -1), velocity], dim=1)
         walls = position.new_zeros(given.windows, 1, len(self.beside), 2)
         if self.options.wall_velocity and given.wall_velocity is not None:
             walls = given.wall_velocity[:, given.frames - 1 :] * self.facts.frame_interval
@@ -285,7 +246,15 @@ class NeuralMPM(Baseline):
         share = self.options.smoothing
         stencil = self.grid.stencil(state.position, state.layer)
         fields, on_grid = self._fields(state, stencil)
-        predicted = torch.cat([on_grid, self._accelerations(state, fields)], dim=1)
+        parts = [fields, state.context[:, :, None, None].expand(-1, -1, *self.grid.shape)]
+        if self.options.wall_velocity:
+            coming = torch.arange(1, self.options.bundle + 1, device=fields.device)
+            moved = state.walls[:, coming.clamp(max=state.walls.shape[1] - 1)] / self.speed
+            parts.append(torch.einsum("fmwc,wxy->fmcxy", moved, self.beside).flatten(1, 2))
+        output: Tensor = self.network(torch.cat(parts, dim=1)) * self.change
+        # accelerations in the coming frames [length/frame^2], shape [layer, 2 bundle, x node, y node]
+        changes = output.reshape(-1, 2 * self.options.bundle, *self.grid.shape)
+        predicted = torch.cat([on_grid, changes], dim=1)
         gathered = self.grid.gather(stencil, predicted).view(len(stencil.weight), -1, 2)
         on_grid, *accelerations = gathered.unbind(dim=1)
         position, velocity = state.position, state.velocity[:, -1]
@@ -318,14 +287,3 @@ class NeuralMPM(Baseline):
         seen = torch.cat([weight, velocity[:, -1] / self.speed, changes.flatten(1, 2)], dim=1)
         geometry = self.geometry.expand(windows, -1, -1, -1)
         return torch.cat([seen.reshape(windows, -1, *self.grid.shape), geometry], dim=1), velocity[:, -1]
-
-    def _accelerations(self, state: GridState, fields: Tensor) -> Tensor:
-        """Return the accelerations in the coming frames [length/frame^2], shape [layer, 2 bundle, x, y]."""
-        bundle = self.options.bundle
-        parts = [fields, state.context[:, :, None, None].expand(-1, -1, *self.grid.shape)]
-        if self.options.wall_velocity:
-            frames = torch.arange(1, bundle + 1, device=fields.device).clamp(max=state.walls.shape[1] - 1)
-            forcing = torch.einsum("fmwc,wxy->fmcxy", state.walls[:, frames] / self.speed, self.beside)
-            parts.append(forcing.flatten(1, 2))
-        output: Tensor = self.network(torch.cat(parts, dim=1)) * self.change
-        return output.reshape(-1, 2 * bundle, *self.grid.shape)

@@ -15,7 +15,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from .facts import Pair
+from .graph import Bounds
+from .torch_grid import nine_nodes, spline_weights
 
 __all__ = ["ParticleGrid", "Stencil"]
 
@@ -43,7 +44,7 @@ class ParticleGrid(nn.Module):
     low: Tensor
     high: Tensor
 
-    def __init__(self, bounds: tuple[Pair, Pair], cells: int, *, multiple: int = 1) -> None:
+    def __init__(self, bounds: Bounds, cells: int, *, multiple: int = 1) -> None:
         super().__init__()
         self.spacing = max(high - low for low, high in bounds) / cells
         for name, (low, high) in zip(("axis_x", "axis_y"), bounds, strict=True):
@@ -72,14 +73,9 @@ class ParticleGrid(nn.Module):
         # On the far wall the third node has weight 0 and may not exist; NaN must not become an index.
         last = s.new_tensor([columns - 3, rows - 3])
         base = torch.floor(s.detach() - 0.5).nan_to_num(0.0).clamp(min=0.0).minimum(last)
-        f = s - base
-        b = torch.stack([0.5 * (1.5 - f) ** 2, 0.75 - (f - 1.0) ** 2, 0.5 * (f - 0.5) ** 2], dim=1)
-        weight = b[:, :, None, 0] * b[:, None, :, 1]
         column, row = base.long().unbind(dim=1)
-        three = torch.arange(3, device=position.device)
-        corner = (layer * columns + column) * rows + row
-        node = corner[:, None, None] + (three[:, None] * rows + three)
-        return Stencil(weight.flatten(1), node.flatten())
+        node = nine_nodes(layer, column, row, self.shape)
+        return Stencil(spline_weights(s - base).flatten(1), node.flatten())
 
     def spread(self, stencil: Stencil, value: Tensor, layers: int) -> Tensor:
         """Return the sums at the nodes, shape [layer, channel, x node, y node].

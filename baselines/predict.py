@@ -11,7 +11,6 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,24 +24,17 @@ from lagbench.submission.budget import budget_in
 from lagbench.submission.writer import PredictionsWriter
 from lagbench.work.progress import Meter, Progress
 
-from .baseline import Baseline, Batch
+from .baseline import Baseline, Facts
 from .checkpoint import Checkpoint, check_data, load, restore
-from .facts import Facts
 from .graph import radius_graph
 from .job import RunFolder, parameter_count
 from .machine import bound_memory, chosen_device, hardware, memory_errors_told, threads_used
-from .rollout import Rollout, roll_out
-from .windows import scenario_batch, scenario_paths
+from .rollout import Rollout, roll_out, scenario_batch, scenario_paths
 
-__all__ = [
-    "PredictionResult",
-    "UnfinishedWarning",
-    "predict",
-]
+__all__ = ["PredictionResult", "UnfinishedWarning", "predict"]
 
 
-SEARCHES = 5
-"""Frames of a rollout on which the neighbour search is timed alone."""
+SEARCHES = 5  # frames of a rollout on which the neighbour search is timed alone
 
 
 class UnfinishedWarning(UserWarning):
@@ -109,18 +101,29 @@ def predict(
         WorkFailedError: out of memory, or the disk is full.
     """
     found = load(checkpoint)
-    _warn_if_unfinished(Path(checkpoint), found)
+    # Weights of the best validation say 'running' for good: what became of the training stands beside them.
+    path = Path(checkpoint)
+    if (reached := RunFolder(path.parent).unfinished(found.training)) is not None:
+        warnings.warn(
+            f"the training behind {path} stands at step {reached[0]} of {reached[1]}; to go on with it"
+            f" give its `lagbench train` command again, with --output {path.parent}",
+            UnfinishedWarning,
+            stacklevel=2,
+        )
     home = resolve_root(root)
     known = rooted(home, registry)
     facts = check_data(found, root=home, registry=known, where=str(checkpoint))
     machine = chosen_device(device)
     bound_memory()
-    paths = _test_files(facts, home, known)
+    tests = scenario_paths(facts.split, subset="test", size=facts.size, root=home, registry=known)
+    paths = list(tests.values())
     side = min(batch or (1 if machine == "cpu" else len(paths)), len(paths))
     with threads_used(threads), memory_errors_told("lower --batch"):
         model = restore(found, where=str(checkpoint)).to(machine)
         work = _Rollouts(model, facts, paths, side, machine)
-        label, hardware_label, count = method or model.method, _device_label(machine), parameter_count(model)
+        label, count, here = method or model.method, parameter_count(model), hardware(machine)
+        on_cpu = f"{here['processor']}, {here['threads']} thread{'s' if here['threads'] > 1 else ''}"
+        hardware_label = str(here["device"]) if machine == "cuda" else on_cpu
         writer = PredictionsWriter(
             output,
             split=facts.split,
@@ -132,7 +135,15 @@ def predict(
             parameters=count,
             **_provenance(found),
         )
-        timed = _write(writer, work, Meter(progress), solver and partial(solver, facts.split, facts.size))
+        meter, timed = Meter(progress), None
+        meter.begin("predicting", total=len(paths), scenarios=len(paths))
+        with writer:
+            for rollout in work:
+                writer.add(rollout.scenario, rollout.position.numpy(), diverged_at=rollout.diverged_at)
+                meter.count(1, scenarios=1)
+            writer.label(seconds_per_frame=work.seconds_per_frame)
+            if solver is not None and (timed := solver(facts.split, facts.size)) is not None:
+                writer.label(solver_seconds_per_frame=timed)
     result = PredictionResult(
         path=Path(output),
         split=facts.split,
@@ -154,39 +165,6 @@ def predict(
     return result
 
 
-def _warn_if_unfinished(path: Path, found: Checkpoint) -> None:
-    # Weights of the best validation say 'running' for good: what became of the training stands beside them.
-    reached = RunFolder(path.parent).unfinished(found.training)
-    if reached is not None:
-        warnings.warn(
-            f"the training behind {path} stands at step {reached[0]} of {reached[1]}; to go on with it"
-            f" give its `lagbench train` command again, with --output {path.parent}",
-            UnfinishedWarning,
-            stacklevel=3,
-        )
-
-
-def _test_files(facts: Facts, root: Path, registry: Registry) -> list[Path]:
-    paths = scenario_paths(facts.split, subset="test", size=facts.size, root=root, registry=registry)
-    return list(paths.values())
-
-
-def _write(
-    writer: PredictionsWriter, work: _Rollouts, meter: Meter, solver: Callable[[], float | None] | None
-) -> float | None:
-    """Write the rollouts and what they cost; return what the solver takes."""
-    meter.begin("predicting", total=len(work), scenarios=len(work))
-    with writer:
-        for rollout in work:
-            writer.add(rollout.scenario, rollout.position.numpy(), diverged_at=rollout.diverged_at)
-            meter.count(1, scenarios=1)
-        writer.label(seconds_per_frame=work.seconds_per_frame)
-        timed = solver() if solver else None
-        if timed is not None:
-            writer.label(solver_seconds_per_frame=timed)
-    return timed
-
-
 class _Rollouts:
     """Rolls scenarios out, some side by side, and takes the time."""
 
@@ -201,10 +179,6 @@ class _Rollouts:
         self._groups = [paths[first : first + side] for first in range(0, len(paths), side)]
         self._searches: list[float] = []
 
-    def __len__(self) -> int:
-        """Return the number of scenarios."""
-        return sum(map(len, self._groups))
-
     def __iter__(self) -> Iterator[Rollout]:
         """Yield the rollout of every scenario."""
         for number, group in enumerate(self._groups):
@@ -214,10 +188,19 @@ class _Rollouts:
             started = self._now()
             found = roll_out(self._model, given, self._facts.horizon)
             self.seconds += self._now() - started
-            self.frames += sum(self._made(one) for one in found)
-            self._time_searches(given, found)
-            marks = {one.scenario: one.diverged_at for one in found if one.diverged_at is not None}
-            self.diverged.update(marks)
+            for one in found:
+                if one.diverged_at is None:
+                    self.frames += self._facts.horizon
+                else:  # the first frame that is not finite was made, too
+                    self.frames += one.diverged_at - self._facts.input_frames + 1
+                    self.diverged[one.scenario] = one.diverged_at
+            radius = getattr(self._model, "radius", None)
+            if radius is not None:  # search neighbours once more in some frames, and take the time
+                positions = torch.cat([one.position for one in found], dim=1).to(self._machine)
+                for frame in range(0, len(positions), max(1, len(positions) // SEARCHES)):
+                    started = self._now()
+                    radius_graph(positions[frame], float(radius), given.sample)
+                    self._searches.append((self._now() - started) / len(found))
             yield from found
 
     @property
@@ -230,34 +213,10 @@ class _Rollouts:
         """Time of the neighbour search in it [s]; 0 for a model without one."""
         return sum(self._searches) / len(self._searches) if self._searches else 0.0
 
-    def _made(self, rollout: Rollout) -> int:
-        """Return the frames that a rollout took, the first one that is not finite included."""
-        if rollout.diverged_at is None:
-            return self._facts.horizon
-        return rollout.diverged_at - self._facts.input_frames + 1
-
-    def _time_searches(self, given: Batch, found: list[Rollout]) -> None:
-        """Search neighbours once more in some frames of the rollouts, and take the time."""
-        radius = getattr(self._model, "radius", None)
-        if radius is None:
-            return
-        positions = torch.cat([one.position for one in found], dim=1).to(self._machine)
-        for frame in range(0, len(positions), max(1, len(positions) // SEARCHES)):
-            started = self._now()
-            radius_graph(positions[frame], float(radius), given.sample)
-            self._searches.append((self._now() - started) / len(found))
-
     def _now(self) -> float:
         if self._machine == "cuda":
             torch.cuda.synchronize()
         return time.process_time() if self.clock == "processor" else time.perf_counter()
-
-
-def _device_label(machine: str) -> str:
-    found = hardware(machine)
-    threads = found["threads"]
-    on_cpu = f"{found['processor']}, {threads} thread{'s' if threads > 1 else ''}"
-    return str(found["device"]) if machine == "cuda" else on_cpu
 
 
 def _provenance(checkpoint: Checkpoint) -> dict[str, Any]:

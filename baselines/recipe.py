@@ -33,13 +33,7 @@ from lagbench.errors import LagbenchError, UnreadableFileError, UsageError, near
 
 from .catalogue import Entry, names
 
-__all__ = [
-    "Schedule",
-    "TrainingOptions",
-    "Recipe",
-    "recipe_for",
-    "recipe_names",
-]
+__all__ = ["Recipe", "TrainingOptions", "recipe_for", "recipe_names"]
 
 
 class _Strict(BaseModel):
@@ -75,12 +69,7 @@ class Schedule(_Strict):
         return rise * (self.floor + (1 - self.floor) * (1 + math.cos(math.pi * done)) / 2)
 
 
-def _named(value: object) -> object:
-    return {"kind": value} if isinstance(value, str) else value
-
-
-VALIDATION_SHARE = 0.15
-"""Share of a training's processor time that validations may take."""
+VALIDATION_SHARE = 0.15  # share of a training's processor time that validations may take
 
 STEP_COST = 1.5
 """Processor time to train on a frame over that to roll one out.
@@ -100,7 +89,9 @@ class TrainingOptions(_Strict):
     learning_rate: float = Field(default=1e-4, gt=0, allow_inf_nan=False)
     # decoupled (AdamW) where it is above 0
     weight_decay: float = Field(default=0.0, ge=0, allow_inf_nan=False)
-    schedule: Annotated[Schedule, BeforeValidator(_named)] = Schedule()  # the rate over the steps
+    schedule: Annotated[
+        Schedule, BeforeValidator(lambda value: {"kind": value} if isinstance(value, str) else value)
+    ] = Schedule()  # the rate over the steps
     warmup_steps: int = Field(default=0, ge=0)  # steps over which the rate rises from 0
     # largest norm of the gradient; None clips nothing
     clip: float | None = Field(default=None, gt=0, allow_inf_nan=False)
@@ -149,12 +140,8 @@ class TrainingOptions(_Strict):
     def validations(self, steps: int, *, trained: int, rolled: int) -> int:
         """Return how many validations take at most 15 % of a training: 8, 4 or 2, and 1 in any case.
 
-        A function of numbers alone, so that a training ends with the same bits on every machine.
-
-        Args:
-            steps: optimiser steps of the training.
-            trained: frames that a step predicts, of all windows of a process.
-            rolled: frames that a validation predicts, of all scenarios.
+        A function of numbers alone, so that a training ends with the same bits on every machine: its steps,
+        the frames that a step predicts, of all windows of a process, and those that a validation predicts.
         """
         affordable = VALIDATION_SHARE * STEP_COST * trained * steps / rolled
         return next((count for count in (8, 4, 2) if count <= affordable), 1)
@@ -228,7 +215,21 @@ def recipe_for(
     own_file = variant is not None and variant.endswith((".yaml", ".yml"))
     path = Path(str(variant)) if own_file else entry.recipes
     file = _read(path) if path else _File(format=1)
-    name, part = _choose(entry, file, split, size if own_file or not variant else f"{size}-{variant}")
+    wanted = size if own_file or not variant else f"{size}-{variant}"
+    name = f"{split}/{wanted}"
+    part = file.recipes.get(name) or file.recipes.get(f"{ANY}/{wanted}")
+    if part is None and file.recipes:
+        known = sorted(file.recipes)
+        same_split = [other for other in known if other.split("/")[0] == split]
+        write = "write your own: --recipe FILE.yaml, see docs/baselines.md"
+        raise UsageError(
+            f"{entry.name} has no recipe {name!r}",
+            where="--split, --size, --recipe",
+            fix=f"{nearest(name, same_split)}; or {write}"
+            if same_split
+            else f"{write}; known: {', '.join(known)}",
+        )
+    part = part or _Shared()
     model, training = _merge(file.model, part.model), _merge(file.training, part.training)
     for other in part.baselines:
         if other not in names():
@@ -259,28 +260,6 @@ def _read(path: Path) -> _File:
         return _File.model_validate(content)
     except ValidationError as error:
         raise _complaint(error, _File, "", str(path), UnreadableFileError) from None
-
-
-def _choose(entry: Entry, file: _File, split: str, size: str) -> tuple[str, _Shared]:
-    """Return the recipe for a split and size, ``*`` standing for any split."""
-    for name in (f"{split}/{size}", f"{ANY}/{size}"):
-        if name in file.recipes:
-            return f"{split}/{size}", file.recipes[name]
-    if not file.recipes:
-        return f"{split}/{size}", _Shared()
-    raise UsageError(
-        f"{entry.name} has no recipe {f'{split}/{size}'!r}",
-        where="--split, --size, --recipe",
-        fix=_closest(f"{split}/{size}", file.recipes),
-    )
-
-
-def _closest(wanted: str, known: Iterable[str]) -> str:
-    """Return what to do without a recipe: the nearest of the same split, or one's own."""
-    names = sorted(known)
-    own = [name for name in names if name.split("/")[0] == wanted.split("/")[0]]
-    write = "write your own: --recipe FILE.yaml, see docs/baselines.md"
-    return f"{nearest(wanted, own)}; or {write}" if own else f"{write}; known: {', '.join(names)}"
 
 
 def _merge(below: Layer, above: Layer) -> Layer:
@@ -331,18 +310,13 @@ def _complaint(
     first = error.errors()[0]
     key = ".".join(str(part) for part in (group, *first["loc"]) if part != "")
     if first["type"] == "extra_forbidden":
-        known = _fields(options, first["loc"][:-1])
-        return kind(f"unknown key {key!r}", where=where, fix=nearest(str(first["loc"][-1]), known))
+        for step in first["loc"][:-1]:  # the keys of options nested below a path
+            field = options.model_fields.get(str(step))
+            inner = field.annotation if field else None
+            if isinstance(inner, type) and issubclass(inner, BaseModel):
+                options = inner
+            elif step == "recipes" or options is _File:
+                options = _Shared
+        fix = nearest(str(first["loc"][-1]), list(options.model_fields))
+        return kind(f"unknown key {key!r}", where=where, fix=fix)
     return kind(f"{key} does not fit", where=where, expected=first["msg"], got=repr(first["input"])[:80])
-
-
-def _fields(options: type[BaseModel], path: tuple[int | str, ...]) -> list[str]:
-    """Return the keys of options, or of those nested below a path."""
-    for step in path:
-        field = options.model_fields.get(str(step))
-        inner = field.annotation if field else None
-        if isinstance(inner, type) and issubclass(inner, BaseModel):
-            options = inner
-        elif step == "recipes" or options is _File:
-            options = _Shared
-    return list(options.model_fields)

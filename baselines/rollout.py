@@ -1,27 +1,41 @@
 """Rollouts: a model fed with its own predictions, frozen where it ceases to be finite or leaves for far.
 
-One function serves validation during training and the predictions that are scored.
+One function serves the predictions that are scored and validation while a model is trained: rollouts
+of every scenario of ``valid`` by the metric that ranks. Files, metric and its rounding are the
+scorer's: were ``valid`` the test subset, the score card would have the same digits. ``test`` is
+never read. Scenarios come whole, as batches; training windows are `lagbench.torch`'s.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, replace
+from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
+from lagbench.data.local import locate
+from lagbench.data.registry import Registry
+from lagbench.data.scenario import read_scenario
+from lagbench.errors import UsageError
+from lagbench.metrics.aggregate import Tally, score, tally
+from lagbench.metrics.frame import FramePair, snapshots
+from lagbench.metrics.table import METRICS, select
+from lagbench.scoring.scenario import as_stored
+from lagbench.scoring.task import ScoredTask, load_scored_task, ranking_metric
+from lagbench.store.copy import scenario_files
+from lagbench.store.windows import window_of
 from lagbench.submission.checks import MAX_DISTANCE
+from lagbench.torch import Window, collate, tensors
 
-from .baseline import Baseline, Batch
+from .baseline import Baseline, Batch, Facts
+from .recipe import TrainingOptions
 
-__all__ = [
-    "Rollout",
-    "roll_out",
-    "single",
-    "as_published",
-]
+__all__ = ["Rollout", "Validation", "roll_out", "scenario_batch", "scenario_paths", "validation_of"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,13 +58,18 @@ def roll_out(model: Baseline, given: Batch, frames: int) -> list[Rollout]:
     was_training = model.training
     model.eval()
     try:
-        found = _together(model, given, frames)
-        if found is None:
-            parts = [single(given, window) for window in range(given.windows)]
-            return [_alone(model, part, frames) for part in parts]
-        return found
+        if given.windows == 1:
+            return [_alone(model, given, frames)]
+        predicted, finite = _advance(model, given, frames)
+        if finite < frames:
+            return [_alone(model, single(given, window), frames) for window in range(given.windows)]
     finally:
         model.train(was_training)
+    sample = given.sample.cpu()
+    return [
+        Rollout(scenario=int(scenario), position=predicted[:, sample == window], diverged_at=None)
+        for window, scenario in enumerate(given.scenario)
+    ]
 
 
 def single(batch: Batch, window: int) -> Batch:
@@ -65,20 +84,6 @@ def single(batch: Batch, window: int) -> Batch:
         scenario=batch.scenario[window : window + 1],
         frame=batch.frame[window : window + 1],
     )
-
-
-def _together(model: Baseline, given: Batch, frames: int) -> list[Rollout] | None:
-    """Return the rollouts of all windows; None where one of several diverges."""
-    if given.windows == 1:
-        return [_alone(model, given, frames)]
-    predicted, finite = _advance(model, given, frames)
-    if finite < frames:
-        return None
-    sample = given.sample.cpu()
-    return [
-        Rollout(scenario=int(scenario), position=predicted[:, sample == window], diverged_at=None)
-        for window, scenario in enumerate(given.scenario)
-    ]
 
 
 def _alone(model: Baseline, given: Batch, frames: int) -> Rollout:
@@ -120,3 +125,98 @@ def as_published(model: nn.Module) -> Iterator[None]:
         with torch.no_grad():
             for tensor, value in kept:
                 tensor.copy_(value)
+
+
+def scenario_batch(paths: Path | Sequence[Path], frames: slice = slice(None)) -> Batch:
+    """Return the same frames of one or several whole scenarios, read without a cache."""
+    windows: list[Window] = []
+    for path in [paths] if isinstance(paths, Path) else paths:
+        with read_scenario(path) as file:
+            numbers = range(file.header.frames)[frames]
+            if not numbers or numbers.step != 1:
+                raise UsageError(
+                    "no consecutive frames",
+                    where=str(path),
+                    expected=f"frames of 0:{file.header.frames}",
+                    got=frames,
+                )
+            run = slice(numbers.start, numbers.stop)
+            held = file.variables
+            position = file.read("position", run)
+            material = file.read("material") if "material" in held else np.zeros(position.shape[1], np.int8)
+            # The forcing is given for all frames, so that a rollout from these knows what comes.
+            walls = file.read("wall_velocity", slice(run.start, None)) if "wall_velocity" in held else None
+            scenario = file.header.key.scenario
+            windows.append(tensors(window_of(list(position), material, walls, scenario, numbers.start)))
+    return collate(windows)
+
+
+def scenario_paths(
+    split: str,
+    *,
+    subset: str = "test",
+    size: str | None = None,
+    root: str | Path | None = None,
+    registry: Registry | None = None,
+) -> dict[int, Path]:
+    """Return the files of a subset by scenario id; all of them exist."""
+    entry, folder, _ = locate(split, size, root=root, registry=registry)
+    return scenario_files(entry, folder, (subset,))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Validation:
+    """The scenarios that a training is validated on; calling it validates."""
+
+    task: ScoredTask  # the valid subset
+    frames: Mapping[int, int]  # frames to predict, by scenario id: later ones do not count
+    compiled: bool = False  # whether the training compiles layers
+
+    @property
+    def metric(self) -> str:
+        """Name of the metric that ranks; lower is better."""
+        return ranking_metric(self.task.size)
+
+    def __call__(self, model: Baseline) -> float:
+        """Return the metric, the mean over scenarios; NaN where it is undefined.
+
+        The model is rolled out with its weights rounded to bfloat16, as predictions use them, on a CPU
+        one scenario after the other, as predictions are. A rollout that diverges counts with its frozen
+        frames.
+        """
+        device = next((p.device for p in model.parameters()), torch.device("cpu"))
+        ids = list(self.frames)
+        groups = [[i] for i in ids] if device.type == "cpu" else [ids]
+        tallies: dict[int, Tally] = {}
+        # A rollout needs no gradients: its layers would be compiled anew.
+        stance = torch.compiler.set_stance("force_eager") if self.compiled else nullcontext()
+        with as_published(model), stance:
+            for group in groups:
+                paths = [self.task.truth.path(i) for i in group]
+                given = scenario_batch(paths, slice(0, self.task.setting.input_frames)).to(device)
+                for rollout in roll_out(model, given, max(self.frames[i] for i in group)):
+                    with self.task.opened(rollout.scenario) as truth:
+                        scenario, frames = truth.scenario, self.task.setting.predicted_frames
+                        predicted = snapshots(scenario, rollout.position.numpy())
+                        states = zip(frames, predicted, truth.snapshots(), strict=False)
+                        pairs = (FramePair(scenario, frame, true, guess) for frame, guess, true in states)
+                        measured = tally(pairs, select([self.metric]), frames)
+                        tallies[rollout.scenario] = as_stored(measured)  # rounded as score files hold them
+        found = score(METRICS[self.metric], tallies)
+        return math.nan if found is None else found.mean
+
+
+def validation_of(
+    options: TrainingOptions, facts: Facts, *, root: Path, registry: Registry
+) -> Validation | None:
+    """Return the validation of a training; None where the recipe wants none."""
+    if options.validate_every == 0:
+        return None
+    task = load_scored_task(registry.size(facts.split, facts.size), root, subset="valid")
+    horizon = min(options.validation_frames or facts.horizon, facts.horizon)
+    task = replace(task, setting=replace(task.setting, horizon=horizon))
+    frames = {}
+    for i in task.scenarios[: options.validation_scenarios]:
+        with task.opened(i) as opened:
+            frames[i] = len(opened.scenario.active)
+    return Validation(task=task, frames=frames, compiled=options.compile)

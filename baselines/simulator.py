@@ -6,14 +6,19 @@
 after Sanchez-Gonzalez et al. (2020) and thesis §§5.6-5.7. Training and rollouts share
 :meth:`GraphNetwork.step`. The network's last layer starts at zero: an untrained model with
 target acceleration keeps every velocity, and training starts from there.
+
+The loss has six terms of motion, density and flow (thesis Eqs. 5.29-5.35) in normalised units, as
+in the thesis: accelerations, velocities and positions over their deviations in train; the grid's
+velocities too, so that vorticity and divergence have the unit 1/length; density over that around a
+particle. Weights are applied by the trainer.
 """
 
 from __future__ import annotations
 
 import enum
 from collections.abc import Mapping
-from dataclasses import replace
-from typing import ClassVar
+from dataclasses import dataclass, replace
+from typing import ClassVar, NamedTuple, Self
 
 import torch
 from pydantic import Field
@@ -21,17 +26,129 @@ from torch import Tensor, nn
 
 from lagbench.baselines.operators.operator import Losses, Operator
 from lagbench.data.grid import Grid, Placement
-from lagbench.errors import UsageError
 
-from .baseline import Baseline, Batch, Options
-from .facts import Facts
+from .augmentation import Symmetry, disturbed
+from .baseline import Baseline, Batch, Facts, Options, check_moving_walls, last_velocities
 from .graph import EDGE_FEATURES, NodeFeatures, Scale, edge_features, radius_graph
-from .loss import LossNorm, Motion, Scales, State, integrate, loss_terms
 from .network import EncodeProcessDecode
-from .seeding import noisy
-from .symmetry import Symmetry, draw, image
+from .torch_grid import Fields, counted_nodes, fields, node_velocity, transfer
 
-__all__ = ["GraphNetwork", "GraphNetworkOptions", "LossWeights", "Target"]
+__all__ = ["GraphNetwork"]
+
+
+class Motion(NamedTuple):
+    """One frame of particles."""
+
+    position: Tensor  # x(f) [length], shape [particle, 2]
+    velocity: Tensor  # x(f) - x(f-1) [length/frame], shape [particle, 2]
+    # velocity less that of the frame before, in target and prediction the same frame, which is the model's
+    # input [length/frame^2], shape [particle, 2]
+    acceleration: Tensor
+
+
+@dataclass(frozen=True, kw_only=True)
+class State:
+    """What a step starts from."""
+
+    position: Tensor  # last positions [length], shape [particle, 2]
+    velocity: Tensor  # last velocities, oldest first [length/frame], shape [particle, velocities, 2]
+    material: Tensor  # material of each particle, int64, shape [particle]
+    sample: Tensor  # window of each particle, ascending, int64, shape [particle]
+    # velocity of the walls in the coming frames, the next one first [length/frame], shape
+    # [window, frame, 4, 2]; beyond them the last one stays. None where walls rest or do not matter.
+    wall_velocity: Tensor | None
+
+    def moved(self, position: Tensor, velocity: Tensor) -> Self:
+        """Return the state one frame on."""
+        last = torch.cat([self.velocity[:, 1:], velocity.unsqueeze(1)], dim=1)
+        walls = self.wall_velocity
+        if walls is not None and walls.shape[1] > 1:
+            walls = walls[:, 1:]
+        return replace(self, position=position, velocity=last, wall_velocity=walls)
+
+
+PARTICLE_TERMS = ("acceleration", "velocity", "position")
+GRID_TERMS = ("density", "divergence", "vorticity")
+TERMS = PARTICLE_TERMS + GRID_TERMS  # the terms of Eq. 5.35, in its order but for positions
+
+
+class LossNorm(enum.StrEnum):
+    """The p of the norms: L2 is the squared error, L1 the absolute one."""
+
+    L1 = "l1"
+    L2 = "l2"
+
+
+class Scales(NamedTuple):
+    """Deviations that errors are divided by, (x, y) each, shape [2]; named as in :class:`Motion`."""
+
+    position: Tensor
+    velocity: Tensor
+    acceleration: Tensor
+
+    @property
+    def speed(self) -> Tensor:
+        """Root mean square of the velocity's two deviations [length/frame], shape []."""
+        return (self.velocity**2).mean().sqrt()
+
+
+def mean_norm(error: Tensor, norm: LossNorm, count: Tensor | int | None = None) -> Tensor:
+    """Return ``(1/N) sum_i ||e_i||_p`` of normalised errors, shape [..., component] (Eqs. 5.29-5.34).
+
+    0 is perfect; N counts particles or nodes, by default those of the array.
+    """
+    each = error**2 if norm is LossNorm.L2 else error.abs()
+    return each.sum() / (each[..., 0].numel() if count is None else count)
+
+
+def loss_terms(
+    predicted: Motion,
+    target: Motion,
+    sample: Tensor,
+    *,
+    grid: Grid,
+    scales: Scales,
+    norm: LossNorm,
+    weights: Mapping[str, float],
+) -> dict[str, Tensor]:
+    """Return the six terms, raw; those of weight 0 without a graph. Missing weights are 1."""
+    terms = {}
+    for name in PARTICLE_TERMS:
+        with _graph(weights, name):
+            error = getattr(predicted, name) - getattr(target, name)
+            terms[name] = mean_norm(error / getattr(scales, name), norm)
+    windows = int(sample[-1]) + 1
+    with torch.no_grad():
+        sums = transfer(target.position, target.velocity, grid, sample=sample, windows=windows)
+        # A node's weight around a particle, on the average: the full weight of a box that is full,
+        # and defined for a splash too, whose area is not known here.
+        full = float((sums.weight**2).sum() / sums.weight.sum())
+        velocity = node_velocity(sums, full)
+        true = Fields(grid, sums.weight, velocity, counted_nodes(sums.weight, full), full)
+    with _graph(weights, *GRID_TERMS):  # the prediction's fields at the nodes that count in the truth
+        own = fields(
+            predicted.position,
+            predicted.velocity,
+            grid,
+            full=full,
+            sample=sample,
+            windows=windows,
+            counted=true.counted,
+        )
+    with _graph(weights, "density"):
+        terms["density"] = mean_norm((own.density - true.density).unsqueeze(-1), norm)
+    count = true.differentiable.sum().clamp(min=1)
+    for name in ("divergence", "vorticity"):
+        with _graph(weights, name):
+            error = (getattr(own, name) - getattr(true, name)) / scales.speed
+            terms[name] = mean_norm(error.unsqueeze(-1), norm, count)
+    return terms
+
+
+def _graph(weights: Mapping[str, float], *names: str) -> torch.set_grad_enabled:
+    """Record a graph only if one is recorded at all and one of the terms counts."""
+    counts = any(weights.get(name, 1.0) != 0.0 for name in names)
+    return torch.set_grad_enabled(torch.is_grad_enabled() and counts)
 
 
 class Target(enum.StrEnum):
@@ -100,7 +217,7 @@ class GraphNetwork(Baseline):
 
     def __init__(self, options: GraphNetworkOptions, facts: Facts) -> None:
         super().__init__(options, facts)
-        self._check()
+        check_moving_walls(options.wall_velocity, facts)
         noise, statistics = options.noise_std, facts.statistics
         self.radius = facts.radius if options.radius is None else options.radius
         self.grid = Grid(facts.score_cells, Placement(facts.score_placement))
@@ -110,7 +227,7 @@ class GraphNetwork(Baseline):
             statistics["acceleration_mean"], statistics["acceleration_std"], noise=noise
         )
         self.features = NodeFeatures(
-            facts,
+            facts.bounds,
             self.velocity,
             self.acceleration,
             options.wall_reach * self.radius,
@@ -127,16 +244,6 @@ class GraphNetwork(Baseline):
         )
         for parameter in self.network.decoder[-1].parameters():
             nn.init.zeros_(parameter)
-
-    def _check(self) -> None:
-        if self.options.wall_velocity and not self.facts.moving_walls:
-            raise UsageError(
-                f"the walls of {self.facts.split} do not move",
-                where="model.wall_velocity",
-                expected=False,
-                got=True,
-                fix="leave the option out",
-            )
 
     @classmethod
     def with_operator(cls, operator: type[Operator]) -> type[GraphNetwork]:
@@ -171,28 +278,40 @@ class GraphNetwork(Baseline):
 
     def forward(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """Return the six terms of Eq. 5.35 and the operator's own, raw, means over the steps."""
-        batch = batch if generator is None else self._disturbed(batch, generator)
+        options = self.options
+        if generator is not None:
+            batch = disturbed(
+                batch,
+                generator,
+                symmetry=options.symmetry,
+                bounds=self.facts.bounds,
+                history=self.history,
+                noise_std=options.noise_std,
+            )
+            if options.noise_std > 0.0:
+                batch = replace(batch, position=self._inside(batch.position))
         state = self.start(batch.part(slice(self.history)))
-        if generator is not None and self.options.forgetful > 0.0:
+        if generator is not None and options.forgetful > 0.0:
             state = self._forgetful(state, batch.windows, generator)
         steps = []
         for frame in range(self.history, self.history + self.future):
             following, own = self.step(state, generator)
             target = batch.position[:, frame]
             velocity = target - batch.position[:, frame - 1]
-            steps.append(self._loss(state, following, target, velocity) | dict(own))
+            # both accelerations start from the state's velocity
+            last, predicted = state.velocity[:, -1], following.velocity[:, -1]
+            terms = loss_terms(
+                Motion(following.position, predicted, predicted - last),
+                Motion(target, velocity, velocity - last),
+                state.sample,
+                grid=self.grid,
+                scales=Scales(self.position.std, self.velocity.std, self.acceleration.std),
+                norm=options.loss_norm,
+                weights=self.weights,
+            )
+            steps.append(terms | dict(own))
             state = following
         return {name: torch.stack([terms[name] for terms in steps]).mean() for name in steps[0]}
-
-    def _disturbed(self, batch: Batch, generator: torch.Generator) -> Batch:
-        """Return the batch as its random image, with noise."""
-        if self.options.symmetry is not Symmetry.NONE:
-            matrix = draw(self.options.symmetry, batch.windows, generator)
-            batch = image(batch, matrix, self.facts.bounds)
-        if self.options.noise_std > 0.0:
-            position = noisy(batch.position, self.history, self.options.noise_std, generator)
-            batch = replace(batch, position=self._inside(position))
-        return batch
 
     def _forgetful(self, state: State, windows: int, generator: torch.Generator) -> State:
         """Return a state in which some windows know their last velocities only; the first one repeats."""
@@ -203,42 +322,15 @@ class GraphNetwork(Baseline):
         index = torch.arange(count, device=first.device).expand(len(first), -1).clamp(min=first[:, None])
         return replace(state, velocity=state.velocity.gather(1, index[..., None].expand(-1, -1, 2)))
 
-    def _loss(self, state: State, following: State, position: Tensor, velocity: Tensor) -> dict[str, Tensor]:
-        """Return the six terms of one step; both accelerations start from the state's velocity."""
-        last = state.velocity[:, -1]
-        predicted = following.velocity[:, -1]
-        return loss_terms(
-            Motion(following.position, predicted, predicted - last),
-            Motion(position, velocity, velocity - last),
-            state.sample,
-            grid=self.grid,
-            scales=Scales(self.position.std, self.velocity.std, self.acceleration.std),
-            norm=self.options.loss_norm,
-            weights=self.weights,
-        )
-
     def start(self, given: Batch) -> State:
-        """Return the state after the given frames.
-
-        Where they are few, the first velocity repeats.
-        """
-        if given.frames < 2:
-            raise UsageError(
-                "too few frames to start from",
-                expected=f"2 or more, {self.history} for all",
-                got=given.frames,
-            )
-        position = given.position[:, -self.history :]
-        velocity = position.diff(dim=1)
-        missing = self.options.velocities - velocity.shape[1]
-        velocity = torch.cat([velocity[:, :1].expand(-1, missing, -1), velocity], dim=1)
+        """Return the state after the given frames; where they are few, the first velocity repeats."""
         walls = None
         if self.options.wall_velocity and given.wall_velocity is not None:
             known = given.wall_velocity.shape[1]
             walls = given.wall_velocity[:, min(given.frames, known - 1) :] * self.facts.frame_interval
         return State(
-            position=position[:, -1],
-            velocity=velocity,
+            position=given.position[:, -1],
+            velocity=last_velocities(given.position, self.options.velocities),
             material=given.material,
             sample=given.sample,
             wall_velocity=walls,
@@ -256,8 +348,8 @@ class GraphNetwork(Baseline):
             velocity = self.velocity.inverse(output)
             position = state.position + velocity
         else:
-            acceleration = self.acceleration.inverse(output)
-            position, velocity = integrate(state.position, state.velocity[:, -1], acceleration)
+            velocity = state.velocity[:, -1] + self.acceleration.inverse(output)
+            position = state.position + velocity
         inside = self._inside(position)
         return state.moved(inside, velocity + (inside - position).detach()), own
 

@@ -20,18 +20,7 @@ from torch.nn.functional import pad
 from lagbench.data.grid import COUNTED_SHARE, EMPTY_SHARE, Grid
 from lagbench.errors import UsageError
 
-__all__ = [
-    "Fields",
-    "Transfer",
-    "central_differences",
-    "counted_nodes",
-    "differentiable_nodes",
-    "divergence",
-    "fields",
-    "node_velocity",
-    "transfer",
-    "vorticity",
-]
+__all__ = ["Fields", "counted_nodes", "fields", "nine_nodes", "node_velocity", "spline_weights", "transfer"]
 
 
 _LOW, _HIGH = 1, 2  # rows that the stencil of a particle in the unit box can reach past the grid
@@ -63,17 +52,28 @@ class Fields:
     @cached_property
     def differentiable(self) -> Tensor:
         """Nodes at which vorticity and divergence stand, bool, shape [..., x node, y node]."""
-        return differentiable_nodes(self.counted)
+        # the four neighbours exist and count
+        across = self.counted[..., 2:, 1:-1] & self.counted[..., :-2, 1:-1]
+        along = self.counted[..., 1:-1, 2:] & self.counted[..., 1:-1, :-2]
+        return pad(across & along, (1, 1, 1, 1))
 
     @cached_property
     def vorticity(self) -> Tensor:
-        """``dv/dx - du/dy`` [unit of u / length]; 0, not NaN, where not differentiable."""
-        return vorticity(self.velocity, self.grid.spacing) * self.differentiable
+        """``dv/dx - du/dy`` (Eq. 5.19) [unit of u / length]; 0, not NaN, where not differentiable."""
+        u, v = self.velocity.unbind(dim=-1)
+        return (self._differences(v)[0] - self._differences(u)[1]) * self.differentiable
 
     @cached_property
     def divergence(self) -> Tensor:
         """``du/dx + dv/dy`` [unit of u / length]; 0, not NaN, where not differentiable."""
-        return divergence(self.velocity, self.grid.spacing) * self.differentiable
+        u, v = self.velocity.unbind(dim=-1)
+        return (self._differences(u)[0] + self._differences(v)[1]) * self.differentiable
+
+    def _differences(self, field: Tensor) -> tuple[Tensor, Tensor]:
+        """Return ``df/dx`` and ``df/dy``, 0 on the rim of the grid where no central difference exists."""
+        along_x = (field[..., 2:, :] - field[..., :-2, :]) / (2.0 * self.grid.spacing)
+        along_y = (field[..., :, 2:] - field[..., :, :-2]) / (2.0 * self.grid.spacing)
+        return pad(along_x, (0, 0, 1, 1)), pad(along_y, (1, 1))
 
 
 def fields(
@@ -86,17 +86,9 @@ def fields(
     windows: int | None = None,
     counted: Tensor | None = None,
 ) -> Fields:
-    """Return the grid fields of particles.
+    """Return the grid fields of particles, at the nodes that count: by default their own.
 
-    Args:
-        position: particle positions [length], shape [..., particle, 2].
-        velocity: particle velocities u, shape [..., particle, 2]; per frame gives 1/frame.
-        grid: grid of the fields.
-        full: weight of a full interior node, :meth:`lagbench.data.grid.Grid.full_weight` [1].
-        sample: see :func:`transfer`.
-        windows: see :func:`transfer`.
-        counted: nodes that count, those of the truth when a prediction is judged; by default
-            those of these particles.
+    ``full`` is the weight of a full interior node; a prediction is judged at the nodes of the truth.
     """
     sums = transfer(position, velocity, grid, sample=sample, windows=windows)
     if counted is None:
@@ -115,21 +107,17 @@ def transfer(
     """Sum weights and momenta of the particles at the nodes.
 
     Particles outside the unit box, or with a position that is no number, carry no weight and
-    get no gradient.
-
-    Args:
-        position: particle positions [length], shape [..., particle, 2].
-        velocity: particle velocities u, shape [..., particle, 2].
-        grid: grid of the fields.
-        sample: window of each particle, int64, shape [particle], for positions of shape
-            [particle, 2] of several windows; by default leading axes are the windows.
-        windows: number of windows, with `sample`; by default one more than its largest, which
-            a GPU has to be waited for.
-
-    Raises:
-        UsageError: the shapes differ or do not end in [particle, 2].
+    get no gradient. Without ``windows`` their number is one more than the largest sample, which a GPU has
+    to be waited for.
     """
-    _check(position, velocity, sample)
+    axes = position.ndim >= 2 if sample is None else position.shape[:1] == sample.shape and position.ndim == 2
+    if position.shape != velocity.shape or not axes or position.shape[-1] != 2:
+        raise UsageError(
+            "positions, velocities and windows do not fit",
+            expected="two tensors of one shape [..., particle, 2], or [particle, 2] with sample [particle]",
+            got=f"{tuple(position.shape)}, {tuple(velocity.shape)}"
+            + ("" if sample is None else f" and sample {tuple(sample.shape)}"),
+        )
     if sample is None:
         leading = tuple(position.shape[:-2])
         windows = math.prod(leading)
@@ -139,45 +127,36 @@ def transfer(
         if windows is None:
             windows = int(sample.max()) + 1 if len(sample) else 0
         leading = (windows,)
-    sums = _scatter(position.reshape(-1, 2), velocity.reshape(-1, 2), grid, sample, windows)
-    sums = sums.reshape(*leading, grid.nodes, grid.nodes, 3)
-    return Transfer(sums[..., 0], sums[..., 1:])
-
-
-def _check(position: Tensor, velocity: Tensor, sample: Tensor | None) -> None:
-    axes = position.ndim >= 2 if sample is None else position.shape[:1] == sample.shape and position.ndim == 2
-    if position.shape != velocity.shape or not axes or position.shape[-1] != 2:
-        raise UsageError(
-            "positions, velocities and windows do not fit",
-            expected="two tensors of one shape [..., particle, 2], or [particle, 2] with sample [particle]",
-            got=f"{tuple(position.shape)}, {tuple(velocity.shape)}"
-            + ("" if sample is None else f" and sample {tuple(sample.shape)}"),
-        )
-
-
-def _scatter(x: Tensor, u: Tensor, grid: Grid, sample: Tensor, windows: int) -> Tensor:
-    """Return ``sum(w), sum(w u_x), sum(w u_y)``, shape [window, x node, y node, 3]."""
+    x, u = position.reshape(-1, 2), velocity.reshape(-1, 2)
     inside = ((x >= 0.0) & (x <= 1.0)).all(dim=-1, keepdim=True)
     # Replaced before any arithmetic: 0 times NaN would be NaN, in the gradient too.
     x, u = torch.where(inside, x, 0.5), torch.where(inside, u, 0.0)
     s = x * grid.cells - grid.origin
     base = torch.floor(s.detach() - 0.5)
-    weight = _spline(s - base)
     side = grid.nodes + _LOW + _HIGH
     column, row = (base.long() + _LOW).unbind(dim=-1)
-    three = torch.arange(3, device=x.device)
-    corner = (sample * side + column) * side + row
-    node = corner[:, None, None] + (three[:, None] * side + three)
-    w = weight[:, :, None, 0] * weight[:, None, :, 1] * inside[..., None]
+    node = nine_nodes(sample, column, row, (side, side))
+    w = spline_weights(s - base) * inside[..., None]
     carried = torch.cat([torch.ones_like(u[:, :1]), u], dim=-1)
     values = w[..., None] * carried[:, None, None]
     sums = values.new_zeros(windows * side * side, 3).index_add(0, node.flatten(), values.reshape(-1, 3))
-    return sums.reshape(windows, side, side, 3)[:, _LOW:-_HIGH, _LOW:-_HIGH]
+    sums = sums.reshape(windows, side, side, 3)[:, _LOW:-_HIGH, _LOW:-_HIGH]
+    sums = sums.reshape(*leading, grid.nodes, grid.nodes, 3)
+    return Transfer(sums[..., 0], sums[..., 1:])
 
 
-def _spline(s: Tensor) -> Tensor:
-    """Return the weights of the three nodes of each axis, shape [particle, node, 2]."""
-    return torch.stack([0.5 * (1.5 - s) ** 2, 0.75 - (s - 1.0) ** 2, 0.5 * (s - 0.5) ** 2], dim=1)
+def spline_weights(s: Tensor) -> Tensor:
+    """Return the spline's weights of the nine nodes around particles, shape [particle, 3, 3]."""
+    b = torch.stack([0.5 * (1.5 - s) ** 2, 0.75 - (s - 1.0) ** 2, 0.5 * (s - 0.5) ** 2], dim=1)
+    return b[:, :, None, 0] * b[:, None, :, 1]
+
+
+def nine_nodes(layer: Tensor, column: Tensor, row: Tensor, shape: tuple[int, int]) -> Tensor:
+    """Return the numbers of the nine nodes from a corner on, among those of all layers of a shape."""
+    columns, rows = shape
+    three = torch.arange(3, device=row.device)
+    corner = (layer * columns + column) * rows + row
+    return corner[:, None, None] + (three[:, None] * rows + three)
 
 
 def counted_nodes(weight: Tensor, full: float) -> Tensor:
@@ -191,44 +170,3 @@ def node_velocity(sums: Transfer, full: float) -> Tensor:
     # Empty nodes divide by 1: a quotient that is thrown away must not have an infinite gradient.
     weight = torch.where(filled, sums.weight, 1.0)
     return torch.where(filled[..., None], sums.momentum / weight[..., None], 0.0)
-
-
-def differentiable_nodes(counted: Tensor) -> Tensor:
-    """Return the nodes whose four neighbours exist and count."""
-    across = counted[..., 2:, 1:-1] & counted[..., :-2, 1:-1]
-    along = counted[..., 1:-1, 2:] & counted[..., 1:-1, :-2]
-    return pad(across & along, (1, 1, 1, 1))
-
-
-def central_differences(field: Tensor, spacing: float) -> tuple[Tensor, Tensor]:
-    """Return ``df/dx`` and ``df/dy``, 0 on the rim of the grid where no central difference exists.
-
-    Args:
-        field: values at the nodes, shape [..., x node, y node].
-        spacing: distance h between nodes [length].
-    """
-    along_x = (field[..., 2:, :] - field[..., :-2, :]) / (2.0 * spacing)
-    along_y = (field[..., :, 2:] - field[..., :, :-2]) / (2.0 * spacing)
-    return pad(along_x, (0, 0, 1, 1)), pad(along_y, (1, 1))
-
-
-def vorticity(velocity: Tensor, spacing: float) -> Tensor:
-    """Return ``omega = dv/dx - du/dy`` (Eq. 5.19); solid-body rotation Omega gives 2 Omega.
-
-    Args:
-        velocity: node velocity, shape [..., x node, y node, 2].
-        spacing: distance h between nodes [length].
-    """
-    u, v = velocity.unbind(dim=-1)
-    return central_differences(v, spacing)[0] - central_differences(u, spacing)[1]
-
-
-def divergence(velocity: Tensor, spacing: float) -> Tensor:
-    """Return ``du/dx + dv/dy``; an incompressible flow gives 0.
-
-    Args:
-        velocity: node velocity, shape [..., x node, y node, 2].
-        spacing: distance h between nodes [length].
-    """
-    u, v = velocity.unbind(dim=-1)
-    return central_differences(u, spacing)[0] + central_differences(v, spacing)[1]

@@ -11,12 +11,11 @@ import logging
 import os
 import shutil
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import chain, count, islice
 from pathlib import Path
-from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,12 +31,11 @@ from lagbench.submission.budget import Track, track_of
 from lagbench.torch import Window, WindowDataset, WindowSampler, collate
 from lagbench.work.progress import Meter, Progress
 
-from .baseline import Baseline
-from .callback import TrainingCallback
+from .augmentation import check_symmetry
+from .baseline import Baseline, facts_of
 from .catalogue import find
-from .checkpoint import Checkpoint, load_weights, rounded_weights, save
-from .facts import Facts, facts_of
-from .job import STOPPED_EARLY, RunFolder, TrainingJob, TrainingRecord, default_folder, parameter_count
+from .checkpoint import load_weights, rounded_weights, save
+from .job import STOPPED_EARLY, RunFolder, TrainingJob, TrainingRecord, parameter_count
 from .machine import (
     bound_memory,
     chosen_device,
@@ -46,22 +44,11 @@ from .machine import (
     multiplies_bfloat16,
     threads_used,
 )
-from .module import TrainingModule
+from .module import TrainingCallback, TrainingModule, generators_kept, reseed, seed_of
 from .recipe import recipe_for
-from .seeding import generators_kept, reseed, seed_of
-from .symmetry import check_symmetry
-from .validation import validation_of
-from .windows import scenario_batch
+from .rollout import scenario_batch, scenario_paths, validation_of
 
-__all__ = [
-    "TrainingResult",
-    "train",
-    "StepBatches",
-    "descend",
-    "quiet",
-    "ClosedForm",
-    "fit",
-]
+__all__ = ["TrainingResult", "train"]
 
 
 SMALLER = "lower --set training.batch=1, then the model: model.latent, .layers, .widths or .lags"
@@ -149,11 +136,27 @@ def train(
     plan = recipe_for(entry, tier.split, tier.name, variant=recipe, settings=settings, seed=seed)
     check_symmetry(plan.model.get("symmetry"), tier)
     facts = facts_of(tier.split, tier.name, root=home, registry=known)
-    folder = RunFolder(Path(output) if output else default_folder(plan))
+    own = Path("runs") / plan.name / f"{plan.baseline}-{plan.training.seed}"
+    folder = RunFolder(Path(output) if output else own)
     check_writable(folder.path, option="--output")
     shared = int(os.environ.get("WORLD_SIZE", processes))
     earlier = folder.earlier(plan, resume=resume, fresh=fresh)
-    _check_same(earlier, facts, shared, folder)
+    if earlier is not None and earlier.facts.dataset_sha256 != facts.dataset_sha256:
+        raise DataError(
+            "the training began on another version of the data set",
+            where=str(folder.path),
+            expected=earlier.facts.dataset_sha256,
+            got=facts.dataset_sha256,
+            fix="train anew with --fresh",
+        )
+    if earlier is not None and earlier.training.get("processes") != shared:
+        raise UsageError(
+            "the training began with another number of processes",
+            where="--processes",
+            expected=earlier.training.get("processes"),
+            got=shared,
+            fix="the learning rate and the order of windows follow from it; or train anew with --fresh",
+        )
     if earlier is None and not is_helper():
         folder.clear()
     job = TrainingJob(
@@ -173,68 +176,23 @@ def train(
     with generators_kept(), threads_used(threads, processes=here), memory_errors_told(SMALLER):
         reseed(seed_of(plan.training.seed))
         model = entry.model.build(plan.model, facts)
-        ledger, steps = _run(job, model)
-        return _result(job, ledger, model, steps)
-
-
-def _run(job: TrainingJob, model: Baseline) -> tuple[TrainingRecord, int]:
-    """Fit or train; Lightning is imported only here."""
-    if getattr(model, "closed_form", False):
-        return fit(job, model)
-
-    return descend(job, model)
-
-
-def _check_same(earlier: Checkpoint | None, facts: Facts, processes: int, folder: RunFolder) -> None:
-    """Refuse to go on with other data, or with another number of processes."""
-    if earlier is None:
-        return
-    if earlier.facts.dataset_sha256 != facts.dataset_sha256:
-        raise DataError(
-            "the training began on another version of the data set",
-            where=str(folder.path),
-            expected=earlier.facts.dataset_sha256,
-            got=facts.dataset_sha256,
-            fix="train anew with --fresh",
+        ledger, steps = (fit if getattr(model, "closed_form", False) else descend)(job, model)
+        budget, said = job.budget(ledger), ledger.as_json()
+        return TrainingResult(
+            baseline=plan.baseline,
+            split=facts.split,
+            size=facts.size,
+            recipe=plan.name,
+            folder=folder.path,
+            weights=folder.weights,
+            checkpoint=folder.checkpoint,
+            steps=steps,
+            parameters=parameter_count(model),
+            device=budget.device or "",
+            threads=budget.threads or 0,
+            track=track_of(facts.size, budget),
+            **{field.name: said[field.name] for field in fields(TrainingResult) if field.name in said},
         )
-    if earlier.training.get("processes") != processes:
-        raise UsageError(
-            "the training began with another number of processes",
-            where="--processes",
-            expected=earlier.training.get("processes"),
-            got=processes,
-            fix="the learning rate and the order of windows follow from it; or train anew with --fresh",
-        )
-
-
-def _result(job: TrainingJob, ledger: TrainingRecord, model: Baseline, steps: int) -> TrainingResult:
-    budget = job.budget(ledger)
-    return TrainingResult(
-        baseline=job.recipe.baseline,
-        split=job.facts.split,
-        size=job.facts.size,
-        recipe=job.recipe.name,
-        folder=job.folder.path,
-        weights=job.folder.weights,
-        checkpoint=job.folder.checkpoint,
-        state=ledger.state,
-        step=ledger.step,
-        steps=steps,
-        parameters=parameter_count(model),
-        loss=ledger.loss,
-        windows_seen=ledger.windows_seen,
-        epochs=ledger.epochs,
-        metric=ledger.metric,
-        best_value=ledger.best_value,
-        best_step=ledger.best_step,
-        device=budget.device or "",
-        threads=budget.threads or 0,
-        track=track_of(job.facts.size, budget),
-        cpu_seconds=ledger.cpu_seconds,
-        validation_cpu_seconds=ledger.validation_cpu_seconds,
-        gpu_seconds=ledger.gpu_seconds,
-        wall_seconds=ledger.wall_seconds,
-    )
 
 
 LOGGERS = ("lightning.pytorch", "lightning.fabric", "pytorch_lightning", "lightning_fabric")
@@ -274,29 +232,24 @@ def descend(job: TrainingJob, model: Baseline) -> tuple[TrainingRecord, int]:
         future=model.future,
     )
     steps = options.total_steps(len(data), processes=job.processes)
-    ledger = job.ledger()
-    module = _module(job, model, data, ledger, steps)
+    ledger, earlier = job.ledger(), job.earlier
+    if earlier is not None:
+        load_weights(model, earlier.weights, where=str(job.folder.checkpoint))
     if ledger.state != STOPPED_EARLY:
         ledger.state = "finished" if ledger.step >= steps else "running"
     if ledger.state != "running":
         return ledger, steps
     if options.compile:
-        _compile(model, job.device)
-    keeper = TrainingCallback(job, ledger, validation=validation_of(job), steps=steps, windows=len(data))
-    with quiet():
-        _fit(_trainer(job, keeper), module)
-    if ledger.state == "interrupted":
-        raise KeyboardInterrupt
-    return ledger, steps
-
-
-def _module(
-    job: TrainingJob, model: Baseline, data: WindowDataset, ledger: TrainingRecord, steps: int
-) -> TrainingModule:
-    """Return the module at the step where an earlier run ended."""
-    options, earlier = job.recipe.training, job.earlier
-    if earlier is not None:
-        load_weights(model, earlier.weights, where=str(job.folder.checkpoint))
+        compiler = os.environ.get("CXX") or "g++"  # the one that torch takes
+        if job.device == "cpu" and shutil.which(compiler) is None:
+            raise UsageError(
+                "no C++ compiler",
+                where="training.compile",
+                expected="g++ on the PATH, or another in CXX",
+                got=f"no {compiler}",
+                fix="install it, or leave the option out",
+            )
+        model.compile_layers()
 
     def loader(rank: int, ranks: int) -> DataLoader[Window]:
         sampler = WindowSampler(data, seed=options.seed, rank=rank, ranks=ranks)
@@ -310,7 +263,7 @@ def _module(
             multiprocessing_context="spawn" if job.workers else None,
         )
 
-    return TrainingModule(
+    module = TrainingModule(
         model,
         options,
         loader=loader,
@@ -319,57 +272,35 @@ def _module(
         step=ledger.step,
         optimizer=earlier.optimizer if earlier else None,
     )
-
-
-def _compile(model: Baseline, device: str) -> None:
-    compiler = os.environ.get("CXX") or "g++"  # the one that torch takes
-    if device == "cpu" and shutil.which(compiler) is None:
-        raise UsageError(
-            "no C++ compiler",
-            where="training.compile",
-            expected="g++ on the PATH, or another in CXX",
-            got=f"no {compiler}",
-            fix="install it, or leave the option out",
+    validation = validation_of(options, facts, root=job.root, registry=job.registry)
+    keeper = TrainingCallback(job, ledger, validation=validation, steps=steps, windows=len(data))
+    half = options.precision == "auto" and multiplies_bfloat16(job.device)
+    with quiet():
+        trainer = Trainer(
+            accelerator="gpu" if job.device == "cuda" else "cpu",
+            # the processes on this machine: torchrun's number where it started us
+            devices=int(os.environ.get("LOCAL_WORLD_SIZE", job.processes)),
+            num_nodes=int(os.environ.get("GROUP_WORLD_SIZE", "1")),
+            strategy="ddp" if job.processes > 1 else "auto",
+            precision="bf16-mixed" if half or options.precision == "bf16" else "32-true",
+            max_epochs=1,
+            logger=TensorBoardLogger(job.folder.path, name="", version=job.folder.logs.name),
+            callbacks=[keeper],
+            default_root_dir=job.folder.path,
+            enable_checkpointing=False,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+            limit_val_batches=0,
+            num_sanity_val_steps=0,
+            use_distributed_sampler=False,
         )
-    model.compile_layers()
-
-
-def _trainer(job: TrainingJob, keeper: TrainingCallback) -> Trainer:
-    options = job.recipe.training
-    return Trainer(
-        accelerator="gpu" if job.device == "cuda" else "cpu",
-        devices=_devices(job),
-        num_nodes=int(os.environ.get("GROUP_WORLD_SIZE", "1")),
-        strategy="ddp" if job.processes > 1 else "auto",
-        precision=_precision(options.precision, job.device),
-        max_epochs=1,
-        logger=TensorBoardLogger(job.folder.path, name="", version=job.folder.logs.name),
-        callbacks=[keeper],
-        default_root_dir=job.folder.path,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        limit_val_batches=0,
-        num_sanity_val_steps=0,
-        use_distributed_sampler=False,
-    )
-
-
-def _devices(job: TrainingJob) -> int:
-    """Return the processes on this machine: torchrun's number where it started us."""
-    return int(os.environ.get("LOCAL_WORLD_SIZE", job.processes))
-
-
-def _precision(name: str, device: str) -> Literal["32-true", "bf16-mixed"]:
-    half = name == "bf16" or (name == "auto" and multiplies_bfloat16(device))
-    return "bf16-mixed" if half else "32-true"
-
-
-def _fit(trainer: Trainer, module: TrainingModule) -> None:
-    try:
-        trainer.fit(module)
-    except SystemExit:  # what Lightning makes of a second Ctrl-C
-        raise KeyboardInterrupt from None
+        try:
+            trainer.fit(module)
+        except SystemExit:  # what Lightning makes of a second Ctrl-C
+            raise KeyboardInterrupt from None
+    if ledger.state == "interrupted":
+        raise KeyboardInterrupt
+    return ledger, steps
 
 
 @contextmanager
@@ -388,20 +319,15 @@ def quiet() -> Iterator[None]:
                 logger.setLevel(level)
 
 
-STEPS = 1
-"""A closed form counts as one step."""
-
-
-class ClosedForm(Protocol):
-    """What a baseline with ``closed_form = True`` has beside the contract."""
-
-    def fit(self, scenarios: Iterator[NDArray[np.float32]]) -> Mapping[str, float]:
-        """Set the coefficients from positions, shape [frame, particle, 2]; return figures to log."""
-        ...
+STEPS = 1  # a closed form counts as one step
 
 
 def fit(job: TrainingJob, model: Baseline) -> tuple[TrainingRecord, int]:
-    """Fit a model to every scenario, validate and store it; return the ledger and its one step."""
+    """Fit a model to every scenario, validate and store it; return the ledger and its one step.
+
+    A baseline with ``closed_form = True`` has ``fit`` beside the contract: it sets the coefficients from
+    positions, shape [frame, particle, 2], of each scenario, and returns figures to log.
+    """
     ledger = job.ledger()
     if job.earlier is not None:
         load_weights(model, job.earlier.weights, where=str(job.folder.checkpoint))
@@ -409,10 +335,24 @@ def fit(job: TrainingJob, model: Baseline) -> tuple[TrainingRecord, int]:
         return ledger, STEPS
     if job.recipe.training.compile:
         model.compile_layers()  # refuses: a closed form has none
-    figures = model.fit(_scenarios(job))  # type: ignore[operator]
+
+    def scenarios() -> Iterator[NDArray[np.float32]]:
+        paths = [
+            path
+            for subset in job.recipe.training.windows
+            for path in scenario_paths(
+                job.facts.split, subset=subset, size=job.facts.size, root=job.root, registry=job.registry
+            ).values()
+        ]
+        job.meter.begin("fitting", total=len(paths) + 1, scenarios=len(paths))
+        for path in paths:
+            yield scenario_batch(path).position.transpose(0, 1).numpy()
+            job.meter.count(1, scenarios=1)
+
+    figures = model.fit(scenarios())  # type: ignore[operator]
     ledger.step, ledger.loss = STEPS, {name: float(value) for name, value in figures.items()}
     ledger.epochs = 1.0
-    validation = validation_of(job)
+    validation = validation_of(job.recipe.training, job.facts, root=job.root, registry=job.registry)
     if validation is not None:
         with ledger.validating(device=job.device):
             value = validation(model)
@@ -424,12 +364,3 @@ def fit(job: TrainingJob, model: Baseline) -> tuple[TrainingRecord, int]:
     save(job.folder.checkpoint, job.checkpoint(ledger, state))
     job.folder.write_record(job.record(model, ledger, steps=STEPS))
     return ledger, STEPS
-
-
-def _scenarios(job: TrainingJob) -> Iterator[NDArray[np.float32]]:
-    """Yield the positions of every scenario to fit, shape [frame, particle, 2]."""
-    paths = [path for subset in job.recipe.training.windows for path in job.files(subset).values()]
-    job.meter.begin("fitting", total=len(paths) + 1, scenarios=len(paths))
-    for path in paths:
-        yield scenario_batch(path).position.transpose(0, 1).numpy()
-        job.meter.count(1, scenarios=1)

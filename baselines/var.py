@@ -1,42 +1,55 @@
-"""Vector autoregression of whole frames (thesis section 4.8.3)."""
+"""Vector autoregression of whole frames (thesis section 4.8.3), by least squares in small memory.
+
+Least squares by the Gram matrix, refined once, are nearly of full accuracy. For regressors X [row,
+regressor] and responses Y [row, response], with G = X'X + r I
+
+    B = G^-1 X'Y,   then   B <- B + G^-1 X'(Y - X B),
+
+the corrected semi-normal equations (Bjorck, Linear Algebra Appl. 88/89 (1987) 31): the residual is formed
+from X itself, so the loss of digits in squaring X is undone while cond(X)^2 is below 1e16. Rows
+pass through in blocks; four square matrices are all that is held. With fewer rows than regressors the
+solution of least norm comes from the Gram matrix of the rows, B = X' (X X')^-1 Y.
+
+Leading principal directions of many long rows come from randomised subspace iteration
+(Halko, Martinsson, Tropp, SIAM Review 53 (2011) 217): a random subspace somewhat larger than
+wanted is multiplied by X'X a few times, then rotated so that X'X is diagonal in it (Rayleigh and
+Ritz). Rows pass through in blocks; nothing as large as X'X is formed.
+"""
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import ClassVar
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from pydantic import Field, PositiveInt
+from scipy.linalg import LinAlgError, blas, cho_factor, cho_solve
+from scipy.sparse.linalg import LinearOperator, eigsh
 from torch import Tensor
 
 from lagbench.errors import WorkFailedError
 
 from . import baseline
-from .facts import Facts
+from .baseline import Facts
 from .frame_model import FrameModel, FrameWindow
-from .least_squares import LeastSquares, principal_directions, solve
 
-__all__ = ["Fitted", "LaggedRows", "StableVAR", "VAR"]
+__all__ = ["LaggedRows", "StableVAR", "VAR", "solve"]
 
-BLOCK = 1024
-"""Most rows that are held at a time."""
-
-EPSILON = 1e-12
-"""Least ridge: directions without any variance stay as they are."""
+BLOCK = 1024  # most rows that are held at a time
+EPSILON = 1e-12  # least ridge: directions without any variance stay as they are
 
 Matrix = NDArray[np.float64]
 Sequences = Sequence[NDArray[np.float32]]
 
 
 class LaggedRows:
-    """Regressors ``(1, z(f-1), ..., z(f-p))`` and responses ``z(f)`` of several sequences.
+    """Regressors ``(1, z(f-1), ..., z(f-p))`` and responses ``z(f)`` of several sequences, p the lags.
 
-    Args:
-        sequences: states, shape [frame, feature]; no row reaches from one into the next.
-        lags: p.
+    No row reaches from one sequence of states, shape [frame, feature], into the next.
     """
 
     def __init__(self, sequences: Sequences, *, lags: int) -> None:
@@ -47,16 +60,14 @@ class LaggedRows:
     def __iter__(self) -> Iterator[tuple[Matrix, Matrix]]:
         """Yield regressors and responses, at most :data:`BLOCK` rows at a time."""
         for states in self.sequences:
+            features = states.shape[1]
             for first in range(self.lags, len(states), BLOCK):
-                yield self._block(states, first, min(first + BLOCK, len(states)))
-
-    def _block(self, states: NDArray[np.float32], first: int, last: int) -> tuple[Matrix, Matrix]:
-        features = states.shape[1]
-        regressors = np.ones((last - first, 1 + self.lags * features))
-        for lag in range(1, self.lags + 1):
-            column = 1 + (lag - 1) * features
-            regressors[:, column : column + features] = states[first - lag : last - lag]
-        return regressors, states[first:last].astype(np.float64)
+                last = min(first + BLOCK, len(states))
+                regressors = np.ones((last - first, 1 + self.lags * features))
+                for lag in range(1, self.lags + 1):
+                    column = 1 + (lag - 1) * features
+                    regressors[:, column : column + features] = states[first - lag : last - lag]
+                yield regressors, states[first:last].astype(np.float64)
 
 
 class Fitted(FrameModel):
@@ -70,12 +81,7 @@ class Fitted(FrameModel):
 
     @abstractmethod
     def fit(self, scenarios: Iterable[NDArray[np.float32]]) -> Mapping[str, float]:
-        """Set the coefficients and return what is worth logging.
-
-        Args:
-            scenarios: positions [length], one array of shape [frame, particle, 2] per scenario;
-                iterated once.
-        """
+        """Set the coefficients from positions, [frame, particle, 2] per scenario; return what to log."""
 
     def states(self, position: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return standardised states [1], shape [frame - 1, feature].
@@ -184,7 +190,12 @@ class StableVAR(Fitted):
         rows = LaggedRows([self.states(position) for position in scenarios], lags=1)
         if not rows.rows:
             raise WorkFailedError("nothing to fit", expected="scenarios of 3 frames or more", got="none")
-        mean, drift, spread = self._moments(rows)
+        mean, drift, squares = np.zeros(self.features), np.zeros(self.features), 0.0
+        for x, y in rows:
+            mean += x[:, 1:].sum(0) / rows.rows
+            drift += (y - x[:, 1:]).sum(0) / rows.rows
+            squares += float(np.square(x[:, 1:]).sum())
+        spread = squares - rows.rows * float(mean @ mean)
 
         def centred() -> Iterator[Matrix]:
             return (x[:, 1:] - mean for x, _ in rows)
@@ -200,17 +211,147 @@ class StableVAR(Fitted):
             getattr(self, name).copy_(torch.from_numpy(value))
         return {"variance": float(eigenvalues.sum() / spread), "rows": rows.rows}
 
-    def _moments(self, rows: LaggedRows) -> tuple[Matrix, Matrix, float]:
-        """Return the mean state, the mean change, and the sum of squares about the mean."""
-        mean, change, squares = np.zeros(self.features), np.zeros(self.features), 0.0
-        for x, y in rows:
-            mean += x[:, 1:].sum(0) / rows.rows
-            change += (y - x[:, 1:]).sum(0) / rows.rows
-            squares += float(np.square(x[:, 1:]).sum())
-        return mean, change, squares - rows.rows * float(mean @ mean)
-
     def next_state(self, window: FrameWindow) -> Tensor:
         """Return the next standardised state [1], shape [window, particle, 4]."""
         state = window.state[:, -1]
         change = self.drift + (state.flatten(1) - self.mean) @ self.directions @ self.response
         return state + change.view(state.shape)
+
+
+TOLERANCE = 1e-3  # relative accuracy of the condition number's two eigenvalues
+
+
+class Blocks(Protocol):
+    """Rows of regressors and responses, block by block; may be read more than once."""
+
+    rows: int
+
+    def __iter__(self) -> Iterator[tuple[Matrix, Matrix]]:
+        """Yield regressors [row, regressor] and responses [row, response], C-ordered."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class LeastSquares:
+    """The solution and how well it is determined."""
+
+    coefficients: Matrix  # B, shape [regressor, response]
+    condition: float  # largest over smallest singular value of X; a lower bound where 'floor' > 0
+    # added to the Gram matrix since it was singular to rounding, as a share of its largest
+    # eigenvalue; 0 if it was not
+    floor: float
+    rows: int  # rows that went in
+
+
+@dataclass(frozen=True)
+class _Factor:
+    """Cholesky factor of a Gram matrix, upper triangle."""
+
+    upper: Matrix
+    condition: float
+    floor: float
+
+    def divide(self, right: Matrix) -> Matrix:
+        """Return G^-1 times a matrix, in its place when it is Fortran-ordered."""
+        solved: Matrix = cho_solve((self.upper, False), right, overwrite_b=True, check_finite=False)
+        return solved
+
+
+def solve(blocks: Blocks) -> LeastSquares:
+    """Return the least-squares solution of X B = Y, that of least norm if there are many."""
+    shape = next(((x.shape[1], y.shape[1]) for x, y in blocks), None)
+    if shape is None:
+        raise WorkFailedError("nothing to fit", expected="scenarios longer than the lags", got="no rows")
+    if blocks.rows >= shape[0]:  # the Gram matrix of the regressors, by blocks of rows
+        factor = _factor(lambda: _gram((x for x, _ in blocks), shape[0]))
+        found = factor.divide(_products(blocks, shape))
+
+        def residual(x: Matrix, y: Matrix) -> Matrix:  # Y - X B of one block, C-ordered
+            transposed: Matrix = blas.dgemm(-1.0, found, x.T, trans_a=True, beta=1.0, c=y.T)
+            return transposed.T
+
+        found += factor.divide(_products(((x, residual(x, y)) for x, y in blocks), shape))
+    else:  # the Gram matrix of the rows, which all fit
+        x, y = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
+        factor = _factor(lambda: _gram([np.ascontiguousarray(x.T)], len(x)))
+        dual = factor.divide(np.asfortranarray(y))
+        dual += factor.divide(np.asfortranarray(y - x @ (x.T @ dual)))
+        found = x.T @ dual
+    return LeastSquares(coefficients=found, condition=factor.condition, floor=factor.floor, rows=blocks.rows)
+
+
+def _gram(blocks: Iterable[Matrix], size: int) -> Matrix:
+    """Return the upper triangle of X'X from blocks of rows."""
+    total: Matrix = np.zeros((size, size), order="F")
+    for x in blocks:
+        total = blas.dsyrk(1.0, x.T, beta=1.0, c=total, overwrite_c=True)
+    return total
+
+
+def _products(blocks: Iterable[tuple[Matrix, Matrix]], shape: tuple[int, int]) -> Matrix:
+    """Return X'Y from blocks of rows, Fortran-ordered."""
+    total: Matrix = np.zeros(shape, order="F")
+    for x, y in blocks:
+        total = blas.dgemm(1.0, x.T, y.T, trans_b=True, beta=1.0, c=total, overwrite_c=True)
+    return total
+
+
+def _factor(gram: Callable[[], Matrix]) -> _Factor:
+    """Return the Cholesky factor, of the matrix with a floor under it if it is singular to rounding."""
+    matrix = gram()
+    size = len(matrix)
+    if not np.isfinite(matrix.diagonal()).all():
+        raise WorkFailedError("values are not finite", where="rows to fit")
+    largest = _largest_eigenvalue(lambda v: blas.dsymv(1.0, matrix, v), size)
+    for floor in (0.0, size * np.finfo(np.float64).eps):
+        if floor:
+            matrix = gram()  # the first attempt has overwritten it
+            matrix[np.diag_indices(size)] += floor * largest
+        try:
+            upper, _ = cho_factor(matrix, overwrite_a=True, check_finite=False)
+        except LinAlgError:
+            continue
+
+        def inverse(v: Matrix) -> Matrix:
+            return np.asarray(cho_solve((upper, False), v, check_finite=False))  # noqa: B023 (called here)
+
+        condition = float(np.sqrt(largest * _largest_eigenvalue(inverse, size)))
+        return _Factor(upper, condition, floor)
+    raise WorkFailedError("the Gram matrix has no Cholesky factor", where="rows to fit")
+
+
+def _largest_eigenvalue(product: Callable[[Matrix], Matrix], size: int) -> float:
+    """Return the largest eigenvalue of a symmetric matrix given by its product with a vector."""
+    if size < 3:
+        return float(np.linalg.eigvalsh(np.column_stack([product(e) for e in np.eye(size)]))[-1])
+    operator = LinearOperator((size, size), matvec=product, dtype=np.float64)
+    start = np.random.default_rng(0).normal(size=size)
+    return float(eigsh(operator, 1, which="LA", tol=TOLERANCE, v0=start, return_eigenvectors=False)[0])
+
+
+OVERSAMPLING = 20  # directions beyond those wanted, which the last wanted ones need to converge
+ITERATIONS = 8  # multiplications by X'X; ratios of neighbouring eigenvalues count to twice this power
+
+
+def principal_directions(
+    blocks: Callable[[], Iterable[Matrix]], features: int, *, rank: int
+) -> tuple[Matrix, Matrix]:
+    """Return orthonormal directions of largest X'X, shape [feature, rank], and their eigenvalues.
+
+    The largest come first. ``blocks`` returns the rows of X in blocks, centred; it is called ten times.
+    """
+    width = min(features, rank + OVERSAMPLING)
+    basis = np.random.default_rng(0).normal(size=(features, width))
+    for _ in range(ITERATIONS):
+        basis = np.linalg.qr(_squared(blocks(), basis))[0]
+    small = basis.T @ _squared(blocks(), basis)
+    values, rotation = np.linalg.eigh((small + small.T) / 2)
+    return basis @ rotation[:, ::-1][:, :rank], values[::-1][:rank].clip(0.0)
+
+
+def _squared(blocks: Iterable[Matrix], basis: Matrix) -> Matrix:
+    """Return X'X times a basis."""
+    total = np.zeros_like(basis)
+    for x in blocks:
+        total += x.T @ (x @ basis)
+    return total

@@ -23,10 +23,9 @@ from importlib.metadata import entry_points
 import torch
 from torch import Tensor, nn
 
-from lagbench.baselines import layers
+from lagbench.baselines import network as layers
 from lagbench.baselines.graph import radius_graph
-from lagbench.baselines.layers import EdgeMLP
-from lagbench.baselines.network import EncodeProcessDecode
+from lagbench.baselines.network import EdgeMLP, EncodeProcessDecode
 
 NODE_FEATURES, EDGE_FEATURES = 30, 3
 RADIUS = 1.72

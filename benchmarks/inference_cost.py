@@ -19,9 +19,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from lagbench.baselines.baseline import Batch
+from lagbench.baselines.baseline import Batch, Facts
 from lagbench.baselines.catalogue import find
-from lagbench.baselines.facts import Facts
 from lagbench.baselines.recipe import recipe_for
 from lagbench.baselines.rollout import roll_out
 from lagbench.data.registry import load

@@ -18,8 +18,7 @@ from pytest_benchmark.fixture import BenchmarkFixture
 from statsmodels.tsa.api import VAR as StatsmodelsVAR
 from timing import best_seconds
 
-from lagbench.baselines.least_squares import solve
-from lagbench.baselines.var import LaggedRows
+from lagbench.baselines.var import LaggedRows, solve
 
 TARGET_RATIO = 10.0
 LEAST_RATIO = 2.0

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from graph_cases import batch, facts, jittered, rolled, swirl
+from simple_models import batch, facts, jittered, rolled, swirl
 from torch import Tensor, nn
 
+from lagbench.baselines.augmentation import image
 from lagbench.baselines.catalogue import find
 from lagbench.baselines.neuralmpm import NeuralMPM
-from lagbench.baselines.recipe import recipe_for, recipe_names
-from lagbench.baselines.symmetry import image
+from lagbench.baselines.recipe import recipe_for
 from lagbench.data.registry import load
 from lagbench.errors import DataError, UsageError
 
@@ -174,15 +174,6 @@ def test_materials_have_channels_of_their_own() -> None:
         surrogate(materials=[0, 2]).start(given)
 
 
-def test_two_frames_are_enough_to_start_from() -> None:
-    """The first velocity repeats before what is given; one frame is refused."""
-    given, model = batch(swirl(0, 5)), surrogate(velocities=4)
-    first = given.position[:, 1] - given.position[:, 0]
-    assert torch.equal(model.start(given.part(slice(2))).velocity, first[:, None].expand(-1, 4, -1))
-    with pytest.raises(UsageError):
-        model.start(given.part(slice(1)))
-
-
 @pytest.mark.parametrize(
     ("options", "where"),
     [
@@ -235,12 +226,3 @@ def test_recipes_fit_every_split(split: str, size: str) -> None:
     assert recipe.model["symmetry"] == ("mirror" if gravity and gravity.value else "square")
     assert len(recipe.model["materials"]) == (4 if split == "multimaterial" else 1)
     assert 2 * sum(p.numel() for p in model.parameters()) <= 4e6  # bytes of its weights in bfloat16
-
-
-def test_every_recipe_is_valid() -> None:
-    """Every entry of the file passes the check of its keys and values."""
-    entry = find("neuralmpm")
-    for name in recipe_names(entry):
-        split, _, tier = name.partition("/")
-        size, _, variant = tier.partition("-")
-        assert recipe_for(entry, split, size, variant=variant or None).name == name

@@ -1,4 +1,4 @@
-"""Predictions: rollouts that are known in closed form, frozen ones, and what a file says."""
+"""Predictions: rollouts that are known in closed form, frozen ones, what a file says; threads."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from simple_models import FACTS, Bursting, Drift, State, install
 from torch import Tensor
 
 from lagbench.baselines import predict as prediction
-from lagbench.baselines.baseline import Batch
+from lagbench.baselines.baseline import Batch, facts_of
 from lagbench.baselines.checkpoint import Checkpoint, save
-from lagbench.baselines.facts import facts_of
 from lagbench.baselines.job import MOST_RECORD, OVER
+from lagbench.baselines.machine import threads_used
 from lagbench.baselines.predict import PredictionResult, UnfinishedWarning, predict
 from lagbench.baselines.rollout import as_published, roll_out, single
 from lagbench.data.registry import Registry
@@ -283,18 +283,39 @@ def test_weights_of_an_unfinished_training(run: Predict, tmp_path: Path, state: 
         json.dumps({**UNFINISHED, "step": "9", "steps": {}}).encode(),
         b'{"state": "running", "step": 9, "steps": 70, "recipe": {"name": "another"}}',
         json.dumps(UNFINISHED).encode() + b" " * MOST_RECORD,
+        "a pipe, which nobody writes to",
     ],
 )
 def test_what_is_no_record_of_these_weights_is_passed_over(
-    run: Predict, tmp_path: Path, record: bytes | None
+    run: Predict, tmp_path: Path, record: bytes | str | None
 ) -> None:
     """Weights alone, damaged records, those of other weights: predictions come without a warning."""
-    if record is not None:
+    if isinstance(record, bytes):
         (tmp_path / "training.json").write_bytes(record)
+    elif record:
+        os.mkfifo(tmp_path / "training.json")
     assert run(training={"state": "running"}).path.is_file()
 
 
-def test_a_pipe_is_no_record(run: Predict, tmp_path: Path) -> None:
-    """It would wait for ever."""
-    os.mkfifo(tmp_path / "training.json")
-    assert run().path.is_file()
+@pytest.mark.parametrize(
+    ("count", "environment", "expected"),
+    [(3, "2", 3), (None, "2", 2), (None, "0", 1), (None, "", None), (None, "many", None)],
+)
+def test_threads_are_those_asked_for(
+    monkeypatch: pytest.MonkeyPatch, count: int | None, environment: str, expected: int | None
+) -> None:
+    """The option wins over OMP_NUM_THREADS, that over one per core; afterwards all is as before."""
+    monkeypatch.setenv("OMP_NUM_THREADS", environment)
+    before = torch.get_num_threads()
+    with threads_used(count):
+        assert torch.get_num_threads() == (expected or len(os.sched_getaffinity(0)))
+    assert torch.get_num_threads() == before
+
+
+def test_processes_share_the_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As many processes as cores have one thread each."""
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    cores = len(os.sched_getaffinity(0))
+    for processes in (cores, cores + 1):
+        with threads_used(None, processes=processes):
+            assert torch.get_num_threads() == 1

@@ -21,7 +21,7 @@ from lagbench.baselines.reproduce.claims import (
     compared,
     floors_ahead,
 )
-from lagbench.baselines.reproduce.curves import SMOOTHED, loss_over_steps, smoothed
+from lagbench.baselines.reproduce.drawing import SMOOTHED, loss_over_steps, smoothed
 from lagbench.baselines.reproduce.evidence import Evidence, Method, Seeded, Sources
 from lagbench.baselines.reproduce.results import agreement
 from lagbench.baselines.reproduce.tables import cubic_errors, cubic_vorticity, rollout_table

@@ -12,7 +12,7 @@ import pytest
 
 from lagbench.baselines import catalogue
 from lagbench.baselines.reproduce import __main__ as command
-from lagbench.baselines.reproduce import mlp_studies
+from lagbench.baselines.reproduce import tables
 from lagbench.baselines.reproduce.runs import Plan
 from lagbench.baselines.reproduce.thesis import STUDIES
 from lagbench.data.registry import Registry
@@ -90,8 +90,8 @@ def test_studies_are_what_was_asked_for(
     generated: GenerationResult, unmeasured: Registry, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Errors of an MLP with another recipe are not taken for those that were asked for."""
-    monkeypatch.setattr(mlp_studies, "TABLES", {"table_4_2": ("4.2", SPLIT)})
-    monkeypatch.setattr(mlp_studies, "study_rows", lambda _: STUDIES[:1])
+    monkeypatch.setattr(tables, "TABLES", {"table_4_2": ("4.2", SPLIT)})
+    monkeypatch.setattr(tables, "study_rows", lambda _: STUDIES[:1])
     for steps in (1, 2):
         plan = Plan(
             size="tiny",
@@ -104,11 +104,11 @@ def test_studies_are_what_was_asked_for(
             registry=unmeasured,
         )
         if steps == 1:
-            mlp_studies.make_studies(plan, "table_4_2")
+            tables.make_studies(plan, "table_4_2")
             assert list((tmp_path / "runs").rglob("errors.json"))
         else:
             with pytest.raises(UsageError):
-                mlp_studies.make_studies(plan, "table_4_2")
+                tables.make_studies(plan, "table_4_2")
 
 
 @pytest.fixture

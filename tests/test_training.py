@@ -1,13 +1,15 @@
-"""Training: what it converges to, how it goes on after an interrupt, and how it stops."""
+"""Training: what it converges to, how it goes on after an interrupt, how it stops and ends."""
 
 from __future__ import annotations
 
 import json
 import os
 import random
-import shutil
+import resource
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -16,16 +18,17 @@ import netCDF4
 import numpy as np
 import pytest
 import torch
-from simple_models import FACTS, Drift, install
+from simple_models import FACTS, Drift, trainer
 from torch import Tensor
 
 from lagbench.baselines.baseline import Batch
-from lagbench.baselines.checkpoint import load
+from lagbench.baselines.checkpoint import load, save
+from lagbench.baselines.job import RunFolder
 from lagbench.baselines.module import TrainingModule
 from lagbench.baselines.recipe import TrainingOptions
 from lagbench.baselines.train import StepBatches, TrainingResult, train
 from lagbench.data.registry import Registry
-from lagbench.errors import UsageError, WorkFailedError
+from lagbench.errors import DataError, UsageError, WorkFailedError
 from lagbench.make.generate import GenerationResult
 from lagbench.torch import WindowDataset, WindowSampler
 from lagbench.work.progress import Progress
@@ -37,24 +40,8 @@ Run = Callable[..., TrainingResult]
 def run(
     generated: GenerationResult, unmeasured: Registry, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Run:
-    """Train on tiny curl-noise data on one thread, a Drift by default."""
-    install(monkeypatch, drift=Drift, greedy=Greedy)
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
-
-    def call(baseline: str = "drift", folder: str = "run", *settings: str, **options: Any) -> TrainingResult:
-        options = {"root": generated.root, **options}
-        return train(
-            baseline,
-            "curl-noise",
-            "tiny",
-            settings=tuple(f"training.{one}" if one[:6] != "model." else one for one in settings),
-            output=tmp_path / folder,
-            threads=1,
-            registry=unmeasured,
-            **options,
-        )
-
-    return call
+    """Train on tiny curl-noise data."""
+    return trainer(generated.root, unmeasured, tmp_path, monkeypatch, drift=Drift, greedy=Greedy)
 
 
 class Greedy(Drift):
@@ -98,9 +85,7 @@ def train_positions(root: Path) -> list[np.ndarray]:
 
 def test_converges_to_least_squares(run: Run, generated: GenerationResult) -> None:
     """The coefficient becomes sum(u(f) u(f+1)) / sum(u(f)^2) over train."""
-    result = run(
-        "drift", "run", "steps=250", "batch=8", "learning_rate=0.03", "schedule=cosine", "validate_every=0"
-    )
+    result = run("drift", "steps=250", "batch=8", "learning_rate=0.03", "schedule=cosine", "validate_every=0")
     above = below = 0.0
     for position in train_positions(generated.root):
         velocity = np.diff(position, axis=0)
@@ -111,30 +96,18 @@ def test_converges_to_least_squares(run: Run, generated: GenerationResult) -> No
     assert result.parameters == 1
 
 
-def test_the_record(run: Run) -> None:
-    """training.json says what was done, what it cost, and on what data."""
-    result = run("drift", "run", "steps=6", "validate_every=2")
-    record = json.loads((result.folder / "training.json").read_text())
-    assert (record["state"], record["step"], record["windows"]) == ("finished", 6, 48)
-    assert record["recipe"]["training"]["steps"] == 6
-    assert [entry["step"] for entry in record["validation"]] == [2, 4, 6]
-    assert 0 < record["cpu_seconds"] < 100
-    assert record["loss"]["total"] == pytest.approx(record["loss"]["motion"] + record["loss"]["swirl"])
-    assert list((result.folder / "tensorboard").iterdir())
-
-
 @pytest.mark.parametrize("baseline", ["supergat", "neuralmpm", "drift"])
 def test_resumed_equals_uninterrupted(run: Run, baseline: str, tmp_path: Path) -> None:
     """Interrupted twice and resumed, a training ends with the bits of an uninterrupted one."""
     settings = ("steps=7", "validate_every=3", "schedule=cosine")
     settings += ("model.noise_std=1e-4",) if baseline != "drift" else ()
-    whole = run(baseline, "whole", *settings)
+    whole = run(baseline, *settings, to="whole")
     for step in (2, 5):
         with pytest.raises(KeyboardInterrupt):
-            run(baseline, "parts", *settings, progress=interrupt_at(step))
+            run(baseline, *settings, to="parts", progress=interrupt_at(step))
         stopped = json.loads((tmp_path / "parts/training.json").read_text())
         assert (stopped["state"], stopped["step"]) == ("interrupted", step)
-    parts = run(baseline, "parts", *settings)
+    parts = run(baseline, *settings, to="parts")
     assert (parts.state, parts.step) == ("finished", 7)
     assert same(whole.checkpoint, parts.checkpoint)
     assert same(whole.weights, parts.weights)
@@ -143,9 +116,9 @@ def test_resumed_equals_uninterrupted(run: Run, baseline: str, tmp_path: Path) -
 
 def test_a_finished_training_is_not_repeated(run: Run) -> None:
     """The same command again changes nothing."""
-    first = run("drift", "run", "steps=3")
+    first = run("drift", "steps=3")
     before = first.checkpoint.read_bytes()
-    again = run("drift", "run", "steps=3")
+    again = run("drift", "steps=3")
     assert (again.state, again.step) == ("finished", 3)
     assert first.checkpoint.read_bytes() == before
 
@@ -153,7 +126,7 @@ def test_a_finished_training_is_not_repeated(run: Run) -> None:
 def test_seeds(run: Run) -> None:
     """The same seed gives the same weights, another seed others."""
     first, second, other = (
-        run("gns", f"run{number}", "steps=2", "validate_every=0", seed=seed)
+        run("gns", "steps=2", "validate_every=0", to=f"run{number}", seed=seed)
         for number, seed in enumerate((3, 3, 4))
     )
     assert same(first.checkpoint, second.checkpoint)
@@ -162,21 +135,22 @@ def test_seeds(run: Run) -> None:
 
 def test_chance_of_the_caller_is_left_alone(run: Run) -> None:
     """Training draws nothing from the caller's generators."""
-    random.seed(5)
-    np.random.seed(5)  # noqa: NPY002 (it must not change)
-    torch.manual_seed(5)
-    run("drift", "run", "steps=2")
-    found = random.random(), float(np.random.random()), float(torch.rand(1))  # noqa: NPY002
-    random.seed(5)
-    np.random.seed(5)  # noqa: NPY002
-    torch.manual_seed(5)
-    assert found == (random.random(), float(np.random.random()), float(torch.rand(1)))  # noqa: NPY002
+
+    def drawn(train: bool) -> tuple[float, ...]:
+        random.seed(5)
+        np.random.seed(5)  # noqa: NPY002 (it must not change)
+        torch.manual_seed(5)
+        if train:
+            run("drift", "steps=2")
+        return random.random(), float(np.random.random()), float(torch.rand(1))  # noqa: NPY002
+
+    assert drawn(train=True) == drawn(train=False)
 
 
 def test_a_loss_that_is_not_finite(run: Run, tmp_path: Path) -> None:
     """NaN stops with the step and the term; the checkpoint before it stays."""
     with pytest.raises(WorkFailedError, match="swirl") as caught:
-        run("drift", "run", "model.fail_at=6", "steps=9", "checkpoint_every=4")
+        run("drift", "model.fail_at=6", "steps=9", "checkpoint_every=4")
     assert "step 6" in str(caught.value)
     assert "motion" not in str(caught.value)
     kept = load(tmp_path / "run/checkpoint.pt")
@@ -188,45 +162,40 @@ def test_a_loss_that_is_not_finite(run: Run, tmp_path: Path) -> None:
 def test_out_of_memory(run: Run) -> None:
     """When memory is full, the message says what to lower."""
     with pytest.raises(WorkFailedError, match=r"lower --set training\.batch"):
-        run("greedy", "run", "steps=2")
+        run("greedy", "steps=2")
 
 
-def test_early_stop(run: Run) -> None:
-    """Training stops when validations bring nothing new, and the best weights are those kept."""
+def test_a_training_that_stopped_early_is_over(run: Run) -> None:
+    """Validations that bring nothing new end it with the best weights; again, no byte changes."""
     # The best coefficient is near 1; with this rate the second step overshoots it for good.
-    result = run(
-        "drift", "run", "model.start=1.0", "steps=50", "validate_every=1", "patience=3", "learning_rate=0.5"
-    )
-    record = json.loads((result.folder / "training.json").read_text())
-    values = [entry["vorticity_nrmse"] for entry in record["validation"]]
-    assert result.state == "stopped early"
-    assert result.step == int(np.argmin(values)) + 1 + 3 < 50
-    assert load(result.weights).training["step"] == result.best_step
+    settings = ("model.start=1.0", "learning_rate=0.5", "steps=50", "validate_every=1", "patience=3")
+    first = run("drift", *settings)
+    files = (first.checkpoint, first.weights, first.folder / "training.json")
+    before = [file.read_bytes() for file in files]
+    values = [entry["vorticity_nrmse"] for entry in json.loads(before[2])["validation"]]
+    assert (first.state, first.step) == ("stopped early", int(np.argmin(values)) + 1 + 3)
+    assert first.step < 50
+    assert load(first.weights).training["step"] == first.best_step
+    again = run("drift", *settings)
+    assert (again.state, again.step, again.best_step) == (first.state, first.step, first.best_step)
+    assert [file.read_bytes() for file in files] == before
 
 
 def test_what_has_no_layers_is_not_compiled(run: Run) -> None:
     """A model without layers to compile refuses the option before it trains."""
     with pytest.raises(UsageError) as caught:
-        run("drift", "run", "steps=2", "compile=true")
+        run("drift", "steps=2", "compile=true")
     assert caught.value.where == "training.compile"
 
 
 def test_folders_are_guarded(run: Run) -> None:
     """Another recipe in a folder is refused unless the user wants to train anew."""
-    run("drift", "run", "steps=2")
+    run("drift", "steps=2")
     with pytest.raises(UsageError, match=r"training\.steps = 3"):
-        run("drift", "run", "steps=3")
+        run("drift", "steps=3")
     with pytest.raises(UsageError, match="--resume"):
-        run("drift", "run", "steps=2", resume=False)
-    assert run("drift", "run", "steps=3", fresh=True).step == 3
-
-
-def test_the_test_subset_is_never_read(run: Run, generated: GenerationResult, tmp_path: Path) -> None:
-    """Training and validation work where no test scenario is on the disk."""
-    root = tmp_path / "root"
-    shutil.copytree(generated.root, root)
-    shutil.rmtree(root / "curl-noise/tiny/v2/test")
-    assert run("drift", "run", "steps=2", root=root).best_value is not None
+        run("drift", "steps=2", resume=False)
+    assert run("drift", "steps=3", fresh=True).step == 3
 
 
 def test_learning_rate_follows_the_processes() -> None:
@@ -256,8 +225,8 @@ def test_gradients_are_clipped(run: Run, monkeypatch: pytest.MonkeyPatch) -> Non
         return out
 
     monkeypatch.setattr(torch.optim.AdamW, "step", watched)
-    run("drift", "free", "steps=2", "validate_every=0")
-    run("drift", "clipped", "steps=2", "validate_every=0", "clip=0.001")
+    run("drift", "steps=2", "validate_every=0")
+    run("drift", "steps=2", "validate_every=0", "clip=0.001", to="clipped")
     assert min(seen[:2]) > 0.001
     assert seen[2:] == pytest.approx([0.001, 0.001], rel=1e-3)
 
@@ -281,9 +250,127 @@ def test_batches_from_any_step(generated: GenerationResult, unmeasured: Registry
 
 def test_closed_forms_go_through_the_same_door(run: Run) -> None:
     """A VAR is fitted, stored and validated like the others; again, it is not fitted twice."""
-    result = run("var", "run")
+    result = run("var")
     assert (result.state, result.step, result.steps) == ("finished", 1, 1)
     assert result.weights.exists()
     stamp = result.checkpoint.stat().st_mtime_ns
-    assert run("var", "run").state == "finished"
+    assert run("var").state == "finished"
     assert result.checkpoint.stat().st_mtime_ns == stamp
+
+
+def test_weights_without_a_checkpoint_are_not_replaced(run: Run) -> None:
+    """Going on is refused where only weights are left: it is said whether that training is finished."""
+    first = run("drift", "steps=1")
+    first.checkpoint.unlink()
+    before = {file: file.read_bytes() for file in (first.weights, first.folder / "training.json")}
+    with pytest.raises(UsageError, match=r"the training is finished(.|\n)*--fresh"):
+        run("drift", "steps=1")
+    with pytest.raises(UsageError, match=r"no checkpoint to go on from(.|\n)*--fresh"):
+        run("drift", "steps=2")
+    with pytest.raises(UsageError, match="holds a training"):
+        run("drift", "steps=1", resume=False)
+    assert {file: file.read_bytes() for file in before} == before
+    for content in (b"{", b"[]"):
+        (first.folder / "training.json").write_bytes(content)
+        with pytest.raises(UsageError, match="no checkpoint to go on from"):
+            run("drift", "steps=1")
+    assert run("drift", "steps=2", fresh=True).step == 2
+
+
+def test_a_record_alone_is_no_training(run: Run) -> None:
+    """What failed before it stored any weights is trained again."""
+    first = run("drift", "steps=1")
+    first.checkpoint.unlink()
+    first.weights.unlink()
+    assert run("drift", "steps=2").step == 2
+
+
+def test_resumed_steps_are_not_counted_in_the_rate(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run that goes on at step 3 tells 0 steps per second at first, and 1 after one step in one second."""
+    settings = ("steps=5", "validate_every=0", "checkpoint_every=1")
+
+    with pytest.raises(KeyboardInterrupt):
+        run("drift", *settings, progress=interrupt_at(3))
+    heard: list[Progress] = []
+    run("drift", *settings, progress=heard.append)
+    assert [news.done for news in heard] == [3, 4, 5]
+    assert {news.total for news in heard} == {5}
+    rates = [replace(news, seconds=1.0 + i).rate for i, news in enumerate(heard)]
+    assert rates == [0.0, 1 / 2, 2 / 3]
+
+
+@pytest.mark.parametrize("split", ["fluid", "multimaterial"])
+def test_gravity_has_no_square_of_images(split: str, tmp_path: Path) -> None:
+    """Where gravity acts, only a mirror image is drawn; a box without it has all eight."""
+    there = {"root": tmp_path, "settings": ("model.symmetry=square",)}
+    with pytest.raises(UsageError, match=r"gravity in(.|\n)*model\.symmetry=mirror"):
+        train("gns", split, "tiny", **there)
+    with pytest.raises(DataError):  # no data are there: what comes next is looked at
+        train("gns", split, "tiny", root=tmp_path, settings=("model.symmetry=mirror",))
+    with pytest.raises(DataError):
+        train("gns", "cavity", "tiny", **there)
+
+
+@contextmanager
+def largest_file(size: int) -> Iterator[None]:
+    """Let the system refuse files above a size, as it refuses them on a full disk [byte]."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_a_full_disk(run: Run) -> None:
+    """Where a checkpoint does not fit on the disk, that is said, and the one before stays."""
+    path = run("drift", "steps=1").checkpoint
+    before, found = path.read_bytes(), load(path)
+    larger = replace(found, weights={**found.weights, "more": torch.ones(10**5)})
+    with largest_file(10**5), pytest.raises(WorkFailedError, match="free disk space") as caught:
+        save(path, larger)
+    assert "checkpoint.pt" in str(caught.value)
+    left = {file.name for file in path.parent.iterdir() if file.is_file()}
+    assert left == {"checkpoint.pt", "training.json", "weights.pt"}
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize("baseline", ["gns", "var"])
+def test_a_model_that_memory_cannot_hold(run: Run, baseline: str) -> None:
+    """A model of 10^15 numbers ends with what to lower, before any step."""
+    setting = "model.lags=1000000000" if baseline == "var" else "model.latent=10000000"
+    with pytest.raises(WorkFailedError, match="out of memory") as caught:
+        run(baseline, setting)
+    assert setting.partition("=")[0].partition(".")[2] in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        "training.epochs",
+        "training.clip",
+        "model.noise_std",
+        "model.radius",
+        "model.loss.vorticity",
+        "model.link_weight",
+    ],
+)
+def test_numbers_without_end_are_refused(run: Run, key: str) -> None:
+    """No option is infinite; the message names it."""
+    with pytest.raises(UsageError, match=key.replace(".", r"\.")):
+        run("gns", f"{key}=.inf")
+
+
+def test_only_our_own_logs_are_cleared(tmp_path: Path) -> None:
+    """A tensorboard folder that holds somebody else's runs keeps them; one of ours goes."""
+    theirs, ours = tmp_path / "theirs", tmp_path / "ours"
+    (theirs / "tensorboard" / "my-runs").mkdir(parents=True)
+    (theirs / "tensorboard" / "my-runs" / "notes.txt").write_text("precious")
+    (ours / "tensorboard").mkdir(parents=True)
+    for name in ("events.out.tfevents.1.host.2.0", "hparams.yaml"):
+        (ours / "tensorboard" / name).touch()
+        (theirs / "tensorboard" / name).touch()
+    for folder in (theirs, ours):
+        RunFolder(folder).clear()
+    assert [path.name for path in theirs.rglob("*") if path.is_file()] == ["notes.txt"]
+    assert list(ours.iterdir()) == []

@@ -6,20 +6,19 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import netCDF4
 import numpy as np
 import pytest
 import torch
-from simple_models import Drift, install
+from simple_models import Drift, trainer
 
+from lagbench.baselines.baseline import facts_of
 from lagbench.baselines.checkpoint import load, restore
-from lagbench.baselines.facts import facts_of
 from lagbench.baselines.predict import predict
 from lagbench.baselines.recipe import TrainingOptions
-from lagbench.baselines.train import TrainingResult, train
-from lagbench.baselines.validation import Validation
+from lagbench.baselines.rollout import Validation
+from lagbench.baselines.train import TrainingResult
 from lagbench.data.registry import Registry
 from lagbench.errors import DataError
 from lagbench.make.generate import GenerationResult
@@ -33,15 +32,8 @@ Run = Callable[..., TrainingResult]
 def run(
     generated: GenerationResult, unmeasured: Registry, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Run:
-    """Train on tiny curl-noise data on one thread."""
-    install(monkeypatch, drift=Drift)
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
-
-    def call(baseline: str, *settings: str, **options: Any) -> TrainingResult:
-        options = {"root": generated.root, "split": "curl-noise", "registry": unmeasured, **options}
-        return train(baseline, size="tiny", settings=settings, output=tmp_path / "run", threads=1, **options)
-
-    return call
+    """Train on tiny curl-noise data."""
+    return trainer(generated.root, unmeasured, tmp_path, monkeypatch, drift=Drift)
 
 
 def validated_on_test(weights: Path, registry: Registry, root: Path, split: str) -> float:
@@ -67,7 +59,7 @@ def test_digits_of_the_scorer_in_a_full_box(
     run: Run, generated: GenerationResult, unmeasured: Registry, baseline: str
 ) -> None:
     """On the same scenarios validation and score card have the same vorticity NRMSE, to the digit."""
-    result = run(baseline, "training.steps=2")
+    result = run(baseline, "steps=2")
     assert result.metric == "vorticity_nrmse"
     there = (result.weights, unmeasured, generated.root)
     assert validated_on_test(*there, "curl-noise") == scored(*there, "vorticity_nrmse")
@@ -78,7 +70,7 @@ def test_digits_of_the_scorer_on_the_free_surface(
 ) -> None:
     """The same for the distance of clouds, although rollouts end where the truth rests."""
     root = tiny_split("fluid").root
-    result = run("neuralmpm", "training.steps=2", root=root, split="fluid")
+    result = run("neuralmpm", "steps=2", root=root, split="fluid")
     assert result.metric == "cloud_distance"
     there = (result.weights, unmeasured, root)
     assert validated_on_test(*there, "fluid") == scored(*there, "cloud_distance")
@@ -89,13 +81,13 @@ def test_all_of_valid_and_no_other(run: Run, copied: Callable[[], Path]) -> None
     root = copied()
     for file in (root / "curl-noise/tiny/v2/test").glob("*.nc"):
         file.unlink()
-    assert run("drift", "training.steps=1", root=root).best_value is not None
+    assert run("drift", "steps=1", root=root).best_value is not None
     files = sorted((root / "curl-noise/tiny/v2/valid").glob("*.nc"))
     with netCDF4.Dataset(files[-1]) as data:
         assert np.isfinite(data["position"][:]).all()
     files[-1].unlink()
     with pytest.raises(DataError, match="--subset valid"):
-        run("drift", "training.steps=1", root=root, fresh=True)
+        run("drift", "steps=1", root=root, fresh=True)
 
 
 def test_how_often() -> None:
@@ -123,8 +115,8 @@ def test_steps_that_a_recipe_names() -> None:
 
 def test_what_a_training_says(run: Run) -> None:
     """Record, weights and result tell windows, epochs, times, machine, and the best validation."""
-    settings = ("training.steps=8", "training.batch=3", "training.validate_every=2", "model.start=1.0")
-    result = run("drift", *settings, "training.learning_rate=0.5")
+    settings = ("steps=8", "batch=3", "validate_every=2", "model.start=1.0")
+    result = run("drift", *settings, "learning_rate=0.5")
     record = json.loads((result.folder / "training.json").read_text())
     stored = load(result.weights).training
     assert record["budget"] == stored["budget"]
@@ -144,7 +136,7 @@ def test_what_a_training_says(run: Run) -> None:
 
 def test_long_records_are_thinned(run: Run) -> None:
     """Of 22 validations a budget tells at most 20, the last one among them."""
-    result = run("drift", "training.steps=22", "training.validate_every=1", "training.validation_frames=2")
+    result = run("drift", "steps=22", "validate_every=1", "validation_frames=2")
     told = json.loads((result.folder / "training.json").read_text())["budget"]["validations"]
     assert len(told) <= 20
     assert told[-1][0] == 22
@@ -152,7 +144,7 @@ def test_long_records_are_thinned(run: Run) -> None:
 
 def test_fewer_frames_for_tests(run: Run, generated: GenerationResult, unmeasured: Registry) -> None:
     """`validation_frames` shortens the rollouts, and the metric is that of the shorter task."""
-    settings = ("training.steps=1", "training.validation_frames=4")
+    settings = ("steps=1", "validation_frames=4")
     result = run("drift", *settings)
     task = load_scored_task(unmeasured.size("curl-noise", "tiny"), generated.root, subset="valid")
     short = replace(task, setting=replace(task.setting, horizon=4))

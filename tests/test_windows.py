@@ -20,7 +20,7 @@ from torch.utils.data import DataLoader
 
 import lagbench
 from lagbench import torch as lagbench_torch
-from lagbench.baselines.windows import scenario_batch, scenario_paths
+from lagbench.baselines.rollout import scenario_batch, scenario_paths
 from lagbench.data.registry import Registry, load
 from lagbench.data.yamlfile import read_yaml
 from lagbench.errors import DataError, LagbenchError, UsageError

@@ -11,10 +11,7 @@ from torch_geometric.nn import GATConv, GATv2Conv
 
 from .operator import Losses, Operator
 
-__all__ = [
-    "GAT",
-    "GATv2",
-]
+__all__ = ["GAT", "GATv2"]
 
 
 class GAT(Operator):
@@ -36,12 +33,7 @@ class GAT(Operator):
         self.conv = GATConv(inputs, latent, edge_dim=latent)
 
     def forward(
-        self,
-        node: Tensor,
-        edge_index: Tensor,
-        edge: Tensor,
-        *,
-        generator: torch.Generator | None = None,
+        self, node: Tensor, edge_index: Tensor, edge: Tensor, *, generator: torch.Generator | None = None
     ) -> tuple[Tensor, Losses]:
         """Return what each node gathers."""
         return self.conv(node, edge_index, edge), {}
@@ -66,12 +58,7 @@ class GATv2(Operator):
         self.conv = GATv2Conv(inputs, latent, edge_dim=latent)
 
     def forward(
-        self,
-        node: Tensor,
-        edge_index: Tensor,
-        edge: Tensor,
-        *,
-        generator: torch.Generator | None = None,
+        self, node: Tensor, edge_index: Tensor, edge: Tensor, *, generator: torch.Generator | None = None
     ) -> tuple[Tensor, Losses]:
         """Return what each node gathers."""
         return self.conv(node, edge_index, edge), {}

@@ -23,12 +23,7 @@ class GNS(Operator):
     reads_nodes = False
 
     def forward(
-        self,
-        node: Tensor,
-        edge_index: Tensor,
-        edge: Tensor,
-        *,
-        generator: torch.Generator | None = None,
+        self, node: Tensor, edge_index: Tensor, edge: Tensor, *, generator: torch.Generator | None = None
     ) -> tuple[Tensor, Losses]:
         """Return what each node gathers."""
         return summed(edge_index, edge, len(node)), {}

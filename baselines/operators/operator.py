@@ -11,8 +11,7 @@ from torch import Tensor, nn
 
 __all__ = ["Losses", "Operator", "summed"]
 
-Losses = Mapping[str, Tensor]
-"""Losses of an operator's own by name, each a scalar."""
+Losses = Mapping[str, Tensor]  # losses of an operator's own by name, each a scalar
 
 
 class Operator(nn.Module):
@@ -41,12 +40,7 @@ class Operator(nn.Module):
 
     @abstractmethod
     def forward(
-        self,
-        node: Tensor,
-        edge_index: Tensor,
-        edge: Tensor,
-        *,
-        generator: torch.Generator | None = None,
+        self, node: Tensor, edge_index: Tensor, edge: Tensor, *, generator: torch.Generator | None = None
     ) -> tuple[Tensor, Losses]:
         """Return what each node gathers, and losses of its own if any.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from lagbench.baselines.layers import Linear
+from lagbench.baselines.network import Linear
 
 from .operator import Losses, Operator
 
@@ -30,12 +30,7 @@ class PointNet(Operator):
         self.local = nn.Sequential(nn.ReLU(inplace=True), Linear(hidden, latent))
 
     def forward(
-        self,
-        node: Tensor,
-        edge_index: Tensor,
-        edge: Tensor,
-        *,
-        generator: torch.Generator | None = None,
+        self, node: Tensor, edge_index: Tensor, edge: Tensor, *, generator: torch.Generator | None = None
     ) -> tuple[Tensor, Losses]:
         """Return what each node gathers."""
         sender, receiver = edge_index

@@ -10,7 +10,7 @@ from torch_geometric.nn import SuperGATConv
 
 from .operator import Losses, Operator
 
-__all__ = ["SuperGAT", "SuperGATDot", "unlinked_pairs"]
+__all__ = ["SuperGAT", "SuperGATDot"]
 
 
 START = 4.0
@@ -26,16 +26,9 @@ others and one neighbour has all the attention.
 def unlinked_pairs(
     edge_index: Tensor, nodes: int, count: int, generator: torch.Generator | None = None
 ) -> Tensor:
-    """Draw pairs of nodes without an edge, at most `count`.
+    """Draw pairs of nodes and return those that are no edge and no loop, shape [2, pair], at most `count`.
 
-    Args:
-        edge_index: senders and receivers, shape [2, edge].
-        nodes: nodes of the graph.
-        count: pairs to draw; those that are an edge or a loop are dropped.
-        generator: source; None draws the same pairs every time.
-
-    Returns:
-        Senders and receivers, shape [2, pair].
+    None as generator draws the same pairs every time.
     """
     source = torch.Generator().manual_seed(0) if generator is None else generator
     pairs = torch.randint(nodes, (2, count), generator=source, device=source.device)
@@ -71,12 +64,7 @@ class SuperGAT(Operator):
         self.conv = SuperGATConv(inputs, latent, attention_type=self.attention)
 
     def forward(
-        self,
-        node: Tensor,
-        edge_index: Tensor,
-        edge: Tensor,
-        *,
-        generator: torch.Generator | None = None,
+        self, node: Tensor, edge_index: Tensor, edge: Tensor, *, generator: torch.Generator | None = None
     ) -> tuple[Tensor, Losses]:
         """Return what each node gathers, and the link loss in training."""
         node = node / self.scale

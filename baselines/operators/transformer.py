@@ -28,12 +28,7 @@ class Transformer(Operator):
         self.conv = TransformerConv(inputs, latent, edge_dim=latent)
 
     def forward(
-        self,
-        node: Tensor,
-        edge_index: Tensor,
-        edge: Tensor,
-        *,
-        generator: torch.Generator | None = None,
+        self, node: Tensor, edge_index: Tensor, edge: Tensor, *, generator: torch.Generator | None = None
     ) -> tuple[Tensor, Losses]:
         """Return what each node gathers."""
         return self.conv(node, edge_index, edge), {}

@@ -14,7 +14,6 @@ import argparse
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
-from itertools import chain
 from pathlib import Path
 
 from lagbench.data.layout import resolve_root
@@ -22,10 +21,10 @@ from lagbench.data.registry import Registry, load
 from lagbench.errors import LagbenchError, UsageError, nearest
 
 from .catalogue import FIGURES
+from .drawing import Figure, write_sheet
 from .evidence import WEIGHTS
-from .mlp_studies import TABLES, make_studies
 from .runs import Plan, budget, make_run, outlook, score_committed
-from .sheet import Figure, write_sheet
+from .tables import TABLES, make_studies
 from .thesis import EXPECTED, ROSTER, Model, label
 
 __all__ = ["main", "rehearse", "reproduce"]
@@ -37,7 +36,10 @@ def main(arguments: Sequence[str] | None = None, *, registry: Registry | None = 
     try:
         figures = _chosen(given.only, given.split)
         if given.list:
-            _say("\n".join(_lines(figures)))
+            for figure in figures:
+                needs = [f"{split}: {' '.join(names)}" for split, names in figure.needs.items() if names]
+                needs += [f"trainings of {figure.studies}"] if figure.studies else []
+                _say(f"{figure.name:14} {figure.title}; needs {'; '.join(needs) or 'no training'}")
             return 0
         (registry or load()).size("cavity", given.size)
         plan = Plan(
@@ -65,9 +67,24 @@ def reproduce(
     plan: Plan, figures: Sequence[Figure], *, training: bool = True, split: str | None = None
 ) -> int:
     """Make figures; what fails is said, and the others are made. Return 0, or the last error's code."""
-    making = _makings(plan, figures, split) if training else _committed(plan, figures, split)
-    drawing = ((figure.name, partial(_draw, plan, figure)) for figure in figures)
-    code = _each(chain(making, drawing))
+
+    def draw(figure: Figure) -> None:
+        _say(write_sheet(figure.draw(plan, figure), plan.output, figure.name, _head(plan, figure)))
+
+    def jobs() -> Iterator[tuple[str, Callable[[], None]]]:
+        if training:
+            for where, model, seed in _runs(plan, figures, split):
+                _note(f"{where} {plan.size} {model.name}-{seed}")
+                yield "", partial(make_run, plan, where, model, seed, say=_note)
+            for study in _studies(plan, figures):
+                _note(f"studies of {study}")
+                yield "", partial(make_studies, plan, study)
+        else:
+            for where, name in _wanted(figures, split):
+                yield "", partial(score_committed, plan, where, ROSTER[name], say=_note)
+        yield from ((figure.name, partial(draw, figure)) for figure in figures)
+
+    code = _each(jobs())
     for path in plan.stale:
         _note(f"{path}: scores of another version of the data; left out")
     return code
@@ -95,30 +112,6 @@ def _each(jobs: Iterable[tuple[str, Callable[[], None]]]) -> int:
             _complain(error, name)
             code = error.exit_code
     return code
-
-
-def _makings(
-    plan: Plan, figures: Sequence[Figure], split: str | None
-) -> Iterator[tuple[str, Callable[[], None]]]:
-    """Yield what makes every run that figures need, one seed after the other, then the studies."""
-    for where, model, seed in _runs(plan, figures, split):
-        _note(f"{where} {plan.size} {model.name}-{seed}")
-        yield "", partial(make_run, plan, where, model, seed, say=_note)
-    for study in _studies(plan, figures):
-        _note(f"studies of {study}")
-        yield "", partial(make_studies, plan, study)
-
-
-def _committed(
-    plan: Plan, figures: Sequence[Figure], split: str | None
-) -> Iterator[tuple[str, Callable[[], None]]]:
-    """Yield what predicts and scores with the committed weights of the models that figures need."""
-    for where, name in _wanted(figures, split):
-        yield "", partial(score_committed, plan, where, ROSTER[name], say=_note)
-
-
-def _draw(plan: Plan, figure: Figure) -> None:
-    _say(write_sheet(figure.draw(plan, figure), plan.output, figure.name, _head(plan, figure)))
 
 
 def _wanted(figures: Sequence[Figure], split: str | None) -> list[tuple[str, str]]:
@@ -194,13 +187,6 @@ def _seeds(text: str) -> tuple[int, ...]:
     if not seeds or min(seeds) < 0:
         raise UsageError("cannot understand the seeds", where="--seeds", expected="as in 0,1", got=text)
     return seeds
-
-
-def _lines(figures: Sequence[Figure]) -> Iterator[str]:
-    for figure in figures:
-        needs = [f"{split}: {' '.join(names)}" for split, names in figure.needs.items() if names]
-        needs += [f"trainings of {figure.studies}"] if figure.studies else []
-        yield f"{figure.name:14} {figure.title}; needs {'; '.join(needs) or 'no training'}"
 
 
 def _say(text: str) -> None:

@@ -6,22 +6,22 @@ from collections.abc import Mapping
 from dataclasses import replace
 from types import MappingProxyType
 
-from . import curves, fields, mlp_studies, tables, var_protocol
-from .sheet import Figure
+from . import figures, tables, var_protocol
+from .drawing import Figure
 from .thesis import FRAME_MODELS, OPERATORS
 
 __all__ = ["FIGURES"]
 
 # what several figures share; each row below holds only how it differs
-_STUDY = Figure(name="", title="", draw=mlp_studies.draw, needs={"fluid": ()})
-_LOSSES = replace(_STUDY, draw=curves.study_losses)
+_STUDY = Figure(name="", title="", draw=tables.studies, needs={"fluid": ()})
+_LOSSES = replace(_STUDY, draw=tables.study_losses)
 _ROLLOUTS = Figure(
     name="", title="Rollouts, scene by scene", draw=tables.rollouts, needs={"fluid": FRAME_MODELS}
 )
 _PARTICLES = Figure(
     name="",
     title="Particles of rollouts",
-    draw=fields.panels,
+    draw=figures.panels,
     needs={"multimaterial": ("lstm-mlp",)},
     whole=True,
     panels=("material",),
@@ -45,28 +45,28 @@ _BARS = replace(_VORTICITY, draw=tables.vorticity_bars, needs={"cavity": OPERATO
 _HISTOGRAMS = replace(
     _BARS,
     title="Histograms of vorticity",
-    draw=fields.histograms,
+    draw=figures.histograms,
     metrics=("vorticity_kl_hist",),
     said="Thesis: SuperGAT's histogram follows the truth's best, PointNet's is broadest.",
 )
 _RESIDUALS = replace(
     _BARS,
     title="Residuals of vorticity",
-    draw=fields.residuals,
+    draw=figures.residuals,
     metrics=tuple(f"vorticity_residual_{m}" for m in ("mean", "std", "max", "p05", "p95", "slope")),
     said="Thesis: SuperGAT's residuals are the smallest and spread evenly about zero.",
 )
 _MAPS = replace(
-    _BARS, title="Maps of vorticity and velocity", draw=fields.panels, metrics=("vorticity_pearson",)
+    _BARS, title="Maps of vorticity and velocity", draw=figures.panels, metrics=("vorticity_pearson",)
 )
 _CURVES = replace(
-    _BARS, title="Vorticity error over frames", draw=curves.model_curves, metrics=("vorticity_mse",)
+    _BARS, title="Vorticity error over frames", draw=figures.model_curves, metrics=("vorticity_mse",)
 )
 _ENERGY = replace(_CURVES, title="Kinetic energy over frames")
 _FLOW = Figure(
     name="",
     title="Quiver and streamlines of rollouts",
-    draw=fields.panels,
+    draw=figures.panels,
     needs={"curl-noise": ("supergat",)},
     frames=(6, 10, 15, 25, 35, 45),  # 1, 5, 10, 20, 30 and 40 after the last given one, as the thesis counts
     metrics=("velocity_rmse",),
@@ -132,7 +132,7 @@ _ALL = (
     Figure(
         name="fig_4_8",
         title="Training loss of the chosen MLP",
-        draw=curves.losses,
+        draw=figures.losses,
         needs={"fluid": ("mlp",), "multimaterial": ("mlp",)},
     ),
     replace(
@@ -171,7 +171,7 @@ _ALL = (
     replace(
         _CURVES,
         name="fig_5_10",
-        draw=curves.case_curves,
+        draw=figures.case_curves,
         needs={"cavity": ("supergat",)},
         said="Thesis: six test cases, below 0.0002 for the first 40 frames and below 0.0004 up to frame 80,"
         " growing almost linearly.",
@@ -203,7 +203,7 @@ _ALL = (
     Figure(
         name="fig_5_21",
         title="Training loss on curl noise, sum of six terms",
-        draw=curves.losses,
+        draw=figures.losses,
         needs={"curl-noise": OPERATORS},
         said="Thesis: the total is 0.302 at step 507 and 0.644 at the end: it rises, so it is no yardstick.",
     ),

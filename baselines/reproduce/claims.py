@@ -19,20 +19,9 @@ from lagbench.metrics.table import CHOSEN
 from lagbench.scoring.tables import Table
 
 from .evidence import Evidence, ordered
-from .sheet import number
-from .thesis import FRAME_MODELS, OPERATORS, key_frame, label
+from .thesis import FRAME_MODELS, OPERATORS, key_frame, label, number
 
-__all__ = [
-    "CLAIMS",
-    "Claim",
-    "Compared",
-    "Verdict",
-    "answer",
-    "claim_rows",
-    "compared",
-    "comparison_table",
-    "floors_ahead",
-]
+__all__ = ["CLAIMS", "answer", "claim_rows", "compared", "comparison_table", "floors_ahead"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -228,24 +217,25 @@ def comparison_table(rows: Sequence[Compared], title: str = "") -> Table:
         *("where", "metric", "first", "second", "means", "seeds"),
         *("lead (95 %)", "won", "p (Holm)", "the first is"),
     )
-    return Table(title, heads, tuple(map(_cells, rows)))
-
-
-def _cells(row: Compared) -> tuple[str, ...]:
-    low, high = (-bound for bound in reversed(row.test.interval))
-    bounds = "" if math.isnan(low) else f" ({number(low)} to {number(high)})"
-    return (
-        row.where,
-        row.metric if row.frame is None else f"{row.metric}, frame {row.frame}",
-        label(row.first),
-        label(row.second),
-        f"{number(row.means[0])} / {number(row.means[1])}",
-        f"{row.seeds[0]} / {row.seeds[1]}",
-        f"{number(-row.test.difference)}{bounds}",
-        f"{row.won} of {len(row.test.scenarios)}",
-        number(row.p, 2),
-        row.verdict.value,
-    )
+    cells = []
+    for row in rows:
+        low, high = (-bound for bound in reversed(row.test.interval))
+        bounds = "" if math.isnan(low) else f" ({number(low)} to {number(high)})"
+        cells.append(
+            (
+                row.where,
+                row.metric if row.frame is None else f"{row.metric}, frame {row.frame}",
+                label(row.first),
+                label(row.second),
+                f"{number(row.means[0])} / {number(row.means[1])}",
+                f"{row.seeds[0]} / {row.seeds[1]}",
+                f"{number(-row.test.difference)}{bounds}",
+                f"{row.won} of {len(row.test.scenarios)}",
+                number(row.p, 2),
+                row.verdict.value,
+            )
+        )
+    return Table(title, heads, tuple(cells))
 
 
 def floors_ahead(everything: Sequence[Evidence]) -> Table:

@@ -1,21 +1,27 @@
-"""Truth and predictions of a scenario, and charts and rows of panels drawn from them in one style."""
+"""Figures of the thesis and the sheets beside them; rollouts, charts and rows of panels in one style."""
 
 from __future__ import annotations
 
+import csv
 import io
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.atomic import write_atomically
 from lagbench.data.scenario import ScenarioFile
+from lagbench.draw.markdown import table
 from lagbench.draw.panels import Panel, colour_bar, colour_scale, draw, draw_walls, limit_of
 from lagbench.draw.recording import Recording, Scene, open_recording
 from lagbench.draw.style import INK, figure, pixels_of, png_bytes
+from lagbench.errors import require
 from lagbench.metrics.frame import FramePair, Scenario, Snapshot
+from lagbench.scoring.tables import Table
 from lagbench.submission.predictions import Predictions, open_predictions
 
 from .runs import Plan
@@ -24,16 +30,29 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Picture
 
-__all__ = ["QUIVER", "TRUTH", "Rollouts", "charts", "opened", "panel_rows", "png", "tidy"]
+__all__ = [
+    "Figure",
+    "SMOOTHED",
+    "Sheet",
+    "TRUTH",
+    "charts",
+    "loss_over_steps",
+    "plot_losses",
+    "opened",
+    "panel_rows",
+    "png",
+    "tidy",
+    "write_sheet",
+]
 
 Floats = NDArray[np.float64]
 
 TRUTH = INK
-LEVELS = 96
-"""Colours of a chart's file."""
+LEVELS = 96  # colours of a chart's file
+QUIVER = "quiver"  # a kind of panel of our own: arrows at the nodes, coloured by speed as streamlines are
 
-QUIVER = "quiver"
-"""A kind of panel of our own: arrows at the nodes, coloured by speed as streamlines are."""
+SMOOTHED = 25
+"""Entries of the log that a drawn point is the mean of, as many before it as after; fewer at both ends."""
 
 SIDE, GAP, TOP, LEFT, BOTTOM = 1.5, 0.08, 0.34, 0.75, 0.62  # [inch]
 
@@ -183,3 +202,94 @@ def _draw_arrows(axes: Axes, scene: Scene, limit: float) -> None:
         width=0.006,
         zorder=2,
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Figure:
+    """A figure, table or section of the thesis: one row of the catalogue."""
+
+    name: str  # as in fig_5_10 or table_5_4
+    title: str  # what it shows
+    draw: Callable[[Plan, Figure], Sheet]
+    needs: Mapping[str, tuple[str, ...]] = field(
+        default_factory=dict
+    )  # models whose scored runs it shows, by split
+    studies: str = ""  # table of MLPs whose trainings it shows
+    cases: tuple[int, ...] = (0,)  # scenarios of the thesis: T0, T1, ...; ids on the free surface
+    frames: tuple[int, ...] = ()  # absolute; empty for the frame at which the thesis compares models
+    whole: bool = False  # show the whole rollout: pictures spread over it, errors over the horizon
+    panels: tuple[str, ...] = ()  # kinds of picture, one each
+    metrics: tuple[
+        str, ...
+    ] = ()  # of its table; of curves: the models', the truth's own, then means over the horizon
+    said: str = ""  # what the thesis says of it
+
+    @property
+    def split(self) -> str:
+        """The split that it is about, the first of several."""
+        return next(iter(self.needs))
+
+    @property
+    def models(self) -> tuple[str, ...]:
+        """The models that it shows on that split."""
+        return self.needs[self.split]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sheet:
+    """One table or figure of the thesis, ours beside it."""
+
+    notes: tuple[str, ...] = ()  # sentences; one paragraph each
+    tables: tuple[Table, ...] = ()
+    pictures: Mapping[str, bytes] = field(default_factory=dict)  # PNG files by what is added to their name
+
+
+def write_sheet(sheet: Sheet, folder: Path, name: str, head: str) -> str:
+    """Write ``<name>.md``, ``<name>[-n].csv`` and pictures; return the Markdown, which the head opens."""
+    parts = [head, *sheet.notes]
+    for count, held in enumerate(sheet.tables, start=1):
+        parts += [f"**{held.title}**"] if held.title else []
+        parts.append(table(held.columns, held.rows))
+        ending = f"-{count}" if len(sheet.tables) > 1 else ""
+        with io.StringIO() as buffer:
+            csv.writer(buffer, lineterminator="\n").writerows([held.columns, *held.rows])
+            write_atomically(folder / f"{name}{ending}.csv", buffer.getvalue().encode(), option="--output")
+    for what, picture in sheet.pictures.items():
+        path = folder / (f"{name}-{what}.png" if what else f"{name}.png")
+        write_atomically(path, picture, option="--output")
+        parts.append(f"![{name} {what}]({path.name})")
+    text = "\n\n".join(parts) + "\n"
+    write_atomically(folder / f"{name}.md", text.encode(), option="--output")
+    return text
+
+
+def plot_losses(axes: Axes, curves: Mapping[str, tuple[str | None, Floats, Floats]]) -> None:
+    """Plot smoothed losses by name: colour, steps and loss of each."""
+    for name, (line, steps, loss) in curves.items():
+        if loss.size:
+            axes.plot(steps, smoothed(loss), lw=1.1, label=name, color=line)
+            axes.set_yscale("log")
+    tidy(axes, f"mean of {SMOOTHED} entries", "optimiser step", "training loss")
+
+
+def loss_over_steps(folder: Path, term: str = "total") -> tuple[Floats, Floats]:
+    """Return steps and loss of a training as TensorBoard was told; empty where it left no log."""
+    logs, tag = folder / "tensorboard", f"loss/{term}"
+    if not logs.is_dir():
+        return np.empty(0), np.empty(0)
+    module = require("tensorboard.backend.event_processing.event_accumulator", extra="baselines")
+    held = module.EventAccumulator(str(logs), size_guidance={"scalars": 0}).Reload()
+    if tag not in held.Tags()["scalars"]:
+        return np.empty(0), np.empty(0)
+    # a training that went on repeats steps; what was told last holds
+    entries = sorted({entry.step: entry.value for entry in held.Scalars(tag)}.items())
+    return np.array([step for step, _ in entries], float), np.array([loss for _, loss in entries])
+
+
+def smoothed(values: Floats) -> Floats:
+    """Return the mean of each value and its neighbours, :data:`SMOOTHED` in all where there are."""
+    total = np.concatenate([[0.0], np.cumsum(values)])
+    place = np.arange(len(values))
+    reach = np.minimum(SMOOTHED // 2, np.minimum(place, place[::-1]))
+    found: Floats = (total[place + reach + 1] - total[place - reach]) / (2 * reach + 1)
+    return found

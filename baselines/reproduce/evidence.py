@@ -31,7 +31,7 @@ from lagbench.scoring.score_file import NETCDF_NAME, read_statistics
 from lagbench.scoring.skill import best_floor
 from lagbench.scoring.task import ranking_metric
 
-__all__ = ["BOARD", "WEIGHTS", "Cost", "Evidence", "Method", "Seeded", "Sources", "ordered", "read_json"]
+__all__ = ["BOARD", "Evidence", "Method", "Sources", "WEIGHTS", "ordered", "read_json"]
 
 BOARD = Path("leaderboard")
 WEIGHTS = BOARD / "weights"
@@ -208,7 +208,14 @@ class Evidence:
             file = folder / NETCDF_NAME
             if file.is_file() and not {(name, seed), (name, None)} & committed:
                 record = read_json(folder / RECORD_NAME) or sources.record(split, size, name, seed)
-                self._add(name, seed, file, record, _run_cost(folder))
+                said, cost = read_json(folder / COST_NAME), None
+                if "seconds_per_frame" in said:
+                    cost = Cost(
+                        seconds_per_frame=float(said["seconds_per_frame"]),
+                        device=str(said.get("device", "")),
+                        solver_seconds_per_frame=said.get("solver_seconds_per_frame"),
+                    )
+                self._add(name, seed, file, record, cost)
         for floor in (shipped(self.size) or {}).values():
             held = Seeded(seed=None, scores=floor.scores, record={}, path=shipped_path(self.size))
             self.methods.setdefault(floor.name, Method(name=floor.name, seeds=(held,)))
@@ -291,17 +298,6 @@ def _score_files(path: Path, entry: Any) -> Iterator[tuple[int | None, Path]]:  
     scores = board / "scores" / path.parent.relative_to(board / "submissions")
     for seed in seeds:
         yield seed, scores / (f"{path.stem}.nc" if len(seeds) == 1 else f"{path.stem}_{seed}.nc")
-
-
-def _run_cost(folder: Path) -> Cost | None:
-    said = read_json(folder / COST_NAME)
-    if "seconds_per_frame" not in said:
-        return None
-    return Cost(
-        seconds_per_frame=float(said["seconds_per_frame"]),
-        device=str(said.get("device", "")),
-        solver_seconds_per_frame=said.get("solver_seconds_per_frame"),
-    )
 
 
 def read_json(path: Path) -> dict[str, Any]:

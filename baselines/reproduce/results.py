@@ -12,10 +12,9 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import combinations
 from pathlib import Path
-from typing import Any
 
 from lagbench.atomic import write_atomically
 from lagbench.draw.markdown import table
@@ -28,9 +27,20 @@ from lagbench.scoring.tables import ARROWS, Table
 from .claims import CLAIMS, answer, claim_rows, comparison_table, floors_ahead
 from .evidence import BOARD, WEIGHTS, Evidence, Method, Sources, read_json
 from .runs import budget, hardware
-from .sheet import interval, number
 from .tables import rollout_table
-from .thesis import EXPECTED, OPERATORS, ROSTER, SIZES, TABLE_4_8, TABLE_5_4, key_frame, label, scenario_of
+from .thesis import (
+    EXPECTED,
+    OPERATORS,
+    ROSTER,
+    SIZES,
+    TABLE_4_8,
+    TABLE_5_4,
+    interval,
+    key_frame,
+    label,
+    number,
+    scenario_of,
+)
 from .var_protocol import FILE, beside_thesis
 
 __all__ = ["agreement", "main", "render"]
@@ -126,7 +136,12 @@ def _training_rows(evidence: Evidence) -> Iterator[list[str]]:
     for name in evidence.order(evidence.models):
         method = evidence.models[name]
         record, hours = method.seeds[0].record, method.cpu_hours
-        best = [_validated(record, share) for share in (0.25, 0.5, 1.0)]
+        # beside the step an entry holds one number, the metric that was validated
+        held = [(e["step"], v) for e in record.get("validation", ()) for n, v in e.items() if n != "step"]
+        best = [
+            min((value for step, value in held if step <= share * record["step"]), default=None)
+            for share in (0.25, 0.5, 1.0)
+        ]
         seen = record["step"] * record["recipe"]["training"]["batch"] if "windows" in record else None
         gain = 1.0 - best[2] / best[1] if best[1] and best[2] is not None else None
         yield [
@@ -139,20 +154,6 @@ def _training_rows(evidence: Evidence) -> Iterator[list[str]]:
             *map(number, best),
             "-" if gain is None else f"{100.0 * gain:.2g} %",
         ]
-
-
-def _validated(record: Mapping[str, Any], share: float) -> float | None:
-    """Return the least validation error up to a share of the steps; None where there was none."""
-    held = record.get("validation", ())
-    # beside the step an entry holds one number, the metric that was validated
-    values = [
-        value
-        for entry in held
-        if entry["step"] <= share * record["step"]
-        for name, value in entry.items()
-        if name != "step"
-    ]
-    return min(values, default=None)
 
 
 def _chapter(evidence: Evidence) -> Iterator[str]:
@@ -174,7 +175,22 @@ def _chapter(evidence: Evidence) -> Iterator[str]:
         yield from _vorticity_at(evidence)
     yield "Cost. Speed-up: our solver's time for a frame on one core over the model's, same machine."
     heads = ("recipe", "changed", "parameters", "seeds", "CPU hours", "hardware", "s/frame", "solver s/frame")
-    rows = [_cost_row(name, method) for name, method in evidence.models.items()]
+    rows = []
+    for name, method in evidence.models.items():
+        record, cost = method.seeds[0].record, method.cost
+        paid = (cost.seconds_per_frame, cost.solver_seconds_per_frame, cost.speed_up) if cost else (None,) * 3
+        rows.append(
+            [
+                label(name),
+                record.get("recipe", {}).get("name", "-"),
+                "; ".join(ROSTER[name].settings if name in ROSTER else ()) or "-",
+                "-" if method.parameters is None else f"{method.parameters:,}",
+                ", ".join("-" if held.seed is None else str(held.seed) for held in method.seeds),
+                number(method.cpu_hours),
+                hardware(record),
+                *map(number, paid),
+            ]
+        )
     yield table(("model", *heads, "speed-up"), rows)
 
 
@@ -188,27 +204,25 @@ def _horizon(evidence: Evidence) -> str:
     # vorticity says little where the material does not fill the box
     hidden = ("vorticity", "distributions") if free else ()
     shown = [m for m in chosen if m.direction is not Direction.NONE and m.family not in hidden]
+
+    def cell(method: Method, metric: str) -> str:
+        if metric not in method.scores:
+            return "-"
+        spread = f" ± {number(method.spread(metric), 2)}" if len(method.seeds) > 1 else ""
+        undefined = sum(method.scores[metric].undefined)
+        return interval(method.scores[metric]) + spread + (f", {undefined} undefined" if undefined else "")
+
     rows = []
     for name in evidence.order():
         method = evidence.methods[name]
         seeds = "floor" if name in FLOORS else str(len(method.seeds))
-        cells = [_cell(method, metric.name) for metric in shown]
+        cells = [cell(method, metric.name) for metric in shown]
         rows.append([label(name), number(evidence.skill(name)), seeds, *cells])
-    return table(["model", "skill", "seeds", *map(_head, shown)], rows)
-
-
-def _head(metric: Metric) -> str:
-    """Return name, unit and direction, as in "position_rmse [length], lower"."""
-    goal = f" {metric.perfect:g}" if metric.direction is Direction.TARGET else ""
-    return f"{metric.name} [{metric.unit}], {ARROWS[metric.direction]}{goal}"
-
-
-def _cell(method: Method, metric: str) -> str:
-    if metric not in method.scores:
-        return "-"
-    spread = f" ± {number(method.spread(metric), 2)}" if len(method.seeds) > 1 else ""
-    undefined = sum(method.scores[metric].undefined)
-    return interval(method.scores[metric]) + spread + (f", {undefined} undefined" if undefined else "")
+    heads = ["model", "skill", "seeds"]
+    for m in shown:  # as in "position_rmse [length], lower"
+        goal = f" {m.perfect:g}" if m.direction is Direction.TARGET else ""
+        heads.append(f"{m.name} [{m.unit}], {ARROWS[m.direction]}{goal}")
+    return table(heads, rows)
 
 
 def _vorticity_at(evidence: Evidence) -> Iterator[str]:
@@ -242,22 +256,6 @@ def agreement(first: Sequence[float], second: Sequence[float]) -> float:
     pairs = list(combinations(zip(first, second, strict=True), 2))
     turned = sum((a - b) * (x - y) < 0.0 for (a, x), (b, y) in pairs)
     return 1.0 - 2.0 * turned / len(pairs)
-
-
-def _cost_row(name: str, method: Method) -> list[str]:
-    record, cost = method.seeds[0].record, method.cost
-    return [
-        label(name),
-        record.get("recipe", {}).get("name", "-"),
-        "; ".join(ROSTER[name].settings if name in ROSTER else ()) or "-",
-        "-" if method.parameters is None else f"{method.parameters:,}",
-        ", ".join("-" if held.seed is None else str(held.seed) for held in method.seeds),
-        number(method.cpu_hours),
-        hardware(record),
-        number(cost.seconds_per_frame if cost else None),
-        number(cost.solver_seconds_per_frame if cost else None),
-        number(cost.speed_up if cost else None),
-    ]
 
 
 def _protocol(sources: Sources, size: str) -> Iterator[str]:

@@ -1,7 +1,15 @@
-"""Tables and bars: solver times, rollouts, statistics of train, vorticity of six operators."""
+"""Tables and bars: solver times, MLPs, rollouts, statistics of train, vorticity of six operators.
+
+Tables 4.2 to 4.5 are activations, widths, depths and more data for an MLP from frame to frame: errors
+are Eq. 4.16 after one step from true frames, over train and over valid. At size ``full`` every row has
+its own recipe, with the thesis's epochs and batch; smaller sizes take a share of the epochs, and batches
+that leave some steps in an epoch, the same for all rows of a table. More data (``extra``, Table 4.5)
+exist at full only.
+"""
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -9,36 +17,46 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.atomic import write_atomically
 from lagbench.data.manifest import read_manifest
 from lagbench.errors import DataError
 from lagbench.metrics.distributions import kl, normalised
 from lagbench.metrics.table import METRICS
 from lagbench.scoring.tables import Table
 
-from .drawing import charts, opened, png, tidy
-from .evidence import Evidence
-from .runs import Plan
-from .sheet import Figure, Sheet, number
+from .drawing import Figure, Sheet, charts, loss_over_steps, opened, plot_losses, png, tidy
+from .evidence import RECORD_NAME, Evidence, read_json
+from .runs import Plan, budget, check_training, make_training
 from .thesis import (
     FRAME_MODELS,
     OPERATORS,
     STATISTICS,
+    STUDIES,
     TABLE_4_7,
     TABLE_4_8,
     TABLE_5_4,
+    Model,
     Rollout,
+    Study,
     colour,
     key_frame,
     label,
+    number,
     scenario_of,
 )
 
 __all__ = [
+    "TABLES",
     "cubic_errors",
     "cubic_vorticity",
+    "make_studies",
     "rollout_table",
     "rollouts",
     "statistics",
+    "studies",
+    "study_losses",
+    "study_folder",
+    "study_rows",
     "times",
     "vorticity",
     "vorticity_bars",
@@ -113,7 +131,14 @@ def vorticity(plan: Plan, figure: Figure) -> Sheet:
     evidence = plan.evidence(figure.split)
     frame, first = key_frame(evidence.size), scenario_of(evidence.size, 0)
     names = [name for name in figure.models if name in evidence.methods]
-    cubic = {i: _by_cubic(plan, figure, i, frame) for i in plan.test_subset(figure.split).scenarios}
+    cubic: dict[int, dict[str, Mapping[str, float]]] = {}  # errors by scenario and model, the thesis's way
+    for i in plan.test_subset(figure.split).scenarios:
+        with opened(plan, figure.split, i, figure.models) as shown:
+            found = {}
+            for name in (None, *shown.predictions):
+                held = shown.snapshot(name, frame)
+                found[name] = cubic_vorticity(held.position, held.velocity, shown.recording.size.bounds)
+            cubic[i] = {name: cubic_errors(found[None], found[name]) for name in shown.predictions}
 
     def scored(model: str, measure: str, scenario: int | None) -> float:
         return evidence.methods[model].at(f"vorticity_{measure}", frame, scenario)
@@ -145,16 +170,6 @@ def vorticity(plan: Plan, figure: Figure) -> Sheet:
         tables.append(Table(title, ("model", *heads), tuple(rows)))
     note = f"Frame {frame}; T0 is our test scenario {first}. {figure.said}"
     return Sheet(notes=(note,), tables=tuple(tables))
-
-
-def _by_cubic(plan: Plan, figure: Figure, scenario: int, frame: int) -> Mapping[str, Mapping[str, float]]:
-    """Return the errors of each model at a frame of a scenario, by the thesis's way."""
-    with opened(plan, figure.split, scenario, figure.models) as rollouts:
-        fields = {}
-        for name in (None, *rollouts.predictions):
-            held = rollouts.snapshot(name, frame)
-            fields[name] = cubic_vorticity(held.position, held.velocity, rollouts.recording.size.bounds)
-        return {name: cubic_errors(fields[None], fields[name]) for name in rollouts.predictions}
 
 
 def cubic_vorticity(
@@ -219,3 +234,146 @@ def vorticity_bars(plan: Plan, figure: Figure) -> Sheet:
         tables=(Table("", ("model", *series), rows),),
         pictures={"": picture},
     )
+
+
+TABLES: Mapping[str, tuple[str, str]] = {
+    "table_4_2": ("4.2", "fluid"),
+    "table_4_3": ("4.3", "fluid"),
+    "table_4_4": ("4.4", "multimaterial"),
+    "table_4_5": ("4.5", "multimaterial"),
+}
+"""Number of the table in the thesis, and the split it is made on."""
+
+SHARES: Mapping[str, tuple[float, int]] = {"mini": (0.1, 16), "tiny": (0.01, 64)}
+"""Share of the thesis's epochs, and what its batch is divided by, by size."""
+
+WINDOWS = 4096  # most windows of a subset that an error is measured over, evenly spaced
+
+FILE = "errors.json"
+
+
+def study_model(plan: Plan, study: Study) -> Model:
+    """Return what to train for a row: at ``full`` its own recipe, else the size's recipe with changes."""
+    name = f"mlp-{study.table.replace('.', '-')}-{study.row}"
+    unvalidated = "training.validate_every=0"
+    if plan.size == "full":
+        # what tells a row's recipe from the others of its table
+        ends = {"4.2": study.activation, "4.3": study.widths[0], "4.4": len(study.widths), "4.5": study.row}
+        variant = f"table-{study.table}-{ends[study.table]}"
+        return Model(name, name, varied="mlp", settings=(unvalidated,), recipe=variant)
+    share, divisor = SHARES[plan.size]
+    settings = (
+        unvalidated,
+        f"model.widths={list(study.widths)}",
+        f"model.activation={study.activation}",
+        *("model.target=state", "model.noise_std=0", "model.material=false"),
+        f"training.epochs={max(1.0, share * study.epochs):g}",
+        f"training.batch={study.batch // divisor}",
+        *("training.learning_rate=0.001", "training.schedule=constant"),
+    )
+    return Model(name, name, varied="mlp", settings=settings)
+
+
+def study_rows(name: str) -> tuple[Study, ...]:
+    """Return the rows of a table."""
+    return tuple(study for study in STUDIES if study.table == TABLES[name][0])
+
+
+def study_folder(plan: Plan, name: str, study: Study) -> Path:
+    """Return the folder of a row's training; it lies apart from the runs that are scored."""
+    return plan.home(TABLES[name][1]) / "studies" / f"{study_model(plan, study).name}-{plan.seeds[0]}"
+
+
+def make_studies(plan: Plan, name: str) -> None:
+    """Train the rows of a table and measure their errors, unless that was done."""
+    split = TABLES[name][1]
+    for study in study_rows(name):
+        folder, model = study_folder(plan, name, study), study_model(plan, study)
+        check_training(plan, split, model, plan.seeds[0], folder=folder)
+        if not (folder / FILE).is_file():
+            make_training(plan, split, model, plan.seeds[0], folder=folder)
+            found = {subset: one_step_error(plan, split, folder, subset) for subset in ("train", "valid")}
+            write_atomically(folder / FILE, json.dumps(found).encode())
+
+
+def one_step_error(plan: Plan, split: str, folder: Path, subset: str) -> float:
+    """Return the mean of Eq. 4.16 over the windows of a subset [standardised^2]."""
+    import torch
+
+    from lagbench.baselines.checkpoint import load, restore
+    from lagbench.torch import WindowDataset, collate
+
+    model = restore(load(folder / "weights.pt")).eval()
+    data = WindowDataset(
+        split, subset=subset, size=plan.size, root=plan.root, history=model.history, registry=plan.registry
+    )
+    count = min(len(data), WINDOWS)
+    chosen = [i * len(data) // count for i in range(count)]
+    total = 0.0
+    with torch.no_grad():
+        for first in range(0, count, 128):
+            windows = [data[i] for i in chosen[first : first + 128]]
+            terms = model(collate(windows))
+            total += len(windows) * float(terms["position"] + terms["velocity"]) / 2.0
+    return total / count
+
+
+def studies(plan: Plan, figure: Figure) -> Sheet:
+    """Return Table 4.2, 4.3, 4.4 or 4.5 with ours beside it."""
+    (printed, split), rows = TABLES[figure.studies], []
+    for study in study_rows(figure.studies):
+        folder = study_folder(plan, figure.studies, study)
+        errors, record = read_json(folder / FILE), read_json(folder / RECORD_NAME)
+        rows.append(
+            (
+                str(study.row),
+                " x ".join(map(str, study.widths)),
+                study.activation,
+                f"{study.parameters:,}",
+                f"{record['parameters']:,}" if record else "-",
+                f"{study.epochs} x {study.batch}" if study.table != "4.2" else f"{study.epochs}",
+                budget(record),
+                number(record["cpu_seconds"] / 3600.0 if record else None),
+                number(study.train, 4),
+                number(errors.get("train")),
+                number(study.valid, 4),
+                number(errors.get("valid")),
+            )
+        )
+    heads = (
+        *("no", "hidden layers", "activation", "parameters at full, thesis", "parameters, ours"),
+        *("epochs x batch, thesis", "steps x batch, ours", "CPU hours"),
+        *("train, thesis", "train, ours", "valid, thesis", "valid, ours"),
+    )
+    share, _ = SHARES.get(plan.size, (1.0, 1))
+    note = (
+        f"Table {printed} on {split} {plan.size}: mean squared error of one step [standardised^2]; {share:g}"
+        " of the thesis's epochs, constant rate 1e-3. Standardisation and data differ from the thesis's:"
+        " compare orders."
+    )
+    return Sheet(notes=(note,), tables=(Table("", heads, tuple(rows)),))
+
+
+def study_losses(plan: Plan, figure: Figure) -> Sheet:
+    """Return the losses of the rows of Table 4.2 or 4.3, and the final errors over train and valid."""
+    studies = study_rows(figure.studies)
+    names = [s.activation if s.table == "4.2" else f"3 x {s.widths[0]}" for s in studies]
+    folders = [study_folder(plan, figure.studies, study) for study in studies]
+    errors = [read_json(folder / FILE) for folder in folders]
+    curves = {name: (None, *loss_over_steps(folder)) for name, folder in zip(names, folders, strict=True)}
+    with charts(2, 2) as drawn:
+        over_steps, after = drawn
+        plot_losses(over_steps, curves)
+        place = np.arange(len(studies))
+        for shift, subset in ((-0.2, "train"), (0.2, "valid")):
+            values = [float(held.get(subset, np.nan)) for held in errors]
+            after.bar(place + shift, values, 0.4, label=subset)
+        after.set_xticks(place, names)
+        tidy(after, "after training", "", "MSE of one step [standardised^2]")
+        picture = png(drawn)
+    rows = [
+        (name, number(s.train, 4), number(e.get("train")), number(s.valid, 4), number(e.get("valid")))
+        for name, s, e in zip(names, studies, errors, strict=True)
+    ]
+    heads = ("network", "train, thesis", "train, ours", "valid, thesis", "valid, ours")
+    return Sheet(notes=(figure.said,), tables=(Table("", heads, tuple(rows)),), pictures={"": picture})

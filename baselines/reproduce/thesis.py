@@ -1,4 +1,4 @@
-"""Numbers that the thesis prints, models that results speak of, and our scenarios that stand for its own.
+"""Numbers that the thesis prints, models that results speak of, our scenarios that stand for its own.
 
 D. Dharma, PhD thesis, University of Leeds, 2025. Models have our names: ``supergat`` is the thesis's own
 model ("OURS"), ``transformer`` its graph transformer. Where the thesis contradicts itself, the reading that
@@ -7,32 +7,36 @@ holds here is said beside the number.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
 from lagbench.data.registry import Size
 from lagbench.draw.style import MUTED
+from lagbench.metrics.aggregate import Score
 
 __all__ = [
     "EXPECTED",
     "FRAME_MODELS",
     "LOSS_SNAPSHOTS",
+    "Model",
     "OPERATORS",
     "ROSTER",
+    "Rollout",
     "SECTION_4_8_3",
     "SIZES",
     "STATISTICS",
     "STUDIES",
+    "Study",
     "TABLE_4_7",
     "TABLE_4_8",
     "TABLE_5_4",
-    "Model",
-    "Rollout",
-    "Study",
     "colour",
+    "interval",
     "key_frame",
     "label",
+    "number",
     "predicted",
     "scenario_of",
 ]
@@ -133,8 +137,7 @@ TABLE_5_4: Mapping[str, Mapping[str, float]] = MappingProxyType(
 of the cavity at frame 54. MAE and RMSE [1/frame], divergence of the magnitudes per node [nat],
 correlation."""
 
-OPERATORS = tuple(TABLE_5_4)
-"""The six operators."""
+OPERATORS = tuple(TABLE_5_4)  # the six operators
 
 STATISTICS: Mapping[str, Mapping[str, tuple[float, float]]] = MappingProxyType(
     {
@@ -169,8 +172,7 @@ LOSS_SNAPSHOTS: Mapping[str, Mapping[str, float]] = MappingProxyType(
 )
 """Raw terms of the loss on curl-noise (section 5.9.3, Fig. 5.21); the total rises: no yardstick."""
 
-SIZES = ("mini", "full")
-"""Sizes that are reported; ``tiny`` is for tests."""
+SIZES = ("mini", "full")  # sizes that are reported; ``tiny`` is for tests
 
 
 @dataclass(frozen=True)
@@ -228,8 +230,7 @@ _MODELS = (
     Model("var-stable", "stable VAR", "#b0569a"),
 )
 
-ROSTER: Mapping[str, Model] = MappingProxyType({model.name: model for model in _MODELS})
-"""Models by name."""
+ROSTER: Mapping[str, Model] = MappingProxyType({model.name: model for model in _MODELS})  # models by name
 
 _EVERYWHERE = ("neuralmpm", *OPERATORS, *FRAME_MODELS, "var", "var-stable")
 _ABLATIONS = ("supergat-unlinked", "supergat-unsummed", "gns-novorticity")
@@ -290,3 +291,19 @@ def predicted(size: Size, frames: Iterable[int]) -> tuple[int, ...]:
     """Return those absolute frames that are predicted; the last predicted one if none is."""
     first, last = size.task.input_frames, size.task.input_frames + size.task.horizon - 1
     return tuple(frame for frame in frames if first <= frame <= last) or (last,)
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """Return a number with so many digits, a dash where there is none.
+
+    >>> number(0.00012345), number(None), number(12345678.0)
+    ('0.000123', '-', '1.23e+07')
+    """
+    return "-" if value is None or math.isnan(value) else f"{value:.{digits}g}"
+
+
+def interval(score: Score) -> str:
+    """Return mean and 95 % interval over scenarios, as in "0.12 (0.1 to 0.15)"."""
+    low, high = score.interval
+    bounds = "" if math.isnan(low) else f" ({number(low)} to {number(high)})"
+    return f"{number(score.mean)}{bounds}"

@@ -18,7 +18,7 @@ import math
 import resource
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -32,21 +32,19 @@ from lagbench.data.scenario import read_scenario
 from lagbench.draw.markdown import table as markdown_table
 from lagbench.scoring.tables import Table
 
+from .drawing import Figure, Sheet
 from .runs import Plan
-from .sheet import Figure, Sheet, number
-from .thesis import SECTION_4_8_3
+from .thesis import SECTION_4_8_3, number
 
 if TYPE_CHECKING:
-    from lagbench.baselines.least_squares import LeastSquares
-    from lagbench.baselines.var import LaggedRows
+    pass
 
 __all__ = ["FILE", "ProtocolResult", "beside_thesis", "draw", "forecast_errors", "measure", "table"]
 
 TRAIN, VALID = 0.70, 0.15
 """Shares of the frames that are fitted and forecast."""
 
-FILE = "var_protocol.json"
-"""What ``--json`` prints, in a folder of runs and beside committed weights."""
+FILE = "var_protocol.json"  # what ``--json`` prints, in a folder of runs and beside committed weights
 
 GROWTH_FRAMES = 100
 
@@ -79,8 +77,7 @@ def measure(
 ) -> ProtocolResult:
     """Fit a VAR of so many lags and forecast by the thesis's protocol."""
     # torch is loaded here, so that pages of results are written without it
-    from lagbench.baselines.least_squares import solve
-    from lagbench.baselines.var import LaggedRows
+    from lagbench.baselines.var import LaggedRows, solve
 
     states = _all_states(split, size, root)
     train = int(TRAIN * len(states))
@@ -90,6 +87,7 @@ def measure(
     found = solve(rows)
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
+    missed = math.fsum(np.square(y - x @ found.coefficients).sum() for x, y in rows)
     errors, growth = forecast_errors(found.coefficients, states[train - lags : train], valid)
     return ProtocolResult(
         split=split,
@@ -101,7 +99,7 @@ def measure(
         peak_gb=peak,
         condition=found.condition,
         floor=found.floor,
-        fit_mse=_fit_mse(rows, found),
+        fit_mse=float(missed / (rows.rows * len(found.coefficients[0]))),
         forecast_frames=len(valid),
         forecast_mse=float(errors.mean()),
         mse_at={frame: float(errors[frame - 1]) for frame in (1, 10, 100, 1000) if frame <= len(errors)},
@@ -112,7 +110,7 @@ def measure(
 
 def _all_states(split: str, size: str, root: str | Path | None) -> States:
     """Return the standardised states of all frames, shape [frame, feature]."""
-    from lagbench.baselines.windows import scenario_paths
+    from lagbench.baselines.rollout import scenario_paths
 
     paths: dict[int, Path] = {}
     for subset in ("train", "valid", "test"):
@@ -121,20 +119,14 @@ def _all_states(split: str, size: str, root: str | Path | None) -> States:
     states = np.empty((sum(map(tier.frame_count, paths)), tier.particles, 4), np.float32)
     filled = 0
     for _, path in sorted(paths.items()):
-        for block in _stored(path):
-            states[filled : filled + len(block)] = block
-            filled += len(block)
+        with read_scenario(path) as file:  # positions and the solver's velocities, block by block
+            for position, velocity in zip(file.blocks("position"), file.blocks("velocity"), strict=True):
+                states[filled : filled + len(position)] = np.concatenate([position, velocity], axis=-1)
+                filled += len(position)
     for feature in np.moveaxis(states, -1, 0):
         feature -= feature.mean(dtype=np.float64)
         feature /= feature.std(dtype=np.float64)
     return states.reshape(len(states), -1)
-
-
-def _stored(path: Path) -> Iterator[States]:
-    """Yield blocks of positions and the solver's velocities, shape [frame, particle, 4]."""
-    with read_scenario(path) as file:
-        for position, velocity in zip(file.blocks("position"), file.blocks("velocity"), strict=True):
-            yield np.concatenate([position, velocity], axis=-1)
 
 
 def forecast_errors(
@@ -159,11 +151,6 @@ def forecast_errors(
     grown = norms[np.isfinite(norms)]
     span = min(GROWTH_FRAMES, len(grown) - 1)
     return errors, float((grown[-1] / grown[-1 - span]) ** (1 / span)) if span > 0 else float("nan")
-
-
-def _fit_mse(rows: LaggedRows, found: LeastSquares) -> float:
-    errors = [np.square(y - x @ found.coefficients).sum() for x, y in rows]
-    return float(math.fsum(errors) / (rows.rows * len(found.coefficients[0])))
 
 
 def draw(plan: Plan, figure: Figure) -> Sheet:

@@ -1,13 +1,19 @@
-"""Symmetries of the box: training windows mirrored and turned, walls and all.
+"""What training adds to its windows: images of the box's symmetries, and random-walk noise.
 
 The flow in a square box without gravity looks the same from its eight sides; with gravity a
 mirror image in x remains. A model that is trained on random images of its windows sees more
 flows than there are scenarios. The stored data and the windows stay as they are.
+
+With noise a model learns to undo its own rollout errors (Sanchez-Gonzalez et al. 2020): the
+velocities of the given frames are moved by a random walk, the positions by its sum. The frames to
+predict move with the last given position, so that the target is the true next velocity, and the
+acceleration that leads to it undoes the noise.
 """
 
 from __future__ import annotations
 
 import enum
+import math
 from dataclasses import replace
 
 import torch
@@ -15,11 +21,11 @@ from torch import Tensor
 
 from lagbench.data.registry import Size
 from lagbench.errors import UsageError
+from lagbench.torch import Batch
 
-from .baseline import Batch
-from .facts import Pair
+from .graph import Bounds
 
-__all__ = ["Symmetry", "check_symmetry", "draw", "image"]
+__all__ = ["Symmetry", "check_symmetry", "disturbed"]
 
 _NORMALS = torch.tensor([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])
 """Outward normals of the walls left, right, bottom, top."""
@@ -63,17 +69,8 @@ def draw(symmetry: Symmetry, windows: int, generator: torch.Generator) -> Tensor
     return torch.where(swap.bool()[:, None, None], matrix.flip(2), matrix)
 
 
-def image(batch: Batch, matrix: Tensor, bounds: tuple[Pair, Pair]) -> Batch:
-    """Return each window's image about the middle of the box.
-
-    Args:
-        batch: windows; left unchanged.
-        matrix: signed permutation of the axes for each window, shape [window, 2, 2].
-        bounds: box (low, high) along x and y [length].
-
-    Raises:
-        UsageError: x and y change places in a box that is no square.
-    """
+def image(batch: Batch, matrix: Tensor, bounds: Bounds) -> Batch:
+    """Return each window's image about the middle of the box, by a signed permutation of its axes each."""
     sides = [high - low for low, high in bounds]
     if abs(sides[0] - sides[1]) > 1e-6 and bool((matrix[:, 0, 1] != 0.0).any()):
         raise UsageError(
@@ -86,7 +83,14 @@ def image(batch: Batch, matrix: Tensor, bounds: tuple[Pair, Pair]) -> Batch:
     matrix = matrix.to(batch.position)
     centre = batch.position.new_tensor([(low + high) / 2 for low, high in bounds])
     position = _turned(matrix[batch.sample][:, None], batch.position - centre) + centre
-    return replace(batch, position=position, wall_velocity=_walls(batch.wall_velocity, matrix))
+    walls = batch.wall_velocity
+    if walls is not None:  # wall k becomes the one that the image of its normal points at
+        normals = _NORMALS.to(matrix)
+        images = _turned(matrix[:, None], normals)  # of window and wall
+        origin = (images[:, None] * normals[:, None]).sum(dim=-1).argmax(dim=2)
+        walls = _turned(matrix[:, None, None], walls)
+        walls = walls.gather(2, origin[:, None, :, None].expand_as(walls))
+    return replace(batch, position=position, wall_velocity=walls)
 
 
 def _turned(matrix: Tensor, vector: Tensor) -> Tensor:
@@ -94,12 +98,38 @@ def _turned(matrix: Tensor, vector: Tensor) -> Tensor:
     return (matrix * vector.unsqueeze(-2)).sum(dim=-1)
 
 
-def _walls(velocity: Tensor | None, matrix: Tensor) -> Tensor | None:
-    """Return the walls' velocities in the image: wall k becomes the one that its normal points at."""
-    if velocity is None:
-        return None
-    normals = _NORMALS.to(matrix)
-    images = _turned(matrix[:, None], normals)  # of window and wall
-    origin = (images[:, None] * normals[:, None]).sum(dim=-1).argmax(dim=2)
-    turned = _turned(matrix[:, None, None], velocity)
-    return turned.gather(2, origin[:, None, :, None].expand_as(turned))
+def random_walk(particles: int, frames: int, std: float, generator: torch.Generator) -> Tensor:
+    """Return position noise [length], shape [particle, frame, 2], with the last velocity's deviation.
+
+    The velocity noise is a walk of ``frames - 1`` steps of ``std / sqrt(frames - 1)`` each; the
+    position noise is its sum, 0 in the first frame.
+    """
+    steps = frames - 1
+    shape = (particles, steps, 2)
+    step = torch.randn(shape, generator=generator, device=generator.device) * (std / math.sqrt(steps))
+    position = step.cumsum(dim=1).cumsum(dim=1)
+    return torch.cat([torch.zeros_like(position[:, :1]), position], dim=1)
+
+
+def noisy(position: Tensor, history: int, std: float, generator: torch.Generator) -> Tensor:
+    """Return the positions of windows with noise on their history; the frames after it move along."""
+    walk = random_walk(len(position), history, std, generator).to(position)
+    after = walk[:, -1:].expand(-1, position.shape[1] - history, -1)
+    return position + torch.cat([walk, after], dim=1)
+
+
+def disturbed(
+    batch: Batch,
+    generator: torch.Generator,
+    *,
+    symmetry: Symmetry,
+    bounds: Bounds,
+    history: int,
+    noise_std: float,
+) -> Batch:
+    """Return the batch as its random image, with noise."""
+    if symmetry is not Symmetry.NONE:
+        batch = image(batch, draw(symmetry, batch.windows, generator), bounds)
+    if noise_std > 0.0:
+        batch = replace(batch, position=noisy(batch.position, history, noise_std, generator))
+    return batch
