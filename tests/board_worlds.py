@@ -27,12 +27,11 @@ from lagbench.board.entry import (
     ScoreBlock,
     ScoredFile,
 )
-from lagbench.board.entry_file import read_entry
+from lagbench.board.entry_file import Verification, read_entry
 from lagbench.board.model import Board, Curve, Floor, Histogram, Pictures, Row, Tab, Value
 from lagbench.board.ranking import combine, summarise
 from lagbench.board.score_file import read_stored, reported_frames
 from lagbench.board.submit import SubmitResult, submit
-from lagbench.board.verified import Verification
 from lagbench.data.checksums import file_sha256
 from lagbench.data.registry import Registry, load
 from lagbench.metrics import METRICS

@@ -20,7 +20,7 @@ from lagbench.report.chart import WIDTH, Plot, Spot, close_logarithmic
 from lagbench.report.html import Markup, tag, text, words
 from lagbench.scoring.task import ranking_metric
 
-from .model import Board, Row, Tab
+from .model import Board, Tab
 
 __all__ = ["Mark", "cost_figure", "draw", "front", "marks_of", "picture"]
 
@@ -56,31 +56,21 @@ class Mark:
 
 def marks_of(tab: Tab) -> list[Mark]:
     """Return active entries that say what they cost, then floors; what has no place is left out."""
-    own = [
-        Mark(
-            name=row.entry.name,
-            seconds=_seconds(row, tab.solver_seconds),
-            error=row.values[tab.ranking].mean,
-            kind="entry",
-            href=f"#tab={tab.id}&entry={row.id}",
-        )
-        for row in tab.rows
-        if row.active and tab.ranking in row.values
-    ]
-    floors = [
+    solver, marks = tab.solver_seconds, []
+    for row in tab.rows:
+        cost = row.entry.cost
+        if row.active and cost is not None and tab.ranking in row.values:
+            # on the machine that timed the solver, where that can be said
+            own, speed_up = cost.seconds_per_frame, cost.speed_up
+            seconds = own if solver is None or speed_up is None else solver / speed_up
+            href, error = f"#tab={tab.id}&entry={row.id}", row.values[tab.ranking].mean
+            marks.append(Mark(name=row.entry.name, seconds=seconds, error=error, kind="entry", href=href))
+    marks += [
         _floor(floor.name, floor.cost.seconds_per_frame, floor.values[tab.ranking].mean)
         for floor in tab.floors
         if floor.cost is not None and tab.ranking in floor.values
     ]
-    return [mark for mark in (*own, *floors) if 0.0 < mark.seconds < math.inf and 0.0 < mark.error < math.inf]
-
-
-def _seconds(row: Row, solver: float | None) -> float:
-    """Return what a frame costs an entry, on the machine that timed the solver where that can be said."""
-    cost = row.entry.cost
-    if cost is None:
-        return math.nan
-    return cost.seconds_per_frame if solver is None or cost.speed_up is None else solver / cost.speed_up
+    return [mark for mark in marks if 0.0 < mark.seconds < math.inf and 0.0 < mark.error < math.inf]
 
 
 def _floor(name: str, seconds: float, error: float) -> Mark:

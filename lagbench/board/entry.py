@@ -135,10 +135,6 @@ def _inside(path: str) -> str:
     return path
 
 
-def _date(value: object) -> object:
-    return datetime.date.fromisoformat(value) if isinstance(value, str) else value
-
-
 Name = Annotated[str, StringConstraints(pattern=ID, max_length=LONGEST_ID)]
 Label = Annotated[str, StringConstraints(pattern=LABEL, max_length=LONGEST_ID)]
 Short = Annotated[
@@ -155,7 +151,9 @@ Version = Annotated[str, StringConstraints(pattern=RELEASE)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Seconds = Annotated[float, Field(ge=1e-7, lt=1e9, allow_inf_nan=False)]
 Number = Annotated[float, Field(allow_inf_nan=False)]
-Date = Annotated[datetime.date, BeforeValidator(_date)]
+Date = Annotated[
+    datetime.date, BeforeValidator(lambda x: datetime.date.fromisoformat(x) if isinstance(x, str) else x)
+]
 
 
 class Status(enum.StrEnum):

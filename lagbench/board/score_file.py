@@ -89,7 +89,23 @@ def read_stored(path: Path, size: Size | None = None) -> Stored:
             raise ValueError("no scenarios, or too many statistics")
         if not all(np.isfinite(tally.total).all() for tally in tallies):
             raise ValueError("infinite statistics")
-        preview, precision = _read_preview(path)
+        with opened(path) as file:
+            group = file[GROUP]
+            vorticity, precision = _unpacked(group["vorticity"])
+            histogram, _ = _unpacked(group["histogram"])
+            film, _ = _unpacked(group["film"])
+            preview = Preview(
+                scenario=int(np.ravel(group.attrs["scenario"])[0]),
+                map_frames=_integers(group["map_frame"]),
+                vorticity=vorticity,
+                histogram=histogram,
+                histogram_range=np.asarray(group["histogram_range"][...], np.float32),
+                film_frames=_integers(group["film_frame"]),
+                particles=_integers(group["film_particle"]),
+                material=np.asarray(group["material"][...], np.int8),
+                film=film,
+            )
+        _check_shapes(preview)
         if size is not None:
             _check_task(scores, preview, size)
     except UnreadableFileError:
@@ -97,27 +113,6 @@ def read_stored(path: Path, size: Size | None = None) -> Stored:
     except Exception as error:  # HDF5 on damaged bytes raises nearly any type
         raise unreadable_scores(path, error) from error
     return Stored(scores=scores, preview=preview, precision=precision)
-
-
-def _read_preview(path: Path) -> tuple[Preview, float]:
-    with opened(path) as file:
-        group = file[GROUP]
-        vorticity, precision = _unpacked(group["vorticity"])
-        histogram, _ = _unpacked(group["histogram"])
-        film, _ = _unpacked(group["film"])
-        preview = Preview(
-            scenario=int(np.ravel(group.attrs["scenario"])[0]),
-            map_frames=_integers(group["map_frame"]),
-            vorticity=vorticity,
-            histogram=histogram,
-            histogram_range=np.asarray(group["histogram_range"][...], np.float32),
-            film_frames=_integers(group["film_frame"]),
-            particles=_integers(group["film_particle"]),
-            material=np.asarray(group["material"][...], np.int8),
-            film=film,
-        )
-    _check_shapes(preview)
-    return preview, precision
 
 
 def _unpacked(variable: h5py.Dataset) -> tuple[NDArray[np.float32], float]:
