@@ -23,7 +23,7 @@ from lagbench.data.registry import load
 from lagbench.metrics import METRICS, Setting, Tally, aggregate
 from lagbench.report.maps import inside, limit_of
 from lagbench.report.subject import Subject
-from lagbench.report.tables import _stable_of
+from lagbench.report.tables import stable_of
 from lagbench.scoring.task import ScoredTask
 from lagbench.submission.truth import Truth
 
@@ -123,4 +123,4 @@ def test_the_stable_tile_says_how_many_frames_do_not_count() -> None:
     }
     stable = aggregate([METRICS["stable_frames"]], tallies)["stable_frames"]
     assert stable.values.tolist() == [1.0, 2.0]
-    assert _stable_of(stable) == "of 3, correlation above 0.95; 2 of 6 frames undefined"
+    assert stable_of(stable) == "of 3, correlation above 0.95; 2 of 6 frames undefined"

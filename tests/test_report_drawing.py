@@ -27,11 +27,10 @@ from lagbench.report.chart import (
     logarithmic,
     spanning,
 )
-from lagbench.report.distributions import _edges, _shares
+from lagbench.report.curves import shares_of
 from lagbench.report.flow import streamlines
 from lagbench.report.html import interval, path_data, text
-from lagbench.report.maps import SIDE, paint
-from lagbench.report.png import LEVELS, diverging, sequential
+from lagbench.report.maps import LEVELS, SIDE, diverging, paint, sequential
 
 ACROSS, UP = WIDTH - LEFT - RIGHT, HEIGHT - TOP - BOTTOM
 
@@ -244,12 +243,11 @@ def test_histogram_shares() -> None:
     """Inside the truth's range the shares are NumPy's; what lies beyond is in the end bins."""
     rng = np.random.Generator(np.random.PCG64(3))
     truth, guess = rng.random(500), 3.0 * rng.random(500) - 1.0
-    edges = _edges(truth)
+    edges, shares = shares_of(guess, truth)
     assert (edges[0], edges[-1]) == (truth.min(), truth.max())
     expected = 100.0 * np.histogram(guess, edges)[0] / 500
-    shares = _shares(guess, edges)
     assert shares.sum() == pytest.approx(100.0)
     np.testing.assert_allclose(shares[1:-1], expected[1:-1])
     assert shares[0] > expected[0]
     assert shares[-1] > expected[-1]
-    assert _shares(np.array([]), _edges(np.array([]))).sum() == 0.0
+    assert shares_of(np.array([]), np.array([]))[1].sum() == 0.0

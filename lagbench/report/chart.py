@@ -2,8 +2,6 @@
 
 Classes of marks: ``s0`` .. ``s5`` series, ``d1`` .. ``d3`` dashes, ``truth``, ``floor0`` ..
 for the floors. Each chart has a title and a description for those who do not see it.
-
-Axes: from values to pixels, with round ticks.
 """
 
 from __future__ import annotations
@@ -18,18 +16,9 @@ from numpy.typing import ArrayLike, NDArray
 from .html import Markup, clipped, decimals, join, path_data, power, tag
 
 __all__ = [
-    "Scale",
-    "Tick",
-    "linear",
-    "close_logarithmic",
-    "logarithmic",
+    *("Bar", "Plot", "Scale", "Spot", "Tick", "bar_chart", "close_logarithmic", "linear", "logarithmic"),
     "spanning",
-    "Bar",
-    "Plot",
-    "Spot",
-    "bar_chart",
 ]
-
 
 Floats = NDArray[np.float64]
 
@@ -38,8 +27,6 @@ WIDE = 60.0
 
 DEEPEST = 1e-6
 """A logarithmic axis reaches no lower than this share of its top."""
-
-_STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)
 
 
 @dataclass(frozen=True)
@@ -81,7 +68,10 @@ def linear(low: float, high: float, *, count: int = 5, tight: bool = False) -> S
     if not high > low:
         middle = abs(low) or 1.0
         low, high = low - 0.5 * middle, low + 0.5 * middle
-    step = _round_step((high - low) / count)
+    rough = (high - low) / count
+    unit = 10.0 ** math.floor(math.log10(rough))
+    # the round number next above
+    step = next(k * unit for k in (1.0, 2.0, 2.5, 5.0, 10.0) if k * unit >= rough * (1 - 1e-9))
     first, last = math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9)
     numbers = [k * step for k in range(first, last + 1)]
     if tight:
@@ -94,12 +84,6 @@ def linear(low: float, high: float, *, count: int = 5, tight: bool = False) -> S
     unit = 10.0**exponent
     labels = decimals([value / unit for value in numbers], step / unit)
     return Scale(low, high, False, exponent, tuple(map(Tick, numbers, labels)))
-
-
-def _round_step(rough: float) -> float:
-    """Return the round number next above."""
-    unit = 10.0 ** math.floor(math.log10(rough))
-    return next(factor * unit for factor in _STEPS if factor * unit >= rough * (1 - 1e-9))
 
 
 def logarithmic(low: float, high: float) -> Scale:
@@ -121,15 +105,11 @@ def close_logarithmic(low: float, high: float) -> Scale:
     last = min(i for i, (value, *_) in enumerate(marks) if value >= 1.25 * high)
     kept = marks[first : last + 1]
     shown = [mark for mark in kept if mark[1] == 1] if len(kept) > 8 else kept
-    ticks = tuple(Tick(value, _spelt(value, factor, k)) for value, factor, k in shown)
-    return Scale(kept[0][0], kept[-1][0], True, 0, ticks)
-
-
-def _spelt(value: float, factor: int, exponent: int) -> str:
-    """Return a round number, in powers of ten where it would be long."""
-    if -3 <= exponent <= 3:
-        return f"{value:g}"
-    return power(exponent) if factor == 1 else f"{factor}×{power(exponent)}"
+    ticks = []
+    for value, factor, k in shown:
+        long = power(k) if factor == 1 else f"{factor}×{power(k)}"
+        ticks.append(Tick(value, f"{value:g}" if -3 <= k <= 3 else long))
+    return Scale(kept[0][0], kept[-1][0], True, 0, tuple(ticks))
 
 
 def spanning(series: Sequence[ArrayLike], *, zero: bool = True, log: bool | None = None) -> Scale:
@@ -157,6 +137,10 @@ FAR = 3.0
 
 ROW, BAR = 40, 11
 """Height of a bar's row, and of the bar [pixel]."""
+
+
+Box = tuple[float, float, float, float]
+"""Left, top, right, bottom [pixel]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -197,14 +181,7 @@ class Plot:
             self._add("path", "", d=path_data([*there, *back]) + "Z", class_=f"band {kind}")
 
     def steps(self, edges: ArrayLike, heights: ArrayLike, kind: str, title: str = "") -> None:
-        """Draw a histogram's outline.
-
-        Args:
-            edges: edges of the bins, shape [bin + 1].
-            heights: height of each bin, shape [bin].
-            kind: classes of the mark.
-            title: shown under the pointer.
-        """
+        """Draw a histogram's outline; there is one edge more than heights."""
         x = np.repeat(np.asarray(edges, np.float64), 2)[1:-1]
         self.line(x, np.repeat(np.asarray(heights, np.float64), 2), f"steps {kind}", title)
 
@@ -249,9 +226,7 @@ class Plot:
                 mark = tag("a", *drawn, class_=kind, href=spot.href, aria_label=spot.said)
             self._marks.append(mark)
 
-    def _name_beside(
-        self, name: str, x: float, y: float, taken: list[tuple[float, float, float, float]]
-    ) -> list[Markup]:
+    def _name_beside(self, name: str, x: float, y: float, taken: list[Box]) -> list[Markup]:
         """Return the name of a dot in the first free place around it, none where there is none."""
         width = sum(9.0 if letter.isupper() else 6.4 for letter in name)
         tries = [
@@ -263,35 +238,18 @@ class Plot:
             left = x + right - width * end
             box = (left, y + down - 11, left + width, y + down + 3)
             inside = box[0] >= 0 and box[2] <= self._across and box[1] >= 0 and box[3] <= self._up
-            others = [one for one in taken if not (one[0] <= x <= one[2] and one[1] <= y <= one[3])]
-            if inside and not any(_meet(box, one) for one in others):
+            touched = any(
+                box[0] < one[2] and box[2] > one[0] and box[1] < one[3] and box[3] > one[1]
+                for one in taken
+                if not (one[0] <= x <= one[2] and one[1] <= y <= one[3])
+            )
+            if inside and not touched:
                 taken.append(box)
                 return [_text(name, x + right, y + down, anchors[end])]
         return []
 
     def svg(self, title: str, description: str) -> Markup:
-        """Return the chart."""
-        area = tag(
-            "svg",
-            tag("g", *self._marks, transform=f"translate({MARGIN} {MARGIN})"),
-            x=LEFT - MARGIN,
-            y=TOP - MARGIN,
-            width=self._across + 2 * MARGIN,
-            height=self._up + 2 * MARGIN,
-        )
-        return _canvas(self._height, title, description, *self._axes(), area, linked=self._linked)
-
-    def _add(self, name: str, title: str, **attributes: object) -> None:
-        self._marks.append(tag(name, *([tag("title", title)] if title else []), **attributes))
-
-    def _columns(self, x: ArrayLike) -> NDArray[np.float64]:
-        return np.clip(self._x.share(x), -FAR, FAR) * self._across
-
-    def _rows(self, y: ArrayLike) -> NDArray[np.float64]:
-        return (1.0 - np.clip(self._y.share(y), -FAR, FAR)) * self._up
-
-    def _axes(self) -> list[Markup]:
-        """Return grid lines, tick labels and the names of the axes."""
+        """Return the chart: grid lines, tick labels, the names of the axes, and the marks."""
         bottom, right = TOP + self._up, WIDTH - RIGHT
         drawn = []
         for tick in self._y.ticks:
@@ -306,7 +264,24 @@ class Plot:
         x_label, y_label = self._labels
         drawn.append(_text(_with_factor(x_label, self._x), right, self._height - 5, "label end"))
         drawn.append(_text(_with_factor(y_label, self._y), 2, 14, "label"))
-        return drawn
+        area = tag(
+            "svg",
+            tag("g", *self._marks, transform=f"translate({MARGIN} {MARGIN})"),
+            x=LEFT - MARGIN,
+            y=TOP - MARGIN,
+            width=self._across + 2 * MARGIN,
+            height=self._up + 2 * MARGIN,
+        )
+        return _canvas(self._height, title, description, *drawn, area, linked=self._linked)
+
+    def _add(self, name: str, title: str, **attributes: object) -> None:
+        self._marks.append(tag(name, *([tag("title", title)] if title else []), **attributes))
+
+    def _columns(self, x: ArrayLike) -> NDArray[np.float64]:
+        return np.clip(self._x.share(x), -FAR, FAR) * self._across
+
+    def _rows(self, y: ArrayLike) -> NDArray[np.float64]:
+        return (1.0 - np.clip(self._y.share(y), -FAR, FAR)) * self._up
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -336,30 +311,19 @@ def bar_chart(bars: Sequence[Bar], scale: Scale, label: str, title: str, descrip
         drawn.append(_text(tick.label, column, bottom + 16, "tick middle"))
     zero = place(0.0) if not scale.log else left
     for number, bar in enumerate(bars):
-        drawn += _bar(bar, number * ROW + 19, zero, place)
+        top, name = number * ROW + 19, tag("tspan", bar.label, class_="strong" if bar.bold else None)
+        value = tag("tspan", f"  {bar.written}", class_="value")
+        drawn.append(tag("text", name, value, x=14, y=top - 5, class_="name"))
+        if np.isfinite(bar.value):
+            low, high = sorted((zero, place(bar.value)))
+            box = {"x": f"{low:.1f}", "y": top, "width": f"{max(high - low, 1.0):.1f}", "height": BAR}
+            drawn.append(tag("rect", **box, class_=f"bar {bar.kind}"))
+        points = [(place(value), top + BAR / 2) for value in bar.dots if np.isfinite(value)]
+        if points:
+            drawn.append(tag("path", d="".join(path_data([p]) for p in points), class_="dots on"))
     drawn.append(tag("path", d=path_data([(zero, 4), (zero, bottom)]), class_="axis"))
     drawn.append(_text(_with_factor(label, scale), WIDTH - right, bottom + 34, "label end"))
     return _canvas(bottom + 40, title, description, *drawn)
-
-
-def _bar(bar: Bar, top: int, zero: float, place: object) -> list[Markup]:
-    at = place if callable(place) else float
-    name = tag("tspan", bar.label, class_="strong" if bar.bold else None)
-    value = tag("tspan", f"  {bar.written}", class_="value")
-    drawn = [tag("text", name, value, x=14, y=top - 5, class_="name")]
-    if np.isfinite(bar.value):
-        low, high = sorted((zero, at(bar.value)))
-        box = {"x": f"{low:.1f}", "y": top, "width": f"{max(high - low, 1.0):.1f}", "height": BAR}
-        drawn.append(tag("rect", **box, class_=f"bar {bar.kind}"))
-    points = [(at(value), top + BAR / 2) for value in bar.dots if np.isfinite(value)]
-    if points:
-        drawn.append(tag("path", d="".join(path_data([p]) for p in points), class_="dots on"))
-    return drawn
-
-
-def _meet(one: tuple[float, float, float, float], other: tuple[float, float, float, float]) -> bool:
-    """Tell whether two boxes (left, top, right, bottom) overlap."""
-    return one[0] < other[2] and one[2] > other[0] and one[1] < other[3] and one[3] > other[1]
 
 
 def _canvas(height: int, title: str, description: str, *drawn: object, linked: bool = False) -> Markup:
