@@ -139,10 +139,6 @@ ROW, BAR = 40, 11
 """Height of a bar's row, and of the bar [pixel]."""
 
 
-Box = tuple[float, float, float, float]
-"""Left, top, right, bottom [pixel]."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class Spot:
     """A dot that has a name, and that the keyboard reaches."""
@@ -226,7 +222,9 @@ class Plot:
                 mark = tag("a", *drawn, class_=kind, href=spot.href, aria_label=spot.said)
             self._marks.append(mark)
 
-    def _name_beside(self, name: str, x: float, y: float, taken: list[Box]) -> list[Markup]:
+    def _name_beside(
+        self, name: str, x: float, y: float, taken: list[tuple[float, float, float, float]]
+    ) -> list[Markup]:
         """Return the name of a dot in the first free place around it, none where there is none."""
         width = sum(9.0 if letter.isupper() else 6.4 for letter in name)
         tries = [
@@ -238,18 +236,35 @@ class Plot:
             left = x + right - width * end
             box = (left, y + down - 11, left + width, y + down + 3)
             inside = box[0] >= 0 and box[2] <= self._across and box[1] >= 0 and box[3] <= self._up
-            touched = any(
-                box[0] < one[2] and box[2] > one[0] and box[1] < one[3] and box[3] > one[1]
-                for one in taken
-                if not (one[0] <= x <= one[2] and one[1] <= y <= one[3])
-            )
-            if inside and not touched:
+            others = [one for one in taken if not (one[0] <= x <= one[2] and one[1] <= y <= one[3])]
+            if inside and not any(_meet(box, one) for one in others):
                 taken.append(box)
                 return [_text(name, x + right, y + down, anchors[end])]
         return []
 
     def svg(self, title: str, description: str) -> Markup:
-        """Return the chart: grid lines, tick labels, the names of the axes, and the marks."""
+        """Return the chart."""
+        area = tag(
+            "svg",
+            tag("g", *self._marks, transform=f"translate({MARGIN} {MARGIN})"),
+            x=LEFT - MARGIN,
+            y=TOP - MARGIN,
+            width=self._across + 2 * MARGIN,
+            height=self._up + 2 * MARGIN,
+        )
+        return _canvas(self._height, title, description, *self._axes(), area, linked=self._linked)
+
+    def _add(self, name: str, title: str, **attributes: object) -> None:
+        self._marks.append(tag(name, *([tag("title", title)] if title else []), **attributes))
+
+    def _columns(self, x: ArrayLike) -> NDArray[np.float64]:
+        return np.clip(self._x.share(x), -FAR, FAR) * self._across
+
+    def _rows(self, y: ArrayLike) -> NDArray[np.float64]:
+        return (1.0 - np.clip(self._y.share(y), -FAR, FAR)) * self._up
+
+    def _axes(self) -> list[Markup]:
+        """Return grid lines, tick labels and the names of the axes."""
         bottom, right = TOP + self._up, WIDTH - RIGHT
         drawn = []
         for tick in self._y.ticks:
@@ -264,24 +279,7 @@ class Plot:
         x_label, y_label = self._labels
         drawn.append(_text(_with_factor(x_label, self._x), right, self._height - 5, "label end"))
         drawn.append(_text(_with_factor(y_label, self._y), 2, 14, "label"))
-        area = tag(
-            "svg",
-            tag("g", *self._marks, transform=f"translate({MARGIN} {MARGIN})"),
-            x=LEFT - MARGIN,
-            y=TOP - MARGIN,
-            width=self._across + 2 * MARGIN,
-            height=self._up + 2 * MARGIN,
-        )
-        return _canvas(self._height, title, description, *drawn, area, linked=self._linked)
-
-    def _add(self, name: str, title: str, **attributes: object) -> None:
-        self._marks.append(tag(name, *([tag("title", title)] if title else []), **attributes))
-
-    def _columns(self, x: ArrayLike) -> NDArray[np.float64]:
-        return np.clip(self._x.share(x), -FAR, FAR) * self._across
-
-    def _rows(self, y: ArrayLike) -> NDArray[np.float64]:
-        return (1.0 - np.clip(self._y.share(y), -FAR, FAR)) * self._up
+        return drawn
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -311,19 +309,30 @@ def bar_chart(bars: Sequence[Bar], scale: Scale, label: str, title: str, descrip
         drawn.append(_text(tick.label, column, bottom + 16, "tick middle"))
     zero = place(0.0) if not scale.log else left
     for number, bar in enumerate(bars):
-        top, name = number * ROW + 19, tag("tspan", bar.label, class_="strong" if bar.bold else None)
-        value = tag("tspan", f"  {bar.written}", class_="value")
-        drawn.append(tag("text", name, value, x=14, y=top - 5, class_="name"))
-        if np.isfinite(bar.value):
-            low, high = sorted((zero, place(bar.value)))
-            box = {"x": f"{low:.1f}", "y": top, "width": f"{max(high - low, 1.0):.1f}", "height": BAR}
-            drawn.append(tag("rect", **box, class_=f"bar {bar.kind}"))
-        points = [(place(value), top + BAR / 2) for value in bar.dots if np.isfinite(value)]
-        if points:
-            drawn.append(tag("path", d="".join(path_data([p]) for p in points), class_="dots on"))
+        drawn += _bar(bar, number * ROW + 19, zero, place)
     drawn.append(tag("path", d=path_data([(zero, 4), (zero, bottom)]), class_="axis"))
     drawn.append(_text(_with_factor(label, scale), WIDTH - right, bottom + 34, "label end"))
     return _canvas(bottom + 40, title, description, *drawn)
+
+
+def _bar(bar: Bar, top: int, zero: float, place: object) -> list[Markup]:
+    at = place if callable(place) else float
+    name = tag("tspan", bar.label, class_="strong" if bar.bold else None)
+    value = tag("tspan", f"  {bar.written}", class_="value")
+    drawn = [tag("text", name, value, x=14, y=top - 5, class_="name")]
+    if np.isfinite(bar.value):
+        low, high = sorted((zero, at(bar.value)))
+        box = {"x": f"{low:.1f}", "y": top, "width": f"{max(high - low, 1.0):.1f}", "height": BAR}
+        drawn.append(tag("rect", **box, class_=f"bar {bar.kind}"))
+    points = [(at(value), top + BAR / 2) for value in bar.dots if np.isfinite(value)]
+    if points:
+        drawn.append(tag("path", d="".join(path_data([p]) for p in points), class_="dots on"))
+    return drawn
+
+
+def _meet(one: tuple[float, float, float, float], other: tuple[float, float, float, float]) -> bool:
+    """Tell whether two boxes (left, top, right, bottom) overlap."""
+    return one[0] < other[2] and one[2] > other[0] and one[1] < other[3] and one[3] > other[1]
 
 
 def _canvas(height: int, title: str, description: str, *drawn: object, linked: bool = False) -> Markup:
