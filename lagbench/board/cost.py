@@ -91,11 +91,12 @@ def draw(marks: Sequence[Mark], solver: float | None, ranking: str, title: str) 
     """Return the figure of some marks, at least one."""
     reach = [mark.seconds for mark in marks] + ([solver] if solver else [])
     errors = [mark.error for mark in marks]
+    unit = METRICS[ranking].unit if ranking in METRICS else "1"
     plot = Plot(
         close_logarithmic(min(reach), NAME_ROOM * max(reach)),
         close_logarithmic(min(errors), max(errors)),
         x_label="time of a frame [s]",
-        y_label=words(ranking) + _unit(ranking),
+        y_label=words(ranking) + ("" if unit == "1" else f" [{unit}]"),
         height=HEIGHT,
     )
     if solver:
@@ -119,11 +120,6 @@ def draw(marks: Sequence[Mark], solver: float | None, ranking: str, title: str) 
     )
     beside = f"; the solver itself takes {text(solver)} s per frame" if solver else ""
     return plot.svg(title, f"{len(marks)} methods by processor time and {words(ranking)}{beside}.")
-
-
-def _unit(metric: str) -> str:
-    unit = METRICS[metric].unit if metric in METRICS else "1"
-    return "" if unit == "1" else f" [{unit}]"
 
 
 def cost_figure(tab: Tab) -> Markup:

@@ -3,7 +3,7 @@
 Everything but the score block is written by whoever submits; the score block is written by
 ``lagbench submit`` alone. Strangers write these files, so every text has a length, every
 number a range, links are http(s) and nothing else, and unknown keys are refused. Whether the
-maintainers scored the predictions again is said elsewhere: verified.py.
+maintainers scored the predictions again is said elsewhere: verified.yaml.
 """
 
 from __future__ import annotations
@@ -33,28 +33,9 @@ from lagbench.submission.budget import Budget, Track, track_of
 from .folder import Place, entry_path, score_paths, weights_path
 
 __all__ = [
-    "ID",
-    "LONGEST_ID",
-    "LONGEST_TEXT",
-    "MOST_SEEDS",
-    "PATTERNS",
-    "About",
-    "EntryBudget",
-    "Cost",
-    "DataSet",
-    "Date",
-    "Entry",
-    "Flag",
-    "Hash",
-    "Meta",
-    "Prediction",
-    "ScoreBlock",
-    "ScoredFile",
-    "Short",
-    "Status",
-    "Strict",
-    "Summary",
-    "Weights",
+    *("ID", "LONGEST_ID", "LONGEST_TEXT", "MOST_SEEDS", "PATTERNS", "About", "EntryBudget", "Cost"),
+    *("DataSet", "Date", "Entry", "Flag", "Hash", "Meta", "Prediction", "ScoreBlock", "ScoredFile"),
+    *("Short", "Status", "Strict", "Summary", "Weights"),
 ]
 
 ID = r"^[a-z0-9]+(-[a-z0-9]+)*$"

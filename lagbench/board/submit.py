@@ -306,7 +306,21 @@ def _publish(
         files = tuple(map(scored_file, cards, staged, outside))
         kept = named_weights(place, [one.seed for one in made], sources)
         made = [one.model_copy(update={"weights": held}) for one, held in zip(made, kept, strict=True)]
-        entry = _entry(place, about, cards, made, files, staged)
+        header = cards[0].header
+        block = ScoreBlock(
+            lagbench=version("lagbench"),
+            dataset_sha256=header.dataset_sha256,
+            ranking_metric=cards[0].ranking,
+            files=files,
+            metrics=summarise(combine([read_stored(target).scores for target in staged])),
+        )
+        held = {name: getattr(about, name) for name in About.model_fields}
+        held |= dict(zip(("format", "split", "size", "method"), (2, *place), strict=True))
+        held["dataset"] = DataSet(version=header.dataset_version, sha256=header.dataset_sha256)
+        entry, mistakes = examine(Entry, {**held, "predictions": tuple(made), "score": block})
+        if entry is None:
+            fix = "say it otherwise in --from meta.yaml; docs/submitting.md describes the keys"
+            raise ChecksFailedError("the entry does not fit the schema", got=listed(mistakes), fix=fix)
         for source, name in zip(staged, names, strict=True):
             (folder.path / name).parent.mkdir(parents=True, exist_ok=True)
             os.replace(source, folder.path / name)
@@ -329,33 +343,6 @@ def _publish(
         board=folder.path,
         files=(*filter(Path.is_file, (folder.path / name for name in (yaml_path, *entry.files))), *floors),
     )
-
-
-def _entry(
-    place: Place,
-    about: About,
-    cards: Sequence[ScoreCard],
-    made: Sequence[Prediction],
-    files: tuple[ScoredFile, ...],
-    staged: Sequence[Path],
-) -> Entry:
-    """Return the entry with the score block that follows from the score files."""
-    header = cards[0].header
-    block = ScoreBlock(
-        lagbench=version("lagbench"),
-        dataset_sha256=header.dataset_sha256,
-        ranking_metric=cards[0].ranking,
-        files=files,
-        metrics=summarise(combine([read_stored(target).scores for target in staged])),
-    )
-    held = {name: getattr(about, name) for name in About.model_fields}
-    held |= dict(zip(("format", "split", "size", "method"), (2, *place), strict=True))
-    held["dataset"] = DataSet(version=header.dataset_version, sha256=header.dataset_sha256)
-    entry, mistakes = examine(Entry, {**held, "predictions": tuple(made), "score": block})
-    if entry is None:
-        fix = "say it otherwise in --from meta.yaml; docs/submitting.md describes the keys"
-        raise ChecksFailedError("the entry does not fit the schema", got=listed(mistakes), fix=fix)
-    return entry
 
 
 def scored_file(card: ScoreCard, path: Path, outside: float | None = None) -> ScoredFile:
