@@ -64,57 +64,37 @@ def test_what_only_adds_touches_nobody(own: BoardBench) -> None:
     assert touched(own) == {}
 
 
-CHANGES: dict[str, tuple[Callable[[BoardBench], object], set[str], str]] = {
-    "removed": (lambda b: b.entry("noisy").unlink(), {f"{PLACE}/noisy.yaml"}, "removed"),
-    "touched": (
-        lambda b: b.edit("noisy", lambda h: h.update(notes="other")),
-        {f"{PLACE}/noisy.yaml"},
-        "other notes",
-    ),
+NOISY, DAMPED = f"{PLACE}/noisy.yaml", f"{SCORES}/damped_3.nc"
+
+CHANGES: dict[str, tuple[Callable[[BoardBench], object], str, str]] = {
+    "removed": (lambda b: b.entry("noisy").unlink(), NOISY, "removed"),
+    "touched": (lambda b: b.edit("noisy", lambda h: h.update(notes="other")), NOISY, "other notes"),
     "superseded": (
         lambda b: b.edit("noisy", lambda h: h.update(status="superseded", superseded_by="damped")),
-        {f"{PLACE}/noisy.yaml"},
-        "superseded_by None -> 'damped'",
+        *(NOISY, "superseded_by None -> 'damped'"),
     ),
     "withdrawn": (
         lambda b: b.edit("noisy", lambda h: h.update(status="withdrawn")),
-        {f"{PLACE}/noisy.yaml"},
-        "status None -> 'withdrawn'",
+        *(NOISY, "status None -> 'withdrawn'"),
     ),
-    "scores changed": (
-        lambda b: (b.folder / SCORES / "damped_3.nc").write_bytes(b"x"),
-        {f"{SCORES}/damped_3.nc"},
-        "changed",
-    ),
-    "scores removed": (
-        lambda b: (b.folder / SCORES / "damped_3.nc").unlink(),
-        {f"{SCORES}/damped_3.nc"},
-        "removed",
-    ),
+    "scores changed": (lambda b: (b.folder / DAMPED).write_bytes(b"x"), DAMPED, "changed"),
+    "scores removed": (lambda b: (b.folder / DAMPED).unlink(), DAMPED, "removed"),
     "a seed added": (
         lambda b: shutil.copyfile(b.folder / SCORES / "noisy.nc", b.folder / SCORES / "damped_9.nc"),
-        {f"{SCORES}/damped_9.nc"},
-        "added",
+        *(f"{SCORES}/damped_9.nc", "added"),
     ),
     "made a link": (
         lambda b: (b.entry("noisy").unlink(), b.entry("noisy").symlink_to("damped.yaml")),
-        {f"{PLACE}/noisy.yaml"},
-        "link",
+        *(NOISY, "link"),
     ),
-    "made a bomb": (
-        lambda b: b.entry("noisy").write_text("a: &a [x]\nb: *a\n"),
-        {f"{PLACE}/noisy.yaml"},
-        "another content",
-    ),
+    "made a bomb": (lambda b: b.entry("noisy").write_text("a: &a [x]\nb: *a\n"), NOISY, "another content"),
     "verified claimed": (
-        lambda b: (b.folder / "verified.yaml").write_text(f"{PLACE}/noisy.yaml: x\n"),
-        {"verified.yaml"},
-        "changed",
+        lambda b: (b.folder / "verified.yaml").write_text(f"{NOISY}: x\n"),
+        *("verified.yaml", "changed"),
     ),
     "floors changed": (
         lambda b: (b.folder / "floors/cavity/tiny/persistence.nc").unlink(),
-        {"floors/cavity/tiny/persistence.nc"},
-        "removed",
+        *("floors/cavity/tiny/persistence.nc", "removed"),
     ),
 }
 
@@ -127,9 +107,8 @@ def test_what_touches_others_is_named(name: str, own: BoardBench) -> None:
     here = touched(own)
     commit(own)
     for found in (here, touched(own)):
-        assert found
-        assert set(found) <= where
-        assert all(got in said for said in found.values())
+        assert set(found) == {where}
+        assert got in found[where]
 
 
 def test_ones_own_may_be_altered(own: BoardBench) -> None:

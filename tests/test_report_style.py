@@ -1,4 +1,4 @@
-"""Colours of the report: enough contrast, and apart for colour-blind readers."""
+"""Colours of report and pictures: enough contrast, and apart for colour-blind readers."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from importlib.resources import files
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+
+from lagbench.draw.style import MATERIAL_COLOURS
 
 Colour = NDArray[np.float64]
 
@@ -34,15 +36,19 @@ CVD = {
 SHEET = files("lagbench.report").joinpath("style.css").read_text("utf-8")
 
 
+def linear(digits: str) -> Colour:
+    """Return a colour of six hexadecimal digits in linear RGB."""
+    srgb = np.frombuffer(bytes.fromhex(digits), np.uint8) / 255.0
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
 def scheme(dark: bool) -> dict[str, Colour]:
     """Return the colours of the light or the dark scheme in linear RGB, by name."""
     light, after = SHEET.split("@media (prefers-color-scheme:dark)")
     text = after.split("}}")[0] if dark else light
     found = {}
     for name, value in re.findall(r"--([a-z0-9]+):#([0-9a-f]{3,6})[;}]", text + "}"):
-        digits = value if len(value) == 6 else "".join(2 * digit for digit in value)
-        srgb = np.frombuffer(bytes.fromhex(digits), np.uint8) / 255.0
-        found[name] = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+        found[name] = linear(value if len(value) == 6 else "".join(2 * digit for digit in value))
     return found
 
 
@@ -83,6 +89,14 @@ def test_series_stay_apart(dark: bool, deficiency: str) -> None:
     seen = [lab(np.array(CVD[deficiency]) @ colours[f"c{k}"]) for k in range(6)]
     for (i, one), (k, two) in itertools.combinations(enumerate(seen), 2):
         assert np.linalg.norm(one - two) >= 10.0, (i, k)
+
+
+@pytest.mark.parametrize("vision", CVD)
+def test_materials_stay_apart(vision: str) -> None:
+    """For colour-blind readers any two materials differ by 0.2 of the RGB cube's side at least."""
+    seen = [np.clip(np.array(CVD[vision]) @ linear(c.removeprefix("#")), 0.0, 1.0) for c in MATERIAL_COLOURS]
+    back = [np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1 / 2.4) - 0.055) for c in seen]
+    assert min(np.linalg.norm(one - two) for one, two in itertools.combinations(back, 2)) > 0.2
 
 
 @pytest.mark.parametrize("dark", [False, True])
