@@ -39,8 +39,7 @@ __all__ = ["TOLERANCE", "Confirmation", "Rescoring", "check_base", "farthest"]
 TOLERANCE = 1e-6
 """Relative difference up to which two numbers are equal; NumPy versions may differ in the last bits."""
 
-FILM_STEP = (FILM_RANGE[1] - FILM_RANGE[0]) / LEVELS
-"""Step of packed film positions [length]."""
+FILM_STEP = (FILM_RANGE[1] - FILM_RANGE[0]) / LEVELS  # step of packed film positions [length]
 
 
 @dataclass(frozen=True)
@@ -195,8 +194,7 @@ def _listed(names: Sequence[str]) -> str:
     return f"other {', '.join(names[:5])}{more}"
 
 
-KEYS = ("status", "superseded_by")
-"""Keys of an entry that decide whether and how it stands on the board."""
+KEYS = ("status", "superseded_by")  # keys of an entry that decide whether and how it stands on the board
 
 
 def check_base(folder: Folder, base: str, own: Collection[str]) -> Iterator[Finding]:

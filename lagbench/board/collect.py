@@ -48,19 +48,13 @@ CURVES = (
 )
 """Metrics that details have curves of, beside the ranking one."""
 
-TRIAL = "tiny"
-"""The size for trying out: nobody is asked to submit to it."""
+TRIAL = "tiny"  # the size for trying out: nobody is asked to submit to it
 
 ENERGIES = ("energy_true", "energy_predicted")
 
-TRUTH, PREDICTION = 0, 1
-"""Sides of a preview."""
-
-CURVE_FRAMES = 120
-"""Most frames of a curve."""
-
-RESIDUAL_BINS = 41
-"""Bins of the histogram of residuals; odd, so that one holds 0."""
+TRUTH, PREDICTION = 0, 1  # sides of a preview
+CURVE_FRAMES = 120  # most frames of a curve
+RESIDUAL_BINS = 41  # bins of the histogram of residuals; odd, so that one holds 0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

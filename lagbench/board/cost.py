@@ -28,8 +28,7 @@ HEIGHT = 330
 
 COARSE = "coarse-solver"
 
-NAME_ROOM = 8.0
-"""The axis of time reaches so many times the dearest, so that its name has a place beside it."""
+NAME_ROOM = 8.0  # the axis of time reaches so many times the dearest, so that its name has a place beside it
 
 STYLE = """
 .chart{background:#fff;font-family:system-ui,sans-serif}.chart text{font-size:12px;fill:#1c2330}

@@ -59,8 +59,7 @@ LONGEST_ID = 60
 LONGEST_TEXT = 1000
 MOST_SEEDS = 20
 MOST_BYTES = 2**40
-MOST_MARKS = 3
-"""Combining marks on one letter; no script needs more, piles of them cover the neighbours."""
+MOST_MARKS = 3  # combining marks on one letter; no script needs more, piles of them cover the neighbours
 
 BLANKS = frozenset("\u115f\u1160\u2800\u3164\uffa0")
 """Letters and symbols that show nothing, though Unicode counts them as printable."""

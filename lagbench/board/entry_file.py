@@ -36,8 +36,7 @@ __all__ = [
 MAX_ENTRY_BYTES = 64_000
 """Longest YAML file of an entry [bytes]; twenty seeds and all metrics take half of it."""
 
-MOST_MISTAKES = 20
-"""Mistakes of one file that are told."""
+MOST_MISTAKES = 20  # mistakes of one file that are told
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -31,11 +31,8 @@ from .sections import empty, lede, navigation, overview, section, stage
 
 __all__ = ["BUDGET", "FEWEST", "LINKS", "BuildResult", "build", "render"]
 
-BUDGET = 30_000
-"""Bytes that an entry shall take, all in all; more only where its coarsest data need them."""
-
-FEWEST = 50
-"""Fewer entries than these share what so many may take, 1.5 MB."""
+BUDGET = 30_000  # bytes that an entry shall take, all in all; more only where its coarsest data need them
+FEWEST = 50  # fewer entries than these share what so many may take, 1.5 MB
 
 SCRIPTS = (
     *("codec", "text", "scale", "chart", "state", "table"),

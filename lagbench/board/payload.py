@@ -59,17 +59,10 @@ FINENESS = (
 DIGITS = np.frombuffer(b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789-_", np.uint8)
 """Letters that need no escape in HTML, JSON or a URL."""
 
-LEVELS = 4094
-"""Greatest packed value."""
-
-MISSING = 4095
-"""What stands for NaN."""
-
-DEEPEST = 1e-9
-"""A logarithmic range reaches no lower than this share of its top."""
-
-MOST_STEPS = 31
-"""Steps of a film's letter to either side of where a particle was going."""
+LEVELS = 4094  # greatest packed value
+MISSING = 4095  # what stands for NaN
+DEEPEST = 1e-9  # a logarithmic range reaches no lower than this share of its top
+MOST_STEPS = 31  # steps of a film's letter to either side of where a particle was going
 
 Packed = list[str | float | int]
 """Text, least value, greatest value, and 1 where the steps are those of the logarithm."""

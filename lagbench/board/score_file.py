@@ -32,11 +32,8 @@ from lagbench.work.process import in_child
 
 __all__ = ["MAX_SCORE_BYTES", "Stored", "read_stored", "reported_frames", "unreadable_in_child"]
 
-MAX_SCORE_BYTES = 1_000_000
-"""Longest score file [bytes]."""
-
-MAX_UNPACKED = 32 << 20
-"""Most that a score file may unpack to [bytes]; the largest of ours takes 3 MB."""
+MAX_SCORE_BYTES = 1_000_000  # longest score file [bytes]
+MAX_UNPACKED = 32 << 20  # most that a score file may unpack to [bytes]; the largest of ours takes 3 MB
 
 MAX_STATISTICS = 500
 
@@ -44,16 +41,12 @@ GROUP = "preview"
 STRUCTURE = Structure(members=40, groups=(GROUP,), unpacked=MAX_UNPACKED)
 """What a score file may hold: plain numbers of its own, in one group beside the root."""
 
-CPU_SECONDS = 10.0
-"""Computing time of the child for every 50 files, its start aside [s]."""
+CPU_SECONDS = 10.0  # computing time of the child for every 50 files, its start aside [s]
 
 FILES_PER_PART = 50
 
-MOST_STOPS = 5
-"""Files that may stop a child before the rest is left unread: each costs a child's whole time."""
-
-WALL_SECONDS = 600.0
-"""Time for every 50 files together [s]; a busy machine may need minutes."""
+MOST_STOPS = 5  # files that may stop a child before the rest is left unread: each costs a child's whole time
+WALL_SECONDS = 600.0  # time for every 50 files together [s]; a busy machine may need minutes
 
 UNREAD = "not read, because too many others had to be stopped or took all the time allowed"
 

@@ -57,11 +57,8 @@ from .weights import copy_weights, named_weights, require_weights
 
 __all__ = ["BOARD", "SubmitResult", "scored_file", "submit"]
 
-BOARD = Path("leaderboard")
-"""The leaderboard's folder, from the root of the repository."""
-
-OUTSIDE = "in_domain"
-"""The warning that comes with a share of the positions."""
+BOARD = Path("leaderboard")  # the leaderboard's folder, from the root of the repository
+OUTSIDE = "in_domain"  # the warning that comes with a share of the positions
 
 STAGE = ".submit-"
 """First letters of the folder in which score files are prepared; a killed process leaves it behind."""

@@ -20,8 +20,7 @@ from .payload import rounded
 
 __all__ = ["EXPLAINED", "draw_table"]
 
-MEAN_DIGITS = 9
-"""Significant digits of means, as in scores.json."""
+MEAN_DIGITS = 9  # significant digits of means, as in scores.json
 
 MOST_REASONS = 4
 """Reasons of a warning that are told; those of other scenarios say the same with other numbers."""

@@ -26,8 +26,7 @@ __all__ = ["MOST_BYTES", "check_weights", "copy_weights", "named_weights", "requ
 MOST_BYTES = 40_000_000
 """All weights of a leaderboard together [bytes]: git keeps every version of them for good."""
 
-MOST_RECORD = 256 << 10
-"""Longest record of a training beside its weights [bytes]; those of ours take 3 kB."""
+MOST_RECORD = 256 << 10  # longest record of a training beside its weights [bytes]; those of ours take 3 kB
 
 RECORD = "training.json"
 

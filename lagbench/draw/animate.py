@@ -151,11 +151,8 @@ def _level(share: NDArray[np.float64], levels: int) -> NDArray[np.intp]:
     return np.clip(share * levels, 0, levels - 1).astype(np.intp)
 
 
-SUFFIXES = (".mp4", ".gif")
-"""Endings of the files that can be written."""
-
-Write = Callable[[NDArray[np.uint8]], None]
-"""Appends one frame: RGB bytes, shape [row, column, 3]."""
+SUFFIXES = (".mp4", ".gif")  # endings of the files that can be written
+Write = Callable[[NDArray[np.uint8]], None]  # appends one frame: RGB bytes, shape [row, column, 3]
 
 _CODING = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "20", "-preset", "veryfast"]
 _CONTAINER = ["-f", "mp4", "-movflags", "+faststart", "-map_metadata", "-1"]
@@ -229,14 +226,9 @@ def _gif(path: Path, rate: float) -> Iterator[Write]:
         file.write(b";")
 
 
-KINDS = (Panel.SPEED, Panel.MATERIAL, Panel.VORTICITY)
-"""What an animation can show."""
-
-SLOWEST, FASTEST = 0.01, 1000.0
-"""Frames per second that every player and both formats can hold [1/s]."""
-
-SAMPLES = 12
-"""Frames that set the colour scale, spread over the scenario."""
+KINDS = (Panel.SPEED, Panel.MATERIAL, Panel.VORTICITY)  # what an animation can show
+SLOWEST, FASTEST = 0.01, 1000.0  # frames per second that every player and both formats can hold [1/s]
+SAMPLES = 12  # frames that set the colour scale, spread over the scenario
 
 SIDE, GAP, MARGIN, TOP, BOTTOM = 512, 24, 24, 84, 76  # [pixel]; all even, as video coding wants it
 BAR = 300  # length of the colour bar [pixel]

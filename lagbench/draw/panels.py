@@ -55,11 +55,8 @@ UNITS = {
 }
 """What colour bars say: physical time throughout, as velocity in the files."""
 
-DOT = 1.25
-"""Diameter of a drawn particle in particle spacings: neighbours overlap a little."""
-
-MOST_DOTS = 1 << 16
-"""Particles drawn at the most; more would take memory and no eye would tell."""
+DOT = 1.25  # diameter of a drawn particle in particle spacings: neighbours overlap a little
+MOST_DOTS = 1 << 16  # particles drawn at the most; more would take memory and no eye would tell
 
 FEW_NODES = 4
 _ALONG = np.array(

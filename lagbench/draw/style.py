@@ -98,8 +98,7 @@ def _cut(name: str, low: float, high: float, levels: int) -> ListedColormap:
     return cut
 
 
-ENDINGS = (".png", ".pdf", ".svg")
-"""Endings of files that pictures can be."""
+ENDINGS = (".png", ".pdf", ".svg")  # endings of files that pictures can be
 
 DPI = 128  # a power of two: every whole number of pixels is exact in inches
 

@@ -22,14 +22,9 @@ __all__ = [
 
 Floats = NDArray[np.float64]
 
-Series = Sequence[tuple[str, str, Floats]]
-"""Label, classes and values over frames of each line."""
-
-STABLE = 0.8
-"""Correlation below which a rollout no longer counts as stable."""
-
-TOLERATED = 3.0
-"""The axis of energies reaches so many times the truth's greatest; what is beyond is cut off."""
+Series = Sequence[tuple[str, str, Floats]]  # label, classes and values over frames of each line
+STABLE = 0.8  # correlation below which a rollout no longer counts as stable
+TOLERATED = 3.0  # the axis of energies reaches so many times the truth's greatest; what is beyond is cut off
 
 
 def error_curves(subject: Subject) -> Iterator[Figure]:
@@ -272,11 +267,8 @@ def bar_figures(subject: Subject) -> Iterator[Figure]:
 BINS = 40
 FEWEST_BINS = 10
 
-MOST_DOTS = 1600
-"""Of more nodes evenly many are drawn."""
-
-FAR_QUANTILE = 0.5
-"""Axes leave out this share of the nodes at either end [%]."""
+MOST_DOTS = 1600  # Of more nodes evenly many are drawn
+FAR_QUANTILE = 0.5  # axes leave out this share of the nodes at either end [%]
 
 
 def histogram_figures(subject: Subject, gallery: Gallery) -> Iterator[Figure]:

@@ -25,17 +25,10 @@ __all__ = ["Stream", "arrow_figures", "stream_figures", "streamlines"]
 
 Floats = NDArray[np.float64]
 
-STEP = 0.4
-"""Length of a step in node distances."""
-
-SLOW = 1e-3
-"""Lines end where the speed falls below this share of the greatest."""
-
-SHORTEST = 3.0
-"""Lines shorter than this many node distances are left out."""
-
-MOST_STEPS = 400
-"""Steps of one line in either direction."""
+STEP = 0.4  # length of a step in node distances
+SLOW = 1e-3  # lines end where the speed falls below this share of the greatest
+SHORTEST = 3.0  # lines shorter than this many node distances are left out
+MOST_STEPS = 400  # steps of one line in either direction
 
 
 @dataclass(frozen=True)
@@ -131,17 +124,10 @@ def _cell(x: float, y: float, scale: float) -> tuple[int, int]:
 LEVELS = 6
 """Colours of speed, classes ``q0`` .. ``q5`` of the style sheet."""
 
-ARROWS = 18
-"""Most arrows across."""
-
-LONGEST = 1.7
-"""Length of an arrow of the scale's top, in distances between arrows."""
-
-HEAD = 0.32
-"""Length of its head, as a share of the arrow."""
-
-MOST = 3
-"""Entries that are drawn: lines take room."""
+ARROWS = 18  # most arrows across
+LONGEST = 1.7  # length of an arrow of the scale's top, in distances between arrows
+HEAD = 0.32  # length of its head, as a share of the arrow
+MOST = 3  # entries that are drawn: lines take room
 
 
 def arrow_figures(subject: Subject, gallery: Gallery) -> Iterator[Figure]:

@@ -19,11 +19,8 @@ __all__ = [
     *("power", "quantity", "sentence", "tag", "text", "unit", "words"),
 ]
 
-VOID = frozenset({"br", "col", "hr", "img", "link", "meta"})
-"""Elements of HTML without an end tag."""
-
-SHAPES = frozenset({"circle", "line", "path", "rect", "stop", "use"})
-"""Elements of SVG that close themselves."""
+VOID = frozenset({"br", "col", "hr", "img", "link", "meta"})  # elements of HTML without an end tag
+SHAPES = frozenset({"circle", "line", "path", "rect", "stop", "use"})  # elements of SVG that close themselves
 
 _ESCAPES = {ord("&"): "&amp;", ord("<"): "&lt;", ord(">"): "&gt;", ord('"'): "&quot;", ord("'"): "&#39;"}
 _UNPRINTABLE = dict.fromkeys((*range(9), 11, 12, *range(14, 32), *range(127, 160)), "�")
@@ -92,14 +89,9 @@ def _short(value: float) -> str:
     return "0" if text == "-0" else text
 
 
-MISSING = "–"
-"""What stands where there is no number."""
-
-DIGITS = 3
-"""Significant digits."""
-
-PLAIN = (-3, 5)
-"""Powers of ten between which numbers are written out."""
+MISSING = "–"  # what stands where there is no number
+DIGITS = 3  # significant digits
+PLAIN = (-3, 5)  # powers of ten between which numbers are written out
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 

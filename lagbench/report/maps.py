@@ -34,14 +34,9 @@ Bytes = NDArray[np.uint8]
 CLOCKWISE, COUNTER, FAST = "#0072b2", "#d55e00", "#009e73"
 """Colours of negative and positive values and of great magnitudes (Okabe & Ito 2008)."""
 
-LEVELS = 100
-"""Steps of opacity on either side of 0."""
-
-NOTHING = 2 * LEVELS + 1
-"""Entry of the palette for nodes without a value."""
-
-VOID = (128, 128, 128, 34)
-"""Their red, green, blue and opacity."""
+LEVELS = 100  # steps of opacity on either side of 0
+NOTHING = 2 * LEVELS + 1  # entry of the palette for nodes without a value
+VOID = (128, 128, 128, 34)  # their red, green, blue and opacity
 
 
 def encode(index: Bytes, palette: Bytes) -> bytes:
@@ -90,8 +85,7 @@ def _ramp(below: str, above: str) -> Bytes:
 _DIVERGING, _SEQUENTIAL = _ramp(CLOCKWISE, COUNTER), _ramp(FAST, FAST)
 
 
-TOP = 99.5
-"""Full colour is the percentile of the truth's magnitudes."""
+TOP = 99.5  # full colour is the percentile of the truth's magnitudes
 
 
 def inside(task: ScoredTask, field: Floats) -> Floats:
@@ -232,17 +226,10 @@ def _vorticity(pair: FramePair) -> Floats:
     return np.where(pair.nodes, pair.predicted_fields.vorticity, np.nan)
 
 
-SIDE = 176
-"""Side of a painted panel [pixel]."""
-
-FINE = 3
-"""Panels are painted so many times larger and averaged, which smooths the rims of the dots."""
-
-DOT = 1.3
-"""Diameter of a dot in particle distances."""
-
-ROWS = 24
-"""Most rows of panels on the page; more would make it too heavy."""
+SIDE = 176  # side of a painted panel [pixel]
+FINE = 3  # panels are painted so many times larger and averaged, which smooths the rims of the dots
+DOT = 1.3  # diameter of a dot in particle distances
+ROWS = 24  # most rows of panels on the page; more would make it too heavy
 
 SHADES = FINE * FINE
 

@@ -114,8 +114,7 @@ def paragraph(*parts: object) -> Markup:
     return tag("p", join(parts))
 
 
-SIDE = 200
-"""Side of the coordinates of a vector panel."""
+SIDE = 200  # side of the coordinates of a vector panel
 
 
 def grid(

@@ -29,16 +29,14 @@ __all__ = [
     "subject_of",
 ]
 
-COLOURS = 6
-"""Series that differ in colour; further ones are dashed."""
+COLOURS = 6  # series that differ in colour; further ones are dashed
 
 THESIS_FRAMES = {"cavity": 54, "curl-noise": 40}
 """Frame at which the thesis compares models: 54, and 35 after the last of 6 given frames."""
 
 OTHER_FRAME = 60
 
-TIMES = 6
-"""Columns of the pictures over time."""
+TIMES = 6  # columns of the pictures over time
 
 SAME = ("split", "size", "dataset_version", "dataset_sha256")
 
