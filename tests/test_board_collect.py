@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from board_worlds import PLACE, BoardBench, copied, master
-from report_bench import noisy
+from made_up import PLACE, BoardBench, copied, master, noisy
 
 from lagbench.board.collect import CURVE_FRAMES, RESIDUAL_BINS, collect, curve, residuals
 from lagbench.board.model import Board, Row

@@ -8,7 +8,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from board_worlds import SCORES, BoardBench, copied
+from made_up import SCORES, BoardBench, copied
 
 from lagbench.board import score_file as isolation
 from lagbench.board.check import check_board

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from board_worlds import DAY, BoardBench, copied, nearer
-from report_bench import damped, motion, noisy, still
+from made_up import DAY, BoardBench, copied, damped, motion, nearer, noisy, still
 
 from lagbench import __version__
 from lagbench.board import submit as submitting

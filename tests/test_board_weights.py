@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from board_worlds import BoardBench, copied
-from report_bench import noisy
+from made_up import BoardBench, copied, noisy
 from simple_models import FACTS, Drift
 
 from lagbench.baselines.checkpoint import Checkpoint, save

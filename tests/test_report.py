@@ -16,9 +16,7 @@ import pytest
 from html_check import Reading, read_html
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
-from PIL import Image
-from report_bench import (
+from made_up import (
     METHODS,
     SPLITS,
     ReportBench,
@@ -30,6 +28,8 @@ from report_bench import (
     runaway,
     still,
 )
+from numpy.typing import NDArray
+from PIL import Image
 
 import lagbench.report
 from lagbench.data.grid import Grid, fields
