@@ -98,13 +98,13 @@ def collect(
                 fix="let split, size and method be those of the path",
             )
         size = described.size(entry.split, entry.size)
-        report(1)
         current = is_current(entry.dataset, size)
         try:
             stored = [read_stored(place.path / path, size) for path in entry.score_paths]
         except UnreadableFileError:
             if current:
                 raise
+            report(1)
             continue  # old scores that do not fit the task of today
         scores = combine([held.scores for held in stored])
         lacking = [name for name in (stored[0].scores.ranking, *ENERGIES) if name not in scores]
@@ -117,6 +117,7 @@ def collect(
             )
         held = _Held(entry=entry, current=current, stored=stored, scores=scores)
         found.setdefault((entry.split, entry.size), []).append(held)
+        report(1)
     verified, tabs, empty = read_verified(place), [], []
     for split, about in described.splits.items():
         for name in about.sizes:

@@ -101,35 +101,41 @@ def method_curves(subject: Subject) -> Iterator[Figure]:
 def energy_curves(subject: Subject) -> Iterator[Figure]:
     """Yield kinetic energy: what is kept of it (Fig. 5.19), and its value (Fig. 5.28)."""
     first, scenario = subject.entries[0].card.submission, subject.scenarios[0]
-    kept = [(r.name, r.kind, 100.0 * _mean(r.scores["energy_retention"])) for r in subject.rows]
+    true = ("truth", "truth", 100.0 * _mean(first["energy_retention_true"]))
+    yield _energy_figure(
+        subject,
+        "energy-kept",
+        "Kinetic energy kept",
+        "Fig. 5.19",
+        [true, *((r.name, r.kind, 100.0 * _mean(r.scores["energy_retention"])) for r in subject.rows)],
+        "kinetic energy [% of the last given frame]",
+        f"Kinetic energy relative to the last given frame, mean over {len(subject.scenarios)} test scenarios."
+        " A surrogate that damps falls below the truth, one that blows up rises above it;"
+        " more energy than the truth is no merit.",
+    )
     raw = [(e.name, e.kind, e.card.submission["energy_predicted"].per_frame[0]) for e in subject.entries]
-    for name, title, thesis, true, others, label, said in (
-        (
-            *("energy-kept", "Kinetic energy kept", "Fig. 5.19"),
-            *(100.0 * _mean(first["energy_retention_true"]), kept),
-            "kinetic energy [% of the last given frame]",
-            "Kinetic energy relative to the last given frame, mean over"
-            f" {len(subject.scenarios)} test scenarios."
-            " A surrogate that damps falls below the truth, one that blows up rises above it;"
-            " more energy than the truth is no merit.",
-        ),
-        (
-            *("energy-raw", f"Kinetic energy, scenario {scenario}", "Fig. 5.28"),
-            *(first["energy_true"].per_frame[0], raw),
-            "kinetic energy [mass length²/frame²]",
-            f"E = Σ m |u|² / 2 with u the displacement per frame, in scenario {scenario}.",
-        ),
-    ):
-        series = [("truth", "truth", true), *others]
-        top = np.nanmax(true, initial=0.0)
-        cut = [np.minimum(values, TOLERATED * top) if top > 0.0 else values for _, _, values in series]
-        plot = Plot(_frame_axis(subject), spanning(cut, log=False), x_label="frame", y_label=label)
-        _draw(subject, plot, series)
-        beyond = any(np.any(values > TOLERATED * top) for _, _, values in series) and top > 0.0
-        more = f" What exceeds {TOLERATED:g} times the truth's maximum is cut off." if beyond else ""
-        names = ", ".join(name for name, _, _ in series)
-        drawn = plot.svg(title, f"Kinetic energy over frames of {names}.")
-        yield _figure(subject, name, title, thesis, series, drawn, said + more)
+    yield _energy_figure(
+        subject,
+        "energy-raw",
+        f"Kinetic energy, scenario {scenario}",
+        "Fig. 5.28",
+        [("truth", "truth", first["energy_true"].per_frame[0]), *raw],
+        "kinetic energy [mass length²/frame²]",
+        f"E = Σ m |u|² / 2 with u the displacement per frame, in scenario {scenario}.",
+    )
+
+
+def _energy_figure(
+    subject: Subject, name: str, title: str, thesis: str, series: Series, label: str, said: str
+) -> Figure:
+    top = np.nanmax(series[0][2], initial=0.0)
+    cut = [np.minimum(values, TOLERATED * top) if top > 0.0 else values for _, _, values in series]
+    plot = Plot(_frame_axis(subject), spanning(cut, log=False), x_label="frame", y_label=label)
+    _draw(subject, plot, series)
+    beyond = any(np.any(values > TOLERATED * top) for _, _, values in series) and top > 0.0
+    more = f" What exceeds {TOLERATED:g} times the truth's maximum is cut off." if beyond else ""
+    drawn = plot.svg(title, f"Kinetic energy over frames of {', '.join(method for method, _, _ in series)}.")
+    return _figure(subject, name, title, thesis, series, drawn, said + more)
 
 
 def body_curves(subject: Subject) -> Iterator[Figure]:
