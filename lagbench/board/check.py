@@ -345,8 +345,8 @@ class _Look:
             self.found.append(finding_of("verified", error, VERIFIED))
             return
         sound = {entry.yaml_path.as_posix() for entry in entries if verification_of(entry, lines)}
-        for path in sorted(lines.keys() - sound):
-            self.add("verified", VERIFIED, ascii(path)[:120])
+        for named_path in sorted(lines.keys() - sound):
+            self.add("verified", VERIFIED, ascii(named_path)[:120])
 
 
 def _same(first: Summary | None, second: Summary | None) -> bool:
