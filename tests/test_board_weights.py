@@ -122,7 +122,10 @@ KEPT = "weights/cavity/tiny/drift_0"
 """Weights and record of a run, without their endings."""
 
 DAMAGE: dict[str, tuple[Callable[[BoardBench], object], str]] = {
-    "edited": (lambda b: (b.folder / f"{KEPT}.pt").open("ab").write(b"x"), "weights"),
+    "edited": (
+        lambda b: (file := b.folder / f"{KEPT}.pt").write_bytes(file.read_bytes()[:-1] + b"x"),
+        "weights",
+    ),
     "lost": (lambda b: (b.folder / f"{KEPT}.pt").unlink(), "weights"),
     "those of another method": (
         lambda b: b.edit(
