@@ -1,4 +1,4 @@
-"""Windows of a split as PyTorch tensors: data set, order and batches.
+"""Windows of a split as PyTorch tensors: data set, order and batches; rollouts of a model.
 
 >>> from torch.utils.data import DataLoader
 >>> from lagbench.torch import WindowDataset, WindowSampler, collate
@@ -11,8 +11,9 @@ the cache. Needs PyTorch: ``pip install 'lagbench[baselines]'``.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import Dataset, Sampler
 
+from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
 from lagbench.store.frames import CACHE_BYTES
 from lagbench.store.windows import Window as Arrays
@@ -30,10 +32,13 @@ __all__ = [
     "POOL_BYTES",
     "RUN",
     "Batch",
+    "Step",
     "Window",
     "WindowDataset",
     "WindowSampler",
     "collate",
+    "predict",
+    "roll_out",
     "tensors",
 ]
 
@@ -127,6 +132,20 @@ class Batch:
             if isinstance(value := getattr(self, field.name), Tensor)
         }
         return replace(self, **moved)
+
+    def followed_by(self, position: Tensor) -> Self:
+        """Return the windows one frame later: their first frame leaves, the given one joins.
+
+        Args:
+            position: particle positions of the frame after the last [length], shape [particle, 2].
+        """
+        walls = None if self.wall_velocity is None else self.wall_velocity[:, 1:]
+        return replace(
+            self,
+            position=torch.cat([self.position[:, 1:], position[:, None]], dim=1),
+            wall_velocity=walls,
+            frame=self.frame + 1,
+        )
 
 
 def collate(windows: Sequence[Window]) -> Batch:
@@ -237,3 +256,84 @@ def _cut(start: int, stop: int) -> list[NDArray[np.int64]]:
 def _permutation(rng: np.random.Generator, length: int) -> NDArray[np.intp]:
     """Return a random order; NumPy promises the same bits for `random` alone."""
     return np.argsort(rng.random(length), kind="stable")
+
+
+Step = Callable[[Batch], Tensor]
+"""A model: from windows of given frames to the positions of the next one [length], shape [particle, 2].
+
+``batch.wall_velocity[:, batch.frames]`` is what acts on the way there.
+"""
+
+
+def roll_out(step: Step, given: Batch, frames: int) -> Tensor:
+    """Feed a model with its own predictions; gradients pass through all frames.
+
+    Args:
+        step: the model.
+        given: the frames that it starts from, with the forcing of those to predict: windows of a
+            loader cut by ``batch.part(slice(history))``.
+        frames: frames to predict.
+
+    Returns:
+        Positions of the frames after the given ones [length], shape [particle, frame, 2].
+    """
+    predicted = []
+    for _ in range(frames):
+        position = step(given)
+        given = given.followed_by(position)
+        predicted.append(position)
+    return torch.stack(predicted, dim=1)
+
+
+def predict(
+    step: Step,
+    split: str,
+    *,
+    subset: str = "test",
+    size: str | None = None,
+    root: str | Path | None = None,
+    history: int | None = None,
+    registry: Registry | None = None,
+    device: torch.device | str = "cpu",
+) -> Iterator[tuple[int, NDArray[np.float32]]]:
+    """Roll a model out over every scenario of a subset, from the frames that the task gives.
+
+    ``dict(predict(...))`` is what `lagbench.submission.write` takes; `PredictionsWriter` takes one
+    scenario after the other. A network with dropout or batch norm is to be set to ``eval()`` before.
+
+    Args:
+        step: the model.
+        split: name of the split, or path of a local split's folder.
+        subset: train, valid, test or, for multimaterial, extra.
+        size: name of the size; the only one that is there when None.
+        root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
+        history: the last of the given frames that the model sees; all of them by default.
+        registry: what describes the data set; ours by default.
+        device: where the model is.
+
+    Yields:
+        Scenario id, and positions of the frames to predict [length], float32, shape
+        [frame, particle, 2].
+
+    Raises:
+        UsageError: unknown split, size or subset, or fewer frames are given than the model is to see.
+        DataError: scenarios are missing; the message has the command that makes them.
+    """
+    data = WindowDataset(split, subset=subset, size=size, root=root, future=0, registry=registry)
+    task = data.size.task
+    if history is not None and not 1 <= history <= task.input_frames:
+        raise UsageError(
+            "a model cannot see that many of the given frames",
+            where="predict",
+            expected=f"history from 1 to {task.input_frames}",
+            got=history,
+        )
+    seen = slice(task.input_frames - (history or task.input_frames), None)
+    for scenario, first in zip(data.scenarios, data.starts, strict=False):
+        _, walls = data.store.constants(scenario)
+        # The forcing is given for all frames, unlike the positions.
+        forcing = None if walls is None else torch.from_numpy(walls.copy())
+        given = collate([data[first]._replace(wall_velocity=forcing)]).part(seen).to(device)
+        with torch.no_grad():
+            positions = roll_out(step, given, task.horizon)
+        yield scenario, positions.transpose(0, 1).float().cpu().numpy()

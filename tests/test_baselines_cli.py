@@ -69,6 +69,7 @@ def test_from_a_name_to_scores_in_words(lagbench: Command) -> None:
         "train", "curl-noise", "--size", "tiny", "--baseline", "gns", "--set", "training.steps=1"
     )
     assert "next: lagbench predict runs/curl-noise/tiny/gns-0/weights.pt" in trained.stdout
+    assert "hint: tiny is for tests" in trained.stdout
     predicted = lagbench("predict", "runs/curl-noise/tiny/gns-0/weights.pt", "--threads", "1", "--no-bench")
     assert "without the neighbour search" in predicted.stdout
     assert "next: lagbench score predictions.nc" in predicted.stdout

@@ -189,8 +189,8 @@ def test_overview_leads_to_every_board(page: Page, board: Board) -> None:
     ranked = [row for row in board.tabs[1].rows if row.rank is not None]
     for row in ranked:
         skill = written(row.skill.mean, "number") if row.skill else ""
-        assert rows[row.entry.name][1] == f"{skill}rank {row.rank}{' ≈' if row.tied else ''} of {len(ranked)}"
-    run(page, "document.querySelector('.across tbody td:nth-child(3) a').click()")
+        assert rows[row.entry.name][2] == f"{skill}rank {row.rank}{' ≈' if row.tied else ''} of {len(ranked)}"
+    run(page, "document.querySelector('.across tbody td:nth-child(4) a').click()")
     until(page, "document.getElementById('panel').open")
     assert page.value("document.querySelector('section.tab:not([hidden])').id") == board.tabs[1].id
 

@@ -67,12 +67,48 @@ def test_dots_stand_where_their_numbers_say(tab: Tab) -> None:
     assert "script" not in {e.tag for e in svg.iter()}
 
 
-def test_names_do_not_meet_other_dots() -> None:
-    """Twenty dots in one place: no name is drawn over another."""
+def boxes(svg: ElementTree.Element, kind: str, letter: float) -> list[tuple[float, float, float, float]]:
+    """Return left, top, right and bottom of every name, with so many pixels to a letter."""
+    found = []
+    for text in svg.iter("text"):
+        classes, width = text.attrib["class"].split(), letter * len(text.text or "")
+        if classes[0] == kind:
+            share = {"end": 1.0, "middle": 0.5}.get(classes[-1], 0.0)
+            left, base = float(text.attrib["x"]) - share * width, float(text.attrib["y"])
+            found.append((left, base - 9, left + width, base + 2))
+    return found
+
+
+def apart(one: tuple[float, float, float, float], other: tuple[float, float, float, float]) -> bool:
+    """Tell whether two boxes do not overlap."""
+    return one[2] <= other[0] or other[2] <= one[0] or one[3] <= other[1] or other[3] <= one[1]
+
+
+def test_names_do_not_meet_names_or_dots() -> None:
+    """Twenty dots in one place and five near it: whatever is named, no name covers another or a dot."""
     marks = [mark(0.01 * (1 + i / 1000), 0.5) for i in range(20)]
+    marks += [mark(0.01 * (1.2 + i / 5), 0.45 + 0.04 * i) for i in range(5)]
+    svg = ElementTree.fromstring(draw(marks, 0.02, "vorticity_nrmse", "title"))
+    texts = boxes(svg, "name", 6.0) + boxes(svg, "note", 6.0)
+    dots = [(float(e.attrib["cx"]), float(e.attrib["cy"])) for e in svg.iter("circle")]
+    assert len(texts) > 5
+    for number, one in enumerate(texts):
+        assert all(apart(one, other) for other in texts[:number])
+        assert all(apart(one, (x - 3, y - 3, x + 3, y + 3)) for x, y in dots)
+
+
+def test_a_name_in_a_crowd_has_a_line_to_its_dot() -> None:
+    """Of nine dots on nine places ten pixels apart most are named; lines begin in the middle of a dot."""
+    marks = [mark(0.01 * 1.3 ** (i % 3), 0.5 * 1.2 ** (i // 3)) for i in range(9)]
     svg = ElementTree.fromstring(draw(marks, None, "vorticity_nrmse", "title"))
-    texts = [e for e in svg.iter("text") if e.attrib["class"].startswith("name")]
-    assert len(texts) < 5
+    area = svg.find(".//svg/g")
+    assert area is not None
+    lines = [e.attrib["d"] for e in area.findall("path") if e.attrib["class"] == "mark"]
+    dots = {(float(e.attrib["cx"]), float(e.attrib["cy"])) for e in svg.iter("circle")}
+    begins = {tuple(map(float, line[1:].split("L")[0].split())) for line in lines}
+    assert begins
+    assert begins <= dots
+    assert len(boxes(svg, "name", 6.0)) >= 7
 
 
 def test_a_crowd_at_the_edge_keeps_its_names() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import math
 import re
 import sys
 from dataclasses import replace
@@ -23,6 +24,7 @@ from lagbench.board.model import Board, Row
 from lagbench.board.page import BUDGET, FEWEST, render
 from lagbench.board.payload import FINENESS, LEVELS, coarse, embedded, pack, pack_film, payload
 from lagbench.board.table import MOST_REASONS
+from lagbench.report.html import text
 
 DIGITS = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789-_"
 
@@ -174,6 +176,24 @@ def test_every_number_stands_in_the_table(board: Board, page: str) -> None:
             assert told == pytest.approx(value.mean, rel=1e-8, nan_ok=True)
         if isinstance(row, Row):
             assert cells["checked"] == ("verified" if row.verified else "as submitted")
+
+
+def test_the_overview_is_ordered_by_the_column_that_stands_first(board: Board, page: str) -> None:
+    """The mean skill, 0 where a method has no entry, the largest first; who has no skill comes last."""
+    table = page[page.index('class="board across"') :]
+    table = table[table.index("<tbody>") : table.index("</tbody>")]
+    shown = {}
+    for line in re.findall(r"<tr>.*?</tr>", table):
+        name, first = re.findall(r"<t[hd][^>]*>(.*?)</t[hd]>", line)[:2]
+        shown[name] = re.findall(r">([^<>]+)<", first)
+    skills: dict[str, list[float]] = {}
+    for row in (row for tab in board.tabs for row in tab.rows if row.rank is not None):
+        skills.setdefault(row.entry.name, []).extend([row.skill.mean] if row.skill else [])
+    assert shown.keys() == skills.keys()
+    means = [sum(skills[name]) / 2 if skills[name] else -math.inf for name in shown]
+    assert means == sorted(means, reverse=True)
+    for name, mean in zip(shown, means, strict=True):
+        assert shown[name] == [text(mean if skills[name] else math.nan), f"{len(skills[name])} of 2"]
 
 
 def test_floors_are_judged_like_entries(board: Board) -> None:

@@ -39,6 +39,7 @@ def test_the_readme_program_beats_the_best_floor(tmp_path: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip().endswith("over persistence")
+    assert "\r" not in done.stdout
     scores = json.loads((tmp_path / "scores.json").read_text())
     assert scores["skill"]["interval"][0] > 0.1
 
@@ -95,8 +96,10 @@ def test_every_command_of_the_pages_exists() -> None:
 
 
 def test_the_readme_is_short_and_its_links_lead_somewhere() -> None:
-    """At most 150 lines; every file that a page of ours links is there."""
+    """At most 150 lines, its program 40; every file that a page of ours links is there."""
     assert len(README.splitlines()) <= 150
+    (program,) = blocks(README, "python")
+    assert len(program.splitlines()) <= 40
     for page in PAGES:
         for target in re.findall(r"\]\(([^)#\s]+)", page.read_text()):
             assert "://" in target or (page.parent / target).exists(), f"{page.name}: {target}"

@@ -68,6 +68,8 @@ def test_the_public_names_are_described(site: Path) -> None:
     text = (site / "api.html").read_text()
     functions = set(lagbench.__all__) - {"__version__", "submission"}
     names = {f"lagbench.{name}" for name in functions} | {"lagbench.submission.write"}
-    names |= {f"lagbench.torch.{name}" for name in ("WindowDataset", "WindowSampler", "collate", "Batch")}
+    classes = ("WindowDataset", "WindowSampler", "collate", "Batch", "roll_out", "predict")
+    names |= {f"lagbench.torch.{name}" for name in classes}
+    names |= {"lagbench.baselines.particle_grid.ParticleGrid"}
     for name in names:
         assert f'id="{name}"' in text, name

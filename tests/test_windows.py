@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import pickle
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from lagbench.errors import DataError, LagbenchError, UsageError
 from lagbench.make.generate import GenerationResult
 from lagbench.store import frames as frame_store
 from lagbench.store.frames import Source
-from lagbench.torch import Batch, Window, WindowDataset, WindowSampler, collate
+from lagbench.torch import Batch, Window, WindowDataset, WindowSampler, collate, predict, roll_out
 
 FRAMES = {0: 40, 1: 26, 2: 31}
 """Frames of the scenarios of train."""
@@ -427,3 +428,71 @@ def test_another_content_hash_is_refused(root: Path, registry: Registry) -> None
     store = frame_store.FrameStore({0: source})
     with pytest.raises(DataError, match=r"(?s)not that of the registry.*content hash 0{16}"):
         store.frames(0, 0, 2)
+
+
+def drifting(batch: Batch) -> torch.Tensor:
+    """Move every particle on as before, and with what the first wall's successors do on the way."""
+    before, now = batch.position[:, -2:].unbind(1)
+    assert batch.wall_velocity is not None
+    coming = batch.wall_velocity[batch.sample, batch.frames]  # [particle, wall, 2]
+    return 2 * now - before + coming.sum(1)
+
+
+def test_a_window_is_followed_by_a_frame(train: Open) -> None:
+    """The first frame leaves, the new one joins; forcing and frame number go on with them."""
+    batch = collate([train(history=3, future=2)[i] for i in (0, 4)])
+    given, new = batch.part(slice(3)), batch.position[:, 3]
+    later = given.followed_by(new)
+    assert same(later, batch.part(slice(1, 4)))
+    assert later.frame.tolist() == [1, 5]
+    assert given.frames == later.frames == 3
+
+
+def test_a_rollout_feeds_on_itself(train: Open) -> None:
+    """By hand: x2 = 2 x1 - x0 + w2 and x3 = 2 x2 - x1 + w3; gradients reach the given frames."""
+    batch = collate([train(history=2, future=2)[i] for i in (0, 40)])
+    assert batch.wall_velocity is not None
+    x0, x1 = batch.position[:, 0].requires_grad_(), batch.position[:, 1]
+    w2, w3 = (batch.wall_velocity[batch.sample, f].sum(1) for f in (2, 3))
+    x2 = 2 * x1 - x0 + w2
+    expected = torch.stack([x2, 2 * x2 - x1 + w3], 1)
+    given = replace(batch.part(slice(2)), position=torch.stack([x0, x1], 1))
+    found = roll_out(drifting, given, 2)
+    assert torch.equal(found, expected)
+    found.sum().backward()
+    assert x0.grad is not None
+    assert torch.equal(x0.grad, torch.full_like(x0, -3.0))
+
+
+@pytest.mark.parametrize("history", [None, 2])
+def test_predictions_are_rollouts_from_what_the_task_gives(
+    root: Path, registry: Registry, history: int | None
+) -> None:
+    """Every test scenario once, from its own last given frames, over the horizon, with the walls of then."""
+    seen: list[Batch] = []
+
+    def step(batch: Batch) -> torch.Tensor:
+        seen.append(batch)
+        return drifting(batch)
+
+    found = dict(
+        predict(step, "cavity", size="tiny", root=root, history=history, registry=registry, device="cpu")
+    )
+    task = registry.size("cavity", "tiny").task
+    assert list(found) == [4, 5]
+    files = scenario_paths("cavity", size="tiny", root=root, registry=registry)
+    for row, (scenario, path) in enumerate(files.items()):
+        whole = scenario_batch(path)
+        start = task.input_frames - (history or task.input_frames)
+        given = whole.part(slice(start, task.input_frames))
+        assert same(seen[row * task.horizon], given)
+        expected = roll_out(drifting, given, task.horizon).transpose(0, 1)
+        assert found[scenario].dtype == np.float32
+        np.testing.assert_array_equal(found[scenario], expected.numpy())
+
+
+def test_predictions_of_more_frames_than_are_given(root: Path, registry: Registry) -> None:
+    """A model that is to see none, or more than the task gives, is refused."""
+    for history in (0, 7):
+        with pytest.raises(UsageError, match="from 1 to 6"):
+            next(predict(drifting, "cavity", size="tiny", root=root, history=history, registry=registry))

@@ -101,7 +101,7 @@ def draw(marks: Sequence[Mark], solver: float | None, ranking: str, title: str) 
     if solver:
         plot.upright(solver, "the solver itself")
     best = front(marks)
-    plot.line([mark.seconds for mark in best], [mark.error for mark in best], "front")
+    plot.front([mark.seconds for mark in best], [mark.error for mark in best])
     told = {"entry": "", "floor": ", a floor", "coarse": ", the solver on a coarser grid"}
     plot.spots(
         [

@@ -196,6 +196,8 @@ def _trained(result: TrainingResult, where: str) -> list[str]:
         f" {result.device}, {result.threads} thread(s); track: {result.track or 'none'}"
     )
     lines.append(f"  weights    {result.weights}")
+    if result.size == "tiny":
+        lines.append("hint: tiny is for tests: no model learns much from so little; try --size mini")
     return [*lines, f"next: lagbench predict {result.weights}{where} -o predictions.nc"]
 
 

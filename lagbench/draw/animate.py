@@ -340,8 +340,10 @@ def _limit(recording: Recording, panel: Panel) -> float:
     """Return a top of the colour scale that suits the whole recording."""
     if panel is Panel.MATERIAL:
         return 1.0
-    numbers = np.linspace(0, recording.frames - 1, SAMPLES).astype(int)
-    return max(limit_of(panel, recording.scene(int(number))) for number in np.unique(numbers))
+    numbers = np.unique(np.linspace(0, recording.frames - 1, SAMPLES).astype(int))
+    limits = [limit_of(panel, recording.scene(int(number))) for number in numbers]
+    # No vorticity is white: on the scale of the strongest frame most of a film would be pale.
+    return float(np.median(limits)) if panel is Panel.VORTICITY else max(limits)
 
 
 def _background(

@@ -41,7 +41,7 @@ MOMENTS = (1 / 9, 1 / 2, 1.0)
 DRIVEN, DECAYING = 30, 36
 """Scenarios on a sheet of flows that walls drive, and of those that only decay (Figs. 5.7, 5.20)."""
 
-SIDE, GAP, LABEL, MARGIN, TOP, BAR = 1.3, 0.08, 0.18, 0.22, 0.7, 0.58  # [inch]
+CELL, CELL_GAP, LABEL, RIM, HEAD, FOOT = 1.3, 0.08, 0.18, 0.22, 0.7, 0.58  # of a sheet [inch]
 KIND_PARAMETERS = ("family", "pair")
 WALL_SHARE = 0.6  # the fluid itself seldom moves faster than this share of the wall's speed
 
@@ -107,10 +107,10 @@ def contact_sheet(
     kinds = _first_of_each_kind(files, splits)
     sheet = _over_time(kinds, panel, splits) if kinds else _table(files, panel, frame, splits)
     columns = max(len(row) for row in sheet.rows)
-    width = 2 * MARGIN + columns * (SIDE + GAP) - GAP
-    height = TOP + len(sheet.rows) * (SIDE + LABEL + GAP) + BAR
+    width = 2 * RIM + columns * (CELL + CELL_GAP) - CELL_GAP
+    height = HEAD + len(sheet.rows) * (CELL + LABEL + CELL_GAP) + FOOT
     with figure(max(width, 5.0), height, dpi=dpi) as drawn:
-        header(drawn, f"{splits.split(tier.split).title} · {tier.split} {size}", sheet.subtitle, left=MARGIN)
+        header(drawn, f"{splits.split(tier.split).title} · {tier.split} {size}", sheet.subtitle, left=RIM)
         _draw_sheet(drawn, sheet)
         return save(drawn, output)
 
@@ -201,12 +201,12 @@ def _draw_sheet(drawn: Figure, sheet: _Sheet) -> None:
     width, height = drawn.get_size_inches()
     for row, cells in enumerate(sheet.rows):
         for column, cell in enumerate(cells):
-            left = MARGIN + column * (SIDE + GAP)
-            bottom = height - TOP - (row + 1) * (SIDE + LABEL + GAP) + GAP
-            axes = drawn.add_axes((left / width, bottom / height, SIDE / width, SIDE / height))
+            left = RIM + column * (CELL + CELL_GAP)
+            bottom = height - HEAD - (row + 1) * (CELL + LABEL + CELL_GAP) + CELL_GAP
+            axes = drawn.add_axes((left / width, bottom / height, CELL / width, CELL / height))
             axes.set_title(cell.label, fontsize=7.5, color=MUTED, pad=2.5)
             draw(axes, sheet.panel, cell.scene, limit=cell.limit, detail=0.0)
-    below = drawn.add_axes((MARGIN / width, 0.42 / height, 2.6 / width, 0.09 / height))
+    below = drawn.add_axes((RIM / width, 0.42 / height, 2.6 / width, 0.09 / height))
     if sheet.panel is Panel.MATERIAL:
         material_key(below, np.concatenate([c.scene.recording.material for row in sheet.rows for c in row]))
     else:
@@ -217,7 +217,7 @@ ALL = "all"
 KINDS = (ALL, *(str(panel) for panel in Panel))
 """What :func:`plot_frame` can draw."""
 
-SIDE, GAP, MARGIN, TOP, BAR = 3.25, 0.25, 0.25, 0.96, 0.66  # [inch]
+SIDE, GAP, MARGIN, TOP, BAR = 3.25, 0.25, 0.25, 0.96, 0.66  # of a frame [inch]
 WALLS = ("left", "right", "bottom", "top")
 MARKS = ("family", "pair", "frequency")
 SEPARATOR = "  ·  "

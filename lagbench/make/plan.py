@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     Row = tuple[float, int, int]  # seconds, particle substeps and frames, as in Pace
 
 __all__ = [
+    "SECONDS_TO_START",
     "Estimate",
     "check_disk",
     "estimate",
@@ -66,6 +67,9 @@ SECONDS_PER_PARTICLE_SUBSTEP = 45e-9
 
 SECONDS_PER_FRAME = 2.3e-3
 """Starting the kernels, reading out, checking and writing one frame there [s], of generations of mini."""
+
+SECONDS_TO_START = 5.0
+"""Starting a worker there, which imports Taichi and compiles the solver [s]; about half the next time."""
 
 BYTES_PER_PARTICLE = 2 * 2 * 4
 """Position and velocity in one frame, two float32 each, before compression [bytes]."""
@@ -120,11 +124,11 @@ class Estimate:
     measured: bool  # whether at a rate that this machine has measured
 
     def seconds(self, workers: int) -> float:
-        """Return the time with some workers [s]: shared evenly, but never below the longest."""
+        """Return the time with some workers [s]: all start, then share evenly, never below the longest."""
         if not self.substeps:
             return 0.0
         longest = self.core_seconds * max(self.substeps) / sum(self.substeps)
-        return max(self.core_seconds / workers, longest)
+        return SECONDS_TO_START + max(self.core_seconds / workers, longest)
 
 
 def scenario_bytes(size: Size, scenario: int) -> int:

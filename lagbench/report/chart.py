@@ -9,11 +9,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .html import Markup, clipped, decimals, join, path_data, power, tag
+from .names import Names, written
 
 __all__ = [
     *("Bar", "Plot", "Scale", "Spot", "Tick", "bar_chart", "close_logarithmic", "linear", "logarithmic"),
@@ -160,12 +162,20 @@ class Plot:
         self._height = height  # height [pixel]; the width is 460
         self._across, self._up = WIDTH - LEFT - RIGHT, height - TOP - BOTTOM
         self._marks: list[Markup] = []
+        self._names = Names(self._across, self._up)
         self._linked = False  # whether the keyboard reaches marks
 
     def line(self, x: ArrayLike, y: ArrayLike, kind: str, title: str = "") -> None:
         """Draw a line through points; NaN leaves a gap."""
         data = path_data(zip(self._columns(x), self._rows(y), strict=True))
         self._add("path", title, d=data, class_=f"line {kind}")
+
+    def front(self, x: ArrayLike, y: ArrayLike) -> None:
+        """Draw a line through dots, which their names keep off."""
+        self.line(x, y, "front")
+        places = list(zip(self._columns(x).tolist(), self._rows(y).tolist(), strict=True))
+        for pair in pairwise(places):
+            self._names.keep_off(*pair)
 
     def band(self, x: ArrayLike, low: ArrayLike, high: ArrayLike, kind: str) -> None:
         """Fill between two lines where both are numbers."""
@@ -200,20 +210,21 @@ class Plot:
         self._add("path", "", d=path_data([(column, 0), (column, self._up)]), class_="level")
         left = column > self._across / 2
         x, kind = (column - 5, "note end") if left else (column + 5, "note")
-        self._marks.append(_text(label, x, 11, kind))
+        self._marks.append(written(label, x, 11, kind))
+        self._names.take(label, (x, 11, float(left)))
 
     def spots(self, spots: Sequence[Spot]) -> None:
         """Draw dots that the keyboard reaches, and their names where they touch nothing; first come first."""
         self._linked = True
-        columns = self._columns([spot.x for spot in spots]).tolist()
-        rows = self._rows([spot.y for spot in spots]).tolist()
-        taken = [(x - 7, y - 7, x + 7, y + 7) for x, y in zip(columns, rows, strict=True)]
-        for spot, x, y in zip(spots, columns, rows, strict=True):
+        columns, rows = self._columns([s.x for s in spots]), self._rows([s.y for s in spots])
+        places = list(zip(columns.tolist(), rows.tolist(), strict=True))
+        names = self._names.beside([clipped(spot.name, 22) for spot in spots], places)
+        for spot, (x, y), name in zip(spots, places, names, strict=True):
             drawn = [
                 tag("title", spot.said),
                 tag("circle", cx=f"{x:.1f}", cy=f"{y:.1f}", r=14, class_="reach"),
                 tag("circle", cx=f"{x:.1f}", cy=f"{y:.1f}", r=5),
-                *self._name_beside(clipped(spot.name, 22), x, y, taken),
+                name,
             ]
             kind = f"dot {spot.kind}".strip()
             if spot.href is None:
@@ -221,26 +232,7 @@ class Plot:
             else:
                 mark = tag("a", *drawn, class_=kind, href=spot.href, aria_label=spot.said)
             self._marks.append(mark)
-
-    def _name_beside(
-        self, name: str, x: float, y: float, taken: list[tuple[float, float, float, float]]
-    ) -> list[Markup]:
-        """Return the name of a dot in the first free place around it, none where there is none."""
-        width = sum(9.0 if letter.isupper() else 6.4 for letter in name)
-        tries = [
-            *((9, 4, 0.0), (-9, 4, 1.0), (4, -9, 0.0), (4, 17, 0.0)),
-            *((-4, -9, 1.0), (-4, 17, 1.0), (0, -9, 0.5), (0, 17, 0.5)),
-        ]
-        anchors = {0.0: "name", 0.5: "name middle", 1.0: "name end"}
-        for right, down, end in tries:
-            left = x + right - width * end
-            box = (left, y + down - 11, left + width, y + down + 3)
-            inside = box[0] >= 0 and box[2] <= self._across and box[1] >= 0 and box[3] <= self._up
-            others = [one for one in taken if not (one[0] <= x <= one[2] and one[1] <= y <= one[3])]
-            if inside and not any(_meet(box, one) for one in others):
-                taken.append(box)
-                return [_text(name, x + right, y + down, anchors[end])]
-        return []
+        self._marks += self._names.leads
 
     def svg(self, title: str, description: str) -> Markup:
         """Return the chart."""
@@ -270,15 +262,15 @@ class Plot:
         for tick in self._y.ticks:
             row = TOP + float(self._rows(tick.value))
             drawn.append(tag("path", d=path_data([(LEFT, row), (right, row)]), class_="grid"))
-            drawn.append(_text(tick.label, LEFT - 7, row + 4, "tick end"))
+            drawn.append(written(tick.label, LEFT - 7, row + 4, "tick end"))
         for tick in self._x.ticks:
             column = LEFT + float(self._columns(tick.value))
             drawn.append(tag("path", d=path_data([(column, bottom), (column, bottom + 4)]), class_="mark"))
-            drawn.append(_text(tick.label, column, bottom + 17, "tick middle"))
+            drawn.append(written(tick.label, column, bottom + 17, "tick middle"))
         drawn.append(tag("path", d=path_data([(LEFT, bottom), (right, bottom)]), class_="axis"))
         x_label, y_label = self._labels
-        drawn.append(_text(_with_factor(x_label, self._x), right, self._height - 5, "label end"))
-        drawn.append(_text(_with_factor(y_label, self._y), 2, 14, "label"))
+        drawn.append(written(_with_factor(x_label, self._x), right, self._height - 5, "label end"))
+        drawn.append(written(_with_factor(y_label, self._y), 2, 14, "label"))
         return drawn
 
 
@@ -306,12 +298,12 @@ def bar_chart(bars: Sequence[Bar], scale: Scale, label: str, title: str, descrip
     for tick in scale.ticks:
         column = place(tick.value)
         drawn.append(tag("path", d=path_data([(column, 4), (column, bottom)]), class_="grid"))
-        drawn.append(_text(tick.label, column, bottom + 16, "tick middle"))
+        drawn.append(written(tick.label, column, bottom + 16, "tick middle"))
     zero = place(0.0) if not scale.log else left
     for number, bar in enumerate(bars):
         drawn += _bar(bar, number * ROW + 19, zero, place)
     drawn.append(tag("path", d=path_data([(zero, 4), (zero, bottom)]), class_="axis"))
-    drawn.append(_text(_with_factor(label, scale), WIDTH - right, bottom + 34, "label end"))
+    drawn.append(written(_with_factor(label, scale), WIDTH - right, bottom + 34, "label end"))
     return _canvas(bottom + 40, title, description, *drawn)
 
 
@@ -330,11 +322,6 @@ def _bar(bar: Bar, top: int, zero: float, place: object) -> list[Markup]:
     return drawn
 
 
-def _meet(one: tuple[float, float, float, float], other: tuple[float, float, float, float]) -> bool:
-    """Tell whether two boxes (left, top, right, bottom) overlap."""
-    return one[0] < other[2] and one[2] > other[0] and one[1] < other[3] and one[3] > other[1]
-
-
 def _canvas(height: int, title: str, description: str, *drawn: object, linked: bool = False) -> Markup:
     return tag(
         "svg",
@@ -346,10 +333,6 @@ def _canvas(height: int, title: str, description: str, *drawn: object, linked: b
         role="group" if linked else "img",
         aria_label=title,
     )
-
-
-def _text(text: str, x: float, y: float, kind: str) -> Markup:
-    return tag("text", text, x=f"{x:.1f}", y=f"{y:.1f}", class_=kind)
 
 
 def _with_factor(label: str, scale: Scale) -> Markup:
