@@ -20,6 +20,7 @@ from browser import Browser, browser
 from exchange_readers import straight_runs
 from filelock import FileLock
 from hypothesis import settings
+from score_bench import ScoreBench, bench_of
 from typer.main import get_command
 from typer.testing import CliRunner, Result
 
@@ -212,6 +213,12 @@ def tiny_split(home: Path) -> Callable[..., GenerationResult]:
 def generated(tiny_split: Callable[..., GenerationResult], unmeasured: Registry) -> GenerationResult:
     """The tiny curl-noise data, generated once by two workers and compared with no hash."""
     return tiny_split(SPLIT, "generated", workers=2, registry=unmeasured)
+
+
+@pytest.fixture(scope="session")
+def bench(generated: GenerationResult, unmeasured: Registry) -> ScoreBench:
+    """The same data for the scorer: two test scenarios of 20 predicted frames."""
+    return bench_of(generated, unmeasured)
 
 
 @pytest.fixture

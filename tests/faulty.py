@@ -20,21 +20,13 @@ SHAPE = (len(TESTS), HORIZON, PARTICLES, 2)
 
 @dataclass(frozen=True)
 class Fault:
-    """A way to be wrong.
+    """A way to be wrong."""
 
-    Attributes:
-        make: writes the file and returns its path.
-        check: check that must name it.
-        exit_code: exit code that it must lead to.
-        hostile: whether it must be looked at in a child process only.
-        says: a word that the message must contain.
-    """
-
-    make: Callable[[Bench], Path]
-    check: str
-    exit_code: int
-    hostile: bool = False
-    says: str = ""
+    make: Callable[[Bench], Path]  # writes the file and returns its path
+    check: str  # that must name it
+    exit_code: int  # that it must lead to
+    hostile: bool = False  # whether it must be looked at in a child process only
+    says: str = ""  # a word that the message must contain
 
 
 FAULTS: dict[str, Fault] = {}

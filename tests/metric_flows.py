@@ -33,10 +33,7 @@ def lattice(side: int = 20) -> Floats:
 def swirl(position: Floats) -> Floats:
     """Return the Taylor-Green velocity that closes at the walls of the unit box."""
     s = np.pi * position
-    return np.stack(
-        [np.sin(s[:, 0]) * np.cos(s[:, 1]), -np.cos(s[:, 0]) * np.sin(s[:, 1])],
-        axis=1,
-    )
+    return np.stack([np.sin(s[:, 0]) * np.cos(s[:, 1]), -np.cos(s[:, 0]) * np.sin(s[:, 1])], axis=1)
 
 
 def rollout(frames: int = 8, side: int = 20, speed: float = 0.01) -> Floats:

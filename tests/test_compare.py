@@ -10,20 +10,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from score_bench import ScoreBench, bench_of, half_right, still, straight
+from score_bench import ScoreBench, half_right, still, straight
 
-from lagbench.data.registry import Registry
 from lagbench.errors import DataError, UnreadableFileError, UsageError
-from lagbench.make.generate import GenerationResult
 from lagbench.metrics import differ
 from lagbench.scoring.compare import ComparisonResult, compare
 from lagbench.scoring.tables import Table, card_tables, comparison_tables, flag_lines
-
-
-@pytest.fixture(scope="module")
-def bench(generated: GenerationResult, unmeasured: Registry) -> ScoreBench:
-    """Tiny curl noise, two test scenarios."""
-    return bench_of(generated, unmeasured)
 
 
 @pytest.fixture(scope="module")
@@ -36,23 +28,13 @@ def scored(bench: ScoreBench, tmp_path_factory: pytest.TempPathFactory) -> dict[
     return folders
 
 
-def published(
-    folder: Path, values: list[float], *, method: str, metric: str = "mse_avg", **changes: Any
-) -> Path:
+def published(folder: Path, values: list[float], *, method: str, **changes: Any) -> Path:
     """Write a scores.json of one metric with these values per scenario."""
-    row = {metric: {"values": values, "undefined": [0] * len(values)}}
-    held = {
-        "lagbench_scores": 1,
-        "split": "cavity",
-        "size": "full",
-        "dataset_version": "1.0.0",
-        "dataset_sha256": "0" * 64,
-        "method": method,
-        "predictions_sha256": method,
-        "task": {"scenarios": list(range(len(values)))},
-        "ranking_metric": metric,
-        "rows": {"submission": row},
-    }
+    row = {"mse_avg": {"values": values, "undefined": [0] * len(values)}}
+    held = {"lagbench_scores": 1, "split": "cavity", "size": "full", "dataset_version": "1.0.0"}
+    held |= {"dataset_sha256": "0" * 64, "method": method, "predictions_sha256": method}
+    held |= {"task": {"scenarios": list(range(len(values)))}, "ranking_metric": "mse_avg"}
+    held |= {"rows": {"submission": row}}
     path = folder / method / "scores.json"
     path.parent.mkdir(parents=True)
     path.write_text(json.dumps(held | changes))
@@ -60,18 +42,24 @@ def published(
 
 
 def test_six_wins_of_six(tmp_path: Path) -> None:
-    """Better in all of six scenarios: p = 2 / 2^6 = 0.03125, significant, said in words."""
+    """Better in all of six scenarios: p = 2 / 2^6 = 0.03125, significant, said in words.
+
+    One loss as large as the wins: |sum| of 4 or more in 14 of 64 patterns, p = 0.21875.
+    """
     a = published(tmp_path, [1, 2, 3, 4, 5, 6], method="a")
     b = published(tmp_path, [2, 3, 4, 5, 6, 8], method="b")
     result = compare(a, b)
     found = result.metrics["mse_avg"]
     assert found.test.p == pytest.approx(2 / 64)
-    assert found.test.difference == pytest.approx(-7 / 6)
-    assert found.first == pytest.approx(21 / 6)
-    assert found.second == pytest.approx(28 / 6)
+    assert (found.test.difference, found.first, found.second) == pytest.approx((-7 / 6, 21 / 6, 28 / 6))
     assert result.verdict.startswith("mse_avg: a is better (p = 0.0312, 6 scenarios, one seed each")
     assert compare(b, a).verdict == result.verdict
     assert result.seeds == (1, 1)
+    c = published(tmp_path, [1, 1, 1, 1, 1, 3], method="c")
+    result = compare(c, published(tmp_path, [2] * 6, method="d"))
+    # sums of six signs: 6 once, 4 six times, and their negatives
+    assert result.metrics["mse_avg"].test.p == pytest.approx(14 / 64)
+    assert "no difference at 5 %" in result.verdict
 
 
 def test_a_folder_of_seeds_is_a_method(tmp_path: Path) -> None:
@@ -101,16 +89,6 @@ def test_seeds_of_two_methods_are_not_one(tmp_path: Path) -> None:
         compare(tmp_path, tmp_path)
 
 
-def test_five_of_six_is_no_difference(tmp_path: Path) -> None:
-    """One loss as large as the wins: |sum| of 4 or more in 14 of 64 patterns, p = 0.21875."""
-    a = published(tmp_path, [1, 1, 1, 1, 1, 3], method="a")
-    b = published(tmp_path, [2, 2, 2, 2, 2, 2], method="b")
-    result = compare(a, b)
-    # sums of six signs: 6 once, 4 six times, and their negatives
-    assert result.metrics["mse_avg"].test.p == pytest.approx(14 / 64)
-    assert "no difference at 5 %" in result.verdict
-
-
 @pytest.mark.parametrize(
     ("changes", "kind", "word"),
     [
@@ -130,7 +108,10 @@ def test_other_data_are_not_compared(
 
 
 def test_folders_files_and_predictions_agree(bench: ScoreBench, scored: dict[str, Path]) -> None:
-    """A folder, its scores.json and its predictions.nc, scored on the way, say the same."""
+    """A folder, its scores.json and its predictions.nc, scored on the way, say the same.
+
+    The short table leads with the ranking metric; all metrics come when asked for.
+    """
     still_, straight_ = scored["still"], scored["straight"]
     by_folder = compare(still_, straight_)
     by_file = compare(still_ / "scores.json", straight_ / "scores.json")
@@ -138,24 +119,24 @@ def test_folders_files_and_predictions_agree(bench: ScoreBench, scored: dict[str
     fresh = compare(still_ / nc, straight_ / nc, root=bench.root, registry=bench.registry)
     assert by_folder.as_json() == by_file.as_json() == fresh.as_json()
     assert by_folder.first == "still"
+    assert compare(still_, still_).verdict == "both hold the same predictions"
     assert next(iter(by_folder.metrics)) == by_folder.ranking
+    result = compare(scored["still"], scored["straight"])
+    (short, means), (whole, _) = comparison_tables(result), comparison_tables(result, every=True)
+    assert short.rows[0][0].split()[0] == "vorticity_nrmse"
+    assert len(means.rows) == len(short.rows)
+    assert len(short.rows) < len(whole.rows) == len(result.metrics)
 
 
 def test_floors_stand_in_the_scores(scored: dict[str, Path]) -> None:
-    """A floor's name compares with the row beside the submission: equal to having submitted it."""
+    """A floor's name compares with the row beside the submission: equal to having submitted it.
+
+    A misspelt metric is a usage error with the nearest name.
+    """
     by_name = compare(scored["still"], "constant-velocity").as_json()
     by_file = compare(scored["still"], scored["straight"]).as_json()
     assert by_name["metrics"] == by_file["metrics"]
     assert (by_name["second"], by_file["second"]) == ("constant-velocity", "straight")
-
-
-def test_the_same_predictions_are_told(scored: dict[str, Path]) -> None:
-    """Comparing a submission with itself says so."""
-    assert compare(scored["still"], scored["still"]).verdict == "both hold the same predictions"
-
-
-def test_unknown_metrics_name_the_nearest(scored: dict[str, Path]) -> None:
-    """A misspelt metric is a usage error with the nearest name."""
     with pytest.raises(UsageError, match="vorticity_rmse"):
         compare(scored["still"], scored["straight"], metrics=["vorticity_rsme"])
     only: ComparisonResult = compare(scored["still"], scored["straight"], metrics=["mse_end"])
@@ -189,6 +170,8 @@ MALFORMED: dict[str, dict[str, Any]] = {
     "undefined frames of one scenario": {"rows": row_of([1] * 6, [0])},
     "ids that occur twice": {"task": {"scenarios": [28] * 6}},
     "an id that is no integer": {"task": {"scenarios": [0, 1, 2, 3, 4, 5.5]}},
+    "booleans as ids": {"task": {"scenarios": [False, True]}, "rows": row_of([1.0, 2.0])},
+    "a boolean as value": {"rows": row_of([True, *[1] * 5])},
     "an observable that ranks": {
         "ranking_metric": "energy_true",
         "rows": {"submission": {"energy_true": {"values": [1] * 6, "undefined": [0] * 6}}},
@@ -196,6 +179,9 @@ MALFORMED: dict[str, dict[str, Any]] = {
     "a name that is no text": {"method": 5},
     "a name with an escape": {"method": "\x1b[31m"},
     "rows in a list": {"rows": [1]},
+    "no rows": {"rows": []},
+    "an id that is text": {"task": {"scenarios": ["a"]}},
+    "fewer ids than values": {"task": {"scenarios": [3]}},
     "a layout of its own": {"lagbench_scores": 2},
 }
 
@@ -211,28 +197,19 @@ def test_malformed_scores_are_unreadable(tmp_path: Path, changes: dict[str, Any]
             compare(*sides)
 
 
-def test_endless_brackets_are_unreadable(tmp_path: Path) -> None:
-    """JSON deeper than Python's stack is a file that cannot be read."""
+def test_scores_that_are_not_there(tmp_path: Path) -> None:
+    """A folder without any, JSON deeper than Python's stack, rows without the ranking metric."""
+    with pytest.raises(UnreadableFileError):
+        compare(tmp_path, tmp_path)
     path = tmp_path / "scores.json"
     path.write_text("[" * 100_000)
     with pytest.raises(UnreadableFileError, match="RecursionError"):
         compare(path, path)
-
-
-def test_a_floor_without_the_ranking_metric(tmp_path: Path) -> None:
-    """An empty row of a floor cannot be compared with."""
-    bare = published(tmp_path, [1.0] * 6, method="a", rows={**row_of([1] * 6), "persistence": {}})
-    with pytest.raises(UnreadableFileError, match="ranking"):
-        compare(bare, "persistence")
-
-
-def test_missing_scores(tmp_path: Path) -> None:
-    """A folder without scores, and scores without the ranking metric, are unreadable."""
-    with pytest.raises(UnreadableFileError):
-        compare(tmp_path, tmp_path)
     bare = published(tmp_path, [1.0], method="a", ranking_metric="vorticity_rmse")
-    with pytest.raises(UnreadableFileError, match="ranking"):
-        compare(bare, bare)
+    empty = published(tmp_path, [1.0] * 6, method="b", rows={**row_of([1] * 6), "persistence": {}})
+    for sides in ((bare, bare), (empty, "persistence")):
+        with pytest.raises(UnreadableFileError, match="ranking"):
+            compare(*sides)
 
 
 def test_tables_show_floors_undefined_and_units(bench: ScoreBench, tmp_path: Path) -> None:
@@ -241,7 +218,6 @@ def test_tables_show_floors_undefined_and_units(bench: ScoreBench, tmp_path: Pat
     horizon, at_frames, per_scenario = card_tables(card)
     rows = {row[0].split()[0]: row for row in horizon.rows}
     assert list(rows)[:2] == ["skill", card.ranking]
-    assert card.skill is not None
     assert [column.replace("\n", "") for column in horizon.columns[2:]] == [card.skill.floor]
     assert rows["vorticity_pearson"][1].endswith("†")
     assert rows["vorticity_rmse"][0].endswith("[1/frame]")
@@ -270,15 +246,6 @@ def test_wide_tables_come_in_blocks() -> None:
     assert sum((block.rows[1][1:] for block in blocks), ()) == rows[1][1:]
 
 
-def test_comparison_table(scored: dict[str, Path]) -> None:
-    """The short table leads with the ranking metric; all metrics come when asked for."""
-    result = compare(scored["still"], scored["straight"])
-    (short, means), (whole, _) = comparison_tables(result), comparison_tables(result, every=True)
-    assert short.rows[0][0].split()[0] == "vorticity_nrmse"
-    assert len(means.rows) == len(short.rows)
-    assert len(short.rows) < len(whole.rows) == len(result.metrics)
-
-
 def test_pipes_and_devices_are_refused_at_once(tmp_path: Path) -> None:
     """A FIFO that nobody writes to, a device that never ends, a file too long, by any name."""
     os.mkfifo(tmp_path / "fifo.json")
@@ -289,16 +256,6 @@ def test_pipes_and_devices_are_refused_at_once(tmp_path: Path) -> None:
         with pytest.raises(UnreadableFileError) as caught:
             compare(tmp_path / name, tmp_path / name)
         assert caught.value.where == str(tmp_path / name)
-
-
-def test_booleans_are_no_ids_and_no_values(tmp_path: Path) -> None:
-    """True is no scenario 1, nor an error of 1."""
-    whole = published(tmp_path, [1.0, 2.0], method="a")
-    for number, task in enumerate(({"scenarios": [False, True]}, {"scenarios": [0, 1]})):
-        values = [True, 2.0] if number else [1.0, 2.0]
-        odd = published(tmp_path, values, method=f"b{number}", task=task)
-        with pytest.raises(UnreadableFileError):
-            compare(whole, odd)
 
 
 @pytest.mark.parametrize(("predict", "row", "word"), [(straight, 0, "better"), (still, 1, "worse")])

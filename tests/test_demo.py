@@ -57,11 +57,6 @@ def made_by(result: Result) -> dict[str, Any]:
     return found
 
 
-def no_torch(name: str, *, extra: str) -> None:
-    """Stand in for check_installed where nothing of the extra is there."""
-    raise UsageError(f"{name} is not installed", fix=f"pip install 'lagbench[{extra}]'")
-
-
 def test_without_the_extra_the_data_are_made_and_one_line_says_how_to_get_the_rest(
     run: Run, only_one: Registry, copied: Callable[[], Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -69,6 +64,18 @@ def test_without_the_extra_the_data_are_made_and_one_line_says_how_to_get_the_re
 
     A split without a tiny size is left out.
     """
+
+    def no_torch(name: str, *, extra: str) -> None:
+        raise UsageError(f"{name} is not installed", fix=f"pip install 'lagbench[{extra}]'")
+
+    def no_solver(*_: str) -> SolverBench:
+        raise WorkFailedError("the solver could not be timed")
+
+    monkeypatch.setattr("lagbench.cli.machine.bench_apart", no_solver)
+    assert demo_steps._solver_time() is None  # then the page shows no speed-up
+    assert demo_steps.model_left_out(only_one) is None
+    without = demo_steps.model_left_out(Registry({"large": only_one.split("large")}, {}))
+    assert without == f"the registry has no {SPLIT} {SIZE}"
     monkeypatch.setattr(demo_steps, "check_installed", no_torch)
     root = copied()
     assert demo_steps.demo_splits(only_one) == [SPLIT]
@@ -84,13 +91,6 @@ def test_without_the_extra_the_data_are_made_and_one_line_says_how_to_get_the_re
     assert list(made["splits"]) == [SPLIT]
     assert made["splits"][SPLIT]["generation"]["kept"] == [0, 1, 2, 3, 4]
     assert Path(made["splits"][SPLIT]["picture"]).is_file()
-
-
-def test_a_registry_without_the_models_split_is_no_error(only_one: Registry) -> None:
-    """The reason names the split."""
-    assert demo_steps.model_left_out(only_one) is None
-    reason = demo_steps.model_left_out(Registry({"large": only_one.split("large")}, {}))
-    assert reason == f"the registry has no {SPLIT} {SIZE}"
 
 
 @pytest.mark.usefixtures("only_one")
@@ -144,16 +144,6 @@ def test_anothers_leaderboard_is_refused_before_the_work(run: Run, tmp_path: Pat
     assert result.exit_code == 2, result.output
     assert "submissions/cavity/mini/mine.yaml" in result.stderr
     assert not (tmp_path / "cavity").exists()
-
-
-def test_a_solver_that_cannot_be_timed_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Then the page shows no speed-up."""
-
-    def failed(*_: str) -> SolverBench:
-        raise WorkFailedError("the solver could not be timed")
-
-    monkeypatch.setattr("lagbench.cli.machine.bench_apart", failed)
-    assert demo_steps._solver_time() is None
 
 
 @pytest.mark.slow

@@ -1,30 +1,37 @@
-"""Floors against closed forms: parabolas, rotations, exponentials, copies, the solver itself."""
+"""Floors against closed forms, copies, the solver itself; those of one's own data, those that are shipped."""
 
 from __future__ import annotations
 
+import json
 import math
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from score_bench import ScoreBench, straight
 
-from lagbench.data.layout import ScenarioKey, scenario_path
-from lagbench.data.registry import Registry, Size, load
+from lagbench.data.layout import ScenarioKey, major_of, scenario_path
+from lagbench.data.registry import Size, load
 from lagbench.data.scenario import read_scenario
 from lagbench.errors import DataError
-from lagbench.floors import FLOORS, Given, floors_of, given_in
+from lagbench.floors import FLOORS, Given, floors_of, given_in, shipped
 from lagbench.floors.analog import assigned, nearest
 from lagbench.floors.carried import linear_field, mirrored
 from lagbench.floors.coarse_solver import coarser, predict_with, spread_subset
 from lagbench.floors.frozen_field import decay
+from lagbench.floors.shipped import FOLDER, shipped_path
 from lagbench.generators.batch import solver_constants
 from lagbench.generators.solver import build
 from lagbench.generators.split import InitialState
-from lagbench.make.generate import GenerationResult
+from lagbench.scoring.floors import measurable
+from lagbench.scoring.scenario import SUBMISSION
+from lagbench.scoring.skill import best_floor
+from lagbench.scoring.task import ranking_metric
 
 Floats = NDArray[np.float64]
 
@@ -57,15 +64,6 @@ def predicted(name: str, held: Given) -> NDArray[np.float32]:
     return np.array(list(FLOORS[name].predict(held)))
 
 
-def test_the_table_says_all_of_every_floor() -> None:
-    """Names are those of the rows, sentences end; the coarse solver alone is never the best floor."""
-    for name, floor in FLOORS.items():
-        assert floor.name == name
-        assert floor.title
-        assert floor.definition.endswith(".")
-    assert [floor.name for floor in FLOORS.values() if not floor.counts] == ["coarse-solver"]
-
-
 @pytest.mark.parametrize(
     ("split", "size", "names"),
     [
@@ -83,6 +81,10 @@ def test_which_floors_a_size_has(split: str, size: str, names: str) -> None:
     assert " ".join(floor.name for floor in floors_of(tier)) == names
     solved = coarser(tier)
     assert solved is None or solved.grid < tier.grid
+    assert all(
+        floor.name == name and floor.title and floor.definition[-1] == "." for name, floor in FLOORS.items()
+    )
+    assert [floor.name for floor in FLOORS.values() if not floor.counts] == ["coarse-solver"]
 
 
 def test_every_floor_predicts_its_frames_inside_the_walls() -> None:
@@ -116,11 +118,9 @@ def test_a_frozen_rotation_stays_a_rotation() -> None:
     """Particles of a rigid rotation by 0.05 a frame keep their distance and turn by 0.05 a frame."""
     centre, angle = np.array([0.5, 0.5]), 0.05
     offset = scattered(4000, -0.4, 0.4)
-    turned = [
-        centre + offset @ np.array([[math.cos(a), math.sin(a)], [-math.sin(a), math.cos(a)]])
-        for a in (-angle, 0.0)
-    ]
-    held = given("cavity", np.stack([*([turned[0]] * 4), *turned]), wall=1e-9)
+    cos, sin = math.cos(angle), math.sin(angle)
+    before = centre + offset @ np.array([[cos, -sin], [sin, cos]])
+    held = given("cavity", np.stack([*([before] * 5), centre + offset]), wall=1e-9)
     found = predicted("frozen-field", held)
     inner = np.hypot(*offset.T) < 0.25
     now, steps = found[-1][inner] - centre, held.size.task.horizon
@@ -167,58 +167,39 @@ def test_the_field_is_linear_and_has_no_holes() -> None:
 
 def opened(root: Path, size: Size, scenario: int) -> tuple[Given, NDArray[np.float32]]:
     """Return what a scenario of a generated data set gives, and its future."""
-    key = ScenarioKey(
-        split=size.split,
-        size=size.name,
-        version=size.version,
-        scenario=scenario,
-        subset=size.subset_of(scenario),
-    )
+    told = {"split": size.split, "size": size.name, "version": size.version}
+    key = ScenarioKey(**told, scenario=scenario, subset=size.subset_of(scenario))
     n = size.task.input_frames
     with read_scenario(scenario_path(root, key)) as file:
         future = file.read("position", slice(n, n + size.task.horizon))
         return given_in(file, size, root), future
 
 
-def test_the_analog_of_a_copy_is_exact(generated: GenerationResult, unmeasured: Registry) -> None:
-    """A full box that stands in train is its own analog, and its motion carries it where it goes."""
-    size = unmeasured.size(generated.split, generated.size)
-    own = size.subsets["train"][1]
-    held, future = opened(generated.root, size, own)
+def test_analogs_of_a_copy_and_of_another(bench: ScoreBench) -> None:
+    """A full box that stands in train is its own analog, and its motion carries it where it goes.
+
+    A test scenario gets another one's motion: particles start where they are and stay in the box.
+    """
+    own = bench.size.subsets["train"][1]
+    held, future = opened(bench.root, bench.size, own)
     assert nearest(held) == own
     np.testing.assert_allclose(predicted("analog", held), future, atol=1e-5)
-
-
-def test_the_analog_of_another_is_of_train(generated: GenerationResult, unmeasured: Registry) -> None:
-    """A test scenario gets another one's motion: particles start where they are and stay in the box."""
-    size = unmeasured.size(generated.split, generated.size)
-    held, future = opened(generated.root, size, size.subsets["test"][0])
-    assert nearest(held) in size.subsets["train"]
+    held, future = opened(bench.root, bench.size, bench.size.subsets["test"][0])
+    assert nearest(held) in bench.size.subsets["train"]
     found = predicted("analog", held)
     assert found.shape == future.shape
     assert np.abs(found[0] - held.last).max() < 0.1
 
 
-def test_the_analog_says_what_is_missing(copied: Callable[[], Path], unmeasured: Registry) -> None:
-    """Without train there is no analog: a data error."""
-    size = unmeasured.size("curl-noise", "tiny")
-    root = copied()
-    held, _ = opened(root, size, size.subsets["test"][0])
-    shutil.rmtree(root / "curl-noise" / "tiny" / f"v{size.major}" / "train")
-    with pytest.raises(DataError):
-        predicted("analog", held)
+def test_assignment_goes_by_material() -> None:
+    """A permuted, slightly moved cloud is matched particle by particle, each material on its own.
 
-
-def test_assignment_undoes_a_permutation_by_material() -> None:
-    """A permuted, slightly moved cloud is matched particle by particle, each material on its own."""
+    Fewer particles are taken more than once, more are left out; a lacking material takes any.
+    """
     points, rng = scattered(120, 0.0, 1.0), np.random.default_rng(1)
     material, order = np.repeat([0, 2], 60), rng.permutation(120)
     partner = assigned(points, points[order] + 1e-6, material, material[order])
     np.testing.assert_array_equal(order[partner], np.arange(120))
-
-
-def test_assignment_of_unequal_counts() -> None:
-    """Fewer particles are taken more than once, more are left out; a lacking material takes any."""
     points = scattered(90, 0.0, 1.0)
     zeros = np.zeros(90, np.int64)
     fewer = assigned(points, points[:30], zeros, zeros[:30])
@@ -254,17 +235,9 @@ def test_the_coarse_solver_at_full_resolution_is_the_solver() -> None:
     found = list(predict_with(held, size))
     fall = np.array([0.0, -0.5 * size.value("gravity") * size.frame_interval])
     solver = build(solver_constants(size))
-    solver.load(
-        [
-            InitialState(
-                position=path[-1],
-                velocity=(path[-1] - path[-2]) / size.frame_interval + fall,
-                affine=np.zeros((count, 2, 2)),
-                material=np.zeros(count, np.int8),
-                area=0.04,
-            )
-        ]
-    )
+    velocity = (path[-1] - path[-2]) / size.frame_interval + fall
+    rest = {"affine": np.zeros((count, 2, 2)), "material": np.zeros(count, np.int8), "area": 0.04}
+    solver.load([InitialState(position=path[-1], velocity=velocity, **rest)])
     for frame in found:
         solver.advance(size.substeps_per_frame)
         np.testing.assert_array_equal(frame, solver.position()[0])
@@ -283,3 +256,66 @@ def test_the_coarse_solver_moves_all_particles() -> None:
         fallen = 0.5 * size.value("gravity") * size.frame_interval**2 * k * (k + 1)
         np.testing.assert_allclose(np.mean(block - frame, axis=0), [0.0, fallen], atol=1e-3)
         assert frame.shape == block.shape
+
+
+def own(size: Size, *, placement: str) -> Size:
+    """Return a split of a user's own: without generator, gravity or recorded scores."""
+    parameters = {name: value for name, value in size.parameters.items() if name != "gravity"}
+    grid = size.task.score_grid.model_copy(update={"placement": placement})
+    task = size.task.model_copy(update={"score_grid": grid})
+    told = {"split": "own", "name": "full", "generator": "none", "parameters": parameters, "task": task}
+    return size.model_copy(update=told)
+
+
+@pytest.mark.parametrize(
+    ("placement", "names"),
+    [
+        ("cell_centres", "persistence constant-velocity frozen-field analog"),
+        ("nodes", "persistence constant-velocity analog"),
+    ],
+)
+def test_floors_go_by_the_kind_of_box(placement: str, names: str) -> None:
+    """A full box has the frozen field; without gravity there is no free flight; nothing is solved."""
+    size = own(load().size("fluid", "mini"), placement=placement)
+    assert " ".join(floor.name for floor in floors_of(size)) == names
+    assert shipped(size) is None
+
+
+def test_an_analog_needs_all_of_train(bench: ScoreBench, copied: Callable[[], Path]) -> None:
+    """One scenario of train that is missing: the other floors are measured, and scoring works.
+
+    Who asks for an analog all the same is told.
+    """
+    root = copied()
+    assert "analog" in measurable(bench.size, root)
+    train = root / bench.size.split / bench.size.name / f"v{bench.size.major}" / "train"
+    next(iter(sorted(train.glob("*.nc")))).unlink()
+    expected = ("persistence", "constant-velocity", "frozen-field")
+    assert measurable(bench.size, root) == expected
+    shutil.rmtree(train)
+    with pytest.raises(DataError):
+        predicted("analog", opened(root, bench.size, bench.size.subsets["test"][0])[0])
+    alone = replace(bench, root=root)
+    card = alone.evaluate(bench.submit(root / "predictions.nc", straight))
+    assert tuple(card.scores) == (SUBMISSION, *expected)
+    assert card.skill is not None
+
+
+@pytest.mark.parametrize("path", sorted(FOLDER.glob("*.json")), ids=lambda path: path.stem)
+def test_shipped_scores_belong_to_the_registry(path: Path) -> None:
+    """Hash, floors, scenarios and ranking metric are those of the size that the file names."""
+    said = json.loads(path.read_text())
+    size = load().size(said["split"], said["size"])
+    assert path == shipped_path(size)
+    assert path.stat().st_size < 200_000
+    if major_of(said["dataset_version"]) != size.major:
+        pytest.skip("measured on another version of the data")
+    held = shipped(size)
+    assert list(held) == [floor.name for floor in floors_of(size)]
+    ranking = ranking_metric(size)
+    for floor in held.values():
+        score = floor.scores[ranking]
+        assert score.scenarios == tuple(sorted(size.subsets["test"]))
+        assert score.mean > 0.0
+        assert floor.correlation.shape == score.values.shape
+    assert best_floor({name: floor.scores[ranking] for name, floor in held.items()}) is not None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -31,21 +32,31 @@ def test_packing_does_not_matter(
     tmp_path: Path, library: str, level: int, shuffle: bool, chunk: tuple[int, int, int], order: random.Random
 ) -> None:
     """Chunks, compression, library and order of attributes leave the hash as it is."""
+
+    def shuffled(names: Any) -> list[str]:  # without the one that only netCDF may write
+        listed = [name for name in names if name != "_NCProperties"]
+        order.shuffle(listed)
+        return listed
+
     path, content = write_scenario(tmp_path, KEY)
     other = tmp_path / f"{library}.nc"
-    REPACK[library](path, other, level, shuffle, chunk, order)
+    REPACK[library](path, other, level, shuffle, chunk, shuffled)
     assert rehash(other) == content
     assert independent_hash.content_hash(other) == content
 
 
+Shuffled = Callable[[Any], list[str]]
+CHUNKED = ("position", "velocity")
+
+
 def repack_h5py(
-    path: Path, other: Path, level: int, shuffle: bool, chunk: tuple[int, int, int], order: random.Random
+    path: Path, other: Path, level: int, shuffle: bool, chunk: tuple[int, int, int], shuffled: Shuffled
 ) -> None:
     """Copy a scenario file by h5py with other packing."""
     with h5py.File(path) as old, h5py.File(other, "w", track_order=True) as new:
-        names = shuffled(old, order)
+        names = shuffled(old)
         for name in names:
-            packing = {"chunks": chunk, "shuffle": shuffle} if name in ("position", "velocity") else {}
+            packing = {"chunks": chunk, "shuffle": shuffle} if name in CHUNKED else {}
             if packing and level:
                 packing |= {"compression": "gzip", "compression_opts": level}
             dtype = h5py.string_dtype() if old[name].dtype.kind == "O" else old[name].dtype.newbyteorder(">")
@@ -55,55 +66,43 @@ def repack_h5py(
         for name in names:
             for axis, dim in enumerate(DIMS[name] if DIMS[name] != (name,) else ()):
                 new[name].dims[axis].attach_scale(new[dim])
-        for name in shuffled(old.attrs, order):
+        for name in shuffled(old.attrs):
             value = old.attrs[name]
             new.attrs[name] = value.decode() if isinstance(value, bytes) else value
 
 
 def repack_netcdf4(
-    path: Path, other: Path, level: int, shuffle: bool, chunk: tuple[int, int, int], order: random.Random
+    path: Path, other: Path, level: int, shuffle: bool, chunk: tuple[int, int, int], shuffled: Shuffled
 ) -> None:
     """Copy a scenario file by netCDF4 with other packing."""
     with netCDF4.Dataset(path) as old, netCDF4.Dataset(other, "w") as new:
-        for name in shuffled(old.dimensions, order):
+        for name in shuffled(old.dimensions):
             new.createDimension(name, None if name == "frame" else old.dimensions[name].size)
-        for name in shuffled(old.variables, order):
+        for name in shuffled(old.variables):
             dtype = old[name].dtype
             packing: dict[str, Any] = {}
-            if chunked(name):
+            if name in CHUNKED:
                 packing = {"chunksizes": chunk, "shuffle": shuffle, "endian": "big"}
                 packing |= {"compression": "zlib" if level else None, "complevel": level}
                 dtype = dtype.newbyteorder(">")
             variable = new.createVariable(name, dtype, DIMS[name], **packing)
             variable[...] = old[name][...]
-        new.setncatts({name: old.getncattr(name) for name in shuffled(old.ncattrs(), order)})
+        new.setncatts({name: old.getncattr(name) for name in shuffled(old.ncattrs())})
 
 
 def repack_xarray(
-    path: Path, other: Path, level: int, shuffle: bool, chunk: tuple[int, int, int], order: random.Random
+    path: Path, other: Path, level: int, shuffle: bool, chunk: tuple[int, int, int], shuffled: Shuffled
 ) -> None:
     """Copy a scenario file by xarray with other packing."""
     with xr.open_dataset(path) as old:
         loaded = old.load().drop_encoding()
-    loaded = loaded[shuffled(loaded.data_vars, order)]
-    loaded.attrs = {name: loaded.attrs[name] for name in shuffled(loaded.attrs, order)}
+    loaded = loaded[shuffled(loaded.data_vars)]
+    loaded.attrs = {name: loaded.attrs[name] for name in shuffled(loaded.attrs)}
     packing = {"chunksizes": chunk, "zlib": level > 0, "complevel": level, "shuffle": shuffle}
     encoding: dict[str, dict[str, Any]] = {str(name): {"_FillValue": None} for name in loaded.variables}
     for name in ("position", "velocity"):
         encoding[name] |= packing
     loaded.to_netcdf(other, engine="netcdf4", encoding=encoding)
-
-
-def shuffled(names: Any, order: random.Random) -> list[str]:
-    """Return names in random order, without the one that only netCDF may write."""
-    listed = [name for name in names if name != "_NCProperties"]
-    order.shuffle(listed)
-    return listed
-
-
-def chunked(name: str) -> bool:
-    """Return whether a variable is stored frame by frame."""
-    return name in ("position", "velocity")
 
 
 REPACK = {"h5py": repack_h5py, "netcdf4": repack_netcdf4, "xarray": repack_xarray}

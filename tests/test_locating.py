@@ -1,4 +1,4 @@
-"""Splits by name and by path: what a user names is found, what a stranger's file names is not a path."""
+"""Roots; splits by name and by path: what a user names is found, what a file names is not a path."""
 
 from __future__ import annotations
 
@@ -7,17 +7,43 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+import platformdirs
 import pytest
 from exchange_readers import straight_runs
+from scenario_factory import make_key
 
 import lagbench
-from lagbench.data.layout import dataset_folder
+from lagbench.data.layout import dataset_folder, resolve_root, scenario_path
 from lagbench.data.local import home, is_name, locate, locate_new, rooted
 from lagbench.data.registry import load
 from lagbench.errors import UnreadableFileError, UsageError
 from lagbench.exchange import adopt
 from lagbench.exchange.local_split import LocalSplit
 from lagbench.make.verify import verify
+
+
+def test_root_given_then_environment_then_platform(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """An option beats LAGBENCH_ROOT, which beats the user data folder; an empty one counts as unset.
+
+    Commands print the root, so a relative one is made absolute; ~ is the home folder.
+    """
+    monkeypatch.setenv("LAGBENCH_ROOT", str(tmp_path / "b"))
+    assert resolve_root(tmp_path / "a") == tmp_path / "a"
+    assert resolve_root() == tmp_path / "b"
+    monkeypatch.setenv("LAGBENCH_ROOT", "")
+    assert resolve_root() == platformdirs.user_data_path("lagbench", appauthor=False)
+    monkeypatch.chdir(tmp_path)
+    assert resolve_root("data") == tmp_path / "data"
+    assert resolve_root("~/data") == Path.home() / "data"
+    assert scenario_path(Path("r"), make_key(7)).as_posix() == "r/cavity/tiny/v2/test/0007.nc"
+
+
+@pytest.mark.parametrize("root", ["x" * 300, "a/" * 3000, "nul\0"])
+def test_a_root_that_no_folder_can_be_named_is_ours_to_refuse(root: str) -> None:
+    """A component of 300 characters, a path of 6000, a NUL: exit code 2."""
+    with pytest.raises(UsageError) as caught:
+        resolve_root(root)
+    assert "--root" in str(caught.value.where)
 
 
 @pytest.fixture(scope="module")
@@ -35,8 +61,11 @@ def own(made: LocalSplit, tmp_path: Path) -> Path:
     return tmp_path / "root" / "own"
 
 
-def test_all_ways_to_name_it(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An absolute path, a relative one, a name with its root, LAGBENCH_ROOT, and the current folder."""
+def test_all_ways_to_name_it(own: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """An absolute path, a relative one, a name with its root, LAGBENCH_ROOT, and the current folder.
+
+    A path names its root; the same one beside it is fine, another is refused.
+    """
     monkeypatch.chdir(own.parent)
     by_path = [(str(own), None), (f"{own}/", None), ("./own", None), ("own/", None)]
     for split, root in [*by_path, ("own", own.parent), ("own", "."), ("own", None)]:
@@ -46,6 +75,9 @@ def test_all_ways_to_name_it(own: Path, monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setenv("LAGBENCH_ROOT", str(own.parent))
     assert home("own").root == own.parent
     assert locate("root/own").size.split == "own"
+    assert locate(str(own), root=own.parent).root == own.parent
+    with pytest.raises(UsageError, match="another root"):
+        locate(str(own), root=tmp_path)
 
 
 def test_ours_are_found_as_before(tmp_path: Path) -> None:
@@ -58,7 +90,7 @@ def test_ours_are_found_as_before(tmp_path: Path) -> None:
         locate(str(tmp_path / "cavity"), "tiny")
 
 
-def test_the_only_size_there_is_the_default(tmp_path: Path) -> None:
+def test_the_only_size_there_is_the_default(own: Path, tmp_path: Path) -> None:
     """One size there: that one. None or several: an error that names them. What is to be made: mini."""
     with pytest.raises(UsageError) as none:
         lagbench.open_split("cavity", root=tmp_path)
@@ -74,10 +106,7 @@ def test_the_only_size_there_is_the_default(tmp_path: Path) -> None:
             opened("cavity", root=tmp_path)
         assert (several.value.where, several.value.fix) == ("--size", "--size full")
     assert locate_new("cavity", root=tmp_path).size.name == "mini"
-
-
-def test_a_local_split_has_one_size_to_make(own: Path) -> None:
-    """Where a split has no mini, its only size is the default."""
+    # Where a split has no mini, its only size is the default.
     assert locate_new("own", root=own.parent).size.name == locate("own", root=own.parent).size.name
 
 
@@ -91,38 +120,24 @@ def test_unknown_names_list_local_ones(own: Path) -> None:
         locate(str(own), "tiny")
 
 
-def test_a_path_and_another_root(own: Path, tmp_path: Path) -> None:
-    """A path names its root; the same one beside it is fine, another is refused."""
-    assert locate(str(own), root=own.parent).root == own.parent
-    with pytest.raises(UsageError, match="another root"):
-        locate(str(own), root=tmp_path)
-
-
-def test_a_renamed_folder_is_told(own: Path) -> None:
-    """The name is part of every hash, so the folder must keep it."""
-    moved = own.rename(own.with_name("mine"))
+def test_a_folder_may_be_moved_but_not_renamed(own: Path, made: LocalSplit, tmp_path: Path) -> None:
+    """The name is part of every hash, so the folder must keep it; where it lies is part of nothing."""
+    moved = Path(shutil.move(own, tmp_path / "own"))
+    assert lagbench.verify(str(moved)).dataset_sha256 == made.dataset_sha256
     with pytest.raises(UnreadableFileError, match="not named like its split"):
-        locate(str(moved))
+        locate(str(moved.rename(moved.with_name("mine"))))
 
 
-def test_a_moved_folder_is_the_same_data_set(own: Path, made: LocalSplit, tmp_path: Path) -> None:
-    """Where it lies is part of nothing."""
-    moved = shutil.move(own, tmp_path / "own")
-    result = lagbench.verify(str(moved))
-    assert result.dataset_sha256 == made.dataset_sha256
+def test_a_description_harms_no_other_split_and_chooses_no_code(own: Path) -> None:
+    """It is told when it is asked for, and only then.
 
-
-def test_a_description_chooses_no_code(own: Path) -> None:
-    """A generator in a local description, which would be imported, is refused."""
+    A generator in a local description, which would be imported, is refused.
+    """
     path = own / "split.yaml"
     path.write_text(path.read_text().replace("generator: none", "generator: antigravity"))
     with pytest.raises(UnreadableFileError, match="cannot name a generator"):
         locate(str(own))
-
-
-def test_a_damaged_description_harms_no_other_split(own: Path) -> None:
-    """It is told when it is asked for, and only then."""
-    (own / "split.yaml").write_text("splits: [")
+    path.write_text("splits: [")
     assert locate("cavity", "tiny", root=own.parent).size.split == "cavity"
     with pytest.raises(UnreadableFileError, match="not a plain YAML file"):
         locate("own", root=own.parent)

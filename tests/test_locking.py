@@ -33,7 +33,6 @@ def other(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
     with subprocess.Popen(
         [sys.executable, "-c", HOLD, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as process:
-        assert process.stdout is not None
         assert process.stdout.readline() == "held\n"
         yield process
         process.kill()
@@ -46,9 +45,8 @@ def test_a_second_writer_is_told_who_holds_the_lock(tmp_path: Path, other: subpr
         pass
     assert time.monotonic() - start < 5
     assert caught.value.exit_code == 5
-    assert re.search(
-        rf"process {other.pid} on {re.escape(os.uname().nodename)}, since 20..-..-..T", str(caught.value)
-    )
+    holder = rf"process {other.pid} on {re.escape(os.uname().nodename)}, since 20..-..-..T"
+    assert re.search(holder, str(caught.value))
 
 
 def test_a_second_writer_waits(tmp_path: Path, other: subprocess.Popen[str]) -> None:
@@ -57,13 +55,11 @@ def test_a_second_writer_waits(tmp_path: Path, other: subprocess.Popen[str]) -> 
 
     def release(holder: str) -> None:
         told.append(holder)
-        assert other.stdin is not None
         other.stdin.write("\n")
         other.stdin.flush()
 
     with dataset_lock(tmp_path, "cavity", "tiny", 1, on_wait=release):
         holder = read_holder(dataset_folder(tmp_path, "cavity", "tiny", 1))
-        assert holder is not None
         assert holder.pid == os.getpid()
     assert len(told) == 1
     assert f"process {other.pid}" in told[0]
@@ -75,7 +71,6 @@ def test_a_killed_writer_blocks_nobody(tmp_path: Path, other: subprocess.Popen[s
     other.wait()
     folder = dataset_folder(tmp_path, "cavity", "tiny", 1)
     stale = read_holder(folder)
-    assert stale is not None
     assert stale.pid == other.pid
     with dataset_lock(tmp_path, "cavity", "tiny", 1, timeout=0):
         pass
@@ -84,28 +79,22 @@ def test_a_killed_writer_blocks_nobody(tmp_path: Path, other: subprocess.Popen[s
 
 def test_other_data_sets_are_not_locked(tmp_path: Path, other: subprocess.Popen[str]) -> None:
     """Another size or MAJOR version of the split can be written meanwhile."""
-    with (
-        dataset_lock(tmp_path, "cavity", "mini", 1, timeout=0),
-        dataset_lock(tmp_path, "cavity", "tiny", 2, timeout=0),
-    ):
+    mini, later = (
+        dataset_lock(tmp_path, "cavity", *which, timeout=0) for which in (("mini", 1), ("tiny", 2))
+    )
+    with mini, later:
         assert other.poll() is None
 
 
-def test_the_lock_is_free_after_an_error(tmp_path: Path) -> None:
-    """Whatever ends the block frees the lock."""
+def test_whatever_ends_the_block_frees_the_lock(tmp_path: Path) -> None:
+    """A root that cannot hold folders gives exit code 5 with the remedy."""
     with pytest.raises(KeyboardInterrupt), dataset_lock(tmp_path, "cavity", "tiny", 1):
         raise KeyboardInterrupt
     with dataset_lock(tmp_path, "cavity", "tiny", 1, timeout=0):
         pass
-
-
-def test_an_unwritable_root_is_told(tmp_path: Path) -> None:
-    """A root that cannot hold folders gives exit code 5 with the remedy."""
-    (tmp_path / "cavity").write_text("in the way")
-    with (
-        pytest.raises(WorkFailedError, match=r"(?s)cannot lock.*--root"),
-        dataset_lock(tmp_path, "cavity", "tiny", 1),
-    ):
+    (tmp_path / "fluid").write_text("in the way")
+    locked = pytest.raises(WorkFailedError, match=r"(?s)cannot lock.*--root")
+    with locked, dataset_lock(tmp_path, "fluid", "tiny", 1):
         pass
 
 

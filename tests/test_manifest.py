@@ -22,30 +22,20 @@ STATISTICS = {"velocity_std": (0.00219, 0.00218)}
 def entry(scenario: int, content: str = "") -> FileEntry:
     """Return a made-up entry."""
     subset = next(name for name, ids in SUBSETS.items() if scenario in ids)
-    return FileEntry(
-        scenario=scenario,
-        subset=subset,
-        path=f"{subset}/{scenario:04d}.nc",
-        frames=4,
-        particles=8,
-        content_sha256=(content or hashlib.sha256(bytes([scenario])).hexdigest()),
-        bytes=100,
-        file_sha256="0" * 64,
-        device="cpu",
-        facts={"energy_last_over_max": 0.25},
-    )
+    told = {"scenario": scenario, "subset": subset, "path": f"{subset}/{scenario:04d}.nc", "bytes": 100}
+    hashes = {"content_sha256": content or hashlib.sha256(bytes([scenario])).hexdigest()}
+    facts = {"energy_last_over_max": 0.25}
+    return FileEntry(**told, **hashes, frames=4, particles=8, file_sha256="0" * 64, device="cpu", facts=facts)
 
 
-def merged(old: Manifest | None, ids: Iterable[int], **options: Any) -> Manifest:
-    """Return an old manifest with made-up entries merged in."""
+OPTIONS: dict[str, Any] = {"split": "cavity", "size": "tiny", "version": "1.2.0", "subsets": SUBSETS}
+
+
+def merged(old: Manifest | None, ids: Iterable[int | FileEntry], **options: Any) -> Manifest:
+    """Return an old manifest with entries merged in, made-up ones where only the id is told."""
+    entries = [entry(i) if isinstance(i, int) else i for i in ids]
     return merge(
-        old,
-        [entry(i) for i in ids],
-        split="cavity",
-        size="tiny",
-        version="1.2.0",
-        subsets=SUBSETS,
-        **{"environment": {"python": "3.11"}, "statistics": None, **options},
+        old, entries, **{**OPTIONS, "environment": {"python": "3.11"}, "statistics": None, **options}
     )
 
 
@@ -69,41 +59,31 @@ def test_hashes_are_those_of_the_files() -> None:
 
 
 def test_new_entries_replace_old_ones() -> None:
-    """A regenerated file counts, not the one before it; ids that the size dropped go."""
+    """A regenerated file counts, not the one before it; ids that the size dropped go.
+
+    Which subset holds a scenario is the registry's word; the file is described anew.
+    """
     old = merged(None, range(6))
-    again = merge(
-        old,
-        [entry(3, "f" * 64)],
-        split="cavity",
-        size="tiny",
-        version="1.3.0",
-        subsets={name: ids for name, ids in SUBSETS.items() if name != "extra"},
-        environment={},
-    )
-    found = again.entry(3)
-    assert found is not None
-    assert found.content_sha256 == "f" * 64
+    less = {name: ids for name, ids in SUBSETS.items() if name != "extra"}
+    again = merged(old, [entry(3, "f" * 64)], version="1.3.0", subsets=less)
+    assert again.entry(3).content_sha256 == "f" * 64
     assert again.entry(5) is None
     assert again.dataset_sha256 != old.dataset_sha256
+    whole = merged(None, range(5))
+    moved = [e.model_copy(update={"subset": "train"}) if e.scenario == 3 else e for e in whole.files]
+    again = merged(whole.model_copy(update={"files": tuple(moved)}), ())
+    assert [e.scenario for e in again.files] == [0, 1, 2, 4]
 
 
-def test_statistics_wait_for_train_and_stay() -> None:
-    """They are dropped while train is incomplete and kept when a later run brings none."""
+def test_statistics_belong_to_train() -> None:
+    """Dropped while train is incomplete, kept when a later run brings none; a new train file takes them."""
     assert merged(None, (0, 3), statistics=STATISTICS).statistics == {}
     first = merged(None, (0, 1), statistics=STATISTICS)
     assert first.statistics == STATISTICS
-    assert merged(first, (2, 3, 4)).statistics == STATISTICS
-
-
-def test_statistics_of_other_train_files_go() -> None:
-    """They belong to the hash of train: a new train file takes them away."""
-    first = merged(None, range(5), statistics=STATISTICS)
-    other = entry(1, "f" * 64)
-    again = merge(
-        first, [other], split="cavity", size="tiny", version="1.2.0", subsets=SUBSETS, environment={}
-    )
-    assert again.complete
-    assert again.statistics == {}
+    whole = merged(first, (2, 3, 4))
+    assert whole.statistics == STATISTICS
+    again = merged(whole, [entry(1, "f" * 64)])
+    assert (again.complete, again.statistics) == (True, {})
 
 
 def machine(name: str, device: str = "cpu") -> dict[str, str]:
@@ -132,18 +112,13 @@ def test_environments_add_up() -> None:
 def test_identity_needs_a_promise_or_evidence(environment: dict[str, str], identity: str) -> None:
     """x86-64 Linux CPUs promise equal bits; elsewhere every file needs the hash of datasets.yaml."""
     files = [entry(i).model_copy(update={"device": environment["device"]}) for i in range(3)]
-    options = {"split": "cavity", "size": "tiny", "version": "1.2.0", "subsets": SUBSETS}
-    made = merge(None, files, environment=environment, **options)  # type: ignore[arg-type]
+    made = merged(None, files, environment=environment)
     assert made.identity == identity
     hashes = {file.scenario: file.content_sha256[:16] for file in files}
-    for recorded, expected in (
-        (hashes, "bitwise"),
-        ({**hashes, 1: "0" * 16}, identity),
-        ({0: hashes[0]}, identity),
-    ):
-        assert merge(made, [], recorded=recorded, **options).identity == expected  # type: ignore[arg-type]
-    rest = merged(made, (3,), environment=machine("x86_64"))
-    assert rest.identity == identity
+    assert merged(made, (), environment=None, recorded=hashes).identity == "bitwise"
+    for recorded in ({**hashes, 1: "0" * 16}, {0: hashes[0]}):
+        assert merged(made, (), environment=None, recorded=recorded).identity == identity
+    assert merged(made, (3,), environment=machine("x86_64")).identity == identity
 
 
 def test_the_mean_twin_floor_is_that_of_test() -> None:
@@ -175,14 +150,6 @@ def test_paths_follow_from_subset_and_id(tmp_path: Path, change: dict[str, str],
         read_manifest(tmp_path, "cavity", "tiny", 1)
 
 
-def test_an_entry_in_the_wrong_subset_is_dropped() -> None:
-    """Which subset holds a scenario is the registry's word; the file is described anew."""
-    whole = merged(None, range(5))
-    moved = [e.model_copy(update={"subset": "train"}) if e.scenario == 3 else e for e in whole.files]
-    again = merged(whole.model_copy(update={"files": tuple(moved)}), ())
-    assert [e.scenario for e in again.files] == [0, 1, 2, 4]
-
-
 def test_round_trip_and_atomic_write(tmp_path: Path) -> None:
     """What is written is read back, as plain JSON, with no temporary file left."""
     manifest = merged(None, range(5), statistics=STATISTICS)
@@ -199,22 +166,16 @@ def test_round_trip_and_atomic_write(tmp_path: Path) -> None:
     [
         ({"complete": "yes"}, "complete"),
         ({"files": [{"scenario": 1}]}, "files.0.subset"),
-        ({"dataset_sha256": "12"}, "dataset_sha256"),
         ({"colour": 1}, "colour"),
         ({"format": 2}, "format"),
     ],
 )
 def test_a_damaged_manifest_names_the_key(tmp_path: Path, change: dict[str, Any], key: str) -> None:
-    """Wrong types, unknown keys and formats are told with file, key and remedy."""
+    """Wrong types, unknown keys and formats are told with file, key and remedy; no JSON as a whole file."""
     path = write_manifest(tmp_path, merged(None, range(5)))
     path.write_text(json.dumps(json.loads(path.read_text()) | change))
     with pytest.raises(DataError, match=rf"(?s)manifest is damaged.*manifest.json, key {key}.*fix"):
         read_manifest(tmp_path, "cavity", "tiny", 1)
-
-
-def test_a_truncated_manifest_is_told(tmp_path: Path) -> None:
-    """Text that is no JSON is damage of the whole file."""
-    path = write_manifest(tmp_path, merged(None, range(5)))
     path.write_text(path.read_text()[:-20])
     with pytest.raises(DataError, match="whole file"):
         read_manifest(tmp_path, "cavity", "tiny", 1)

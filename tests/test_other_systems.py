@@ -10,10 +10,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from score_bench import ScoreBench, bench_of, straight
+from score_bench import ScoreBench, straight
 
 import lagbench
-from lagbench.data.registry import Registry
 from lagbench.errors import WorkFailedError
 from lagbench.make.generate import GenerationResult
 from lagbench.work import pool, process
@@ -46,12 +45,6 @@ assert sys.modules["resource"] is sys.modules["fcntl"] is None
 """
 
 Run = Callable[..., None]
-
-
-@pytest.fixture(scope="module")
-def bench(generated: GenerationResult, unmeasured: Registry) -> ScoreBench:
-    """Tiny curl noise."""
-    return bench_of(generated, unmeasured)
 
 
 @pytest.fixture

@@ -1,21 +1,30 @@
-"""The programs of README, docs and notebook run as they stand and do what is said of them."""
+"""The programs of README, docs and notebook run as they stand and do what is said of them; so do examples."""
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import re
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
+from score_bench import ScoreBench
+from simple_models import install
 from typer.main import get_command
 
 import lagbench
+from lagbench.baselines.predict import predict
+from lagbench.baselines.train import train
 from lagbench.cli.app import app
-from lagbench.make.generate import GenerationResult
+from lagbench.data import registry
+from lagbench.make.generate import GenerationResult, generate
+from lagbench.metrics import METRICS
+from lagbench.scoring import flags
 
 CLONE = Path(__file__).parent.parent
 README = (CLONE / "README.md").read_text()
@@ -42,14 +51,6 @@ def test_the_readme_program_beats_the_best_floor(tmp_path: Path) -> None:
     assert "\r" not in done.stdout
     scores = json.loads((tmp_path / "scores.json").read_text())
     assert scores["skill"]["interval"][0] > 0.1
-
-
-def test_the_notebook_is_stored_without_outputs() -> None:
-    """What a run leaves behind is not committed: no outputs, no counts."""
-    cells = json.loads(NOTEBOOK.read_text())["cells"]
-    code = [cell for cell in cells if cell["cell_type"] == "code"]
-    assert len(code) > 5
-    assert not any(cell["outputs"] or cell["execution_count"] for cell in code)
 
 
 @pytest.mark.slow
@@ -105,6 +106,89 @@ def test_the_readme_is_short_and_its_links_lead_somewhere() -> None:
             assert "://" in target or (page.parent / target).exists(), f"{page.name}: {target}"
 
 
-def test_the_film_is_small() -> None:
-    """A reader on a slow line waits for at most 1 MB."""
+def test_what_is_stored_is_small() -> None:
+    """The notebook has no outputs and no counts; on a slow line the film's reader waits for at most 1 MB."""
     assert (CLONE / "docs" / "figures" / "film.gif").stat().st_size <= 1_000_000
+    cells = json.loads(NOTEBOOK.read_text())["cells"]
+    code = [cell for cell in cells if cell["cell_type"] == "code"]
+    assert len(code) > 5
+    assert not any(cell["outputs"] or cell["execution_count"] for cell in code)
+
+
+TEXT = (CLONE / "docs" / "scoring.md").read_text()
+
+
+def test_every_metric_stands_in_the_table() -> None:
+    """The table of metrics is that of the code, line by line and in its order."""
+    expected = [
+        f"| `{m.name}` | {m.summary} | {m.unit} | {m.direction}"
+        f"{'' if m.perfect is None else f', {m.perfect:g}'} | {m.source} |"
+        for m in METRICS.values()
+    ]
+    table = TEXT[TEXT.index("## Metrics") :]
+    assert re.findall(r"^\| `.*", table, re.MULTILINE) == expected
+
+
+def test_thresholds_of_the_flags() -> None:
+    """The thresholds in the text are those of the code."""
+    assert f"is below {flags.AUTOCORRELATION:g};" in TEXT
+    assert (flags.DROP, "less than half within one frame" in TEXT) == (0.5, True)
+    assert (flags.SHIFT_GAIN, "less than a quarter of the error" in TEXT) == (0.25, True)
+    assert (flags.GROWTH, "less than twice the first frame's" in TEXT) == (2.0, True)
+    assert f"outside {flags.ENERGY[0]:g} to {flags.ENERGY[1]:g} times" in TEXT
+    assert f"outside {flags.OCCUPANCY[0]:g} to {flags.OCCUPANCY[1]:g} times" in TEXT
+    assert (flags.TWIN_REGULAR, "past a tenth of that of persistence" in TEXT) == (0.1, True)
+
+
+def test_every_option_of_score_is_described() -> None:
+    """The table of options holds all that `lagbench score` has, and none that it has not."""
+    table = TEXT[TEXT.index("| option | does |") : TEXT.index("Several files are scored")]
+    cells = "".join(line.split("|")[1] for line in table.splitlines() if line.startswith("| `"))
+    score = get_command(app).commands["score"]  # type: ignore[attr-defined]
+    options = {name for p in score.params for name in p.opts if name.startswith("-")}
+    assert set(re.findall(r"(?<![\w-])--?[a-z]+(?:-[a-z]+)*", cells)) == options - {"--help"}
+
+
+@pytest.fixture
+def dam_break(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Make the example's split known as its entry point would."""
+    folder = str(CLONE / "docs" / "examples" / "dam_break")
+    monkeypatch.syspath_prepend(folder)
+    monkeypatch.setenv("PYTHONPATH", folder)
+    monkeypatch.delenv(registry.REGISTRY_VARIABLE, raising=False)
+    point = EntryPoint(name="dam-break", value="dam_break", group=registry.GROUP)
+    monkeypatch.setattr(registry, "entry_points", lambda group: [point])
+    registry._load.cache_clear()
+    yield
+    registry._load.cache_clear()
+
+
+def test_dam_break_is_a_split(dam_break: None, tmp_path: Path) -> None:
+    """It is listed, generated and scored like one of ours; the column starts at rest and falls."""
+    assert "dam-break" in registry.load().splits
+    result = generate("dam-break", "tiny", subset="test", root=tmp_path)
+    assert result.simulated == (3, 4)
+    test = lagbench.open_split("dam-break", subset="test", size="tiny", root=tmp_path)
+    height = test.position.sel(space="y").mean("particle")
+    assert (height.isel(frame=-1) < 0.8 * height.isel(frame=0)).all()
+
+
+def test_sage_is_a_baseline_and_enstrophy_a_metric(
+    monkeypatch: pytest.MonkeyPatch, bench: ScoreBench, tmp_path: Path
+) -> None:
+    """One class is a graph network that trains with the recipes of the six and predicts.
+
+    The METRICS of the other module is a metric that ours do not have.
+    """
+    for name in ("sage", "enstrophy"):
+        monkeypatch.syspath_prepend(CLONE / "docs" / "examples" / name)
+    sage, enstrophy = importlib.import_module("sage"), importlib.import_module("enstrophy")
+    assert enstrophy.METRICS.name == "enstrophy_error"
+    assert enstrophy.METRICS.name not in METRICS
+    install(monkeypatch, sage=sage.Sage)
+    options = {"root": bench.root, "registry": bench.registry, "threads": 1}
+    run, settings = tmp_path / "run", ["training.steps=2"]
+    trained = train("sage", "curl-noise", "tiny", output=run, settings=settings, **options)
+    predicted = predict(trained.weights, tmp_path / "predictions.nc", **options)
+    assert predicted.method == "GNS + SAGEConv"
+    assert (tmp_path / "predictions.nc").is_file()

@@ -1,28 +1,30 @@
-"""The registry: the numbers of the design, and mistakes that are named."""
+"""The registry: the numbers of design and thesis; mistakes, limits and packages of others that are named."""
 
 from __future__ import annotations
 
+import math
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
+from hypothesis import given
+from hypothesis import strategies as st
 
-from lagbench.data.limits import SUBSETS
-from lagbench.data.registry import Size, default_path, load
+from lagbench.data import registry
+from lagbench.data.limits import NEEDED, SUBSETS, Limit
+from lagbench.data.registry import Registry, default_path, load
 from lagbench.data.yamlfile import read_yaml
 from lagbench.errors import UnreadableFileError, UsageError
+from lagbench.generators.constants import LIMITS
+from lagbench.make.generate import generate
+from lagbench.make.verify import verify
 
-TIERS = [
-    (split, size)
-    for split in ("fluid", "multimaterial", "cavity", "curl-noise")
-    for size in ("full", "mini", "tiny")
-]
-
-
-def tier(split: str, size: str) -> Size:
-    """Return a size of our registry."""
-    return load().size(split, size)
+SPLITS = ("fluid", "multimaterial", "cavity", "curl-noise")
 
 
 @pytest.mark.parametrize(
@@ -44,7 +46,7 @@ def test_full_sizes_are_those_of_the_design(
     counts: tuple[int, ...],
 ) -> None:
     """Particles, grid and substeps of section 3; subsets of version 2; frames over train, valid and test."""
-    full = tier(split, "full")
+    full = load().size(split, "full")
     official = [i for name in ("train", "valid", "test") for i in full.subsets[name]]
     assert (full.particles, full.grid, full.substeps_per_frame) == (particles, grid, substeps)
     assert full.frame_interval == pytest.approx(interval, rel=1e-15)
@@ -55,20 +57,21 @@ def test_full_sizes_are_those_of_the_design(
 
 def test_special_ids_of_the_design() -> None:
     """Subsets are runs of ids; extra and the frames of fluid 0 and 26 are as section 3 names them."""
-    fluid, pairs = tier("fluid", "full"), tier("multimaterial", "full")
+    fluid, pairs, cavity, noise = (load().size(split, "full") for split in SPLITS)
     assert fluid.subsets["test"] == tuple(range(36, 52))
     assert fluid.subsets["valid"] == tuple(range(28, 36))
     assert fluid.frame_count(0) == fluid.frame_count(26) == 600
     assert pairs.subsets["extra"] == tuple(range(72, 87))
     assert {pairs.frame_count(i) for i in pairs.subsets["extra"]} == {1200}
-    assert tier("cavity", "full").subsets["test"] == tuple(range(56, 76))
-    assert tier("curl-noise", "full").subsets["test"] == tuple(range(56, 72))
+    assert cavity.subsets["test"] == tuple(range(56, 76))
+    assert noise.subsets["test"] == tuple(range(56, 72))
 
 
-@pytest.mark.parametrize(("split", "size"), TIERS)
+@pytest.mark.parametrize("size", ["full", "mini", "tiny"])
+@pytest.mark.parametrize("split", SPLITS)
 def test_every_size_is_consistent(split: str, size: str) -> None:
     """Frames cover the task, frames of interest are predicted ones, bounds lie in the unit box."""
-    entry = tier(split, size)
+    entry = load().size(split, size)
     task = entry.task
     last = task.input_frames + task.horizon - 1
     assert all(entry.frame_count(i) > last for i in entry.subsets["test"])
@@ -80,10 +83,10 @@ def test_every_size_is_consistent(split: str, size: str) -> None:
     assert all(p.unit and p.description and p.value is not None for p in entry.parameters.values())
 
 
-@pytest.mark.parametrize("split", ["fluid", "multimaterial", "cavity", "curl-noise"])
+@pytest.mark.parametrize("split", SPLITS)
 def test_mini_and_tiny_are_small_relatives(split: str) -> None:
     """As many particles per cell, the same frame interval, substeps as cells; tiny for tests."""
-    full, mini, tiny = (tier(split, size) for size in ("full", "mini", "tiny"))
+    full, mini, tiny = (load().size(split, size) for size in ("full", "mini", "tiny"))
     inside = [(size.bounds[0][1] - size.bounds[0][0]) * size.grid for size in (full, mini)]
     if split in ("cavity", "curl-noise"):
         per_cell = [size.particles / cells**2 for size, cells in zip((full, mini), inside, strict=True)]
@@ -97,49 +100,31 @@ def test_mini_and_tiny_are_small_relatives(split: str) -> None:
     assert mini.scenarios == tuple(range(len(mini.scenarios)))
 
 
-def edited(tmp_path: Path, change: object) -> Path:
+Change = Callable[[dict[str, Any]], object]
+
+
+def edited(tmp_path: Path, change: Change) -> Path:
     """Write a copy of our registry after a function has changed it."""
     data = read_yaml(default_path())
     data.pop("measured", None)
-    change(data)  # type: ignore[operator]
+    change(data["splits"])
     path = tmp_path / "datasets.yaml"
     path.write_text(yaml.safe_dump(data))
     return path
 
 
-def cavity(data: dict[str, Any]) -> dict[str, Any]:
-    """Return the full size of cavity as written."""
-    full: dict[str, Any] = data["splits"]["cavity"]["sizes"]["full"]
-    return full
+def cavity(*below: str, **values: object) -> Change:
+    """Return a change of cavity full, or of a mapping in it; None takes a key away."""
 
+    def change(splits: dict[str, Any]) -> None:
+        entry = splits["cavity"]["sizes"]["full"]
+        for key in below:
+            entry = entry[key]
+        entry.update(values)
+        for key in [key for key, value in values.items() if value is None]:
+            del entry[key]
 
-@pytest.mark.parametrize(
-    ("change", "place", "message"),
-    [
-        (lambda d: d.update(splts={}), "registry", "unknown key 'splts': did you mean 'splits'?"),
-        (lambda d: cavity(d).update(taks={}), "splits.cavity.sizes.full", "did you mean 'task'?"),
-        (lambda d: cavity(d)["task"].update(radios=1.0), "task", "did you mean 'radius'?"),
-        (lambda d: cavity(d)["task"].update(horizon="ninety"), "task.horizon", "valid integer"),
-        (lambda d: cavity(d).update(frames=1.5), "frames", "valid integer"),
-        (lambda d: cavity(d)["parameters"].update(gird=40), "cavity", "did you mean 'grid'?"),
-        (lambda d: cavity(d)["parameters"].pop("grid"), "cavity", "no value for grid"),
-        (lambda d: cavity(d)["subsets"].update(test="54-x"), "subsets.test", "no id and no range"),
-        (lambda d: cavity(d)["subsets"].update(tset="90"), "cavity", "did you mean 'test'?"),
-        (lambda d: cavity(d)["subsets"].update(extra="0"), "cavity", "stands in two subsets"),
-        (lambda d: cavity(d).update(frames={600: "0-58"}), "cavity", "name every scenario once"),
-        (lambda d: d["splits"]["cavity"].update(version="1.0"), "cavity.version", "match pattern"),
-    ],
-)
-def test_mistakes_are_named(change: object, place: str, message: str, tmp_path: Path) -> None:
-    """An unknown key or a value of the wrong type: file, key and the nearest known word, exit code 3."""
-    path = edited(tmp_path, change)
-    with pytest.raises(UnreadableFileError) as caught:
-        load(path)
-    text = str(caught.value)
-    assert str(path) in text
-    assert place in text
-    assert message in text
-    assert caught.value.exit_code == 3
+    return change
 
 
 def test_unknown_names_offer_the_nearest() -> None:
@@ -149,18 +134,231 @@ def test_unknown_names_offer_the_nearest() -> None:
     with pytest.raises(UsageError, match="did you mean 'full'"):
         load().size("fluid", "ful")
     with pytest.raises(UsageError, match="did you mean 'liquid_modulus'"):
-        tier("fluid", "full").value("liqid_modulus")
+        load().size("fluid", "full").value("liqid_modulus")
     with pytest.raises(UsageError, match="extra 72-86"):
-        tier("multimaterial", "full").subset_of(87)
+        load().size("multimaterial", "full").subset_of(87)
 
 
 def test_a_registry_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """LAGBENCH_REGISTRY replaces ours; a change of the file is seen in the same process."""
-    path = edited(tmp_path, lambda d: d["splits"].pop("fluid"))
+    path = edited(tmp_path, lambda splits: splits.pop("fluid"))
     monkeypatch.setenv("LAGBENCH_REGISTRY", str(path))
     assert set(load().splits) == {"cavity", "curl-noise", "multimaterial"}
-    edited(tmp_path, lambda d: d["splits"].pop("cavity"))
+    edited(tmp_path, lambda splits: splits.pop("cavity"))
     assert set(load().splits) == {"fluid", "curl-noise", "multimaterial"}
     monkeypatch.setenv("LAGBENCH_REGISTRY", str(tmp_path / "none.yaml"))
     with pytest.raises(UnreadableFileError, match="cannot read"):
         load()
+
+
+def tiny(**values: object) -> Change:
+    """Return a change of parameters of tiny fluid."""
+    return lambda splits: splits["fluid"]["sizes"]["tiny"]["parameters"].update(values)
+
+
+def always(name: str, value: object) -> Change:
+    """Return a change of a parameter that fluid declares for all sizes."""
+    return lambda splits: splits["fluid"]["parameters"][name].update(value=value)
+
+
+def frames(count: object) -> Change:
+    """Return a change of the frame counts of tiny fluid."""
+    return lambda splits: splits["fluid"]["sizes"]["tiny"].update(frames=count)
+
+
+def renamed(split: str, old: str, new: str) -> Change:
+    """Return a change of a parameter's name, wherever it stands."""
+
+    def change(splits: dict[str, Any]) -> None:
+        entry = splits[split]
+        for mapping in (entry["parameters"], *(s["parameters"] for s in entry["sizes"].values())):
+            if old in mapping:
+                mapping[new] = mapping.pop(old)
+
+    return change
+
+
+def refused(path: Path, parts: tuple[str, ...], call: Callable[[], object]) -> None:
+    """Assert that a call names file and parts, exit code 3."""
+    with pytest.raises(UnreadableFileError) as caught:
+        call()
+    text = str(caught.value)
+    assert caught.value.exit_code == 3
+    assert all(part in text for part in (str(path), *parts)), text
+
+
+@pytest.mark.parametrize(
+    ("change", "parts"),
+    [
+        (lambda splits: splits["cavity"].update(splts={}), ("cavity", "unknown key 'splts'")),
+        (cavity(taks={}), ("splits.cavity.sizes.full", "did you mean 'task'?")),
+        (cavity("task", radios=1.0), ("task", "did you mean 'radius'?")),
+        (cavity("task", horizon="ninety"), ("task.horizon", "valid integer")),
+        (cavity("parameters", gird=40), ("cavity", "did you mean 'grid'?")),
+        (cavity("parameters", grid=None), ("cavity", "no value for grid")),
+        (cavity("subsets", test="54-x"), ("subsets.test", "no id and no range")),
+        (cavity("subsets", tset="90"), ("cavity", "did you mean 'test'?")),
+        (cavity("subsets", extra="0"), ("cavity", "stands in two subsets")),
+        (cavity(frames={600: "0-58"}), ("cavity", "name every scenario once")),
+        (lambda splits: splits["cavity"].update(version="1.0"), ("cavity.version", "match pattern")),
+        (tiny(substeps_per_frame="many"), ("tiny.parameters.substeps_per_frame", ">= 1", "'many'")),
+        (tiny(substeps_per_frame=2.5), ("tiny.parameters.substeps_per_frame", "an integer", "2.5")),
+        (tiny(substeps_per_frame=0), ("tiny.parameters.substeps_per_frame", ">= 1", "0")),
+        (tiny(particles=True), ("tiny.parameters.particles", "an integer, >= 1", "True")),
+        (tiny(particles=99999999999), ("tiny.parameters.particles", "<= 10000000", "99999999999")),
+        (tiny(grid=10**6), ("tiny.parameters.grid", "<= 4096", "1000000")),
+        (always("frame_rate", 0), ("parameters.frame_rate.value", "a finite number, > 0", "got 0")),
+        (always("gravity", math.nan), ("parameters.gravity.value", "a finite number", "nan")),
+        (always("gravity", math.inf), ("parameters.gravity.value", "a finite number", "inf")),
+        (frames(0), ("sizes.tiny.frames", "an integer, >= 1", "got 0")),
+        (frames({31: "0-3", 32: "4"}), ("sizes.tiny.frames", "horizon = 32 for test scenario 3", "got 31")),
+        (renamed("fluid", "particles", "particels"), ("'particles'", "did you mean 'particels'?")),
+        (renamed("cavity", "density", "denstiy"), ("'density'", "did you mean 'denstiy'?", "needs")),
+    ],
+)
+def test_mistakes_are_named_on_load(change: Change, parts: tuple[str, ...], tmp_path: Path) -> None:
+    """An unknown key or a value that cannot be: file, key, what is expected, what was got."""
+    path = edited(tmp_path, change)
+    refused(path, parts, lambda: load(path))
+
+
+@pytest.mark.parametrize(
+    ("change", "parts"),
+    [
+        (renamed("fluid", "gravity", "gravty"), ("parameter gravity", "did you mean 'gravty'?")),
+        (always("gravity", "down"), ("parameter gravity", "a finite number", "'down'")),
+        (always("liquid_modulus", -1.0), ("parameter liquid_modulus", "a finite number, > 0", "-1.0")),
+        (always("jacobian_relaxation", 2), ("parameter jacobian_relaxation", ">= 0 and <= 1", "2")),
+        (tiny(wall=16), ("parameter wall", "an integer, >= 0 and <= 14", "16")),
+        (always("area_min", "big"), ("size tiny", "generators.fluid can use", "area_min = 'big'")),
+        (renamed("fluid", "area_max", "aera_max"), ("size tiny", "did you mean 'aera_max'?", "'area_max'")),
+    ],
+)
+def test_a_solver_that_cannot_be_fed_is_refused_before_work(
+    change: Change, parts: tuple[str, ...], tmp_path: Path
+) -> None:
+    """By ``generate``, dry or not, and by ``verify --regenerate``; nothing is written."""
+    path, root = edited(tmp_path, change), tmp_path / "data"
+    options = {"root": root, "registry": load(path), "workers": 1}
+    for dry_run in (True, False):
+        refused(path, parts, lambda dry_run=dry_run: generate("fluid", "tiny", dry_run=dry_run, **options))
+    assert [p for p in root.rglob("*") if p.is_file() and not p.name.startswith(".lock")] == []
+    refused(path, parts, lambda: verify("fluid", "tiny", regenerate=1, **options))
+
+
+def test_our_own_values_hold_with_room() -> None:
+    """Every number of ours lies within its limit, at every size, or the limits are wrong."""
+    for split, entry in load().splits.items():
+        for name in entry.sizes:
+            size = load().size(split, name)
+            for parameter, limit in {**LIMITS, **NEEDED}.items():
+                if parameter in size.parameters:
+                    assert limit.holds(size.value(parameter)), (split, name, parameter)
+
+
+@given(st.one_of(st.integers(), st.floats(), st.booleans(), st.text()))
+def test_limits_agree_with_their_words(value: object) -> None:
+    """An integer from -2 to 5, exclusive of 5, is what `holds` says, whatever the type."""
+    whole = Limit(low=-2, high=5, whole=True, open_high=True)
+    assert whole.holds(value) == (type(value) is int and value in range(-2, 5))
+    real = Limit(low=0.0, open_low=True)
+    assert real.holds(value) == (type(value) in (int, float) and 0 < value < math.inf)  # type: ignore[operator]
+    assert str(whole) == "an integer, >= -2 and < 5"
+    assert str(real) == "a finite number, > 0"
+
+
+Plug = Callable[..., Registry]
+
+
+@pytest.fixture
+def plugged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Plug]:
+    """A function that loads our registry with other packages' modules, given as name=source."""
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delenv(registry.REGISTRY_VARIABLE, raising=False)
+
+    def plug(**sources: str) -> Registry:
+        points = [EntryPoint("cavity", "lagbench.generators.cavity", registry.GROUP)]
+        for name, source in sources.items():
+            (tmp_path / f"{name}_split.py").write_text(source)
+            points += 2 * [EntryPoint(name, f"{name}_split", registry.GROUP)]  # found on two paths
+        monkeypatch.setattr(registry, "entry_points", lambda group: points)
+        registry._load.cache_clear()
+        return load()
+
+    yield plug
+    registry._load.cache_clear()
+
+
+@pytest.fixture
+def theirs(tmp_path: Path) -> str:
+    """A datasets.yaml of a split of one's own that also rewrites the cavity and its hash."""
+    data = read_yaml(default_path())
+    splits = {"sloshing": data["splits"]["fluid"], "cavity": data["splits"]["cavity"]}
+    splits["cavity"]["title"] = "Hijacked"
+    nothing = {"subset_sha256": {}, "scenario_sha256": {}, "statistics": {}, "twin_floor": []}
+    measured = {"cavity": {"tiny": {"dataset_sha256": "0" * 64, **nothing}}}
+    path = tmp_path / "theirs.yaml"
+    path.write_text(yaml.safe_dump({"format": 1, "splits": splits, "measured": measured}))
+    return str(path)
+
+
+def test_other_packages_add_splits_and_change_none(plugged: Plug, theirs: str) -> None:
+    """Only the split that an entry point names is taken: our split and its hash stay ours."""
+    before = load(default_path())
+    found = plugged(sloshing=f"REGISTRY = {theirs!r}")
+    assert set(found.splits) == {*before.splits, "sloshing"}
+    assert found.size("sloshing", "tiny").particles == 256
+    assert found.size("cavity", "tiny") == before.size("cavity", "tiny")
+    assert found.split("cavity") == before.split("cavity")
+
+
+@pytest.mark.parametrize(
+    ("name", "source", "reason"),
+    [
+        ("careless", "", "REGISTRY"),
+        ("broken", "import no_such_module_at_all", "ModuleNotFoundError.*no_such_module_at_all"),
+        ("lost", "REGISTRY = '/nowhere/datasets.yaml'", "cannot read"),
+        ("silent", "REGISTRY = {theirs!r}", "no split 'silent'"),
+        ("cavity", "REGISTRY = {theirs!r}", "its name is taken"),
+    ],
+)
+def test_a_broken_package_is_left_out(
+    name: str, source: str, reason: str, plugged: Plug, theirs: str
+) -> None:
+    """A package that cannot be imported or read costs one warning that names it, and none of our splits."""
+    with pytest.warns(registry.PluginWarning, match=f"(?s)package {name}_split .*{reason}") as told:
+        found = plugged(**{name: source.format(theirs=theirs)})
+    assert len(told) == 1
+    assert found.splits == load(default_path()).splits
+
+
+def test_a_broken_package_breaks_no_command(tmp_path: Path) -> None:
+    """An installed package whose module is gone: the command works, one line on stderr names the package."""
+    folder = tmp_path / "wave_splits-1.0.dist-info"
+    folder.mkdir()
+    (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: wave-splits\nVersion: 1.0\n")
+    (folder / "entry_points.txt").write_text(f"[{registry.GROUP}]\nwaves = wave_splits.gone\n")
+    code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); from lagbench.cli import main; main()"
+    command = [sys.executable, "-c", code, "cite", "cavity", "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+    assert '"split": "cavity"' in done.stdout
+    assert done.stderr.startswith("warning: package wave-splits adds no split 'waves'")
+    assert len(done.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("split", "expected"), [("cavity", (0.002191, 0.002195)), ("curl-noise", (1.600e-03, 1.600e-03))]
+)
+def test_statistics_of_train_are_those_of_the_thesis(split: str, expected: tuple[float, float]) -> None:
+    """Standard deviations of per-frame velocities within 5 % of Tables 5.1 and 5.3, by component.
+
+    Positions of curl noise spread as in Table 5.1 (0.272): a uniform box of this width gives it within 2 %.
+    """
+    size = load().size(split, "full")
+    assert size.measured.statistics["velocity_std"] == pytest.approx(expected, rel=0.05)
+    if split == "curl-noise":
+        (low, high), _ = size.bounds
+        uniform = (high - low) / 12**0.5
+        assert size.measured.statistics["position_std"] == pytest.approx((uniform, uniform), rel=1e-3)
+        assert uniform == pytest.approx(0.272, rel=0.02)

@@ -11,11 +11,9 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from score_bench import ScoreBench, bench_of, half_right, right, still, straight
+from score_bench import ScoreBench, half_right, right, still, straight
 
-from lagbench.data.registry import Registry
 from lagbench.errors import ChecksFailedError, DataError, UsageError
-from lagbench.make.generate import GenerationResult
 from lagbench.scoring import score as scoring
 from lagbench.scoring.card import ScoreCard, digits
 from lagbench.scoring.scenario import SUBMISSION
@@ -24,12 +22,6 @@ from lagbench.scoring.score_file import read_statistics
 from lagbench.store.dataset import open_split
 from lagbench.submission import validate
 from lagbench.work.progress import Progress
-
-
-@pytest.fixture(scope="module")
-def bench(generated: GenerationResult, unmeasured: Registry) -> ScoreBench:
-    """Tiny curl noise, two test scenarios of 20 predicted frames."""
-    return bench_of(generated, unmeasured)
 
 
 @pytest.fixture(scope="module")
@@ -93,21 +85,11 @@ def test_json_says_what_the_card_says(standing: ScoreCard) -> None:
     frames = said["task"]["frames"]
     assert frames == sorted({*standing.setting.frames_of_interest, standing.setting.predicted_frames[-1]})
     assert list(said["rows"][SUBMISSION]["position_mse"]["at"]) == [str(frame) for frame in frames]
-    assert said["metrics"]["vorticity_rmse"] == {
-        "family": "vorticity",
-        "unit": "1/frame",
-        "direction": "lower",
-        "perfect": 0.0,
-        "source": "Eq. 3.3, Table 5.4",
-        "summary": "Root mean squared vorticity error over the counted nodes",
-    }
-
-
-def test_undefined_is_null_and_counted(standing: ScoreCard) -> None:
-    """At rest there is no correlation: null, every frame counted, in both scenarios."""
-    entry = held(standing)["rows"][SUBMISSION]["vorticity_pearson"]
-    assert entry["mean"] is None
-    assert entry["values"] == [None, None]
+    told = {"family": "vorticity", "unit": "1/frame", "direction": "lower", "perfect": 0.0}
+    assert said["metrics"]["vorticity_rmse"].items() >= told.items()
+    # At rest there is no correlation: null, every frame counted, in both scenarios.
+    entry = said["rows"][SUBMISSION]["vorticity_pearson"]
+    assert (entry["mean"], entry["values"]) == (None, [None, None])
     assert entry["undefined"] == [standing.setting.horizon] * 2
 
 
@@ -136,27 +118,21 @@ def test_scores_follow_from_scores_nc(standing: ScoreCard) -> None:
 
 
 def test_same_bytes_from_worker_processes(bench: ScoreBench, standing: ScoreCard, tmp_path: Path) -> None:
-    """Two workers and another folder give the same bytes; nothing of place or time is in them."""
+    """Two workers, another folder, scenarios stored in another order: the same bytes, no place or time."""
     source = standing.files[0].parent / "predictions.nc"
-    card = bench.score(source, workers=2, output_dir=tmp_path / "elsewhere")
-    for first, second in zip(standing.files, card.files, strict=True):
-        assert first.read_bytes() == second.read_bytes()
-    text = card.files[0].read_text()
-    assert str(bench.root) not in text
-    assert str(source.parent) not in text
-
-
-def test_order_of_scenarios_does_not_matter(bench: ScoreBench, standing: ScoreCard, tmp_path: Path) -> None:
-    """Scenarios stored in another order are matched by id and give the same bytes."""
     shuffled = tmp_path / "predictions.nc"
-    shuffled.write_bytes((standing.files[0].parent / "predictions.nc").read_bytes())
+    shuffled.write_bytes(source.read_bytes())
     with h5py.File(shuffled, "r+") as file:
         for name in ("scenario", "position"):
             file[name][...] = file[name][...][::-1]
-    card = bench.score(shuffled)
-    assert card.header.scenarios == (4, 3)
-    assert card.files[0].read_bytes() == standing.files[0].read_bytes()
-    assert card.files[1].read_bytes() == standing.files[1].read_bytes()
+    reordered = bench.score(shuffled)
+    assert reordered.header.scenarios == (4, 3)
+    for card in (bench.score(source, workers=2, output_dir=tmp_path / "elsewhere"), reordered):
+        for first, second in zip(standing.files, card.files, strict=True):
+            assert first.read_bytes() == second.read_bytes()
+    text = standing.files[0].read_text()
+    assert str(bench.root) not in text
+    assert str(source.parent) not in text
 
 
 def test_a_wild_prediction_gets_finite_scores(bench: ScoreBench, tmp_path: Path) -> None:
@@ -212,23 +188,18 @@ def test_invalid_predictions_are_refused(bench: ScoreBench, standing: ScoreCard,
     assert list(tmp_path.iterdir()) == [broken]
 
 
-def test_without_the_test_subset(bench: ScoreBench, standing: ScoreCard, tmp_path: Path) -> None:
-    """A root without the data set is a data error that names the command which makes it."""
-    source = standing.files[0].parent / "predictions.nc"
-    with pytest.raises(DataError, match="lagbench generate --split curl-noise --size tiny"):
-        score(source, root=tmp_path, registry=bench.registry)
-
-
-def test_without_statistics_of_train(bench: ScoreBench, tmp_path: Path) -> None:
-    """With the manifest gone and nothing recorded, the error says what is missing and how to get it."""
+def test_without_what_the_score_needs(bench: ScoreBench, tmp_path: Path) -> None:
+    """A root without the data set names the command which makes it; then statistics of train are lacking."""
     root = tmp_path / "root"
+    path = bench.submit(tmp_path / "predictions.nc", still)
+    assert validate(path, root=bench.root, registry=bench.registry).valid
+    with pytest.raises(DataError, match="lagbench generate --split curl-noise --size tiny"):
+        score(path, root=root, registry=bench.registry)
     for scenario in bench.size.subsets["test"]:
         source = bench.task.truth.path(scenario)
         target = root / source.relative_to(bench.root)
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_bytes(source.read_bytes())
-    path = bench.submit(tmp_path / "predictions.nc", still)
-    assert validate(path, root=bench.root, registry=bench.registry).valid
     with pytest.raises(DataError, match="recorded"):
         score(path, root=root, registry=bench.registry)
 

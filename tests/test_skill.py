@@ -12,24 +12,16 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy.stats
-from score_bench import ScoreBench, bench_of, right, still, straight
+from score_bench import ScoreBench, right, still, straight
 
-from lagbench.data.registry import Measured, Registry, Size
+from lagbench.data.registry import Measured, Size
 from lagbench.floors import FLOORS, floors_of, shipped
 from lagbench.floors.shipped import shipped_path, write_shipped
-from lagbench.make.generate import GenerationResult
 from lagbench.metrics import METRICS, Score
 from lagbench.scoring import floors as floors_of_scoring
 from lagbench.scoring import score as scoring
 from lagbench.scoring.card import ScoreCard
-from lagbench.scoring.floors import (
-    differences,
-    kept_in,
-    measurable,
-    measure,
-    measured_again,
-    measured_sizes,
-)
+from lagbench.scoring.floors import differences, kept_in, measurable, measure, measured_again, measured_sizes
 from lagbench.scoring.scenario import SUBMISSION
 from lagbench.scoring.score_file import read_statistics
 from lagbench.scoring.skill import best_floor, skill
@@ -44,50 +36,35 @@ def scored(values: list[float], metric: str = "vorticity_rmse", first: int = 0) 
 
 
 def test_skill_is_one_minus_the_ratio_of_means() -> None:
-    """Means 1 and 4: skill 3/4 beside the better floor; a perfect score has 1, twice the floor's -1."""
+    """Means 1 and 4: skill 3/4 beside the better floor; a perfect score has 1, twice the floor's -1.
+
+    The coarse solver knows the equations: however good, skill is measured against what does not; nor are
+    strangers. A scenario that is undefined on one side is left out on both.
+    """
     floors = {"persistence": scored([6.0, 6.0]), "frozen-field": scored([3.0, 5.0])}
-    found = skill([scored([0.5, 1.5])], floors)
-    assert found is not None
-    assert (found.floor, found.value) == ("frozen-field", 0.75)
-    perfect, worse = skill([scored([0.0, 0.0])], floors), skill([scored([6.0, 10.0])], floors)
-    assert perfect is not None
-    assert worse is not None
-    assert (perfect.value, worse.value) == (1.0, -1.0)
-
-
-def test_the_coarse_solver_is_no_best_floor() -> None:
-    """It knows the equations: however good, skill is measured against what does not; nor are strangers."""
+    found = [skill([scored(v)], floors) for v in ([0.5, 1.5], [0.0, 0.0], [6.0, 10.0])]
+    assert [(one.floor, one.value) for one in found] == [("frozen-field", v) for v in (0.75, 1.0, -1.0)]
     floors = {"analog": scored([2.0]), "coarse-solver": scored([0.1]), "stranger": scored([0.1])}
     assert best_floor(floors) == "analog"
+    gappy = skill([scored([1.0, 9.0])], {"analog": scored([4.0, math.nan])})
+    assert gappy.value == 0.75
+    assert all(math.isnan(bound) for bound in gappy.interval)
 
 
-def test_skill_is_undefined_without_a_floor() -> None:
-    """No floor, an undefined one, a perfect one, other scenarios, or a metric of which more is better."""
-    ours = scored([1.0, 1.0])
+def test_what_skill_and_its_interval_need() -> None:
+    """No floor, an undefined one, a perfect one, other scenarios, or a metric of which more is better.
+
+    A ratio that is 1/2 in every scenario is certain; three scenarios have no interval.
+    """
+    ours, pearson = scored([1.0, 1.0]), scored([0.5, 0.5], "vorticity_pearson")
     assert skill([ours], {}) is None
-    assert skill([ours], {"analog": scored([math.nan, math.nan])}) is None
-    assert skill([ours], {"analog": scored([0.0, 0.0])}) is None
-    assert skill([ours], {"analog": scored([1.0, 1.0], first=7)}) is None
-    pearson = scored([0.5, 0.5], "vorticity_pearson")
+    for floor in (scored([math.nan] * 2), scored([0.0, 0.0]), scored([1.0, 1.0], first=7)):
+        assert skill([ours], {"analog": floor}) is None
     assert skill([pearson], {"analog": pearson}) is None
-
-
-def test_skill_takes_the_scenarios_that_both_have() -> None:
-    """An undefined scenario is left out on both sides: 1 of 4, not (1 + 9) of anything."""
-    found = skill([scored([1.0, 9.0])], {"analog": scored([4.0, math.nan])})
-    assert found is not None
-    assert found.value == 0.75
-    assert all(math.isnan(bound) for bound in found.interval)
-
-
-def test_the_interval_of_a_ratio() -> None:
-    """A ratio that is 1/2 in every scenario is certain; three scenarios have no interval."""
     base = [1.0, 2.0, 5.0, 3.0]
     certain = skill([scored([0.5, 1.0, 2.5, 1.5])], {"analog": scored(base)})
-    assert certain is not None
     assert (certain.value, certain.interval) == (0.5, (0.5, 0.5))
     few = skill([scored([1.0, 1.0, 4.0])], {"analog": scored(base[:3])})
-    assert few is not None
     assert all(math.isnan(bound) for bound in few.interval)
 
 
@@ -97,14 +74,12 @@ def test_the_interval_is_that_of_resampled_ratios() -> None:
     base = rng.gamma(9.0, size=20)
     ours = 0.3 * base * rng.gamma(25.0, 0.04, size=20)
     found = skill([scored(ours.tolist())], {"analog": scored(base.tolist())})
-    assert found is not None
-    theirs = scipy.stats.bootstrap(
-        (ours, base),
-        lambda a, b, axis: 1.0 - a.mean(axis=axis) / b.mean(axis=axis),
-        paired=True,
-        method="percentile",
-        rng=np.random.default_rng(1),
-    ).confidence_interval
+
+    def ratio(a: Any, b: Any, axis: int) -> Any:
+        return 1.0 - a.mean(axis=axis) / b.mean(axis=axis)
+
+    options = {"paired": True, "method": "percentile", "rng": np.random.default_rng(1)}
+    theirs = scipy.stats.bootstrap((ours, base), ratio, **options).confidence_interval
     stretch = math.sqrt(20 / 19) * scipy.stats.t.ppf(0.975, 19) / scipy.stats.norm.ppf(0.975)
     expected = [found.value + stretch * (bound - found.value) for bound in theirs]
     assert found.interval == pytest.approx(expected, abs=0.1 * (expected[1] - expected[0]))
@@ -115,19 +90,11 @@ def test_seeds_widen_the_interval_of_skill() -> None:
     base, share = np.full(12, 4.0), np.array([0.4, 0.5, 0.9])
     seeds = [scored((part * base).tolist()) for part in share]
     found = skill(seeds, {"analog": scored(base.tolist())})
-    assert found is not None
     assert (found.value, found.std) == pytest.approx((0.4, np.std(share, ddof=1)))
     reach = np.std(share, ddof=1) / math.sqrt(3) * scipy.stats.t.ppf(0.975, 2)
     assert found.interval[1] - found.interval[0] == pytest.approx(2 * reach, rel=0.15)
     alone = skill(seeds[:1], {"analog": scored(base.tolist())})
-    assert alone is not None
     assert alone.interval == pytest.approx((0.6, 0.6))
-
-
-@pytest.fixture(scope="module")
-def bench(generated: GenerationResult, unmeasured: Registry) -> ScoreBench:
-    """Tiny curl noise."""
-    return bench_of(generated, unmeasured)
 
 
 @pytest.fixture(scope="module")
@@ -139,9 +106,8 @@ def measured_floors(bench: ScoreBench) -> dict[str, Any]:
 def recorded(size: Size, sha256: str = "a" * 64) -> Size:
     """Return a size as if its data set were recorded."""
     statistics = {"position_std": (0.3, 0.3), "velocity_std": (1e-3, 1e-3)}
-    measured = Measured(
-        dataset_sha256=sha256, subset_sha256={}, scenario_sha256={}, statistics=statistics, twin_floor=()
-    )
+    hashes = {"dataset_sha256": sha256, "subset_sha256": {}, "scenario_sha256": {}}
+    measured = Measured(**hashes, statistics=statistics, twin_floor=())
     return size.model_copy(update={"measured": measured})
 
 
@@ -154,7 +120,6 @@ def test_shipped_scores_are_the_measured_ones(
     size, frames = recorded(bench.size), (15, 25)
     path = write_shipped(size, found, dataset_sha256="a" * 64, reported=frames, folder=tmp_path)
     held = shipped(size, tmp_path)
-    assert held is not None
     assert differences(held, found) == {}
     for name, floor in found.items():
         for metric, score in floor.scores.items():
@@ -174,9 +139,9 @@ def test_shipped_scores_are_the_measured_ones(
 
 
 def test_a_forged_shipped_score_is_found(
-    bench: ScoreBench, measured_floors: dict[str, Any], tmp_path: Path
+    bench: ScoreBench, measured_floors: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One value changed by 1 % differs from what is measured; so does a floor that is left out."""
+    """One value changed by 1 % differs from what is measured again; so does a floor that is left out."""
     found = {name: measured_floors[name] for name in ("persistence", "constant-velocity")}
     size = recorded(bench.size)
     path = write_shipped(size, found, dataset_sha256="a" * 64, reported=(15,), folder=tmp_path)
@@ -184,17 +149,10 @@ def test_a_forged_shipped_score_is_found(
     said["floors"]["persistence"]["values"]["position_rmse"][1] *= 1.01
     del said["floors"]["constant-velocity"]
     path.write_text(json.dumps(said))
-    held = shipped(size, tmp_path)
-    assert held is not None
-    unlike = differences(held, found)
+    unlike = differences(shipped(size, tmp_path), found)
     assert unlike["persistence"] == ("position_rmse",)
     assert set(unlike["constant-velocity"]) == set(found["constant-velocity"].scores)
 
-
-def test_shipped_floors_are_measured_again(
-    bench: ScoreBench, measured_floors: dict[str, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """What is shipped agrees with a second measurement; one value changed by 1 % is named with its floor."""
     assert [size.name for size in measured_sizes(bench.root, registry=bench.registry)] == [bench.size.name]
     held = dict(measured_floors)
     monkeypatch.setattr(floors_of_scoring, "shipped", lambda size: held)
@@ -240,8 +198,6 @@ def test_skill_stands_in_the_card(bench: ScoreBench, tmp_path: Path) -> None:
     """The truth has skill 1; persistence has none above 0; first row and JSON say the same."""
     perfect = bench.evaluate(bench.submit(tmp_path / "right.nc", right))
     standing: ScoreCard = bench.score(bench.submit(tmp_path / "still.nc", still))
-    assert perfect.skill is not None
-    assert standing.skill is not None
     assert perfect.skill.value == 1.0
     assert standing.skill.value <= 0.0
     said = standing.as_json()["skill"]
@@ -249,6 +205,5 @@ def test_skill_stands_in_the_card(bench: ScoreBench, tmp_path: Path) -> None:
     assert FLOORS[said["floor"]].counts
     assert said["value"] == pytest.approx(standing.skill.value)
     again = read_statistics(standing.files[1]).skill()
-    assert again is not None
     assert (again.floor, again.value) == (standing.skill.floor, standing.skill.value)
     assert next(iter(card_tables(standing))).rows[0][0].startswith("skill")

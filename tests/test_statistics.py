@@ -36,6 +36,15 @@ def test_by_hand() -> None:
     assert result["velocity_std"] == (1.0, 0.0)
     assert result["acceleration_mean"] == (0.0, 0.0)
     assert result["acceleration_std"] == (2.0, 0.0)
+    # One frame has no velocity: no statistic is invented for it.
+    stream = MomentStream()
+    stream.update(np.zeros((4, 2), np.float32))
+    assert set(statistics([stream.result()])) == {"position_mean", "position_std"}
+    longer = scenario_moments(frames_of(1, 6, 4))
+    assert statistics([stream.result(), longer])["velocity_std"] == statistics([longer])["velocity_std"]
+    # Nine significant digits, no negative zero.
+    assert [round_digits(x) for x in (1 / 3, -2.19123456789e-3)] == [0.333333333, -2.19123457e-3]
+    assert str(round_digits(-0.0)) == "0.0"
 
 
 def test_against_numpy() -> None:
@@ -74,19 +83,3 @@ def test_files_give_the_same_as_arrays(tmp_path: Path) -> None:
     assert file_statistics(paths) == expected
     with pytest.raises(DataError, match="no scenario files"):
         file_statistics([])
-
-
-def test_too_few_frames_leave_quantities_out() -> None:
-    """One frame has no velocity; no statistic is invented for it."""
-    stream = MomentStream()
-    stream.update(np.zeros((4, 2), np.float32))
-    assert set(statistics([stream.result()])) == {"position_mean", "position_std"}
-    longer = scenario_moments(frames_of(1, 6, 4))
-    assert statistics([stream.result(), longer])["velocity_std"] == statistics([longer])["velocity_std"]
-
-
-def test_rounding() -> None:
-    """Nine significant digits, no negative zero."""
-    assert round_digits(1 / 3) == 0.333333333
-    assert round_digits(-2.19123456789e-3) == -2.19123457e-3
-    assert str(round_digits(-0.0)) == "0.0"

@@ -1,7 +1,9 @@
-"""The checks: warnings, truth that is missing or wrong, all findings together, guesses."""
+"""The checks: warnings, truth that is missing or changed, all findings together, guesses."""
 
 from __future__ import annotations
 
+import json
+import os
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -18,11 +20,16 @@ from numpy.typing import NDArray
 from scenario_factory import make_key, write_scenario
 from submission_data import FRAMES, GIVEN, PARTICLES, Bench, make_bench, truth
 
+from lagbench.data.layout import NOTES_NAME
 from lagbench.data.registry import Registry
 from lagbench.data.scenario import ScenarioFile
 from lagbench.data.writer import scenario_path
 from lagbench.errors import ChecksFailedError, DataError, UnreadableFileError
-from lagbench.submission import Severity, ValidationResult, validate
+from lagbench.make.generate import GenerationResult
+from lagbench.make.verify import verify
+from lagbench.scoring.score import score
+from lagbench.submission import Severity, ValidationResult, template, validate
+from lagbench.submission import truth as module
 from lagbench.submission.task_checks import guess_frames, guess_scenarios
 from lagbench.submission.truth import Truth
 
@@ -44,7 +51,10 @@ def changed(bench: Bench, edit: Callable[[Values], Values]) -> ValidationResult:
 
 
 def test_particles_outside_the_box_are_flagged(bench: Bench) -> None:
-    """One position of 1152 at x = 1.5: a warning with its place, exit code 0."""
+    """One position of 1152 at x = 1.5: a warning with its place, exit code 0.
+
+    The wall is at 0.9375 and a solver cell is 0.125 wide: 1.06 passes, 1.07 does not.
+    """
 
     def edit(values: Values) -> Values:
         values[1, 4, 9, 0] = 1.5
@@ -54,40 +64,31 @@ def test_particles_outside_the_box_are_flagged(bench: Bench) -> None:
     flag = next(f for f in result.findings if f.check == "in_domain")
     assert (flag.severity, result.exit_code) == (Severity.WARNING, 0)
     assert flag.where == "first in scenario 4, frame 7, particle 9"
-    # 1 / (3 * 8 * 48) = 0.087 %; the wall is at 0.9375
+    # 1 / (3 * 8 * 48) = 0.087 %
     assert "0.09%" in flag.what
     assert "0.562" in flag.got
-
-
-def test_a_cell_beyond_the_wall_is_no_warning(bench: Bench) -> None:
-    """The wall is at 0.9375 and a solver cell is 0.125 wide: 1.06 passes, 1.07 does not."""
     for place, flagged in ((1.06, False), (1.07, True)):
-        everywhere = np.full((3, 8, PARTICLES, 2), place, np.float32)
-        result = changed(bench, lambda _, values=everywhere: values)  # type: ignore[misc]
+        result = changed(bench, lambda values, place=place: np.full_like(values, place))  # type: ignore[misc]
         assert ("in_domain" in {f.check for f in result.warnings}) == flagged
 
 
 def test_jumps_are_flagged(bench: Bench) -> None:
-    """Particles permuted in the middle of the rollout jump; the start is right."""
+    """A particle that starts 15 steps away and stays there jumps once, before the first predicted frame.
 
-    def edit(values: Values) -> Values:
-        values[:, 4:] = values[:, 4:, ::-1]
-        return values
-
-    result = changed(bench, edit)
+    Particles permuted in the middle of the rollout jump too; a displacement that is surely reached ends the
+    search in the truth.
+    """
+    source = Truth(bench.registry.size("cavity", "tiny"), bench.root)
+    everything = source.largest_displacement(4, enough=np.inf)
+    assert 0 < source.largest_displacement(4, enough=1e-9) <= everything
+    result = changed(bench, lambda x: np.concatenate([x[:, :4], x[:, 4:, ::-1]], axis=1))
     assert {f.check for f in result.findings} == {"max_displacement"}
     assert [f.where.split(",")[1].strip() for f in result.warnings] == ["from frame 6 to 7"] * 3
     assert result.exit_code == 0
 
-
-def test_a_jump_from_the_last_given_frame_is_flagged(bench: Bench) -> None:
-    """A particle that starts 15 steps away and stays there jumps once, before the first predicted frame."""
-    source = Truth(bench.registry.size("cavity", "tiny"), bench.root)
-    far = 15 * source.largest_displacement(4, enough=np.inf)
-
     def edit(values: Values) -> Values:
         values[1, :, 9] = source.given(4)[-1, 9]
-        values[1, :, 9, 0] += far
+        values[1, :, 9, 0] += 15 * everything
         return values
 
     result = changed(bench, edit)
@@ -114,13 +115,6 @@ def test_the_limit_of_the_start_is_ten_displacements(bench: Bench) -> None:
         assert result.exit_code == 0
         flagged.append([float(f.got) for f in result.warnings if f.check == "discontinuous_start"])
     assert flagged == [[], [pytest.approx(1.1 * limit, rel=0.01)]]
-
-
-def test_scanning_the_truth_stops_when_it_knows_enough(bench: Bench) -> None:
-    """A displacement that is surely reached ends the search at once."""
-    source = Truth(bench.registry.size("cavity", "tiny"), bench.root)
-    everything = source.largest_displacement(4, enough=np.inf)
-    assert 0 < source.largest_displacement(4, enough=1e-9) <= everything
 
 
 def test_a_sound_file_opens_the_truth_once(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -232,3 +226,104 @@ def test_guesses_never_fail(numbers: list[int]) -> None:
 def test_guesses_about_frames(numbers: range, word: str) -> None:
     """Given 6 frames and a horizon of 90: what each wrong numbering seems to be."""
     assert word in guess_frames(list(numbers), range(6, 96))
+
+
+@pytest.fixture
+def own(tmp_path: Path) -> Bench:
+    """A small data set of which a test may change files, and a valid submission."""
+    return make_bench(tmp_path)
+
+
+def truth_of(own: Bench) -> Truth:
+    """The test subset."""
+    return Truth(own.registry.size("cavity", "tiny"), own.root)
+
+
+def change(path: Path, *, keep_times: bool = False) -> None:
+    """Change one value of a file and nothing else."""
+    before = path.stat()
+    with h5py.File(path, "r+") as file:
+        file["position"][1, 2, 0] += 0.001
+    if keep_times:
+        os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+
+
+@pytest.fixture
+def hashed(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
+    """Files whose values are hashed during a test."""
+    found: list[Path] = []
+    check = module.check_scenario
+
+    def listen(path: Path) -> str:
+        found.append(path)
+        return check(path)
+
+    monkeypatch.setattr(module, "check_scenario", listen)
+    return found
+
+
+def test_a_changed_value_is_refused(own: Bench) -> None:
+    """One value, all attributes kept: exit code 4, naming the file and the command that mends it."""
+    path = truth_of(own).path(4)
+    change(path)
+    result = own.validate(own.valid)
+    assert (result.exit_code, {f.check for f in result.errors}) == (4, {"dataset"})
+    assert str(path) in result.errors[0].where
+    assert "lagbench generate --split cavity --size tiny --subset test" in result.errors[0].fix
+    assert set(result.skipped) == {"start", "discontinuous_start", "max_displacement"}
+
+
+def test_a_change_after_the_check_is_seen(own: Bench, hashed: list[Path]) -> None:
+    """What was noted counts for the bytes that were hashed, also where the times were put back."""
+    assert own.validate(own.valid).valid
+    path = truth_of(own).path(4)
+    change(path, keep_times=True)
+    hashed.clear()
+    with pytest.raises(DataError) as caught:
+        truth_of(own).check()
+    assert (caught.value.exit_code, hashed) == (4, [path])
+
+
+def test_notes_of_another_machine_count_for_nothing(own: Bench, tmp_path: Path, hashed: list[Path]) -> None:
+    """Values are hashed once; where a folder is copied with its notes its files are hashed again."""
+    truth_of(own).check()
+    truth_of(own).check()
+    assert len(hashed) == 3
+    root = tmp_path / "copy"
+    shutil.copytree(own.root, root)
+    Truth(own.registry.size("cavity", "tiny"), root).check()
+    assert len(hashed) == 6
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{", '{"test/0004.nc": 1}', '{"test/0004.nc": [1]}', "[" * 10**5])
+def test_damaged_notes_are_no_notes(own: Bench, text: str) -> None:
+    """The files are hashed, and the notes written anew."""
+    notes = truth_of(own).folder / NOTES_NAME
+    notes.write_text(text)
+    truth_of(own).check()
+    assert set(json.loads(notes.read_text())) == {f"test/{i:04d}.nc" for i in (3, 4, 5)}
+
+
+def test_another_data_set_of_its_own_right_is_refused(own: Bench) -> None:
+    """A file that agrees with itself, but not with datasets.yaml."""
+    held = truth_of(own)
+    size = held.size
+    other = size.measured.model_copy(update={"scenario_sha256": {3: "0" * 16, 4: "0" * 16, 5: "0" * 16}})
+    with pytest.raises(DataError) as caught:
+        Truth(size.model_copy(update={"measured": other}), own.root).check()
+    assert caught.value.expected == "0" * 16
+
+
+def test_the_scorer_refuses_a_changed_truth(
+    copied: Callable[[], Path], unmeasured: Registry, tmp_path: Path, generated: GenerationResult
+) -> None:
+    """Of a data set that only its manifest records; generate and verify have noted what they hashed."""
+    assert (generated.folder / NOTES_NAME).is_file()
+    root = copied()
+    verify("curl-noise", "tiny", root=root, registry=unmeasured)
+    made = template("curl-noise", "tiny", output=tmp_path / "p.nc", root=root, registry=unmeasured)
+    score(made.path, root=root, registry=unmeasured, write=False)
+    change(Truth(unmeasured.size("curl-noise", "tiny"), root).path(4), keep_times=True)
+    with pytest.raises(DataError) as caught:
+        score(made.path, root=root, registry=unmeasured, write=False)
+    assert caught.value.exit_code == 4

@@ -18,11 +18,13 @@ def _write(folder: Path, text: str | bytes) -> Path:
 
 
 def test_plain_values_are_read(tmp_path: Path) -> None:
-    """Mappings, lists, numbers and strings come back as plain Python."""
-    assert read_yaml(_write(tmp_path, "a: [1, 2.5, x]\nb: {c: true}\n")) == {
-        "a": [1, 2.5, "x"],
-        "b": {"c": True},
-    }
+    """Mappings, lists, numbers and strings; a file that is missing or over the bound is named."""
+    text = "a: [1, 2.5, x]\nb: {c: true}\n"
+    assert read_yaml(_write(tmp_path, text)) == {"a": [1, 2.5, "x"], "b": {"c": True}}
+    with pytest.raises(UnreadableFileError, match=f"at most {MAX_BYTES} bytes"):
+        read_yaml(_write(tmp_path, b"#" * (MAX_BYTES + 1)))
+    with pytest.raises(UnreadableFileError, match=r"absent\.yaml"):
+        read_yaml(tmp_path / "absent.yaml")
 
 
 @pytest.mark.parametrize(
@@ -70,18 +72,6 @@ def test_numbers_are_those_of_yaml_1_2(tmp_path: Path, text: str, value: object)
     """Base 60, underscores and binary are text, 010 is ten, an exponent needs no point."""
     found = read_yaml(_write(tmp_path, f"a: {text}\n"))["a"]
     assert (found, type(found)) == (value, type(value))
-
-
-def test_large_files_are_not_even_opened(tmp_path: Path) -> None:
-    """A file over the bound is refused by its size."""
-    with pytest.raises(UnreadableFileError, match=f"at most {MAX_BYTES} bytes"):
-        read_yaml(_write(tmp_path, b"#" * (MAX_BYTES + 1)))
-
-
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    """The path stands in the message."""
-    with pytest.raises(UnreadableFileError, match=r"absent\.yaml"):
-        read_yaml(tmp_path / "absent.yaml")
 
 
 @pytest.mark.parametrize(

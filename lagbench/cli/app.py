@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Annotated, Any, TextIO
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
@@ -15,8 +15,6 @@ from typer.core import TyperGroup
 from lagbench.errors import LagbenchError
 
 from . import board, data, draw, exchange, scoring, training
-from . import data as show
-from . import data as upkeep
 from . import demo as tour
 
 __all__ = ["app"]
@@ -41,7 +39,9 @@ class _Commands(TyperGroup):
         except (typer.Exit, typer.Abort, BrokenPipeError):
             raise
         except Exception as error:
-            if _is_usage(error) or os.environ.get("LAGBENCH_DEBUG") == "1":
+            # click's usage errors, or typer's own copy of them, are typer's to show
+            usage = any(kind.__name__ == "ClickException" for kind in type(error).__mro__)
+            if usage or os.environ.get("LAGBENCH_DEBUG") == "1":
                 raise
             typer.echo(
                 f"lagbench: unexpected {type(error).__name__}: {error}\n"
@@ -58,26 +58,14 @@ def _plain_warnings() -> Iterator[None]:
     with warnings.catch_warnings():
         show = warnings.showwarning
 
-        def tell(
-            message: Warning | str,
-            category: type[Warning],
-            filename: str,
-            lineno: int,
-            file: TextIO | None = None,
-            line: str | None = None,
-        ) -> None:
+        def tell(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:  # noqa: ANN401
             if category.__module__.startswith("lagbench."):
                 typer.echo(f"warning: {message}", err=True)
             else:
-                show(message, category, filename, lineno, file, line)
+                show(message, category, *place, **more)
 
         warnings.showwarning = tell
         yield
-
-
-def _is_usage(error: Exception) -> bool:
-    """Tell whether typer shall show an error itself: click's or its own copy of them."""
-    return any(kind.__name__ == "ClickException" for kind in type(error).__mro__)
 
 
 app = typer.Typer(
@@ -107,48 +95,32 @@ def _lagbench(
     """Bit-reproducible particle data sets for neural surrogates of continuum simulators."""
 
 
-app.command("demo", epilog="Example: lagbench demo --root demo")(tour.demo)
-app.command("list", epilog="Example: lagbench list --json")(show.list_splits)
-app.command("info", epilog="Example: lagbench info cavity --size mini")(show.info)
-app.command("generate", epilog="Example: lagbench generate --split cavity --size tiny --workers 2")(
-    data.generate
+COMMANDS: tuple[tuple[Callable[..., None], str], ...] = (
+    (tour.demo, "demo --root demo"),
+    (data.list_splits, "list --json"),
+    (data.info, "info cavity --size mini"),
+    (data.generate, "generate --split cavity --size tiny --workers 2"),
+    (data.verify, "verify --split cavity --size tiny --regenerate 2"),
+    (exchange.download, "download --split cavity --size mini --from https://host/data"),
+    (exchange.export, "export cavity --size mini --format gns-npz -o cavity-gns"),
+    (exchange.import_split, "import WaterDrop --format gns-npz --allow-pickle -o drop"),
+    (exchange.adopt, "adopt runs/*.npz -o own --radius 0.03 --frame-interval 0.1"),
+    (scoring.template, "template cavity --size tiny -o predictions.nc"),
+    (scoring.validate, "validate predictions.nc"),
+    (scoring.score, "score predictions.nc"),
+    (scoring.compare, "compare ours/scores.json theirs/scores.json"),
+    (training.train, "train --baseline gns --split cavity --size tiny"),
+    (training.predict, "predict runs/cavity/tiny/gns-0/weights.pt"),
+    (training.bench, "bench solver --split cavity --size tiny"),
+    (board.submit, "submit predictions.nc --from meta.yaml"),
+    (draw.plot, "plot cavity --size tiny --scenario 3 --frame 15 -o flow.png"),
+    (draw.animate, "animate fluid --size tiny --scenario 3 -o splash.gif"),
+    (data.cite, "cite cavity"),
+    (data.doctor, "doctor"),
+    (data.clean, "clean --split cavity --size tiny --dry-run"),
 )
-app.command("verify", epilog="Example: lagbench verify --split cavity --size tiny --regenerate 2")(
-    data.verify
-)
-app.command(
-    "download", epilog="Example: lagbench download --split cavity --size mini --from https://host/data"
-)(exchange.download)
-app.command("export", epilog="Example: lagbench export cavity --size mini --format gns-npz -o cavity-gns")(
-    exchange.export
-)
-app.command("import", epilog="Example: lagbench import WaterDrop --format gns-npz --allow-pickle -o drop")(
-    exchange.import_split
-)
-app.command("adopt", epilog="Example: lagbench adopt runs/*.npz -o own --radius 0.03 --frame-interval 0.1")(
-    exchange.adopt
-)
-app.command("template", epilog="Example: lagbench template cavity --size tiny -o predictions.nc")(
-    scoring.template
-)
-app.command("validate", epilog="Example: lagbench validate predictions.nc")(scoring.validate)
-app.command("score", epilog="Example: lagbench score predictions.nc")(scoring.score)
-app.command("compare", epilog="Example: lagbench compare ours/scores.json theirs/scores.json")(
-    scoring.compare
-)
-app.command("train", epilog="Example: lagbench train --baseline gns --split cavity --size tiny")(
-    training.train
-)
-app.command("predict", epilog="Example: lagbench predict runs/cavity/tiny/gns-0/weights.pt")(training.predict)
-app.command("bench", epilog="Example: lagbench bench solver --split cavity --size tiny")(training.bench)
-app.command("submit", epilog="Example: lagbench submit predictions.nc --from meta.yaml")(board.submit)
+"""Every command, and the example below its help, which begins with its name."""
+
+for function, example in COMMANDS:
+    app.command(example.split()[0], epilog=f"Example: lagbench {example}")(function)
 app.add_typer(board.leaderboard, name="leaderboard", epilog="Example: lagbench leaderboard show")
-app.command("plot", epilog="Example: lagbench plot cavity --size tiny --scenario 3 --frame 15 -o flow.png")(
-    draw.plot
-)
-app.command("animate", epilog="Example: lagbench animate fluid --size tiny --scenario 3 -o splash.gif")(
-    draw.animate
-)
-app.command("cite", epilog="Example: lagbench cite cavity")(show.cite)
-app.command("doctor", epilog="Example: lagbench doctor")(upkeep.doctor)
-app.command("clean", epilog="Example: lagbench clean --split cavity --size tiny --dry-run")(upkeep.clean)

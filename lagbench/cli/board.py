@@ -19,12 +19,12 @@ from .options import (
     WorkersOption,
     chosen,
 )
-from .output import print_json, print_table, progress_bar, say, spell_bytes
+from .output import complain, print_blocks, print_json, progress_bar, say, spell_bytes
+from .output import show as tell
 
 if TYPE_CHECKING:
     from lagbench.board.check import CheckResult
     from lagbench.board.submit import SubmitResult
-    from lagbench.submission.findings import ValidationResult
 
 __all__ = ["leaderboard", "submit"]
 
@@ -86,18 +86,12 @@ def submit(
             new_board=new_board,
             workers=workers,
             progress=draw,
-            examined=_complain,
+            examined=complain,
         )
     if as_json:
         print_json(result)
     else:
         _submitted(result, quiet=quiet)
-
-
-def _complain(result: ValidationResult) -> None:
-    """Tell on stderr what rejects a file; the error that follows names the first finding only."""
-    if len(result.errors) > 1:
-        typer.echo("\n".join(str(finding) for finding in result.errors), err=True)
 
 
 def _submitted(result: SubmitResult, *, quiet: bool) -> None:
@@ -133,13 +127,10 @@ def build(
     from lagbench.board.page import build as run
 
     result = run(board, check=check)
-    if as_json:
-        print_json(result)
-        return
     state = "written" if result.page in result.written else "up to date"
     tabs = f"{result.tabs} {'tab' if result.tabs == 1 else 'tabs'}"
     what = f"{_entries(result.rows)}, {tabs}, {spell_bytes(result.bytes)}"
-    say(f"{result.page}: {what}, {state}", quiet=quiet)
+    tell(result, [f"{result.page}: {what}, {state}"], as_json=as_json, quiet=quiet)
 
 
 def _entries(count: int) -> str:
@@ -278,8 +269,6 @@ def show(
     if as_json:
         print_json(as_plain(tabs))
         return
-    for table in tables(held, tabs, metric or (), wide=wide):
-        for block in table.blocks():
-            print_table(block.title, block.columns, block.rows)
+    print_blocks(tables(held, tabs, metric or (), wide=wide))
     if not tabs:
         say(f"{board}: no entries yet; the first: lagbench submit predictions.nc --from meta.yaml")

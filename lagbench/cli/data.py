@@ -159,9 +159,7 @@ def verify(
 
 
 def _verified(result: VerificationResult) -> Iterator[str]:
-    rows = [
-        (r.name, r.present, len(r.missing), len(r.wrong), len(r.extra), r.verdict) for r in result.subsets
-    ]
+    rows = [(r.name, r.present, *map(len, (r.missing, r.wrong, r.extra)), r.verdict) for r in result.subsets]
     columns = ("subset", "present", "missing", "wrong", "extra", "hash")
     print_table(f"{result.split} {result.size} in {result.folder}", columns, rows)
     if result.regenerated:
@@ -207,16 +205,9 @@ def _origin(found: list[Overview]) -> list[str]:
 
 
 def _row(entry: Overview) -> tuple[object, ...]:
-    return (
-        entry.split,
-        entry.size,
-        "/".join(str(count) for count in entry.scenarios.values()),
-        entry.particles,
-        entry.frames,
-        spell_bytes(entry.bytes),
-        spell_seconds(entry.seconds) if entry.seconds else "-",
-        entry.state,
-    )
+    counts = "/".join(str(count) for count in entry.scenarios.values())
+    cost = spell_bytes(entry.bytes), spell_seconds(entry.seconds) if entry.seconds else "-"
+    return entry.split, entry.size, counts, entry.particles, entry.frames, *cost, entry.state
 
 
 def info(
@@ -307,42 +298,27 @@ def cite(
     entry = registry.split(split_name)
     measured = registry.measured.get(split_name, {})
     hashes = {size: values.dataset_sha256 for size, values in measured.items()}
-    facts = {
-        "split": split_name,
-        "version": entry.version,
-        "title": entry.title,
-        "licence": entry.licence,
-        "citation": entry.citation,
-        "dataset_sha256": hashes,
-    }
+    head = {key: getattr(entry, key) for key in ("version", "title", "licence", "citation")}
     if bibtex:
         held = ", ".join(f"{size} {value}" for size, value in hashes.items())
         note = f"After {entry.citation}. SHA-256 of the data sets: {held}"
         title = f"{entry.title}: split {split_name} of lagbench"
-        say(
-            _bibtex(
-                "misc",
-                f"lagbench-{split_name}",
-                title=title,
-                version=entry.version,
-                license=entry.licence,
-                note=note,
-            )
-        )
+        fields = {"title": title, "version": entry.version, "license": entry.licence, "note": note}
+        say(_bibtex("misc", f"lagbench-{split_name}", **fields))
         return
     words = [
         f"lagbench, split {split_name!r} ({entry.title}), version {entry.version}, {entry.licence}.",
         f"After: {entry.citation}.",
         *(f"Data set hash of size {size}: {value}" for size, value in hashes.items()),
     ]
-    show(facts, words, as_json=as_json)
+    show({"split": split_name, **head, "dataset_sha256": hashes}, words, as_json=as_json)
 
 
 def _bibtex(kind: str, key: str, **fields: str) -> str:
     """Return a BibTeX entry by the authors of lagbench; what TeX would read as a command is escaped."""
     plain = str.maketrans({character: f"\\{character}" for character in "&%$#_{}"} | {"\\": "/"})
-    year = str(RELEASED)
-    lines = [f"  {name} = {{{value.translate(plain)}}}," for name, value in {**fields, "year": year}.items()]
+    told = {**fields, "year": str(RELEASED)}
+    lines = [f"  {name} = {{{value.translate(plain)}}}," for name, value in told.items()]
     # The inner braces keep BibTeX from taking the name apart.
     return "\n".join([f"@{kind}{{{key},", "  author = {{The lagbench authors}},", *lines, "}"])
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lagbench.data.layout import ScenarioKey, resolve_root, scenario_path
-from lagbench.data.registry import Registry, Size, load
+from lagbench.data.registry import Registry, load
 from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError, check_installed
 from lagbench.make.generate import GenerationResult, generate
 from lagbench.make.verify import VerificationResult, verify
@@ -89,18 +89,7 @@ def demo(
     workers: int | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> DemoResult:
-    """Generate, verify and draw one split at size ``tiny``.
-
-    Args:
-        split: name of the split.
-        root: folder of the data and of ``pictures/``; see ``resolve_root``.
-        workers: worker processes; one per core when None.
-        progress: called as the generation advances.
-
-    Raises:
-        LagbenchError: what :func:`~lagbench.make.generate.generate`,
-            :func:`~lagbench.make.verify.verify` and :func:`~lagbench.draw.plot.plot_frame` raise.
-    """
+    """Generate, verify and draw one split at size ``tiny``; the picture lies in ``pictures/`` of the root."""
     from lagbench.draw.plot import plot_frame
 
     folder = resolve_root(root)
@@ -110,18 +99,11 @@ def demo(
     verification.check()
     pictures = folder / "pictures"
     pictures.mkdir(exist_ok=True)
-    picture = plot_frame(
-        _first_test(size, folder), size.task.frames_of_interest[-1], pictures / f"{split}.png"
-    )
+    first: dict[str, Any] = {"scenario": size.subsets["test"][0], "subset": "test"}
+    key = ScenarioKey(split=size.split, size=size.name, version=size.version, **first)
+    frame = size.task.frames_of_interest[-1]
+    picture = plot_frame(scenario_path(folder, key), frame, pictures / f"{split}.png")
     return DemoResult(generation=generation, verification=verification, picture=picture)
-
-
-def _first_test(size: Size, root: Path) -> Path:
-    scenario = size.subsets["test"][0]
-    key = ScenarioKey(
-        split=size.split, size=size.name, version=size.version, scenario=scenario, subset="test"
-    )
-    return scenario_path(root, key)
 
 
 def model_left_out(registry: Registry) -> str | None:
@@ -137,11 +119,7 @@ def model_left_out(registry: Registry) -> str | None:
 
 
 def demo_board(root: str | Path | None = None) -> Path:
-    """Return the folder of the demo's leaderboard; refuse that of anyone else.
-
-    Raises:
-        UsageError: the folder holds entries of other sizes, so it is no demo's.
-    """
+    """Return the folder of the demo's leaderboard; refuse one with entries of other sizes."""
     from lagbench.board.folder import Folder
 
     board = Folder(resolve_root(root) / "leaderboard")
@@ -163,44 +141,28 @@ def demo_model(
     """Train a small model, predict, score and submit it, draw the page.
 
     The data set must be there, see :func:`demo`. One thread: a model as small as this gains
-    nothing by a second, and the same machine trains the same weights.
-
-    Args:
-        root: folder of the data, of ``runs/`` and of ``leaderboard/``.
-        progress: called as the work advances.
-
-    Raises:
-        UsageError: the extra ``baselines`` is not installed, or the leaderboard is no demo's.
-        DataError: the data set is missing or damaged.
-        WorkFailedError: the work failed, or the disk is full.
-        KeyboardInterrupt: interrupted; the next call goes on with the training.
+    nothing by a second, and the same machine trains the same weights. Interrupted, it goes on with
+    the training at the next call.
     """
     from lagbench.baselines.predict import predict
+    from lagbench.baselines.train import train
     from lagbench.board.page import build
     from lagbench.board.submit import submit
     from lagbench.scoring.score import score
 
     folder, board = resolve_root(root), demo_board(root)
     run = folder / "runs" / f"{MODEL_SPLIT}-{MODEL}"
-    training = _trained(run, folder, progress)
-    prediction = predict(
-        training.weights,
-        run / "predictions.nc",
-        root=folder,
-        device="cpu",
-        threads=1,
-        method=MODEL,
-        progress=progress,
-    )
+    here: dict[str, Any] = {"root": folder, "device": "cpu", "threads": 1, "progress": progress}
+    begin = partial(train, MODEL, MODEL_SPLIT, DEMO_SIZE, settings=SETTINGS, output=run, **here)
+    try:
+        training = begin()
+    except (UsageError, DataError, UnreadableFileError):
+        # What is left of another version or was damaged is the demo's own: not worth an error.
+        training = begin(fresh=True)
+    prediction = predict(training.weights, run / "predictions.nc", method=MODEL, **here)
     solver = _solver_time()
-    entry = submit(
-        [prediction.path],
-        _said(training, prediction, solver),
-        board=board,
-        root=folder,
-        replace=True,
-        new_board=True,
-    )
+    said = _said(training, prediction, solver)
+    entry = submit([prediction.path], said, board=board, root=folder, replace=True, new_board=True)
     return ModelResult(
         training=training,
         prediction=prediction,
@@ -209,28 +171,6 @@ def demo_model(
         entry=entry,
         page=build(board),
     )
-
-
-def _trained(run: Path, root: Path, progress: Callable[[Progress], None] | None) -> TrainingResult:
-    from lagbench.baselines.train import train
-
-    begin = partial(
-        train,
-        MODEL,
-        MODEL_SPLIT,
-        DEMO_SIZE,
-        settings=SETTINGS,
-        root=root,
-        output=run,
-        device="cpu",
-        threads=1,
-        progress=progress,
-    )
-    try:
-        return begin()
-    except (UsageError, DataError, UnreadableFileError):
-        # What is left of another version or was damaged is the demo's own: not worth an error.
-        return begin(fresh=True)
 
 
 def _solver_time() -> SolverBench | None:

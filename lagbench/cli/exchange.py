@@ -116,10 +116,8 @@ def download(
     counts = (
         f"{len(result.downloaded)} downloaded, {len(result.generated)} simulated, {len(result.kept)} kept"
     )
-    words = [
-        f"{result.split} {result.size}: {counts}, {spell_bytes(result.bytes)}",
-        f"  folder  {result.folder}",
-    ]
+    what = f"{result.split} {result.size}: {counts}, {spell_bytes(result.bytes)}"
+    words = [what, f"  folder  {result.folder}"]
     if result.downloaded:
         words.append(f"  mirror  {result.mirror}: scenarios {spell_ids(sorted(result.downloaded))}")
     if result.dataset_sha256:
@@ -269,21 +267,15 @@ def _wishes(ctx: typer.Context) -> Any:  # noqa: ANN401 (the functions type them
     if not said["rescale"]:  # a flag that is not given says nothing
         del said["rescale"]
     if "bounds" in said:
-        said["bounds"] = _box(said["bounds"])
+        try:
+            left, right, bottom, top = (float(part) for part in said["bounds"].split(","))
+        except ValueError:
+            expected = "x0,x1,y0,y1, as in 0,2,0,1"
+            raise UsageError("bad bounds", where="--bounds", expected=expected, got=said["bounds"]) from None
+        said["bounds"] = (left, right), (bottom, top)
     if "frames_of_interest" in said:
         said["frames_of_interest"] = parse_ids(said["frames_of_interest"])
     return said if file is None else {**read_wishes(file), **said}
-
-
-def _box(text: str) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the walls x0,x1,y0,y1 as two pairs."""
-    try:
-        left, right, bottom, top = (float(part) for part in text.split(","))
-    except ValueError:
-        raise UsageError(
-            "bad bounds", where="--bounds", expected="x0,x1,y0,y1, as in 0,2,0,1", got=text
-        ) from None
-    return (left, right), (bottom, top)
 
 
 def _made(made: LocalSplit, *, as_json: bool, quiet: bool) -> None:

@@ -25,29 +25,12 @@ __all__ = ["Check", "Diagnosis", "SolverBench", "bench_apart", "bench_solver", "
 
 
 NEEDED = (
-    "numpy",
-    "scipy",
-    "xarray",
-    "netCDF4",
-    "h5py",
-    "dask",
-    "pandas",
-    "pydantic",
-    "PyYAML",
-    "typer",
-    "rich",
-    "platformdirs",
-    "filelock",
-    "fsspec",
+    *("numpy", "scipy", "xarray", "netCDF4", "h5py", "dask", "pandas", "pydantic", "PyYAML"),
+    *("typer", "rich", "platformdirs", "filelock", "fsspec"),
 )
-OPTIONAL = {
-    "taichi": "generate",
-    "matplotlib": "plots",
-    "imageio": "plots",
-    "torch": "baselines",
-    "distributed": "cluster",
-    "s3fs": "s3",
-}
+OPTIONAL = {"taichi": "generate", "matplotlib": "plots", "imageio": "plots"}
+OPTIONAL |= {"torch": "baselines", "distributed": "cluster", "s3fs": "s3"}
+"""Libraries of our extras."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,43 +55,31 @@ class Diagnosis:
 
 
 def doctor(root: str | Path | None = None) -> Diagnosis:
-    """Look at what lagbench needs on this machine; changes nothing.
-
-    Args:
-        root: folder of all data sets; else ``LAGBENCH_ROOT``, else the user data folder.
-    """
+    """Look at what lagbench needs on this machine, data sets under ``root``; changes nothing."""
     folder = resolve_root(root)
+    native = platform.machine() in {"x86_64", "AMD64"} and platform.system() == "Linux"
+    promise = "bits as in datasets.yaml" if native else "bits may differ: see docs/determinism.md"
+    cores = f"{platform.machine()}, {available_cores()} of {os.cpu_count()} cores; {promise}"
     return Diagnosis(
         checks=(
             Check(name="lagbench", state="ok", detail=version("lagbench")),
             Check(name="python", state="ok", detail=f"{platform.python_version()} on {platform.platform()}"),
-            _processor(),
+            Check(name="processor", state="ok", detail=cores),
             *(_library(name) for name in NEEDED),
-            *(_extra(name, extra) for name, extra in OPTIONAL.items()),
+            *(_library(name, extra) for name, extra in OPTIONAL.items()),
             _attempt("registry", _registry),
             _attempt("data folder", lambda: _folder(folder)),
         )
     )
 
 
-def _processor() -> Check:
-    native = platform.machine() in {"x86_64", "AMD64"} and platform.system() == "Linux"
-    promise = "bits as in datasets.yaml" if native else "bits may differ: see docs/determinism.md"
-    detail = f"{platform.machine()}, {available_cores()} of {os.cpu_count()} cores; {promise}"
-    return Check(name="processor", state="ok", detail=detail)
-
-
-def _library(name: str) -> Check:
+def _library(name: str, extra: str | None = None) -> Check:
+    """Look for a library; nothing is broken without that of an extra."""
     try:
         return Check(name=name, state="ok", detail=version(name))
     except PackageNotFoundError:
-        return Check(name=name, state="broken", detail="not installed: pip install lagbench")
-
-
-def _extra(name: str, extra: str) -> Check:
-    try:
-        return Check(name=name, state="ok", detail=version(name))
-    except PackageNotFoundError:
+        if extra is None:
+            return Check(name=name, state="broken", detail="not installed: pip install lagbench")
         return Check(name=name, state="missing", detail=f"pip install 'lagbench[{extra}]'")
 
 
@@ -156,26 +127,17 @@ class SolverBench:
 
 
 def bench_solver(split: str, size: str, *, frames: int = FRAMES) -> SolverBench:
-    """Simulate the first test scenario for some frames and time them.
+    """Simulate the first test scenario and time so many frames, or as many as half a second takes.
 
     Taichi starts once per process: call this from one of its own, as :func:`bench_apart` does.
-
-    Args:
-        split: name of the split.
-        size: name of the size.
-        frames: frames to time at least; as many as half a second takes if that is more.
-
-    Raises:
-        UsageError: unknown split or size, or Taichi is not installed.
     """
     tier = load().size(split, size)
     check_installed("taichi", extra="generate")
     from lagbench.generators.batch import draw, solver_constants
     from lagbench.generators.solver import build
 
-    with_state = draw(tier, tier.subsets["test"][0])
     solver = build(solver_constants(tier))
-    solver.load([with_state])
+    solver.load([draw(tier, tier.subsets["test"][0])])
     solver.advance(WARM_UP * tier.substeps_per_frame)
     started, timed = time.process_time(), 0
     while timed < frames or time.process_time() - started < LEAST:
@@ -183,14 +145,8 @@ def bench_solver(split: str, size: str, *, frames: int = FRAMES) -> SolverBench:
         solver.position()
         timed += 1
     seconds = (time.process_time() - started) / timed
-    return SolverBench(
-        split=split,
-        size=size,
-        particles=tier.particles,
-        substeps=tier.substeps_per_frame,
-        frames=timed,
-        seconds_per_frame=seconds,
-    )
+    flow = {"particles": tier.particles, "substeps": tier.substeps_per_frame, "frames": timed}
+    return SolverBench(split=split, size=size, **flow, seconds_per_frame=seconds)
 
 
 def bench_apart(split: str, size: str, *, frames: int = FRAMES) -> SolverBench:

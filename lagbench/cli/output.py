@@ -13,15 +13,26 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 if TYPE_CHECKING:
+    from lagbench.scoring.tables import Table
+    from lagbench.submission.findings import ValidationResult
     from lagbench.work.progress import Progress as State
 
-__all__ = ["print_json", "print_table", "progress_bar", "say", "show", "spell_bytes", "spell_seconds"]
-
+__all__ = [
+    "complain",
+    "print_blocks",
+    "print_json",
+    "print_table",
+    "progress_bar",
+    "say",
+    "show",
+    "spell_bytes",
+    "spell_seconds",
+]
 
 LAST_COLUMN = 24
 """Characters that the last column of a table, which wraps, keeps at least."""
@@ -53,6 +64,19 @@ def show(value: object, words: Iterable[str], *, as_json: bool, quiet: bool = Fa
             typer.echo(line)
 
 
+def complain(result: ValidationResult) -> None:
+    """Tell on stderr what rejects a file; the error that follows names the first finding only."""
+    if len(result.errors) > 1:
+        typer.echo("\n".join(str(finding) for finding in result.errors), err=True)
+
+
+def print_blocks(tables: Iterable[Table]) -> None:
+    """Print tables that know how wide they are, in blocks that fit."""
+    for table in tables:
+        for block in table.blocks():
+            print_table(block.title, block.columns, block.rows)
+
+
 def _plain(value: object) -> object:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
@@ -81,13 +105,9 @@ def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[obje
     # In a file or a pipe the width is fixed, so that the output is the same everywhere.
     width = console.width if console.is_terminal else 120
     # On a narrow terminal long lines run on to the next: a number cut short would be worse.
-    Console(width=max(width, _least_width(columns, cells))).print(table)
-
-
-def _least_width(columns: Sequence[str], cells: Sequence[Sequence[str]]) -> int:
-    """Return the width below which a column other than the last would be cut."""
     widths = [max(map(len, column)) for column in zip(columns, *cells, strict=True)]
-    return sum(widths[:-1]) + min(widths[-1], LAST_COLUMN) + COLUMN_GAP * len(widths)
+    least = sum(widths[:-1]) + min(widths[-1], LAST_COLUMN) + COLUMN_GAP * len(widths)
+    Console(width=max(width, least)).print(table)
 
 
 def spell_bytes(count: float) -> str:
@@ -117,16 +137,10 @@ def spell_seconds(seconds: float) -> str:
 
 @contextmanager
 def progress_bar(*, quiet: bool, counted: str = "scenarios") -> Iterator[Callable[[State], None] | None]:
-    """Yield what tells of progress: how much is done, how fast, and the time left.
+    """Yield what tells of progress: how much is done, how fast, and the time left; None for silence.
 
     A terminal shows a bar; a file or a pipe gets a line per minute, so that short work leaves none.
-
-    Args:
-        quiet: whether the user wants silence.
-        counted: what the work is counted in.
-
-    Yields:
-        A function to hand to ``generate``; None where silence is wanted.
+    ``counted`` is what the work is counted in.
     """
     if quiet:
         from lagbench.store.copy import quietly
@@ -140,24 +154,20 @@ def progress_bar(*, quiet: bool, counted: str = "scenarios") -> Iterator[Callabl
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
+    count = TextColumn("{task.fields[count]}")
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
         TaskProgressColumn(),
-        TextColumn("{task.fields[count]}"),
+        count,
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("starting", total=None, count="")
 
         def draw(news: State) -> None:
-            bar.update(
-                task,
-                description=news.stage,
-                total=news.total or None,
-                completed=news.done,
-                count=_count(news, counted),
-            )
+            told: dict[str, Any] = {"description": news.stage, "count": _count(news, counted)}
+            bar.update(task, total=news.total or None, completed=news.done, **told)
 
         yield draw
 

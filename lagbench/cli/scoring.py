@@ -23,12 +23,10 @@ from .options import (
     WorkersOption,
     chosen,
 )
-from .output import print_json, print_table, progress_bar, say, spell_bytes
+from .output import complain, print_blocks, print_json, progress_bar, say, show, spell_bytes
 
 if TYPE_CHECKING:
     from lagbench.scoring.card import ScoreCard
-    from lagbench.scoring.compare import ComparisonResult
-    from lagbench.scoring.tables import Table
     from lagbench.submission.findings import ValidationResult
 
 __all__ = ["compare", "score", "template", "validate"]
@@ -61,12 +59,10 @@ def template(
     from lagbench.submission.writer import template as run
 
     result = run(chosen(name, split), size, output=output, overwrite=overwrite, root=root)
-    if as_json:
-        print_json(result)
-        return
     first, last = result.frames
     shape = f"{len(result.scenarios)} scenarios, frames {first} to {last}, {result.particles} particles"
-    say(f"{result.path}: {shape}, {spell_bytes(result.bytes)}", quiet=quiet)
+    words = [f"{result.path}: {shape}, {spell_bytes(result.bytes)}"]
+    show(result, words, as_json=as_json, quiet=quiet)
 
 
 def validate(
@@ -82,23 +78,16 @@ def validate(
     wanted = _wanted(split, root)
     result = run(predictions, root=wanted.root)
     wanted.check(result)
-    if as_json:
-        print_json(result)
-    elif not quiet:
-        _checked(result)
-    raise typer.Exit(result.exit_code)
-
-
-def _checked(result: ValidationResult) -> None:
-    for finding in result.findings:
-        say(str(finding))
+    words = [str(finding) for finding in result.findings]
     for reason in dict.fromkeys(result.skipped.values()):
         checks = ", ".join(check for check, why in result.skipped.items() if why == reason)
-        say(f"not made, since {reason}: {checks}")
+        words.append(f"not made, since {reason}: {checks}")
     counts = (
         f"{len(result.errors)} errors, {len(result.warnings)} warnings, {len(result.passed)} checks passed"
     )
-    say(f"{result.path}: {'valid' if result.valid else 'not valid'}, {counts}")
+    words.append(f"{result.path}: {'valid' if result.valid else 'not valid'}, {counts}")
+    show(result, words, as_json=as_json, quiet=quiet)
+    raise typer.Exit(result.exit_code)
 
 
 def score(
@@ -139,7 +128,7 @@ def score(
     together = _checked_together(predictions, root) if len(predictions) > 1 else [None]
     if report is not None:
         check_writable(report, option="--report")
-    cards = []
+    cards: list[ScoreCard] = []
     for path, target, validated in zip(predictions, targets, together, strict=True):
         with progress_bar(quiet=quiet) as draw:
             card = run(
@@ -164,8 +153,13 @@ def score(
         if as_json:
             print_json(cards[0].as_json() if len(cards) == 1 else [card.as_json() for card in cards])
         elif not quiet:
+            from lagbench.scoring.tables import card_tables, flag_lines
+
             for card in cards:
-                _scored(card, every=every, floors=floors)
+                print_blocks(card_tables(card, every=every, floors=floors))
+                for line in flag_lines(card):
+                    say(line)
+                say("written: " + ", ".join(str(path) for path in card.files))
     if written is not None:
         say(f"report: {written}", quiet=quiet or as_json)
 
@@ -195,7 +189,7 @@ def _checked_together(predictions: Sequence[Path], root: Path | None) -> list[Va
     results: list[ValidationResult] = []
     for path in predictions:
         result = examine(path, root=root, require_truth=True)
-        _complain(result)
+        complain(result)
         result.check()
         results.append(result)
         first = results[0]
@@ -231,7 +225,7 @@ class _Wanted:
     def complain(self, result: ValidationResult) -> None:
         """Refuse predictions for another split; else tell what rejects the file."""
         self.check(result)
-        _complain(result)
+        complain(result)
 
 
 def _wanted(split: str | None, root: Path | None) -> _Wanted:
@@ -242,27 +236,6 @@ def _wanted(split: str | None, root: Path | None) -> _Wanted:
 
     found = home(split, root=root)
     return _Wanted(found.name, found.root)
-
-
-def _complain(result: ValidationResult) -> None:
-    """Tell on stderr what rejects a file; the error that follows names the first finding only."""
-    if len(result.errors) > 1:
-        typer.echo("\n".join(str(finding) for finding in result.errors), err=True)
-
-
-def _scored(card: ScoreCard, *, every: bool, floors: bool) -> None:
-    from lagbench.scoring.tables import card_tables, flag_lines
-
-    for table in card_tables(card, every=every, floors=floors):
-        _print(table)
-    for line in flag_lines(card):
-        say(line)
-    say("written: " + ", ".join(str(path) for path in card.files))
-
-
-def _print(table: Table) -> None:
-    for block in table.blocks():
-        print_table(block.title, block.columns, block.rows)
 
 
 def compare(
@@ -287,12 +260,7 @@ def compare(
     if as_json:
         print_json(result.as_json())
     elif not quiet:
-        _compared(result, every=every or bool(metric))
+        from lagbench.scoring.tables import comparison_tables
 
-
-def _compared(result: ComparisonResult, *, every: bool) -> None:
-    from lagbench.scoring.tables import comparison_tables
-
-    for table in comparison_tables(result, every=every):
-        _print(table)
-    say(result.verdict)
+        print_blocks(comparison_tables(result, every=every or bool(metric)))
+        say(result.verdict)

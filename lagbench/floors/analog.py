@@ -74,11 +74,7 @@ def distance(one: Start, other: Start) -> float:
 
 
 def nearest(given: Given) -> int:
-    """Return the id of the scenario of train that starts most like this one.
-
-    Raises:
-        DataError: a scenario of train is missing or damaged, or none is long enough.
-    """
+    """Return the id of the scenario of train that starts most like this one; all must be there."""
     size, own = given.size, start_of(given)
     needed = size.task.input_frames + size.task.horizon
     bring(size, given.root, size.subsets["train"])
@@ -150,10 +146,8 @@ def _frame(file: ScenarioFile, frame: int) -> Floats:
 
 def _open(given: Given, scenario: int) -> ScenarioFile:
     size = given.size
-    key = ScenarioKey(
-        split=size.split, size=size.name, version=size.version, scenario=scenario, subset="train"
-    )
-    return read_scenario(scenario_path(given.root, key))
+    names = {"split": size.split, "size": size.name, "version": size.version, "subset": "train"}
+    return read_scenario(scenario_path(given.root, ScenarioKey(scenario=scenario, **names)))
 
 
 FLOOR = Floor(

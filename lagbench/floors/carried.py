@@ -41,13 +41,9 @@ def linear_field(points: Floats, values: Floats) -> Field:
 
 
 def mirrored(given: Given, points: Floats, values: Floats, walls: Floats) -> tuple[Floats, Floats]:
-    """Return points and velocities with those that the walls reflect.
+    """Return points and velocities there, each [point, 2], with those that the walls reflect.
 
-    Args:
-        given: says where the walls are and whether they hold the fluid.
-        points: places within the box [length], shape [point, 2].
-        values: velocities there [length/frame], shape [point, 2].
-        walls: velocity of each wall, left, right, bottom, top [length/frame], shape [4, 2].
+    ``walls`` are their velocities, left, right, bottom, top [length/frame], shape [4, 2].
     """
     (left, right), (bottom, top) = given.size.bounds
     depth = DEPTH * np.sqrt((right - left) * (top - bottom) / len(points))

@@ -57,12 +57,7 @@ def predict(given: Given) -> Prediction:
 
 
 def predict_with(given: Given, coarse: Size) -> Prediction:
-    """Yield positions that the solver finds with the constants of a size.
-
-    Raises:
-        UsageError: Taichi is not installed.
-        WorkFailedError: the simulation blew up.
-    """
+    """Yield positions that the solver finds with the constants of a size."""
     require("taichi", extra="generate")
     from lagbench.generators.batch import solver_constants
 

@@ -86,12 +86,7 @@ def shipped_path(size: Size, folder: Path = FOLDER) -> Path:
 def shipped(size: Size, folder: Path = FOLDER) -> Mapping[str, FloorScores] | None:
     """Return what the floors of a split and size score, by name.
 
-    Args:
-        size: the split and size.
-        folder: where the measured scores are; those of the package by default.
-
-    Returns:
-        None where none were measured on the data set that the registry describes.
+    None where none were measured on the data set that the registry describes.
     """
     held = _held(size, folder)
     if held is None:
@@ -141,17 +136,8 @@ def _scores(
             per_frame[0] = np.interp(frames, _knots(frames), _floats(said["curves"][name]))
         if name in said["at"]:
             per_frame[0, [frames.index(f) for f in reported]] = _floats(said["at"][name])
-        yield (
-            name,
-            Score(
-                metric=known[name],
-                scenarios=scenarios,
-                frames=tuple(frames),
-                per_frame=per_frame,
-                values=_floats(values),
-                undefined=tuple(said["undefined"].get(name, none)),
-            ),
-        )
+        undefined = tuple(said["undefined"].get(name, none))
+        yield name, Score(known[name], scenarios, tuple(frames), per_frame, _floats(values), undefined)
 
 
 def _knots(frames: Sequence[int]) -> NDArray[np.intp]:

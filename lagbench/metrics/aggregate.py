@@ -176,13 +176,9 @@ class Resampling:
 
 
 def quantile(ordered: Floats, share: float) -> float:
-    """Return a quantile of ascending values, linear between them: the bits of ``np.quantile``.
+    """Return a quantile of two or more ascending values, linear between them: the bits of ``np.quantile``.
 
     NumPy partitions anew and takes several times as long as a sort of ten thousand values.
-
-    Args:
-        ordered: two or more values, shape [value].
-        share: of the values that lie below, from 0 to 1.
     """
     place = share * (len(ordered) - 1)
     below = min(int(place), len(ordered) - 2)
@@ -211,12 +207,9 @@ def resample(values: ArrayLike, minus: ArrayLike | None = None) -> Resampling | 
     scenarios are drawn: the mean is then that of these weights, not of the method. The draws are
     seeded: two calls with as many scenarios draw the same ones.
 
-    Args:
-        values: NaN where undefined, shape [scenario] or [seed, scenario].
-        minus: values of another method in the same scenarios: the mean is that of the difference.
-
-    Returns:
-        None where fewer than two scenarios are defined.
+    Values are NaN where undefined, shape [scenario] or [seed, scenario]; with those of another method in
+    the same scenarios as ``minus`` the mean is that of the difference. None where fewer than two
+    scenarios are defined.
     """
     sides = [np.atleast_2d(np.asarray(side, np.float64)) for side in (values, minus) if side is not None]
     defined = np.all([~np.isnan(side).all(axis=0) for side in sides], axis=0)
@@ -234,14 +227,9 @@ def resample(values: ArrayLike, minus: ArrayLike | None = None) -> Resampling | 
 
 
 def bootstrap_interval(values: ArrayLike, minus: ArrayLike | None = None) -> tuple[float, float]:
-    """Return the 95 % interval of a mean by the two-way bootstrap, :func:`resample`.
+    """Return the 95 % interval of a mean by the two-way bootstrap, which takes these: :func:`resample`.
 
-    Args:
-        values: NaN where undefined (left out), shape [scenario] or [seed, scenario].
-        minus: values of another method: the interval is that of the difference.
-
-    Returns:
-        Lower and upper bound; NaN when fewer than four scenarios are defined.
+    NaN when fewer than four scenarios are defined.
     """
     found = resample(values, minus)
     return (math.nan, math.nan) if found is None else found.interval

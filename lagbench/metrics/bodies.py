@@ -22,11 +22,8 @@ def rigid_residual(truth: Floats, prediction: Floats) -> float:
     """Return the RMS distance after the best rigid fit of prediction to truth [length].
 
     With both centred, the best rotation (Kabsch, in two dimensions) is by ``atan2(X, D)``
-    with ``D = sum(p . t)`` and ``X = sum(p x t)``. A mirrored body does not fit.
-
-    Args:
-        truth: true positions [length], shape [particle, 2].
-        prediction: predicted positions [length], shape [particle, 2].
+    with ``D = sum(p . t)`` and ``X = sum(p x t)`` over positions of shape [particle, 2]. A mirrored
+    body does not fit.
     """
     t, p = truth - np.mean(truth, axis=0), prediction - np.mean(prediction, axis=0)
     dot = float(np.sum(p * t))

@@ -16,24 +16,10 @@ import numpy as np
 from lagbench.data.grid import divergence
 
 from .frame import Floats, FramePair, Snapshot, average, dot, lengths
-from .metric import (
-    Direction,
-    Metric,
-    enough_nodes,
-    floored_quotient,
-    metric,
-    quotient,
-    total,
-)
+from .metric import Direction, enough_nodes, floored_quotient, metric, metrics_of, quotient, total
 from .metric import root_mean_square as over_frames_rms
 
-__all__ = [
-    "METRICS",
-    "angular_momentum",
-    "kinetic_energy",
-    "momentum",
-    "root_mean_square",
-]
+__all__ = ["METRICS", "angular_momentum", "kinetic_energy", "momentum", "root_mean_square"]
 
 MOVING = 0.01
 """Share of the truth's greatest kinetic energy from which on a frame counts as moving."""
@@ -202,23 +188,5 @@ def outside_share(pair: FramePair) -> float:
     return 100.0 * pair.outside
 
 
-METRICS: tuple[Metric, ...] = (
-    energy_true,
-    energy_predicted,
-    energy_ratio,
-    energy_retention,
-    energy_retention_true,
-    energy_error,
-    active_frames,
-    momentum_gap,
-    momentum_scale,
-    momentum_error,
-    angular_momentum_gap,
-    angular_momentum_scale,
-    angular_momentum_error,
-    density_rmse,
-    divergence_rms,
-    divergence_rms_true,
-    outside_share,
-)
-"""Metrics of this family."""
+METRICS = metrics_of(globals())
+"""Metrics of this family, in the order of their definition."""

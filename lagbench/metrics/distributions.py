@@ -15,7 +15,7 @@ from functools import partial
 import numpy as np
 
 from .frame import Floats, FramePair, average
-from .metric import Direction, Metric, at_slow_frames, enough_nodes, metric, turning
+from .metric import Direction, at_slow_frames, enough_nodes, metric, metrics_of, turning
 
 __all__ = [
     "BINS",
@@ -129,15 +129,12 @@ def _cosines(nodes: int) -> Floats:
 
 
 def energy_spectrum(velocity: Floats) -> Floats:
-    """Return the kinetic energy in shells of half waves across the box, shape [shell].
+    """Return the kinetic energy of node velocities [x node, y node, 2] in shells of half waves, [shell].
 
     Cosine modes (k, l) of both components, summed over ``round(sqrt(k^2 + l^2)) = 1, 2, ...``: a
     box with walls has no period, and cosines, unlike a Fourier series, put no jump at them (Denis,
     Cote and Laprise, Monthly Weather Review 2002). Shell 0, the mean flow, is left out, as are the
     corners of the wave-number plane beyond the shorter side.
-
-    Args:
-        velocity: node velocity, shape [x node, y node, 2].
     """
     rows, columns = velocity.shape[:2]
     left, right = _cosines(rows), _cosines(columns)
@@ -186,11 +183,5 @@ def spectrum_error(pair: FramePair) -> float:
     return math.sqrt(float(np.mean(np.log10(ratio) ** 2)))
 
 
-METRICS: tuple[Metric, ...] = (
-    vorticity_kl,
-    vorticity_kl_hist,
-    vorticity_kl_hist_abs,
-    vorticity_w1,
-    spectrum_error,
-)
-"""Metrics of this family."""
+METRICS = metrics_of(globals())
+"""Metrics of this family, in the order of their definition."""

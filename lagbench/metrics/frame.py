@@ -87,16 +87,10 @@ def mean_square(vectors: Floats) -> Floats:
 
 
 def sorted_projections(points: ArrayLike) -> NDArray[np.float32]:
-    """Return the coordinates along each direction in ascending order [length].
+    """Return the coordinates along each direction in ascending order [length], shape [direction, particle].
 
     In single precision, which is what positions are stored in: its sort is several times faster,
     and distances are good to 1e-7 of the box.
-
-    Args:
-        points: positions [length], shape [particle, 2].
-
-    Returns:
-        Shape [direction, particle].
     """
     x, y = np.asarray(points, np.float32).T
     projected = np.empty((DIRECTIONS, len(x)), np.float32)
@@ -115,12 +109,7 @@ class Bonds:
 
     @classmethod
     def within(cls, radius: float, position: Floats) -> Bonds:
-        """Return the bonds of particles closer than a radius.
-
-        Args:
-            radius: greatest distance of neighbours [length].
-            position: first positions of the body [length], shape [particle, 2].
-        """
+        """Return the bonds of particles closer than a radius at first [length]."""
         from scipy.spatial import cKDTree  # a fifth of a second that splits without bodies save
 
         found = cKDTree(position).query_pairs(radius, output_type="ndarray")
@@ -286,12 +275,9 @@ class Scenario:
 def snapshots(
     scenario: Scenario, positions: Iterable[ArrayLike], *, previous: ArrayLike | None = None
 ) -> Iterator[Snapshot]:
-    """Yield the snapshots of consecutive frames, holding two frames at a time.
+    """Yield the snapshots of consecutive frames [length], each [particle, 2], holding two frames at a time.
 
-    Args:
-        scenario: the scenario they belong to.
-        positions: positions of one frame after the other [length], each [particle, 2].
-        previous: positions one frame before the first; those last given by default.
+    ``previous`` are the positions one frame before the first; those last given by default.
     """
     before = scenario.given[-1] if previous is None else previous
     for position in positions:

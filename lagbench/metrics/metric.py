@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import enum
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,6 +33,7 @@ __all__ = [
     "last",
     "mean",
     "metric",
+    "metrics_of",
     "quotient",
     "root_mean_square",
     "total",
@@ -220,3 +221,8 @@ def metric(
         )
 
     return made
+
+
+def metrics_of(module: Mapping[str, object]) -> tuple[Metric, ...]:
+    """Return the metrics among the names of a module, in the order of their definition."""
+    return tuple(value for value in module.values() if isinstance(value, Metric))

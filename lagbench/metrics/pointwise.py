@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -35,6 +36,9 @@ def mean_squared_error(error: Floats) -> float:
 def mean_absolute_error(error: Floats) -> float:
     """Return ``MAE = mean(|y - yhat|)`` over particles and components (Eq. 3.4)."""
     return average(np.abs(error))
+
+
+_error = partial(Metric, family="pointwise", direction=Direction.LOWER, perfect=0.0)
 
 
 @metric(unit="1", direction=Direction.LOWER, source="Eqs. 4.15, 4.16")
@@ -87,23 +91,17 @@ def _errors(
     laws = {"mse": (mean_squared_error, SQUARED[unit], "3.3"), "mae": (mean_absolute_error, unit, "3.4")}
     for name, (law, law_unit, equation) in laws.items():
         statistic = ErrorMean(error, law, material)
-        yield Metric(
+        yield _error(
             name=f"{quantity}_{name}{suffix}",
-            family="pointwise",
             unit=law_unit,
-            direction=Direction.LOWER,
-            perfect=0.0,
             source=f"Eq. {equation}",
             summary=f"Mean {'squared' if name == 'mse' else 'absolute'} {quantity} error of {whose}",
             statistic=statistic,
             applies=statistic.applies,
         )
-    yield Metric(
+    yield _error(
         name=f"{quantity}_rmse{suffix}",
-        family="pointwise",
         unit=unit,
-        direction=Direction.LOWER,
-        perfect=0.0,
         source="Eq. 3.3",
         summary=f"Root mean squared {quantity} error of {whose}",
         of=(f"{quantity}_mse{suffix}",),
@@ -118,12 +116,9 @@ def _over_rollouts() -> Iterator[Metric]:
     for name, (reduction, equation, word) in whole.items():
         for horizon in (None, *HORIZONS):
             frames = "the rollout" if horizon is None else f"the first {horizon} frames"
-            yield Metric(
+            yield _error(
                 name=name if horizon is None else f"{name}_{horizon}",
-                family="pointwise",
                 unit="1",
-                direction=Direction.LOWER,
-                perfect=0.0,
                 source=f"Eq. {equation}",
                 summary=f"{word} attribute_mse of {frames}",
                 of=("attribute_mse",),
@@ -133,12 +128,9 @@ def _over_rollouts() -> Iterator[Metric]:
             )
 
 
-EARLY = Metric(
+EARLY = _error(
     name="position_rmse_20",
-    family="pointwise",
     unit="length",
-    direction=Direction.LOWER,
-    perfect=0.0,
     source="design 2, section 4",
     summary="Root mean squared position error of the first 20 frames, as LagrangeBench's MSE_20",
     of=("position_mse",),

@@ -53,13 +53,7 @@ def sign_flip_p(differences: ArrayLike) -> float:
 
     If neither is better, each difference is as likely as its negative: the share of all 2^n sign
     patterns whose mean is at least as far from 0 as the one seen. Zero differences count: they
-    are the same under either sign. All zero gives 1.
-
-    Args:
-        differences: paired differences, one per scenario, shape [scenario].
-
-    Raises:
-        UsageError: no differences, or more than 40.
+    are the same under either sign. All zero gives 1. None, or more than 40, are refused.
     """
     d = np.abs(np.asarray(differences, np.float64))
     if not 1 <= d.size <= MOST_SCENARIOS:
@@ -90,15 +84,8 @@ def differ(first: ArrayLike, second: ArrayLike) -> float:
     ``t = mean difference / two-way bootstrap error`` against Student's t with Satterthwaite's
     degrees of freedom; no p-value is below the sign-flip test's least, ``2^(1-n)``.
 
-    Args:
-        first: losses, NaN where undefined, shape [seed, scenario] or [scenario].
-        second: losses of another method in the same scenarios, likewise.
-
-    Returns:
-        NaN with fewer than six scenarios in which both have a value: none is claimed.
-
-    Raises:
-        UsageError: the two have different numbers of scenarios.
+    Losses are NaN where undefined, shape [seed, scenario] or [scenario]. With fewer than six scenarios
+    in which both have a value the answer is NaN: none is claimed.
     """
     a, b = (np.atleast_2d(np.asarray(side, np.float64)) for side in (first, second))
     if a.shape[1] != b.shape[1]:

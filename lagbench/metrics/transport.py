@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from lagbench.errors import require
 
 from .frame import DIRECTIONS, FramePair, sorted_projections
-from .metric import Direction, Metric, at_slow_frames, metric
+from .metric import Direction, at_slow_frames, metric, metrics_of
 
 __all__ = ["CLOUD_FRAMES", "DIRECTIONS", "METRICS", "sinkhorn_divergence", "sliced_wasserstein2"]
 
@@ -33,11 +33,8 @@ TOLERANCE = 1e-5
 def sliced_wasserstein2(x: ArrayLike, y: ArrayLike) -> float:
     """Return ``sqrt(mean_ki(((x.d_k)_(i) - (y.d_k)_(i))^2))``, sorted along each direction.
 
-    The directions are fixed: nothing is drawn. A shift by s gives ``|s| / sqrt(2)``.
-
-    Args:
-        x: one cloud [length], shape [particle, 2].
-        y: another of as many particles [length], shape [particle, 2].
+    Of two clouds of as many particles [length], shape [particle, 2]. The directions are fixed: nothing
+    is drawn. A shift by s gives ``|s| / sqrt(2)``.
     """
     return _distance(sorted_projections(x), sorted_projections(y))
 
@@ -55,9 +52,6 @@ def sinkhorn_divergence(x: NDArray[np.float64], y: NDArray[np.float64]) -> float
     A blur of 0.1 is a third of the box in length, so it sees little but shifts of the whole; three
     n x n matrices make it slow and large (8192 particles: minutes and gigabytes). Prefer
     :func:`sliced_wasserstein2`.
-
-    Raises:
-        UsageError: POT is not installed.
     """
     ot = require("ot", extra="transport")
 
@@ -88,11 +82,8 @@ def cloud_distance(pair: FramePair) -> float:
     Which particle is which does not count, of which material it is does. A cloud that is shifted by
     s is |s| / sqrt(2) off; where the truth has come to rest nothing is measured.
     """
-    members, true, predicted = (
-        pair.scenario.members,
-        pair.truth.material_projections,
-        pair.prediction.material_projections,
-    )
+    true, predicted = pair.truth.material_projections, pair.prediction.material_projections
+    members = pair.scenario.members
     weighted = [len(members[name]) * _distance(true[name], predicted[name]) for name in members]
     return math.fsum(weighted) / len(pair.scenario.material)
 
@@ -124,5 +115,5 @@ def sinkhorn_pot(pair: FramePair) -> float:
     return sinkhorn_divergence(pair.truth.position, pair.prediction.position)
 
 
-METRICS: tuple[Metric, ...] = (cloud_distance, sliced_w2, sinkhorn_pot)
-"""Metrics of this family."""
+METRICS = metrics_of(globals())
+"""Metrics of this family, in the order of their definition."""

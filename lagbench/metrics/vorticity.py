@@ -14,7 +14,17 @@ from functools import partial
 import numpy as np
 
 from .frame import PERCENTILES, Floats, FramePair, average
-from .metric import Direction, Metric, enough_nodes, mean, metric, quotient, root_mean_square, turning
+from .metric import (
+    Direction,
+    Metric,
+    enough_nodes,
+    mean,
+    metric,
+    metrics_of,
+    quotient,
+    root_mean_square,
+    turning,
+)
 from .pointwise import mean_absolute_error, mean_squared_error
 
 __all__ = ["METRICS", "STABLE_PEARSON", "frames_before_fall", "pearson", "slope"]
@@ -176,18 +186,5 @@ def _percentile(percent: int) -> Metric:
     )
 
 
-METRICS: tuple[Metric, ...] = (
-    vorticity_mse,
-    vorticity_mae,
-    vorticity_rmse,
-    vorticity_square_true,
-    vorticity_nrmse,
-    vorticity_pearson,
-    stable_frames,
-    vorticity_residual_mean,
-    vorticity_residual_std,
-    vorticity_residual_max,
-    vorticity_residual_slope,
-    *map(_percentile, PERCENTILES),
-)
-"""Metrics of this family."""
+METRICS = (*metrics_of(globals()), *map(_percentile, PERCENTILES))
+"""Metrics of this family, in the order of their definition."""

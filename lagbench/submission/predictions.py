@@ -84,7 +84,9 @@ class Predictions:
                 expected=f"scenarios {spell_ids(self.header.scenarios)}, frames {spell_ids(numbers)}",
                 got=f"scenario {scenario}, {count} frames from {start}",
             )
-        return self._rows(self._row[scenario], first, count)
+        with reading(self.path, "position"):
+            values: NDArray[Any] = self._position[self._row[scenario], first : first + count]
+            return np.ascontiguousarray(values, dtype=np.float32)
 
     def blocks(self, scenario: int) -> Iterator[tuple[int, NDArray[np.float32]]]:
         """Yield a scenario in pieces of about 1 MiB: absolute first frame, positions.
@@ -122,11 +124,6 @@ class Predictions:
         shape = (len(ids), len(header.frames), header.particles, SPACE)
         hasher.declare("position", np.dtype(np.float32), DIMS, shape)
         return hasher
-
-    def _rows(self, row: int, first: int, count: int) -> NDArray[np.float32]:
-        with reading(self.path, "position"):
-            values: NDArray[Any] = self._position[row, first : first + count]
-            return np.ascontiguousarray(values, dtype=np.float32)
 
 
 def open_predictions(path: str | Path) -> Predictions:

@@ -86,7 +86,10 @@ def check_start(starts: Mapping[int, Start], first: int, truth: Truth, out: Find
 
     ``first`` is the number of the first predicted frame.
     """
-    said = {i: mistake(start, truth.size.bounds, _without(starts, i)) for i, start in starts.items()}
+    said = {
+        i: mistake(start, truth.size.bounds, {j: s for j, s in starts.items() if j != i})
+        for i, start in starts.items()
+    }
     counts = Counter(found for found in said.values() if found is not None)
     for scenario, start in starts.items():
         found = said[scenario]
@@ -104,10 +107,6 @@ def check_start(starts: Mapping[int, Start], first: int, truth: Truth, out: Find
         )
     _check_shift(starts, first, out)
     out.made("start", "discontinuous_start")
-
-
-def _without(starts: Mapping[int, Start], scenario: int) -> Mapping[int, Start]:
-    return {other: start for other, start in starts.items() if other != scenario}
 
 
 def _start(predictions: Predictions, truth: Truth, scenario: int) -> Start:

@@ -102,21 +102,15 @@ def validate(
         return _examine(file, folder, known, require_truth=require_truth)
 
     result = look()
-    size = _size_of(result, known)
-    if size is None:
+    if result.split is None or result.size is None or "split" not in result.passed:
         return result
+    size = known.size(result.split, result.size)
     # Only the file says which test subset it needs; the child that reads it fetches nothing.
     from lagbench.store.copy import bring
 
     if bring(size, folder, size.subsets["test"]):
         result = look()
     return _with_hashed_truth(result, Truth(size, folder))
-
-
-def _size_of(result: ValidationResult, registry: Registry) -> Size | None:
-    if result.split is None or result.size is None or "split" not in result.passed:
-        return None
-    return registry.size(result.split, result.size)
 
 
 def _with_hashed_truth(result: ValidationResult, truth: Truth) -> ValidationResult:

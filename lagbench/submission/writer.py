@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -108,7 +108,7 @@ class PredictionsWriter:
                 self._file = netCDF4.Dataset(temporary, "w", format="NETCDF4")
             except OSError as error:
                 raise self._refused(error) from error
-            stack.callback(self._close)
+            stack.callback(lambda: self._file.isopen() and self._file.close())
             self._define()
             self._stack = stack.pop_all()
         return self
@@ -224,40 +224,21 @@ class PredictionsWriter:
         self._create("frame", "i4", ("frame",), np.array(frames_to_predict(size), np.int32))
         for name in self._names:
             self._create(name, "f4", DIMS)
-        self._file.setncatts(
-            {
-                "Conventions": "CF-1.11",
-                "lagbench_format": np.int32(FORMAT),
-                "split": size.split,
-                "size": size.name,
-                "dataset_version": size.version,
-                "dataset_sha256": self._hash,
-            }
-        )
+        names = {"split": size.split, "size": size.name, "dataset_version": size.version}
+        head = {"Conventions": "CF-1.11", "lagbench_format": np.int32(FORMAT)}
+        self._file.setncatts({**head, **names, "dataset_sha256": self._hash})
 
     def _create(
         self, name: str, dtype: str, dims: tuple[str, ...], values: NDArray[np.int32] | None = None
     ) -> None:
-        chunked = len(dims) > 1
-        variable = self._file.createVariable(
-            name,
-            dtype,
-            dims,
-            compression="zlib" if chunked else None,
-            complevel=1,
-            shuffle=True,
-            chunksizes=(1, 1, *self.shape[1:]) if chunked else None,
-            endian="little",
-            fill_value=False,
-            chunk_cache=CHUNK_CACHE if chunked else None,
-        )
+        packing: dict[str, Any] = {"complevel": 1, "shuffle": True, "endian": "little", "fill_value": False}
+        if len(dims) > 1:
+            packing |= {"compression": "zlib", "chunksizes": (1, 1, *self.shape[1:])}
+            packing |= {"chunk_cache": CHUNK_CACHE}
+        variable = self._file.createVariable(name, dtype, dims, **packing)
         variable.setncatts(_ATTRIBUTES[name])
         if values is not None:
             variable[:] = values
-
-    def _close(self) -> None:
-        if self._file.isopen():
-            self._file.close()
 
     def _refused(self, error: Exception) -> WorkFailedError:
         fix = "free disk space, or name a folder that you may write to"

@@ -1,0 +1,291 @@
+"""Predictions as files: what is written is read, in any packing, in bounded memory; what is refused."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tracemalloc
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import xarray as xr
+from bad_submissions import FAULTS
+from faulty import positions, rows, store
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from scenario_factory import frames_of
+from submission_data import FRAMES, GIVEN, HORIZON, PARTICLES, TESTS, Bench, frozen, make_bench, truth
+
+from lagbench.data.registry import Registry
+from lagbench.errors import ChecksFailedError, DataError, UnreadableFileError, UsageError, WorkFailedError
+from lagbench.submission import PredictionsWriter, open_predictions, template, write
+
+SHAPE = (HORIZON, PARTICLES, 2)
+RIGHT = {i: truth(i) for i in TESTS}
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
+    """A small data set and a valid submission."""
+    return make_bench(tmp_path_factory.mktemp("bench"))
+
+
+def options(bench: Bench, **more: Any) -> dict[str, Any]:
+    """What every call needs."""
+    return {"split": "cavity", "size": "tiny", "method": "m", "registry": bench.registry, **more}
+
+
+FINITE = st.floats(-(2.0**99), 2.0**99, width=32)
+
+
+@settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(values=hnp.arrays(np.float32, (len(TESTS), *SHAPE), elements=FINITE, fill=FINITE))
+def test_what_is_written_is_read(bench: Bench, values: np.ndarray) -> None:
+    """Every finite float32 comes back bit by bit, from an array and from a mapping."""
+    for form in (values, dict(zip(TESTS, values, strict=True))):
+        path = write(bench.folder / "round.nc", form, **options(bench))
+        with open_predictions(path) as predictions:
+            for row, scenario in enumerate(TESTS):
+                got = predictions.frames(scenario, GIVEN, HORIZON)
+                np.testing.assert_array_equal(got.view("u4"), values[row].view("u4"))
+
+
+def test_the_template_is_the_last_given_frame_repeated(bench: Bench, tmp_path: Path) -> None:
+    """Valid as it is; one frame per chunk; no time, host or path enters the file.
+
+    Without the test scenarios the message has the command that makes them, and nothing is written.
+    """
+    made: dict[str, Any] = {"root": bench.root, "registry": bench.registry}
+    result = template("cavity", "tiny", output=bench.folder / "t.nc", **made)
+    assert (result.scenarios, result.frames, result.particles) == (TESTS, (GIVEN, FRAMES - 1), PARTICLES)
+    assert bench.validate(result.path).exit_code == 0
+    with open_predictions(result.path) as predictions:
+        assert predictions.header.method == "persistence"
+        for scenario in TESTS:
+            last = np.broadcast_to(frames_of(scenario, FRAMES, PARTICLES)[GIVEN - 1], SHAPE)
+            np.testing.assert_array_equal(predictions.frames(scenario, GIVEN, HORIZON), last)
+    with h5py.File(result.path) as file:
+        assert file["position"].chunks == (1, 1, PARTICLES, 2)
+    again = template("cavity", "tiny", output=bench.folder / "twice.nc", **made)
+    assert again.path.read_bytes() == result.path.read_bytes()
+    with pytest.raises(DataError, match="lagbench generate --split cavity --size tiny --subset test"):
+        template("cavity", "tiny", output=tmp_path / "t.nc", **{**made, "root": tmp_path})
+    assert not (tmp_path / "t.nc").exists()
+
+
+def test_without_a_recorded_hash_one_must_be_given(unmeasured: Registry, tmp_path: Path) -> None:
+    """A split that nobody measured has no hash; a given one is stored."""
+    zeros = np.full((2, 20, 324, 2), 0.5)
+    path = tmp_path / "p.nc"
+    more: dict[str, Any] = {"split": "cavity", "size": "tiny", "method": "m", "registry": unmeasured}
+    with pytest.raises(DataError, match="hash of the data set is not known"):
+        write(path, zeros, root=tmp_path, **more)
+    write(path, zeros, root=tmp_path, dataset_sha256="ab" * 32, **more)
+    with open_predictions(path) as predictions:
+        assert predictions.header.dataset_sha256 == "ab" * 32
+
+
+def _nan(values: np.ndarray) -> np.ndarray:
+    values = values.copy()
+    values[2, 5, 1] = np.nan
+    return values
+
+
+@pytest.mark.parametrize(
+    ("values", "labels", "message"),
+    [
+        ({3: truth(3), 4: truth(4)}, {}, "missing: 5"),
+        ({**{i: truth(i) for i in TESTS}, 9: truth(3)}, {}, "no test scenario"),
+        ({i: truth(i)[:5] for i in TESTS}, {}, "shape"),
+        ({i: truth(i).swapaxes(1, 2) for i in TESTS}, {}, "shape"),
+        ({i: _nan(truth(i)) for i in TESTS}, {}, "frame 5, particle 5"),
+        ({i: truth(i).astype("f8") * 1e300 for i in TESTS}, {}, "not finite as float32"),
+        (np.zeros((2, *SHAPE)), {}, "one entry per test scenario"),
+        (np.zeros(SHAPE), {}, "one entry per test scenario"),
+        ({}, {"sed": 3}, "did you mean 'seed'"),
+        ({}, {"seed": "three"}, "an integer"),
+        ({}, {"seed": True}, "an integer"),
+        ({}, {"parameters": -5}, "an integer >= 0"),
+        ({}, {"seconds_per_frame": -1}, "positive"),
+        ({}, {"seconds_per_frame": float("inf")}, "positive"),
+        # a mark before motion that goes on, beyond the horizon, or in the given frames
+        (RIGHT, {"diverged_at": {4: 7}}, "frame 8 differs"),
+        *((RIGHT, {"diverged_at": {4: mark}}, "no such frame") for mark in (100_000, GIVEN - 1, -5)),
+    ],
+)
+def test_wrong_arrays_and_labels_are_refused_and_leave_no_file(
+    bench: Bench, values: Any, labels: dict[str, Any], message: str
+) -> None:
+    """Missing, unknown, misshapen, not finite; unknown names suggest the nearest; no file is left."""
+    before = sorted(bench.folder.iterdir())
+    with pytest.raises(UsageError, match=message):
+        write(bench.folder / "refused.nc", values, **options(bench, **labels))
+    assert sorted(bench.folder.iterdir()) == before
+
+
+def test_velocities_and_frozen_rollouts_are_recorded(bench: Bench) -> None:
+    """Velocities are not read by the scorer but are there for others; diverged_at comes back by id."""
+    values = RIGHT | {5: frozen(truth(5), 7)}
+    more = options(bench, velocities={i: -v for i, v in values.items()}, diverged_at={5: 7})
+    path = write(bench.folder / "v.nc", values, **more)
+    with h5py.File(path) as file:
+        np.testing.assert_array_equal(file["velocity"][...], -file["position"][...])
+    with open_predictions(path) as predictions:
+        assert predictions.header.diverged_at == {5: 7}
+    assert not bench.validate(path).findings
+    with pytest.raises(WorkFailedError, match="cannot write"):  # a parent that is a file
+        write(bench.valid / "p.nc", RIGHT, **options(bench))
+
+
+def test_labels_may_come_while_writing(bench: Bench) -> None:
+    """The cost of a frame is known only after the rollout."""
+    path = bench.folder / "late.nc"
+    with PredictionsWriter(path, **options(bench)) as writer:
+        for scenario in reversed(TESTS):
+            writer.add(scenario, truth(scenario))
+        with pytest.raises(UsageError, match="written twice"):
+            writer.add(3, truth(3))
+        writer.label(seconds_per_frame=0.5, device="one core")
+    with open_predictions(path) as predictions:
+        assert (predictions.header.seconds_per_frame, predictions.header.device) == (0.5, "one core")
+
+
+ALL = list(range(GIVEN, FRAMES))
+
+
+def test_frames_are_found_by_id_and_absolute_number(bench: Bench) -> None:
+    """Scenario 4, three frames from frame 5 on; names, ids, frames, optional attributes in the header."""
+    with open_predictions(bench.valid) as predictions:
+        got, header = predictions.frames(4, 5, 3), predictions.header
+    assert got.dtype == np.float32
+    np.testing.assert_array_equal(got, truth(4)[5 - GIVEN : 8 - GIVEN])
+    assert (header.split, header.size, header.method) == ("cavity", "tiny", "truth")
+    assert (header.scenarios, header.frames, header.particles) == (TESTS, tuple(ALL), PARTICLES)
+    assert (header.seconds_per_frame, header.seed, header.device) == (0.25, 7, None)
+
+
+def test_scenarios_in_another_order_are_matched_by_id(bench: Bench) -> None:
+    """A reordered file is valid, reads the same and has the same content hash."""
+    path = rows(bench, "reordered", [5, 3, 4], ALL, [2, 0, 1])
+    assert bench.validate(path).passed == bench.validate(bench.valid).passed
+    with open_predictions(path) as shuffled, open_predictions(bench.valid) as plain:
+        assert shuffled.header.scenarios == (5, 3, 4)
+        for scenario in TESTS:
+            np.testing.assert_array_equal(
+                shuffled.frames(scenario, GIVEN, HORIZON), plain.frames(scenario, GIVEN, HORIZON)
+            )
+        assert shuffled.content_sha256() == plain.content_sha256()
+
+
+PACKINGS: dict[str, dict[str, Any]] = {
+    "contiguous": {},
+    "big_endian": {"dtype": ">f4"},
+    "one_chunk": {"chunks": (3, 8, PARTICLES, 2), "compression": 9},
+    "chunks_over_scenarios": {"chunks": (2, 3, 7, 1), "compression": 1, "shuffle": True},
+    "checksummed": {"chunks": (1, 1, PARTICLES, 2), "fletcher32": True},
+    "unlimited": {"chunks": (1, 1, PARTICLES, 2), "maxshape": (None, None, PARTICLES, 2)},
+}
+
+
+@pytest.mark.parametrize("name", PACKINGS)
+def test_packing_does_not_matter(bench: Bench, name: str) -> None:
+    """Valid, equal values in the machine's byte order, equal content hash, whatever else the file holds."""
+    path = bench.copy(f"{name}.nc")
+    with h5py.File(path, "r+") as file:
+        store(file, positions(file), **PACKINGS[name])
+        file.create_group("notes").attrs["author"] = "someone"
+        file["more"] = np.zeros(3)
+        file.attrs["comment"] = "x" * 1000
+        file.attrs["lagbench_format"] = np.int64(1)
+    assert not bench.validate(path).findings
+    with open_predictions(path) as packed, open_predictions(bench.valid) as plain:
+        got = packed.frames(3, GIVEN, HORIZON)
+        assert got.dtype.isnative
+        np.testing.assert_array_equal(got, truth(3))
+        assert packed.content_sha256() == plain.content_sha256()
+
+
+def test_files_of_xarray_and_links_to_files_are_read(bench: Bench) -> None:
+    """Opened, stored and symlinked with nothing of ours."""
+    with xr.open_dataset(bench.valid) as dataset:
+        assert dataset["position"].dims == ("scenario", "frame", "particle", "space")
+        dataset.to_netcdf(bench.folder / "xarray.nc")
+    link = bench.folder / "link.nc"
+    link.symlink_to(bench.folder / "xarray.nc")
+    assert not bench.validate(link).findings
+
+
+def test_the_content_hash_is_that_of_the_document(bench: Bench) -> None:
+    """Computed by hashlib and json alone, as docs/predictions.md says."""
+
+    def spelt(value: object) -> bytes:
+        return json.dumps(value, sort_keys=True, separators=(",", ":")).encode()
+
+    values = np.stack([truth(i) for i in TESTS]).astype("<f4")
+    header = {"dims": ["scenario", "frame", "particle", "space"], "dtype": "float32", "name": "position"}
+    variable = hashlib.sha256(spelt({**header, "shape": list(values.shape)}) + b"\n" + values.tobytes())
+    with open_predictions(bench.valid) as predictions:
+        got, head = predictions.content_sha256(), predictions.header
+    whole = {"dataset_sha256": head.dataset_sha256, "dataset_version": "2.2.0", "method": "truth"}
+    whole |= {"split": "cavity", "size": "tiny", "scenarios": list(TESTS), "frames": ALL}
+    whole |= {"variables": {"position": variable.hexdigest()}}
+    assert got == hashlib.sha256(spelt(whole)).hexdigest()
+
+
+def test_blocks_cover_a_scenario_in_order_and_in_bounded_memory(tmp_path: Path) -> None:
+    """A scenario of 96 MB in pieces of 1 MiB, read in less than 20 MB."""
+    path = tmp_path / "large.nc"
+    frames, particles = 120, 100_000
+    with h5py.File(path, "w") as file:
+        for name, values in {"scenario": [1], "frame": np.arange(2, 2 + frames)}.items():
+            file[name] = np.asarray(values)
+            file[name].make_scale(name)
+        for name, length in {"particle": particles, "space": 2}.items():
+            file[name] = np.zeros(length)
+            file[name].make_scale(name)
+        shape, chunks = (1, frames, particles, 2), (1, 1, particles, 2)
+        position = file.create_dataset("position", shape, "f4", chunks=chunks)
+        for frame in range(frames):
+            position[0, frame] = frame
+        for axis, name in enumerate(("scenario", "frame", "particle", "space")):
+            position.dims[axis].attach_scale(file[name])
+        file.attrs.update(lagbench_format=1, split="a", size="b", method="c")
+        file.attrs.update(dataset_version="1.0.0", dataset_sha256="d")
+    tracemalloc.start()
+    seen: list[int] = []
+    with open_predictions(path) as predictions:
+        for first, block in predictions.blocks(1):
+            assert (block[:, 0, 0] == np.arange(len(seen), len(seen) + len(block))).all()
+            assert first == 2 + len(seen)
+            seen += [first] * len(block)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert len(seen) == frames
+    assert peak < 20e6
+
+
+@pytest.mark.parametrize(
+    ("scenario", "start", "count"), [(9, 3, 1), (3, 2, 1), (3, 3, 9), (3, 11, 1), (3, 3, -1)]
+)
+def test_frames_that_are_not_there_are_named(bench: Bench, scenario: int, start: int, count: int) -> None:
+    """No such scenario, before the first, beyond the last."""
+    with open_predictions(bench.valid) as predictions, pytest.raises(UsageError, match="no such frames"):
+        predictions.frames(scenario, start, count)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        *((name, UnreadableFileError) for name in ("fifo", "truncated_half", "netcdf3")),
+        *((name, ChecksFailedError) for name in ("external_link", "virtual_dataset")),
+        *((name, ChecksFailedError) for name in ("positions_float64", "space_before_particle")),
+    ],
+)
+def test_opening_what_is_unreadable_raises(bench: Bench, name: str, kind: type[Exception]) -> None:
+    """Exit code 3; of another layout exit code 1, naming the check."""
+    with pytest.raises(kind, match=FAULTS[name].check if kind is ChecksFailedError else None):
+        open_predictions(FAULTS[name].make(bench))
