@@ -33,15 +33,15 @@ from lagbench.board.entry import (
     Status,
 )
 from lagbench.board.entry_file import spell
-from lagbench.board.floors import floor_names, write_floors
 from lagbench.board.folder import Folder, score_paths
 from lagbench.board.page import build
-from lagbench.board.ranking import combine, summarise
+from lagbench.board.ranking import combine, summarise, write_floors
 from lagbench.board.score_file import read_stored, reported_frames
 from lagbench.cli.output import spell_bytes
 from lagbench.data.checksums import file_sha256
 from lagbench.data.grid import Grid, Placement
 from lagbench.data.registry import Size, load
+from lagbench.floors.table import FLOORS
 from lagbench.metrics import METRICS, Direction, Setting, Tally, aggregate
 from lagbench.metrics.distributions import BINS
 from lagbench.scoring.card import ScoreCard
@@ -152,7 +152,7 @@ def make_entry(size: Size, target: Path, number: int) -> None:
 def made_up(size: Size, method: str, seed: int, quality: float) -> ScoreCard:
     """Return a score card of nobody's predictions: errors that grow, pictures of noise."""
     rng, rows = np.random.Generator(np.random.PCG64(seed)), {SUBMISSION: quality}
-    rows |= {name: 3.0 + i for i, name in enumerate(floor_names())}
+    rows |= {name: 3.0 + i for i, name in enumerate(FLOORS)}
     task, frames, ranking = size.task, tuple(frames_to_predict(size)), ranking_metric(size)
     tallies = {
         row: {

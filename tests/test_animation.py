@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 from pathlib import Path
 
 import imageio_ffmpeg
@@ -16,7 +15,6 @@ from PIL.GifImagePlugin import GifImageFile
 from swirls import OMEGA, write_swirl
 
 from lagbench.draw import animate as animation
-from lagbench.draw import animate as video
 from lagbench.draw import style
 from lagbench.draw.animate import Painter, animate, halve, pack, unpack
 from lagbench.draw.panels import Panel
@@ -86,21 +84,15 @@ def test_vorticity_of_a_rotating_disc_is_red_inside(swirl: Path) -> None:
     assert tuple(image[12, 115]) == tuple(style.rgb(style.PAPER))
 
 
-def test_speeds_are_symmetric_about_the_middle(swirl: Path) -> None:
-    """A turning disc is dark in the middle and bright at the rim."""
-    image = paint(swirl, Panel.SPEED, 2).astype(int)
-    assert image[64, 64].sum() < image[64, 64 + 48].sum()
-
-
 def test_mp4_has_every_frame_and_an_even_size(swirl: Path, tmp_path: Path) -> None:
-    """Eight frames at 30 a second; width and height are even."""
-    path = animate(swirl, tmp_path / "swirl.mp4")
-    frames, seconds = imageio_ffmpeg.count_frames_and_secs(path)
-    assert frames == 8
-    assert seconds == pytest.approx(8 / 30, abs=0.02)
-    meta = next(imageio_ffmpeg.read_frames(path))
+    """Eight frames at 30 a second, even sides; no date, so that the same frames give the same bytes."""
+    first, second = (animate(swirl, tmp_path / name) for name in ("a.mp4", "b.mp4"))
+    frames, seconds = imageio_ffmpeg.count_frames_and_secs(first)
+    assert (frames, seconds) == (8, pytest.approx(8 / 30, abs=0.02))
+    meta = next(imageio_ffmpeg.read_frames(first))
     assert meta["size"] == (SIDE, animation.TOP + animation.SIDE + animation.BOTTOM)
     assert all(length % 2 == 0 for length in meta["size"])
+    assert first.read_bytes() == second.read_bytes()
 
 
 def test_two_scenarios_side_by_side_end_with_the_shorter(swirl: Path, tmp_path: Path) -> None:
@@ -147,7 +139,7 @@ def test_an_error_leaves_no_file(swirl: Path, tmp_path: Path, monkeypatch: pytes
 
 def test_ffmpeg_that_fails_is_reported(swirl: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What ffmpeg refuses becomes an error of lagbench, and no file is left."""
-    monkeypatch.setattr(video, "_CODING", ["-no_such_option", "1"])
+    monkeypatch.setattr(animation, "_CODING", ["-no_such_option", "1"])
     with pytest.raises(WorkFailedError, match="encode"):
         animate(swirl, tmp_path / "x.mp4")
     assert not list(tmp_path.iterdir())
@@ -162,29 +154,16 @@ def test_no_progress_without_a_terminal(
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    "options",
     [
-        ({"kind": "streamlines"}, "cannot show"),
-        ({"kind": "sped"}, "did you mean 'speed'"),
-        ({"frames_per_second": 0}, "positive"),
-        ({"frames_per_second": float("nan")}, "positive"),
-        ({"frames_per_second": float("inf")}, "positive"),
-        ({"frames_per_second": 1e-9}, "0.01 to 1000"),
-        ({"every": 0}, "positive"),
+        *({"kind": kind} for kind in ("streamlines", "sped")),
+        *({"frames_per_second": rate} for rate in (0, float("nan"), float("inf"), 1e-9)),
+        {"every": 0},
     ],
 )
-def test_bad_options_are_refused(
-    swirl: Path, tmp_path: Path, options: dict[str, object], message: str
-) -> None:
-    """Each message names what is wrong."""
-    with pytest.raises(UsageError, match=message):
+def test_bad_options_are_refused(swirl: Path, tmp_path: Path, options: dict[str, object]) -> None:
+    """The error names the option, and nothing is written."""
+    with pytest.raises(UsageError) as error:
         animate(swirl, tmp_path / "x.mp4", **options)  # type: ignore[arg-type]
-
-
-def test_mp4_holds_no_date(swirl: Path, tmp_path: Path) -> None:
-    """The container's metadata name no time, so the same frames give the same bytes."""
-    first, second = (animate(swirl, tmp_path / name) for name in ("a.mp4", "b.mp4"))
-    assert first.read_bytes() == second.read_bytes()
-    tool = imageio_ffmpeg.get_ffmpeg_exe()
-    told = subprocess.run([tool, "-i", str(first)], capture_output=True, text=True, check=False).stderr
-    assert "creation_time" not in told
+    assert str(error.value.where) == ("--kind" if "kind" in options else "--fps, --every")
+    assert not list(tmp_path.iterdir())

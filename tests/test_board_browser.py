@@ -12,9 +12,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from board_browsing import active, close, names, press, restored, run, seen, still, until
 from board_worlds import make_board, with_entry
-from browser import CHROMIUM, Browser, Page
+from browser import CHROMIUM, Browser, Page, close, names, press, restored, run, seen, still, until
 from PIL import Image
 
 from lagbench.board.columns import columns_of, presets_of, value_of, written
@@ -250,7 +249,7 @@ def test_sorting(page: Page, board: Board, key: str) -> None:
         value = float(value_of(row, column))
         return {Direction.HIGHER: -value, Direction.TARGET: abs(value - 1.0)}.get(direction, value)
 
-    rows = active(tab.rows)
+    rows = [row for row in tab.rows if row.active]
     known = sorted((row for row in rows if not np.isnan(loss(row))), key=loss)
     gaps = [row.entry.name for row in rows if np.isnan(loss(row))]
     heading = f"section:not([hidden]) [data-sort={key}]"
@@ -271,7 +270,9 @@ def test_filter_by_keyboard(page: Page, board: Board) -> None:
     press(page, "/")
     page.call("Input.insertText", text="examples GAT")
     run(page, "0")
-    assert names(page) == [row.entry.name for row in active(board.tabs[0].rows) if "GAT" in row.entry.name]
+    assert names(page) == [
+        row.entry.name for row in board.tabs[0].rows if row.active and "GAT" in row.entry.name
+    ]
     assert len(seen(page)) == len(names(page)) + 2
     assert "of 6 entries" in page.value("document.querySelector('section:not([hidden]) .count').textContent")
     page.call("Input.insertText", text=" nobody")
@@ -293,7 +294,7 @@ def test_tabs_by_keyboard(page: Page, board: Board) -> None:
     assert page.value("[...document.querySelectorAll('[aria-selected=true]')].map(a => a.dataset.tab)") == [
         "fluid-mini"
     ]
-    assert names(page) == [row.entry.name for row in active(board.tabs[2].rows)]
+    assert names(page) == [row.entry.name for row in board.tabs[2].rows if row.active]
     run(page, "history.back()")
     until(page, f"String({shown}) === 'cavity-mini'")
 
@@ -324,7 +325,7 @@ def test_address_restores_the_state(page: Page) -> None:
 def test_odd_addresses_do_no_harm(page: Page, board: Board, address: str) -> None:
     """The name of a tab alone is enough; what is unknown is passed over."""
     restored(page, address)
-    assert names(page) == [row.entry.name for row in active(board.tabs[2].rows)]
+    assert names(page) == [row.entry.name for row in board.tabs[2].rows if row.active]
     assert page.value("document.getElementById('panel').open") is False
 
 

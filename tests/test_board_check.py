@@ -9,21 +9,16 @@ from pathlib import Path
 from typing import Any
 
 import netCDF4
-import numpy as np
 import pytest
 import yaml
-from board_worlds import PLACE, SCORES, BoardBench, copied, master
-from report_bench import damped, noisy
+from made_up import PLACE, SCORES, BoardBench, copied, master, reform, scale, set_mean
 
 from lagbench.board import check as checking
-from lagbench.board import submit as submitting
-from lagbench.board.check import CheckResult, check_board
-from lagbench.board.collect import collect
+from lagbench.board.check import check_board
 from lagbench.board.findings import CHECKS, skeleton
 from lagbench.board.page import build
 from lagbench.data.registry import load
-from lagbench.errors import ChecksFailedError, UnreadableFileError
-from lagbench.scoring import score
+from lagbench.errors import ChecksFailedError
 
 FLOOR = "floors/cavity/tiny/persistence.nc"
 
@@ -55,11 +50,6 @@ def test_nothing_is_wrong_with_what_submit_writes(home: Path) -> None:
     assert (result.findings, result.entries) == ((), 3)
 
 
-def set_mean(held: dict[str, Any], factor: float = 0.9) -> None:
-    """Better the ranking metric of an entry."""
-    held["score"]["metrics"]["vorticity_rmse"]["mean"] *= factor
-
-
 def halve(path: Path, statistic: str = "vorticity_mse") -> None:
     """Halve a statistic in a score file."""
     with netCDF4.Dataset(path, "r+") as file:
@@ -71,32 +61,6 @@ def link(path: Path, target: Path) -> None:
     """Replace a file by a symbolic link."""
     path.unlink()
     path.symlink_to(target)
-
-
-def reform(bench: BoardBench, change: Callable[[Any], object], *, whole: bool = True) -> None:
-    """Change the values of a score file and make its hash, and the aggregates, follow."""
-    with netCDF4.Dataset(bench.folder / SCORES / "noisy.nc", "r+") as file:
-        file.set_auto_maskandscale(False)
-        change(file)
-    if whole:
-        bench.forge("noisy")
-    else:
-        bench.rehash("noisy")
-
-
-def row_of(file: Any, statistic: str) -> int:
-    """Return where a statistic stands in a score file."""
-    return int(file.statistics.split().index(statistic))
-
-
-def scale(statistic: str, factor: float) -> Callable[[Any], object]:
-    """Return a change that multiplies a statistic."""
-
-    def change(file: Any) -> None:
-        row = row_of(file, statistic)
-        file["value"][row] = factor * file["value"][row]
-
-    return change
 
 
 def copy_of(bench: BoardBench, method: str, other: str, **changes: Any) -> None:
@@ -342,101 +306,6 @@ def test_names_that_look_alike(one: str, other: str) -> None:
     """Other scripts, wide letters, accents, case, hyphens, and digits like letters."""
     assert skeleton(one) == skeleton(other)
     assert skeleton(one) != skeleton(f"{other} b")
-
-
-@pytest.fixture
-def predictions(own: BoardBench) -> Path:
-    """The predictions of noisy."""
-    return own.predict(noisy, "noisy", parameters=5)
-
-
-def rescored(bench: BoardBench, *paths: Path, **options: Any) -> CheckResult:
-    """Check with predictions scored again."""
-    where = {"registry": bench.registry, "root": bench.data.root, "isolated": False}
-    return check_board(bench.folder, predictions=paths, **where, **options)
-
-
-def test_scoring_again_confirms_and_is_recorded(own: BoardBench, predictions: Path) -> None:
-    """The entry is named with how close it came; only the list makes it verified, while its files stay."""
-    result = rescored(own, predictions)
-    assert not result.findings
-    (one,) = result.confirmed
-    assert (one.entry, one.difference) == (Path(PLACE, "noisy.yaml"), 0.0)
-    assert not (own.folder / "verified.yaml").exists()
-    assert rescored(own, predictions, recording=True).recorded == (f"{PLACE}/noisy.yaml",)
-    rows = {row.id: row.verified for row in collect(own.folder, registry=own.registry).tabs[0].rows}
-    assert rows["noisy"] is not None
-    assert rows["damped"] is None
-    assert found(own) == []
-    before = (own.folder / "verified.yaml").read_bytes()
-    rescored(own, predictions, recording=True)
-    assert (own.folder / "verified.yaml").read_bytes() == before
-    reform(own, scale("vorticity_mse", 0.5))
-    rows = {row.id: row.verified for row in collect(own.folder, registry=own.registry).tabs[0].rows}
-    assert rows["noisy"] is None
-    assert found(own) == ["verified"]
-
-
-def test_a_method_is_verified_with_all_its_seeds(own: BoardBench) -> None:
-    """One of two seeds confirms its score file, not the entry."""
-    path = own.predict(damped, "damped", seed=0, device="cpu", seconds_per_frame=0.25)
-    result = rescored(own, path, recording=True)
-    assert ([one.score_file.name for one in result.confirmed], result.recorded) == (["damped_0.nc"], ())
-
-
-def test_scoring_again_finds_what_a_forger_hid(own: BoardBench, predictions: Path) -> None:
-    """Statistics halved, hashes and aggregates forged: only the predictions themselves tell."""
-    reform(own, scale("vorticity_mse", 0.5))
-    assert found(own) == []
-    result = rescored(own, predictions, recording=True)
-    assert [(f.check, f.got) for f in result.findings] == [("rescored", "other vorticity_mse")]
-    assert (result.confirmed, result.recorded) == ((), ())
-    own.entry("noisy").unlink()
-    (own.folder / SCORES / "noisy.nc").unlink()
-    assert [f.check for f in rescored(own, predictions).findings] == ["rescored"]
-
-
-def test_what_is_said_beside_the_numbers_is_compared(own: BoardBench, predictions: Path) -> None:
-    """Flags and frozen scenarios are those that the scorer tells; so are the scores of floors."""
-    said = {"diverged_at": {0: 7}, "flags": [{"name": "physics"}]}
-    own.edit("noisy", lambda held: held["score"]["files"][0].update(said))
-    with netCDF4.Dataset(own.folder / FLOOR, "r+") as file:
-        file.set_auto_maskandscale(False)
-        scale("position_mse", 2.0)(file)
-    got = [finding.got for finding in rescored(own, predictions).findings]
-    assert got == ["other position_mse", "[]", "{}"]
-
-
-def test_pictures_are_compared(own: BoardBench, predictions: Path) -> None:
-    """A preview that is not of these predictions is found."""
-
-    def repaint(file: Any) -> None:
-        film = file["preview"]["film"]
-        film.set_auto_maskandscale(False)
-        film[1] = np.clip(film[1].astype(np.int64) + 500, 0, 60_000).astype(np.uint16)
-
-    reform(own, repaint)
-    assert [finding.got for finding in rescored(own, predictions).findings] == ["other film pictures"]
-
-
-def test_broken_predictions_are_opened_in_the_child_only(
-    own: BoardBench, predictions: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Whatever is wrong with the file is found before this process opens it; other findings remain."""
-    cut = tmp_path / "cut.nc"
-    cut.write_bytes(predictions.read_bytes()[:-9999])
-    own.edit("damped", set_mean)
-
-    def never(*_: object, **__: object) -> None:
-        raise AssertionError
-
-    for module in (score, submitting):
-        monkeypatch.setattr(module, "open_predictions", never)
-    result = rescored(own, cut)
-    assert [finding.check for finding in result.findings] == ["score", "rescored"]
-    assert result.findings[1].where == str(cut)
-    with pytest.raises(UnreadableFileError):
-        own.submit(cut, method="cut")
 
 
 def test_withdrawn_entries_may_be_old(own: BoardBench) -> None:

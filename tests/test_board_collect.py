@@ -9,17 +9,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from board_worlds import PLACE, BoardBench, copied, master
-from report_bench import noisy
+from made_up import PLACE, BoardBench, copied, master, noisy
 
 from lagbench.board.collect import CURVE_FRAMES, RESIDUAL_BINS, collect, curve, residuals
-from lagbench.board.floors import floor_names
 from lagbench.board.model import Board, Row
 from lagbench.board.page import build
 from lagbench.board.ranking import Combined, combine
 from lagbench.board.score_file import read_stored
 from lagbench.board.show import as_plain, chosen_tabs, tables
 from lagbench.errors import ChecksFailedError, UsageError
+from lagbench.floors.table import FLOORS
 from lagbench.metrics import METRICS, Score, bootstrap_interval
 from lagbench.scoring.card import ScoreCard, digits
 from lagbench.scoring.scenario import SUBMISSION
@@ -75,7 +74,7 @@ def test_floors_stand_as_the_scorer_sees_them(board: Board, card: ScoreCard) -> 
     """Every floor of the scorer is there, with the scores that it has beside any submission."""
     floors = {floor.name: floor for floor in board.tabs[0].floors}
     assert set(floors) == set(card.scores) - {SUBMISSION}
-    assert set(floors) < set(floor_names())
+    assert set(floors) < set(FLOORS)
     for name, floor in floors.items():
         assert set(floor.values) == set(card.scores[name])
         for metric, score in card.scores[name].items():

@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from board_browsing import active, close, names, press, restored, run, still, until
 from board_worlds import make_board, with_entry
-from browser import CHROMIUM, Browser, Page
+from browser import CHROMIUM, Browser, Page, close, names, press, restored, run, still, until
 
 from lagbench.board.cost import marks_of
 from lagbench.board.entry import Flag
@@ -152,7 +151,7 @@ def test_scatter_leads_to_entries(page: Page, board: Board) -> None:
         "[...document.querySelectorAll('section:not([hidden]) [data-figure=cost] a.dot')]"
         ".map(a => [a.href.baseVal, a.classList.contains('best')])"
     )
-    rows = [row for row in active(board.tabs[0].rows) if row.entry.cost is not None]
+    rows = [row for row in board.tabs[0].rows if row.active and row.entry.cost is not None]
     assert len(dots) == len(rows)
     points = {
         row.id: (mark.seconds, mark.error)

@@ -8,7 +8,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from board_worlds import SCORES, BoardBench, copied
+from made_up import SCORES, BoardBench, copied
 
 from lagbench.board import score_file as isolation
 from lagbench.board.check import check_board
@@ -89,28 +89,23 @@ def test_hostile_score_files_are_refused(kind: str, own: BoardBench) -> None:
     assert [finding.check for finding in result.findings] == ["score_file"]
 
 
-def test_the_child_is_limited_and_started_anew(own: BoardBench, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It tells which file is damaged; a file that stops it costs that file only."""
-    good, bad = own.folder / SCORES / "noisy.nc", own.folder / SCORES / "flipping.nc"
-    bad.write_bytes(bad.read_bytes()[:5000])
-    assert set(unreadable_in_child([good, bad, good])) == {bad}
-    program = own.folder.parent / "fake"
-    program.mkdir()
-    (program / "child_that_stops.py").write_text(
-        "import os\ndef read(path):\n    if 'flipping' in path: os.kill(os.getpid(), 11)\n"
-    )
-    monkeypatch.setenv("PYTHONPATH", f"{program}:{PACKAGE}")
-    monkeypatch.setattr(isolation, "READ", "child_that_stops.read")
-    stopped = unreadable_in_child([good, bad, good])
-    assert set(stopped) == {bad}
-    assert "had to be stopped" in stopped[bad]
-
-
 def use_child(monkeypatch: pytest.MonkeyPatch, folder: Path, program: str) -> None:
     """Let the child run another program."""
     (folder / "other_child.py").write_text(program)
     monkeypatch.setenv("PYTHONPATH", f"{folder}:{PACKAGE}")
     monkeypatch.setattr(isolation, "READ", "other_child.read")
+
+
+def test_the_child_is_limited_and_started_anew(own: BoardBench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It tells which file is damaged; a file that stops it costs that file only."""
+    good, bad = own.folder / SCORES / "noisy.nc", own.folder / SCORES / "flipping.nc"
+    bad.write_bytes(bad.read_bytes()[:5000])
+    assert set(unreadable_in_child([good, bad, good])) == {bad}
+    program = "import os\ndef read(path):\n    if 'flipping' in path: os.kill(os.getpid(), 11)\n"
+    use_child(monkeypatch, own.folder.parent, program)
+    stopped = unreadable_in_child([good, bad, good])
+    assert set(stopped) == {bad}
+    assert "had to be stopped" in stopped[bad]
 
 
 def test_many_files_that_stop_the_child_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

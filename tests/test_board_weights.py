@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from board_worlds import BoardBench, copied
-from report_bench import noisy
+from made_up import BoardBench, copied, noisy
 from simple_models import FACTS, Drift
 
 from lagbench.baselines.checkpoint import Checkpoint, save
@@ -119,64 +118,46 @@ def test_other_weights_are_refused(own: BoardBench) -> None:
     assert own.state() == before
 
 
-def edit(own: BoardBench) -> None:
-    """Change a byte of the weights."""
-    path = own.folder / "weights/cavity/tiny/drift_0.pt"
-    path.write_bytes(path.read_bytes()[:-1] + b"x")
+KEPT = "weights/cavity/tiny/drift_0"
+"""Weights and record of a run, without their endings."""
+
+DAMAGE: dict[str, tuple[Callable[[BoardBench], object], str]] = {
+    "edited": (
+        lambda b: (file := b.folder / f"{KEPT}.pt").write_bytes(file.read_bytes()[:-1] + b"x"),
+        "weights",
+    ),
+    "lost": (lambda b: (b.folder / f"{KEPT}.pt").unlink(), "weights"),
+    "those of another method": (
+        lambda b: b.edit(
+            "drift", lambda held: held["predictions"][0]["weights"].update(path="weights/cavity/tiny/a_0.pt")
+        ),
+        "weights",
+    ),
+    "of no entry": (lambda b: (b.folder / "weights/cavity/tiny/other_0.pt").write_bytes(b"1"), "weights"),
+    "long record": (
+        lambda b: (b.folder / f"{KEPT}.json").write_text(json.dumps({"note": "x" * kept.MOST_RECORD})),
+        "weights",
+    ),
+    "record nested far deeper than one is": (
+        lambda b: (b.folder / f"{KEPT}.json").write_text("[" * 100_000),
+        "weights",
+    ),
+    "JSON that is no record": (lambda b: (b.folder / f"{KEPT}.json").write_text("[1]"), "weights"),
+    "track claimed": (
+        lambda b: b.edit("drift", lambda held: held["budget"].update(track="converged")),
+        "budget",
+    ),
+    "track claimed without a budget": (
+        lambda b: b.edit("noisy", lambda held: held.update(budget={"track": "equal compute"})),
+        "budget",
+    ),
+}
 
 
-def lose(own: BoardBench) -> None:
-    """Remove the weights."""
-    (own.folder / "weights/cavity/tiny/drift_0.pt").unlink()
-
-
-def misplace(own: BoardBench) -> None:
-    """Name the weights of another method."""
-    own.edit(
-        "drift", lambda held: held["predictions"][0]["weights"].update(path="weights/cavity/tiny/a_0.pt")
-    )
-
-
-def stray(own: BoardBench) -> None:
-    """Add weights that no entry names."""
-    (own.folder / "weights/cavity/tiny/other_0.pt").write_bytes(b"1")
-
-
-def lengthen(own: BoardBench) -> None:
-    """Let the record of the training be long."""
-    text = json.dumps({"note": "x" * kept.MOST_RECORD})
-    (own.folder / "weights/cavity/tiny/drift_0.json").write_text(text)
-
-
-def garble(own: BoardBench) -> None:
-    """Let it be no record: nested far deeper than one is."""
-    (own.folder / "weights/cavity/tiny/drift_0.json").write_text("[" * 100_000)
-
-
-def listed(own: BoardBench) -> None:
-    """Let it be JSON, but no record."""
-    (own.folder / "weights/cavity/tiny/drift_0.json").write_text("[1]")
-
-
-def claim(own: BoardBench) -> None:
-    """Claim a track."""
-    own.edit("drift", lambda held: held["budget"].update(track="converged"))
-
-
-def claim_without(own: BoardBench) -> None:
-    """Claim a track for predictions that tell no budget."""
-    own.edit("noisy", lambda held: held.update(budget={"track": "equal compute"}))
-
-
-@pytest.mark.parametrize(
-    ("change", "check"),
-    [
-        *((change, "weights") for change in (edit, lose, misplace, stray, lengthen, garble, listed)),
-        *((change, "budget") for change in (claim, claim_without)),
-    ],
-)
-def test_what_the_check_finds(own: BoardBench, change: Callable[[BoardBench], None], check: str) -> None:
+@pytest.mark.parametrize("name", DAMAGE)
+def test_what_the_check_finds(own: BoardBench, name: str) -> None:
     """Weights edited, lost, elsewhere or nobody's; records that are none; tracks that no budget gives."""
+    change, check = DAMAGE[name]
     submitted(own, trained(own, 0))
     change(own)
     assert found(own) == {check}

@@ -18,7 +18,7 @@ from swirls import OMEGA, TOP_TO_THE_RIGHT, write_swirl
 from lagbench import errors
 from lagbench.draw import style
 from lagbench.draw.panels import Panel, draw_walls, limit_of
-from lagbench.draw.plot import KINDS, contact_sheet, describe, plot_frame
+from lagbench.draw.plot import KINDS, contact_sheet, plot_frame
 from lagbench.draw.recording import open_recording
 from lagbench.draw.style import figure, pixels_of
 from lagbench.errors import DataError, UsageError
@@ -50,16 +50,16 @@ def pixels(path: Path) -> NDArray[np.uint8]:
         return np.asarray(image.convert("RGB"))
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_every_kind_of_picture_is_small_and_has_the_same_bytes_twice(
-    swirl: Path, tmp_path: Path, kind: str
-) -> None:
-    """PNGs hold no date or software, fit a repository and repeat to the byte."""
-    first, second = (plot_frame(swirl, 2, tmp_path / name, kind=kind) for name in ("a.png", "b.png"))
-    data = first.read_bytes()
-    assert data == second.read_bytes()
-    assert len(data) < 300_000
-    assert set(chunks(data)) == {b"IHDR", b"PLTE", b"IDAT", b"IEND"}
+def test_every_kind_of_picture_is_small_and_has_the_same_bytes_twice(swirl: Path, tmp_path: Path) -> None:
+    """PNGs hold no date or software, fit a repository and repeat to the byte; no two kinds are the same."""
+    drawn = set()
+    for kind in KINDS:
+        data, again = (plot_frame(swirl, 2, tmp_path / n, kind=kind).read_bytes() for n in ("a.png", "b.png"))
+        assert data == again
+        assert len(data) < 300_000
+        assert set(chunks(data)) == {b"IHDR", b"PLTE", b"IDAT", b"IEND"}
+        drawn.add(data)
+    assert len(drawn) == len(KINDS)
 
 
 def test_a_data_set_draws_what_its_file_draws(swirl: Path, tmp_path: Path) -> None:
@@ -167,22 +167,9 @@ def test_vector_pictures_have_the_same_bytes_twice(
     swirl: Path, tmp_path: Path, name: str, head: bytes
 ) -> None:
     """PDF and SVG hold no date."""
-    first, second = (plot_frame(swirl, 0, tmp_path / i / name).read_bytes() for i in _folders(tmp_path))
+    first = plot_frame(swirl, 0, tmp_path / name).read_bytes()
     assert first.startswith(head)
-    assert first == second
-
-
-def _folders(parent: Path) -> list[str]:
-    for name in ("a", "b"):
-        (parent / name).mkdir()
-    return ["a", "b"]
-
-
-def test_dpi_scales_a_picture(swirl: Path, tmp_path: Path) -> None:
-    """Twice the pixels per inch are twice the pixels a side."""
-    one, two = (plot_frame(swirl, 0, tmp_path / f"{dpi}.png", dpi=dpi) for dpi in (64, 128))
-    with Image.open(one) as small, Image.open(two) as large:
-        assert large.size == pytest.approx((2 * small.width, 2 * small.height), abs=1)
+    assert plot_frame(swirl, 0, tmp_path / name).read_bytes() == first
 
 
 def test_only_known_endings_are_taken(swirl: Path, tmp_path: Path) -> None:
@@ -256,60 +243,8 @@ def test_all_that_is_drawn_is_in_the_palette() -> None:
     """Every level of both maps and every flat colour keeps its exact value in a file."""
     table = {tuple(colour) for colour in style.colours().tolist()}
     assert style.colours().shape == (256, 3)
-    flat = (
-        style.PAPER,
-        style.INK,
-        style.MUTED,
-        style.WALL,
-        style.MOVING,
-        *style.MATERIAL_COLOURS,
-    )
+    flat = (style.PAPER, style.INK, style.MUTED, style.WALL, style.MOVING, *style.MATERIAL_COLOURS)
     assert {tuple(style.rgb(colour).tolist()) for colour in flat} <= table
     for levels in (style.speed_map(), style.vorticity_map()):
         drawn = (np.asarray(levels.colors)[:, :3] * 255.0).round().astype(int)
         assert {tuple(colour) for colour in drawn.tolist()} <= table
-
-
-MACHADO = {  # Machado, Oliveira & Fernandes (2009), severity 1, linear RGB
-    "protan": [
-        [0.152286, 1.052583, -0.204868],
-        [0.114503, 0.786281, 0.099216],
-        [-0.003882, -0.048116, 1.051998],
-    ],
-    "deutan": [
-        [0.367322, 0.860646, -0.227968],
-        [0.280085, 0.672501, 0.047413],
-        [-0.011820, 0.042940, 0.968881],
-    ],
-    "tritan": [
-        [1.255528, -0.076749, -0.178779],
-        [-0.078411, 0.930809, 0.147602],
-        [0.004733, 0.691367, 0.303900],
-    ],
-}
-
-
-@pytest.mark.parametrize("vision", MACHADO)
-def test_materials_stay_apart_for_colour_blind_readers(vision: str) -> None:
-    """Simulated deficiencies leave at least 0.2 of the RGB cube's side between any two materials."""
-    srgb = np.array([style.rgb(colour) for colour in style.MATERIAL_COLOURS]) / 255.0
-    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-    seen = np.clip(linear @ np.array(MACHADO[vision]).T, 0.0, 1.0)
-    back = np.where(seen <= 0.0031308, 12.92 * seen, 1.055 * seen ** (1 / 2.4) - 0.055)
-    distance = np.sqrt(((back[:, None] - back[None]) ** 2).sum(axis=-1))
-    assert distance[np.triu_indices(4, 1)].min() > 0.2
-
-
-def test_kinds_differ(swirl: Path, tmp_path: Path) -> None:
-    """No two kinds draw the same picture."""
-    drawn = {plot_frame(swirl, 2, tmp_path / f"{kind}.png", kind=kind).read_bytes() for kind in KINDS}
-    assert len(drawn) == len(KINDS)
-
-
-def test_captions_say_what_sets_a_scenario_apart(swirl: Path, tmp_path: Path) -> None:
-    """Reynolds number, family or frequency stand beside split, size and id."""
-    with open_recording(swirl) as recording:
-        assert describe(recording) == "cavity tiny  ·  scenario 0  ·  Re 100"
-    splash = write_swirl(tmp_path, "fluid", 3, walls=None, parameters={"family": "splash"})
-    with open_recording(splash) as recording:
-        assert describe(recording) == "fluid tiny  ·  scenario 3  ·  family splash"

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import base64
+import io
+import math
 import re
+import tomllib
 from collections.abc import Callable
+from fnmatch import fnmatch
 from pathlib import Path
 
 import numpy as np
@@ -11,21 +16,33 @@ import pytest
 from html_check import Reading, read_html
 from hypothesis import given
 from hypothesis import strategies as st
-from report_bench import (
+from made_up import (
     METHODS,
     SPLITS,
     ReportBench,
     damped,
     make_report_bench,
+    motion,
     noisy,
     page_of,
     runaway,
     still,
 )
+from numpy.typing import NDArray
+from PIL import Image
 
+import lagbench.report
+from lagbench.data.grid import Grid, fields
+from lagbench.data.registry import load
 from lagbench.errors import UsageError
+from lagbench.metrics import METRICS, Setting, Tally, aggregate
 from lagbench.report import write_report
 from lagbench.report.html import Markup, tag, text
+from lagbench.report.maps import inside, limit_of
+from lagbench.report.subject import Subject
+from lagbench.report.tables import stable_of
+from lagbench.scoring.task import ScoredTask
+from lagbench.submission.truth import Truth
 
 HOSTILE = (
     "<script>alert(1)</script>",
@@ -106,8 +123,8 @@ def assert_harmless(reading: Reading) -> None:
 
 
 @pytest.mark.parametrize("split", SPLITS)
-def test_page_is_whole(page: Callable[[str], str], split: str) -> None:
-    """Elements close in order, ids are unique, links of the contents lead somewhere, 3 MB hold it."""
+def test_page_is_whole_and_harmless(page: Callable[[str], str], split: str) -> None:
+    """Elements close in order, ids are unique, links lead somewhere, nothing runs; 3 MB hold it."""
     held = page(split)
     reading = read_html(held)
     assert not reading.faults
@@ -116,6 +133,10 @@ def test_page_is_whole(page: Callable[[str], str], split: str) -> None:
     targets = [a.attributes["href"] for a in reading.named("a")]
     assert targets
     assert {target.removeprefix("#") for target in targets} <= set(reading.ids)
+    assert_harmless(reading)
+    (policy,) = [m.attributes["content"] for m in reading.named("meta") if "http-equiv" in m.attributes]
+    assert policy.startswith("default-src 'none'")
+    assert "script-src" not in policy
 
 
 @pytest.mark.parametrize("split", SPLITS)
@@ -142,17 +163,6 @@ def test_everything_can_be_read_aloud(page: Callable[[str], str], split: str) ->
     for drawing in reading.named("svg"):
         spoken = drawing.attributes.get("aria-hidden") == "true" or drawing.text
         assert spoken or "role" not in drawing.attributes
-
-
-@pytest.mark.parametrize("split", SPLITS)
-def test_page_is_harmless(page: Callable[[str], str], split: str) -> None:
-    """No script, no handler, no address outside the page, and a policy that forbids both."""
-    reading = read_html(page(split))
-    assert_harmless(reading)
-    policies = [m.attributes["content"] for m in reading.named("meta") if "http-equiv" in m.attributes]
-    assert len(policies) == 1
-    assert policies[0].startswith("default-src 'none'")
-    assert "script-src" not in policies[0]
 
 
 def test_strangers_text_is_shown_not_run(bench_of: Callable[[str], ReportBench], tmp_path: Path) -> None:
@@ -246,15 +256,10 @@ def test_scores_on_the_page_are_those_of_the_card(
 def test_methods_of_one_name_are_told_apart(bench_of: Callable[[str], ReportBench], tmp_path: Path) -> None:
     """Two files of one method get numbers, so does one with a floor's name."""
     bench = bench_of("curl-noise")
-    names = ["gns", "gns", "persistence"]
-    methods = [damped, noisy, still]
-    paths = [
-        bench.submit(tmp_path / f"{i}.nc", method, name)
-        for i, (method, name) in enumerate(zip(methods, names, strict=True))
-    ]
-    page = write_report(
-        tmp_path, [bench.card(p) for p in paths], paths, root=bench.root, registry=bench.registry
-    )
+    methods = [("gns", damped), ("gns", noisy), ("persistence", still)]
+    paths = [bench.submit(tmp_path / f"{i}.nc", method, name) for i, (name, method) in enumerate(methods)]
+    cards = [bench.card(path) for path in paths]
+    page = write_report(tmp_path, cards, paths, root=bench.root, registry=bench.registry)
     heading = read_html(page.read_text("utf-8")).named("h1")[0].text
     assert heading == "gns (1) · gns (2) · persistence (1)"
 
@@ -264,10 +269,105 @@ def test_cards_must_belong_together(bench_of: Callable[[str], ReportBench], tmp_
     one, two = bench_of("curl-noise"), bench_of("cavity")
     first, second = one.submit(tmp_path / "1.nc", still, "a"), two.submit(tmp_path / "2.nc", still, "b")
     cards = [one.card(first), two.card(second)]
-    with pytest.raises(UsageError, match="needs score cards"):
-        write_report(tmp_path, [], [], root=one.root, registry=one.registry)
-    with pytest.raises(UsageError, match="needs score cards"):
-        write_report(tmp_path, cards[:1], [], root=one.root, registry=one.registry)
-    with pytest.raises(UsageError, match="two values of split"):
-        write_report(tmp_path, cards, [first, second], root=one.root, registry=one.registry)
+    for held, files in (([], []), (cards[:1], []), (cards, [first, second])):
+        with pytest.raises(UsageError):
+            write_report(tmp_path, held, files, root=one.root, registry=one.registry)
     assert not (tmp_path / "index.html").exists()
+
+
+def subject_on(split: str, size_name: str) -> Subject:
+    """Return a subject without entries: enough to ask which frames are shown."""
+    size = load().size(split, size_name)
+    task = size.task
+    setting = Setting(
+        grid=Grid(task.score_grid.cells),
+        input_frames=task.input_frames,
+        horizon=task.horizon,
+        frames_of_interest=task.frames_of_interest,
+        attribute_std=(1.0, 1.0, 1.0, 1.0),
+        radius=task.radius,
+    )
+    scored = ScoredTask(truth=Truth(size, Path()), setting=setting, density=1.0)
+    return Subject(task=scored, title=split, entries=())
+
+
+@pytest.mark.parametrize(
+    ("split", "frame"), [("cavity", 54), ("curl-noise", 40), ("fluid", 60), ("multimaterial", 60)]
+)
+def test_key_frame_is_that_of_the_thesis(split: str, frame: int) -> None:
+    """Models are compared at frame 54, at 35 after the last given one (5), and at 60."""
+    for size in ("full", "mini"):
+        assert subject_on(split, size).key_frame == frame
+
+
+def test_histograms_are_at_the_frames_of_the_thesis() -> None:
+    """Fig. 5.18 shows frames 6, 9, 18, 21, 48 and 51."""
+    assert subject_on("cavity", "full").histogram_frames == (6, 9, 18, 21, 48, 51)
+
+
+@pytest.mark.parametrize("split", ["cavity", "curl-noise", "fluid", "multimaterial"])
+@pytest.mark.parametrize("size", ["full", "mini", "tiny"])
+def test_pictures_over_time_are_six(split: str, size: str) -> None:
+    """Six ascending predicted frames, the first and the last among them."""
+    subject = subject_on(split, size)
+    predicted = subject.task.setting.predicted_frames
+    assert len(subject.times) == 6
+    assert list(subject.times) == sorted(subject.times)
+    assert (subject.times[0], subject.times[-1]) == (predicted[0], predicted[-1])
+
+
+def opacity(address: str) -> NDArray[np.float64]:
+    """Return a signed picture's values from -1 to 1, shape [x node, y node], as Pillow reads it."""
+    png = base64.b64decode(address.removeprefix("data:image/png;base64,"))
+    shown = np.asarray(Image.open(io.BytesIO(png)).convert("RGBA")).astype(np.float64)
+    sign = np.where(shown[..., 0] > shown[..., 2], 1.0, -1.0)
+    grey = (shown[..., 0] == 128) & (shown[..., 1] == 128)
+    return np.where(grey, np.nan, sign * shown[..., 3] / 255.0)[::-1].T
+
+
+def test_maps_show_their_frames(home: Path, tmp_path: Path) -> None:
+    """Each panel of true vorticity holds the field of x(f) - x(f-1) at its frame f, none other."""
+    bench = make_report_bench(home, "curl-noise")
+    page = bench.report(tmp_path, {"damped": damped}).read_text("utf-8")
+    truth = motion(bench.size, bench.size.subsets["test"][0]).astype(np.float32).astype(np.float64)
+    grid = Grid(bench.size.task.score_grid.cells)
+    (low, high), _ = bench.size.bounds
+    full = grid.full_weight(bench.size.particles, (high - low) ** 2)
+
+    def vorticity(frame: int) -> NDArray[np.float64]:
+        return fields(truth[frame], truth[frame] - truth[frame - 1], grid, full=full).vorticity
+
+    panels = {
+        int(found[1]): opacity(image.attributes["src"])
+        for image in read_html(page).named("img")
+        if (found := re.fullmatch(r"true vorticity, frame (\d+)", image.attributes["alt"]))
+    }
+    assert len(panels) == 6
+    limit = limit_of([vorticity(frame) for frame in panels])
+    for frame, shown in panels.items():
+        meant = np.clip(inside(bench.task, vorticity(frame)) / limit, -1.0, 1.0)
+        np.testing.assert_array_equal(np.isnan(shown), np.isnan(meant))
+        np.testing.assert_allclose(np.nan_to_num(shown), np.nan_to_num(meant), atol=0.0101)
+
+
+def test_style_sheet_is_packaged() -> None:
+    """Whatever lies in the package and is no module is named in pyproject.toml, so that wheels hold it."""
+    root = Path(__file__).parents[1]
+    data = tomllib.loads((root / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
+    folder = Path(str(lagbench.report.__file__)).parent
+    others = [p.name for p in folder.iterdir() if p.is_file() and p.suffix != ".py"]
+    assert "style.css" in others
+    assert all(any(fnmatch(name, pattern) for pattern in data["lagbench.report"]) for name in others)
+
+
+def test_the_stable_tile_says_how_many_frames_do_not_count() -> None:
+    """Two scenarios of 3 frames, 2 of them without a correlation: both numbers stand on the tile."""
+    names, frames, nan = ("vorticity_pearson",), (2, 3, 4), math.nan
+    rows = {0: (0.96, nan, nan), 1: (0.96, 0.96, 0.9)}
+    tallies = {
+        i: Tally.of(names, frames, {f: {names[0]: v} for f, v in zip(frames, row, strict=True)})
+        for i, row in rows.items()
+    }
+    stable = aggregate([METRICS["stable_frames"]], tallies)["stable_frames"]
+    assert stable.values.tolist() == [1.0, 2.0]
+    assert stable_of(stable) == "of 3, correlation above 0.95; 2 of 6 frames undefined"

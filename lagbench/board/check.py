@@ -21,21 +21,19 @@ from lagbench.data.layout import resolve_root
 from lagbench.data.registry import Registry, Size, load
 from lagbench.errors import LagbenchError, UnreadableFileError, UsageError
 from lagbench.floors.shipped import shipped_path
+from lagbench.floors.table import FLOORS
 from lagbench.scoring.floors import measured_again
 from lagbench.submission.findings import Finding
 from lagbench.work.progress import Progress
 
-from .base import check_base
+from .against import TOLERANCE, Confirmation, Rescoring, check_base
 from .entry import Entry, EntryBudget, Status, Summary
-from .entry_file import examine, load_plain
+from .entry_file import examine, load_plain, read_verified, record, verification_of
 from .findings import finding, finding_of, impossible, print_of, skeleton
-from .floors import dataset_of, floor_names
 from .folder import VERIFIED, Folder, Place, entry_path
 from .page import build
-from .ranking import combine, is_current, summarise
-from .rescore import TOLERANCE, Confirmation, Rescoring
+from .ranking import combine, dataset_of, is_current, summarise
 from .score_file import MAX_SCORE_BYTES, Stored, read_stored, unreadable_in_child
-from .verified import read_verified, record, verification_of
 from .weights import check_weights
 
 __all__ = ["CheckResult", "check_board"]
@@ -179,11 +177,6 @@ class _Look:
             self.add("split", path, f"{entry.split} {entry.size}", fix=error.fix)
             return
         self.known.append((entry, size))
-        self._place(path, entry, size)
-        self._scores(path, entry, size)
-
-    def _place(self, path: Path, entry: Entry, size: Size) -> None:
-        """Check place, data set, date and predictions of an entry."""
         if entry.yaml_path != path:
             self.add("place", path, path, expected=entry.yaml_path)
         if entry.status is Status.ACTIVE and not is_current(entry.dataset, size):
@@ -201,6 +194,7 @@ class _Look:
             self.add("budget", f"{path}, budget", entry.budget, expected=formed)
         elif formed is None and entry.budget is not None and entry.budget.track is not None:
             self.add("budget", f"{path}, budget.track", entry.budget.track)
+        self._scores(path, entry, size)
 
     def _length(self, path: Path) -> str | int:
         """Return the length of a file in the folder [bytes], or what is there instead."""
@@ -217,8 +211,8 @@ class _Look:
         task = size if is_current(entry.dataset, size) else None
         stored = []
         for inner, said, made in zip(entry.score_paths, entry.score.files, entry.predictions, strict=True):
-            held = self._read(inner, said.sha256, task)
-            if held is None:
+            one = self._read(inner, said.sha256, task)
+            if one is None:
                 continue
             expected = {
                 "split": entry.split,
@@ -227,20 +221,37 @@ class _Look:
                 "dataset_sha256": entry.dataset.sha256,
                 "predictions_sha256": made.sha256,
             }
-            found = {**held.scores.identity, "predictions_sha256": held.scores.predictions_sha256}
+            found = {**one.scores.identity, "predictions_sha256": one.scores.predictions_sha256}
             for name in (name for name, wanted in expected.items() if found[name] != wanted):
                 self.add("score_file", inner, f"{name} {ascii(found[name])[:80]}, not {expected[name]!a}")
-            odd = list(impossible(held))
-            if odd:
-                self.add("values", inner, odd[0] + f" and {len(odd) - 1} more" * (len(odd) > 1))
+            wrong = list(impossible(one))
+            if wrong:
+                self.add("values", inner, wrong[0] + f" and {len(wrong) - 1} more" * (len(wrong) > 1))
             else:
-                stored.append(held)
-            for print_ in (made.sha256, print_of(held)):
+                stored.append(one)
+            for print_ in (made.sha256, print_of(one)):
                 self.prints.setdefault(print_, []).append((entry, inner))
         if entry.score.dataset_sha256 != entry.dataset.sha256:
             self.add("score", f"{path}, score", entry.score.dataset_sha256, expected=entry.dataset.sha256)
-        if len(stored) == len(entry.predictions) and self._alike(entry, stored):
-            self._numbers(path, entry, stored)
+        if len(stored) < len(entry.predictions):
+            return
+        # only seeds of the same scenarios and frames have a mean
+        held = [one.scores for one in stored]
+        extents = [(sorted(h.tallies), next(iter(h.tallies.values())).frames, h.ranking) for h in held]
+        odd = [p for p, extent in zip(entry.score_paths, extents, strict=True) if extent != extents[0]]
+        for inner in odd:
+            self.add("score_file", inner, "other scenarios, frames or ranking metric than the first seed has")
+        if odd:
+            return
+        where, ranking = f"{path}, score", held[0].ranking
+        if entry.score.ranking_metric != ranking:
+            self.add("score", where, entry.score.ranking_metric, expected=f"ranking_metric {ranking}")
+        formed, told = summarise(combine(held)), entry.score.metrics
+        differing = [name for name in {**formed, **told} if not _same(formed.get(name), told.get(name))]
+        if differing:
+            name, more = differing[0], len(differing) - 1
+            got = _spelt(told.get(name)) + f", and {more} more metrics differ" * (more > 0)
+            self.add("score", where, got, expected=f"{name}: {_spelt(formed.get(name))}")
 
     def _read(self, path: Path, sha256: str, task: Size | None) -> Stored | None:
         """Return a score file; None, and a finding, where it cannot be one."""
@@ -263,41 +274,13 @@ class _Look:
                 return held
         return None
 
-    def _alike(self, entry: Entry, stored: Sequence[Stored]) -> bool:
-        """Tell whether seeds are of the same scenarios and frames, so that they have a mean."""
-
-        def extent(held: Stored) -> tuple[object, ...]:
-            tallies = held.scores.tallies
-            return sorted(tallies), next(iter(tallies.values())).frames, held.scores.ranking
-
-        odd = [
-            path
-            for path, held in zip(entry.score_paths, stored, strict=True)
-            if extent(held) != extent(stored[0])
-        ]
-        for path in odd:
-            self.add("score_file", path, "other scenarios, frames or ranking metric than the first seed has")
-        return not odd
-
-    def _numbers(self, path: Path, entry: Entry, stored: Sequence[Stored]) -> None:
-        """Form the aggregates again and compare."""
-        ranking, where = stored[0].scores.ranking, f"{path}, score"
-        if entry.score.ranking_metric != ranking:
-            self.add("score", where, entry.score.ranking_metric, expected=f"ranking_metric {ranking}")
-        formed, said = summarise(combine([held.scores for held in stored])), entry.score.metrics
-        differing = [name for name in {**formed, **said} if not _same(formed.get(name), said.get(name))]
-        if differing:
-            name, more = differing[0], len(differing) - 1
-            got = _spelt(said.get(name)) + f", and {more} more metrics differ" * (more > 0)
-            self.add("score", where, got, expected=f"{name}: {_spelt(formed.get(name))}")
-
     def floor(self, path: Path) -> None:
         """Check the scores of a floor."""
         try:
             size = self.registry.size(*path.parts[1:3])
-            if path.stem not in floor_names() or self.folder.path / path in self.broken:
+            if path.stem not in FLOORS or self.folder.path / path in self.broken:
                 got = self.broken.get(self.folder.path / path, "an unknown name")
-                self.add("floor", path, got, expected=", ".join(floor_names()))
+                self.add("floor", path, got, expected=", ".join(FLOORS))
                 return
             identity = read_stored(self.folder.path / path, size).scores.identity
             if not is_current(dataset_of(identity), size):
@@ -318,22 +301,14 @@ class _Look:
 
     def together(self) -> None:
         """Check what entries are to each other, and what else lies in the folder."""
-        named = [Path(made.path) for entry, _ in self.known for made in entry.predictions if made.path]
+        entries = [entry for entry, _ in self.known]
+        named = [Path(made.path) for entry in entries for made in entry.predictions if made.path]
         for path, reason in self.folder.odd(named):
             self.add("folder", ascii(path.as_posix())[1:-1], reason)
-        self.found += check_weights(self.folder, [entry for entry, _ in self.known])
-        self._lives()
-        self._twins()
-        self._names()
-        self._strays()
-        self._verified()
-
-    def _lives(self) -> None:
-        """Find entries whose successor is not there, and those that follow each other in a circle."""
+        self.found += check_weights(self.folder, entries)
+        # a successor has to be there, and a line of them to end
         after: dict[Place, Place] = {
-            entry.place: (entry.split, entry.size, entry.superseded_by)
-            for entry, _ in self.known
-            if entry.superseded_by is not None
+            e.place: (e.split, e.size, e.superseded_by) for e in entries if e.superseded_by is not None
         }
         for place, successor in after.items():
             line = [successor]
@@ -343,48 +318,35 @@ class _Look:
                 self.add("lifecycle", entry_path(place), f"{successor[2]}, which is not there")
             elif place in line:
                 self.add("lifecycle", entry_path(place), " -> ".join(name for *_, name in line))
-
-    def _twins(self) -> None:
-        """Find predictions that stand under two names or seeds."""
         told = set()
-        for held in self.prints.values():
+        for held in self.prints.values():  # predictions under two names or seeds
             files = list(dict.fromkeys(path for entry, path in held if entry.status is Status.ACTIVE))
             for path in files[1:]:
                 if path not in told and path.parts[1:3] == files[0].parts[1:3]:
                     told.add(path)
                     self.add("twin", path, f"those of {files[0]}")
-
-    def _names(self) -> None:
-        """Find names that readers cannot tell apart."""
         seen: dict[tuple[str, str, str], str] = {}
-        for entry, size in self.known:
-            if entry.status is not Status.ACTIVE:
-                continue
-            for floor in floor_names():
-                seen[size.split, size.name, skeleton(floor)] = f"that of the floor {floor}"
+        for entry in (entry for entry in entries if entry.status is Status.ACTIVE):
+            for floor in FLOORS:
+                seen[entry.split, entry.size, skeleton(floor)] = f"that of the floor {floor}"
             own = f"that of {entry.method}, {entry.name!a}"
-            other = seen.setdefault((size.split, size.name, skeleton(entry.name)), own)
+            other = seen.setdefault((entry.split, entry.size, skeleton(entry.name)), own)
             if other != own:
                 self.add("name", entry.yaml_path, other)
-
-    def _strays(self) -> None:
-        """Find score files that belong to nothing, those of entries that cannot be read aside."""
-        named = {path for entry, _ in self.known for path in entry.score_paths}
-        unread = self.folder.claims() - {entry.place for entry, _ in self.known}
+        scored = {path for entry in entries for path in entry.score_paths}
+        # those of entries that cannot be read are no strays
+        unread = self.folder.claims() - {entry.place for entry in entries}
         for path in self.folder.score_files():
-            if path not in named and (*path.parts[1:3], path.stem.partition("_")[0]) not in unread:
+            if path not in scored and (*path.parts[1:3], path.stem.partition("_")[0]) not in unread:
                 self.add("stray", path, "none")
-
-    def _verified(self) -> None:
-        """Find lines of the maintainers' list that hold for no entry."""
         try:
             lines = read_verified(self.folder)
         except LagbenchError as error:
             self.found.append(finding_of("verified", error, VERIFIED))
             return
-        sound = {entry.yaml_path.as_posix() for entry, _ in self.known if verification_of(entry, lines)}
-        for path in sorted(lines.keys() - sound):
-            self.add("verified", VERIFIED, ascii(path)[:120])
+        sound = {entry.yaml_path.as_posix() for entry in entries if verification_of(entry, lines)}
+        for named_path in sorted(lines.keys() - sound):
+            self.add("verified", VERIFIED, ascii(named_path)[:120])
 
 
 def _same(first: Summary | None, second: Summary | None) -> bool:

@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lagbench.data.registry import Registry, Size, load
 from lagbench.errors import ChecksFailedError, UnreadableFileError
@@ -27,14 +26,12 @@ from lagbench.scoring.skill import skill
 from lagbench.submission.task_checks import frames_to_predict
 
 from .entry import Cost, Entry, Status
-from .entry_file import read_entry
-from .floors import read_floors
+from .entry_file import Verification, read_entry, read_verified, verification_of
 from .folder import Folder
 from .model import Board, Curve, Floor, Histogram, Pictures, Row, Tab, Value
 from .payload import spaced
-from .ranking import Combined, combine, is_current
+from .ranking import Combined, combine, is_current, read_floors
 from .score_file import Stored, read_stored, reported_frames
-from .verified import Verification, read_verified, verification_of
 
 __all__ = ["COLUMNS", "CURVES", "CURVE_FRAMES", "RESIDUAL_BINS", "collect", "curve", "residuals"]
 
@@ -51,19 +48,13 @@ CURVES = (
 )
 """Metrics that details have curves of, beside the ranking one."""
 
-TRIAL = "tiny"
-"""The size for trying out: nobody is asked to submit to it."""
+TRIAL = "tiny"  # the size for trying out: nobody is asked to submit to it
 
 ENERGIES = ("energy_true", "energy_predicted")
 
-TRUTH, PREDICTION = 0, 1
-"""Sides of a preview."""
-
-CURVE_FRAMES = 120
-"""Most frames of a curve."""
-
-RESIDUAL_BINS = 41
-"""Bins of the histogram of residuals; odd, so that one holds 0."""
+TRUTH, PREDICTION = 0, 1  # sides of a preview
+CURVE_FRAMES = 120  # most frames of a curve
+RESIDUAL_BINS = 41  # bins of the histogram of residuals; odd, so that one holds 0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -106,9 +97,26 @@ def collect(
                 expected=str(entry.yaml_path),
                 fix="let split, size and method be those of the path",
             )
-        held = _held(place, entry, described.size(entry.split, entry.size))
-        if held is not None:
-            found.setdefault((entry.split, entry.size), []).append(held)
+        size = described.size(entry.split, entry.size)
+        current = is_current(entry.dataset, size)
+        try:
+            stored = [read_stored(place.path / path, size) for path in entry.score_paths]
+        except UnreadableFileError:
+            if current:
+                raise
+            report(1)
+            continue  # old scores that do not fit the task of today
+        scores = combine([held.scores for held in stored])
+        lacking = [name for name in (stored[0].scores.ranking, *ENERGIES) if name not in scores]
+        if lacking:
+            raise UnreadableFileError(
+                "a score file lacks metrics that every one has",
+                where=str(place.path / entry.score_paths[0]),
+                expected=", ".join(lacking),
+                fix="score the predictions again: lagbench submit",
+            )
+        held = _Held(entry=entry, current=current, stored=stored, scores=scores)
+        found.setdefault((entry.split, entry.size), []).append(held)
         report(1)
     verified, tabs, empty = read_verified(place), [], []
     for split, about in described.splits.items():
@@ -122,27 +130,6 @@ def collect(
     seen = {name for tab in tabs for row in tab.lines for name in row.values}
     metrics = {name: metric for name, metric in METRICS.items() if name in seen}
     return Board(tabs=tuple(tabs), empty=tuple(empty), metrics=metrics)
-
-
-def _held(place: Folder, entry: Entry, size: Size) -> _Held | None:
-    """Return what a row is made of; None for old scores that do not fit the task of today."""
-    current = is_current(entry.dataset, size)
-    try:
-        stored = [read_stored(place.path / path, size) for path in entry.score_paths]
-    except UnreadableFileError:
-        if current:
-            raise
-        return None
-    scores = combine([held.scores for held in stored])
-    lacking = [name for name in (stored[0].scores.ranking, *ENERGIES) if name not in scores]
-    if lacking:
-        raise UnreadableFileError(
-            "a score file lacks metrics that every one has",
-            where=str(place.path / entry.score_paths[0]),
-            expected=", ".join(lacking),
-            fix="score the predictions again: lagbench submit",
-        )
-    return _Held(entry=entry, current=current, stored=stored, scores=scores)
 
 
 def _tab(
@@ -171,28 +158,24 @@ def _tab(
         for held in sorted(found, key=order)
     ]
     shown = {name for row in rows for name in row.values}
-    standing_for = (ranking, *METRICS[ranking].of, *CURVES)
-    frames, scenarios = tuple(frames_to_predict(size)), tuple(sorted(size.subsets["test"]))
+    curved = {name for row in rows for name in row.curves}
+    scenarios = tuple(sorted(size.subsets["test"]))
     return Tab(
         size=size,
         title=title,
         scenarios=scenarios,
-        frames=frames,
+        frames=tuple(frames_to_predict(size)),
         marked=reported_frames(size),
         ranking=ranking,
         decided=len(scenarios) >= FEWEST_SCENARIOS,
-        columns=_known((ranking, *COLUMNS), shown),
-        curves=_known(standing_for, {name for row in rows for name in row.curves}),
+        columns=tuple(name for name in dict.fromkeys((ranking, *COLUMNS)) if name in shown),
+        curves=tuple(name for name in _with_curves(ranking) if name in curved),
         energy=curve(witness.scores[ENERGIES[0]].score),
         truth=_pictures(witness.stored[0].preview, TRUTH),
         rows=tuple(rows),
         floors=tuple(_floor(held, size, ranking) for held in floors),
         solver_seconds=solver_seconds(size),
     )
-
-
-def _known(names: Iterable[str], known: set[str]) -> tuple[str, ...]:
-    return tuple(name for name in dict.fromkeys(names) if name in known)
 
 
 def _row(
@@ -204,6 +187,12 @@ def _row(
 ) -> Row:
     preview, ranking = held.stored[0].preview, held.stored[0].scores.ranking
     scores = {name: found.score for name, found in held.scores.items()}
+    better, known = None, {floor.name: floor.scores[ranking] for floor in floors if ranking in floor.scores}
+    if held.current and (found := skill(held.scores[ranking].seeds, known)) is not None:
+        low, high = found.interval
+        better = Value(
+            mean=found.value, std=found.std, low=low, high=high, per_scenario=(), at={}, undefined=0
+        )
     return Row(
         entry=held.entry,
         current=held.current,
@@ -211,10 +200,8 @@ def _row(
         tied=standing is not None and standing.tied and not math.isnan(standing.p),
         p=standing.p if standing else math.nan,
         verified=verified,
-        skill=_skill(held.scores[ranking], floors) if held.current else None,
-        values={
-            name: _value(found.score, found.interval, found.std, size) for name, found in held.scores.items()
-        },
+        skill=better,
+        values={name: _value(one.score, one.interval, one.std, size) for name, one in held.scores.items()},
         seed_means=held.scores[ranking].means,
         curves=_curves(scores, ranking),
         energy=curve(scores[ENERGIES[1]]),
@@ -223,19 +210,13 @@ def _row(
     )
 
 
-def _skill(scores: Combined, floors: Sequence[FloorScores]) -> Value | None:
-    """Return how much better a row is than the best floor, over its seeds."""
-    name = scores.score.metric.name
-    known = {floor.name: floor.scores[name] for floor in floors if name in floor.scores}
-    found = skill(scores.seeds, known)
-    if found is None:
-        return None
-    low, high = found.interval
-    return Value(mean=found.value, std=found.std, low=low, high=high, per_scenario=(), at={}, undefined=0)
-
-
 def _floor(held: FloorScores, size: Size, ranking: str) -> Floor:
     energy, about = held.scores.get(ENERGIES[1]), FLOORS[held.name]
+    cost = Cost.model_construct(
+        seconds_per_frame=held.seconds_per_frame,
+        device="one core, where the floors were measured",
+        solver_seconds_per_frame=solver_seconds(size),
+    )
     return Floor(
         name=held.name,
         definition=about.definition,
@@ -243,15 +224,7 @@ def _floor(held: FloorScores, size: Size, ranking: str) -> Floor:
         curves=_curves(held.scores, ranking),
         energy=curve(energy) if energy is not None and np.isfinite(energy.per_frame).mean() > 0.5 else None,
         counts=about.counts,
-        cost=None if math.isnan(held.seconds_per_frame) else _cost(held.seconds_per_frame, size),
-    )
-
-
-def _cost(seconds: float, size: Size) -> Cost:
-    return Cost.model_construct(
-        seconds_per_frame=seconds,
-        device="one core, where the floors were measured",
-        solver_seconds_per_frame=solver_seconds(size),
+        cost=None if math.isnan(held.seconds_per_frame) else cost,
     )
 
 
@@ -269,9 +242,13 @@ def _value(score: Score, interval: tuple[float, float], std: float, size: Size) 
     )
 
 
+def _with_curves(ranking: str) -> dict[str, None]:
+    """Return the metrics to draw over frames, the ranking one or what stands for it first."""
+    return dict.fromkeys((ranking, *METRICS[ranking].of, *CURVES))
+
+
 def _curves(scores: Mapping[str, Score], ranking: str) -> dict[str, Curve]:
-    names = dict.fromkeys((ranking, *METRICS[ranking].of, *CURVES))
-    known = {name: scores[name] for name in names if name in scores}
+    known = {name: scores[name] for name in _with_curves(ranking) if name in scores}
     return {name: curve(score) for name, score in known.items() if score.metric.per_frame and score.frames}
 
 
@@ -302,17 +279,15 @@ def _pictures(preview: Preview, side: int) -> Pictures:
 
 
 def residuals(preview: Preview) -> tuple[Histogram, ...]:
-    """Return the histogram of predicted minus true vorticity at each map frame."""
+    """Return shares of predicted minus true vorticity at each map frame, over +- its greatest."""
     truth, prediction = preview.vorticity.astype(np.float64)
-    return tuple(_histogram((p - t)[~np.isnan(p - t)]) for t, p in zip(truth, prediction, strict=True))
-
-
-def _histogram(values: NDArray[np.float64]) -> Histogram:
-    """Return shares over +-max abs value; NaN without values."""
-    if not values.size:
-        return Histogram(low=0.0, high=0.0, shares=np.full(RESIDUAL_BINS, np.nan))
-    end = float(np.max(np.abs(values)))
-    # a field without any error is one bin, not a division by 0
-    bins = np.rint((values / end if end else values) * (RESIDUAL_BINS // 2)).astype(int) + RESIDUAL_BINS // 2
-    counts = np.bincount(bins, minlength=RESIDUAL_BINS)
-    return Histogram(low=-end, high=end, shares=counts / values.size)
+    found = []
+    for difference in prediction - truth:
+        values = difference[~np.isnan(difference)]
+        end, half = float(np.max(np.abs(values), initial=0.0)), RESIDUAL_BINS // 2
+        # a field without any error is one bin, not a division by 0
+        bins = np.rint((values / end if end else values) * half).astype(int) + half
+        counts = np.bincount(bins, minlength=RESIDUAL_BINS)
+        shares = counts / values.size if values.size else np.full(RESIDUAL_BINS, np.nan)
+        found.append(Histogram(low=-end if values.size else 0.0, high=end, shares=shares))
+    return tuple(found)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 from lagbench.metrics.metric import Direction, Metric
@@ -91,16 +91,8 @@ def _of(part: str, key: str) -> Callable[[Row | Floor], object]:
 def _reported(part: str, held: Mapping[str, tuple[str, str, str, Direction, str]]) -> Iterator[Column]:
     """Yield columns of what submitters say: key to label, unit, form, direction and meaning."""
     for key, (label, unit, form, direction, meaning) in held.items():
-        yield Column(
-            key=key,
-            label=label,
-            unit=unit,
-            direction=direction,
-            form=form,
-            reported=True,
-            meaning=meaning,
-            of=_of(part, key),
-        )
+        said = Column(key=key, label=label, unit=unit, form=form, meaning=meaning)
+        yield replace(said, direction=direction, reported=True, of=_of(part, key))
 
 
 LOWER, HIGHER, NONE = Direction.LOWER, Direction.HIGHER, Direction.NONE
@@ -171,19 +163,11 @@ def columns_of(tab: Tab, metrics: Mapping[str, Metric]) -> dict[str, Column]:
     found = {name for row in tab.lines for name in row.values}
     names = [name for name in dict.fromkeys((*tab.columns, *metrics)) if name in found]
     columns = [SKILL] if any(row.skill for row in tab.rows) else []
-    columns += [_metric_column(metrics[name]) for name in names]
+    for metric in (metrics[name] for name in names):
+        unit = "" if metric.unit == "1" else metric.unit.replace("^2", "²")
+        shown = Column(key=metric.name, label=words(metric.name), unit=unit, meaning=sentence(metric))
+        columns.append(replace(shown, direction=metric.direction, perfect=metric.perfect))
     return {column.key: column for column in (*columns, *OF_ENTRY)}
-
-
-def _metric_column(metric: Metric) -> Column:
-    return Column(
-        key=metric.name,
-        label=words(metric.name),
-        unit="" if metric.unit == "1" else metric.unit.replace("^2", "²"),
-        direction=metric.direction,
-        perfect=metric.perfect,
-        meaning=sentence(metric),
-    )
 
 
 def presets_of(tab: Tab, columns: Mapping[str, Column]) -> dict[str, tuple[str, ...]]:

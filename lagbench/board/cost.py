@@ -20,7 +20,7 @@ from lagbench.report.chart import WIDTH, Plot, Spot, close_logarithmic
 from lagbench.report.html import Markup, tag, text, words
 from lagbench.scoring.task import ranking_metric
 
-from .model import Board, Row, Tab
+from .model import Board, Tab
 
 __all__ = ["Mark", "cost_figure", "draw", "front", "marks_of", "picture"]
 
@@ -28,8 +28,7 @@ HEIGHT = 330
 
 COARSE = "coarse-solver"
 
-NAME_ROOM = 8.0
-"""The axis of time reaches so many times the dearest, so that its name has a place beside it."""
+NAME_ROOM = 8.0  # the axis of time reaches so many times the dearest, so that its name has a place beside it
 
 STYLE = """
 .chart{background:#fff;font-family:system-ui,sans-serif}.chart text{font-size:12px;fill:#1c2330}
@@ -56,31 +55,21 @@ class Mark:
 
 def marks_of(tab: Tab) -> list[Mark]:
     """Return active entries that say what they cost, then floors; what has no place is left out."""
-    own = [
-        Mark(
-            name=row.entry.name,
-            seconds=_seconds(row, tab.solver_seconds),
-            error=row.values[tab.ranking].mean,
-            kind="entry",
-            href=f"#tab={tab.id}&entry={row.id}",
-        )
-        for row in tab.rows
-        if row.active and tab.ranking in row.values
-    ]
-    floors = [
+    solver, marks = tab.solver_seconds, []
+    for row in tab.rows:
+        cost = row.entry.cost
+        if row.active and cost is not None and tab.ranking in row.values:
+            # on the machine that timed the solver, where that can be said
+            own, speed_up = cost.seconds_per_frame, cost.speed_up
+            seconds = own if solver is None or speed_up is None else solver / speed_up
+            href, error = f"#tab={tab.id}&entry={row.id}", row.values[tab.ranking].mean
+            marks.append(Mark(name=row.entry.name, seconds=seconds, error=error, kind="entry", href=href))
+    marks += [
         _floor(floor.name, floor.cost.seconds_per_frame, floor.values[tab.ranking].mean)
         for floor in tab.floors
         if floor.cost is not None and tab.ranking in floor.values
     ]
-    return [mark for mark in (*own, *floors) if 0.0 < mark.seconds < math.inf and 0.0 < mark.error < math.inf]
-
-
-def _seconds(row: Row, solver: float | None) -> float:
-    """Return what a frame costs an entry, on the machine that timed the solver where that can be said."""
-    cost = row.entry.cost
-    if cost is None:
-        return math.nan
-    return cost.seconds_per_frame if solver is None or cost.speed_up is None else solver / cost.speed_up
+    return [mark for mark in marks if 0.0 < mark.seconds < math.inf and 0.0 < mark.error < math.inf]
 
 
 def _floor(name: str, seconds: float, error: float) -> Mark:
@@ -101,11 +90,12 @@ def draw(marks: Sequence[Mark], solver: float | None, ranking: str, title: str) 
     """Return the figure of some marks, at least one."""
     reach = [mark.seconds for mark in marks] + ([solver] if solver else [])
     errors = [mark.error for mark in marks]
+    unit = METRICS[ranking].unit if ranking in METRICS else "1"
     plot = Plot(
         close_logarithmic(min(reach), NAME_ROOM * max(reach)),
         close_logarithmic(min(errors), max(errors)),
         x_label="time of a frame [s]",
-        y_label=words(ranking) + _unit(ranking),
+        y_label=words(ranking) + ("" if unit == "1" else f" [{unit}]"),
         height=HEIGHT,
     )
     if solver:
@@ -129,11 +119,6 @@ def draw(marks: Sequence[Mark], solver: float | None, ranking: str, title: str) 
     )
     beside = f"; the solver itself takes {text(solver)} s per frame" if solver else ""
     return plot.svg(title, f"{len(marks)} methods by processor time and {words(ranking)}{beside}.")
-
-
-def _unit(metric: str) -> str:
-    unit = METRICS[metric].unit if metric in METRICS else "1"
-    return "" if unit == "1" else f" [{unit}]"
 
 
 def cost_figure(tab: Tab) -> Markup:

@@ -3,7 +3,7 @@
 Everything but the score block is written by whoever submits; the score block is written by
 ``lagbench submit`` alone. Strangers write these files, so every text has a length, every
 number a range, links are http(s) and nothing else, and unknown keys are refused. Whether the
-maintainers scored the predictions again is said elsewhere: verified.py.
+maintainers scored the predictions again is said elsewhere: verified.yaml.
 """
 
 from __future__ import annotations
@@ -33,28 +33,9 @@ from lagbench.submission.budget import Budget, Track, track_of
 from .folder import Place, entry_path, score_paths, weights_path
 
 __all__ = [
-    "ID",
-    "LONGEST_ID",
-    "LONGEST_TEXT",
-    "MOST_SEEDS",
-    "PATTERNS",
-    "About",
-    "EntryBudget",
-    "Cost",
-    "DataSet",
-    "Date",
-    "Entry",
-    "Flag",
-    "Hash",
-    "Meta",
-    "Prediction",
-    "ScoreBlock",
-    "ScoredFile",
-    "Short",
-    "Status",
-    "Strict",
-    "Summary",
-    "Weights",
+    *("ID", "LONGEST_ID", "LONGEST_TEXT", "MOST_SEEDS", "PATTERNS", "About", "EntryBudget", "Cost"),
+    *("DataSet", "Date", "Entry", "Flag", "Hash", "Meta", "Prediction", "ScoreBlock", "ScoredFile"),
+    *("Short", "Status", "Strict", "Summary", "Weights"),
 ]
 
 ID = r"^[a-z0-9]+(-[a-z0-9]+)*$"
@@ -78,8 +59,7 @@ LONGEST_ID = 60
 LONGEST_TEXT = 1000
 MOST_SEEDS = 20
 MOST_BYTES = 2**40
-MOST_MARKS = 3
-"""Combining marks on one letter; no script needs more, piles of them cover the neighbours."""
+MOST_MARKS = 3  # combining marks on one letter; no script needs more, piles of them cover the neighbours
 
 BLANKS = frozenset("\u115f\u1160\u2800\u3164\uffa0")
 """Letters and symbols that show nothing, though Unicode counts them as printable."""
@@ -135,10 +115,6 @@ def _inside(path: str) -> str:
     return path
 
 
-def _date(value: object) -> object:
-    return datetime.date.fromisoformat(value) if isinstance(value, str) else value
-
-
 Name = Annotated[str, StringConstraints(pattern=ID, max_length=LONGEST_ID)]
 Label = Annotated[str, StringConstraints(pattern=LABEL, max_length=LONGEST_ID)]
 Short = Annotated[
@@ -155,7 +131,9 @@ Version = Annotated[str, StringConstraints(pattern=RELEASE)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Seconds = Annotated[float, Field(ge=1e-7, lt=1e9, allow_inf_nan=False)]
 Number = Annotated[float, Field(allow_inf_nan=False)]
-Date = Annotated[datetime.date, BeforeValidator(_date)]
+Date = Annotated[
+    datetime.date, BeforeValidator(lambda x: datetime.date.fromisoformat(x) if isinstance(x, str) else x)
+]
 
 
 class Status(enum.StrEnum):

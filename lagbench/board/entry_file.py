@@ -1,39 +1,42 @@
-"""Read and write YAML files of submitters; whatever a stranger put there stays text."""
+"""Read and write YAML files: those of submitters, where all stays text, and the list of verified entries.
+
+That list, leaderboard/verified.yaml, names the entries whose predictions the maintainers scored again. It
+lies apart from the entries, so that nobody can claim it for his own: ``leaderboard check --base`` names
+every change to it. A line holds while the entry has the very score files that it names;
+``leaderboard check --predictions FILE --record`` writes it.
+"""
 
 from __future__ import annotations
 
+import datetime
 import enum
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
-from typing import Any, TypeVar, get_args
+from typing import Annotated, Any, TypeVar, get_args
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, Field, RootModel, ValidationError
 from pydantic_core import ErrorDetails
 
+from lagbench.atomic import write_atomically
 from lagbench.data.yamlfile import read_yaml, spell_yaml
 from lagbench.errors import ChecksFailedError, UnreadableFileError, UsageError, nearest
 from lagbench.submission.findings import quoted
 
-from .entry import PATTERNS, Entry, Meta
+from .entry import MOST_SEEDS, PATTERNS, Date, Entry, Hash, Meta, Short, Strict
+from .folder import VERIFIED, Folder
 
 __all__ = [
-    "MAX_ENTRY_BYTES",
-    "Mistake",
-    "examine",
-    "load_plain",
-    "read_entry",
-    "read_meta",
-    "schema_bytes",
-    "spell",
+    *("MAX_ENTRY_BYTES", "Mistake", "examine", "listed", "load_plain", "read_entry", "read_meta"),
+    *("Verification", "read_verified", "record", "schema_bytes", "spell", "verification_of"),
 ]
 
 MAX_ENTRY_BYTES = 64_000
 """Longest YAML file of an entry [bytes]; twenty seeds and all metrics take half of it."""
 
-MOST_MISTAKES = 20
-"""Mistakes of one file that are told."""
+MOST_MISTAKES = 20  # mistakes of one file that are told
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,16 +85,18 @@ def examine(kind: type[Model], value: object) -> tuple[Model | None, tuple[Mista
     return None, tuple(_mistake(kind, item) for item in told)
 
 
+def listed(mistakes: Sequence[Mistake]) -> str:
+    """Return mistakes one below the other."""
+    return "\n    ".join(["", *map(str, mistakes)])
+
+
 def read_entry(path: Path) -> Entry:
     """Read the entry of a YAML file."""
     entry, mistakes = examine(Entry, load_plain(path))
     if entry is None:
-        raise ChecksFailedError(
-            f"{len(mistakes)} mistake(s) in an entry",
-            where=str(path),
-            got="\n    ".join(["", *map(str, mistakes)]),
-            fix="mend the keys named above; docs/submitting.md describes them",
-        )
+        fix = "mend the keys named above; docs/submitting.md describes them"
+        what = f"{len(mistakes)} mistake(s) in an entry"
+        raise ChecksFailedError(what, where=str(path), got=listed(mistakes), fix=fix)
     return entry
 
 
@@ -117,7 +122,7 @@ def read_meta(path: Path | None, options: Mapping[str, object]) -> Meta:
         raise UsageError(
             "what is said of the method does not fit",
             where="options" if path is None else f"{path}, or options",
-            got="\n    ".join(["", *map(str, mistakes)]),
+            got=listed(mistakes),
             fix="docs/submitting.md describes the keys",
         )
     return meta
@@ -176,3 +181,55 @@ def _model_in(annotation: object) -> type[BaseModel] | None:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     return next((found for inner in get_args(annotation) if (found := _model_in(inner))), None)
+
+
+class Verification(Strict):
+    """What the maintainers found."""
+
+    scores: Annotated[tuple[Hash, ...], Field(min_length=1, max_length=MOST_SEEDS, strict=False)]
+    lagbench: Short
+    date: Date
+
+
+class _List(RootModel[dict[str, Verification]]):
+    """Entries, by path relative to the leaderboard's folder."""
+
+
+def read_verified(folder: Folder) -> Mapping[str, Verification]:
+    """Return the list; empty where there is none."""
+    path = folder.path / VERIFIED
+    if not path.exists() and not path.is_symlink():
+        return {}
+    held = load_plain(path)
+    found, mistakes = examine(_List, {} if held is None else held)
+    if found is None:
+        raise ChecksFailedError(
+            "the list of verified entries does not fit",
+            where=str(path),
+            expected="entry path: {scores: [SHA-256, ...], lagbench: VERSION, date: YYYY-MM-DD}",
+            got=listed(mistakes),
+            fix="`lagbench leaderboard check --predictions FILE --record` writes it",
+        )
+    return found.root
+
+
+def verification_of(entry: Entry, known: Mapping[str, Verification]) -> Verification | None:
+    """Return the line of an entry; None without one, or if it is of other score files."""
+    line = known.get(entry.yaml_path.as_posix())
+    return line if line and line.scores == tuple(held.sha256 for held in entry.score.files) else None
+
+
+def record(folder: Folder, entries: Sequence[Entry], date: datetime.date) -> Path | None:
+    """Add entries to the list, or renew their lines; return its path, None without any."""
+    if not entries:
+        return None
+    held: dict[str, object] = {path: line.model_dump() for path, line in read_verified(folder).items()}
+    for entry in entries:
+        held[entry.yaml_path.as_posix()] = {
+            "scores": tuple(file.sha256 for file in entry.score.files),
+            "lagbench": version("lagbench"),
+            "date": date,
+        }
+    path = folder.path / VERIFIED
+    write_atomically(path, spell({name: held[name] for name in sorted(held)}), option="--board")
+    return path

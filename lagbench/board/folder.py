@@ -20,22 +20,11 @@ from pathlib import Path
 from lagbench.errors import UsageError
 
 __all__ = [
-    "FLOORS",
-    "PAGE",
-    "SCHEMA",
-    "SCORES",
-    "SUBMISSIONS",
-    "VERIFIED",
-    "WEIGHTS",
-    "Folder",
-    "Place",
-    "entry_path",
-    "score_paths",
-    "weights_path",
+    *("FLOORS", "PAGE", "SCHEMA", "SCORES", "SUBMISSIONS", "VERIFIED", "WEIGHTS", "Folder", "Place"),
+    *("entry_path", "score_paths", "weights_path"),
 ]
 
-Place = tuple[str, str, str]
-"""Split, size and method."""
+Place = tuple[str, str, str]  # split, size and method
 
 SUBMISSIONS, SCORES, FLOORS, WEIGHTS = "submissions", "scores", "floors", "weights"
 PAGE, SCHEMA, VERIFIED, README = "index.html", "schema.json", "verified.yaml", "README.md"
@@ -45,8 +34,7 @@ KEPT = ".gitkeep"
 PART = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 """What a folder or file may be called: nothing that a terminal or a CI log would obey."""
 
-DEPTH = 4
-"""Parts of a path: submissions or scores, split, size, file name."""
+DEPTH = 4  # parts of a path: submissions or scores, split, size, file name
 
 
 def entry_path(place: Place) -> Path:

@@ -16,7 +16,7 @@ from lagbench.data.registry import Size
 from lagbench.metrics.metric import Metric
 
 from .entry import Cost, Entry, Flag, Status
-from .verified import Verification
+from .entry_file import Verification
 
 __all__ = ["Board", "Curve", "Floor", "Histogram", "Pictures", "Row", "Tab", "Value"]
 

@@ -26,16 +26,13 @@ from .collect import collect
 from .entry_file import schema_bytes
 from .folder import PAGE, SCHEMA, Folder
 from .model import Board
-from .payload import FINENESS, embedded, payload
+from .payload import FINENESS, Fineness, embedded, payload
 from .sections import empty, lede, navigation, overview, section, stage
 
 __all__ = ["BUDGET", "FEWEST", "LINKS", "BuildResult", "build", "render"]
 
-BUDGET = 30_000
-"""Bytes that an entry shall take, all in all; more only where its coarsest data need them."""
-
-FEWEST = 50
-"""Fewer entries than these share what so many may take, 1.5 MB."""
+BUDGET = 30_000  # bytes that an entry shall take, all in all; more only where its coarsest data need them
+FEWEST = 50  # fewer entries than these share what so many may take, 1.5 MB
 
 SCRIPTS = (
     *("codec", "text", "scale", "chart", "state", "table"),
@@ -94,8 +91,9 @@ def build(
     folder, held = Folder(board), collect(board, registry=registry, report=report)
     links = {label: path for label, path in LINKS.items() if (folder.path / path).exists()}
     page = folder.path / PAGE
-    if check:  # a copy of the folder elsewhere still has the links of where it was drawn
-        links = _links_in(page) if page.is_file() else links
+    if check and page.is_file():  # a copy of the folder elsewhere still has the links of where it was drawn
+        said = page.read_bytes()
+        links = {n: path for n, path in LINKS.items() if str(tag("a", n, href=path)).encode() in said}
     wanted = {page: render(held, links).encode(), folder.path / SCHEMA: schema_bytes()}
     stale = [
         path
@@ -124,15 +122,17 @@ def build(
     )
 
 
-def _links_in(page: Path) -> dict[str, str]:
-    """Return those of our links that a page has."""
-    said = page.read_bytes()
-    return {label: path for label, path in LINKS.items() if str(tag("a", label, href=path)).encode() in said}
-
-
 def render(board: Board, links: Mapping[str, str] = LINKS) -> str:
     """Return the page."""
-    style, theme, script = _style(), _part("theme.js"), _script()
+    theme, parts = _part("theme.js"), "\n".join(_part(f"{name}.js") for name in SCRIPTS)
+    script = f'(() => {{\n"use strict";\n{parts}}})();\n'
+    report = files("lagbench.report").joinpath("style.css").read_text("utf-8")
+    # colours by choice of the reader are those of the report's style sheet once more
+    light, dark = re.findall(r":root\{([^}]*)\}", report)[:2]
+    light = light.replace("color-scheme:light dark", "color-scheme:light")
+    dark = f"color-scheme:dark;{dark.strip()}"
+    chosen = f":root[data-theme=light]{{{light}}}\n:root[data-theme=dark]{{{dark}}}\n"
+    style = report + chosen + _part("page.css")
     allowed = " ".join(_source(one) for one in (theme, script))
     held = {
         "policy": f"default-src 'none'; script-src {allowed}; style-src {_source(style)}; img-src data:;"
@@ -150,46 +150,24 @@ def render(board: Board, links: Mapping[str, str] = LINKS) -> str:
     }
     entries = sum(len(tab.rows) for tab in board.tabs)
     room = BUDGET * max(FEWEST, entries) - sum(len(one.encode()) for one in held.values())
-    return _filled(_part("page.html"), {**held, "payload": _fitting(board, room)})
 
+    @functools.cache
+    def drawn(fineness: Fineness) -> str:
+        return embedded(payload(board, fineness))
 
-def _fitting(board: Board, room: int) -> str:
-    """Return the finest data that take no more bytes, else the coarsest."""
-    first = embedded(payload(board, FINENESS[0]))
-    if len(first.encode()) <= room:
-        return first
-    found = bisect.bisect_left(
-        FINENESS[1:-1], True, key=lambda one: len(embedded(payload(board, one)).encode()) <= room
-    )
-    return embedded(payload(board, FINENESS[1 + found]))
+    def fits(fineness: Fineness) -> bool:
+        return len(drawn(fineness).encode()) <= room
 
-
-def _filled(template: str, held: dict[str, str]) -> str:
+    # the finest data that take no more room, else the coarsest; mostly it is the finest of all
+    first = 0 if fits(FINENESS[0]) else 1 + bisect.bisect_left(FINENESS[1:-1], True, key=fits)
+    held["payload"] = drawn(FINENESS[first])
     # one pass: what is filled in is not looked at again
-    return re.sub(r"\{\{([a-z]+)\}\}", lambda found: held[found[1]], template)
+    return re.sub(r"\{\{([a-z]+)\}\}", lambda found: held[found[1]], _part("page.html"))
 
 
 @functools.cache
 def _part(name: str) -> str:
     return files(__package__).joinpath("page", name).read_text("utf-8")
-
-
-@functools.cache
-def _script() -> str:
-    parts = "\n".join(_part(f"{name}.js") for name in SCRIPTS)
-    return f'(() => {{\n"use strict";\n{parts}}})();\n'
-
-
-@functools.cache
-def _style() -> str:
-    """Return the report's style sheet, its colours by choice of the reader, then our own."""
-    report = files("lagbench.report").joinpath("style.css").read_text("utf-8")
-    light, dark = re.findall(r":root\{([^}]*)\}", report)[:2]
-    light = light.replace("color-scheme:light dark", "color-scheme:light")
-    chosen = (
-        f":root[data-theme=light]{{{light}}}\n:root[data-theme=dark]{{color-scheme:dark;{dark.strip()}}}\n"
-    )
-    return report + chosen + _part("page.css")
 
 
 def _source(said: str) -> str:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -23,18 +23,10 @@ from numpy.typing import ArrayLike, NDArray
 from lagbench.report.html import MISSING as NOTHING
 from lagbench.report.html import text, words
 
-from .model import Board, Curve, Floor, Histogram, Pictures, Row, Tab, Value
+from .model import Board, Curve, Floor, Histogram, Pictures, Row, Tab
 
 __all__ = [
-    "FINENESS",
-    "LEVELS",
-    "Fineness",
-    "coarse",
-    "embedded",
-    "pack",
-    "pack_film",
-    "payload",
-    "rounded",
+    *("FINENESS", "LEVELS", "Fineness", "coarse", "embedded", "pack", "pack_film", "payload", "rounded"),
     "spaced",
 ]
 
@@ -67,17 +59,10 @@ FINENESS = (
 DIGITS = np.frombuffer(b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789-_", np.uint8)
 """Letters that need no escape in HTML, JSON or a URL."""
 
-LEVELS = 4094
-"""Greatest packed value."""
-
-MISSING = 4095
-"""What stands for NaN."""
-
-DEEPEST = 1e-9
-"""A logarithmic range reaches no lower than this share of its top."""
-
-MOST_STEPS = 31
-"""Steps of a film's letter to either side of where a particle was going."""
+LEVELS = 4094  # greatest packed value
+MISSING = 4095  # what stands for NaN
+DEEPEST = 1e-9  # a logarithmic range reaches no lower than this share of its top
+MOST_STEPS = 31  # steps of a film's letter to either side of where a particle was going
 
 Packed = list[str | float | int]
 """Text, least value, greatest value, and 1 where the steps are those of the logarithm."""
@@ -92,12 +77,9 @@ def payload(board: Board, fineness: Fineness = FINENESS[0]) -> dict[str, Any]:
     return {"tabs": [writer.tab(tab) for tab in board.tabs], "pool": writer.pool}
 
 
-def _numbers(values: Sequence[float], digits: int) -> list[float | str | None]:
+def _numbers(values: Sequence[float]) -> list[float | str | None]:
     """Return numbers as JSON knows them: None for NaN, text for what is infinite."""
-    return [
-        None if math.isnan(value) else rounded(value, digits) if math.isfinite(value) else f"{value}"
-        for value in values
-    ]
+    return [None if math.isnan(x) else rounded(x, 4) if math.isfinite(x) else f"{x}" for x in values]
 
 
 @dataclass
@@ -122,40 +104,66 @@ class _Writer:
             "curves": [{"key": name, "label": words(name)} for name in tab.curves],
             "energy": self._curve(tab.energy),
             "truth": self._pictures(tab.truth, scale),
-            "floors": [self._floor(floor, tab) for floor in tab.floors],
+            "floors": [
+                {"id": floor.name, "name": floor.name, **self._series(floor, tab)} for floor in tab.floors
+            ],
             "rows": [self._row(row, tab, scale) for row in tab.rows],
         }
 
-    def _floor(self, floor: Floor, tab: Tab) -> dict[str, Any]:
-        energy = floor.energy
+    def _series(self, row: Row | Floor, tab: Tab) -> dict[str, Any]:
+        """Return curves of a row, and the means of each scenario of the main metrics."""
+        values, energy = row.values, row.energy
         return {
-            "id": floor.name,
-            "name": floor.name,
-            "curves": {name: self._curve(curve) for name, curve in floor.curves.items()},
+            "curves": {name: self._curve(curve) for name, curve in row.curves.items()},
             "energy": None if energy is None else self._curve(energy),
-            "spread": _spread(floor.values, tab),
+            "spread": {name: _numbers(values[name].per_scenario) for name in tab.columns if name in values},
         }
 
     def _row(self, row: Row, tab: Tab, scale: float) -> dict[str, Any]:
-        entry = row.entry
+        entry, line = row.entry, row.verified
+        verified = "as submitted"
+        if line:
+            verified = f"verified by the maintainers, lagbench {line.lagbench}, {line.date}"
+        about = {
+            "training": entry.training,
+            "hardware, self-reported": entry.hardware,
+            "seeds": str(len(entry.predictions)),
+            "licence": entry.licence,
+            "submitted": f"{entry.date}, scored by lagbench {entry.score.lagbench}",
+            "scores": verified,
+            "notes": entry.notes,
+        }
+        predictions = [
+            [
+                NOTHING if made.seed is None else str(made.seed),
+                text(mean),
+                NOTHING if made.bytes is None else f"{text(made.bytes / 1e6)} MB",
+                *(made.sha256, made.url, made.path, path.as_posix()),
+            ]
+            for made, mean, path in zip(entry.predictions, row.seed_means, entry.score_paths, strict=True)
+        ]
+        standing = "Not ranked."
+        if row.rank is not None:
+            told = "cannot be told from the leader at 5 %" if row.tied else "differs from the leader"
+            against = "" if math.isnan(row.p) else f"; it {told} (p = {text(row.p, 2)}, corrected)"
+            weights = "These weights: one seed only. " if len(predictions) == 1 else ""
+            standing = f"{weights}Rank {row.rank}{against}."
         return {
             "id": row.id,
             "name": entry.name,
             "active": row.active,
-            "standing": _standing(row),
-            "curves": {name: self._curve(curve) for name, curve in row.curves.items()},
-            "energy": self._curve(row.energy),
-            "spread": _spread(row.values, tab),
+            "standing": standing,
+            **self._series(row, tab),
             "at": {
-                name: _numbers([value.at.get(frame, math.nan) for frame in tab.marked], 4)
+                name: _numbers([value.at.get(frame, math.nan) for frame in tab.marked])
                 for name in tab.columns
                 if (value := row.values.get(name)) and value.at
             },
             "pictures": self._pictures(row.pictures, scale),
             "residuals": [self._histogram(row.residuals[i]) for i in self._shown(tab.truth.map_frames)],
             "command": entry.command,
-            "about": [[name, said] for name, said in _about(row).items() if said],
-            "predictions": _predictions(row),
+            "about": [[name, said] for name, said in about.items() if said],
+            "predictions": predictions,
         }
 
     def _curve(self, curve: Curve) -> dict[str, int]:
@@ -199,55 +207,6 @@ class _Writer:
         return self._known[said]
 
 
-def _spread(values: Mapping[str, Value], tab: Tab) -> dict[str, list[float | str | None]]:
-    """Return the means of each scenario of the main metrics."""
-    return {name: _numbers(values[name].per_scenario, 4) for name in tab.columns if name in values}
-
-
-def _standing(row: Row) -> str:
-    """Return how an entry stands, in a sentence."""
-    if row.rank is None:
-        return "Not ranked."
-    weights = "These weights: one seed only. " if len(row.entry.predictions) == 1 else ""
-    if math.isnan(row.p):
-        return f"{weights}Rank {row.rank}."
-    told = "cannot be told from the leader at 5 %" if row.tied else "differs from the leader"
-    return f"{weights}Rank {row.rank}; it {told} (p = {text(row.p, 2)}, corrected)."
-
-
-def _about(row: Row) -> dict[str, str]:
-    entry, line = row.entry, row.verified
-    checked = (
-        f"verified by the maintainers, lagbench {line.lagbench}, {line.date}" if line else "as submitted"
-    )
-    return {
-        "training": entry.training,
-        "hardware, self-reported": entry.hardware,
-        "seeds": str(len(entry.predictions)),
-        "licence": entry.licence,
-        "submitted": f"{entry.date}, scored by lagbench {entry.score.lagbench}",
-        "scores": checked,
-        "notes": entry.notes,
-    }
-
-
-def _predictions(row: Row) -> list[list[str | None]]:
-    """Return seed, mean, length, hash, address, path and score file of each, as text."""
-    entry = row.entry
-    return [
-        [
-            NOTHING if made.seed is None else str(made.seed),
-            text(mean),
-            NOTHING if made.bytes is None else f"{text(made.bytes / 1e6)} MB",
-            made.sha256,
-            made.url,
-            made.path,
-            path.as_posix(),
-        ]
-        for made, mean, path in zip(entry.predictions, row.seed_means, entry.score_paths, strict=True)
-    ]
-
-
 def pack(values: ArrayLike, *, limits: tuple[float, float] | None = None, log: bool = False) -> Packed:
     """Return values in 4094 equal steps between the least and the greatest."""
     x = np.asarray(values, np.float64).ravel()
@@ -262,7 +221,8 @@ def pack(values: ArrayLike, *, limits: tuple[float, float] | None = None, log: b
     else:
         share = _share(np.clip(x, low, high), low, high)
     steps = np.where(np.isfinite(x), np.rint(np.nan_to_num(share) * LEVELS), MISSING).astype(np.int64)
-    return [_text(steps), rounded(low), rounded(high), int(logarithmic)]
+    letters = np.stack([DIGITS[steps >> 6], DIGITS[steps & 63]], axis=-1)
+    return [letters.tobytes().decode("ascii"), rounded(low), rounded(high), int(logarithmic)]
 
 
 def pack_film(film: ArrayLike, *, limits: tuple[float, float] = (-0.5, 1.5)) -> PackedFilm:
@@ -271,10 +231,7 @@ def pack_film(film: ArrayLike, *, limits: tuple[float, float] = (-0.5, 1.5)) -> 
     A letter says how far a coordinate is from where it was going at constant velocity:
     sign(k) k^2 / 31^2 of the greatest such distance, k from -31 to 31, so that slow particles stand
     still and fast ones stay on their way. What was rounded off is made up for in the next frame.
-
-    Args:
-        film: positions, finite, shape [frame, particle, 2].
-        limits: least and greatest value of the first frame [length].
+    Positions are finite, shape [frame, particle, 2]; limits are those of the first frame [length].
     """
     wanted = np.asarray(film, np.float64)
     wanted = wanted.reshape(len(wanted), -1)
@@ -297,11 +254,6 @@ def pack_film(film: ArrayLike, *, limits: tuple[float, float] = (-0.5, 1.5)) -> 
 
 def _share(x: NDArray[np.float64], low: float, high: float) -> NDArray[np.float64]:
     return (x - low) / (high - low) if high > low else np.zeros_like(x)
-
-
-def _text(steps: NDArray[np.int64]) -> str:
-    letters = np.stack([DIGITS[steps >> 6], DIGITS[steps & 63]], axis=-1)
-    return letters.tobytes().decode("ascii")
 
 
 def rounded(value: float, digits: int = 6) -> float:
@@ -327,15 +279,7 @@ def spaced(length: int, count: int) -> list[int]:
 
 
 def coarse(field: NDArray[np.floating], nodes: int) -> NDArray[np.float64]:
-    """Return a square field with at most so many nodes a side, as means over blocks.
-
-    Args:
-        field: values at nodes, NaN where there is none, shape [..., x node, y node].
-        nodes: most nodes a side.
-
-    Returns:
-        Means of the known nodes of each block, NaN where none is known.
-    """
+    """Return a field, shape [..., x node, y node], with at most so many nodes a side: means of known ones."""
     side = -(-field.shape[-1] // nodes)
     if side == 1:
         return field.astype(np.float64)
@@ -350,10 +294,6 @@ def coarse(field: NDArray[np.floating], nodes: int) -> NDArray[np.float64]:
     return np.where(number > 0, total / np.maximum(number, 1), np.nan)
 
 
-_ESCAPED = "<>&\u2028\u2029"
-"""What could end an element, start one, or end a line of a script."""
-
-
 def embedded(value: object) -> str:
     r"""Return JSON that may stand in an HTML element, whatever the strings in it hold.
 
@@ -362,6 +302,6 @@ def embedded(value: object) -> str:
     """
     text = json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
     text = text.encode("utf-8", "replace").decode("utf-8")
-    for letter in _ESCAPED:
+    for letter in "<>&\u2028\u2029":  # they could end an element, start one, or end a line of a script
         text = text.replace(letter, f"\\u{ord(letter):04x}")
     return text

@@ -1,4 +1,4 @@
-"""From score files to one score per method.
+"""From score files to one score per method, floors included.
 
 The mean over seeds is taken per scenario (and per frame) first, over the seeds that have a
 value there; intervals and tests resample scenarios and seeds together.
@@ -8,20 +8,28 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from lagbench.data.layout import major_of
 from lagbench.data.registry import Size
+from lagbench.errors import UnreadableFileError
+from lagbench.floors.shipped import FloorScores, shipped
+from lagbench.floors.table import FLOORS as KNOWN
 from lagbench.metrics.aggregate import Score, aggregate, bootstrap_interval, mean_over_seeds
 from lagbench.metrics.table import METRICS
-from lagbench.scoring.card import digits
-from lagbench.scoring.score_file import StoredScores
+from lagbench.scoring.card import ScoreCard, digits
+from lagbench.scoring.scenario import SUBMISSION
+from lagbench.scoring.score_file import StoredScores, write_statistics
 
 from .entry import DataSet, Summary
+from .folder import FLOORS, Folder
+from .score_file import read_stored
 
-__all__ = ["Combined", "combine", "is_current", "summarise"]
+__all__ = ["Combined", "combine", "dataset_of", "is_current", "read_floors", "summarise", "write_floors"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -83,3 +91,57 @@ def is_current(dataset: DataSet, size: Size) -> bool:
     """Tell whether a data set is that of today: same MAJOR version, same hash where one is recorded."""
     recorded = size.measured.dataset_sha256 if size.measured else dataset.sha256
     return major_of(dataset.version) == size.major and dataset.sha256 == recorded
+
+
+def read_floors(folder: Folder, size: Size) -> tuple[FloorScores, ...]:
+    """Return the floors of a split and size, those of another data set left out.
+
+    What ours score, the package ships. Those of a split of somebody's own the scorer measures beside a
+    submission, and :func:`write_floors` keeps them in the folder: they are equal whoever submits.
+    """
+    if known := shipped(size):
+        return tuple(known.values())
+    found = []
+    for path in folder.floor_files(size.split, size.name):
+        scores = read_stored(folder.path / path).scores
+        if path.stem not in KNOWN or not is_current(dataset_of(scores.identity), size):
+            continue
+        read_stored(folder.path / path, size)
+        held = {name: made.score for name, made in combine([scores]).items()}
+        found.append(
+            FloorScores(name=path.stem, scores=held, seconds_per_frame=math.nan, correlation=np.empty(0))
+        )
+    return tuple(found)
+
+
+def dataset_of(identity: Mapping[str, str]) -> DataSet:
+    """Return the data set that scores say they belong to."""
+    return DataSet.model_construct(version=identity["dataset_version"], sha256=identity["dataset_sha256"])
+
+
+def write_floors(card: ScoreCard, folder: Folder) -> tuple[Path, ...]:
+    """Write the floors that a score card has and the folder lacks, as score files; return their paths.
+
+    Their pictures show the truth alone.
+    """
+    written = []
+    header, preview = card.header, card.preview
+    nothing = np.full_like(preview.vorticity[0], np.nan)
+    truth = replace(
+        preview,
+        vorticity=np.stack([preview.vorticity[0], nothing]),
+        histogram=np.stack([preview.histogram[0], np.full_like(preview.histogram[0], np.nan)]),
+        film=np.stack([preview.film[0], preview.film[0]]),
+    )
+    for name in card.tallies.keys() - {SUBMISSION}:
+        path = folder.path / FLOORS / header.split / header.size / f"{name}.nc"
+        with suppress(UnreadableFileError):
+            if read_stored(path).scores.identity["dataset_sha256"] == header.dataset_sha256:
+                continue
+        path.parent.mkdir(parents=True, exist_ok=True)
+        tallies = {SUBMISSION: card.tallies[name]}
+        named, nobody = replace(header, method=name), "0" * 64
+        floor = replace(card, header=named, predictions_sha256=nobody, tallies=tallies, preview=truth)
+        write_statistics(floor, path)
+        written.append(path)
+    return tuple(sorted(written))

@@ -32,11 +32,8 @@ from lagbench.work.machine import in_child
 
 __all__ = ["MAX_SCORE_BYTES", "Stored", "read_stored", "reported_frames", "unreadable_in_child"]
 
-MAX_SCORE_BYTES = 1_000_000
-"""Longest score file [bytes]."""
-
-MAX_UNPACKED = 32 << 20
-"""Most that a score file may unpack to [bytes]; the largest of ours takes 3 MB."""
+MAX_SCORE_BYTES = 1_000_000  # longest score file [bytes]
+MAX_UNPACKED = 32 << 20  # most that a score file may unpack to [bytes]; the largest of ours takes 3 MB
 
 MAX_STATISTICS = 500
 
@@ -44,16 +41,12 @@ GROUP = "preview"
 STRUCTURE = Structure(members=40, groups=(GROUP,), unpacked=MAX_UNPACKED)
 """What a score file may hold: plain numbers of its own, in one group beside the root."""
 
-CPU_SECONDS = 10.0
-"""Computing time of the child for every 50 files, its start aside [s]."""
+CPU_SECONDS = 10.0  # computing time of the child for every 50 files, its start aside [s]
 
 FILES_PER_PART = 50
 
-MOST_STOPS = 5
-"""Files that may stop a child before the rest is left unread: each costs a child's whole time."""
-
-WALL_SECONDS = 600.0
-"""Time for every 50 files together [s]; a busy machine may need minutes."""
+MOST_STOPS = 5  # files that may stop a child before the rest is left unread: each costs a child's whole time
+WALL_SECONDS = 600.0  # time for every 50 files together [s]; a busy machine may need minutes
 
 UNREAD = "not read, because too many others had to be stopped or took all the time allowed"
 
@@ -89,7 +82,23 @@ def read_stored(path: Path, size: Size | None = None) -> Stored:
             raise ValueError("no scenarios, or too many statistics")
         if not all(np.isfinite(tally.total).all() for tally in tallies):
             raise ValueError("infinite statistics")
-        preview, precision = _read_preview(path)
+        with opened(path) as file:
+            group = file[GROUP]
+            vorticity, precision = _unpacked(group["vorticity"])
+            histogram, _ = _unpacked(group["histogram"])
+            film, _ = _unpacked(group["film"])
+            preview = Preview(
+                scenario=int(np.ravel(group.attrs["scenario"])[0]),
+                map_frames=_integers(group["map_frame"]),
+                vorticity=vorticity,
+                histogram=histogram,
+                histogram_range=np.asarray(group["histogram_range"][...], np.float32),
+                film_frames=_integers(group["film_frame"]),
+                particles=_integers(group["film_particle"]),
+                material=np.asarray(group["material"][...], np.int8),
+                film=film,
+            )
+        _check_shapes(preview)
         if size is not None:
             _check_task(scores, preview, size)
     except UnreadableFileError:
@@ -97,27 +106,6 @@ def read_stored(path: Path, size: Size | None = None) -> Stored:
     except Exception as error:  # HDF5 on damaged bytes raises nearly any type
         raise unreadable_scores(path, error) from error
     return Stored(scores=scores, preview=preview, precision=precision)
-
-
-def _read_preview(path: Path) -> tuple[Preview, float]:
-    with opened(path) as file:
-        group = file[GROUP]
-        vorticity, precision = _unpacked(group["vorticity"])
-        histogram, _ = _unpacked(group["histogram"])
-        film, _ = _unpacked(group["film"])
-        preview = Preview(
-            scenario=int(np.ravel(group.attrs["scenario"])[0]),
-            map_frames=_integers(group["map_frame"]),
-            vorticity=vorticity,
-            histogram=histogram,
-            histogram_range=np.asarray(group["histogram_range"][...], np.float32),
-            film_frames=_integers(group["film_frame"]),
-            particles=_integers(group["film_particle"]),
-            material=np.asarray(group["material"][...], np.int8),
-            film=film,
-        )
-    _check_shapes(preview)
-    return preview, precision
 
 
 def _unpacked(variable: h5py.Dataset) -> tuple[NDArray[np.float32], float]:

@@ -23,17 +23,14 @@ def lede(board: Board) -> Markup:
     for tab in board.tabs:
         entries += len(tab.rows)
         checked += sum(row.verified is not None for row in tab.rows)
-    shown = f"{_counted(entries, 'entry', 'entries')} on {_counted(len(board.tabs), 'data set', 'data sets')}"
+    many = len(board.tabs)
+    shown = f"{entries} {'entry' if entries == 1 else 'entries'} on {many} data set{'s' * (many != 1)}"
     told = f"those of {checked}" if checked else "none yet"
     return escaped(
         "Neural surrogates of Lagrangian continuum simulators on data that anyone regenerates bit for bit:"
         f" {shown}. Every score follows from a score file; predictions that the maintainers scored again:"
         f" {told}. Costs are self-reported."
     )
-
-
-def _counted(count: int, one: str, many: str) -> str:
-    return f"{count} {one if count == 1 else many}"
 
 
 def stage(board: Board) -> Markup:
@@ -143,13 +140,19 @@ def _summary(row: Row | None, tab: Tab, of: int) -> Markup:
 
 def section(tab: Tab, metrics: Mapping[str, Metric]) -> Markup:
     """Return the section of a tab."""
-    presets = presets_of(tab, columns_of(tab, metrics))
+    better = "higher" if metrics[tab.ranking].direction is Direction.HIGHER else "lower"
+    sha256 = tab.size.measured.dataset_sha256 if tab.size.measured else tab.rows[0].entry.dataset.sha256
+    facts = (
+        f"Given {tab.size.task.input_frames} frames of each of {len(tab.scenarios)} test scenarios of"
+        f" {tab.size.particles} particles, predict the next {len(tab.frames)}. Ranked by {words(tab.ranking)}"
+        f" over the horizon, {better} is better. Data set version {tab.size.version}, SHA-256 {sha256[:12]}…"
+    )
     return tag(
         "section",
         tag("h2", f"{tab.title}, {tab.size.name}"),
-        tag("p", _facts(tab, metrics), class_="facts"),
+        tag("p", facts, class_="facts"),
         tag("ul", *_tiles(tab, metrics), class_="tiles"),
-        _tools(tab, presets),
+        _tools(tab, presets_of(tab, columns_of(tab, metrics))),
         tag(
             "div",
             draw_table(tab, metrics),
@@ -162,16 +165,6 @@ def section(tab: Tab, metrics: Mapping[str, Metric]) -> Markup:
         tag("div", cost_figure(tab), class_="figures"),
         id=tab.id,
         class_="tab",
-    )
-
-
-def _facts(tab: Tab, metrics: Mapping[str, Metric]) -> str:
-    better = "higher" if metrics[tab.ranking].direction is Direction.HIGHER else "lower"
-    sha256 = tab.size.measured.dataset_sha256 if tab.size.measured else tab.rows[0].entry.dataset.sha256
-    return (
-        f"Given {tab.size.task.input_frames} frames of each of {len(tab.scenarios)} test scenarios of"
-        f" {tab.size.particles} particles, predict the next {len(tab.frames)}. Ranked by {words(tab.ranking)}"
-        f" over the horizon, {better} is better. Data set version {tab.size.version}, SHA-256 {sha256[:12]}…"
     )
 
 

@@ -11,7 +11,6 @@ from lagbench.scoring.card import digits
 from lagbench.scoring.tables import Table
 
 from .columns import held
-from .entry import Cost
 from .model import Board, Floor, Row, Tab, Value
 
 __all__ = ["as_plain", "chosen_tabs", "tables"]
@@ -111,38 +110,27 @@ def _plain_value(value: Value) -> dict[str, float | None]:
 
 
 def _cells(row: Row | Floor, names: list[str]) -> tuple[str, ...]:
-    values = tuple(_spelt(held(row, name)) for name in names)
+    found = [held(row, name) for name in names]
+    values = [
+        "-"
+        if value is None or math.isnan(value.mean)
+        else f"{value.mean:.4g}" + ("" if math.isnan(value.std) else f" ± {value.std:.2g}")
+        for value in found
+    ]
+    cost = row.cost if isinstance(row, Floor) else row.entry.cost
+    time = f"{cost.seconds_per_frame:.3g}" if cost else ""
+    speed_up = f"{cost.speed_up:.3g}" if cost and cost.speed_up is not None else ""
     if isinstance(row, Floor):
-        return ("-", row.name, *values, *_spent(row.cost), "floor")
+        return ("-", row.name, *values, time, speed_up, "floor")
     rank = "-" if row.rank is None else f"{row.rank}{'≈' if row.tied else ''}"
-    return (rank, row.id, *values, *_spent(row.entry.cost), ", ".join(_remarks(row)))
-
-
-def _spent(cost: Cost | None) -> tuple[str, str]:
-    """Return the time of a frame and the speed-up over the solver."""
-    if cost is None:
-        return "", ""
-    return f"{cost.seconds_per_frame:.3g}", "" if cost.speed_up is None else f"{cost.speed_up:.3g}"
-
-
-def _spelt(value: Value | None) -> str:
-    """Return a mean, with its deviation over seeds where there are several."""
-    if value is None or math.isnan(value.mean):
-        return "-"
-    return f"{value.mean:.4g}" + ("" if math.isnan(value.std) else f" ± {value.std:.2g}")
-
-
-def _remarks(row: Row) -> Iterator[str]:
-    if row.verified:
-        yield "verified"
-    if str(row.entry.status) != "active":
-        yield str(row.entry.status)
-    if not row.current:
-        yield f"data set {row.entry.dataset.version}"
-    if row.entry.budget and row.entry.budget.track:
-        yield row.entry.budget.track
-    if len(row.entry.predictions) > 1:
-        yield f"{len(row.entry.predictions)} seeds"
-    if row.diverged:
-        yield f"{row.diverged} diverged"
-    yield from (flag.name for flag in row.flags)
+    entry, track = row.entry, row.entry.budget.track if row.entry.budget else None
+    remarks = [
+        "verified" if row.verified else "",
+        "" if str(entry.status) == "active" else str(entry.status),
+        "" if row.current else f"data set {entry.dataset.version}",
+        track or "",
+        f"{len(entry.predictions)} seeds" if len(entry.predictions) > 1 else "",
+        f"{row.diverged} diverged" if row.diverged else "",
+        *(flag.name for flag in row.flags),
+    ]
+    return (rank, row.id, *values, time, speed_up, ", ".join(filter(None, remarks)))

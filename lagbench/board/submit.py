@@ -23,6 +23,7 @@ from lagbench.atomic import write_atomically
 from lagbench.data.checksums import file_sha256
 from lagbench.data.registry import Registry, Size, load
 from lagbench.errors import ChecksFailedError, UsageError, WorkFailedError
+from lagbench.floors.table import FLOORS
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.score import score
 from lagbench.scoring.score_file import write_statistics
@@ -48,20 +49,16 @@ from .entry import (
     ScoreBlock,
     ScoredFile,
 )
-from .entry_file import examine, read_entry, spell
-from .floors import floor_names, write_floors
+from .entry_file import examine, listed, read_entry, spell
 from .folder import SUBMISSIONS, Folder, Place, entry_path, score_paths
-from .ranking import combine, summarise
+from .ranking import combine, summarise, write_floors
 from .score_file import MAX_SCORE_BYTES, read_stored
 from .weights import copy_weights, named_weights, require_weights
 
 __all__ = ["BOARD", "SubmitResult", "scored_file", "submit"]
 
-BOARD = Path("leaderboard")
-"""The leaderboard's folder, from the root of the repository."""
-
-OUTSIDE = "in_domain"
-"""The warning that comes with a share of the positions."""
+BOARD = Path("leaderboard")  # the leaderboard's folder, from the root of the repository
+OUTSIDE = "in_domain"  # the warning that comes with a share of the positions
 
 STAGE = ".submit-"
 """First letters of the folder in which score files are prepared; a killed process leaves it behind."""
@@ -120,7 +117,13 @@ def submit(
         WorkFailedError: the disk is full or not writable, or a score file became too long.
     """
     folder, paths = Folder(board), [Path(path) for path in predictions]
-    _check_needed(meta, folder, new_board=new_board)
+    needed = {"authors": "--author NAME", "command": "--command 'what makes the predictions again'"}
+    missing = [option for key, option in needed.items() if not getattr(meta, key)]
+    if missing:
+        fix = "give them as options, or authors and command in a file: --from meta.yaml"
+        raise UsageError("the entry lacks what readers need", expected=" and ".join(missing), fix=fix)
+    if not new_board:
+        folder.require("run it from the root of a clone, name it with --board, or begin one: --new-board")
     headers, outside, results, described = [], [], [], registry or load()
     for path in paths:
         result = validate(path, root=root, require_truth=True, registry=registry)
@@ -139,9 +142,20 @@ def submit(
         where = str(folder.path / entry_path(place))
         fix = "replace it with --replace, or name this one otherwise: --method NAME"
         raise UsageError("there is such an entry already", where=where, fix=fix)
-    about, urls, sources = _about(headers, meta), _urls(headers, meta), require_weights(weights, headers)
-    cards = [
-        score(
+    about = _about(headers, meta)
+    if meta.urls and len(meta.urls) != len(headers):
+        raise UsageError(
+            "addresses and files differ in number",
+            where="--url",
+            expected=len(headers),
+            got=len(meta.urls),
+            fix="give one address per file, in their order, or none",
+        )
+    urls = meta.urls or (None,) * len(headers)
+    sources = require_weights(weights, headers)
+    cards, made = [], []
+    for path, result, header, seed, url in zip(paths, results, headers, seeds, urls, strict=True):
+        card = score(
             path,
             root=root,
             workers=workers,
@@ -150,19 +164,19 @@ def submit(
             write=False,
             validated=result,
         )
-        for path, result in zip(paths, results, strict=True)
-    ]
-    made = [
-        Prediction(
-            seed=seed,
-            sha256=card.predictions_sha256,
-            url=url,
-            path=_inner_path(path, folder),
-            bytes=path.stat().st_size,
-            budget=header.budget,
+        inside, whole = path.resolve(), folder.path.resolve()
+        kept = inside.relative_to(whole).as_posix() if inside.is_relative_to(whole) else None
+        cards.append(card)
+        made.append(
+            Prediction(
+                seed=seed,
+                sha256=card.predictions_sha256,
+                url=url,
+                path=kept,
+                bytes=path.stat().st_size,
+                budget=header.budget,
+            )
         )
-        for card, path, seed, url, header in zip(cards, paths, seeds, urls, headers, strict=True)
-    ]
     try:
         return _publish(place, about, cards, made, folder, outside, sources)
     except OSError as error:
@@ -172,20 +186,6 @@ def submit(
             got=error.strerror or error,
             fix="free disk space, or name a folder that you may write to: --board",
         ) from error
-
-
-def _check_needed(meta: Meta, folder: Folder, *, new_board: bool) -> None:
-    """Refuse a description that lacks what readers need, and to begin a board by mistake."""
-    needed = {"authors": "--author NAME", "command": "--command 'what makes the predictions again'"}
-    missing = [option for key, option in needed.items() if not getattr(meta, key)]
-    if missing:
-        raise UsageError(
-            "the entry lacks what readers need",
-            expected=" and ".join(missing),
-            fix="give them as options, or authors and command in a file: --from meta.yaml",
-        )
-    if not new_board:
-        folder.require("run it from the root of a clone, name it with --board, or begin one: --new-board")
 
 
 def _seeds(headers: Sequence[Header]) -> tuple[int | None, ...]:
@@ -219,22 +219,10 @@ def _method(header: Header, meta: Meta) -> str:
             got=ascii(name),
             fix="name it: --method my-model",
         )
-    if name in floor_names():
+    if name in FLOORS:
         fix = "name your method otherwise; the floors are added by themselves"
         raise UsageError(f"{name!r} is the name of a floor", where="--method", fix=fix)
     return name
-
-
-def _urls(headers: Sequence[Header], meta: Meta) -> tuple[str | None, ...]:
-    if meta.urls and len(meta.urls) != len(headers):
-        raise UsageError(
-            "addresses and files differ in number",
-            where="--url",
-            expected=len(headers),
-            got=len(meta.urls),
-            fix="give one address per file, in their order, or none",
-        )
-    return meta.urls or (None,) * len(headers)
 
 
 def _about(headers: Sequence[Header], meta: Meta) -> About:
@@ -275,12 +263,6 @@ def _mean(values: Sequence[float]) -> float:
     return float(f"{sum(values) / len(values):.6g}")
 
 
-def _inner_path(path: Path, folder: Folder) -> str | None:
-    """Return a path relative to the leaderboard's folder, None for a file outside it."""
-    inside, outside = path.resolve(), folder.path.resolve()
-    return inside.relative_to(outside).as_posix() if inside.is_relative_to(outside) else None
-
-
 def _outside(opened: Predictions, size: Size) -> float:
     """Return the share of positions that lie more than a solver cell outside the box."""
     low, high = np.array(size.bounds).T + np.array([[-1.0], [1.0]]) / size.grid
@@ -309,11 +291,33 @@ def _publish(
         staged = [Path(stage) / name.name for name in names]
         for card, target in zip(cards, staged, strict=True):
             write_statistics(card, target)
-            _check_length(target, card)
+            length = target.stat().st_size
+            if length > MAX_SCORE_BYTES:
+                raise WorkFailedError(
+                    "the score file is too long",
+                    where=f"{place[0]} {place[1]}",
+                    expected=f"at most {MAX_SCORE_BYTES} bytes",
+                    got=f"{length} bytes",
+                    fix="uninstall packages that add metrics, and submit again",
+                )
         files = tuple(map(scored_file, cards, staged, outside))
         kept = named_weights(place, [one.seed for one in made], sources)
         made = [one.model_copy(update={"weights": held}) for one, held in zip(made, kept, strict=True)]
-        entry = _entry(place, about, cards, made, files, staged)
+        header = cards[0].header
+        block = ScoreBlock(
+            lagbench=version("lagbench"),
+            dataset_sha256=header.dataset_sha256,
+            ranking_metric=cards[0].ranking,
+            files=files,
+            metrics=summarise(combine([read_stored(target).scores for target in staged])),
+        )
+        held = {name: getattr(about, name) for name in About.model_fields}
+        held |= dict(zip(("format", "split", "size", "method"), (2, *place), strict=True))
+        held["dataset"] = DataSet(version=header.dataset_version, sha256=header.dataset_sha256)
+        entry, mistakes = examine(Entry, {**held, "predictions": tuple(made), "score": block})
+        if entry is None:
+            fix = "say it otherwise in --from meta.yaml; docs/submitting.md describes the keys"
+            raise ChecksFailedError("the entry does not fit the schema", got=listed(mistakes), fix=fix)
         for source, name in zip(staged, names, strict=True):
             (folder.path / name).parent.mkdir(parents=True, exist_ok=True)
             os.replace(source, folder.path / name)
@@ -338,34 +342,6 @@ def _publish(
     )
 
 
-def _entry(
-    place: Place,
-    about: About,
-    cards: Sequence[ScoreCard],
-    made: Sequence[Prediction],
-    files: tuple[ScoredFile, ...],
-    staged: Sequence[Path],
-) -> Entry:
-    """Return the entry with the score block that follows from the score files."""
-    header = cards[0].header
-    block = ScoreBlock(
-        lagbench=version("lagbench"),
-        dataset_sha256=header.dataset_sha256,
-        ranking_metric=cards[0].ranking,
-        files=files,
-        metrics=summarise(combine([read_stored(target).scores for target in staged])),
-    )
-    held = {name: getattr(about, name) for name in About.model_fields}
-    held |= dict(zip(("format", "split", "size", "method"), (2, *place), strict=True))
-    held["dataset"] = DataSet(version=header.dataset_version, sha256=header.dataset_sha256)
-    entry, mistakes = examine(Entry, {**held, "predictions": tuple(made), "score": block})
-    if entry is None:
-        got = "\n    ".join(["", *map(str, mistakes)])
-        fix = "say it otherwise in --from meta.yaml; docs/submitting.md describes the keys"
-        raise ChecksFailedError("the entry does not fit the schema", got=got, fix=fix)
-    return entry
-
-
 def scored_file(card: ScoreCard, path: Path, outside: float | None = None) -> ScoredFile:
     """Return what an entry says of the score file that was written from a card."""
 
@@ -382,15 +358,3 @@ def scored_file(card: ScoreCard, path: Path, outside: float | None = None) -> Sc
             for one in card.warnings
         ),
     )
-
-
-def _check_length(path: Path, card: ScoreCard) -> None:
-    length = path.stat().st_size
-    if length > MAX_SCORE_BYTES:
-        raise WorkFailedError(
-            "the score file is too long",
-            where=f"{card.header.split} {card.header.size}",
-            expected=f"at most {MAX_SCORE_BYTES} bytes",
-            got=f"{length} bytes",
-            fix="uninstall packages that add metrics, and submit again",
-        )

@@ -14,15 +14,13 @@ from lagbench.metrics.metric import Direction, Metric
 from lagbench.report.html import MISSING, Markup, interval, join, tag, text
 
 from .columns import Column, columns_of, held, presets_of, value_of, written
-from .entry import Flag
 from .folder import weights_path
 from .model import Floor, Row, Tab
 from .payload import rounded
 
 __all__ = ["EXPLAINED", "draw_table"]
 
-MEAN_DIGITS = 9
-"""Significant digits of means, as in scores.json."""
+MEAN_DIGITS = 9  # significant digits of means, as in scores.json
 
 MOST_REASONS = 4
 """Reasons of a warning that are told; those of other scenarios say the same with other numbers."""
@@ -49,14 +47,8 @@ EXPLAINED: Mapping[str, tuple[str, str]] = MappingProxyType(
             "leaves the box",
             "Predicted particles lie outside the box; there they carry no weight on the grid.",
         ),
-        "max_displacement": (
-            "jumps",
-            "Predicted particles move farther in a frame than any of the truth.",
-        ),
-        "discontinuous_start": (
-            "jumps at the start",
-            "The first frame is far from the last given.",
-        ),
+        "max_displacement": ("jumps", "Predicted particles move farther in a frame than any of the truth."),
+        "discontinuous_start": ("jumps at the start", "The first frame is far from the last given."),
     }
 )
 """What flags and warnings are called on the page, which shows what is wrong, and what they mean."""
@@ -83,8 +75,23 @@ def draw_table(tab: Tab, metrics: Mapping[str, Metric]) -> Markup:
     head = [
         _heading("rank", tag("span", "#", class_="metric"), "Rank by the ranking metric", class_="rank"),
         _heading("name", tag("span", "method", class_="metric"), "Name of the method", class_="method"),
-        *(_column_heading(column, main=key in main) for key, column in columns.items()),
     ]
+    for key, column in columns.items():
+        unit = f"{column.unit} {ARROWS[column.direction]}".strip()
+        said = [tag("span", s, class_="unit") for s in (unit, REPORTED_MARK * column.reported) if s]
+        head.append(
+            _heading(
+                key,
+                join([tag("span", column.label, class_="metric"), *said]),
+                f"{column.meaning} {REPORTED if column.reported else ''}".strip(),
+                class_="words" if column.form == "text" else None,
+                hidden=key not in main,
+                data_unit=column.unit or None,
+                data_direction=str(column.direction),
+                data_perfect=column.perfect if column.direction is Direction.TARGET else None,
+                data_form=None if column.form == "number" else column.form,
+            )
+        )
     return tag(
         "table",
         tag("caption", f"{tab.size.split} {tab.size.name}: methods and scores", class_="unseen"),
@@ -97,22 +104,6 @@ def draw_table(tab: Tab, metrics: Mapping[str, Metric]) -> Markup:
 def _heading(key: str, label: object, meaning: str, **attributes: object) -> Markup:
     sorter = tag("button", label, type="button", class_="sorter", data_sort=key, title=meaning)
     return tag("th", sorter, scope="col", **attributes)
-
-
-def _column_heading(column: Column, *, main: bool) -> Markup:
-    unit = f"{column.unit} {ARROWS[column.direction]}".strip()
-    below = [tag("span", said, class_="unit") for said in (unit, REPORTED_MARK * column.reported) if said]
-    return _heading(
-        column.key,
-        join([tag("span", column.label, class_="metric"), *below]),
-        f"{column.meaning} {REPORTED if column.reported else ''}".strip(),
-        class_="words" if column.form == "text" else None,
-        hidden=not main,
-        data_unit=column.unit or None,
-        data_direction=str(column.direction),
-        data_perfect=column.perfect if column.direction is Direction.TARGET else None,
-        data_form=None if column.form == "number" else column.form,
-    )
 
 
 class _Shades:
@@ -185,7 +176,8 @@ def _line(tab: Tab, row: Row | Floor, number: int, cells: Sequence[Markup]) -> M
         rank = tag("td", "", class_="rank", data_value=number)
         return tag("tr", rank, method, *cells, class_="floor", data_floor=row.name)
     entry = row.entry
-    tied = tag("span", "≈", class_="tied", title=_told(row.p)) if row.tied else ""
+    told = f"cannot be told from the leader at 5 % (p = {text(row.p, 2)}, corrected)"
+    tied = tag("span", "≈", class_="tied", title=told) if row.tied else ""
     by = " · ".join(filter(None, (", ".join(entry.authors), entry.affiliation)))
     links = [
         tag("a", name, href=address, rel="noopener noreferrer nofollow", target="_blank")
@@ -225,10 +217,6 @@ def _line(tab: Tab, row: Row | Floor, number: int, cells: Sequence[Markup]) -> M
     )
 
 
-def _told(p: float) -> str:
-    return f"cannot be told from the leader at 5 % (p = {text(p, 2)}, corrected)"
-
-
 def _chips(row: Row) -> Iterator[Markup]:
     """Yield small marks beside a name: status, data set version, flags."""
     entry = row.entry
@@ -240,20 +228,17 @@ def _chips(row: Row) -> Iterator[Markup]:
         yield _chip("unknown", f"data {entry.dataset.version}", said)
     for kind, flags in (("bad", row.flags), ("warn", row.warnings)):
         for flag in flags:
-            yield _chip(kind, *_explained(flag, most=MOST_REASONS if kind == "warn" else len(flag.reasons)))
+            # an unknown one is called as the scorer does
+            label, meaning = EXPLAINED.get(flag.name, (flag.name.replace("_", " "), ""))
+            if flag.share is not None:
+                label = f"{label}: {text(100.0 * flag.share, 2)} %"
+            most = MOST_REASONS if kind == "warn" else len(flag.reasons)
+            more = len(flag.reasons) - most
+            said = "; ".join([*flag.reasons[:most], *([f"and {more} more such"] if more > 0 else [])])
+            yield _chip(kind, label, " ".join(filter(None, (meaning, f"{said}." if said else ""))))
     if row.diverged:
         yield _chip("warn", "diverged", f"{row.diverged} rollouts are frozen at their last finite frame.")
 
 
 def _chip(kind: str, label: str, meaning: str) -> Markup:
     return tag("span", label, class_=f"flag {kind}", title=meaning)
-
-
-def _explained(flag: Flag, *, most: int) -> tuple[str, str]:
-    """Return label and meaning of a flag or warning; an unknown one is called as the scorer does."""
-    label, meaning = EXPLAINED.get(flag.name, (flag.name.replace("_", " "), ""))
-    if flag.share is not None:
-        label = f"{label}: {text(100.0 * flag.share, 2)} %"
-    more = len(flag.reasons) - most
-    said = "; ".join([*flag.reasons[:most], *([f"and {more} more such"] if more > 0 else [])])
-    return label, " ".join(filter(None, (meaning, f"{said}." if said else "")))

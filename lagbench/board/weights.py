@@ -26,8 +26,7 @@ __all__ = ["MOST_BYTES", "check_weights", "copy_weights", "named_weights", "requ
 MOST_BYTES = 40_000_000
 """All weights of a leaderboard together [bytes]: git keeps every version of them for good."""
 
-MOST_RECORD = 256 << 10
-"""Longest record of a training beside its weights [bytes]; those of ours take 3 kB."""
+MOST_RECORD = 256 << 10  # longest record of a training beside its weights [bytes]; those of ours take 3 kB
 
 RECORD = "training.json"
 
@@ -128,7 +127,15 @@ def check_weights(folder: Folder, entries: Sequence[Entry]) -> Iterator[Finding]
             elif (found := file_sha256(file)) != made.weights.sha256:
                 said = made.weights.sha256[:16]
                 yield finding("weights", path, f"SHA-256 {found[:16]}", expected=f"{said} as the entry says")
-            yield from _check_record(folder, path.with_suffix(".json"))
+            record = path.with_suffix(".json")  # its absence is no finding
+            kept = folder.path / record
+            if (
+                kept.exists()
+                and folder.link_in(record) is None
+                and (reason := unfit_record(kept)) is not None
+            ):
+                most = f"a JSON object of at most {MOST_RECORD} bytes, or no file"
+                yield finding("weights", record, reason, what="no record of a training", expected=most)
     held = folder.weight_files()
     for path in held:
         if path not in known:
@@ -138,11 +145,3 @@ def check_weights(folder: Folder, entries: Sequence[Entry]) -> Iterator[Finding]
         fix = "keep larger ones as files of a release, and name them by `weights: https://...` in the entry"
         most = f"at most {MOST_BYTES} bytes in all"
         yield finding("weights", "weights", f"{total} bytes", what="too many", expected=most, fix=fix)
-
-
-def _check_record(folder: Folder, path: Path) -> Iterator[Finding]:
-    """Yield a record that is long or no JSON; its absence is no finding."""
-    file = folder.path / path
-    if file.exists() and folder.link_in(path) is None and (reason := unfit_record(file)) is not None:
-        most = f"a JSON object of at most {MOST_RECORD} bytes, or no file"
-        yield finding("weights", path, reason, what="no record of a training", expected=most)

@@ -1,16 +1,9 @@
 """A scenario as a moving picture: MP4 or GIF, two scenarios side by side where two are given.
 
-Needs ``pip install 'lagbench[plots]'``. Frames are read, painted and encoded one at a time,
-so memory does not grow with the length.
-
-Frames of an animation, drawn straight into pixels: milliseconds where a figure takes longer.
-
-A panel is painted at twice its size and averaged down, which smooths the rims of the dots.
-Pixels are packed into one integer, ``red + green 2^8 + blue 2^16``.
-
-Video files that grow frame by frame: MP4 through ffmpeg, GIF with one palette.
-
-Files appear whole or not at all, without dates, and memory does not grow with their length.
+Needs ``pip install 'lagbench[plots]'``. Frames are read, painted and encoded one at a time, so memory does
+not grow with the length; files appear whole or not at all, without dates. Frames are drawn straight into
+pixels: milliseconds where a figure takes longer. A panel is painted at twice its size and averaged down,
+which smooths the rims of the dots. Pixels are packed into one integer, ``red + green 2^8 + blue 2^16``.
 """
 
 from __future__ import annotations
@@ -47,24 +40,12 @@ from .style import (
 )
 
 if TYPE_CHECKING:
-    from matplotlib.colors import ListedColormap
-
     from lagbench.data.registry import Registry
 
 __all__ = [
-    "Packed",
-    "Painter",
-    "check_ending",
-    "halve",
-    "pack",
-    "unpack",
-    "SUFFIXES",
-    "Write",
-    "open_video",
-    "KINDS",
-    "animate",
+    *("KINDS", "SUFFIXES", "Packed", "Painter", "Write", "animate", "check_ending", "halve", "open_video"),
+    *("pack", "unpack"),
 ]
-
 
 Packed = NDArray[np.uint32]
 
@@ -99,22 +80,6 @@ def _mean(a: Packed, b: Packed) -> Packed:
     return (a & b) + (((a ^ b) & _EVEN) >> np.uint32(1))
 
 
-@dataclass(frozen=True)
-class _Disc:
-    """Offsets of the pixels of a dot from its middle, as rows and columns."""
-
-    rows: NDArray[np.intp]
-    columns: NDArray[np.intp]
-
-    @staticmethod
-    def of(diameter: float) -> _Disc:
-        """Return a disc of a diameter in pixels, one pixel at least."""
-        reach = int(np.ceil(diameter / 2))
-        grid = np.mgrid[-reach : reach + 1, -reach : reach + 1]
-        inside = (grid**2).sum(axis=0) <= max(diameter / 2, 0.5) ** 2
-        return _Disc(grid[0][inside], grid[1][inside])
-
-
 class Painter:
     """Paints one recording, frame by frame."""
 
@@ -123,18 +88,24 @@ class Painter:
         self.panel = panel  # speed, material or vorticity
         self.limit = limit  # top of the colour scale
         self._side = side * OVERSAMPLING
-        self._disc = _Disc.of(DOT * recording.spacing * self._side)
-        self._margin = int(self._disc.rows.max(initial=0)) + 1
+        diameter = DOT * recording.spacing * self._side
+        reach = int(np.ceil(diameter / 2))
+        grid = np.mgrid[-reach : reach + 1, -reach : reach + 1]
+        # rows and columns of a dot's pixels from its middle, one pixel at least
+        self._disc = grid[:, (grid**2).sum(axis=0) <= max(diameter / 2, 0.5) ** 2]
+        self._margin = int(self._disc[0].max(initial=0)) + 1
         self._drawn_walls: dict[bytes, Packed] = {}
         self._materials = pack(np.array([rgb(colour) for colour in MATERIAL_COLOURS]))[recording.material]
-        self._colours = _table(vorticity_map() if panel is Panel.VORTICITY else speed_map())
-        self._inside = _inside(recording, self._side)
+        colours = vorticity_map() if panel is Panel.VORTICITY else speed_map()
+        self._colours = pack((np.asarray(colours.colors)[:, :3] * 255.0).round().astype(np.uint8))
+        left, right, bottom, top = box_of(recording)
+        middle = (np.arange(self._side) + 0.5) / self._side
+        rows = (1.0 - middle >= bottom) & (1.0 - middle <= top)
+        self._inside: NDArray[np.bool_] = rows[:, None] & (middle >= left) & (middle <= right)
 
     def paint(self, scene: Scene) -> Packed:
         """Return the panel of one frame, shape [row, column], first row at the top."""
-        if self.panel is Panel.VORTICITY:
-            return halve(self._field(scene))
-        return halve(self._dots(scene))
+        return halve(self._field(scene) if self.panel is Panel.VORTICITY else self._dots(scene))
 
     def _walls(self, scene: Scene) -> Packed:
         """Return the empty box; it changes only where a wall turns."""
@@ -155,14 +126,13 @@ class Painter:
         column = np.minimum((x * self._side).astype(np.intp), self._side - 1) + margin
         row = np.minimum(((1.0 - y) * self._side).astype(np.intp), self._side - 1) + margin
         width = image.shape[1]
-        stamp = self._disc.rows * width + self._disc.columns
-        colours = self._materials if self.panel is Panel.MATERIAL else self._by_speed(scene)
+        stamp = self._disc[0] * width + self._disc[1]
+        colours = self._materials
+        if self.panel is Panel.SPEED:
+            colours = self._colours[_level(scene.speed / self.limit, len(self._colours))]
         places = (row * width + column)[:, None] + stamp
         image.reshape(-1)[places] = colours[shown][:, None]
         return np.where(self._inside, image[margin:-margin, margin:-margin], walls)
-
-    def _by_speed(self, scene: Scene) -> Packed:
-        return self._colours[_level(scene.speed / self.limit, len(self._colours))]
 
     def _field(self, scene: Scene) -> Packed:
         """Draw a square around every node that has a vorticity; paper elsewhere."""
@@ -181,25 +151,8 @@ def _level(share: NDArray[np.float64], levels: int) -> NDArray[np.intp]:
     return np.clip(share * levels, 0, levels - 1).astype(np.intp)
 
 
-def _table(colours: ListedColormap) -> Packed:
-    return pack((np.asarray(colours.colors)[:, :3] * 255.0).round().astype(np.uint8))
-
-
-def _inside(recording: Recording, side: int) -> NDArray[np.bool_]:
-    """Return the pixels within the walls, shape [row, column]."""
-    left, right, bottom, top = box_of(recording)
-    middle = (np.arange(side) + 0.5) / side
-    columns = (middle >= left) & (middle <= right)
-    rows = (1.0 - middle >= bottom) & (1.0 - middle <= top)
-    inside: NDArray[np.bool_] = rows[:, None] & columns
-    return inside
-
-
-SUFFIXES = (".mp4", ".gif")
-"""Endings of the files that can be written."""
-
-Write = Callable[[NDArray[np.uint8]], None]
-"""Appends one frame: RGB bytes, shape [row, column, 3]."""
+SUFFIXES = (".mp4", ".gif")  # endings of the files that can be written
+Write = Callable[[NDArray[np.uint8]], None]  # appends one frame: RGB bytes, shape [row, column, 3]
 
 _CODING = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "20", "-preset", "veryfast"]
 _CONTAINER = ["-f", "mp4", "-movflags", "+faststart", "-map_metadata", "-1"]
@@ -218,17 +171,26 @@ def open_video(path: Path, size: tuple[int, int], frames_per_second: float) -> I
 
 @contextmanager
 def _mp4(path: Path, size: tuple[int, int], rate: float) -> Iterator[Write]:
-    """Feed frames to ffmpeg through a pipe."""
+    """Feed frames to ffmpeg through a pipe: that which imageio brings, or the system's."""
+    try:
+        ffmpeg = str(require("imageio_ffmpeg", extra="plots").get_ffmpeg_exe())
+    except RuntimeError as error:
+        fix = "pip install 'lagbench[plots]', or write a .gif"
+        raise UsageError("no ffmpeg", got=error, fix=fix) from None
     width, height = size
     source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{rate:g}", "-i", "-"]
-    command = [_ffmpeg(), "-y", "-loglevel", "error", *source, *_CODING, *_CONTAINER, *_NO_DATES, str(path)]
+    command = [ffmpeg, "-y", "-loglevel", "error", *source, *_CODING, *_CONTAINER, *_NO_DATES, str(path)]
     with tempfile.TemporaryFile() as log:
         # A session of its own: Ctrl-C shall reach us, not the encoder.
         process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=log, start_new_session=True)
         pipe = cast("IO[bytes]", process.stdin)
         finished = False
+
+        def write(frame: NDArray[np.uint8]) -> None:
+            pipe.write(frame.tobytes())
+
         try:
-            yield lambda frame: _send(pipe, frame)
+            yield write
             pipe.close()
             finished = process.wait() == 0
         except BrokenPipeError:
@@ -244,21 +206,6 @@ def _mp4(path: Path, size: tuple[int, int], rate: float) -> Iterator[Write]:
             raise WorkFailedError(
                 "ffmpeg cannot encode the video", where=str(path.parent), got=said or "nothing said"
             )
-
-
-def _send(pipe: IO[bytes], frame: NDArray[np.uint8]) -> None:
-    pipe.write(frame.tobytes())
-
-
-def _ffmpeg() -> str:
-    """Return the path of the encoder that imageio brings, or of the system's."""
-    ffmpeg = require("imageio_ffmpeg", extra="plots")
-    try:
-        return str(ffmpeg.get_ffmpeg_exe())
-    except RuntimeError as error:
-        raise UsageError(
-            "no ffmpeg", got=error, fix="pip install 'lagbench[plots]', or write a .gif"
-        ) from None
 
 
 @contextmanager
@@ -279,14 +226,9 @@ def _gif(path: Path, rate: float) -> Iterator[Write]:
         file.write(b";")
 
 
-KINDS = (Panel.SPEED, Panel.MATERIAL, Panel.VORTICITY)
-"""What an animation can show."""
-
-SLOWEST, FASTEST = 0.01, 1000.0
-"""Frames per second that every player and both formats can hold [1/s]."""
-
-SAMPLES = 12
-"""Frames that set the colour scale, spread over the scenario."""
+KINDS = (Panel.SPEED, Panel.MATERIAL, Panel.VORTICITY)  # what an animation can show
+SLOWEST, FASTEST = 0.01, 1000.0  # frames per second that every player and both formats can hold [1/s]
+SAMPLES = 12  # frames that set the colour scale, spread over the scenario
 
 SIDE, GAP, MARGIN, TOP, BOTTOM = 512, 24, 24, 84, 76  # [pixel]; all even, as video coding wants it
 BAR = 300  # length of the colour bar [pixel]
@@ -327,11 +269,22 @@ def animate(
         WorkFailedError: the video cannot be encoded or written.
     """
     path = Path(output)
-    _check(path, kind, frames_per_second, every)
+    check_ending(path)
+    if kind is not None and kind not in KINDS:
+        fix = nearest(str(kind), map(str, KINDS))
+        raise UsageError(f"an animation cannot show {kind!r}", where="--kind", fix=fix)
+    if not SLOWEST <= frames_per_second <= FASTEST or every < 1:  # nan lies in no interval
+        raise UsageError(
+            "an animation needs a positive rate and step",
+            where="--fps, --every",
+            expected=f"{SLOWEST:g} to {FASTEST:g} frames/s, every 1 or more",
+            got=f"{frames_per_second} frames/s, every {every}",
+        )
     with ExitStack() as stack:
         sources = [source] if beside is None else [source, beside]
         recordings = [stack.enter_context(open_recording(item, registry=registry)) for item in sources]
-        film = _Film(recordings, _kind(kind, recordings))
+        mixed = any(np.unique(recording.material).size > 1 for recording in recordings)
+        film = _Film(recordings, Panel(kind or (Panel.MATERIAL if mixed else Panel.SPEED)))
         numbers = range(0, min(recording.frames for recording in recordings), every)
         write = stack.enter_context(open_video(path, film.size, frames_per_second))
         for frame in _counted(numbers, path, quiet=quiet):
@@ -348,28 +301,6 @@ def check_ending(path: Path) -> None:
             expected=f"a name ending in {' or '.join(SUFFIXES)}",
             got=path,
         )
-
-
-def _check(path: Path, kind: Panel | str | None, rate: float, every: int) -> None:
-    check_ending(path)
-    if kind is not None and kind not in KINDS:
-        raise UsageError(
-            f"an animation cannot show {kind!r}", where="--kind", fix=nearest(str(kind), map(str, KINDS))
-        )
-    if not SLOWEST <= rate <= FASTEST or every < 1:  # nan lies in no interval
-        raise UsageError(
-            "an animation needs a positive rate and step",
-            where="--fps, --every",
-            expected=f"{SLOWEST:g} to {FASTEST:g} frames/s, every 1 or more",
-            got=f"{rate} frames/s, every {every}",
-        )
-
-
-def _kind(kind: Panel | str | None, recordings: Sequence[Recording]) -> Panel:
-    if kind is not None:
-        return Panel(kind)
-    mixed = any(np.unique(recording.material).size > 1 for recording in recordings)
-    return Panel.MATERIAL if mixed else Panel.SPEED
 
 
 def _counted(numbers: range, path: Path, *, quiet: bool) -> Iterator[int]:
@@ -450,7 +381,11 @@ class _Counter:
         """Return the counter of a recording."""
         last = recording.frames - 1
         interval = recording.size.frame_interval
-        letters = {letter: _letter(letter) for letter in "0123456789.frames t="}
+        letters = {}
+        for letter in "0123456789.frames t=":
+            with figure(DIGIT / DPI, LINE / DPI) as drawn:
+                drawn.text(0.5, 0.25, letter, fontsize=8.5, family="DejaVu Sans Mono", ha="center", color=INK)
+                letters[letter] = pixels_of(drawn)
         return _Counter(letters, right, interval, (len(str(last)), len(f"{last * interval:.2f}")))
 
     def draw(self, image: NDArray[np.uint8], number: int) -> None:
@@ -461,10 +396,3 @@ class _Counter:
         for letter in text:
             image[top : top + LINE, left : left + DIGIT] = self.digits[letter]
             left += DIGIT
-
-
-def _letter(letter: str) -> NDArray[np.uint8]:
-    """Return the picture of one character in a cell of its own, shape [LINE, DIGIT, 3]."""
-    with figure(DIGIT / DPI, LINE / DPI) as drawn:
-        drawn.text(0.5, 0.25, letter, fontsize=8.5, family="DejaVu Sans Mono", ha="center", color=INK)
-        return pixels_of(drawn)

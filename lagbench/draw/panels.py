@@ -24,19 +24,9 @@ if TYPE_CHECKING:
     from matplotlib.patches import Rectangle
 
 __all__ = [
-    "DOT",
-    "TITLES",
-    "Panel",
-    "box_of",
-    "colour_bar",
-    "colour_scale",
-    "draw",
-    "draw_walls",
-    "limit_of",
-    "material_key",
-    "moving_walls",
+    *("DOT", "TITLES", "Panel", "box_of", "colour_bar", "colour_scale", "draw", "draw_walls", "limit_of"),
+    *("material_key", "moving_walls"),
 ]
-
 
 Floats = NDArray[np.float64]
 
@@ -65,11 +55,8 @@ UNITS = {
 }
 """What colour bars say: physical time throughout, as velocity in the files."""
 
-DOT = 1.25
-"""Diameter of a drawn particle in particle spacings: neighbours overlap a little."""
-
-MOST_DOTS = 1 << 16
-"""Particles drawn at the most; more would take memory and no eye would tell."""
+DOT = 1.25  # diameter of a drawn particle in particle spacings: neighbours overlap a little
+MOST_DOTS = 1 << 16  # particles drawn at the most; more would take memory and no eye would tell
 
 FEW_NODES = 4
 _ALONG = np.array(
@@ -101,7 +88,22 @@ def draw(axes: Axes, panel: Panel, scene: Scene, *, limit: float, detail: float 
         _draw_field(axes, scene, scene.vorticity, scale)
     else:
         _draw_field(axes, scene, np.where(scene.fields.counted, _grid_speed(scene), np.nan), scale)
-        _draw_streamlines(axes, scene, detail)
+        fields = scene.fields
+        if fields.differentiable.sum() < FEW_NODES:
+            return
+        u, v = (np.ma.masked_array(fields.velocity[..., axis], ~fields.counted).T for axis in (0, 1))
+        axes.streamplot(
+            fields.grid.axis,
+            fields.grid.axis,
+            u,
+            v,
+            density=0.7 + 0.7 * detail,
+            color=PAPER,
+            linewidth=0.35 + 0.45 * detail,
+            arrowsize=0.3 + 0.4 * detail,
+            maxlength=2.0,
+            zorder=2,
+        )
 
 
 def box_of(recording: Recording) -> tuple[float, float, float, float]:
@@ -118,8 +120,8 @@ def moving_walls(recording: Recording, frame: int) -> Iterator[tuple[int, Floats
 
 
 def draw_walls(axes: Axes, recording: Recording, frame: int) -> None:
-    """Draw the walls as bands around the box; arrowheads show which way a moving one slides."""
-    from matplotlib.patches import Rectangle
+    """Draw the walls as bands around the box; five arrowheads show which way a moving one slides."""
+    from matplotlib.patches import Polygon, Rectangle
 
     axes.set(xlim=(0, 1), ylim=(0, 1), xticks=[], yticks=[], aspect="equal", frame_on=False)
     left, right, bottom, top = box_of(recording)
@@ -134,37 +136,25 @@ def draw_walls(axes: Axes, recording: Recording, frame: int) -> None:
     for wall, velocity in moving_walls(recording, frame):
         x, y, width, height = bands[wall]
         axes.add_patch(Rectangle((x, y), width, height, color=MOVING, lw=0, zorder=0.6))
-        _draw_arrowheads(axes, bands[wall], velocity / np.abs(velocity).max())
-
-
-def _draw_arrowheads(axes: Axes, band: tuple[float, float, float, float], along: Floats) -> None:
-    """Draw five arrowheads in a moving wall."""
-    from matplotlib.patches import Polygon
-
-    x, y, width, height = band
-    size = 0.3 * min(width, height)
-    across = np.array([-along[1], along[0]])
-    length = np.abs(along) * max(width, height)
-    for share in (-0.4, -0.2, 0.0, 0.2, 0.4):
-        middle = np.array([x + width / 2, y + height / 2]) + share * length
-        tip, tail = middle + size * along, middle - 0.7 * size * along
-        corners = [tip, tail + size * across, tail - size * across]
-        axes.add_patch(Polygon(corners, closed=True, color=PAPER, lw=0, zorder=0.7))
-
-
-def _dot_area(axes: Axes, recording: Recording) -> float:
-    """Return the marker area at which neighbouring particles overlap a little [point^2]."""
-    drawn = axes.get_figure()
-    inches = axes.get_position().width * drawn.get_figwidth()  # type: ignore[union-attr]
-    return float((DOT * 72.0 * inches * recording.spacing) ** 2)
+        along = velocity / np.abs(velocity).max()
+        size = 0.3 * min(width, height)
+        across = np.array([-along[1], along[0]])
+        length = np.abs(along) * max(width, height)
+        for share in (-0.4, -0.2, 0.0, 0.2, 0.4):
+            middle = np.array([x + width / 2, y + height / 2]) + share * length
+            tip, tail = middle + size * along, middle - 0.7 * size * along
+            corners = [tip, tail + size * across, tail - size * across]
+            axes.add_patch(Polygon(corners, closed=True, color=PAPER, lw=0, zorder=0.7))
 
 
 def _draw_dots(axes: Axes, scene: Scene, colours: NDArray[Any]) -> None:
     """Draw a dot for every particle, or for every k-th of too many, cut off at the walls."""
     step = -(-len(scene.position) // MOST_DOTS)
     x, y = scene.position[::step].T
-    area = step * _dot_area(axes, scene.recording)
-    dots = axes.scatter(x, y, area, colours[::step], linewidths=0, zorder=2)
+    # the marker area at which neighbouring particles overlap a little [point^2]
+    inches = axes.get_position().width * axes.get_figure().get_figwidth()  # type: ignore[union-attr]
+    area = float((DOT * 72.0 * inches * scene.recording.spacing) ** 2)
+    dots = axes.scatter(x, y, step * area, colours[::step], linewidths=0, zorder=2)
     dots.set_clip_path(_box_patch(axes, scene.recording))
 
 
@@ -199,26 +189,6 @@ def _grid_speed(scene: Scene) -> Floats:
     return per_frame / scene.recording.size.frame_interval
 
 
-def _draw_streamlines(axes: Axes, scene: Scene, detail: float) -> None:
-    """Draw streamlines of the velocity on the grid; nothing where hardly a node counts."""
-    fields = scene.fields
-    if fields.differentiable.sum() < FEW_NODES:
-        return
-    u, v = (np.ma.masked_array(fields.velocity[..., axis], ~fields.counted).T for axis in (0, 1))
-    axes.streamplot(
-        fields.grid.axis,
-        fields.grid.axis,
-        u,
-        v,
-        density=0.7 + 0.7 * detail,
-        color=PAPER,
-        linewidth=0.35 + 0.45 * detail,
-        arrowsize=0.3 + 0.4 * detail,
-        maxlength=2.0,
-        zorder=2,
-    )
-
-
 def colour_scale(panel: Panel, limit: float) -> ScalarMappable:
     """Return the colours of speeds from 0, or vorticities from minus the limit, to the limit."""
     from matplotlib.cm import ScalarMappable
@@ -231,20 +201,16 @@ def colour_scale(panel: Panel, limit: float) -> ScalarMappable:
 
 def colour_bar(axes: Axes, panel: Panel, limit: float, *, label: str | None = None) -> None:
     """Draw a horizontal colour bar with its unit; pointed where values lie beyond it."""
+    from matplotlib.ticker import MaxNLocator
+
     drawn = axes.get_figure()
     extend = "both" if panel is Panel.VORTICITY else "max"
     bar = drawn.colorbar(colour_scale(panel, limit), cax=axes, orientation="horizontal", extend=extend)  # type: ignore[union-attr]
     bar.outline.set_visible(False)
     bar.set_label(label or UNITS[panel], labelpad=3)
     bar.ax.tick_params(length=0, pad=3)
-    bar.locator = _few_ticks()
+    bar.locator = MaxNLocator(nbins=5, steps=[1, 2, 2.5, 5, 10])
     bar.update_ticks()
-
-
-def _few_ticks() -> object:
-    from matplotlib.ticker import MaxNLocator
-
-    return MaxNLocator(nbins=5, steps=[1, 2, 2.5, 5, 10])
 
 
 def material_key(axes: Axes, materials: NDArray[np.int8]) -> None:

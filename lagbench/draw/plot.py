@@ -1,17 +1,14 @@
-"""Pictures of one frame: particles, vorticity, streamlines, with the walls around them.
+"""Pictures of one frame, and contact sheets: many scenarios of a split on one page.
 
-Needs matplotlib: ``pip install 'lagbench[plots]'``. The same frame gives the same bytes.
-
-Contact sheets: many scenarios of a split on one page, to be looked at.
-
-Splits whose scenarios draw a ``family`` or ``pair`` get one row per kind over time; the
-others get a table of scenarios at one frame. Needs matplotlib.
+Needs matplotlib: ``pip install 'lagbench[plots]'``. The same frame gives the same bytes. Splits whose
+scenarios draw a ``family`` or ``pair`` get a sheet of one row per kind over time; the others get a table of
+scenarios at one frame.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -31,15 +28,7 @@ if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.figure import Figure
 
-__all__ = [
-    "contact_sheet",
-    "scenario_files",
-    "KINDS",
-    "Panel",
-    "describe",
-    "check_kind",
-    "plot_frame",
-]
+__all__ = ["KINDS", "Panel", "check_kind", "contact_sheet", "describe", "plot_frame", "scenario_files"]
 
 
 COLUMNS = 6
@@ -136,43 +125,33 @@ def scenario_files(size: Size, root: Path) -> list[Path]:
     return [path for path in (scenario_path(root, key) for key in keys) if path.is_file()]
 
 
-def _kind_of(recording: Recording) -> str:
-    names = [str(recording.parameters[name]) for name in KIND_PARAMETERS if name in recording.parameters]
-    return names[0] if names else ""
-
-
 def _first_of_each_kind(files: Sequence[Path], splits: Registry) -> dict[str, Path]:
     """Return the first scenario of every family or pair, in order of appearance."""
     found: dict[str, Path] = {}
     for path in files:
         with open_recording(path, registry=splits) as recording:
-            if kind := _kind_of(recording):
-                found.setdefault(kind, path)
+            kinds = [
+                str(recording.parameters[name]) for name in KIND_PARAMETERS if name in recording.parameters
+            ]
+            if kinds and kinds[0]:
+                found.setdefault(kinds[0], path)
     return dict(sorted(found.items(), key=lambda item: item[1].name))
 
 
 def _over_time(kinds: dict[str, Path], panel: Panel | None, splits: Registry) -> _Sheet:
     """Return one row per kind: the same moments of each, one colour scale."""
-    rows = [list(_moments(path, splits)) for path in kinds.values()]
+    rows = []
+    for path in kinds.values():
+        with open_recording(path, registry=splits) as recording:
+            rows.append([recording.scene(round(share * (recording.frames - 1))) for share in TIMES])
     if panel is None:
         mixed = any(np.unique(row[0].recording.material).size > 1 for row in rows)
         panel = Panel.MATERIAL if mixed else Panel.SPEED
     limit = max(limit_of(panel, scene) for row in rows for scene in row)
-    cells = [
-        [_Cell(scene=s, label=_moment_label(kind, s, first=s is row[0]), limit=limit) for s in row]
-        for kind, row in zip(kinds, rows, strict=True)
-    ]
+    cells = [[_Cell(scene=s, label=f"frame {s.frame}", limit=limit) for s in row] for row in rows]
+    for kind, row in zip(kinds, cells, strict=True):
+        row[0] = replace(row[0], label=f"{row[0].scene.recording.scenario}  {kind}")
     return _Sheet(rows=cells, panel=panel, subtitle="the first scenario of each kind over time", limit=limit)
-
-
-def _moments(path: Path, splits: Registry) -> Iterator[Scene]:
-    with open_recording(path, registry=splits) as recording:
-        for share in TIMES:
-            yield recording.scene(round(share * (recording.frames - 1)))
-
-
-def _moment_label(kind: str, scene: Scene, *, first: bool) -> str:
-    return f"{scene.recording.scenario}  {kind}" if first else f"frame {scene.frame}"
 
 
 def _table(files: Sequence[Path], panel: Panel | None, frame: int | None, splits: Registry) -> _Sheet:
@@ -277,11 +256,22 @@ def plot_frame(
     check_kind(kind)
     with open_recording(source, registry=registry) as recording:
         scene = recording.scene(frame)
-    panels = _panels(recording) if kind == ALL else [Panel(kind)]
+    mixed = np.unique(recording.material).size > 1
+    three = [Panel.SPEED, Panel.VORTICITY, Panel.STREAMLINES]
+    if mixed:
+        three = [Panel.MATERIAL, Panel.SPEED, Panel.VORTICITY]
+    panels = three if kind == ALL else [Panel(kind)]
     width = 2 * MARGIN + len(panels) * SIDE + (len(panels) - 1) * GAP
     with figure(width, TOP + SIDE + BAR, dpi=dpi) as drawn:
         single = len(panels) == 1
-        subtitle = describe(recording) if single else SEPARATOR.join([describe(recording), *_moment(scene)])
+        subtitle = describe(recording)
+        if not single:
+            # frame and time, and which walls move, which way, how fast
+            said = [subtitle, f"frame {scene.frame}", f"t = {scene.time:.2f} s"]
+            for wall, v in moving_walls(recording, scene.frame):
+                way = DIRECTIONS[int(np.sign(v[0])), int(np.sign(v[1]))]
+                said.append(f"{WALLS[wall]} wall moves {way} at {np.abs(v).max():.3g} length/s")
+            subtitle = SEPARATOR.join(said)
         header(drawn, recording.title, subtitle, left=MARGIN)
         _draw_panels(drawn, panels, scene)
         return save(drawn, output)
@@ -294,30 +284,6 @@ def describe(recording: Recording) -> str:
         parts.append(f"Re {recording.reynolds:.0f}")
     parts += [f"{name} {recording.parameters[name]}" for name in MARKS if name in recording.parameters]
     return SEPARATOR.join(parts)
-
-
-def _moment(scene: Scene) -> list[str]:
-    """Return frame and time, and which walls move, which way, how fast."""
-    return [f"frame {scene.frame}", f"t = {scene.time:.2f} s", *_motions(scene)]
-
-
-def _motions(scene: Scene) -> list[str]:
-    """Say which walls move, which way, how fast."""
-    return [
-        f"{WALLS[wall]} wall moves {DIRECTIONS[_sign(v[0]), _sign(v[1])]} at {np.abs(v).max():.3g} length/s"
-        for wall, v in moving_walls(scene.recording, scene.frame)
-    ]
-
-
-def _sign(value: float) -> int:
-    return int(np.sign(value))
-
-
-def _panels(recording: Recording) -> list[Panel]:
-    """Return the three panels that suit a scenario."""
-    if np.unique(recording.material).size > 1:
-        return [Panel.MATERIAL, Panel.SPEED, Panel.VORTICITY]
-    return [Panel.SPEED, Panel.VORTICITY, Panel.STREAMLINES]
 
 
 def _draw_panels(drawn: Figure, panels: Sequence[Panel], scene: Scene) -> None:

@@ -159,14 +159,9 @@ def open_recording(
         key = head.key
         identity = {"split": key.split, "size": key.size, "scenario": key.scenario, "subset": key.subset}
         variables = set(file.variables)
-        splits = rooted(_root_of(Path(source)), registry)
+        parents = Path(source).absolute().parents  # the root is where `scenario_path` has it
+        splits = rooted(parents[min(4, len(parents) - 1)], registry)
         yield Recording(identity, head.parameters, head.frames, variables, file.read, splits)
-
-
-def _root_of(path: Path) -> Path:
-    """Return the root folder of a scenario file that stands where ``scenario_path`` puts it."""
-    parents = path.absolute().parents
-    return parents[min(4, len(parents) - 1)]
 
 
 def _of_dataset(data: xr.Dataset, registry: Registry) -> Recording:

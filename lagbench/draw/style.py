@@ -1,6 +1,4 @@
-"""Figures without a display: one style, and PNG files with the same bytes every time.
-
-Colours of every picture: safe for colour-blind readers, the same in plots and animations.
+"""Figures without a display: one style, one set of colours, PNG files with the same bytes every time.
 
 Materials take hues of Okabe & Ito (2008), which stay apart under every common colour vision
 deficiency and in grey. Speed and vorticity take matplotlib maps that do as well. All of them,
@@ -30,40 +28,15 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
 __all__ = [
-    "INK",
-    "MATERIAL_COLOURS",
-    "MOVING",
-    "MUTED",
-    "PAPER",
-    "WALL",
-    "colours",
-    "reduced",
-    "rgb",
-    "speed_map",
-    "vorticity_map",
-    "DPI",
-    "figure",
-    "header",
-    "pixels_of",
-    "png_bytes",
-    "save",
+    *("DPI", "INK", "MATERIAL_COLOURS", "MOVING", "MUTED", "PAPER", "WALL", "colours", "figure", "header"),
+    *("pixels_of", "png_bytes", "reduced", "rgb", "save", "speed_map", "vorticity_map"),
 ]
 
-
-INK = "#1c2330"
-"""Titles and labels."""
-
-MUTED = "#667085"
-"""Second lines and tick labels."""
-
-PAPER = "#ffffff"
-"""Background."""
-
-WALL = "#d5d9e0"
-"""Walls at rest."""
-
-MOVING = "#d55e00"
-"""Moving walls: vermilion, which jelly has too; no split has both."""
+INK = "#1c2330"  # titles and labels
+MUTED = "#667085"  # second lines and tick labels
+PAPER = "#ffffff"  # background
+WALL = "#d5d9e0"  # walls at rest
+MOVING = "#d55e00"  # moving walls: vermilion, which jelly has too; no split has both
 
 MATERIAL_COLOURS = ("#0072b2", "#d55e00", "#56b4e9", "#e69f00")
 """Colours of liquid, jelly, snow, rope: blue, vermilion, sky blue, orange."""
@@ -93,7 +66,15 @@ def rgb(colour: str) -> NDArray[np.uint8]:
 @functools.cache
 def colours() -> NDArray[np.uint8]:
     """Return the 256 colours of every file, paper first, shape [256, 3]."""
-    table = np.concatenate(list(_stretches())).round().astype(np.uint8)
+    paper = rgb(PAPER).astype(float)
+    speeds = np.asarray(speed_map().colors)[:, :3] * 255.0
+    drawn = [paper[None], speeds, np.asarray(vorticity_map().colors)[:, :3] * 255.0]
+    # blends with the paper where edges are smoothed
+    drawn += [_blend(speeds[::3], paper, 0.62), _blend(speeds[::5], paper, 0.3)]
+    for colour, shares in ((INK, 8), (MUTED, 6), (MOVING, 4), (WALL, 3), *((m, 4) for m in MATERIAL_COLOURS)):
+        for share in np.arange(1, shares + 1) / shares:
+            drawn.append(_blend(rgb(colour)[None].astype(float), paper, share))
+    table = np.concatenate(drawn).round().astype(np.uint8)
     return np.concatenate([table, np.repeat(table[:1], 256 - len(table), axis=0)])
 
 
@@ -103,20 +84,6 @@ def reduced(image: Image) -> Image:
     palette = images.new("P", (1, 1))
     palette.putpalette(colours().tobytes())
     return image.quantize(palette=palette, dither=images.Dither.NONE)
-
-
-def _stretches() -> Iterator[NDArray[np.float64]]:
-    """Yield what is drawn, and its blends with the paper where edges are smoothed."""
-    paper = rgb(PAPER).astype(float)
-    speeds = np.asarray(speed_map().colors)[:, :3] * 255.0
-    yield paper[None]
-    yield speeds
-    yield np.asarray(vorticity_map().colors)[:, :3] * 255.0
-    yield _blend(speeds[::3], paper, 0.62)
-    yield _blend(speeds[::5], paper, 0.3)
-    for colour, shares in ((INK, 8), (MUTED, 6), (MOVING, 4), (WALL, 3), *((m, 4) for m in MATERIAL_COLOURS)):
-        for share in np.arange(1, shares + 1) / shares:
-            yield _blend(rgb(colour)[None].astype(float), paper, share)
 
 
 def _blend(table: NDArray[np.float64], paper: NDArray[np.float64], share: float) -> NDArray[np.float64]:
@@ -131,8 +98,7 @@ def _cut(name: str, low: float, high: float, levels: int) -> ListedColormap:
     return cut
 
 
-ENDINGS = (".png", ".pdf", ".svg")
-"""Endings of files that pictures can be."""
+ENDINGS = (".png", ".pdf", ".svg")  # endings of files that pictures can be
 
 DPI = 128  # a power of two: every whole number of pixels is exact in inches
 

@@ -2,8 +2,6 @@
 
 Classes of marks: ``s0`` .. ``s5`` series, ``d1`` .. ``d3`` dashes, ``truth``, ``floor0`` ..
 for the floors. Each chart has a title and a description for those who do not see it.
-
-Axes: from values to pixels, with round ticks.
 """
 
 from __future__ import annotations
@@ -20,18 +18,9 @@ from .html import Markup, clipped, decimals, join, path_data, power, tag
 from .names import Names, written
 
 __all__ = [
-    "Scale",
-    "Tick",
-    "linear",
-    "close_logarithmic",
-    "logarithmic",
+    *("Bar", "Plot", "Scale", "Spot", "Tick", "bar_chart", "close_logarithmic", "linear", "logarithmic"),
     "spanning",
-    "Bar",
-    "Plot",
-    "Spot",
-    "bar_chart",
 ]
-
 
 Floats = NDArray[np.float64]
 
@@ -40,8 +29,6 @@ WIDE = 60.0
 
 DEEPEST = 1e-6
 """A logarithmic axis reaches no lower than this share of its top."""
-
-_STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)
 
 
 @dataclass(frozen=True)
@@ -83,7 +70,10 @@ def linear(low: float, high: float, *, count: int = 5, tight: bool = False) -> S
     if not high > low:
         middle = abs(low) or 1.0
         low, high = low - 0.5 * middle, low + 0.5 * middle
-    step = _round_step((high - low) / count)
+    rough = (high - low) / count
+    unit = 10.0 ** math.floor(math.log10(rough))
+    # the round number next above
+    step = next(k * unit for k in (1.0, 2.0, 2.5, 5.0, 10.0) if k * unit >= rough * (1 - 1e-9))
     first, last = math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9)
     numbers = [k * step for k in range(first, last + 1)]
     if tight:
@@ -96,12 +86,6 @@ def linear(low: float, high: float, *, count: int = 5, tight: bool = False) -> S
     unit = 10.0**exponent
     labels = decimals([value / unit for value in numbers], step / unit)
     return Scale(low, high, False, exponent, tuple(map(Tick, numbers, labels)))
-
-
-def _round_step(rough: float) -> float:
-    """Return the round number next above."""
-    unit = 10.0 ** math.floor(math.log10(rough))
-    return next(factor * unit for factor in _STEPS if factor * unit >= rough * (1 - 1e-9))
 
 
 def logarithmic(low: float, high: float) -> Scale:
@@ -123,15 +107,11 @@ def close_logarithmic(low: float, high: float) -> Scale:
     last = min(i for i, (value, *_) in enumerate(marks) if value >= 1.25 * high)
     kept = marks[first : last + 1]
     shown = [mark for mark in kept if mark[1] == 1] if len(kept) > 8 else kept
-    ticks = tuple(Tick(value, _spelt(value, factor, k)) for value, factor, k in shown)
-    return Scale(kept[0][0], kept[-1][0], True, 0, ticks)
-
-
-def _spelt(value: float, factor: int, exponent: int) -> str:
-    """Return a round number, in powers of ten where it would be long."""
-    if -3 <= exponent <= 3:
-        return f"{value:g}"
-    return power(exponent) if factor == 1 else f"{factor}×{power(exponent)}"
+    ticks = []
+    for value, factor, k in shown:
+        long = power(k) if factor == 1 else f"{factor}×{power(k)}"
+        ticks.append(Tick(value, f"{value:g}" if -3 <= k <= 3 else long))
+    return Scale(kept[0][0], kept[-1][0], True, 0, tuple(ticks))
 
 
 def spanning(series: Sequence[ArrayLike], *, zero: bool = True, log: bool | None = None) -> Scale:
@@ -207,14 +187,7 @@ class Plot:
             self._add("path", "", d=path_data([*there, *back]) + "Z", class_=f"band {kind}")
 
     def steps(self, edges: ArrayLike, heights: ArrayLike, kind: str, title: str = "") -> None:
-        """Draw a histogram's outline.
-
-        Args:
-            edges: edges of the bins, shape [bin + 1].
-            heights: height of each bin, shape [bin].
-            kind: classes of the mark.
-            title: shown under the pointer.
-        """
+        """Draw a histogram's outline; there is one edge more than heights."""
         x = np.repeat(np.asarray(edges, np.float64), 2)[1:-1]
         self.line(x, np.repeat(np.asarray(heights, np.float64), 2), f"steps {kind}", title)
 

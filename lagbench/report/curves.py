@@ -1,7 +1,4 @@
-"""Curves over frames: errors, correlation and energy, of scenarios and of methods.
-
-Bars at the key frame: correlation (Fig. 5.13), divergence (Fig. 5.16), distance.
-"""
+"""Curves over frames, of scenarios and of methods; bars, histograms and residuals at the key frame."""
 
 from __future__ import annotations
 
@@ -11,72 +8,52 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.metrics.aggregate import Score, bootstrap_interval
-from lagbench.metrics.metric import Direction, Metric, mean
+from lagbench.metrics.metric import Direction, mean
 
 from .chart import Bar, Plot, Scale, bar_chart, linear, spanning
 from .html import Markup, clipped, html, join, quantity, sentence, tag, text, words
 from .page import Figure, key, table
-from .subject import Row, Subject, kind_of
+from .subject import Gallery, Moment, Row, Subject, kind_of
 
 __all__ = [
-    "body_curves",
-    "energy_curves",
-    "error_curves",
-    "method_curves",
-    "bar_figures",
+    *("bar_figures", "body_curves", "energy_curves", "error_curves", "histogram_figures", "method_curves"),
+    *("residual_figures", "shares_of"),
 ]
-
 
 Floats = NDArray[np.float64]
 
-STABLE = 0.8
-"""Correlation below which a rollout no longer counts as stable."""
-
-TOLERATED = 3.0
-"""The axis of energies reaches so many times the truth's greatest; what is beyond is cut off."""
+Series = Sequence[tuple[str, str, Floats]]  # label, classes and values over frames of each line
+STABLE = 0.8  # correlation below which a rollout no longer counts as stable
+TOLERATED = 3.0  # the axis of energies reaches so many times the truth's greatest; what is beyond is cut off
 
 
 def error_curves(subject: Subject) -> Iterator[Figure]:
     """Yield the error over frames for all test scenarios, two figures per entry (Fig. 5.10)."""
+    several = len(subject.entries) > 1
+    shared = " The axis is shared by all files." if several else ""
+    first, last = subject.frames[0], subject.frames[-1]
     for row in subject.rows:
         for name in ("vorticity_mse" if subject.full_box else "attribute_mse", "position_rmse"):
-            if row.entry is not None and name in row.scores:
-                yield _scenario_figure(subject, row, name)
-
-
-def _scenario_figure(subject: Subject, row: Row, name: str) -> Figure:
-    score = row.scores[name]
-    number = row.entry.number if row.entry else 0
-    several = len(subject.entries) > 1
-    y = spanning([r.scores[name].per_frame for r in subject.rows if r.entry is not None])
-    shared = " The axis is shared by all files." if several else ""
-    return Figure(
-        name=f"scenarios-{name.replace('_', '-')}-{number}",
-        title=f"{words(name, capital=True)}, every test scenario" + (f": {row.name}" if several else ""),
-        thesis="Fig. 5.10",
-        body=join([key(_scenario_key(score)), _scenario_chart(subject, score, y, row.name)]),
-        caption=join([f"{sentence(score.metric)} One line per test scenario.{shared}"]),
-        data=_numbers(subject, [(f"scenario {i}", values) for i, values in _by_scenario(score)], "scenario"),
-    )
-
-
-def _scenario_key(score: Score) -> list[tuple[str, str]]:
-    return [(kind_of(i), f"scenario {number}") for i, number in enumerate(score.scenarios)]
-
-
-def _by_scenario(score: Score) -> Iterator[tuple[int, Floats]]:
-    yield from zip(score.scenarios, score.per_frame, strict=True)
-
-
-def _scenario_chart(subject: Subject, score: Score, y: Scale, name: str) -> Markup:
-    plot = Plot(_frame_axis(subject), y, x_label="frame", y_label=quantity(score.metric))
-    for i, (scenario, values) in enumerate(_by_scenario(score)):
-        plot.line(subject.frames, values, kind_of(i), f"scenario {scenario}")
-    return plot.svg(
-        f"{score.metric.name} over frames",
-        f"Lines of {len(score.scenarios)} test scenarios of {name} from frame {subject.frames[0]}"
-        f" to {subject.frames[-1]}.",
-    )
+            if row.entry is None or name not in row.scores:
+                continue
+            score = row.scores[name]
+            y = spanning([r.scores[name].per_frame for r in subject.rows if r.entry is not None])
+            scenarios = enumerate(zip(score.scenarios, score.per_frame, strict=True))
+            series = [(f"scenario {number}", kind_of(i), values) for i, (number, values) in scenarios]
+            plot = Plot(_frame_axis(subject), y, x_label="frame", y_label=quantity(score.metric))
+            for label, kind, values in series:
+                plot.line(subject.frames, values, kind, label)
+            said = f"Lines of {len(series)} test scenarios of {row.name} from frame {first} to {last}."
+            yield _figure(
+                subject,
+                f"scenarios-{name.replace('_', '-')}-{row.entry.number}",
+                f"{words(name, capital=True)}, every test scenario" + (f": {row.name}" if several else ""),
+                "Fig. 5.10",
+                series,
+                plot.svg(f"{score.metric.name} over frames", said),
+                f"{sentence(score.metric)} One line per test scenario.{shared}",
+                what="scenario",
+            )
 
 
 def method_curves(subject: Subject) -> Iterator[Figure]:
@@ -88,139 +65,138 @@ def method_curves(subject: Subject) -> Iterator[Figure]:
         ("vorticity_pearson", "Fig. 5.13"),
     ):
         rows = [row for row in subject.rows if name in row.scores]
-        if rows:
-            yield _method_figure(subject, rows, name, thesis)
-
-
-def _method_figure(subject: Subject, rows: Sequence[Row], name: str, thesis: str) -> Figure:
-    metric = rows[0].scores[name].metric
-    series = [(row, _mean(row.scores[name])) for row in rows]
-    correlation = name == "vorticity_pearson"
-    twin = np.asarray(subject.task.twin_floor)
-    twinned = name == "position_rmse" and len(twin) == len(subject.frames)
-    y = spanning([*(values for _, values in series), *([twin] if twinned else [])])
-    if correlation:
-        y = linear(min(0.0, _least(values for _, values in series)), 1.0)
-    plot = Plot(_frame_axis(subject), y, x_label="frame", y_label=quantity(metric))
-    for row, _ in series:
-        if row.entry is not None:
-            plot.band(subject.frames, *_interval(row.scores[name]), row.kind)
-    for row, values in reversed(series):
-        plot.line(subject.frames, values, row.kind, row.name)
-    items = [(row.kind, row.name) for row in rows]
-    if twinned:
-        plot.line(subject.frames, twin, "twin", "the solver after a nudge of 2^-20")
-        items.append(("twin", "twin of the solver"))
-    if correlation:
-        plot.level(STABLE, f"stable above {STABLE}")
-    return Figure(
-        name=f"methods-{name.replace('_', '-')}",
-        title=f"{words(metric.name, capital=True)} over frames",
-        thesis=thesis,
-        body=join([key(items), _chart(plot, metric, rows)]),
-        caption=join(
-            [
-                f"{sentence(metric)} Mean over {len(subject.scenarios)} test scenarios; the bands are 95 %"
-                " bootstrap intervals over scenarios. ",
-                "Grey: floors that cost nothing.",
-            ]
-        ),
-        data=_numbers(subject, [(row.name, values) for row, values in series], "method"),
-    )
-
-
-def _chart(plot: Plot, metric: Metric, rows: Sequence[Row]) -> Markup:
-    names = ", ".join(row.name for row in rows)
-    return plot.svg(f"{metric.name} over frames", f"{metric.summary}, one line each for {names}.")
+        if not rows:
+            continue
+        metric = rows[0].scores[name].metric
+        series = [(row.name, row.kind, _mean(row.scores[name])) for row in rows]
+        twin = np.asarray(subject.task.twin_floor)
+        twinned = name == "position_rmse" and len(twin) == len(subject.frames)
+        y = spanning([*(values for _, _, values in series), *([twin] if twinned else [])])
+        if name == "vorticity_pearson":
+            y = linear(min(float(np.min(s[np.isfinite(s)], initial=0.0)) for _, _, s in series), 1.0)
+        plot = Plot(_frame_axis(subject), y, x_label="frame", y_label=quantity(metric))
+        for row in rows:
+            if row.entry is not None:
+                columns = row.scores[name].per_frame.T
+                low, high = np.array([bootstrap_interval(column) for column in columns]).T
+                plot.band(subject.frames, low, high, row.kind)
+        _draw(subject, plot, series)
+        if twinned:
+            plot.line(subject.frames, twin, "twin", "the solver after a nudge of 2^-20")
+        if name == "vorticity_pearson":
+            plot.level(STABLE, f"stable above {STABLE}")
+        yield _figure(
+            subject,
+            f"methods-{name.replace('_', '-')}",
+            f"{words(metric.name, capital=True)} over frames",
+            thesis,
+            series,
+            plot.svg(f"{metric.name} over frames", f"{metric.summary}, one line each for {_names(rows)}."),
+            f"{sentence(metric)} Mean over {len(subject.scenarios)} test scenarios; the bands are 95 %"
+            " bootstrap intervals over scenarios. Grey: floors that cost nothing.",
+            more=[("twin", "twin of the solver")] if twinned else [],
+        )
 
 
 def energy_curves(subject: Subject) -> Iterator[Figure]:
     """Yield kinetic energy: what is kept of it (Fig. 5.19), and its value (Fig. 5.28)."""
-    first = subject.entries[0].card.submission
-    kept = [(row, _mean(row.scores["energy_retention"])) for row in subject.rows]
-    true = _mean(first["energy_retention_true"])
+    first, scenario = subject.entries[0].card.submission, subject.scenarios[0]
+    true = ("truth", "truth", 100.0 * _mean(first["energy_retention_true"]))
     yield _energy_figure(
         subject,
         "energy-kept",
         "Kinetic energy kept",
         "Fig. 5.19",
-        [("truth", "truth", 100.0 * true)] + [(row.name, row.kind, 100.0 * values) for row, values in kept],
+        [true, *((r.name, r.kind, 100.0 * _mean(r.scores["energy_retention"])) for r in subject.rows)],
         "kinetic energy [% of the last given frame]",
         f"Kinetic energy relative to the last given frame, mean over {len(subject.scenarios)} test scenarios."
         " A surrogate that damps falls below the truth, one that blows up rises above it;"
         " more energy than the truth is no merit.",
     )
-    scenario = subject.scenarios[0]
+    raw = [(e.name, e.kind, e.card.submission["energy_predicted"].per_frame[0]) for e in subject.entries]
     yield _energy_figure(
         subject,
         "energy-raw",
         f"Kinetic energy, scenario {scenario}",
         "Fig. 5.28",
-        [("truth", "truth", first["energy_true"].per_frame[0])]
-        + [(e.name, e.kind, e.card.submission["energy_predicted"].per_frame[0]) for e in subject.entries],
+        [("truth", "truth", first["energy_true"].per_frame[0]), *raw],
         "kinetic energy [mass length²/frame²]",
         f"E = Σ m |u|² / 2 with u the displacement per frame, in scenario {scenario}.",
     )
 
 
 def _energy_figure(
-    subject: Subject,
-    name: str,
-    title: str,
-    thesis: str,
-    series: Sequence[tuple[str, str, Floats]],
-    quantity: str,
-    text: str,
+    subject: Subject, name: str, title: str, thesis: str, series: Series, label: str, said: str
 ) -> Figure:
     top = np.nanmax(series[0][2], initial=0.0)
     cut = [np.minimum(values, TOLERATED * top) if top > 0.0 else values for _, _, values in series]
-    plot = Plot(_frame_axis(subject), spanning(cut, log=False), x_label="frame", y_label=quantity)
-    for label, kind, values in reversed(series):
-        plot.line(subject.frames, values, kind, label)
+    plot = Plot(_frame_axis(subject), spanning(cut, log=False), x_label="frame", y_label=label)
+    _draw(subject, plot, series)
     beyond = any(np.any(values > TOLERATED * top) for _, _, values in series) and top > 0.0
     more = f" What exceeds {TOLERATED:g} times the truth's maximum is cut off." if beyond else ""
-    names = ", ".join(label for label, _, _ in series)
-    return Figure(
-        name=name,
-        title=title,
-        thesis=thesis,
-        body=join(
-            [
-                key([(kind, label) for label, kind, _ in series]),
-                plot.svg(title, f"Kinetic energy over frames of {names}."),
-            ]
-        ),
-        caption=join([text, more]),
-        data=_numbers(subject, [(label, values) for label, _, values in series], "method"),
-    )
+    drawn = plot.svg(title, f"Kinetic energy over frames of {', '.join(method for method, _, _ in series)}.")
+    return _figure(subject, name, title, thesis, series, drawn, said + more)
 
 
 def body_curves(subject: Subject) -> Iterator[Figure]:
     """Yield how elastic bodies keep their shape and hold together (section 4.8.2)."""
     for name in ("shape_error", "connectivity"):
         rows = [row for row in subject.rows if name in row.scores]
-        if rows:
-            yield _body_figure(subject, rows, name)
+        if not rows:
+            continue
+        metric = rows[0].scores[name].metric
+        series = [(row.name, row.kind, _mean(row.scores[name])) for row in rows]
+        true = rows[0].scores.get(f"{name}_true")
+        if true is not None:
+            series.insert(0, ("truth", "truth", _mean(true)))
+        y = linear(0.0, 1.0) if name == "connectivity" else spanning([s for _, _, s in series], log=False)
+        plot = Plot(_frame_axis(subject), y, x_label="frame", y_label=quantity(metric))
+        _draw(subject, plot, series)
+        yield _figure(
+            subject,
+            f"bodies-{name.replace('_', '-')}",
+            f"{words(metric.name, capital=True)} of jelly and rope",
+            "section 4.8.2",
+            series,
+            plot.svg(f"{metric.name} over frames", f"{metric.summary}, one line each for {_names(rows)}."),
+            f"{sentence(metric)} Mean over the scenarios with an elastic body.",
+        )
 
 
-def _body_figure(subject: Subject, rows: Sequence[Row], name: str) -> Figure:
-    metric = rows[0].scores[name].metric
-    series = [(row.name, row.kind, _mean(row.scores[name])) for row in rows]
-    true = rows[0].scores.get(f"{name}_true")
-    if true is not None:
-        series.insert(0, ("truth", "truth", _mean(true)))
-    y = linear(0.0, 1.0) if name == "connectivity" else spanning([s for _, _, s in series], log=False)
-    plot = Plot(_frame_axis(subject), y, x_label="frame", y_label=quantity(metric))
+def _draw(subject: Subject, plot: Plot, series: Series) -> None:
+    """Draw lines, the first on top."""
     for label, kind, values in reversed(series):
         plot.line(subject.frames, values, kind, label)
+
+
+def _figure(
+    subject: Subject,
+    name: str,
+    title: str,
+    thesis: str,
+    series: Series,
+    drawn: Markup,
+    caption: str,
+    *,
+    more: Sequence[tuple[str, str]] = (),
+    what: str = "method",
+) -> Figure:
+    """Return a chart of lines with its key, and their values at the frames of interest and the last one."""
+    frames = sorted({*subject.frames_of_interest, int(subject.frames[-1])})
+    column = {int(frame): i for i, frame in enumerate(subject.frames)}
+    rows = [[label, *(html(values[column[frame]]) for frame in frames)] for label, _, values in series]
     return Figure(
-        name=f"bodies-{name.replace('_', '-')}",
-        title=f"{words(metric.name, capital=True)} of jelly and rope",
-        thesis="section 4.8.2",
-        body=join([key([(kind, label) for label, kind, _ in series]), _chart(plot, metric, rows)]),
-        caption=join([f"{sentence(metric)} Mean over the scenarios with an elastic body."]),
-        data=_numbers(subject, [(label, values) for label, _, values in series], "method"),
+        name=name,
+        title=title,
+        thesis=thesis,
+        body=join([key([*((kind, label) for label, kind, _ in series), *more]), drawn]),
+        caption=join([caption]),
+        data=table([what, *(tag("span", f"frame {frame}") for frame in frames)], rows, label="Numbers"),
     )
+
+
+def _names(rows: Sequence[Row]) -> str:
+    return ", ".join(row.name for row in rows)
 
 
 def _frame_axis(subject: Subject) -> Scale:
@@ -235,24 +211,6 @@ def _mean(score: Score) -> Floats:
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
-def _interval(score: Score) -> tuple[Floats, Floats]:
-    """Return the 95 % bootstrap interval of the mean per frame."""
-    bounds = np.array([bootstrap_interval(column) for column in score.per_frame.T])
-    return bounds[:, 0], bounds[:, 1]
-
-
-def _least(series: Iterator[Floats]) -> float:
-    return float(min((np.min(s[np.isfinite(s)], initial=0.0) for s in series), default=0.0))
-
-
-def _numbers(subject: Subject, series: Sequence[tuple[str, Floats]], what: str) -> Markup:
-    """Return the values at the frames of interest and the last one."""
-    frames = sorted({*subject.frames_of_interest, int(subject.frames[-1])})
-    column = {int(frame): i for i, frame in enumerate(subject.frames)}
-    rows = [[name, *(html(values[column[frame]]) for frame in frames)] for name, values in series]
-    return table([what, *(tag("span", f"frame {frame}") for frame in frames)], rows, label="Numbers")
-
-
 SHOWN = (
     ("vorticity_pearson", "Correlation of vorticity", "Fig. 5.13"),
     ("vorticity_kl", "KL divergence of vorticity", "Fig. 5.16"),
@@ -262,69 +220,172 @@ SHOWN = (
 
 def bar_figures(subject: Subject) -> Iterator[Figure]:
     """Yield one figure per metric that is defined in this split."""
+    frame, unknown = (
+        subject.key_frame,
+        [np.nan] * len(subject.scenarios),
+    )  # of shipped floors the mean is kept
     for name, title, thesis in SHOWN:
         rows = [row for row in subject.rows if name in row.scores]
-        if rows:
-            yield _figure(subject, rows, name, title, thesis)
+        if not rows:
+            continue
+        metric = rows[0].scores[name].metric
+        values = {row.name: row.scores[name].at(frame) for row in rows}
+        rows.sort(key=lambda row: float(np.nan_to_num(metric.loss(mean(values[row.name])), nan=np.inf)))
+        best = next((row for row in rows if row.entry is not None), None)
+        bars = [
+            Bar(
+                label=clipped(row.name),
+                value=mean(values[row.name]),
+                written=text(mean(values[row.name])),
+                dots=tuple(values[row.name].tolist()) if row.entry is not None else (),
+                kind=row.kind,
+                bold=row is best and len(subject.entries) > 1,
+            )
+            for row in rows
+        ]
+        known = [value for bar in bars for value in (bar.value, *bar.dots) if np.isfinite(value)]
+        higher = metric.direction is Direction.HIGHER
+        scale = linear(min(0.0, *known, 0.0), 1.0) if higher else spanning([np.array(known)], log=False)
+        whole, said = f"{title} at frame {frame}", "; ".join(f"{bar.label}: {bar.written}" for bar in bars)
+        yield Figure(
+            name=f"bars-{name.replace('_', '-')}",
+            title=whole,
+            thesis=thesis,
+            body=bar_chart(bars, scale, quantity(metric), whole, said),
+            caption=join(
+                [
+                    f"{sentence(metric)} Mean over {len(subject.scenarios)} test scenarios at frame {frame},"
+                    f" dots are the scenarios of entries. {'Higher' if higher else 'Lower'} is better;"
+                    f" perfect is {metric.perfect:g}. A dash means undefined, as for a prediction at rest."
+                ]
+            ),
+            data=table(
+                ["method", "mean", *(f"scenario {i}" for i in subject.scenarios)],
+                [
+                    [row.name, html(bar.value), *(html(v) for v in bar.dots or unknown)]
+                    for row, bar in zip(rows, bars, strict=True)
+                ],
+                label=title,
+            ),
+        )
 
 
-def _figure(subject: Subject, rows: list[Row], name: str, title: str, thesis: str) -> Figure:
-    frame = subject.key_frame
-    metric = rows[0].scores[name].metric
-    ordered = sorted(rows, key=lambda row: _loss(metric, mean(row.scores[name].at(frame))))
-    best = next((row for row in ordered if row.entry is not None), None)
-    bars = [_bar(row, name, frame, best=row is best and len(subject.entries) > 1) for row in ordered]
-    unknown = [np.nan] * len(subject.scenarios)  # of shipped floors the mean is kept
-    drawn = bar_chart(
-        bars,
-        _scale(metric, bars),
-        quantity(metric),
-        f"{title} at frame {frame}",
-        "; ".join(f"{bar.label}: {bar.written}" for bar in bars),
-    )
-    better = "Higher is better" if metric.direction is Direction.HIGHER else "Lower is better"
-    return Figure(
-        name=f"bars-{name.replace('_', '-')}",
-        title=f"{title} at frame {frame}",
-        thesis=thesis,
-        body=drawn,
+BINS = 40
+FEWEST_BINS = 10
+
+MOST_DOTS = 1600  # Of more nodes evenly many are drawn
+FAR_QUANTILE = 0.5  # axes leave out this share of the nodes at either end [%]
+
+
+def histogram_figures(subject: Subject, gallery: Gallery) -> Iterator[Figure]:
+    """Yield the distribution of vorticity at the key frame (5.12) and at several (5.18)."""
+    scenario = subject.scenarios[0]
+    items = [("truth", "truth"), *((entry.kind, entry.name) for entry in subject.entries)]
+    moment = gallery.moments[scenario, subject.key_frame]
+    yield Figure(
+        name="histogram",
+        title=f"Vorticity distribution at frame {subject.key_frame}",
+        thesis="Fig. 5.12",
+        body=join([key(items), _histogram(subject, moment)]),
         caption=join(
             [
-                f"{sentence(metric)} Mean over {len(subject.scenarios)} test scenarios at frame {frame},"
-                f" dots are the scenarios of entries. {better};"
-                f" perfect is {metric.perfect:g}. A dash means undefined, as for a prediction at rest."
+                "Share of the grid nodes per bin of vorticity [1/frame], scenario"
+                f" {scenario}. Black: the truth, whose range sets the bins; the first and the last bin hold"
+                " all that lies beyond."
             ]
         ),
-        data=table(
-            ["method", "mean", *(f"scenario {i}" for i in subject.scenarios)],
-            [
-                [row.name, html(bar.value), *(html(v) for v in bar.dots or unknown)]
-                for row, bar in zip(ordered, bars, strict=True)
-            ],
-            label=title,
+    )
+    charts = [
+        tag("div", tag("p", f"frame {held.frame}", class_="panels-title"), _histogram(subject, held))
+        for held in gallery.at(scenario, subject.histogram_frames)
+    ]
+    yield Figure(
+        name="histograms",
+        title="Vorticity distribution over time",
+        thesis="Fig. 5.18",
+        body=join([key(items), tag("div", *charts, class_="figures small")]),
+        caption=join(
+            [f"As the figure before, at other frames of scenario {scenario}; each frame has bins of its own."]
         ),
+        wide=True,
     )
 
 
-def _loss(metric: Metric, value: float) -> float:
-    return float(np.nan_to_num(metric.loss(value), nan=np.inf))
-
-
-def _bar(row: Row, name: str, frame: int, *, best: bool) -> Bar:
-    values = row.scores[name].at(frame)
-    middle = mean(values)
-    return Bar(
-        label=clipped(row.name),
-        value=middle,
-        written=text(middle),
-        dots=tuple(values.tolist()) if row.entry is not None else (),
-        kind=row.kind,
-        bold=best,
+def _histogram(subject: Subject, moment: Moment) -> Markup:
+    series = [("truth", "truth", moment.pairs[0].true_vorticity)]
+    for entry, pair in zip(subject.entries, moment.pairs, strict=True):
+        series.append((entry.name, entry.kind, pair.predicted_vorticity))
+    edges, _ = shares_of(series[0][2], series[0][2])
+    shares = [(name, kind, shares_of(values, series[0][2])[1]) for name, kind, values in series]
+    top = max((float(heights.max()) for _, _, heights in shares), default=1.0)
+    plot = Plot(
+        linear(float(edges[0]), float(edges[-1]), tight=True),
+        linear(0.0, top),
+        x_label="vorticity [1/frame]",
+        y_label="share of nodes [%]",
+        height=230,
+    )
+    for name, kind, heights in [*shares[1:], shares[0]]:
+        plot.steps(edges, heights, kind, name)
+    return plot.svg(
+        f"Vorticity distribution at frame {moment.frame}",
+        f"Histograms of {', '.join(name for name, _, _ in shares)} in scenario {moment.scenario}.",
     )
 
 
-def _scale(metric: Metric, bars: list[Bar]) -> Scale:
-    values = [value for bar in bars for value in (bar.value, *bar.dots) if np.isfinite(value)]
-    if metric.direction is Direction.HIGHER:
-        return linear(min(0.0, *values, 0.0), 1.0)
-    return spanning([np.array(values)], log=False)
+def shares_of(values: Floats, truth: Floats) -> tuple[Floats, Floats]:
+    """Return edges of bins over the truth's range, and per cent of the values in each."""
+    bins = int(np.clip(2.0 * np.sqrt(max(truth.size, 1)), FEWEST_BINS, BINS))  # few where there are few nodes
+    low, high = (float(truth.min()), float(truth.max())) if truth.size else (-1.0, 1.0)
+    edges = np.linspace(low, high, bins + 1) if high > low else np.linspace(low - 1.0, high + 1.0, bins + 1)
+    # the end bins are open
+    count = np.bincount(np.searchsorted(edges[1:-1], values, side="right"), minlength=bins)
+    return edges, 100.0 * count / max(1, values.size)
+
+
+def residual_figures(subject: Subject, gallery: Gallery) -> Iterator[Figure]:
+    """Yield residuals against the truth (5.14) and against the node's number (5.15)."""
+    scenario = subject.scenarios[0]
+    pairs = [pair for pair in gallery.moments[scenario, subject.key_frame].pairs if pair.node_count]
+    if not pairs:
+        return
+    # axes leave out the farthest nodes
+    farthest = [np.percentile(np.abs(pair.vorticity_residual), 100.0 - FAR_QUANTILE) for pair in pairs]
+    reach = float(max(farthest))
+    reach = reach if np.isfinite(reach) and 0.0 < reach < 1e300 else 1.0
+    y, true = linear(-reach, reach), pairs[0].true_vorticity
+    low, high = np.percentile(true, [FAR_QUANTILE, 100.0 - FAR_QUANTILE])
+    room = 0.05 * (high - low)
+    by_truth = linear(float(low - room), float(high + room), tight=True)
+    by_number = linear(0.0, float(pairs[0].nodes.size), tight=True)
+    drawn = f" {min(len(true), MOST_DOTS)} of {len(true)} nodes are drawn." if len(true) > MOST_DOTS else ""
+    said = (
+        f"Residual r = predicted − true vorticity [1/frame] at the grid nodes, scenario {scenario}, frame"
+        f" {subject.key_frame}."
+    )
+    slope = "A cloud without slope around 0 is good; slope −1 means that no rotation is predicted."
+    places = "Nodes are numbered column by column from the lower left: clusters are places."
+    for name, against, thesis, axis, label, told in (
+        ("truth", "true vorticity", "Fig. 5.14", by_truth, "true vorticity [1/frame]", slope),
+        ("node", "node number", "Fig. 5.15", by_number, "node", places),
+    ):
+        title, charts = f"Residual against {against}", []
+        for entry, pair in zip(subject.entries, pairs, strict=False):
+            x = pair.true_vorticity if name == "truth" else np.flatnonzero(pair.nodes).astype(np.float64)
+            every = -(-len(x) // MOST_DOTS)
+            plot = Plot(axis, y, x_label=label, y_label="residual [1/frame]", height=230)
+            plot.dots(x[::every], pair.vorticity_residual[::every], entry.kind)
+            plot.level(0.0, "")
+            spread = text(float(np.sqrt(np.mean(pair.vorticity_residual**2))))
+            rms = tag("span", f"RMS {spread}", class_="muted n")
+            heading = tag("p", entry.name, "  ", rms, class_="panels-title")
+            cloud = plot.svg(f"{title}, {entry.name}", f"{len(x)} nodes, RMS residual {spread} per frame.")
+            charts.append(tag("div", heading, cloud))
+        yield Figure(
+            name=f"residuals-{name}",
+            title=title,
+            thesis=thesis,
+            body=tag("div", *charts, class_="figures small"),
+            caption=join([f"{said} {told}{drawn}"]),
+            wide=len(charts) > 1,
+        )

@@ -1,9 +1,7 @@
 """Arrows and streamlines over time (Figs. 5.22 to 5.24).
 
-Streamlines of a velocity on a grid, evenly spaced, traced by the midpoint rule.
-
-Each line keeps a cell of a coarse mask for itself, as in Jobard & Lefer (1997): a new line
-starts where no other has passed and ends where it would run into one.
+Streamlines are evenly spaced and traced by the midpoint rule. Each keeps a cell of a coarse mask for
+itself, as in Jobard & Lefer (1997): it starts where no other has passed, and ends where it would meet one.
 """
 
 from __future__ import annotations
@@ -21,29 +19,16 @@ from lagbench.data.grid import Fields
 from .html import Markup, join, path_data, tag
 from .maps import limit_of
 from .page import SIDE, Figure, grid, ramp, vector
-from .subject import Gallery, Moment, Subject
+from .subject import Gallery, Subject
 
-__all__ = [
-    "Stream",
-    "streamlines",
-    "arrow_figures",
-    "stream_figures",
-]
-
+__all__ = ["Stream", "arrow_figures", "stream_figures", "streamlines"]
 
 Floats = NDArray[np.float64]
 
-STEP = 0.4
-"""Length of a step in node distances."""
-
-SLOW = 1e-3
-"""Lines end where the speed falls below this share of the greatest."""
-
-SHORTEST = 3.0
-"""Lines shorter than this many node distances are left out."""
-
-MOST_STEPS = 400
-"""Steps of one line in either direction."""
+STEP = 0.4  # length of a step in node distances
+SLOW = 1e-3  # lines end where the speed falls below this share of the greatest
+SHORTEST = 3.0  # lines shorter than this many node distances are left out
+MOST_STEPS = 400  # steps of one line in either direction
 
 
 @dataclass(frozen=True)
@@ -73,30 +58,24 @@ class _Flow:
         if not (0 <= i < self.shape[0] and 0 <= k < self.shape[1] and self._whole[i][k]):
             return None
         a, b = x - i, y - k
-        u, v = (_mixed(field, i, k, a, b) for field in (self._u, self._v))
+        u, v = (
+            (field[i][k] * (1 - a) + field[i + 1][k] * a) * (1 - b)
+            + (field[i][k + 1] * (1 - a) + field[i + 1][k + 1] * a) * b
+            for field in (self._u, self._v)
+        )
         speed = math.hypot(u, v)
         return None if speed <= self._slow else (u / speed, v / speed, speed)
 
 
-def _mixed(field: list[list[float]], i: int, k: int, a: float, b: float) -> float:
-    low = field[i][k] * (1 - a) + field[i + 1][k] * a
-    high = field[i][k + 1] * (1 - a) + field[i + 1][k + 1] * a
-    return low * (1 - b) + high * b
-
-
 def streamlines(velocity: Floats, counted: NDArray[np.bool_], *, cells: int = 18) -> list[Stream]:
-    """Return streamlines that cover a flow evenly.
-
-    Args:
-        velocity: velocity at the nodes, shape [x node, y node, 2].
-        counted: nodes that count, shape [x node, y node].
-        cells: cells across of the mask that keeps lines apart.
-    """
+    """Return streamlines that cover a flow evenly; so many cells across keep them apart."""
     flow = _Flow(velocity, counted)
     scale = cells / max(flow.shape)
     taken: set[tuple[int, int]] = set()
     found = []
-    for column, row in _seeds(cells):
+    # from the rim inwards: lines along walls come first
+    every = [(i, k) for i in range(cells) for k in range(cells)]
+    for column, row in sorted(every, key=lambda c: min(c[0], c[1], cells - 1 - c[0], cells - 1 - c[1])):
         if (column, row) in taken:
             continue
         passed: set[tuple[int, int]] = set()
@@ -107,12 +86,6 @@ def streamlines(velocity: Floats, counted: NDArray[np.bool_], *, cells: int = 18
             taken |= passed
             found.append(Stream(*np.array(line).T))
     return found
-
-
-def _seeds(cells: int) -> list[tuple[int, int]]:
-    """Return all cells, from the rim inwards: lines along walls come first."""
-    every = [(i, k) for i in range(cells) for k in range(cells)]
-    return sorted(every, key=lambda c: min(c[0], c[1], cells - 1 - c[0], cells - 1 - c[1]))
 
 
 def _trace(
@@ -151,17 +124,10 @@ def _cell(x: float, y: float, scale: float) -> tuple[int, int]:
 LEVELS = 6
 """Colours of speed, classes ``q0`` .. ``q5`` of the style sheet."""
 
-ARROWS = 18
-"""Most arrows across."""
-
-LONGEST = 1.7
-"""Length of an arrow of the scale's top, in distances between arrows."""
-
-HEAD = 0.32
-"""Length of its head, as a share of the arrow."""
-
-MOST = 3
-"""Entries that are drawn: lines take room."""
+ARROWS = 18  # most arrows across
+LONGEST = 1.7  # length of an arrow of the scale's top, in distances between arrows
+HEAD = 0.32  # length of its head, as a share of the arrow
+MOST = 3  # entries that are drawn: lines take room
 
 
 def arrow_figures(subject: Subject, gallery: Gallery) -> Iterator[Figure]:
@@ -188,10 +154,21 @@ def _figures(
 ) -> Iterator[Figure]:
     scenario = subject.scenarios[0]
     moments = gallery.at(scenario, subject.times)
-    limit = limit_of([_speed(m.truth.fields.velocity) for m in moments])
+    limit = limit_of([np.sqrt((m.truth.fields.velocity**2).sum(axis=-1)) for m in moments])
+    said = f"Scenario {scenario}; colour is speed on the score grid, on one scale for all panels"
+    said += ", and so is the length of arrows. Difference: predicted − true." if difference else "."
+    left = [entry.name for entry in subject.entries[MOST:]]
     for entry in subject.entries[:MOST]:
-        rows = list(_rows(subject, gallery, moments, entry.number, limit, draw, difference=difference))
-        rows[1] = (entry.name, rows[1][1])
+        rows: list[tuple[str, list[Markup]]] = [("truth", []), (entry.name, [])]
+        rows += [("difference", [])] if difference else []
+        for moment in moments:
+            true = moment.truth.fields.velocity
+            predicted = moment.pairs[entry.number].predicted_fields.velocity
+            fields = {"truth": true, "prediction": predicted, "difference": predicted - true}
+            for (what, velocity), (_, panels) in zip(fields.items(), rows, strict=False):
+                drawn = draw(subject, moment.truth.fields, velocity, limit)
+                alt = f"{what}, frame {moment.frame}"
+                panels.append(vector(drawn, gallery.walls[scenario], alt))
         yield Figure(
             name=f"{name}-{entry.number}",
             title=f"{title} over time: {entry.name}",
@@ -202,42 +179,9 @@ def _figures(
                     grid([f"frame {m.frame}" for m in moments], rows, width=7.4),
                 ]
             ),
-            caption=join([_caption(subject, scenario, difference=difference)]),
+            caption=join([said + (f" Not drawn for want of room: {', '.join(left)}." if left else "")]),
             wide=True,
         )
-
-
-def _caption(subject: Subject, scenario: int, *, difference: bool) -> str:
-    said = f"Scenario {scenario}; colour is speed on the score grid, on one scale for all panels"
-    said += ", and so is the length of arrows. Difference: predicted − true." if difference else "."
-    left = [entry.name for entry in subject.entries[MOST:]]
-    return said + (f" Not drawn for want of room: {', '.join(left)}." if left else "")
-
-
-def _rows(
-    subject: Subject,
-    gallery: Gallery,
-    moments: Sequence[Moment],
-    number: int,
-    limit: float,
-    draw: Callable[[Subject, Fields, Floats, float], Markup],
-    *,
-    difference: bool,
-) -> Iterator[tuple[str, list[Markup]]]:
-    """Yield the rows: truth, prediction, and their difference where it is asked for."""
-    sides: dict[str, Callable[[Moment], Floats]] = {
-        "truth": lambda m: m.truth.fields.velocity,
-        "prediction": lambda m: m.pairs[number].predicted_fields.velocity,
-    }
-    if difference:
-        sides["difference"] = lambda m: m.pairs[number].predicted_fields.velocity - m.truth.fields.velocity
-    for name, velocity in sides.items():
-        panels = []
-        for moment in moments:
-            drawn = draw(subject, moment.truth.fields, velocity(moment), limit)
-            alt = f"{name}, frame {moment.frame}"
-            panels.append(vector(drawn, gallery.walls[moment.scenario], alt))
-        yield name, panels
 
 
 def _arrows(subject: Subject, fields: Fields, velocity: Floats, limit: float) -> Markup:
@@ -250,21 +194,16 @@ def _arrows(subject: Subject, fields: Fields, velocity: Floats, limit: float) ->
     u, v = velocity[chosen[:, 0], chosen[:, 1]].T
     capped = np.minimum(1.0, 1.5 * limit / np.maximum(np.hypot(u, v), 1e-300))  # runaways stay in sight
     lines: list[list[str]] = [[] for _ in range(LEVELS)]
-    for level, data in zip(
-        _levels(np.hypot(u, v), limit), map(_arrow, x, y, u * unit * capped, -v * unit * capped), strict=True
-    ):
+    levels = _levels(np.hypot(u, v), limit)
+    for x0, y0, a, b, level in zip(x, y, u * unit * capped, -v * unit * capped, levels, strict=True):
+        data = path_data([(x0, y0)])  # a short arrow is a dot
+        if np.hypot(a, b) >= 1.0:
+            tip = tip_x, tip_y = x0 + a / 2, y0 + b / 2
+            left = (tip_x - HEAD * (a + 0.55 * b), tip_y - HEAD * (b - 0.55 * a))
+            right = (tip_x - HEAD * (a - 0.55 * b), tip_y - HEAD * (b + 0.55 * a))
+            data = path_data([(x0 - a / 2, y0 - b / 2), tip]) + path_data([left, tip, right])
         lines[level].append(data)
     return _by_level(lines)
-
-
-def _arrow(x: float, y: float, a: float, b: float) -> str:
-    """Return an arrow through a point as path data; a short one is a dot."""
-    if not np.hypot(a, b) >= 1.0:
-        return path_data([(x, y)])
-    tip_x, tip_y = x + a / 2, y + b / 2
-    left = (tip_x - HEAD * (a + 0.55 * b), tip_y - HEAD * (b - 0.55 * a))
-    right = (tip_x - HEAD * (a - 0.55 * b), tip_y - HEAD * (b + 0.55 * a))
-    return path_data([(x - a / 2, y - b / 2), (tip_x, tip_y)]) + path_data([left, (tip_x, tip_y), right])
 
 
 def _streams(subject: Subject, fields: Fields, velocity: Floats, limit: float) -> Markup:
@@ -272,30 +211,19 @@ def _streams(subject: Subject, fields: Fields, velocity: Floats, limit: float) -
     lines: list[list[str]] = [[] for _ in range(LEVELS)]
     for stream in streamlines(velocity, fields.counted):
         x, y = _places(subject, fields, stream.x, stream.y)
-        for level, piece in _pieces(stream, limit):
-            lines[level].append(path_data(zip(x[piece], y[piece], strict=True)))
-        lines[_levels(stream.speed, limit)[len(x) // 2]].append(_head(x, y))
+        levels = _levels(stream.speed, limit)
+        cuts = [0, *(np.flatnonzero(np.diff(levels)) + 1).tolist(), len(levels)]
+        for low, high in pairwise(cuts):  # thinned out, joined to the next stretch
+            last = min(high, len(levels) - 1)
+            points = np.array([*range(low, last, 2), last])
+            lines[levels[low]].append(path_data(zip(x[points], y[points], strict=True)))
+        k = len(x) // 2  # an arrowhead in the middle
+        a, b = x[k] - x[k - 1], y[k] - y[k - 1]
+        size = 5.0 / max(float(np.hypot(a, b)), 1e-9)
+        a, b = a * size, b * size
+        left, right = (x[k] - a - 0.6 * b, y[k] - b + 0.6 * a), (x[k] - a + 0.6 * b, y[k] - b - 0.6 * a)
+        lines[levels[k]].append(path_data([left, (x[k], y[k]), right]))
     return _by_level(lines)
-
-
-def _pieces(stream: Stream, limit: float) -> Iterator[tuple[int, NDArray[np.intp]]]:
-    """Yield stretches of one colour and their points, thinned out, joined to the next stretch."""
-    levels = _levels(stream.speed, limit)
-    cuts = [0, *(np.flatnonzero(np.diff(levels)) + 1).tolist(), len(levels)]
-    for low, high in pairwise(cuts):
-        last = min(high, len(levels) - 1)
-        points = [*range(low, last, 2), last]
-        yield int(levels[low]), np.array(points)
-
-
-def _head(x: Floats, y: Floats) -> str:
-    """Return an arrowhead in the middle of a line."""
-    k = len(x) // 2
-    a, b = x[k] - x[k - 1], y[k] - y[k - 1]
-    size = 5.0 / max(float(np.hypot(a, b)), 1e-9)
-    a, b = a * size, b * size
-    wings = [(x[k] - a - 0.6 * b, y[k] - b + 0.6 * a), (x[k], y[k]), (x[k] - a + 0.6 * b, y[k] - b - 0.6 * a)]
-    return path_data(wings)
 
 
 def _places(subject: Subject, fields: Fields, i: Floats, k: Floats) -> tuple[Floats, Floats]:
@@ -309,10 +237,6 @@ def _places(subject: Subject, fields: Fields, i: Floats, k: Floats) -> tuple[Flo
 def _width(subject: Subject) -> float:
     (left, right), _ = subject.task.size.bounds
     return right - left
-
-
-def _speed(velocity: Floats) -> Floats:
-    return np.asarray(np.sqrt((velocity**2).sum(axis=-1)), np.float64)
 
 
 def _levels(speed: Floats, limit: float) -> NDArray[np.intp]:

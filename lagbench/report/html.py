@@ -3,9 +3,7 @@
 >>> tag("p", "a < b", tag("b", "!"), class_="note")
 '<p class="note">a &lt; b<b>!</b></p>'
 
-Numbers as readers like them: few digits, real minus signs, powers of ten raised.
-
-Names of metrics and frames as readers read them.
+Numbers and names of metrics as readers like them: few digits, real minus signs, words.
 """
 
 from __future__ import annotations
@@ -17,30 +15,12 @@ from unicodedata import east_asian_width
 from lagbench.metrics.metric import Metric
 
 __all__ = [
-    "Markup",
-    "escaped",
-    "join",
-    "path_data",
-    "tag",
-    "MISSING",
-    "decimals",
-    "html",
-    "interval",
-    "power",
-    "text",
-    "clipped",
-    "quantity",
-    "sentence",
-    "unit",
-    "words",
+    *("MISSING", "Markup", "clipped", "decimals", "escaped", "html", "interval", "join", "path_data"),
+    *("power", "quantity", "sentence", "tag", "text", "unit", "words"),
 ]
 
-
-VOID = frozenset({"br", "col", "hr", "img", "link", "meta"})
-"""Elements of HTML without an end tag."""
-
-SHAPES = frozenset({"circle", "line", "path", "rect", "stop", "use"})
-"""Elements of SVG that close themselves."""
+VOID = frozenset({"br", "col", "hr", "img", "link", "meta"})  # elements of HTML without an end tag
+SHAPES = frozenset({"circle", "line", "path", "rect", "stop", "use"})  # elements of SVG that close themselves
 
 _ESCAPES = {ord("&"): "&amp;", ord("<"): "&lt;", ord(">"): "&gt;", ord('"'): "&quot;", ord("'"): "&#39;"}
 _UNPRINTABLE = dict.fromkeys((*range(9), 11, 12, *range(14, 32), *range(127, 160)), "�")
@@ -76,19 +56,16 @@ def join(parts: Iterable[object], separator: object = "") -> Markup:
 
 def tag(name: str, /, *children: object, **attributes: object) -> Markup:
     """Return an element; children and values that are no markup are escaped."""
-    spelled = "".join(_attribute(key, value) for key, value in attributes.items())
+    spelled = ""
+    for key, value in attributes.items():
+        if value is not None and value is not False:
+            label = key.rstrip("_").replace("_", "-")
+            spelled += f" {label}" if value is True else f' {label}="{escaped(value)}"'
     if name in VOID:
         return Markup(f"<{name}{spelled}>")
     if name in SHAPES and not children:
         return Markup(f"<{name}{spelled}/>")
     return Markup(f"<{name}{spelled}>{join(children)}</{name}>")
-
-
-def _attribute(key: str, value: object) -> str:
-    if value is None or value is False:
-        return ""
-    name = key.rstrip("_").replace("_", "-")
-    return f" {name}" if value is True else f' {name}="{escaped(value)}"'
 
 
 def path_data(points: Iterable[tuple[float, float]]) -> str:
@@ -104,9 +81,7 @@ def path_data(points: Iterable[tuple[float, float]]) -> str:
             pieces[-1].append(f"{_short(x)} {_short(y)}")
         elif pieces[-1]:
             pieces.append([])
-    return "".join(
-        f"M{piece[0]}h0" if len(piece) == 1 else "M" + "L".join(piece) for piece in pieces if piece
-    )
+    return "".join(f"M{p[0]}h0" if len(p) == 1 else "M" + "L".join(p) for p in pieces if p)
 
 
 def _short(value: float) -> str:
@@ -114,14 +89,9 @@ def _short(value: float) -> str:
     return "0" if text == "-0" else text
 
 
-MISSING = "–"
-"""What stands where there is no number."""
-
-DIGITS = 3
-"""Significant digits."""
-
-PLAIN = (-3, 5)
-"""Powers of ten between which numbers are written out."""
+MISSING = "–"  # what stands where there is no number
+DIGITS = 3  # significant digits
+PLAIN = (-3, 5)  # powers of ten between which numbers are written out
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 

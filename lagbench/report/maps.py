@@ -1,10 +1,13 @@
-"""Maps of the score grid: velocity, vorticity and its error.
+"""Maps: velocity, vorticity and its error on the score grid; particles by material (Figs. 4.11 to 4.13).
 
-Particles by material, truth above predictions, six times (Figs. 4.11 to 4.13).
+They are small PNG pictures of indexed colours with opacity, which suit light and dark pages: nothing is
+drawn where the page is to shine through. The same pixels give the same bytes.
 """
 
 from __future__ import annotations
 
+import struct
+import zlib
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -17,24 +20,72 @@ from lagbench.scoring.task import ScoredTask
 
 from .html import Markup, join, tag
 from .page import Figure, grid, image, key, ramp
-from .png import diverging, encode, sequential
 from .subject import Gallery, Moment, Subject, Walls
 
 __all__ = [
-    "field_figure",
-    "inside",
-    "limit_of",
-    "scenario_figure",
-    "vorticity_figure",
-    "paint",
-    "particle_figures",
+    *("CLOCKWISE", "COUNTER", "FAST", "diverging", "encode", "field_figure", "inside", "limit_of", "paint"),
+    *("particle_figures", "scenario_figure", "sequential", "vorticity_figure"),
 ]
-
 
 Floats = NDArray[np.float64]
 
-TOP = 99.5
-"""Full colour is the percentile of the truth's magnitudes."""
+Bytes = NDArray[np.uint8]
+
+CLOCKWISE, COUNTER, FAST = "#0072b2", "#d55e00", "#009e73"
+"""Colours of negative and positive values and of great magnitudes (Okabe & Ito 2008)."""
+
+LEVELS = 100  # steps of opacity on either side of 0
+NOTHING = 2 * LEVELS + 1  # entry of the palette for nodes without a value
+VOID = (128, 128, 128, 34)  # their red, green, blue and opacity
+
+
+def encode(index: Bytes, palette: Bytes) -> bytes:
+    """Return an indexed PNG of the palette's entry per pixel, first row at the top, shape [row, column]."""
+    height, width = index.shape
+    rows = np.concatenate([np.zeros((height, 1), np.uint8), index], axis=1)
+    parts = [
+        (b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 3, 0, 0, 0)),
+        (b"PLTE", palette[:, :3].tobytes()),
+        (b"tRNS", palette[:, 3].tobytes()),
+        (b"IDAT", zlib.compress(rows.tobytes(), 9)),
+        (b"IEND", b""),
+    ]
+    whole = b"\x89PNG\r\n\x1a\n"
+    for name, data in parts:
+        whole += struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+    return whole
+
+
+def diverging(field: NDArray[np.floating], limit: float) -> bytes:
+    """Return a picture of signed values: blue below 0, vermilion above, clear at 0, full at the limit."""
+    return _coloured(field, limit, -1.0, _DIVERGING)
+
+
+def sequential(field: NDArray[np.floating], limit: float) -> bytes:
+    """Return a picture of magnitudes: clear at 0, green at the limit."""
+    return _coloured(field, limit, 0.0, _SEQUENTIAL)
+
+
+def _coloured(field: NDArray[np.floating], limit: float, least: float, palette: Bytes) -> bytes:
+    """Return values at nodes, NaN where there is none, shape [x node, y node], as rows from the top."""
+    share = np.clip(np.nan_to_num(field / limit, nan=0.0, posinf=1.0, neginf=-1.0), least, 1.0)
+    index = np.where(np.isnan(field), NOTHING, np.round(LEVELS + LEVELS * share))
+    return encode(np.ascontiguousarray(index.T[::-1]).astype(np.uint8), palette)
+
+
+def _ramp(below: str, above: str) -> Bytes:
+    side = np.arange(-LEVELS, LEVELS + 1)
+    table = np.empty((NOTHING + 1, 4), np.uint8)
+    table[:-1, :3] = np.where(side[:, None] < 0, rgb(below), rgb(above))
+    table[:-1, 3] = np.round(255.0 * np.abs(side) / LEVELS)
+    table[NOTHING] = VOID
+    return table
+
+
+_DIVERGING, _SEQUENTIAL = _ramp(CLOCKWISE, COUNTER), _ramp(FAST, FAST)
+
+
+TOP = 99.5  # full colour is the percentile of the truth's magnitudes
 
 
 def inside(task: ScoredTask, field: Floats) -> Floats:
@@ -58,7 +109,9 @@ def field_figure(subject: Subject, gallery: Gallery) -> Figure:
     """Return velocity and vorticity of all entries at the key frame (Fig. 5.17)."""
     scenario, frame = subject.scenarios[0], subject.key_frame
     moment, walls = gallery.moments[scenario, frame], gallery.walls[scenario]
-    speeds = [_speed(moment.pairs[0], true=True), *(_speed(pair) for pair in moment.pairs)]
+    flows = [moment.truth.fields, *(pair.predicted_fields for pair in moment.pairs)]
+    # NaN at nodes that do not count
+    speeds = [np.where(flow.counted, np.sqrt((flow.velocity**2).sum(axis=-1)), np.nan) for flow in flows]
     omegas = [moment.true_vorticity, *(_vorticity(pair) for pair in moment.pairs)]
     errors = [omega - omegas[0] for omega in omegas]
     fast, strong = limit_of(speeds[:1]), limit_of(omegas[:1])
@@ -80,17 +133,13 @@ def field_figure(subject: Subject, gallery: Gallery) -> Figure:
         ramp("sequential", fast, "speed [length/frame]"),
         ramp("diverging", strong, "vorticity and its error [1/frame]", signed=True),
     ]
+    grey = " Grey: nodes that are not compared; the colours are those of the truth's range."
     return Figure(
         name="fields",
         title=f"Fields side by side at frame {frame}",
         thesis="Fig. 5.17",
         body=join([*keys, grid(names, rows, width=8.5)]),
-        caption=join(
-            [
-                _where(scenario, walls),
-                " Grey: nodes that are not compared; the colours are those of the truth's range.",
-            ]
-        ),
+        caption=join([_where(scenario, walls), grey]),
         wide=True,
     )
 
@@ -106,17 +155,10 @@ def vorticity_figure(subject: Subject, gallery: Gallery) -> Figure:
 
     rows = [("truth", [picture(m.true_vorticity, "true vorticity", m.frame) for m in moments])]
     for i, entry in enumerate(subject.entries):
-        fields = [_vorticity(moment.pairs[i]) for moment in moments]
-        rows.append(
-            (entry.name, [picture(f, "predicted", m.frame) for f, m in zip(fields, moments, strict=True)])
-        )
-        differences = [field - m.true_vorticity for field, m in zip(fields, moments, strict=True)]
-        rows.append(
-            (
-                "difference",
-                [picture(f, "difference", m.frame) for f, m in zip(differences, moments, strict=True)],
-            )
-        )
+        fields = [(_vorticity(m.pairs[i]), m) for m in moments]
+        rows.append((entry.name, [picture(field, "predicted", m.frame) for field, m in fields]))
+        apart = [picture(field - m.true_vorticity, "difference", m.frame) for field, m in fields]
+        rows.append(("difference", apart))
     return Figure(
         name="vorticity",
         title="Vorticity over time",
@@ -154,15 +196,13 @@ def scenario_figure(subject: Subject, gallery: Gallery) -> Figure:
     columns = [
         join([f"scenario {m.scenario}", *_short(gallery.walls[m.scenario])], tag("br")) for m in moments
     ]
+    said = "Vorticity; each column has a colour scale of its own, set by its truth. Orange edges move."
     return Figure(
         name="every-scenario",
         title=f"Every test scenario at frame {frame}",
         thesis="Figs. 5.26, 5.27",
         body=grid(columns, rows, width=5.0),
-        caption=tag(
-            "span",
-            "Vorticity; each column has a colour scale of its own, set by its truth. Orange edges move.",
-        ),
+        caption=tag("span", said),
         wide=True,
     )
 
@@ -186,57 +226,38 @@ def _vorticity(pair: FramePair) -> Floats:
     return np.where(pair.nodes, pair.predicted_fields.vorticity, np.nan)
 
 
-def _speed(pair: FramePair, *, true: bool = False) -> Floats:
-    """Return the speed at the nodes that count [length/frame], NaN elsewhere."""
-    held = pair.truth.fields if true else pair.predicted_fields
-    speed = np.sqrt((held.velocity**2).sum(axis=-1))
-    return np.where(held.counted, speed, np.nan)
-
-
-SIDE = 176
-"""Side of a painted panel [pixel]."""
-
-FINE = 3
-"""Panels are painted so many times larger and averaged, which smooths the rims of the dots."""
-
-DOT = 1.3
-"""Diameter of a dot in particle distances."""
-
-ROWS = 24
-"""Most rows of panels on the page; more would make it too heavy."""
+SIDE = 176  # side of a painted panel [pixel]
+FINE = 3  # panels are painted so many times larger and averaged, which smooths the rims of the dots
+DOT = 1.3  # diameter of a dot in particle distances
+ROWS = 24  # most rows of panels on the page; more would make it too heavy
 
 SHADES = FINE * FINE
 
 
 def particle_figures(subject: Subject, gallery: Gallery) -> Iterator[Figure]:
     """Yield one figure per scenario, as many as there is room for."""
-    per_scenario = 1 + len(subject.entries)
-    shown = subject.scenarios[: max(1, ROWS // per_scenario)]
+    shown = subject.scenarios[: max(1, ROWS // (1 + len(subject.entries)))]
     for scenario in shown:
-        left_out = len(subject.scenarios) - len(shown) if scenario == shown[-1] else 0
-        yield _figure(subject, gallery, scenario, left_out=left_out)
-
-
-def _figure(subject: Subject, gallery: Gallery, scenario: int, *, left_out: int) -> Figure:
-    moments, walls = gallery.at(scenario, subject.times), gallery.walls[scenario]
-    rows = [("truth", [_panel(subject, gallery, m, m.truth, "truth") for m in moments])]
-    for i, entry in enumerate(subject.entries):
-        panels = [_panel(subject, gallery, m, m.pairs[i].prediction, "prediction") for m in moments]
-        rows.append((entry.name, panels))
-    present = np.unique(moments[0].setting_of.material).tolist()
-    seconds = [f"frame {m.frame}\u2002{m.frame * subject.task.size.frame_interval:.2f} s" for m in moments]
-    more = f" For want of room {left_out} more test scenarios are not drawn." if left_out else ""
-    what = f": {walls.mark}" if walls.mark else ""
-    return Figure(
-        name=f"particles-{scenario}",
-        title=f"Particles, scenario {scenario}{what}",
-        thesis="Fig. 4.11" if len(present) == 1 and present[0] == 0 else "Figs. 4.12, 4.13",
-        body=join([key([(f"m{m}", MATERIALS[m]) for m in present], kind="square"), grid(seconds, rows)]),
-        caption=join(
-            [f"All particles by material, truth above predictions, inside the walls of the box.{more}"]
-        ),
-        wide=True,
-    )
+        moments, walls = gallery.at(scenario, subject.times), gallery.walls[scenario]
+        rows = [("truth", [_panel(subject, gallery, m, m.truth, "truth") for m in moments])]
+        for i, entry in enumerate(subject.entries):
+            panels = [_panel(subject, gallery, m, m.pairs[i].prediction, "prediction") for m in moments]
+            rows.append((entry.name, panels))
+        present = np.unique(moments[0].setting_of.material).tolist()
+        interval = subject.task.size.frame_interval
+        seconds = [f"frame {m.frame}\u2002{m.frame * interval:.2f} s" for m in moments]
+        said = "All particles by material, truth above predictions, inside the walls of the box."
+        left_out = len(subject.scenarios) - len(shown)
+        if left_out and scenario == shown[-1]:
+            said += f" For want of room {left_out} more test scenarios are not drawn."
+        yield Figure(
+            name=f"particles-{scenario}",
+            title=f"Particles, scenario {scenario}" + (f": {walls.mark}" if walls.mark else ""),
+            thesis="Fig. 4.11" if len(present) == 1 and present[0] == 0 else "Figs. 4.12, 4.13",
+            body=join([key([(f"m{m}", MATERIALS[m]) for m in present], kind="square"), grid(seconds, rows)]),
+            caption=join([said]),
+            wide=True,
+        )
 
 
 def _panel(subject: Subject, gallery: Gallery, moment: Moment, snapshot: Snapshot, what: str) -> Markup:
@@ -254,15 +275,15 @@ def paint(
 ) -> bytes:
     """Return the particles inside the box as PNG; later particles lie on earlier ones.
 
-    Args:
-        position: positions [length], shape [particle, 2].
-        material: material of each particle, shape [particle].
-        bounds: walls of the box along x and along y [length].
-        spacing: distance of neighbouring particles at first [length].
+    Bounds are the walls along x and y, spacing is the distance of neighbouring particles at first [length].
     """
     (left, right), (bottom, top) = bounds
     fine = SIDE * FINE
-    disc = _disc(DOT * spacing / (right - left) * fine)
+    # rows and columns of a dot's pixels from its middle
+    diameter = DOT * spacing / (right - left) * fine
+    reach = int(np.ceil(diameter / 2))
+    offsets = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, -1)
+    disc = offsets[:, (offsets**2).sum(axis=0) <= max(diameter / 2, 0.5) ** 2]
     margin = int(np.abs(disc).max()) + 1
     x, y = position.T
     shown = (x >= left) & (x <= right) & (y >= bottom) & (y <= top)
@@ -271,24 +292,12 @@ def paint(
     canvas = np.zeros((fine + 2 * margin, fine + 2 * margin), np.uint8)
     colour = np.asarray(material)[shown].astype(np.uint8) + 1
     canvas[row[:, None] + disc[0], column[:, None] + disc[1]] = colour[:, None]
-    return encode(_averaged(canvas[margin:-margin, margin:-margin]), _PALETTE)
-
-
-def _disc(diameter: float) -> NDArray[np.intp]:
-    """Return rows and columns of a dot's pixels from its middle, shape [2, pixel]."""
-    reach = int(np.ceil(diameter / 2))
-    offsets = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, -1)
-    inside = (offsets**2).sum(axis=0) <= max(diameter / 2, 0.5) ** 2
-    return offsets[:, inside]
-
-
-def _averaged(canvas: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return an image FINE times smaller: the commonest material of a block, as opaque as it is full."""
-    blocks = canvas.reshape(SIDE, FINE, SIDE, FINE)
+    # the commonest material of a block, as opaque as the block is full
+    blocks = canvas[margin:-margin, margin:-margin].reshape(SIDE, FINE, SIDE, FINE)
     counts = np.stack([(blocks == m + 1).sum(axis=(1, 3)) for m in range(len(MATERIALS))])
     filled = counts.sum(axis=0)
     entry = np.argmax(counts, axis=0) * SHADES + filled
-    return np.where(filled > 0, entry, 0).astype(np.uint8)
+    return encode(np.where(filled > 0, entry, 0).astype(np.uint8), _PALETTE)
 
 
 def _palette() -> NDArray[np.uint8]:

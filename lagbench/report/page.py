@@ -8,27 +8,15 @@ Panels side by side: rows of truth, predictions and differences, columns of fram
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 
 from .html import Markup, join, tag, text
-from .png import data_uri
 from .subject import Walls
 
-__all__ = [
-    "Figure",
-    "Section",
-    "document",
-    "key",
-    "paragraph",
-    "table",
-    "grid",
-    "image",
-    "ramp",
-    "vector",
-]
-
+__all__ = ["Figure", "Section", "document", "grid", "image", "key", "paragraph", "ramp", "table", "vector"]
 
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
 
@@ -46,7 +34,7 @@ class Figure:
     data: Markup | None = None  # its numbers as a table, where that is cheap
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Section:
     """A stretch of the page."""
 
@@ -78,47 +66,37 @@ def document(title: str, head: Markup, sections: Sequence[Section], foot: Markup
         tag("meta", name="referrer", content="no-referrer"),
         tag("title", title),
         tag("link", rel="icon", href="data:,"),
-        tag("style", Markup(_style())),
+        tag("style", Markup(files(__package__).joinpath("style.css").read_text("utf-8"))),
     ]
     whole = tag("html", tag("head", *meta), tag("body", *body), lang="en")
     return f"<!DOCTYPE html>\n{whole}\n"
 
 
-def _style() -> str:
-    """Return the style sheet, which lies beside this module."""
-    return files(__package__).joinpath("style.css").read_text("utf-8")
-
-
 def _section(section: Section, first: int) -> Markup:
-    figures = [_figure(figure, first + i) for i, figure in enumerate(section.figures)]
-    grid = tag("div", *figures, class_="figures") if figures else Markup("")
+    figures = []
+    for number, figure in enumerate(section.figures, first):
+        heading = tag("h3", tag("span", f"Figure {number}", class_="number"), " ", figure.title)
+        source = tag("span", f"thesis {figure.thesis}", class_="thesis")
+        numbers = tag("details", tag("summary", "Numbers"), figure.data, class_="numbers")
+        parts = [heading, figure.body, tag("figcaption", tag("p", figure.caption, " ", source))]
+        kind = "figure wide" if figure.wide else "figure"
+        drawn = tag("figure", *parts, numbers if figure.data else "", id=figure.name, class_=kind)
+        figures.append(join([drawn, "\n"]))
+    grid = tag("div", *figures, class_="figures") if figures else ""
     heading = tag("h2", section.title)
     return join([tag("section", heading, section.lead, grid, id=f"part-{section.name}", class_="part"), "\n"])
 
 
-def _figure(figure: Figure, number: int) -> Markup:
-    heading = tag("h3", tag("span", f"Figure {number}", class_="number"), " ", figure.title)
-    source = tag("span", f"thesis {figure.thesis}", class_="thesis")
-    numbers = tag("details", tag("summary", "Numbers"), figure.data, class_="numbers") if figure.data else ""
-    caption = tag("figcaption", tag("p", figure.caption, " ", source))
-    kind = "figure wide" if figure.wide else "figure"
-    drawn = tag("figure", heading, figure.body, caption, numbers, id=figure.name, class_=kind)
-    return join([drawn, "\n"])
-
-
 def key(items: Sequence[tuple[str, str]], *, kind: str = "line") -> Markup:
     """Return what the marks of a figure mean."""
-    return tag(
-        "ul", *(tag("li", _swatch(mark, kind), tag("span", name)) for mark, name in items), class_="key"
-    )
-
-
-def _swatch(mark: str, kind: str) -> Markup:
-    if kind == "square":
-        drawn = tag("rect", x=5, y=0, width=12, height=10, rx=2, class_=f"bar {mark}")
-    else:
-        drawn = tag("path", d="M1 5H21", class_=f"line {mark}")
-    return tag("svg", drawn, viewBox="0 0 22 10", class_="swatch", aria_hidden="true")
+    drawn = []
+    for mark, name in items:
+        swatch = tag("path", d="M1 5H21", class_=f"line {mark}")
+        if kind == "square":
+            swatch = tag("rect", x=5, y=0, width=12, height=10, rx=2, class_=f"bar {mark}")
+        shown = tag("svg", swatch, viewBox="0 0 22 10", class_="swatch", aria_hidden="true")
+        drawn.append(tag("li", shown, tag("span", name)))
+    return tag("ul", *drawn, class_="key")
 
 
 def table(
@@ -136,8 +114,7 @@ def paragraph(*parts: object) -> Markup:
     return tag("p", join(parts))
 
 
-SIDE = 200
-"""Side of the coordinates of a vector panel."""
+SIDE = 200  # side of the coordinates of a vector panel
 
 
 def grid(
@@ -153,8 +130,9 @@ def grid(
 
 def image(png: bytes, walls: Walls, alt: str, *, smooth: bool = False) -> Markup:
     """Return a panel that shows a picture of the inside of the box."""
-    kind = "smooth" if smooth else None
-    return tag("span", tag("img", src=data_uri(png), alt=alt, class_=kind), class_=_classes(walls))
+    source = "data:image/png;base64," + base64.b64encode(png).decode("ascii")
+    shown = tag("img", src=source, alt=alt, class_="smooth" if smooth else None)
+    return tag("span", shown, class_=_classes(walls))
 
 
 def vector(drawn: Markup, walls: Walls, alt: str) -> Markup:

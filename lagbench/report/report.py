@@ -2,38 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from lagbench.atomic import write_atomically
 from lagbench.data.registry import Registry
 from lagbench.scoring.card import ScoreCard
 
-from .curves import bar_figures, body_curves, energy_curves, error_curves, method_curves
-from .distributions import histogram_figures, residual_figures
-from .flow import arrow_figures, stream_figures
-from .html import join, tag, words
-from .maps import field_figure, particle_figures, scenario_figure, vorticity_figure
+from . import curves, flow, maps, tables
+from .html import Markup, join, tag, words
 from .page import Figure, Section, document, paragraph
-from .subject import Gallery, Subject, open_gallery, subject_of
-from .tables import (
-    every_metric,
-    flag_list,
-    frame_table,
-    head,
-    identity,
-    scenario_table,
-    score_table,
-    title,
-    verdict_table,
-)
+from .subject import Subject, open_gallery, subject_of
 
-__all__ = [
-    "FILE_NAME",
-    "render",
-    "write_report",
-]
-
+__all__ = ["FILE_NAME", "render", "write_report"]
 
 FILE_NAME = "index.html"
 
@@ -57,9 +38,6 @@ def write_report(
         root: folder of all data sets: pictures show the truth too.
         registry: where splits are described; ours when None.
 
-    Returns:
-        Path of the page.
-
     Raises:
         UsageError: no card, or cards that do not belong together.
         DataError: the test subset is missing or damaged.
@@ -75,89 +53,60 @@ def write_report(
 def render(subject: Subject) -> str:
     """Return the page."""
     gallery = open_gallery(subject)
+    ranking = subject.ranking.name
+    scores = [
+        paragraph("Mean over the horizon and the test scenarios, 95 % interval below; bold is best."),
+        tables.score_table(subject),
+        tag("h4", f"Ranking by {words(ranking)}"),
+        tables.verdict_table(subject),
+        tag("h4", f"At frame {subject.key_frame}"),
+        tables.frame_table(subject),
+        tag("h4", f"{words(ranking, capital=True)} per test scenario"),
+        tables.scenario_table(subject),
+        tag("h4", "Flags and warnings"),
+        tables.flag_list(subject),
+    ]
+    now, over_time = curves.histogram_figures(subject, gallery)
+    bars = list(curves.bar_figures(subject))
+    vorticity = _section(
+        "vorticity",
+        "Vorticity",
+        "Where the flow rotates, how strongly, and how the prediction differs.",
+        maps.field_figure(subject, gallery),
+        *(now, *bars[:1], over_time, *bars[1:]),
+        *curves.residual_figures(subject, gallery),
+    )
+    if subject.full_box:
+        motion = _section(
+            "flow",
+            "The flow over time",
+            "Truth and prediction as fields on the score grid.",
+            maps.vorticity_figure(subject, gallery),
+            *flow.arrow_figures(subject, gallery),
+            *flow.stream_figures(subject, gallery),
+            maps.scenario_figure(subject, gallery),
+        )
+    else:
+        figures = [*maps.particle_figures(subject, gallery), *curves.body_curves(subject)]
+        said = "What the particles do: truth above, predictions below."
+        motion = _section("particles", "Particles", said, *figures)
+    means = "Means over the horizon and the test scenarios, with 95 % intervals; bold is best."
+    errors = [*curves.method_curves(subject), *curves.error_curves(subject)]
+    energy = curves.energy_curves(subject)
+    sections = [
+        _section("scores", "Scores", join(scores)),
+        _section("rollout", "Error over the rollout", "How the error grows from frame to frame.", *errors),
+        *([vorticity, motion] if subject.full_box else [motion, vorticity]),
+        _section("energy", "Energy", "Whether the motion is damped, kept or fed.", *energy),
+        _section("metrics", "Every metric", join([paragraph(means), tables.every_metric(subject)])),
+        _section("identity", "What was scored", tables.identity(subject)),
+    ]
     foot = paragraph(
         "Intervals are 95 % bootstrap intervals over test scenarios. Velocity and vorticity are per frame;"
         " lengths are in units of the box. This page is one file and asks nothing of the network."
     )
-    return document(title(subject), head(subject), list(_sections(subject, gallery)), foot)
+    return document(tables.title(subject), tables.head(subject), sections, foot)
 
 
-def _sections(subject: Subject, gallery: Gallery) -> Iterator[Section]:
-    yield _scores(subject)
-    yield Section(
-        name="rollout",
-        title="Error over the rollout",
-        lead=paragraph("How the error grows from frame to frame."),
-        figures=[*method_curves(subject), *error_curves(subject)],
-    )
-    if subject.full_box:
-        yield _vorticity(subject, gallery)
-        yield _flow(subject, gallery)
-    else:
-        yield _particles(subject, gallery)
-        yield _vorticity(subject, gallery)
-    yield Section(
-        name="energy",
-        title="Energy",
-        lead=paragraph("Whether the motion is damped, kept or fed."),
-        figures=list(energy_curves(subject)),
-    )
-    yield Section(
-        name="metrics",
-        title="Every metric",
-        lead=join(
-            [
-                paragraph(
-                    "Means over the horizon and the test scenarios, with 95 % intervals; bold is best."
-                ),
-                every_metric(subject),
-            ]
-        ),
-    )
-    yield Section(name="identity", title="What was scored", lead=identity(subject))
-
-
-def _scores(subject: Subject) -> Section:
-    frame = subject.key_frame
-    parts = [
-        paragraph("Mean over the horizon and the test scenarios, 95 % interval below; bold is best."),
-        score_table(subject),
-        tag("h4", f"Ranking by {words(subject.ranking.name)}"),
-        verdict_table(subject),
-        tag("h4", f"At frame {frame}"),
-        frame_table(subject),
-        tag("h4", f"{words(subject.ranking.name, capital=True)} per test scenario"),
-        scenario_table(subject),
-        tag("h4", "Flags and warnings"),
-        flag_list(subject),
-    ]
-    return Section(name="scores", title="Scores", lead=join(parts))
-
-
-def _vorticity(subject: Subject, gallery: Gallery) -> Section:
-    now, over_time = histogram_figures(subject, gallery)
-    bars = list(bar_figures(subject))
-    figures: list[Figure] = [
-        field_figure(subject, gallery),
-        *(now, *bars[:1], over_time, *bars[1:]),
-        *residual_figures(subject, gallery),
-    ]
-    text = "Where the flow rotates, how strongly, and how the prediction differs."
-    return Section(name="vorticity", title="Vorticity", lead=paragraph(text), figures=figures)
-
-
-def _flow(subject: Subject, gallery: Gallery) -> Section:
-    figures = [
-        vorticity_figure(subject, gallery),
-        *arrow_figures(subject, gallery),
-        *stream_figures(subject, gallery),
-        scenario_figure(subject, gallery),
-    ]
-    text = "Truth and prediction as fields on the score grid."
-    return Section(name="flow", title="The flow over time", lead=paragraph(text), figures=figures)
-
-
-def _particles(subject: Subject, gallery: Gallery) -> Section:
-    figures = [*particle_figures(subject, gallery), *body_curves(subject)]
-    text = "What the particles do: truth above, predictions below."
-    return Section(name="particles", title="Particles", lead=paragraph(text), figures=figures)
+def _section(name: str, title: str, lead: str, *figures: Figure) -> Section:
+    return Section(name, title, lead if isinstance(lead, Markup) else paragraph(lead), figures)

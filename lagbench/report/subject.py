@@ -1,7 +1,4 @@
-"""What a report is about: the entries, the task, and the frames that its pictures show.
-
-The frames that pictures show, read from truth and predictions a few at a time.
-"""
+"""What a report is about: the entries, the task, and the frames that its pictures show."""
 
 from __future__ import annotations
 
@@ -25,32 +22,21 @@ from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.compare import told_apart
 from lagbench.scoring.scenario import SUBMISSION
 from lagbench.scoring.task import OpenScenario, ScoredTask, load_scored_task
-from lagbench.submission.predictions import Predictions, open_predictions
+from lagbench.submission.predictions import open_predictions
 
 __all__ = [
-    "COLOURS",
-    "Entry",
-    "Row",
-    "Subject",
-    "kind_of",
+    *("COLOURS", "Entry", "Gallery", "Moment", "Row", "Subject", "Walls", "kind_of", "open_gallery"),
     "subject_of",
-    "Gallery",
-    "Moment",
-    "Walls",
-    "open_gallery",
 ]
 
-
-COLOURS = 6
-"""Series that differ in colour; further ones are dashed."""
+COLOURS = 6  # series that differ in colour; further ones are dashed
 
 THESIS_FRAMES = {"cavity": 54, "curl-noise": 40}
 """Frame at which the thesis compares models: 54, and 35 after the last of 6 given frames."""
 
 OTHER_FRAME = 60
 
-TIMES = 6
-"""Columns of the pictures over time."""
+TIMES = 6  # columns of the pictures over time
 
 SAME = ("split", "size", "dataset_version", "dataset_sha256")
 
@@ -91,13 +77,11 @@ class Subject:
     @cached_property
     def rows(self) -> tuple[Row, ...]:
         """Entries, then the floors."""
-        entries = [Row(name=e.name, kind=e.kind, scores=e.card.submission, entry=e) for e in self.entries]
+        rows = [Row(name=e.name, kind=e.kind, scores=e.card.submission, entry=e) for e in self.entries]
         first = self.entries[0].card.scores
         floors = [name for name in first if name != SUBMISSION]
-        return (
-            *entries,
-            *(Row(name=name, kind=f"floor{i}", scores=first[name]) for i, name in enumerate(floors)),
-        )
+        rows += [Row(name=name, kind=f"floor{i}", scores=first[name]) for i, name in enumerate(floors)]
+        return tuple(rows)
 
     @property
     def ranking(self) -> Metric:
@@ -193,9 +177,18 @@ def subject_of(
             expected="one file per score card, at least one",
             got=f"{len(cards)} cards, {len(predictions)} files",
         )
-    for card, path in zip(cards, predictions, strict=True):
-        _check_same(cards[0], card, path)
     folder, header = resolve_root(root), cards[0].header
+    for card, path in zip(cards, predictions, strict=True):
+        for name in SAME:
+            expected, got = getattr(header, name), getattr(card.header, name)
+            if expected != got:
+                raise UsageError(
+                    f"one report, two values of {name}",
+                    where=str(path),
+                    expected=expected,
+                    got=got,
+                    fix="report submissions to one data set together, others on their own",
+                )
     described = rooted(folder, registry)
     task = load_scored_task(described.size(header.split, header.size), folder)
     names = told_apart([card.header.method for card in cards], taken=cards[0].scores)
@@ -204,19 +197,6 @@ def subject_of(
         for i, (name, card, path) in enumerate(zip(names, cards, predictions, strict=True))
     ]
     return Subject(task=task, title=described.split(header.split).title, entries=tuple(entries))
-
-
-def _check_same(first: ScoreCard, card: ScoreCard, path: Path) -> None:
-    for name in SAME:
-        expected, got = getattr(first.header, name), getattr(card.header, name)
-        if expected != got:
-            raise UsageError(
-                f"one report, two values of {name}",
-                where=str(path),
-                expected=expected,
-                got=got,
-                fix="report submissions to one data set together, others on their own",
-            )
 
 
 WALLS = ("left", "right", "bottom", "top")
@@ -279,37 +259,24 @@ def open_gallery(subject: Subject) -> Gallery:
     walls: dict[int, Walls] = {}
     with ExitStack() as stack:
         files = [stack.enter_context(open_predictions(entry.predictions)) for entry in subject.entries]
-        for scenario in subject.scenarios:
-            with subject.task.opened(scenario) as truth:
-                walls[scenario] = _walls(truth)
-                for moment in _moments(truth, files, scenario, _frames(subject, scenario)):
-                    moments[scenario, moment.frame] = moment
+        for number in subject.scenarios:
+            # all frames in the first scenario, and of free surfaces
+            frames = sorted({subject.key_frame, *subject.times, *subject.histogram_frames})
+            if number != subject.scenarios[0] and subject.full_box:
+                frames = [subject.key_frame]
+            with subject.task.opened(number) as truth:
+                scenario, walls[number] = truth.scenario, _walls(truth)
+                for frame in frames:
+                    before, now = truth.file.read("position", slice(frame - 1, frame + 1))
+                    true, pairs = scenario.snapshot(now, before), []
+                    for file in files:
+                        if frame == scenario.setting.input_frames:
+                            before, now = scenario.given[-1], file.frames(number, frame, 1)[0]
+                        else:
+                            before, now = file.frames(number, frame - 1, 2)
+                        pairs.append(FramePair(scenario, frame, true, scenario.snapshot(now, before)))
+                    moments[number, frame] = Moment(scenario=number, frame=frame, pairs=tuple(pairs))
     return Gallery(moments, walls)
-
-
-def _frames(subject: Subject, scenario: int) -> list[int]:
-    """Return the frames of a scenario that are shown: all in the first, and of free surfaces."""
-    if scenario != subject.scenarios[0] and subject.full_box:
-        return [subject.key_frame]
-    return sorted({subject.key_frame, *subject.times, *subject.histogram_frames})
-
-
-def _moments(
-    truth: OpenScenario, files: list[Predictions], number: int, frames: list[int]
-) -> Iterator[Moment]:
-    scenario = truth.scenario
-    for frame in frames:
-        position = truth.file.read("position", slice(frame - 1, frame + 1))
-        true = scenario.snapshot(position[1], position[0])
-        pairs = [FramePair(scenario, frame, true, _predicted(f, scenario, number, frame)) for f in files]
-        yield Moment(scenario=number, frame=frame, pairs=tuple(pairs))
-
-
-def _predicted(file: Predictions, scenario: Scenario, number: int, frame: int) -> Snapshot:
-    if frame == scenario.setting.input_frames:
-        return scenario.snapshot(file.frames(number, frame, 1)[0], scenario.given[-1])
-    before, now = file.frames(number, frame - 1, 2)
-    return scenario.snapshot(now, before)
 
 
 def _walls(truth: OpenScenario) -> Walls:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -16,26 +16,16 @@ from lagbench.metrics.metric import Direction, Metric, mean
 from lagbench.metrics.significance import FEWEST_SCENARIOS, compare, standings
 from lagbench.metrics.table import CHOSEN, FAMILIES
 from lagbench.metrics.vorticity import STABLE_PEARSON
-from lagbench.scoring.flags import Flag
-from lagbench.submission.findings import Finding
 
 from .html import Markup, html, interval, join, tag, text, unit, words
 from .html import unit as unit_of
 from .page import paragraph, table
-from .subject import Entry, Row, Subject
+from .subject import Row, Subject
 
 __all__ = [
-    "every_metric",
-    "frame_table",
-    "score_table",
-    "scenario_table",
-    "verdict_table",
-    "flag_list",
-    "head",
-    "identity",
-    "title",
+    *("every_metric", "flag_list", "frame_table", "head", "identity", "scenario_table", "score_table"),
+    *("stable_of", "title", "verdict_table"),
 ]
-
 
 AT_FRAMES = ("vorticity_mae", "vorticity_mse", "vorticity_rmse", "vorticity_pearson", "vorticity_kl")
 AT_FRAMES_FREE = ("sliced_w2", "position_rmse", "attribute_mse", "velocity_rmse", "energy_ratio")
@@ -79,12 +69,13 @@ def _score_rows(subject: Subject, names: Sequence[str]) -> Markup:
         scores = [row.scores.get(name) for row in rows]
         metric = rows[0].scores[name].metric
         best = _best(metric, [math.nan if score is None else score.mean for score in scores])
-        cells.append(
-            [
-                _named(metric, ranks=name == subject.ranking.name),
-                *("" if score is None else _cell(score, best=i in best) for i, score in enumerate(scores)),
-            ]
-        )
+        line: list[object] = [_named(metric, ranks=name == subject.ranking.name)]
+        for i, score in enumerate(scores):
+            undefined = sum(score.undefined) if score else 0
+            lost = tag("span", f"{undefined} undefined", class_="ci") if undefined else ""
+            number = tag("span", text(score.mean), class_="n best" if i in best else "n") if score else ""
+            line.append(join([number, interval(score.interval), lost]) if score else "")
+        cells.append(line)
     return table(["metric", *(_heading(row) for row in rows)], cells, kind="scores", label="Scores")
 
 
@@ -106,13 +97,6 @@ def _named(metric: Metric, *, ranks: bool) -> Markup:
     flag = join([" ", tag("span", "ranks", class_="flag ok")]) if ranks else ""
     name = tag("span", metric.name.replace("_", "_\u200b"), unit, flag, class_="metric")
     return join([name, tag("span", f"{metric.summary}; {aim}", class_="sub")])
-
-
-def _cell(score: Score, *, best: bool) -> Markup:
-    number = tag("span", text(score.mean), class_="n best" if best else "n")
-    undefined = sum(score.undefined)
-    lost = tag("span", f"{undefined} undefined", class_="ci") if undefined else ""
-    return join([number, interval(score.interval), lost])
 
 
 def frame_table(subject: Subject) -> Markup:
@@ -171,6 +155,9 @@ def verdict_table(subject: Subject) -> Markup:
 
 TILES = ("vorticity_pearson", "stable_frames", "spectrum_error", "position_rmse_20", "outside_share")
 
+STATES = {True: ("raised", "bad"), False: ("clear", "ok"), None: ("unknown", "unknown")}
+"""What a flag says, and the classes of that."""
+
 TILE_NOTES = {
     "spectrum_error": "decades of energy, at the frames of interest",
     "position_rmse_20": "particle by particle, first 20 frames",
@@ -187,43 +174,42 @@ def head(subject: Subject) -> Markup:
     """Return the top of the page."""
     size, header = subject.task.size, subject.entries[0].card.header
     setting = subject.task.setting
+    many = len(subject.entries) > 1
     names = " · ".join(entry.name for entry in subject.entries)
     lede = (
         f"Given {setting.input_frames} frames of each of {len(subject.scenarios)} test scenarios, predict the"
         f" next {setting.horizon}. {subject.title}, {size.particles} particles, data set version"
         f" {header.dataset_version}."
     )
-    return join(
-        [
-            tag("p", f"lagbench · score report · {size.split} {size.name}", class_="brand"),
-            tag("h1", names),
-            tag("p", lede, class_="lede"),
-            tag("ul", *_tiles(subject), class_="tiles"),
-        ]
-    )
-
-
-def _tiles(subject: Subject) -> Iterator[Markup]:
-    best = subject.best_entry
-    whose = f"{best.name}: " if len(subject.entries) > 1 else ""
-    ranking = subject.ranking.name
+    best, ranking, tiles = subject.best_entry, subject.ranking.name, []
+    whose = f"{best.name}: " if many else ""
     found = best.entry.card.skill if best.entry is not None else None
     if found is not None:
-        yield _card(f"{whose}skill", found.value, found.interval, f"1 - score / score of {found.floor}")
-    yield _tile(f"{whose}{words(ranking)}", best.scores[ranking], _beside(subject, best))
+        said = f"1 - score / score of {found.floor}"
+        tiles.append(_card(f"{whose}skill", found.value, found.interval, said))
+    tiles.append(_tile(f"{whose}{words(ranking)}", best.scores[ranking], _beside(subject, best)))
     for name in TILES:
         score = best.scores.get(name)
         if score is None or name == ranking:
             continue
         if name == "stable_frames":
-            yield _tile("stable", score, _stable_of(score))
+            tiles.append(_tile("stable", score, stable_of(score)))
         elif name == "vorticity_pearson":
-            yield _at_frame(subject, score)
+            values, said = score.at(subject.key_frame), f"at frame {subject.key_frame}"
+            tiles.append(_card(words(name), mean(values), bootstrap_interval(values), said))
         else:
-            yield _tile(words(name), score, TILE_NOTES.get(name, "mean over the horizon"))
+            tiles.append(_tile(words(name), score, TILE_NOTES.get(name, "mean over the horizon")))
+    return join(
+        [
+            tag("p", f"lagbench · score report · {size.split} {size.name}", class_="brand"),
+            tag("h1", names),
+            tag("p", lede, class_="lede"),
+            tag("ul", *tiles, class_="tiles"),
+        ]
+    )
 
 
-def _stable_of(score: Score) -> str:
+def stable_of(score: Score) -> str:
     """Return out of how many frames, and how many of all scenarios' do not count."""
     lost, every = sum(score.undefined), len(score.scenarios) * len(score.frames)
     said = f"of {len(score.frames)}, correlation above {STABLE_PEARSON}"
@@ -239,12 +225,6 @@ def _card(what: str, value: float, bounds: tuple[float, float], more: str) -> Ma
     spread = "" if math.isnan(low) else tag("span", f"{text(low)} … {text(high)}", class_="more")
     number = tag("span", text(value), class_="big")
     return tag("li", tag("span", what, class_="what"), number, spread, tag("span", more, class_="more"))
-
-
-def _at_frame(subject: Subject, score: Score) -> Markup:
-    values = score.at(subject.key_frame)
-    more = f"at frame {subject.key_frame}"
-    return _card(words(score.metric.name), mean(values), bootstrap_interval(values), more)
 
 
 def _beside(subject: Subject, row: Row) -> str:
@@ -264,33 +244,27 @@ def flag_list(subject: Subject) -> Markup:
     many = len(subject.entries) > 1
     parts = []
     for entry in subject.entries:
-        items = [_flag(flag) for flag in entry.card.flags]
-        items += [_warning(finding) for finding in entry.card.warnings]
-        items += [_diverged(entry)] if entry.card.header.diverged_at else []
+        items = []
+        for flag in entry.card.flags:
+            word, kind = STATES[flag.raised]
+            evidence = [f"{name.replace('_', ' ')} {text(value)}" for name, value in flag.evidence.items()]
+            reasons = f": {'; '.join(flag.reasons)}" if flag.reasons else ""
+            items.append(_item(word, kind, flag.name.replace("_", " "), reasons, ", ".join(evidence)))
+        for finding in entry.card.warnings:
+            more = f"{finding.where}: expected {finding.expected}, got {finding.got}. {finding.fix}"
+            items.append(_item("warning", "warn", finding.check, f": {finding.what}", more))
+        if marks := sorted(entry.card.header.diverged_at.items()):
+            said = ", ".join(f"scenario {i} at frame {frame}" for i, frame in marks)
+            said = f": the rollout is frozen from there on: {said}"
+            items.append(_item("warning", "warn", "diverged", said))
         parts.append(join([tag("h4", entry.name) if many else "", tag("ul", *items, class_="flags")]))
     return join(parts)
 
 
-def _flag(flag: Flag) -> Markup:
-    word, kind = {True: ("raised", "bad"), False: ("clear", "ok"), None: ("unknown", "unknown")}[flag.raised]
-    numbers = ", ".join(f"{name.replace('_', ' ')} {text(value)}" for name, value in flag.evidence.items())
-    reasons = f": {'; '.join(flag.reasons)}" if flag.reasons else ""
-    said = tag(
-        "span", tag("strong", flag.name.replace("_", " ")), reasons, tag("span", numbers, class_="sub")
-    )
-    return tag("li", tag("span", word, class_=f"flag {kind}"), said)
-
-
-def _warning(finding: Finding) -> Markup:
-    more = f"{finding.where}: expected {finding.expected}, got {finding.got}. {finding.fix}"
-    said = tag("span", tag("strong", finding.check), f": {finding.what}", tag("span", more, class_="sub"))
-    return tag("li", tag("span", "warning", class_="flag warn"), said)
-
-
-def _diverged(entry: Entry) -> Markup:
-    where = ", ".join(f"scenario {i} at frame {f}" for i, f in sorted(entry.card.header.diverged_at.items()))
-    said = tag("span", tag("strong", "diverged"), f": the rollout is frozen from there on: {where}")
-    return tag("li", tag("span", "warning", class_="flag warn"), said)
+def _item(word: str, kind: str, name: str, said: str, more: str | None = None) -> Markup:
+    below = "" if more is None else tag("span", more, class_="sub")
+    told = tag("span", tag("strong", name), said, below)
+    return tag("li", tag("span", word, class_=f"flag {kind}"), told)
 
 
 def identity(subject: Subject) -> Markup:
@@ -302,26 +276,19 @@ def identity(subject: Subject) -> Markup:
     ]
     parts = [table(["what", "value"], data, kind="text", label="Data set")]
     for entry in subject.entries:
-        parts += [
-            tag("h4", entry.name),
-            table(["what", "value"], _about(entry), kind="text", label=entry.name),
-        ]
+        header = entry.card.header
+        parameters, seconds = header.parameters, header.seconds_per_frame
+        known = {
+            "method": header.method,
+            "predictions SHA-256": tag("code", entry.card.predictions_sha256),
+            "parameters": None if parameters is None else f"{parameters:,}".replace(",", "\u202f"),
+            "seconds per frame": None if seconds is None else text(seconds),
+            "device": header.device,
+            "seed": header.seed,
+            "training": header.training,
+        }
+        about = [[name, value] for name, value in known.items() if value is not None]
+        parts += [tag("h4", entry.name), table(["what", "value"], about, kind="text", label=entry.name)]
     files = " ".join(shlex.quote(entry.predictions.name) for entry in subject.entries)
     parts += [tag("h4", "The same report again"), tag("pre", f"lagbench score {files} --report report")]
     return join(parts)
-
-
-def _about(entry: Entry) -> list[list[object]]:
-    header = entry.card.header
-    rows: list[list[object]] = [
-        ["method", header.method],
-        ["predictions SHA-256", tag("code", entry.card.predictions_sha256)],
-    ]
-    known = {
-        "parameters": None if header.parameters is None else f"{header.parameters:,}".replace(",", "\u202f"),
-        "seconds per frame": None if header.seconds_per_frame is None else text(header.seconds_per_frame),
-        "device": header.device,
-        "seed": header.seed,
-        "training": header.training,
-    }
-    return rows + [[name, value] for name, value in known.items() if value is not None]

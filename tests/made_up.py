@@ -1,17 +1,27 @@
-"""Small made-up flows of every split, methods that predict them, and their reports."""
+"""Small made-up flows of every split, methods that predict them, their reports and a leaderboard of them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import datetime
+import hashlib
+import shutil
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import netCDF4
 import numpy as np
+import yaml
 from filelock import FileLock
 from numpy.typing import NDArray
 
-from lagbench.data.checksums import dataset_hash, subset_hash
+from lagbench.board.entry import Meta
+from lagbench.board.entry_file import read_entry
+from lagbench.board.ranking import combine, summarise
+from lagbench.board.score_file import read_stored
+from lagbench.board.submit import SubmitResult, submit
+from lagbench.data.checksums import dataset_hash, file_sha256, subset_hash
 from lagbench.data.registry import Registry, Size, default_path, load
 from lagbench.data.writer import ScenarioKey, ScenarioWriter, scenario_path
 from lagbench.data.yamlfile import read_yaml, spell_yaml
@@ -25,6 +35,8 @@ Floats = NDArray[np.float64]
 Method = Callable[[Floats, int, int], Floats]
 """From all true positions [frame, particle, 2], given frames n and horizon h to predictions."""
 
+DAY = datetime.date(2026, 1, 31)
+PLACE, SCORES = "submissions/cavity/tiny", "scores/cavity/tiny"
 SPLITS = ("cavity", "curl-noise", "fluid", "multimaterial")
 
 
@@ -207,3 +219,137 @@ HOSTILE = "<script>console.error(1)</script><img src=http://example.com/x onerro
 
 METHODS: dict[str, Method] = {"GNS & friends": damped, HOSTILE: noisy}
 """The methods of :func:`page_of`."""
+
+
+@dataclass(frozen=True)
+class BoardBench:
+    """A leaderboard's folder, and the data and registry that its entries were scored with.
+
+    It has the floors, ``damped`` with two seeds, ``noisy`` and the wild ``flipping``.
+    """
+
+    folder: Path
+    data: ReportBench
+
+    @property
+    def registry(self) -> Registry:
+        """The registry."""
+        return self.data.registry
+
+    def predict(self, method: Method, name: str, **labels: Any) -> Path:
+        """Write predictions outside the folder."""
+        seed = f"_{labels['seed']}" if "seed" in labels else ""
+        return self.data.submit(self.folder.parent / f"{name}{seed}.nc", method, name, **labels)
+
+    def submit(self, *paths: Path, replace: bool = False, **keys: Any) -> SubmitResult:
+        """Submit predictions."""
+        meta = Meta(**{"authors": ("A. Author",), "command": "make", "date": DAY, **keys})
+        return submit(paths, meta, replace=replace, new_board=True, **self.where)
+
+    @property
+    def where(self) -> dict[str, Any]:
+        """Folders and registry as arguments."""
+        return {"board": self.folder, "root": self.data.root, "registry": self.registry, "workers": 1}
+
+    def entry(self, method: str) -> Path:
+        """Return the YAML file of an entry."""
+        return self.folder / PLACE / f"{method}.yaml"
+
+    def edit(self, method: str, change: Callable[[dict[str, Any]], object]) -> None:
+        """Change the YAML file of an entry by hand."""
+        held = yaml.load(self.entry(method).read_text(), Loader=yaml.CSafeLoader)
+        change(held)
+        self.entry(method).write_text(yaml.dump(held, Dumper=yaml.CSafeDumper, sort_keys=False))
+
+    def forge(self, method: str) -> None:
+        """Make hashes and aggregates of an entry follow from its score files, as one does who knows how."""
+        self.rehash(method)
+        entry = read_entry(self.entry(method))
+        stored = [read_stored(self.folder / path).scores for path in entry.score_paths]
+        plain = {name: summary.model_dump() for name, summary in summarise(combine(stored)).items()}
+        self.edit(method, lambda held: held["score"].update(metrics=plain))
+
+    def rehash(self, method: str) -> None:
+        """Make the hashes of an entry those of its score files, whatever these hold."""
+        paths = read_entry(self.entry(method)).score_paths
+
+        def change(held: dict[str, Any]) -> None:
+            for said, path in zip(held["score"]["files"], paths, strict=True):
+                said["sha256"] = file_sha256(self.folder / path)
+
+        self.edit(method, change)
+
+    def state(self) -> dict[str, str]:
+        """Return path to hash of every file in the folder."""
+        files = sorted(path for path in self.folder.rglob("*") if path.is_file())
+        return {
+            path.relative_to(self.folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+            for path in files
+        }
+
+
+def master(home: Path) -> BoardBench:
+    """Return the bench that all tests and processes share; do not change its files."""
+    bench = BoardBench(home / "board-bench" / "leaderboard", make_report_bench(home, "cavity"))
+    finished = home / "board-bench" / "finished"
+    with FileLock(home / "board-bench.lock"):
+        if not finished.exists():
+            shutil.rmtree(finished.parent, ignore_errors=True)
+            finished.parent.mkdir()
+            seeds = [bench.predict(damped, "damped", seed=0, device="cpu", seconds_per_frame=0.25)]
+            seeds.append(bench.predict(_worse, "damped", seed=3, device="cpu", seconds_per_frame=0.75))
+            bench.submit(*seeds, solver_seconds_per_frame=2.0)
+            bench.submit(bench.predict(noisy, "noisy", parameters=5))
+            bench.submit(bench.predict(flipping, "flipping"))
+            finished.touch()
+    return bench
+
+
+def flipping(truth: Any, n: int, h: int) -> Any:
+    """Predict a box that is mirrored every other frame from the third on: a vorticity out of all bounds."""
+    guess = np.array(truth[n : n + h])
+    guess[3::2, :, 0] = 1.0 - guess[3::2, :, 0]
+    return guess
+
+
+def _worse(truth: Any, n: int, h: int) -> Any:
+    return damped(truth, n, h) + 2.0 * (noisy(truth, n, h) - truth[n : n + h])
+
+
+def nearer(truth: Any, n: int, h: int) -> Any:
+    """Predict the truth with half the error of ``noisy``."""
+    return truth[n : n + h] + 0.5 * (noisy(truth, n, h) - truth[n : n + h])
+
+
+def copied(home: Path, folder: Path, *, without: Sequence[str] = ()) -> BoardBench:
+    """Return the bench with a copy of the leaderboard that a test may damage, without some entries."""
+    shared = master(home)
+    left_out = [f"{name}{end}" for name in without for end in (".yaml", ".nc", "_*.nc")]
+    shutil.copytree(shared.folder, folder / "leaderboard", ignore=shutil.ignore_patterns(*left_out))
+    return BoardBench(folder / "leaderboard", shared.data)
+
+
+def set_mean(held: dict[str, Any], factor: float = 0.9) -> None:
+    """Better the ranking metric of an entry."""
+    held["score"]["metrics"]["vorticity_rmse"]["mean"] *= factor
+
+
+def reform(bench: BoardBench, change: Callable[[Any], object], *, whole: bool = True) -> None:
+    """Change the values of a score file and make its hash, and the aggregates, follow."""
+    with netCDF4.Dataset(bench.folder / SCORES / "noisy.nc", "r+") as file:
+        file.set_auto_maskandscale(False)
+        change(file)
+    if whole:
+        bench.forge("noisy")
+    else:
+        bench.rehash("noisy")
+
+
+def scale(statistic: str, factor: float) -> Callable[[Any], object]:
+    """Return a change that multiplies a statistic."""
+
+    def change(file: Any) -> None:
+        row = file.statistics.split().index(statistic)
+        file["value"][row] = factor * file["value"][row]
+
+    return change

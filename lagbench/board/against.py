@@ -1,13 +1,20 @@
-"""Score predictions again and compare with their score files: the proof of a score."""
+"""Check a leaderboard against what lies outside it: predictions scored again, and the base of a change.
+
+Scoring again is the proof of a score. A pull request adds; whoever alters what others submitted has to be
+seen, so the folder is compared with the commit at which the change left the base.
+"""
 
 from __future__ import annotations
 
+import subprocess
 import tempfile
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import yaml
 
 from lagbench.data.registry import Registry
 from lagbench.errors import ChecksFailedError, UnreadableFileError, UsageError
@@ -21,21 +28,21 @@ from lagbench.submission.findings import Finding
 from lagbench.work.progress import Progress
 
 from .entry import Entry, ScoredFile
+from .entry_file import MAX_ENTRY_BYTES
 from .findings import FLOORS_ANEW, finding
-from .folder import Folder
-from .score_file import Stored, read_stored
+from .folder import FLOORS, SCORES, SUBMISSIONS, VERIFIED, WEIGHTS, Folder
+from .score_file import read_stored
 from .submit import scored_file
 
-__all__ = ["TOLERANCE", "Confirmation", "Rescoring", "farthest"]
+__all__ = ["TOLERANCE", "Confirmation", "Rescoring", "check_base", "farthest"]
 
 TOLERANCE = 1e-6
 """Relative difference up to which two numbers are equal; NumPy versions may differ in the last bits."""
 
-FILM_STEP = (FILM_RANGE[1] - FILM_RANGE[0]) / LEVELS
-"""Step of packed film positions [length]."""
+FILM_STEP = (FILM_RANGE[1] - FILM_RANGE[0]) / LEVELS  # step of packed film positions [length]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Confirmation:
     """Predictions that, scored again, gave what an entry says."""
 
@@ -71,7 +78,14 @@ class Rescoring:
             fix = "lagbench validate says what is wrong"
             yield finding("rescored", where, got, expected="valid predictions", fix=fix)
             return
-        yield from self._floors(card)
+        for inner in self.folder.floor_files(card.header.split, card.header.size):
+            if inner.stem not in card.tallies or inner.stem == SUBMISSION:
+                continue
+            kept = read_stored(self.folder.path / inner).scores
+            if kept.identity["dataset_sha256"] == card.header.dataset_sha256:
+                unlike, _ = _unlike(dict(card.tallies[inner.stem]), kept)
+                if unlike:
+                    yield finding("rescored", inner, _listed(unlike), fix=FLOORS_ANEW)
         known = [
             (entry, inner, said)
             for entry in self.entries
@@ -95,17 +109,6 @@ class Rescoring:
             path, root=self.root, registry=self.registry, progress=self.progress, extras=extras, write=False
         )
 
-    def _floors(self, card: ScoreCard) -> Iterator[Finding]:
-        """Yield floors whose scores are not those that were measured beside the predictions."""
-        for path in self.folder.floor_files(card.header.split, card.header.size):
-            if path.stem in card.tallies and path.stem != SUBMISSION:
-                held = read_stored(self.folder.path / path).scores
-                if held.identity["dataset_sha256"] != card.header.dataset_sha256:
-                    continue
-                told = _unlike(dict(card.tallies[path.stem]), held)
-                if told[0]:
-                    yield finding("rescored", path, _listed(told[0]), fix=FLOORS_ANEW)
-
     def _compared(
         self, path: str | Path, card: ScoreCard, entry: Entry, inner: Path, said: ScoredFile
     ) -> Iterator[Finding]:
@@ -113,8 +116,9 @@ class Rescoring:
         if inner not in self.sound:
             return  # told by the checks of the score file
         where, theirs = str(path), read_stored(self.folder.path / inner)
-        extras = _extras(theirs.scores)
-        if extras:
+        statistics = next(iter(theirs.scores.tallies.values())).names
+        measured = {METRICS[name].extra for name in statistics if name in METRICS}
+        if extras := sorted(extra for extra in measured if extra is not None):
             try:
                 card = self._card(path, extras)
             except UsageError as error:
@@ -126,7 +130,12 @@ class Rescoring:
             write_statistics(card, file)
             ours, stored = scored_file(card, file), read_stored(file)
         differing, difference = _unlike(dict(stored.scores.tallies), theirs.scores)
-        differing += _other_pictures(stored, theirs)
+        step = max(stored.precision, theirs.precision)
+        for name, room in {"vorticity": 1.01 * step, "film": 1.01 * FILM_STEP}.items():
+            a, b = (np.asarray(getattr(held.preview, name), np.float64) for held in (stored, theirs))
+            # pictures may differ by the steps in which they are packed
+            if a.shape != b.shape or not np.allclose(a, b, rtol=1e-5, atol=room, equal_nan=True):
+                differing.append(f"{name} pictures")
         if differing:
             yield finding("rescored", where, _listed(differing), expected=f"what {inner} holds")
         for name in ("flags", "warnings", "diverged_at"):
@@ -139,10 +148,8 @@ class Rescoring:
             differing.append("budget")
             yield finding("rescored", where, card.header.budget, expected=f"budget {made.budget}")
         if not differing:
-            found = Confirmation(
-                predictions=Path(path), entry=entry.yaml_path, score_file=inner, difference=difference
-            )
-            self.confirmed.append(found)
+            confirmed = Confirmation(Path(path), entry.yaml_path, inner, difference)
+            self.confirmed.append(confirmed)
 
 
 def _unlike(ours: dict[int, Tally], theirs: StoredScores) -> tuple[list[str], float]:
@@ -175,25 +182,6 @@ def farthest(one: Tally, other: Tally, name: str) -> float:
     return float(np.nanmax(apart / scale, initial=0.0))
 
 
-def _other_pictures(one: Stored, other: Stored) -> list[str]:
-    """Return which pictures differ by more than the steps in which they are packed."""
-    step = max(one.precision, other.precision)
-    rooms = {"vorticity": 1.01 * step, "film": 1.01 * FILM_STEP}
-    found = []
-    for name, room in rooms.items():
-        a, b = (np.asarray(getattr(held.preview, name), np.float64) for held in (one, other))
-        if a.shape != b.shape or not np.allclose(a, b, rtol=1e-5, atol=room, equal_nan=True):
-            found.append(f"{name} pictures")
-    return found
-
-
-def _extras(held: StoredScores) -> tuple[str, ...]:
-    """Return the extras whose metrics a score file has."""
-    names = next(iter(held.tallies.values())).names
-    found = {METRICS[name].extra for name in names if name in METRICS}
-    return tuple(sorted(extra for extra in found if extra is not None))
-
-
 def _named(held: object) -> object:
     """Return flags as their names, marks of divergence by scenario."""
     if isinstance(held, dict):
@@ -204,3 +192,75 @@ def _named(held: object) -> object:
 def _listed(names: Sequence[str]) -> str:
     more = f" and {len(names) - 5} more" if len(names) > 5 else ""
     return f"other {', '.join(names[:5])}{more}"
+
+
+KEYS = ("status", "superseded_by")  # keys of an entry that decide whether and how it stands on the board
+
+
+def check_base(folder: Folder, base: str, own: Collection[str]) -> Iterator[Finding]:
+    """Yield the entries of others that a change touches, removes, supersedes or alters in status."""
+    start = _git(folder, "merge-base", base, "HEAD").decode().strip()
+    told = _git(folder, "diff", "--name-status", "--no-renames", "--relative", "-z", start, "--", ".")
+    words = told.decode("utf-8", "replace").split("\0")[:-1]
+    before = set(_git(folder, "ls-tree", "-r", "-z", "--name-only", start, ".").decode().split("\0"))
+    changes = dict(zip(map(Path, words[1::2]), words[0::2], strict=True))
+    # files that git does not follow yet may still take the place of others'
+    untracked = _git(folder, "ls-files", "--others", "-z", ".").decode("utf-8", "replace").split("\0")
+    changes |= {Path(name): "A" for name in untracked if name}
+    for path, how in sorted(changes.items()):
+        if path == Path(VERIFIED) or path.parts[0] == FLOORS:
+            if path.as_posix() in before or path == Path(VERIFIED):
+                yield finding("base", path, _verb(how), expected="what the maintainers keep, unchanged")
+        elif path.parts[0] in (SUBMISSIONS, SCORES, WEIGHTS) and len(path.parts) == 4:
+            method = path.stem.partition("_")[0]
+            entry = Path(SUBMISSIONS, *path.parts[1:3], f"{method}.yaml")
+            if entry.as_posix() not in before or method in own:
+                continue
+            got = _verb(how)
+            if path == entry and how == "M":
+                now, file = None, folder.path / entry
+                if folder.oddity(entry) is None and file.stat().st_size <= MAX_ENTRY_BYTES:
+                    now = _plain(file.read_bytes())
+                got = _altered(_plain(_git(folder, "show", f"{start}:./{entry.as_posix()}")), now)
+            yield finding("base", path, got, expected=f"{entry} and its score files, unchanged")
+
+
+def _verb(how: str) -> str:
+    return {"A": "added", "D": "removed", "T": "replaced by a link"}.get(how[:1], "changed")
+
+
+def _altered(before: Any, now: Any) -> str:  # noqa: ANN401
+    """Return which keys differ; those that decide how the entry stands with both values."""
+    if not isinstance(before, dict) or not isinstance(now, dict):
+        return "another content"
+    names = [str(key) for key in {**before, **now} if before.get(key) != now.get(key)]
+    said = [f"{key} {before.get(key)!a:.60} -> {now.get(key)!a:.60}" for key in KEYS if key in names]
+    others = [ascii(name)[1:-1][:40] for name in names if name not in KEYS][:8]
+    return "; ".join(said + ([f"other {', '.join(others)}"] if others else [])) or "another wording"
+
+
+def _plain(data: bytes) -> Any:  # noqa: ANN401
+    # the loader that makes text of every value: it cannot fail on numbers and dates
+    try:
+        return None if b"&" in data and b"*" in data else yaml.load(data, Loader=yaml.BaseLoader)
+    except (yaml.YAMLError, ValueError, RecursionError):
+        return None
+
+
+def _git(folder: Folder, *words: str) -> bytes:
+    # settings of the checkout must neither run programs nor quote paths
+    safe = ("-c", "core.fsmonitor=false", "-c", "core.quotePath=false", "--no-optional-locks")
+    try:
+        done = subprocess.run(
+            ["git", *safe, "-C", str(folder.path), *words], capture_output=True, check=True, timeout=60
+        )
+    except (OSError, subprocess.SubprocessError) as error:
+        said = getattr(error, "stderr", None) or str(error).encode()
+        raise UsageError(
+            "git cannot say what the change alters",
+            where=f"--base, {folder.path}",
+            expected="a leaderboard in a git repository, and a revision that it knows, as in origin/main",
+            got=ascii(said.decode("utf-8", "replace").strip().split("\n")[0][:200])[1:-1],
+            fix="run it in a clone with history (fetch the base), or leave --base out",
+        ) from error
+    return done.stdout

@@ -1,0 +1,263 @@
+"""What lies outside a leaderboard's folder: predictions scored again, and the base of a change."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import netCDF4
+import numpy as np
+import pytest
+import yaml
+from made_up import PLACE, SCORES, BoardBench, copied, damped, noisy, reform, scale, set_mean
+
+from lagbench.board import submit as submitting
+from lagbench.board.check import CheckResult, check_board
+from lagbench.board.collect import collect
+from lagbench.errors import UnreadableFileError, UsageError
+from lagbench.scoring import score
+
+FLOOR = "floors/cavity/tiny/persistence.nc"
+
+
+@pytest.fixture
+def own(home: Path, tmp_path: Path) -> BoardBench:
+    """A copy of the leaderboard that the test may damage."""
+    return copied(home, tmp_path, without=["flipping", "constant-velocity", "frozen-field", "analog"])
+
+
+def found(bench: BoardBench) -> list[str]:
+    """Return the names of the checks that find something without either."""
+    result = check_board(bench.folder, registry=bench.registry, isolated=False)
+    return [finding.check for finding in result.findings]
+
+
+@pytest.fixture
+def predictions(own: BoardBench) -> Path:
+    """The predictions of noisy."""
+    return own.predict(noisy, "noisy", parameters=5)
+
+
+def rescored(bench: BoardBench, *paths: Path, **options: Any) -> CheckResult:
+    """Check with predictions scored again."""
+    where = {"registry": bench.registry, "root": bench.data.root, "isolated": False}
+    return check_board(bench.folder, predictions=paths, **where, **options)
+
+
+def test_scoring_again_confirms_and_is_recorded(own: BoardBench, predictions: Path) -> None:
+    """The entry is named with how close it came; only the list makes it verified, while its files stay."""
+    result = rescored(own, predictions)
+    assert not result.findings
+    (one,) = result.confirmed
+    assert (one.entry, one.difference) == (Path(PLACE, "noisy.yaml"), 0.0)
+    assert not (own.folder / "verified.yaml").exists()
+    assert rescored(own, predictions, recording=True).recorded == (f"{PLACE}/noisy.yaml",)
+    rows = {row.id: row.verified for row in collect(own.folder, registry=own.registry).tabs[0].rows}
+    assert rows["noisy"] is not None
+    assert rows["damped"] is None
+    assert found(own) == []
+    before = (own.folder / "verified.yaml").read_bytes()
+    rescored(own, predictions, recording=True)
+    assert (own.folder / "verified.yaml").read_bytes() == before
+    reform(own, scale("vorticity_mse", 0.5))
+    rows = {row.id: row.verified for row in collect(own.folder, registry=own.registry).tabs[0].rows}
+    assert rows["noisy"] is None
+    assert found(own) == ["verified"]
+
+
+def test_a_method_is_verified_with_all_its_seeds(own: BoardBench) -> None:
+    """One of two seeds confirms its score file, not the entry."""
+    path = own.predict(damped, "damped", seed=0, device="cpu", seconds_per_frame=0.25)
+    result = rescored(own, path, recording=True)
+    assert ([one.score_file.name for one in result.confirmed], result.recorded) == (["damped_0.nc"], ())
+
+
+def test_scoring_again_finds_what_a_forger_hid(own: BoardBench, predictions: Path) -> None:
+    """Statistics halved, hashes and aggregates forged: only the predictions themselves tell."""
+    reform(own, scale("vorticity_mse", 0.5))
+    assert found(own) == []
+    result = rescored(own, predictions, recording=True)
+    assert [(f.check, f.got) for f in result.findings] == [("rescored", "other vorticity_mse")]
+    assert (result.confirmed, result.recorded) == ((), ())
+    own.entry("noisy").unlink()
+    (own.folder / SCORES / "noisy.nc").unlink()
+    assert [f.check for f in rescored(own, predictions).findings] == ["rescored"]
+
+
+def test_what_is_said_beside_the_numbers_is_compared(own: BoardBench, predictions: Path) -> None:
+    """Flags and frozen scenarios are those that the scorer tells; so are the scores of floors."""
+    said = {"diverged_at": {0: 7}, "flags": [{"name": "physics"}]}
+    own.edit("noisy", lambda held: held["score"]["files"][0].update(said))
+    with netCDF4.Dataset(own.folder / FLOOR, "r+") as file:
+        file.set_auto_maskandscale(False)
+        scale("position_mse", 2.0)(file)
+    got = [finding.got for finding in rescored(own, predictions).findings]
+    assert got == ["other position_mse", "[]", "{}"]
+
+
+def test_pictures_are_compared(own: BoardBench, predictions: Path) -> None:
+    """A preview that is not of these predictions is found."""
+
+    def repaint(file: Any) -> None:
+        film = file["preview"]["film"]
+        film.set_auto_maskandscale(False)
+        film[1] = np.clip(film[1].astype(np.int64) + 500, 0, 60_000).astype(np.uint16)
+
+    reform(own, repaint)
+    assert [finding.got for finding in rescored(own, predictions).findings] == ["other film pictures"]
+
+
+def test_broken_predictions_are_opened_in_the_child_only(
+    own: BoardBench, predictions: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever is wrong with the file is found before this process opens it; other findings remain."""
+    cut = tmp_path / "cut.nc"
+    cut.write_bytes(predictions.read_bytes()[:-9999])
+    own.edit("damped", set_mean)
+
+    def never(*_: object, **__: object) -> None:
+        raise AssertionError
+
+    for module in (score, submitting):
+        monkeypatch.setattr(module, "open_predictions", never)
+    result = rescored(own, cut)
+    assert [finding.check for finding in result.findings] == ["score", "rescored"]
+    assert result.findings[1].where == str(cut)
+    with pytest.raises(UnreadableFileError):
+        own.submit(cut, method="cut")
+
+
+def git(folder: Path, *words: str) -> str:
+    """Run git as somebody without settings of his own."""
+    about = ("-c", "user.name=A", "-c", "user.email=a@example.org", "-c", "init.defaultBranch=main")
+    command = ["git", *about, "-C", str(folder), *words]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+
+
+def commit(bench: BoardBench) -> None:
+    """Commit all that lies there."""
+    git(bench.folder.parent, "add", "-A")
+    git(bench.folder.parent, "commit", "-q", "-m", "x", "--allow-empty")
+
+
+@pytest.fixture
+def branch(home: Path, tmp_path: Path) -> BoardBench:
+    """A copy of the leaderboard in a repository, on a branch that left main."""
+    if shutil.which("git") is None:
+        pytest.skip("no git here")
+    bench = copied(home, tmp_path, without=["flipping"])
+    git(tmp_path, "init", "-q")
+    (bench.folder / "verified.yaml").write_text("{}\n")
+    commit(bench)
+    git(tmp_path, "checkout", "-q", "-b", "change")
+    return bench
+
+
+def touched(bench: BoardBench, **options: Any) -> dict[str, str]:
+    """Return where and got of what the check against main finds."""
+    result = check_board(bench.folder, registry=bench.registry, isolated=False, base="main", **options)
+    return {finding.where: finding.got for finding in result.findings if finding.check == "base"}
+
+
+def new_entry(bench: BoardBench) -> None:
+    """Add an entry of one's own."""
+    held = yaml.safe_load(bench.entry("noisy").read_text()) | {"method": "mine", "name": "Mine"}
+    bench.entry("mine").write_text(yaml.safe_dump(held))
+    shutil.copyfile(bench.folder / SCORES / "noisy.nc", bench.folder / SCORES / "mine.nc")
+
+
+def test_what_only_adds_touches_nobody(branch: BoardBench) -> None:
+    """A new entry, committed or not, and a page built anew are nobody else's."""
+    new_entry(branch)
+    (branch.folder / "index.html").write_text("built anew")
+    assert touched(branch) == {}
+    commit(branch)
+    assert touched(branch) == {}
+
+
+NOISY, DAMPED = f"{PLACE}/noisy.yaml", f"{SCORES}/damped_3.nc"
+
+CHANGES: dict[str, tuple[Callable[[BoardBench], object], str, str]] = {
+    "removed": (lambda b: b.entry("noisy").unlink(), NOISY, "removed"),
+    "touched": (lambda b: b.edit("noisy", lambda h: h.update(notes="other")), NOISY, "other notes"),
+    "superseded": (
+        lambda b: b.edit("noisy", lambda h: h.update(status="superseded", superseded_by="damped")),
+        *(NOISY, "superseded_by None -> 'damped'"),
+    ),
+    "withdrawn": (
+        lambda b: b.edit("noisy", lambda h: h.update(status="withdrawn")),
+        *(NOISY, "status None -> 'withdrawn'"),
+    ),
+    "scores changed": (lambda b: (b.folder / DAMPED).write_bytes(b"x"), DAMPED, "changed"),
+    "scores removed": (lambda b: (b.folder / DAMPED).unlink(), DAMPED, "removed"),
+    "a seed added": (
+        lambda b: shutil.copyfile(b.folder / SCORES / "noisy.nc", b.folder / SCORES / "damped_9.nc"),
+        *(f"{SCORES}/damped_9.nc", "added"),
+    ),
+    "made a link": (
+        lambda b: (b.entry("noisy").unlink(), b.entry("noisy").symlink_to("damped.yaml")),
+        *(NOISY, "link"),
+    ),
+    "made a bomb": (lambda b: b.entry("noisy").write_text("a: &a [x]\nb: *a\n"), NOISY, "another content"),
+    "verified claimed": (
+        lambda b: (b.folder / "verified.yaml").write_text(f"{NOISY}: x\n"),
+        *("verified.yaml", "changed"),
+    ),
+    "floors changed": (
+        lambda b: (b.folder / "floors/cavity/tiny/persistence.nc").unlink(),
+        *("floors/cavity/tiny/persistence.nc", "removed"),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_what_touches_others_is_named(name: str, branch: BoardBench) -> None:
+    """Each way is found, in the working tree and in a commit, with the file and what became of it."""
+    change, where, got = CHANGES[name]
+    change(branch)
+    here = touched(branch)
+    commit(branch)
+    for found in (here, touched(branch)):
+        assert set(found) == {where}
+        assert got in found[where]
+
+
+def test_ones_own_may_be_altered(branch: BoardBench) -> None:
+    """What the change says is its own is not named, other entries are."""
+    branch.edit("noisy", lambda held: held.update(notes="other"))
+    branch.entry("damped").unlink()
+    assert set(touched(branch, own=["noisy"])) == {f"{PLACE}/damped.yaml"}
+
+
+def test_the_base_may_have_gone_on(branch: BoardBench) -> None:
+    """Entries that others added to main since are not missed on a branch that left it before."""
+    root = branch.folder.parent
+    git(root, "checkout", "-q", "main")
+    new_entry(branch)
+    commit(branch)
+    git(root, "checkout", "-q", "change")
+    assert touched(branch) == {}
+
+
+def test_without_git_it_says_so(
+    branch: BoardBench, home: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    """An unknown revision, and a folder outside any repository, are a matter of usage."""
+    with pytest.raises(UsageError) as error:
+        check_board(branch.folder, registry=branch.registry, isolated=False, base="nowhere")
+    assert "--base" in str(error.value.where)
+    outside = copied(home, tmp_path_factory.mktemp("outside"))
+    with pytest.raises(UsageError):
+        check_board(outside.folder, registry=outside.registry, isolated=False, base="main")
+
+
+def test_settings_of_a_checkout_run_nothing(branch: BoardBench, tmp_path: Path) -> None:
+    """A repository's own settings are strangers' too: no program of theirs is started."""
+    git(branch.folder.parent, "config", "core.fsmonitor", f"touch {tmp_path}/ran; false")
+    git(branch.folder.parent, "config", "diff.external", f"touch {tmp_path}/ran; false")
+    branch.edit("noisy", lambda held: held.update(notes="other"))
+    assert touched(branch)
+    assert not (tmp_path / "ran").exists()
