@@ -222,7 +222,7 @@ def read_scenario(path: Path) -> ScenarioFile:
     if not path.is_file():
         raise DataError("a scenario file is missing", where=str(path), fix=_REPAIR)
     with _damage(path), ExitStack() as stack:
-        file = h5py.File(path, "r", locking=False, rdcc_nbytes=CHUNK_CACHE)
+        file = h5py.File(path, "r", rdcc_nbytes=CHUNK_CACHE)
         stack.callback(file.close)
         opened = ScenarioFile(path, file)
         stack.pop_all()

@@ -272,7 +272,7 @@ def _nearest(
     for row, point in enumerate(points):
         np.subtract(columns, point[:, None], out=apart)
         np.square(apart, out=apart)
-        squares = np.add(*apart, out=apart[0])
+        squares = np.add(apart[0], apart[1], out=apart[0])
         if skip is not None:
             squares[skip[row]] = np.inf
         found[row] = np.argmin(squares)
