@@ -37,6 +37,7 @@ from lagbench.scoring import score as scored
 from lagbench.scoring.scenario import ScenarioScores
 from lagbench.scoring.task import ScoredTask
 from lagbench.submission import ValidationResult
+from lagbench.submission.format import Anatomy
 from lagbench.submission.validation import validate
 from lagbench.work.pool import Pool
 
@@ -120,14 +121,19 @@ def floors_once() -> Iterator[None]:
     known: dict[Hashable, dict[int, dict[str, Tally]]] = {}
 
     def outcomes(
-        task: ScoredTask, path: Path, metrics: tuple[str, ...], floors: tuple[str, ...], *others: Any
+        task: ScoredTask,
+        path: Path,
+        anatomy: Anatomy,
+        metrics: tuple[str, ...],
+        floors: tuple[str, ...],
+        *others: Any,
     ) -> list[ScenarioScores]:
         workers, scheduler, _ = others
         if not floors or scheduler is not None or (workers or 1) > 1:
-            return OUTCOMES(task, path, metrics, floors, *others)
+            return OUTCOMES(task, path, anatomy, metrics, floors, *others)
         files = sorted(task.truth.path(task.scenarios[0]).parents[1].rglob("*.nc"))
         key = metrics, floors, repr((task.size, task.setting)), *map(file_sha256, files)
-        found = OUTCOMES(task, path, metrics, () if key in known else floors, *others)
+        found = OUTCOMES(task, path, anatomy, metrics, () if key in known else floors, *others)
         if key not in known:
             known[key] = {one.scenario: {name: one.tallies[name] for name in floors} for one in found}
         return [replace(one, tallies={**one.tallies, **known[key][one.scenario]}) for one in found]

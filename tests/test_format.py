@@ -244,6 +244,42 @@ def writer(path: Path, **changes: Any) -> ScenarioWriter:
     return ScenarioWriter(path, KEY, **(told | changes))
 
 
+def test_other_readers_may_have_the_file_open(written: tuple[Path, str]) -> None:
+    """HDF5 opens a file twice in a process only if both openings treat locks alike."""
+    path, _ = written
+    with h5py.File(path, "r"), read_scenario(path) as file, h5py.File(path, "r"):
+        assert file.header.particles == 8
+
+
+@pytest.mark.parametrize("link", [h5py.SoftLink("/position"), h5py.ExternalLink("other.nc", "/position")])
+def test_links_are_not_followed(written: tuple[Path, str], link: object) -> None:
+    """What another name or another file would be read for is damage."""
+    path, _ = written
+    with h5py.File(path, "r+") as file:
+        file["material_too"] = link
+    with pytest.raises(DataError, match=r"(?s)damaged.*'material_too' is a \w+ link"):
+        read_scenario(path)
+
+
+def test_values_in_other_files_are_refused(written: tuple[Path, str]) -> None:
+    """A virtual data set reads another file, which need not be there."""
+    path, _ = written
+    layout = h5py.VirtualLayout(shape=(4, 8, 2), dtype="f4")
+    layout[:] = h5py.VirtualSource("other.nc", "position", shape=(4, 8, 2))
+    with h5py.File(path, "r+") as file:
+        file.create_virtual_dataset("spin", layout)
+    with pytest.raises(DataError, match=r"(?s)damaged.*'spin' lie elsewhere: virtual"):
+        read_scenario(path)
+
+
+def test_the_old_netcdf_is_refused(tmp_path: Path) -> None:
+    """A netCDF-3 file has no HDF5 inside."""
+    path = tmp_path / "old.nc"
+    xr.Dataset({"a": ("b", [1.0])}).to_netcdf(path, engine="netcdf4", format="NETCDF3_CLASSIC")
+    with pytest.raises(DataError, match=r"(?s)damaged.*old.nc"):
+        read_scenario(path)
+
+
 def test_reading_parts(written: tuple[Path, str]) -> None:
     """Method read takes frames or slices, blocks stream everything in order, unknown names are told."""
     path, _ = written

@@ -10,6 +10,7 @@ import pytest
 import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.special import stdtrit
 from statsmodels.stats.multitest import multipletests
 
 from lagbench.errors import UsageError
@@ -24,7 +25,7 @@ from lagbench.metrics import (
     sign_flip_p,
     standings,
 )
-from lagbench.metrics.aggregate import quantile
+from lagbench.metrics.aggregate import quantile, student_quantile
 from lagbench.metrics.significance import mean_loss
 
 DIFFERENCES = st.lists(st.integers(-5, 5).map(float), min_size=1, max_size=9)
@@ -85,6 +86,12 @@ def test_interval_is_scipys_percentile_bootstrap() -> None:
     stretch = math.sqrt(12 / 11) * scipy.stats.t.ppf(0.975, 11) / scipy.stats.norm.ppf(0.975)
     expected = [x.mean() + stretch * (bound - x.mean()) for bound in (theirs.low, theirs.high)]
     assert [low, high] == pytest.approx(expected, abs=0.05 * (high - low))
+
+
+def test_students_quantile_is_scipys() -> None:
+    """For whole degrees of freedom, for whole ones but for rounding, and for others."""
+    for freedom in (*range(3, 60), 500, 1000, 1001, 19.000000000000004, 2.5, 7.3):
+        assert student_quantile(freedom, 0.975) == pytest.approx(stdtrit(freedom, 0.975), rel=1e-12)
 
 
 @pytest.mark.parametrize("count", [2, 3, 101, 10_000])

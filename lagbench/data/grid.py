@@ -206,23 +206,23 @@ def _scatter(x: Floats, u: Floats, grid: Grid) -> Floats:
     s -= base
     weight_x, weight_y = _spline(s)
     side = grid.nodes + _LOW + _HIGH
-    size = side * side
-    column, row = base.astype(np.intp) + _LOW
-    # the three sums lie one behind the other, so that one call adds to all of them
-    corner = (column * side + row + size * np.arange(3)[:, None]).ravel()
+    base += _LOW
+    base[0] *= side
+    corner = (base[0] + base[1]).astype(np.intp)
     velocity = np.ascontiguousarray(u.T)
 
-    sums, part = np.zeros((3, size)), np.empty((3, size))
-    product = np.empty((3, len(column)))
+    size = side * side
+    sums, weight, product = np.zeros((3, size)), np.empty(len(corner)), np.empty(len(corner))
     for i in range(3):
         for k in range(3):
-            np.multiply(weight_x[i], weight_y[k], out=product[0])
-            np.multiply(product[0], velocity, out=product[1:])
-            part[:] = 0.0
-            np.add.at(part.reshape(-1), corner, product.reshape(-1))
             # node numbers stay those of the corner; its sums are shifted to the node instead
             shift = i * side + k
-            sums[:, shift:] += part[:, : size - shift]
+            np.multiply(weight_x[i], weight_y[k], out=weight)
+            # one sum at a time: the particles and the nodes of all three do not fit the fast cache
+            sums[0, shift:] += np.bincount(corner, weight, size)[: size - shift]
+            for component, along in zip(sums[1:], velocity, strict=True):
+                np.multiply(weight, along, out=product)
+                component[shift:] += np.bincount(corner, product, size)[: size - shift]
     return sums.reshape(3, side, side)[:, _LOW:-_HIGH, _LOW:-_HIGH]
 
 

@@ -23,6 +23,7 @@ import numpy as np
 from lagbench.errors import LagbenchError, UnreadableFileError
 
 __all__ = [
+    "INSIDE",
     "MAX_LINKS",
     "Array",
     "Odd",
@@ -34,6 +35,8 @@ __all__ = [
     "check_regular",
     "check_structure",
     "describe",
+    "dims_of",
+    "layout_of",
     "members_of",
     "opened",
     "reading",
@@ -76,6 +79,9 @@ LAYOUTS = {
     h5py.h5d.CHUNKED: "chunked",
     h5py.h5d.VIRTUAL: "virtual",
 }
+INSIDE = ("compact", "contiguous", "chunked")
+"""Layouts of arrays whose values lie in the file itself."""
+
 KINDS = {
     h5py.h5t.STRING: "string",
     h5py.h5t.COMPOUND: "compound",
@@ -270,14 +276,17 @@ def attribute_of(owner: h5py.HLObject, name: str) -> object:
     return value if isinstance(value, (str, int, float)) else Odd("neither a text nor a number")
 
 
+def layout_of(dataset: h5py.Dataset) -> str:
+    """Return how the values are stored: one of :data:`INSIDE`, "virtual" or "external files"."""
+    plist = dataset.id.get_create_plist()
+    return "external files" if plist.get_external_count() else LAYOUTS.get(plist.get_layout(), "unknown")
+
+
 def describe(dataset: h5py.Dataset, name: str) -> Array:
     """Return what the header of a data set says; no value is read."""
-    plist = dataset.id.get_create_plist()
-    layout = LAYOUTS.get(plist.get_layout(), "unknown")
-    if plist.get_external_count():
-        layout = "external files"
+    plist, layout = dataset.id.get_create_plist(), layout_of(dataset)
     # HDF5 opens the sources of a virtual data set to tell its shape.
-    elsewhere = layout not in ("compact", "contiguous", "chunked")
+    elsewhere = layout not in INSIDE
     simple = not elsewhere and dataset.id.get_space().get_simple_extent_type() in (
         h5py.h5s.SIMPLE,
         h5py.h5s.SCALAR,
@@ -290,7 +299,7 @@ def describe(dataset: h5py.Dataset, name: str) -> Array:
     return Array(
         name=name,
         shape=tuple(dataset.id.shape) if simple else None,
-        dims=() if elsewhere else _dims(dataset),
+        dims=() if elsewhere else dims_of(dataset),
         kind=_kind(kind),
         item=kind.get_size(),
         layout=layout,
@@ -306,7 +315,7 @@ def describe(dataset: h5py.Dataset, name: str) -> Array:
     )
 
 
-def _dims(dataset: h5py.Dataset) -> tuple[str, ...]:
+def dims_of(dataset: h5py.Dataset) -> tuple[str, ...]:
     """Return the names of the dimension scales that netCDF attaches, one per dimension."""
     rank: int = dataset.id.rank
     if not h5py.h5a.exists(dataset.id, b"DIMENSION_LIST"):

@@ -27,7 +27,7 @@ from .checksums import ContentHasher, plain
 from .layout import ScenarioKey
 
 if TYPE_CHECKING:
-    import netCDF4
+    import h5py
 
 __all__ = [
     "ATTRIBUTES",
@@ -96,7 +96,7 @@ BLOCK_BYTES = 1 << 20
 """Files are streamed in pieces of about this size [bytes]."""
 
 CHUNK_CACHE = 1 << 20
-"""Chunk cache of a variable [bytes]; the default of 64 MB would keep whole scenarios."""
+"""Chunk cache of a variable [bytes]; netCDF's default of 64 MB would keep whole scenarios."""
 
 DEFLATE_RATIO = 1032
 """No zlib stream unpacks to more than this many times its length."""
@@ -112,7 +112,6 @@ class ScenarioHeader:
     seed: str  # how the random numbers were seeded
     parameters: Mapping[str, object]  # physical parameters by name, those that enter the content hash
     content_sha256: str  # content hash as stored; see rehash for the true one
-    variable_sha256: Mapping[str, str]  # stored hash of each variable
     frames: int  # recorded frames
     particles: int  # particles in every frame
     device: str  # device that simulated
@@ -131,11 +130,14 @@ class ScenarioFile:
         header: what the file says about itself.
     """
 
-    def __init__(self, path: Path, file: netCDF4.Dataset) -> None:
+    def __init__(self, path: Path, file: h5py.File) -> None:
+        from .netcdf import variables
+
         self.path = path
         self._file = file
         with _damage(path):
-            _check_lengths(path, file)
+            self._variables = variables(file)
+            _check_lengths(path, self._variables)
             self.header = _header(file)
 
     def __enter__(self) -> Self:
@@ -148,26 +150,26 @@ class ScenarioFile:
 
     def close(self) -> None:
         """Close the file; a second call does nothing."""
-        if self._file.isopen():
-            self._file.close()
+        self._file.close()
 
     @property
     def variables(self) -> tuple[str, ...]:
         """Names of all variables, sorted."""
-        with _damage(self.path):
-            return tuple(sorted(self._file.variables))
+        return tuple(sorted(self._variables))
 
     def read(self, name: str, frames: slice | int = slice(None)) -> NDArray[Any]:
         """Return a variable, or some of its frames (entries along the first dimension)."""
+        from .netcdf import is_text
+
         with _damage(self.path, name):
-            variable = self._file.variables[name]
-            part = frames if variable.ndim else ...
-            return _texts(self.path, name, part) if variable.dtype is str else np.asarray(variable[part])
+            variable = self._variables[name]
+            part = frames if variable.ndim else ()
+            return np.asarray(variable.asstr()[part] if is_text(variable) else variable[part])
 
     def blocks(self, name: str) -> Iterator[NDArray[Any]]:
         """Yield a variable in order, in pieces of at most about 1 MiB."""
         with _damage(self.path, name):
-            shape = self._file.variables[name].shape
+            shape = self._variables[name].shape
             item = np.dtype(np.float64).itemsize * int(np.prod(shape[1:], dtype=np.int64))
         step = max(1, BLOCK_BYTES // max(1, item))
         starts = range(0, shape[0], step) if shape else range(1)
@@ -176,11 +178,12 @@ class ScenarioFile:
 
     def check_attributes(self) -> None:
         """Refuse attributes that make other readers read other values."""
-        for name in self.variables:
+        from .netcdf import attributes, dimensions
+
+        for name, variable in sorted(self._variables.items()):
             with _damage(self.path, name):
-                variable = self._file.variables[name]
-                found = {key: variable.getncattr(key) for key in variable.ncattrs()}
-                unlike = differing_attributes(name, variable.dimensions, found)
+                found = attributes(variable)
+                unlike = differing_attributes(name, dimensions(variable, name), found)
             if unlike:
                 raise DataError(
                     "attributes of a variable are not those of the format",
@@ -192,44 +195,35 @@ class ScenarioFile:
 
     def computed_hasher(self) -> ContentHasher:
         """Return a hasher that has read the whole file."""
+        from .netcdf import dimensions, is_text
+
         header = self.header
         hasher = ContentHasher(header.key.identity(header.seed, header.parameters))
-        for name in self.variables:
+        for name, variable in sorted(self._variables.items()):
             with _damage(self.path, name):
-                variable = self._file.variables[name]
-                hasher.declare(name, variable.dtype, variable.dimensions, variable.shape)
+                dtype = str if is_text(variable) else variable.dtype
+                hasher.declare(name, dtype, dimensions(variable, name), variable.shape)
                 for block in self.blocks(name):
                     hasher.update(name, block)
         return hasher
 
+    def stored_digests(self) -> dict[str, object]:
+        """Return the hash of each variable as stored; :meth:`computed_hasher` has the true ones."""
+        from .netcdf import attribute
 
-def _texts(path: Path, name: str, part: object) -> NDArray[Any]:
-    """Return a variable of texts, read by h5py.
-
-    Texts read by netCDF4 1.7.5 from a file that is open elsewhere in this process leave the
-    HDF5 library in a state in which, once another file is written, that file opens no more.
-    h5py has a library of its own.
-    """
-    import h5py
-
-    with h5py.File(path, "r") as file:
-        return np.asarray(file[name].asstr()[part])
+        with _damage(self.path):
+            return {name: attribute(held, "content_sha256") for name, held in self._variables.items()}
 
 
 def read_scenario(path: Path) -> ScenarioFile:
     """Open a scenario file."""
-    import netCDF4
+    import h5py
 
     if not path.is_file():
         raise DataError("a scenario file is missing", where=str(path), fix=_REPAIR)
     with _damage(path), ExitStack() as stack:
-        file = netCDF4.Dataset(path, "r")
+        file = h5py.File(path, "r", rdcc_nbytes=CHUNK_CACHE)
         stack.callback(file.close)
-        file.set_auto_maskandscale(False)
-        file.set_auto_chartostring(False)
-        for variable in file.variables.values():
-            if variable.chunking() != "contiguous":
-                variable.set_var_chunk_cache(CHUNK_CACHE)
         opened = ScenarioFile(path, file)
         stack.pop_all()
     return opened
@@ -244,13 +238,13 @@ def rehash(path: Path) -> str:
 def check_scenario(path: Path, expected: str | None = None) -> str:
     """Recompute a file's content hash, compare it, and check what is not hashed."""
     with read_scenario(path) as file:
-        stored = file.header
+        stored, digests = file.header, file.stored_digests()
         hasher = file.computed_hasher()
         file.check_attributes()
     for name, digest in hasher.digests().items():
-        if stored.variable_sha256.get(name) != digest:
+        if digests.get(name) != digest:
             where = f"{path}, variable {name!r}"
-            raise _mismatch("values differ from their hash", where, stored.variable_sha256.get(name), digest)
+            raise _mismatch("values differ from their hash", where, digests.get(name), digest)
     content = hasher.hexdigest()
     if content != stored.content_sha256:
         where = f"{path}, attributes"
@@ -260,15 +254,17 @@ def check_scenario(path: Path, expected: str | None = None) -> str:
     return content
 
 
-def _mismatch(what: str, where: str, expected: str | None, got: str) -> DataError:
+def _mismatch(what: str, where: str, expected: object, got: str) -> DataError:
     return DataError(what, where=where, expected=expected or "a stored hash", got=got, fix=_REPAIR)
 
 
-def _check_lengths(path: Path, file: netCDF4.Dataset) -> None:
+def _check_lengths(path: Path, variables: Mapping[str, h5py.Dataset]) -> None:
     """Refuse lengths that no file of this size can hold, before memory is asked for them."""
+    from .netcdf import is_text
+
     largest = DEFLATE_RATIO * path.stat().st_size
-    for name, variable in file.variables.items():
-        held = variable.size * (1 if variable.dtype is str else variable.dtype.itemsize)
+    for name, variable in variables.items():
+        held = variable.size * (1 if is_text(variable) else variable.dtype.itemsize)
         if held > largest:
             raise DataError(
                 "a variable is larger than its file can hold",
@@ -279,25 +275,31 @@ def _check_lengths(path: Path, file: netCDF4.Dataset) -> None:
             )
 
 
-def _header(file: netCDF4.Dataset) -> ScenarioHeader:
-    names = str(file.hashed_parameters).split()
+def _header(file: h5py.File) -> ScenarioHeader:
+    from .netcdf import attribute
+
+    def said(name: str) -> Any:  # noqa: ANN401 - a text or a number
+        value = attribute(file, name)
+        if value is None:
+            raise DataError(f"the attribute {name!r} is missing")
+        return value
+
     return ScenarioHeader(
         key=ScenarioKey(
-            split=str(file.split),
-            size=str(file.size),
-            version=str(file.version),
-            scenario=int(file.scenario),
-            subset=str(file.subset),
+            split=str(said("split")),
+            size=str(said("size")),
+            version=str(said("version")),
+            scenario=int(said("scenario")),
+            subset=str(said("subset")),
         ),
-        seed=str(file.seed),
-        parameters={name: plain(file.getncattr(name)) for name in names},
-        content_sha256=str(file.content_sha256),
-        variable_sha256={n: str(getattr(v, "content_sha256", "")) for n, v in file.variables.items()},
-        frames=file.dimensions["frame"].size,
-        particles=file.dimensions["particle"].size,
-        device=str(file.device),
-        generator=str(file.generator),
-        lagbench_version=str(file.lagbench_version),
+        seed=str(said("seed")),
+        parameters={name: plain(said(name)) for name in str(said("hashed_parameters")).split()},
+        content_sha256=str(said("content_sha256")),
+        frames=file["frame"].shape[0],
+        particles=file["particle"].shape[0],
+        device=str(said("device")),
+        generator=str(said("generator")),
+        lagbench_version=str(said("lagbench_version")),
     )
 
 

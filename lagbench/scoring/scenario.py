@@ -23,6 +23,7 @@ from lagbench.metrics.distributions import BINS, histograms
 from lagbench.metrics.frame import FramePair, Scenario, Snapshot, snapshots
 from lagbench.metrics.metric import Metric
 from lagbench.metrics.table import select
+from lagbench.submission.format import Anatomy
 from lagbench.submission.predictions import Predictions, open_predictions
 from lagbench.work.pool import Report
 
@@ -149,6 +150,7 @@ class ScenarioJob:
     task: ScoredTask  # the test subset
     scenario: int  # id of the scenario
     predictions: Path  # a predictions.nc that has been validated
+    anatomy: Anatomy  # what its headers say
     metrics: tuple[str, ...]  # names of the metrics
     floors: tuple[str, ...] = ()  # names of the floors to measure beside it
     pictured: bool = False  # whether to take the preview
@@ -170,7 +172,10 @@ _selected = functools.cache(select)  # the search through installed packages tak
 def score_scenario(job: ScenarioJob, report: Report) -> ScenarioScores:
     """Score one scenario of a submission and of the floors that are to be measured."""
     metrics = _selected(job.metrics)
-    with job.task.opened(job.scenario) as truth, open_predictions(job.predictions) as predictions:
+    with (
+        job.task.opened(job.scenario) as truth,
+        open_predictions(job.predictions, checked=job.anatomy) as predictions,
+    ):
         scenario = truth.scenario
         rows = {SUBMISSION: _predicted(predictions, job.scenario, scenario)}
         rows |= {name: floor_snapshots(name, truth, job.task) for name in job.floors}

@@ -18,7 +18,7 @@ from lagbench.metrics.aggregate import Score, Tally, aggregate
 from lagbench.metrics.metric import Metric
 from lagbench.metrics.table import available, select
 from lagbench.submission.findings import Finding, ValidationResult
-from lagbench.submission.format import Header
+from lagbench.submission.format import Anatomy, Header
 from lagbench.submission.predictions import open_predictions
 from lagbench.submission.validation import validate
 from lagbench.work.machine import available_cores
@@ -101,14 +101,14 @@ def score(
     if write:
         check_writable(folder, option="--output")
     with open_predictions(path) as opened:
-        header, content = opened.header, result.sha256 or opened.content_sha256()
+        header, anatomy, content = opened.header, opened.anatomy, result.sha256 or opened.content_sha256()
     if write:
         _check_own(folder / JSON_NAME, header)
     task = load_scored_task(described.size(header.split, header.size), holder)
     known = shipped(task.size) or {}
     floors = () if known else measurable(task.size, holder)
     outcomes = _outcomes(
-        task, path, tuple(m.name for m in metrics), floors, workers, scheduler, Meter(progress)
+        task, path, anatomy, tuple(m.name for m in metrics), floors, workers, scheduler, Meter(progress)
     )
     tallies = {
         row: {outcome.scenario: outcome.tallies[row] for outcome in outcomes} for row in outcomes[0].tallies
@@ -193,6 +193,7 @@ def _chosen(extras: Collection[str]) -> tuple[Metric, ...]:
 def _outcomes(
     task: ScoredTask,
     path: Path,
+    anatomy: Anatomy,
     metrics: tuple[str, ...],
     floors: tuple[str, ...],
     workers: int | None,
@@ -203,7 +204,13 @@ def _outcomes(
     ids, horizon = task.scenarios, task.setting.horizon
     jobs = {
         f"scenario {i}": ScenarioJob(
-            task=task, scenario=i, predictions=path, metrics=metrics, floors=floors, pictured=i == ids[0]
+            task=task,
+            scenario=i,
+            predictions=path,
+            anatomy=anatomy,
+            metrics=metrics,
+            floors=floors,
+            pictured=i == ids[0],
         )
         for i in ids
     }

@@ -14,7 +14,7 @@ from lagbench.data.registry import Size
 from .findings import Findings
 from .predictions import Predictions
 from .start import JUMP, Start
-from .truth import Truth, squared_steps
+from .truth import Truth, squared_lengths
 
 __all__ = [
     "MAX_DISTANCE",
@@ -61,10 +61,11 @@ class Survey:
 
     def add(self, first: int, block: NDArray[np.float32], size: Size) -> None:
         """Take in consecutive frames [length], shape [frame, particle, space], the first one by number."""
-        wrong = ~np.isfinite(block) | (block == FILL)
-        if wrong.any():
-            self._add_wrong(first, block, wrong)
-            block = np.where(wrong, np.float32(np.nan), block)
+        if not (block.min(initial=0.0) > -np.inf and block.max(initial=0.0) < FILL):  # NaN too
+            wrong = ~np.isfinite(block) | (block == FILL)
+            if wrong.any():
+                self._add_wrong(first, block, wrong)
+                block = np.where(wrong, np.float32(np.nan), block)
         self.values += block.size
         self._add_places(first, block, size)
         if self._last is None:
@@ -115,8 +116,11 @@ class Survey:
 
     def _add_jumps(self, first: int, joined: NDArray[np.floating]) -> None:
         """Take in the steps between consecutive frames, of which the first leads to ``first``."""
-        for frame in range(len(joined) - 1):  # a frame fits the cache, a block does not
-            (squares,) = squared_steps(joined[frame : frame + 2])
+        before = joined[0].astype(np.float64)
+        for frame, there in enumerate(joined[1:]):  # a frame fits the cache, a block does not
+            after = there.astype(np.float64)
+            squares = squared_lengths(after - before)
+            before = after
             if np.isnan(squares.max()):
                 squares = np.nan_to_num(squares)
             if squares.max() > self._jump_square:

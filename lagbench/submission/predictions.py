@@ -41,12 +41,13 @@ BLOCK_BYTES = 1 << 20
 class Predictions:
     """An open predictions.nc; use it as a context manager."""
 
-    def __init__(self, path: Path, header: Header, position: h5py.Dataset, stack: ExitStack) -> None:
+    def __init__(self, path: Path, anatomy: Anatomy, position: h5py.Dataset, stack: ExitStack) -> None:
         self.path = path
-        self.header = header
+        self.anatomy = anatomy
+        self.header: Header = header_of(anatomy)
         self._position = position
         self._stack = stack
-        self._row = {scenario: row for row, scenario in enumerate(header.scenarios)}
+        self._row = {scenario: row for row, scenario in enumerate(self.header.scenarios)}
 
     def __enter__(self) -> Self:
         """Return the predictions themselves."""
@@ -126,11 +127,15 @@ class Predictions:
         return hasher
 
 
-def open_predictions(path: str | Path) -> Predictions:
+def open_predictions(path: str | Path, *, checked: Anatomy | None = None) -> Predictions:
     """Open a predictions.nc without trusting it.
 
     Only the layout of the file is checked here, not its agreement with a data set: that is
     `lagbench.validate`, which also guards against files that make HDF5 loop or crash.
+
+    Args:
+        path: the file.
+        checked: the anatomy of this very file when it was opened before; it is not checked again.
 
     Raises:
         UnreadableFileError: missing, not netCDF4, or damaged.
@@ -139,21 +144,24 @@ def open_predictions(path: str | Path) -> Predictions:
     path = Path(path)
     with ExitStack() as stack:
         file = stack.enter_context(opened(path, fix=WRITE))
-        anatomy = dissect(file, path)
-        out = Findings()
-        for check in (check_format, check_dims, check_dtype, check_marks):
-            check(anatomy, out)
-        out.result(path).check()
-        return attach(file, path, anatomy, stack)
+        return attach(file, path, checked or _checked(file, path), stack)
+
+
+def _checked(file: h5py.File, path: Path) -> Anatomy:
+    anatomy = dissect(file, path)
+    out = Findings()
+    for check in (check_format, check_dims, check_dtype, check_marks):
+        check(anatomy, out)
+    out.result(path).check()
+    return anatomy
 
 
 def attach(file: h5py.File, path: Path, anatomy: Anatomy, stack: ExitStack) -> Predictions:
     """Return the predictions of an open file whose layout has been checked; they take over the stack."""
-    header = header_of(anatomy)
     with reading(path, "position"):
         # just the chunk cache that reading in order needs
         size, kept = cache_of(anatomy.arrays["position"])
         plist = h5py.h5p.create(h5py.h5p.DATASET_ACCESS)
         plist.set_chunk_cache(10 * kept + 521, size, 1.0)
         position = h5py.Dataset(h5py.h5d.open(file.id, b"position", plist))
-    return Predictions(path, header, position, stack.pop_all())
+    return Predictions(path, anatomy, position, stack.pop_all())

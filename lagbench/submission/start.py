@@ -268,9 +268,11 @@ def _nearest(
     """Return for every point the nearest particle of a cloud but ``skip``, and its distance."""
     found, distance = np.empty(len(points), np.int_), np.empty(len(points))
     columns = np.ascontiguousarray(cloud.T)  # a sum over two neighbours in memory takes ten times as long
+    apart = np.empty_like(columns)
     for row, point in enumerate(points):
-        x, y = columns - point[:, None]
-        squares = x * x + y * y
+        np.subtract(columns, point[:, None], out=apart)
+        np.square(apart, out=apart)
+        squares = np.add(apart[0], apart[1], out=apart[0])
         if skip is not None:
             squares[skip[row]] = np.inf
         found[row] = np.argmin(squares)

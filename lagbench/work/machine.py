@@ -56,6 +56,16 @@ TOO_LONG = -int(getattr(signal, "SIGXCPU", 0)) or None
 
 OUT_OF_MEMORY = 77  # exit code of a child that needed more than it may
 MEMORY = 768 << 20  # address space of a child [bytes]
+# what a child's libraries read when they start; one thread, since cores are not its to choose
+ENVIRONMENT = {
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MALLOC_ARENA_MAX": "2",
+    # glibc keeps what is freed: each block of a MiB taken from the system anew is 256 page faults
+    "MALLOC_MMAP_THRESHOLD_": str(32 << 20),
+    "MALLOC_TRIM_THRESHOLD_": str(64 << 20),
+}
+
 CHILD = "from lagbench.work.machine import serve; serve()"
 """The child's program; -P keeps the current folder, where strangers' files may lie, off its path."""
 
@@ -118,7 +128,7 @@ def in_child(
     address space [bytes]. An exception in the child, as where it cannot import the function, is a
     WorkFailedError.
     """
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2"}
+    environment = {**os.environ, **ENVIRONMENT}
     try:
         done = subprocess.run(
             [sys.executable, "-P", "-c", CHILD, function, str(memory), str(int(seconds))],
