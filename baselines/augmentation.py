@@ -25,8 +25,6 @@ from lagbench.torch import Batch
 
 from .graph import Bounds
 
-__all__ = ["Symmetry", "check_symmetry", "disturbed"]
-
 _NORMALS = torch.tensor([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])
 """Outward normals of the walls left, right, bottom, top."""
 

@@ -19,8 +19,6 @@ from lagbench.errors import LagbenchError, UsageError, nearest
 
 from .baseline import Baseline
 
-__all__ = ["Entry", "find", "names"]
-
 GROUP = "lagbench.baselines"
 
 OWN = "lagbench.baselines."

@@ -38,9 +38,6 @@ from lagbench.errors import DataError, LagbenchError, UnreadableFileError, WorkF
 from .baseline import Baseline, Facts, facts_of
 from .catalogue import find
 
-__all__ = ["Checkpoint", "check_data", "load", "load_weights", "restore", "rounded_weights", "save"]
-
-
 SPARE = 2**20  # numbers that a model may have beside those of its file: buffers that are not stored
 PARTS = 1000  # tensors that it may have beside those of its file
 

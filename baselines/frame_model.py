@@ -30,9 +30,6 @@ from . import baseline
 from .baseline import Baseline, Batch, Facts
 from .graph import MATERIALS
 
-__all__ = ["FrameModel", "FrameNetwork", "FrameNetworkOptions", "FrameWindow", "squared_errors"]
-
-
 FEATURES = 4  # x, y and the two components of the velocity per frame
 
 

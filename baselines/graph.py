@@ -27,9 +27,6 @@ from torch import Tensor, nn
 
 from lagbench.errors import UsageError
 
-__all__ = ["EDGE_FEATURES", "NodeFeatures", "Scale", "edge_features", "radius_graph"]
-
-
 Bounds = tuple[tuple[float, float], tuple[float, float]]
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

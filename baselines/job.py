@@ -31,17 +31,6 @@ from .checkpoint import Checkpoint, load
 from .machine import hardware
 from .recipe import Recipe
 
-__all__ = [
-    "OVER",
-    "RunFolder",
-    "STOPPED_EARLY",
-    "TrainingJob",
-    "TrainingRecord",
-    "first_difference",
-    "parameter_count",
-]
-
-
 STOPPED_EARLY = "stopped early"  # state of a training whose validations brought nothing new; it is over
 MOST_RECORD = 4 << 20  # longest training.json that is read [bytes]
 OVER = ("finished", STOPPED_EARLY)  # states of a training that is not to be gone on with

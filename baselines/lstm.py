@@ -16,8 +16,6 @@ from .frame_model import FrameNetwork, FrameNetworkOptions, FrameWindow, squared
 from .mlp import Activation, dense
 from .torch_grid import transfer
 
-__all__ = ["LSTM", "LSTMWithMLP"]
-
 Share = Annotated[float, Field(ge=0, lt=1)]
 
 

@@ -15,17 +15,6 @@ import torch
 from lagbench.errors import UsageError, WorkFailedError
 from lagbench.work.machine import available_cores
 
-__all__ = [
-    "bound_memory",
-    "chosen_device",
-    "hardware",
-    "is_helper",
-    "memory_errors_told",
-    "multiplies_bfloat16",
-    "return_memory",
-    "threads_used",
-]
-
 
 def chosen_device(name: str) -> str:
     """Return ``cpu`` or ``cuda``; ``auto`` takes a GPU that is there."""

@@ -12,8 +12,6 @@ from torch import Tensor, nn
 from .baseline import Facts
 from .frame_model import FrameNetwork, FrameNetworkOptions, FrameWindow
 
-__all__ = ["Activation", "MLP", "dense"]
-
 
 class Activation(enum.StrEnum):
     """The activations of Table 4.2."""

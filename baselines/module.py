@@ -34,8 +34,6 @@ from .machine import return_memory
 from .recipe import TrainingOptions
 from .rollout import Validation
 
-__all__ = ["TrainingCallback", "TrainingModule", "generators_kept", "reseed", "seed_of"]
-
 TOTAL = "total"  # name of the weighted sum among the loss terms
 
 

@@ -14,8 +14,6 @@ from torch import Tensor, nn
 
 from lagbench.baselines.operators.operator import Losses, Operator, summed
 
-__all__ = ["EdgeMLP", "EncodeProcessDecode", "Linear"]
-
 
 class ProcessorLayer(nn.Module):
     r"""One round of message passing; everything but the aggregation is fixed.

@@ -27,8 +27,6 @@ from .baseline import Baseline, Batch, Facts, Options, check_moving_walls, last_
 from .graph import MATERIALS
 from .particle_grid import ParticleGrid, Stencil
 
-__all__ = ["NeuralMPM"]
-
 EMPTY = 1e-3  # below this weight, in units of particles a radius apart, a node's velocity fades to 0
 REACH = 4  # cells over which the U-Net sees how far a wall is
 COARSEST = 4  # nodes of the U-Net's finest level to one of its coarsest, along each axis

@@ -31,9 +31,6 @@ from .job import RunFolder, parameter_count
 from .machine import bound_memory, chosen_device, hardware, memory_errors_told, threads_used
 from .rollout import Rollout, roll_out, scenario_batch, scenario_paths
 
-__all__ = ["PredictionResult", "UnfinishedWarning", "predict"]
-
-
 SEARCHES = 5  # frames of a rollout on which the neighbour search is timed alone
 
 

@@ -33,8 +33,6 @@ from lagbench.errors import LagbenchError, UnreadableFileError, UsageError, near
 
 from .catalogue import Entry, names
 
-__all__ = ["Recipe", "TrainingOptions", "recipe_for", "recipe_names"]
-
 
 class _Strict(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")

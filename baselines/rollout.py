@@ -35,8 +35,6 @@ from lagbench.torch import Window, collate, tensors
 from .baseline import Baseline, Batch, Facts
 from .recipe import TrainingOptions
 
-__all__ = ["Rollout", "Validation", "roll_out", "scenario_batch", "scenario_paths", "validation_of"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Rollout:

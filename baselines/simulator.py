@@ -33,8 +33,6 @@ from .graph import EDGE_FEATURES, NodeFeatures, Scale, edge_features, radius_gra
 from .network import EncodeProcessDecode
 from .torch_grid import Fields, counted_nodes, fields, node_velocity, transfer
 
-__all__ = ["GraphNetwork"]
-
 
 class Motion(NamedTuple):
     """One frame of particles."""

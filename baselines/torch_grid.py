@@ -20,9 +20,6 @@ from torch.nn.functional import pad
 from lagbench.data.grid import COUNTED_SHARE, EMPTY_SHARE, Grid
 from lagbench.errors import UsageError
 
-__all__ = ["Fields", "counted_nodes", "fields", "nine_nodes", "node_velocity", "spline_weights", "transfer"]
-
-
 _LOW, _HIGH = 1, 2  # rows that the stencil of a particle in the unit box can reach past the grid
 
 

@@ -48,9 +48,6 @@ from .module import TrainingCallback, TrainingModule, generators_kept, reseed, s
 from .recipe import recipe_for
 from .rollout import scenario_batch, scenario_paths, validation_of
 
-__all__ = ["TrainingResult", "train"]
-
-
 SMALLER = "lower --set training.batch=1, then the model: model.latent, .layers, .widths or .lags"
 
 

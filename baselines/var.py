@@ -37,8 +37,6 @@ from . import baseline
 from .baseline import Facts
 from .frame_model import FrameModel, FrameWindow
 
-__all__ = ["LaggedRows", "StableVAR", "VAR", "solve"]
-
 BLOCK = 1024  # most rows that are held at a time
 EPSILON = 1e-12  # least ridge: directions without any variance stay as they are
 

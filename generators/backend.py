@@ -17,9 +17,6 @@ from lagbench.work.machine import available_cores
 
 from .solver import Device
 
-__all__ = ["HARMLESS", "place", "start"]
-
-
 # Taichi greets on stdout as it is imported, which would spoil `--json`, and asks the network.
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")

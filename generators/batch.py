@@ -27,17 +27,6 @@ from .draws import generator
 from .solver import Device, Solver, build
 from .split import ClosedBoxParameters, FreeSurfaceParameters, InitialState, Split
 
-__all__ = [
-    "Batch",
-    "Extremes",
-    "SimulationJob",
-    "Report",
-    "draw",
-    "solver_constants",
-    "split_module",
-    "substeps_of",
-]
-
 STRIDE = 4_000_000  # particle-substeps between two reports: about a tenth of a second on a core
 
 Report = Callable[[int], None]

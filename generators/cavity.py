@@ -27,8 +27,6 @@ from .split import WALLS, ClosedBoxParameters, InitialState, Material
 if TYPE_CHECKING:
     from lagbench.data.registry import Size
 
-__all__ = ["DRIVEN", "initial_state", "is_classic", "solver_parameters"]
-
 DRIVEN = (("top",), ("bottom",), ("left",), ("right",), ("left", "right"), ("bottom", "top"))
 """The sets of walls that move, by id % 6: six consecutive scenarios hold each once."""
 

@@ -20,8 +20,6 @@ from .nodal_stress import JACOBIAN_BOUND, NodalStress
 from .solver import Health
 from .split import WALLS, ClosedBoxParameters, InitialState
 
-__all__ = ["ClosedBox"]
-
 
 class ClosedBox(Driver[ClosedBoxParameters]):
     """Solver for scenarios that share :class:`ClosedBoxParameters`; see :class:`.Solver`."""

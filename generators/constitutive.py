@@ -18,20 +18,6 @@ import taichi as ti
 
 from .transfer import Value, bounded
 
-__all__ = [
-    "EXPONENT_MAX",
-    "STRETCH_MIN",
-    "corotated_stress",
-    "exponential",
-    "hardening",
-    "lame",
-    "larger",
-    "liquid_stress",
-    "plastic_return",
-    "rotation",
-    "viscous_stress",
-]
-
 EXPONENT_MAX = 4.0
 """Largest magnitude of the argument for which the error bound of :func:`exponential` holds."""
 

@@ -30,8 +30,6 @@ from .split import ClosedBoxParameters, InitialState, Material
 if TYPE_CHECKING:
     from lagbench.data.registry import Size
 
-__all__ = ["initial_state", "solver_parameters", "stream_function"]
-
 Array = NDArray[np.float64]
 
 

@@ -19,8 +19,6 @@ from .solver import Device, Health
 from .split import ClosedBoxParameters, FreeSurfaceParameters, InitialState
 from .transfer import Nothing, Template
 
-__all__ = ["Driver", "Kernels", "stack"]
-
 Parameters = TypeVar("Parameters", ClosedBoxParameters, FreeSurfaceParameters)
 
 

@@ -21,8 +21,6 @@ from .split import FreeSurfaceParameters, InitialState, Material
 if TYPE_CHECKING:
     from lagbench.data.registry import Size
 
-__all__ = ["FAMILIES", "initial_state", "solver_parameters"]
-
 Array = NDArray[np.float64]
 
 FAMILIES = ("falling-rectangle", "thrown", "falling-circle", "splash")

@@ -20,8 +20,6 @@ from .particle_stress import ParticleStress
 from .solver import Health
 from .split import FreeSurfaceParameters, InitialState, Material
 
-__all__ = ["Energy", "FreeSurface", "courant"]
-
 Array = NDArray[np.float64]
 
 _LARGEST = 1e30

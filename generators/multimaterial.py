@@ -25,8 +25,6 @@ from .split import FreeSurfaceParameters, InitialState, Material
 if TYPE_CHECKING:
     from lagbench.data.registry import Size
 
-__all__ = ["PAIRS", "initial_state", "solver_parameters"]
-
 Array = NDArray[np.float64]
 
 PAIRS = (

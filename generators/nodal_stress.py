@@ -41,8 +41,6 @@ from .transfer import (
 )
 from .walls import Walls
 
-__all__ = ["JACOBIAN_BOUND", "NodalStress"]
-
 JACOBIAN_BOUND = 8.0
 """Largest J that the sums have room for [1]."""
 

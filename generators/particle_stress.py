@@ -46,8 +46,6 @@ from .transfer import (
     stepped,
 )
 
-__all__ = ["ParticleStress"]
-
 _INSET = 1e-3
 """Distance that particles keep from a wall [cells]."""
 

@@ -26,17 +26,6 @@ from lagbench.data.registry import Measured, Size, default_path, load
 from lagbench.data.statistics import file_statistics
 from lagbench.errors import DataError, LagbenchError
 
-__all__ = [
-    "check_files",
-    "main",
-    "measured_values",
-    "record",
-    "released_name",
-    "render",
-    "replace_measured",
-    "with_statistics",
-]
-
 MARKER = "\nmeasured:"  # where the generated part of datasets.yaml begins
 _NOTICE = "# Written by `python -m lagbench.generators.record`; do not edit below this line."
 _SHORT = 16

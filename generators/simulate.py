@@ -34,21 +34,6 @@ from .batch import Batch, Report, SimulationJob, split_module, substeps_of
 from .draws import QUANTUM, entropy, seed_text
 from .split import ClosedBoxParameters, FreeSurfaceParameters, InitialState
 
-__all__ = [
-    "OUTCOMES",
-    "Facts",
-    "Pace",
-    "Simulated",
-    "active_frames",
-    "file_parameters",
-    "scenario_writer",
-    "simulate",
-    "nudge",
-    "twin_floors",
-    "twin_substeps",
-]
-
-
 STILL = 0.01  # share of its greatest kinetic energy from which on a free surface moves
 OUTCOMES = ("active_frames",)
 """Parameters of a file that follow from its simulation; all others are known before it."""

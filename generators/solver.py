@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 
 from .split import ClosedBoxParameters, FreeSurfaceParameters, InitialState
 
-__all__ = ["Device", "Health", "Solver", "build"]
-
 
 class Device(enum.StrEnum):
     """Where and how the substeps run; the bits do not depend on it."""

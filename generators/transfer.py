@@ -31,21 +31,6 @@ else:
     Value = inspect.Parameter.empty
     Nothing = tuple[()]
 
-__all__ = [
-    "Nothing",
-    "Template",
-    "Value",
-    "accumulate",
-    "base_node",
-    "bounded",
-    "fixed_point_scale",
-    "from_fixed",
-    "largest",
-    "stencil",
-    "stepped",
-    "to_fixed",
-]
-
 _ROUNDING_SHIFT = 6755399441055744.0
 """1.5 x 2^52: added to a float64 below 2^51, it leaves the rounded integer in the low bits."""
 

@@ -10,8 +10,6 @@ import taichi as ti
 
 from .transfer import Template, Value
 
-__all__ = ["Walls"]
-
 
 @ti.data_oriented
 class Walls:

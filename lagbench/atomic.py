@@ -11,8 +11,6 @@ from pathlib import Path
 
 from .errors import LagbenchError, WorkFailedError
 
-__all__ = ["atomic_path", "check_writable", "remove_leftovers", "temporary_name", "write_atomically"]
-
 SUFFIX = ".partial"
 """Ending of temporary names; nothing but this module creates or removes such files."""
 

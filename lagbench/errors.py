@@ -16,18 +16,6 @@ from collections.abc import Iterable
 from types import ModuleType
 from typing import ClassVar
 
-__all__ = [
-    "ChecksFailedError",
-    "DataError",
-    "LagbenchError",
-    "UnreadableFileError",
-    "UsageError",
-    "WorkFailedError",
-    "nearest",
-    "check_installed",
-    "require",
-]
-
 
 class LagbenchError(Exception):
     """Base of every error that lagbench raises on purpose."""

@@ -11,8 +11,6 @@ from torch_geometric.nn import GATConv, GATv2Conv
 
 from .operator import Losses, Operator
 
-__all__ = ["GAT", "GATv2"]
-
 
 class GAT(Operator):
     r"""Graph attention of Velickovic et al. (2018): PyG's GATConv.

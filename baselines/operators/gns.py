@@ -7,8 +7,6 @@ from torch import Tensor
 
 from .operator import Losses, Operator, summed
 
-__all__ = ["GNS"]
-
 
 class GNS(Operator):
     r"""The interaction network of Sanchez-Gonzalez et al. (2020).

@@ -9,8 +9,6 @@ from lagbench.baselines.network import Linear
 
 from .operator import Losses, Operator
 
-__all__ = ["PointNet"]
-
 
 class PointNet(Operator):
     r"""The set layer of PointNet++ (Qi et al. 2017) on edge updates.

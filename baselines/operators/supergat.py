@@ -10,9 +10,6 @@ from torch_geometric.nn import SuperGATConv
 
 from .operator import Losses, Operator
 
-__all__ = ["SuperGAT", "SuperGATDot"]
-
-
 START = 4.0
 """Links and attention see inputs over this times the root of the latent width, values are multiplied by it.
 

@@ -8,8 +8,6 @@ from torch_geometric.nn import TransformerConv
 
 from .operator import Losses, Operator
 
-__all__ = ["Transformer"]
-
 
 class Transformer(Operator):
     r"""The graph transformer of Shi et al. (2021): PyG's TransformerConv.

@@ -27,8 +27,6 @@ from .runs import Plan, budget, make_run, outlook, score_committed
 from .tables import TABLES, make_studies
 from .thesis import EXPECTED, ROSTER, Model, label
 
-__all__ = ["main", "rehearse", "reproduce"]
-
 
 def main(arguments: Sequence[str] | None = None, *, registry: Registry | None = None) -> int:
     """Make what the arguments name; return the exit code."""

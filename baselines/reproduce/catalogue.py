@@ -10,8 +10,6 @@ from . import figures, tables, var_protocol
 from .drawing import Figure
 from .thesis import FRAME_MODELS, OPERATORS
 
-__all__ = ["FIGURES"]
-
 # what several figures share; each row below holds only how it differs
 _STUDY = Figure(name="", title="", draw=tables.studies, needs={"fluid": ()})
 _LOSSES = replace(_STUDY, draw=tables.study_losses)

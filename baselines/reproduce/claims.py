@@ -21,8 +21,6 @@ from lagbench.scoring.tables import Table
 from .evidence import Evidence, ordered
 from .thesis import FRAME_MODELS, OPERATORS, key_frame, label, number
 
-__all__ = ["CLAIMS", "answer", "claim_rows", "compared", "comparison_table", "floors_ahead"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Claim:

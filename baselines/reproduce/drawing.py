@@ -30,21 +30,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Picture
 
-__all__ = [
-    "Figure",
-    "SMOOTHED",
-    "Sheet",
-    "TRUTH",
-    "charts",
-    "loss_over_steps",
-    "plot_losses",
-    "opened",
-    "panel_rows",
-    "png",
-    "tidy",
-    "write_sheet",
-]
-
 Floats = NDArray[np.float64]
 
 TRUTH = INK

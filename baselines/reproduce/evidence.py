@@ -31,8 +31,6 @@ from lagbench.scoring.score_file import NETCDF_NAME, read_statistics
 from lagbench.scoring.skill import best_floor
 from lagbench.scoring.task import ranking_metric
 
-__all__ = ["BOARD", "Evidence", "Method", "Sources", "WEIGHTS", "ordered", "read_json"]
-
 BOARD = Path("leaderboard")
 WEIGHTS = BOARD / "weights"
 """Where committed weights and the records of their trainings lie, as `lagbench submit --weights` put them."""

@@ -35,15 +35,6 @@ from .thesis import LOSS_SNAPSHOTS, TABLE_4_8, colour, key_frame, label, number,
 if TYPE_CHECKING:
     pass
 
-__all__ = [
-    "case_curves",
-    "histograms",
-    "losses",
-    "model_curves",
-    "panels",
-    "residuals",
-]
-
 TIMES = 6  # columns of a picture that shows a whole rollout
 
 BINS = 40

@@ -43,8 +43,6 @@ from .thesis import (
 )
 from .var_protocol import FILE, beside_thesis
 
-__all__ = ["agreement", "main", "render"]
-
 HEAD = """# Results
 
 The reference models, their variants and floors on the test scenarios of each data set, beside the numbers

@@ -25,17 +25,6 @@ from .thesis import Model
 if TYPE_CHECKING:
     from lagbench.baselines.recipe import Recipe
 
-__all__ = [
-    "Plan",
-    "budget",
-    "check_training",
-    "hardware",
-    "make_run",
-    "make_training",
-    "outlook",
-    "score_committed",
-]
-
 PREDICTIONS = "predictions.nc"
 
 OTHER = "name another folder of runs with --runs, or remove this run"

@@ -45,23 +45,6 @@ from .thesis import (
     scenario_of,
 )
 
-__all__ = [
-    "TABLES",
-    "cubic_errors",
-    "cubic_vorticity",
-    "make_studies",
-    "rollout_table",
-    "rollouts",
-    "statistics",
-    "studies",
-    "study_losses",
-    "study_folder",
-    "study_rows",
-    "times",
-    "vorticity",
-    "vorticity_bars",
-]
-
 Floats = NDArray[np.float64]
 
 

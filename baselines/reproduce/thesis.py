@@ -16,31 +16,6 @@ from lagbench.data.registry import Size
 from lagbench.draw.style import MUTED
 from lagbench.metrics.aggregate import Score
 
-__all__ = [
-    "EXPECTED",
-    "FRAME_MODELS",
-    "LOSS_SNAPSHOTS",
-    "Model",
-    "OPERATORS",
-    "ROSTER",
-    "Rollout",
-    "SECTION_4_8_3",
-    "SIZES",
-    "STATISTICS",
-    "STUDIES",
-    "Study",
-    "TABLE_4_7",
-    "TABLE_4_8",
-    "TABLE_5_4",
-    "colour",
-    "interval",
-    "key_frame",
-    "label",
-    "number",
-    "predicted",
-    "scenario_of",
-]
-
 
 @dataclass(frozen=True)
 class Study:

@@ -39,8 +39,6 @@ from .thesis import SECTION_4_8_3, number
 if TYPE_CHECKING:
     pass
 
-__all__ = ["FILE", "ProtocolResult", "beside_thesis", "draw", "forecast_errors", "measure", "table"]
-
 TRAIN, VALID = 0.70, 0.15
 """Shares of the frames that are fitted and forecast."""
 

@@ -32,9 +32,6 @@ from lagbench.generators.solver import Device
 from .diagnostics import X, Y, box_of, centre_lines, draw
 from .experiment import Case, Experiment, Result, plan, run, solver_parameters
 
-__all__ = ["document", "main", "parser", "settings"]
-
-
 DIGITS = 9  # significant digits of the numbers in the JSON file: fewer than libraries differ in
 JSON = dict[str, Any]
 

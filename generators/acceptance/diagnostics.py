@@ -23,28 +23,6 @@ from scipy.interpolate import CubicSpline
 
 from lagbench.generators.split import ClosedBoxParameters
 
-__all__ = [
-    "REYNOLDS",
-    "X",
-    "Y",
-    "Box",
-    "CentreLines",
-    "Deviation",
-    "Profiles",
-    "Rates",
-    "box_of",
-    "centre_lines",
-    "deviation",
-    "displacement_energy",
-    "draw",
-    "extract",
-    "grid_rates",
-    "kinetic_energy",
-    "lid_corners",
-    "occupancy",
-]
-
-
 CORNER_CELLS = 5  # extent of the regions under the two ends of the lid, where J is far from 1 [cells]
 
 Reals = NDArray[np.floating]

@@ -47,8 +47,6 @@ from .diagnostics import (
 if TYPE_CHECKING:
     from lagbench.generators.closed_box import ClosedBox
 
-__all__ = ["CHECK_EVERY", "Case", "Experiment", "Result", "initial_state", "plan", "run", "solver_parameters"]
-
 
 _FULL_GRID = 40
 _LEAST_GRID = 16

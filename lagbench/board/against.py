@@ -34,8 +34,6 @@ from .folder import FLOORS, SCORES, SUBMISSIONS, VERIFIED, WEIGHTS, Folder
 from .score_file import read_stored
 from .submit import scored_file
 
-__all__ = ["TOLERANCE", "Confirmation", "Rescoring", "check_base", "farthest"]
-
 TOLERANCE = 1e-6
 """Relative difference up to which two numbers are equal; NumPy versions may differ in the last bits."""
 

@@ -36,8 +36,6 @@ from .ranking import combine, dataset_of, is_current, summarise
 from .score_file import MAX_SCORE_BYTES, Stored, read_stored, unreadable_in_child
 from .weights import check_weights
 
-__all__ = ["CheckResult", "check_board"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class CheckResult:

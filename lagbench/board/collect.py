@@ -33,8 +33,6 @@ from .payload import spaced
 from .ranking import Combined, combine, is_current, read_floors
 from .score_file import Stored, read_stored, reported_frames
 
-__all__ = ["COLUMNS", "CURVES", "CURVE_FRAMES", "RESIDUAL_BINS", "collect", "curve", "residuals"]
-
 COLUMNS = (
     *("vorticity_nrmse", "cloud_distance", "vorticity_rmse", "mse_avg", "vorticity_pearson"),
     *("stable_frames", "position_rmse_20", "position_rmse", "spectrum_error", "velocity_rmse"),

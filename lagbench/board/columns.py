@@ -13,8 +13,6 @@ from lagbench.report.html import MISSING, sentence, text, words
 from .entry import EntryBudget
 from .model import Floor, Row, Tab, Value
 
-__all__ = ["Column", "columns_of", "held", "presets_of", "value_of", "written"]
-
 MAIN_METRICS = 5
 """Metrics of the first table, the ranking one among them; with more it would be wider than a screen."""
 

@@ -22,8 +22,6 @@ from lagbench.scoring.task import ranking_metric
 
 from .model import Board, Tab
 
-__all__ = ["Mark", "cost_figure", "draw", "front", "marks_of", "picture"]
-
 HEIGHT = 330
 
 COARSE = "coarse-solver"

@@ -32,12 +32,6 @@ from lagbench.submission.budget import Budget, Track, track_of
 
 from .folder import Place, entry_path, score_paths, weights_path
 
-__all__ = [
-    *("ID", "LONGEST_ID", "LONGEST_TEXT", "MOST_SEEDS", "PATTERNS", "About", "EntryBudget", "Cost"),
-    *("DataSet", "Date", "Entry", "Flag", "Hash", "Meta", "Prediction", "ScoreBlock", "ScoredFile"),
-    *("Short", "Status", "Strict", "Summary", "Weights"),
-]
-
 ID = r"^[a-z0-9]+(-[a-z0-9]+)*$"
 WEB = r"^https?://[A-Za-z0-9][!#-&(-;=?-\[\]_a-z~]*$"  # nothing that could end an HTML attribute
 SHA256 = r"^[0-9a-f]{64}$"

@@ -28,11 +28,6 @@ from lagbench.submission.findings import quoted
 from .entry import MOST_SEEDS, PATTERNS, Date, Entry, Hash, Meta, Short, Strict
 from .folder import VERIFIED, Folder
 
-__all__ = [
-    *("MAX_ENTRY_BYTES", "Mistake", "examine", "listed", "load_plain", "read_entry", "read_meta"),
-    *("Verification", "read_verified", "record", "schema_bytes", "spell", "verification_of"),
-]
-
 MAX_ENTRY_BYTES = 64_000
 """Longest YAML file of an entry [bytes]; twenty seeds and all metrics take half of it."""
 

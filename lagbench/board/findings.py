@@ -17,8 +17,6 @@ from lagbench.submission.findings import Finding, Severity
 
 from .score_file import MAX_SCORE_BYTES, Stored
 
-__all__ = ["CHECKS", "FLOORS_ANEW", "Check", "finding", "finding_of", "impossible", "print_of", "skeleton"]
-
 ROUNDING = 1e-6  # share of the greatest value by which rounding may take one below zero, or above one
 
 RESCORE = "submit the predictions again: lagbench submit; the score block is not for editing"

@@ -19,11 +19,6 @@ from pathlib import Path
 
 from lagbench.errors import UsageError
 
-__all__ = [
-    *("FLOORS", "PAGE", "SCHEMA", "SCORES", "SUBMISSIONS", "VERIFIED", "WEIGHTS", "Folder", "Place"),
-    *("entry_path", "score_paths", "weights_path"),
-]
-
 Place = tuple[str, str, str]  # split, size and method
 
 SUBMISSIONS, SCORES, FLOORS, WEIGHTS = "submissions", "scores", "floors", "weights"

@@ -18,8 +18,6 @@ from lagbench.metrics.metric import Metric
 from .entry import Cost, Entry, Flag, Status
 from .entry_file import Verification
 
-__all__ = ["Board", "Curve", "Floor", "Histogram", "Pictures", "Row", "Tab", "Value"]
-
 Floats = NDArray[np.float64]
 
 

@@ -29,8 +29,6 @@ from .model import Board
 from .payload import FINENESS, Fineness, embedded, payload
 from .sections import empty, lede, navigation, overview, section, stage
 
-__all__ = ["BUDGET", "FEWEST", "LINKS", "BuildResult", "build", "render"]
-
 BUDGET = 30_000  # bytes that an entry shall take, all in all; more only where its coarsest data need them
 FEWEST = 50  # fewer entries than these share what so many may take, 1.5 MB
 

@@ -25,11 +25,6 @@ from lagbench.report.html import text, words
 
 from .model import Board, Curve, Floor, Histogram, Pictures, Row, Tab
 
-__all__ = [
-    *("FINENESS", "LEVELS", "Fineness", "coarse", "embedded", "pack", "pack_film", "payload", "rounded"),
-    "spaced",
-]
-
 
 class Fineness(NamedTuple):
     """How much of the pictures the page holds."""

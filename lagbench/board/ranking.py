@@ -29,8 +29,6 @@ from .entry import DataSet, Summary
 from .folder import FLOORS, Folder
 from .score_file import read_stored
 
-__all__ = ["Combined", "combine", "dataset_of", "is_current", "read_floors", "summarise", "write_floors"]
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Combined:

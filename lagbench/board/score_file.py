@@ -30,8 +30,6 @@ from lagbench.scoring.task import ranking_metric
 from lagbench.submission.task_checks import frames_to_predict
 from lagbench.work.machine import in_child
 
-__all__ = ["MAX_SCORE_BYTES", "Stored", "read_stored", "reported_frames", "unreadable_in_child"]
-
 MAX_SCORE_BYTES = 1_000_000  # longest score file [bytes]
 MAX_UNPACKED = 32 << 20  # most that a score file may unpack to [bytes]; the largest of ours takes 3 MB
 

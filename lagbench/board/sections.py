@@ -14,8 +14,6 @@ from .cost import cost_figure
 from .model import Board, Row, Tab
 from .table import EXPLAINED, draw_table
 
-__all__ = ["empty", "lede", "navigation", "overview", "section", "stage"]
-
 
 def lede(board: Board) -> Markup:
     """Return the sentence under the title."""

@@ -13,8 +13,6 @@ from lagbench.scoring.tables import Table
 from .columns import held
 from .model import Board, Floor, Row, Tab, Value
 
-__all__ = ["as_plain", "chosen_tabs", "tables"]
-
 
 def chosen_tabs(board: Board, split: str | None, size: str | None) -> tuple[Tab, ...]:
     """Return the tabs of a split, of a size, or all.

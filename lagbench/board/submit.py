@@ -55,8 +55,6 @@ from .ranking import combine, summarise, write_floors
 from .score_file import MAX_SCORE_BYTES, read_stored
 from .weights import copy_weights, named_weights, require_weights
 
-__all__ = ["BOARD", "SubmitResult", "scored_file", "submit"]
-
 BOARD = Path("leaderboard")  # the leaderboard's folder, from the root of the repository
 OUTSIDE = "in_domain"  # the warning that comes with a share of the positions
 

@@ -18,8 +18,6 @@ from .folder import weights_path
 from .model import Floor, Row, Tab
 from .payload import rounded
 
-__all__ = ["EXPLAINED", "draw_table"]
-
 MEAN_DIGITS = 9  # significant digits of means, as in scores.json
 
 MOST_REASONS = 4

@@ -21,8 +21,6 @@ from .entry import Entry, Weights
 from .findings import finding
 from .folder import Folder, Place, weights_path
 
-__all__ = ["MOST_BYTES", "check_weights", "copy_weights", "named_weights", "require_weights"]
-
 MOST_BYTES = 40_000_000
 """All weights of a leaderboard together [bytes]: git keeps every version of them for good."""
 

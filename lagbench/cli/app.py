@@ -17,8 +17,6 @@ from lagbench.errors import LagbenchError
 from . import board, data, draw, exchange, scoring, training
 from . import demo as tour
 
-__all__ = ["app"]
-
 INTERRUPTED = 130
 FAILED = 5
 

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from lagbench.board.check import CheckResult
     from lagbench.board.submit import SubmitResult
 
-__all__ = ["leaderboard", "submit"]
-
 BoardOption = Annotated[Path, typer.Option("--board", metavar="FOLDER", help="The leaderboard's folder.")]
 BOARD = Path("leaderboard")
 

@@ -37,8 +37,6 @@ if TYPE_CHECKING:
     from lagbench.make.inventory import Overview
     from lagbench.make.verify import VerificationResult
 
-__all__ = ["cite", "clean", "doctor", "generate", "info", "list_splits", "verify"]
-
 TITLE = (
     "lagbench: bit-reproducible data sets and benchmarks "
     "for neural surrogates of Lagrangian continuum simulators"

@@ -15,8 +15,6 @@ from .output import print_table, progress_bar, show, spell_seconds
 if TYPE_CHECKING:
     from .demo_steps import DemoResult, ModelResult
 
-__all__ = ["demo"]
-
 METRICS = ("position_rmse_20", "vorticity_pearson", "outside_share")
 """What the table of scores shows beside the metric that ranks."""
 

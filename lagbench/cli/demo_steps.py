@@ -29,19 +29,6 @@ if TYPE_CHECKING:
 
     from .machine import SolverBench
 
-__all__ = [
-    "DEMO_SIZE",
-    "MODEL",
-    "MODEL_SPLIT",
-    "DemoResult",
-    "ModelResult",
-    "demo",
-    "demo_board",
-    "demo_model",
-    "demo_splits",
-    "model_left_out",
-]
-
 
 DEMO_SIZE = "tiny"
 

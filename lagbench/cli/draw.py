@@ -14,8 +14,6 @@ from lagbench.errors import DataError, UnreadableFileError, UsageError
 from .options import JsonFlag, PresentSizeOption, QuietFlag, RootOption, chosen
 from .output import show
 
-__all__ = ["animate", "plot"]
-
 SourceArgument = Annotated[
     str | None, typer.Argument(metavar="SPLIT|FILE", help="Split, or a scenario file.")
 ]

@@ -27,8 +27,6 @@ from .output import progress_bar, show, spell_bytes
 if TYPE_CHECKING:
     from lagbench.exchange.local_split import LocalSplit
 
-__all__ = ["adopt", "download", "export", "import_split"]
-
 FormatOption = Annotated[str, typer.Option("--format", metavar="NAME", help="gns-npz or lagrangebench-h5.")]
 FolderOption = Annotated[
     Path,

@@ -21,9 +21,6 @@ from lagbench.make.plan import free_bytes
 from lagbench.work.machine import available_cores
 from lagbench.work.pool import Pool, Report, Task
 
-__all__ = ["Check", "Diagnosis", "SolverBench", "bench_apart", "bench_solver", "doctor"]
-
-
 NEEDED = (
     *("numpy", "scipy", "xarray", "netCDF4", "h5py", "dask", "pandas", "pydantic", "PyYAML"),
     *("typer", "rich", "platformdirs", "filelock", "fsspec"),

@@ -9,22 +9,6 @@ import typer
 
 from lagbench.errors import UsageError
 
-__all__ = [
-    "DeviceOption",
-    "JsonFlag",
-    "QuietFlag",
-    "RootOption",
-    "ScenariosOption",
-    "SchedulerOption",
-    "NewSizeOption",
-    "PresentSizeOption",
-    "SplitArgument",
-    "SplitOption",
-    "SubsetOption",
-    "WorkersOption",
-    "chosen",
-]
-
 SplitArgument = Annotated[str | None, typer.Argument(metavar="SPLIT", help="The same as --split.")]
 SplitOption = Annotated[
     str | None, typer.Option("--split", metavar="NAME", help="Data set; `lagbench list` names them.")

@@ -22,18 +22,6 @@ if TYPE_CHECKING:
     from lagbench.submission.findings import ValidationResult
     from lagbench.work.progress import Progress as State
 
-__all__ = [
-    "complain",
-    "print_blocks",
-    "print_json",
-    "print_table",
-    "progress_bar",
-    "say",
-    "show",
-    "spell_bytes",
-    "spell_seconds",
-]
-
 LAST_COLUMN = 24
 """Characters that the last column of a table, which wraps, keeps at least."""
 

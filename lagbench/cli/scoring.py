@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from lagbench.scoring.card import ScoreCard
     from lagbench.submission.findings import ValidationResult
 
-__all__ = ["compare", "score", "template", "validate"]
-
 PredictionsArgument = Annotated[Path, typer.Argument(metavar="FILE", help="A predictions.nc.")]
 FilesArgument = Annotated[
     list[Path], typer.Argument(metavar="FILE...", help="A predictions.nc; several with --report.")

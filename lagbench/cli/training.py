@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 
     from .machine import SolverBench
 
-__all__ = ["bench", "predict", "train"]
-
 EXTRA = "baselines"
 DeviceOption = Annotated[str, typer.Option("--device", metavar="NAME", help="cpu, cuda, or auto.")]
 ThreadsOption = Annotated[

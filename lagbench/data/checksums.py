@@ -25,21 +25,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from lagbench.errors import DataError
 
-__all__ = [
-    "HASHED_SUBSETS",
-    "ContentHasher",
-    "Variable",
-    "VariableHasher",
-    "canonical_json",
-    "content_hash",
-    "dataset_hash",
-    "dtype_name",
-    "file_sha256",
-    "plain",
-    "subset_hash",
-]
-
-
 HASHED_SUBSETS = ("train", "valid", "test")
 """Subsets that the data set hash covers."""
 

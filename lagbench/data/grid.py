@@ -21,23 +21,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from lagbench.errors import UsageError
 
-__all__ = [
-    "COUNTED_SHARE",
-    "EMPTY_SHARE",
-    "Fields",
-    "Grid",
-    "Placement",
-    "Transfer",
-    "counted_nodes",
-    "differentiable_nodes",
-    "divergence",
-    "fields",
-    "node_velocity",
-    "transfer",
-    "vorticity",
-]
-
-
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 

@@ -22,27 +22,6 @@ import numpy as np
 
 from lagbench.errors import LagbenchError, UnreadableFileError
 
-__all__ = [
-    "INSIDE",
-    "MAX_LINKS",
-    "Array",
-    "Odd",
-    "Problem",
-    "Structure",
-    "attribute_of",
-    "cache_of",
-    "check_file",
-    "check_regular",
-    "check_structure",
-    "describe",
-    "dims_of",
-    "layout_of",
-    "members_of",
-    "opened",
-    "reading",
-    "storage_problems",
-]
-
 MAX_LINKS = 1000
 """Most entries of a group that are looked at."""
 

@@ -24,23 +24,6 @@ from pathlib import Path
 from lagbench.atomic import write_atomically
 from lagbench.errors import UsageError
 
-__all__ = [
-    "CACHE_VARIABLE",
-    "as_url",
-    "cache_folder",
-    "open_copy",
-    "url_of",
-    "MANIFEST_NAME",
-    "NOTES_NAME",
-    "ROOT_VARIABLE",
-    "ScenarioKey",
-    "dataset_folder",
-    "major_of",
-    "resolve_root",
-    "scenario_path",
-]
-
-
 CACHE_VARIABLE = "LAGBENCH_CACHE"
 """Environment variable that names the folder of working copies and of what this machine measured."""
 

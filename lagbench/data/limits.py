@@ -13,9 +13,6 @@ from dataclasses import dataclass
 
 from lagbench.errors import nearest
 
-__all__ = ["SUBSETS", "Limit", "check_frames", "check_parameters", "check_subsets"]
-
-
 Value = int | float | bool | str
 
 SUBSETS = ("train", "valid", "test", "extra")

@@ -22,20 +22,6 @@ from lagbench.errors import UnreadableFileError, UsageError, nearest
 from .layout import dataset_folder, resolve_root, url_of
 from .registry import NO_GENERATOR, Measured, Registry, Size, Split, load
 
-__all__ = [
-    "DESCRIPTION",
-    "Home",
-    "Located",
-    "RootedRegistry",
-    "home",
-    "is_name",
-    "locate",
-    "locate_new",
-    "rooted",
-    "remedy",
-]
-
-
 DESCRIPTION = "split.yaml"
 """Name of the file that describes a local split; it stands in the split's folder."""
 

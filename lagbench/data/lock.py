@@ -25,8 +25,6 @@ from .layout import dataset_folder
 if TYPE_CHECKING:
     import filelock
 
-__all__ = ["Holder", "dataset_lock", "read_holder"]
-
 
 LOCK_NAME = ".lock"
 HOLDER_NAME = ".lock.holder.json"

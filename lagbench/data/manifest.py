@@ -26,20 +26,6 @@ from .registry import Size
 from .scenario import read_scenario
 from .statistics import round_digits
 
-__all__ = [
-    "FileEntry",
-    "Manifest",
-    "describe_file",
-    "merge",
-    "merged",
-    "note",
-    "noted_content",
-    "read_manifest",
-    "read_or_empty",
-    "write_manifest",
-]
-
-
 Hash = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]*$")]
 Row = Annotated[tuple[float, ...], Field(strict=False)]

@@ -13,8 +13,6 @@ from lagbench.errors import DataError
 
 from .hdf5 import INSIDE, dims_of, layout_of, members_of
 
-__all__ = ["attribute", "attributes", "dimensions", "is_text", "variables"]
-
 HIDDEN = frozenset(
     (
         *("CLASS", "NAME", "REFERENCE_LIST", "DIMENSION_LIST"),

@@ -29,20 +29,6 @@ from .layout import ScenarioKey
 if TYPE_CHECKING:
     import h5py
 
-__all__ = [
-    "ATTRIBUTES",
-    "AXES",
-    "MATERIALS",
-    "WALLS",
-    "attributes_of",
-    "differing_attributes",
-    "ScenarioFile",
-    "ScenarioHeader",
-    "check_scenario",
-    "read_scenario",
-    "rehash",
-]
-
 
 MATERIALS = ("liquid", "jelly", "snow", "rope")
 """Meaning of the values 0, 1, 2, 3 of ``material``."""

@@ -27,19 +27,6 @@ from lagbench.errors import DataError
 
 from .scenario import read_scenario
 
-__all__ = [
-    "QUANTITIES",
-    "MomentStream",
-    "Moments",
-    "combine",
-    "file_moments",
-    "file_statistics",
-    "round_digits",
-    "scenario_moments",
-    "statistics",
-]
-
-
 QUANTITIES = ("position", "velocity", "acceleration")
 """Order of the quantities: differences of order 0, 1 and 2 over frames."""
 

@@ -16,9 +16,6 @@ import yaml
 
 from lagbench.errors import UnreadableFileError
 
-__all__ = ["MAX_BYTES", "MAX_DEPTH", "read_yaml", "spell_yaml"]
-
-
 MAX_BYTES = 4 * 2**20
 """Largest YAML file that is read [bytes]."""
 

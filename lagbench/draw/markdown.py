@@ -5,9 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-__all__ = ["escape", "table"]
-
-
 _SPECIAL = re.compile(r"([\\`*_\[\]<>|#&~$])")
 
 

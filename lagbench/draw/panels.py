@@ -23,11 +23,6 @@ if TYPE_CHECKING:
     from matplotlib.colors import Normalize
     from matplotlib.patches import Rectangle
 
-__all__ = [
-    *("DOT", "TITLES", "Panel", "box_of", "colour_bar", "colour_scale", "draw", "draw_walls", "limit_of"),
-    *("material_key", "moving_walls"),
-]
-
 Floats = NDArray[np.float64]
 
 

@@ -25,8 +25,6 @@ from lagbench.errors import UsageError
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["Recording", "Scene", "open_recording"]
-
 
 Read = Callable[[str, slice | int], NDArray[Any]]
 

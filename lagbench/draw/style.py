@@ -27,11 +27,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from PIL.Image import Image
 
-__all__ = [
-    *("DPI", "INK", "MATERIAL_COLOURS", "MOVING", "MUTED", "PAPER", "WALL", "colours", "figure", "header"),
-    *("pixels_of", "png_bytes", "reduced", "rgb", "save", "speed_map", "vorticity_map"),
-]
-
 INK = "#1c2330"  # titles and labels
 MUTED = "#667085"  # second lines and tick labels
 PAPER = "#ffffff"  # background

@@ -24,8 +24,6 @@ from .metadata import DROP, Format, Source, parse_format, read_source
 from .mistakes import check_meaning
 from .trajectory import Description, Frame, Trajectory, Wishes, check_array, check_inflation
 
-__all__ = ["adopt", "import_split"]
-
 READABLE = (".npy", ".npz", ".nc")  # files that are adopted: an array, named arrays, netCDF
 ARRAYS = POSITION, VELOCITY, MATERIAL, WALLS = "position", "velocity", "material", "wall_velocity"
 

@@ -33,8 +33,6 @@ from lagbench.store.objects import NotInStoreError, StoreUnreachableError
 from lagbench.store.publication import publication
 from lagbench.work.progress import Meter, Progress
 
-__all__ = ["CONNECTIONS", "DownloadResult", "download"]
-
 SLACK = 1.25  # share by which a compressed file may be longer than its values
 REMEDY = "try again; if it stays so, name another store: --from"
 

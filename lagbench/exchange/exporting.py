@@ -26,8 +26,6 @@ from . import gns_npz, lagrangebench_h5
 from .metadata import NAME, WALL_NUMBERS, Format, describe, floor_of, numbers_of, parse_format, write_metadata
 from .trajectory import Box
 
-__all__ = ["ENDINGS", "ExportResult", "export"]
-
 ENDINGS = {Format.GNS_NPZ: gns_npz.ENDING, Format.LAGRANGEBENCH_H5: lagrangebench_h5.ENDING}
 
 LAYERS = 3  # layers of particles of a wall, as LagrangeBench's own lid-driven cavity has them

@@ -28,8 +28,6 @@ from lagbench.errors import UnreadableFileError, UsageError
 from .metadata import Format, materials_of
 from .trajectory import Trajectory, check_array, check_inflation
 
-__all__ = ["ENDING", "read_header", "trajectories", "write"]
-
 ENDING = ".npz"
 JOINT = "gns_data"  # key under which some files hold all trajectories together
 _EPOCH = (1980, 1, 1, 0, 0, 0)

@@ -22,8 +22,6 @@ from lagbench.errors import UnreadableFileError
 from .metadata import Format, materials_of
 from .trajectory import Frame, Trajectory, check_array
 
-__all__ = ["ENDING", "FORCE", "trajectories", "write"]
-
 ENDING = ".h5"
 FORCE = "force.py"  # name of the program that the other side would run
 

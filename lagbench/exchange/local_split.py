@@ -34,8 +34,6 @@ from lagbench.work.progress import Meter, Progress
 
 from .trajectory import FEWEST_CELLS, MOST_CELLS, Description, Trajectory, estimate_spacing
 
-__all__ = ["LocalSplit", "make_local_split", "output_name"]
-
 SIZE = "full"  # size of every local split
 VERSION = "1.0.0"
 DEVICE = "cpu"

@@ -27,25 +27,6 @@ from lagbench.data.registry import Size
 from lagbench.data.scenario import MATERIALS
 from lagbench.errors import UnreadableFileError, UsageError, nearest
 
-__all__ = [
-    "DROP",
-    "MEANINGS",
-    "NAME",
-    "NUMBERS",
-    "WALL_NUMBERS",
-    "Format",
-    "Shapes",
-    "Source",
-    "describe",
-    "floor_of",
-    "materials_of",
-    "numbers_of",
-    "parse_format",
-    "parse_kinds",
-    "read_source",
-    "write_metadata",
-]
-
 NAME = "metadata.json"
 OWN_KEY = "lagbench"
 MAX_BYTES = 1 << 20

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from lagbench.errors import DataError
 from lagbench.submission.start import Mistake
 
-__all__ = ["check_meaning", "misplaced_axes"]
-
 STRETCH = 4
 """Neighbours along an axis that are looked at together: two second differences, a step and its neighbours."""
 

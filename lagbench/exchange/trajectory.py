@@ -19,21 +19,6 @@ from lagbench.errors import DataError, UnreadableFileError, UsageError
 
 from .mistakes import misplaced_axes
 
-__all__ = [
-    "FEWEST_CELLS",
-    "MOST_CELLS",
-    "Box",
-    "Description",
-    "Frame",
-    "Measure",
-    "Trajectory",
-    "Wishes",
-    "check_array",
-    "check_inflation",
-    "estimate_spacing",
-    "read_wishes",
-]
-
 Array = NDArray[np.floating]
 Frame = tuple[Array, Array | None]
 """Positions [length of the source] and, where the source has them, velocities [its length/s]."""

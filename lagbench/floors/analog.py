@@ -30,8 +30,6 @@ from lagbench.store.copy import bring
 from .carried import linear_field, mirrored
 from .floor import Floats, Floor, Given, Prediction, fills_box, given_in, wall_motion
 
-__all__ = ["FLOOR", "assigned", "distance", "nearest", "predict"]
-
 ANGLES = np.arange(64) * (np.pi / 64)
 DIRECTIONS = np.stack([np.cos(ANGLES), np.sin(ANGLES)])
 """Directions on which clouds are projected, shape [2, direction]."""

@@ -14,8 +14,6 @@ import numpy as np
 
 from .floor import Floats, Given
 
-__all__ = ["Field", "linear_field", "mirrored"]
-
 Field = Callable[[Floats], Floats]
 """From points [length], shape [point, 2], to velocities there [length/frame]."""
 

@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from lagbench.generators.solver import Solver
     from lagbench.generators.split import ClosedBoxParameters, FreeSurfaceParameters, InitialState
 
-__all__ = ["FLOOR", "coarser", "predict", "predict_with", "spread_subset"]
-
 NEXT = {"full": "mini", "mini": "tiny"}
 """The next smaller size of each size."""
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from .floor import Floor, Given, Prediction
 
-__all__ = ["FLOOR", "predict"]
-
 
 def predict(given: Given) -> Prediction:
     """Yield positions on straight lines."""

@@ -14,8 +14,6 @@ from lagbench.data.grid import Placement
 from lagbench.data.registry import Size
 from lagbench.data.scenario import WALLS, ScenarioFile
 
-__all__ = ["Floats", "Floor", "Given", "Prediction", "fills_box", "given_in", "wall_motion"]
-
 Floats = NDArray[np.float64]
 
 Prediction = Iterator[NDArray[np.float32]]

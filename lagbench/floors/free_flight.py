@@ -12,8 +12,6 @@ from lagbench.data.registry import Size
 
 from .floor import Floor, Given, Prediction, fills_box
 
-__all__ = ["FLOOR", "predict"]
-
 
 def predict(given: Given) -> Prediction:
     """Yield positions on parabolas."""

@@ -16,8 +16,6 @@ import numpy as np
 from .carried import linear_field, mirrored
 from .floor import Floats, Floor, Given, Prediction, fills_box
 
-__all__ = ["FLOOR", "decay", "predict"]
-
 
 def decay(position: Floats) -> float:
     """Return the factor on the speed from frame to frame, fitted to given frames [1]."""

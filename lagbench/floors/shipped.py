@@ -26,18 +26,6 @@ from lagbench.metrics.aggregate import Score
 from lagbench.metrics.metric import Metric
 from lagbench.metrics.table import available
 
-__all__ = [
-    "CURVES",
-    "FOLDER",
-    "FloorScores",
-    "correlation_of",
-    "shipped",
-    "shipped_path",
-    "solver_seconds",
-    "write_shipped",
-    "write_solver_seconds",
-]
-
 FOLDER = Path(__file__).parent / "measured"
 
 FORMAT = 1

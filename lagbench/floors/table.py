@@ -10,8 +10,6 @@ from lagbench.data.registry import Size
 from . import analog, coarse_solver, constant_velocity, free_flight, frozen_field, persistence
 from .floor import Floor
 
-__all__ = ["FLOORS", "floors_of"]
-
 FLOORS: Mapping[str, Floor] = MappingProxyType(
     {
         module.FLOOR.name: module.FLOOR

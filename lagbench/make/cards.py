@@ -18,19 +18,6 @@ from lagbench.data.manifest import Manifest
 from lagbench.data.registry import Registry, Size, Split, spell_ids
 from lagbench.draw.markdown import escape, table
 
-__all__ = [
-    "CONFORMS_TO",
-    "croissant_json",
-    "describe_dataset",
-    "CARD_NAME",
-    "CROISSANT_NAME",
-    "NOTES",
-    "PICTURES",
-    "card_texts",
-    "dataset_card",
-    "write_cards",
-]
-
 CONFORMS_TO = "http://mlcommons.org/croissant/1.1"
 LICENCES = {"CC-BY-4.0": "https://creativecommons.org/licenses/by/4.0/"}
 NETCDF = "application/x-netcdf"

@@ -15,9 +15,6 @@ from lagbench.errors import WorkFailedError
 
 from .cards import CARD_NAME, CROISSANT_NAME, PICTURES
 
-__all__ = ["CleanResult", "clean"]
-
-
 CARDS = (MANIFEST_NAME, CARD_NAME, CROISSANT_NAME, *PICTURES)  # what lagbench writes beside the subsets
 
 

@@ -39,9 +39,6 @@ from .cards import card_texts, write_cards
 from .inventory import Look, compare, look
 from .plan import Estimate, Scenarios, Selection, check_disk, estimate, free_bytes, note_pace, select
 
-__all__ = ["Generation", "GenerationResult", "Progress", "generate"]
-
-
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 

@@ -27,25 +27,6 @@ from lagbench.work.machine import available_cores, may_differ
 from .cards import PICTURES
 from .plan import estimate, scenario_bytes
 
-__all__ = [
-    "Finding",
-    "Look",
-    "Overview",
-    "State",
-    "compare",
-    "examine",
-    "extra_files",
-    "hash_verdict",
-    "look",
-    "other_bits",
-    "overview",
-    "record_of",
-    "recorded_hash",
-    "unlike",
-    "unlike_measures",
-]
-
-
 DRAWN = 2  # scenarios of a size that are drawn to estimate the time: all of them would take seconds
 
 

@@ -30,19 +30,6 @@ if TYPE_CHECKING:
 
     Row = tuple[float, int, int]  # seconds, particle substeps and frames, as in Pace
 
-__all__ = [
-    "SECONDS_TO_START",
-    "Estimate",
-    "check_disk",
-    "estimate",
-    "free_bytes",
-    "measured_ratio",
-    "note_pace",
-    "reference_seconds",
-    "scenario_bytes",
-    "select",
-]
-
 
 RATES = "rates.json"
 """File of the measured rates, in the user's cache."""

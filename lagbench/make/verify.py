@@ -38,8 +38,6 @@ from .inventory import (
 )
 from .plan import Scenarios, Selection, estimate, select
 
-__all__ = ["SubsetReport", "VerificationResult", "evenly_spaced", "verify"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class SubsetReport:

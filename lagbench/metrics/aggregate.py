@@ -23,21 +23,6 @@ from lagbench.errors import UsageError
 from .frame import Floats, FramePair
 from .metric import Metric, mean
 
-__all__ = [
-    "FEWEST_FOR_INTERVAL",
-    "Resampling",
-    "Score",
-    "Tally",
-    "aggregate",
-    "bootstrap_interval",
-    "mean_over_seeds",
-    "measure",
-    "quantile",
-    "resample",
-    "score",
-    "tally",
-]
-
 LEVEL = 0.95
 """Share of the resampled means that an interval holds."""
 

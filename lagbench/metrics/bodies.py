@@ -15,8 +15,6 @@ import numpy as np
 from .frame import ELASTIC, Floats, FramePair, Snapshot
 from .metric import Direction, Metric
 
-__all__ = ["METRICS", "rigid_residual"]
-
 
 def rigid_residual(truth: Floats, prediction: Floats) -> float:
     """Return the RMS distance after the best rigid fit of prediction to truth [length].

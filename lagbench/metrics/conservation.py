@@ -19,8 +19,6 @@ from .frame import Floats, FramePair, Snapshot, average, dot, lengths
 from .metric import Direction, enough_nodes, floored_quotient, metric, metrics_of, quotient, total
 from .metric import root_mean_square as over_frames_rms
 
-__all__ = ["METRICS", "angular_momentum", "kinetic_energy", "momentum", "root_mean_square"]
-
 MOVING = 0.01
 """Share of the truth's greatest kinetic energy from which on a frame counts as moving."""
 

@@ -16,8 +16,6 @@ from lagbench.data.grid import Grid, Placement, fields
 
 from .metric import MINIMUM_NODES
 
-__all__ = ["Cloud", "covered_nodes", "fitting_cells"]
-
 TRIED = range(4, 129)
 """Cells across of the grids that are tried."""
 

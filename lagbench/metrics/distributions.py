@@ -17,19 +17,6 @@ import numpy as np
 from .frame import Floats, FramePair, average
 from .metric import Direction, at_slow_frames, enough_nodes, metric, metrics_of, turning
 
-__all__ = [
-    "BINS",
-    "DECADES",
-    "EPSILON",
-    "METRICS",
-    "PSEUDO_COUNT",
-    "energy_spectrum",
-    "histograms",
-    "kl",
-    "normalised",
-    "wasserstein1",
-]
-
 EPSILON = 1e-10
 """Added to every magnitude, so that no node has probability 0 [1/frame]."""
 

@@ -19,27 +19,6 @@ from lagbench.data.grid import Fields, Grid, Placement, fields, vorticity
 from lagbench.data.scenario import MATERIALS
 from lagbench.errors import ChecksFailedError, UsageError
 
-__all__ = [
-    "DIRECTIONS",
-    "ELASTIC",
-    "PERCENTILES",
-    "ROUNDING",
-    "STRETCH",
-    "WALL_TOLERANCE",
-    "Bonds",
-    "Floats",
-    "FramePair",
-    "Scenario",
-    "Setting",
-    "Snapshot",
-    "average",
-    "dot",
-    "lengths",
-    "mean_square",
-    "snapshots",
-    "sorted_projections",
-]
-
 Floats = NDArray[np.float64]
 
 DIRECTIONS = 64

@@ -19,27 +19,6 @@ from lagbench.errors import UsageError
 
 from .frame import Floats, FramePair
 
-__all__ = [
-    "MINIMUM_NODES",
-    "SCALE_FLOOR",
-    "Direction",
-    "FirstFrames",
-    "Metric",
-    "always",
-    "at_slow_frames",
-    "enough_nodes",
-    "floored_quotient",
-    "identity",
-    "last",
-    "mean",
-    "metric",
-    "metrics_of",
-    "quotient",
-    "root_mean_square",
-    "total",
-    "turning",
-]
-
 MINIMUM_NODES = 16
 """With fewer compared nodes the metrics of vorticity and divergence are undefined."""
 

@@ -20,8 +20,6 @@ from lagbench.data.scenario import MATERIALS
 from .frame import Floats, FramePair, average
 from .metric import Direction, FirstFrames, Metric, last, mean, metric, root_mean_square
 
-__all__ = ["HORIZONS", "METRICS", "attribute_mse", "mean_absolute_error", "mean_squared_error"]
-
 HORIZONS = (1, 5, 10, 20, 50)
 """Predicted frames at which ``mse_avg`` and ``mse_end`` are taken besides the whole rollout."""
 

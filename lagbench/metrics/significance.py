@@ -21,20 +21,6 @@ from .aggregate import Score, mean_over_seeds, resample
 from .frame import Floats
 from .metric import mean
 
-__all__ = [
-    "FEWEST_SCENARIOS",
-    "MOST_SCENARIOS",
-    "SIGNIFICANCE",
-    "Comparison",
-    "Standing",
-    "compare",
-    "differ",
-    "holm",
-    "mean_loss",
-    "sign_flip_p",
-    "standings",
-]
-
 SIGNIFICANCE = 0.05
 """Level at which two methods are told apart."""
 

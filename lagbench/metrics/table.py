@@ -16,8 +16,6 @@ from lagbench.errors import UsageError, nearest
 from . import bodies, conservation, distributions, pointwise, transport, vorticity
 from .metric import Metric
 
-__all__ = ["CHOSEN", "FAMILIES", "GROUP", "METRICS", "available", "select"]
-
 GROUP = "lagbench.metrics"
 """Entry-point group that adds metrics."""
 

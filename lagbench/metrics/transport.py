@@ -12,10 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from lagbench.errors import require
 
-from .frame import DIRECTIONS, FramePair, sorted_projections
+from .frame import FramePair, sorted_projections
 from .metric import Direction, at_slow_frames, metric, metrics_of
-
-__all__ = ["CLOUD_FRAMES", "DIRECTIONS", "METRICS", "sinkhorn_divergence", "sliced_wasserstein2"]
 
 CLOUD_FRAMES = 10
 """``cloud_distance`` is taken at every one of so many active frames."""

@@ -27,8 +27,6 @@ from .metric import (
 )
 from .pointwise import mean_absolute_error, mean_squared_error
 
-__all__ = ["METRICS", "STABLE_PEARSON", "frames_before_fall", "pearson", "slope"]
-
 STABLE_PEARSON = 0.95
 """A rollout is stable until the vorticity correlation falls below this; at 0.8 good models saturate."""
 

@@ -17,11 +17,6 @@ from numpy.typing import ArrayLike, NDArray
 from .html import Markup, clipped, decimals, join, path_data, power, tag
 from .names import Names, written
 
-__all__ = [
-    *("Bar", "Plot", "Scale", "Spot", "Tick", "bar_chart", "close_logarithmic", "linear", "logarithmic"),
-    "spanning",
-]
-
 Floats = NDArray[np.float64]
 
 WIDE = 60.0

@@ -15,11 +15,6 @@ from .html import Markup, clipped, html, join, quantity, sentence, tag, text, wo
 from .page import Figure, key, table
 from .subject import Gallery, Moment, Row, Subject, kind_of
 
-__all__ = [
-    *("bar_figures", "body_curves", "energy_curves", "error_curves", "histogram_figures", "method_curves"),
-    *("residual_figures", "shares_of"),
-]
-
 Floats = NDArray[np.float64]
 
 Series = Sequence[tuple[str, str, Floats]]  # label, classes and values over frames of each line

@@ -21,8 +21,6 @@ from .maps import limit_of
 from .page import SIDE, Figure, grid, ramp, vector
 from .subject import Gallery, Subject
 
-__all__ = ["Stream", "arrow_figures", "stream_figures", "streamlines"]
-
 Floats = NDArray[np.float64]
 
 STEP = 0.4  # length of a step in node distances

@@ -14,11 +14,6 @@ from unicodedata import east_asian_width
 
 from lagbench.metrics.metric import Metric
 
-__all__ = [
-    *("MISSING", "Markup", "clipped", "decimals", "escaped", "html", "interval", "join", "path_data"),
-    *("power", "quantity", "sentence", "tag", "text", "unit", "words"),
-]
-
 VOID = frozenset({"br", "col", "hr", "img", "link", "meta"})  # elements of HTML without an end tag
 SHAPES = frozenset({"circle", "line", "path", "rect", "stop", "use"})  # elements of SVG that close themselves
 

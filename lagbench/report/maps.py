@@ -22,11 +22,6 @@ from .html import Markup, join, tag
 from .page import Figure, grid, image, key, ramp
 from .subject import Gallery, Moment, Subject, Walls
 
-__all__ = [
-    *("CLOCKWISE", "COUNTER", "FAST", "diverging", "encode", "field_figure", "inside", "limit_of", "paint"),
-    *("particle_figures", "scenario_figure", "sequential", "vorticity_figure"),
-]
-
 Floats = NDArray[np.float64]
 
 Bytes = NDArray[np.uint8]

@@ -10,8 +10,6 @@ from collections.abc import Iterator, Sequence
 
 from .html import Markup, path_data, tag
 
-__all__ = ["Box", "Names", "Place", "Point", "written"]
-
 Point = tuple[float, float]
 """Across and down [pixel]."""
 

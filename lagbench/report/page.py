@@ -16,8 +16,6 @@ from importlib.resources import files
 from .html import Markup, join, tag, text
 from .subject import Walls
 
-__all__ = ["Figure", "Section", "document", "grid", "image", "key", "paragraph", "ramp", "table", "vector"]
-
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
 
 

@@ -14,8 +14,6 @@ from .html import Markup, join, tag, words
 from .page import Figure, Section, document, paragraph
 from .subject import Subject, open_gallery, subject_of
 
-__all__ = ["FILE_NAME", "render", "write_report"]
-
 FILE_NAME = "index.html"
 
 

@@ -24,11 +24,6 @@ from lagbench.scoring.scenario import SUBMISSION
 from lagbench.scoring.task import OpenScenario, ScoredTask, load_scored_task
 from lagbench.submission.predictions import open_predictions
 
-__all__ = [
-    *("COLOURS", "Entry", "Gallery", "Moment", "Row", "Subject", "Walls", "kind_of", "open_gallery"),
-    "subject_of",
-]
-
 COLOURS = 6  # series that differ in colour; further ones are dashed
 
 THESIS_FRAMES = {"cavity": 54, "curl-noise": 40}

@@ -22,11 +22,6 @@ from .html import unit as unit_of
 from .page import paragraph, table
 from .subject import Row, Subject
 
-__all__ = [
-    *("every_metric", "flag_list", "frame_table", "head", "identity", "scenario_table", "score_table"),
-    *("stable_of", "title", "verdict_table"),
-]
-
 AT_FRAMES = ("vorticity_mae", "vorticity_mse", "vorticity_rmse", "vorticity_pearson", "vorticity_kl")
 AT_FRAMES_FREE = ("sliced_w2", "position_rmse", "attribute_mse", "velocity_rmse", "energy_ratio")
 

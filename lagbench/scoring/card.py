@@ -34,20 +34,6 @@ from .flags import Flag
 from .scenario import SUBMISSION, Preview
 from .skill import Skill, skill
 
-__all__ = [
-    "FORMAT",
-    "IDENTITY",
-    "JSON_NAME",
-    "ScoreCard",
-    "digits",
-    "write_json",
-    "PublishedScores",
-    "parse_scores",
-    "read_scores",
-    "unreadable_scores",
-]
-
-
 FORMAT = 1
 """Number of the layout of scores.json and scores.nc; stored as ``lagbench_scores``."""
 

@@ -26,14 +26,6 @@ from .card import JSON_NAME, PublishedScores, digits, parse_scores, read_scores
 from .scenario import SUBMISSION
 from .score import score
 
-__all__ = [
-    "told_apart",
-    "ComparisonResult",
-    "Contestant",
-    "MetricComparison",
-    "compare",
-]
-
 
 def told_apart(methods: Sequence[str], taken: Collection[str] = ()) -> list[str]:
     """Return the methods; those that occur twice, or have a taken name, with a number.

@@ -29,19 +29,6 @@ from lagbench.data.grid import counted_nodes
 from lagbench.metrics.frame import FramePair, Scenario, average, dot, mean_square
 from lagbench.metrics.metric import mean
 
-__all__ = [
-    "SHIFTS",
-    "Trace",
-    "Tracer",
-    "Evidence",
-    "Flag",
-    "below_twin_floor",
-    "copy_suspect",
-    "evidence",
-    "physics",
-]
-
-
 Floats = NDArray[np.float64]
 
 SHIFTS = (-2, -1, 1, 2)

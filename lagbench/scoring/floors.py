@@ -31,17 +31,6 @@ from lagbench.work.run import run_all
 from .scenario import measure_rows
 from .task import ScoredTask, load_scored_task
 
-__all__ = [
-    "FloorJob",
-    "differences",
-    "kept_in",
-    "measurable",
-    "measure",
-    "measure_scenario",
-    "measured_again",
-    "measured_sizes",
-]
-
 TOLERANCE = 1e-4
 """Relative difference up to which shipped and measured values are equal: libraries round differently."""
 

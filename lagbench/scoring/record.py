@@ -27,8 +27,6 @@ from lagbench.floors.shipped import FOLDER, write_shipped, write_solver_seconds
 from .floors import kept_in, measure, measured_sizes
 from .task import load_scored_task
 
-__all__ = ["main", "record", "time_solver"]
-
 
 def record(size: Size, root: Path, *, workers: int = 1, folder: Path = FOLDER) -> Path:
     """Measure the floors of a data set and write them to the folder of shipped scores.

@@ -30,21 +30,6 @@ from lagbench.work.pool import Report
 from .flags import Trace, Tracer
 from .task import OpenScenario, ScoredTask
 
-__all__ = [
-    "FRAMES",
-    "PARTICLES",
-    "PreviewRecorder",
-    "Preview",
-    "SUBMISSION",
-    "ScenarioJob",
-    "ScenarioScores",
-    "as_stored",
-    "floor_snapshots",
-    "measure_rows",
-    "score_scenario",
-]
-
-
 FRAMES = 45
 """Frames of the particle film, evenly spaced over the horizon."""
 

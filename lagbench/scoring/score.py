@@ -33,11 +33,6 @@ from .score_file import NETCDF_NAME, write_statistics
 from .task import ScoredTask, load_scored_task, ranking_metric
 from .usable import OF_NODES, few_nodes
 
-__all__ = [
-    "score",
-]
-
-
 PREDICTIONS = "predictions.nc"
 """The usual name of a submission; its scores lie beside it."""
 

@@ -28,14 +28,6 @@ from .card import FORMAT, IDENTITY, ScoreCard, unreadable_scores
 from .scenario import SUBMISSION, Preview
 from .skill import Skill, skill
 
-__all__ = [
-    "NETCDF_NAME",
-    "StoredScores",
-    "read_statistics",
-    "write_statistics",
-]
-
-
 NETCDF_NAME = "scores.nc"
 
 INDEX = 4096

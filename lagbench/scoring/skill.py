@@ -17,8 +17,6 @@ from lagbench.floors.table import FLOORS
 from lagbench.metrics.aggregate import Score, bootstrap_interval, mean_over_seeds
 from lagbench.metrics.metric import Direction
 
-__all__ = ["Skill", "best_floor", "skill"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Skill:

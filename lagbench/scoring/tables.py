@@ -14,14 +14,6 @@ from .card import ScoreCard
 from .compare import ComparisonResult
 from .scenario import SUBMISSION
 
-__all__ = [
-    "Table",
-    "card_tables",
-    "comparison_tables",
-    "flag_lines",
-]
-
-
 SHOWN_AT_FRAMES = (
     *("vorticity_mse", "vorticity_mae", "vorticity_rmse", "vorticity_pearson", "vorticity_kl"),
     *("vorticity_w1", "spectrum_error", "position_rmse", "attribute_mse", "energy_ratio"),

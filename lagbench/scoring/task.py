@@ -25,15 +25,6 @@ from lagbench.metrics.frame import Scenario, Setting, Snapshot, snapshots
 from lagbench.store.copy import bring
 from lagbench.submission.truth import Truth
 
-__all__ = [
-    "RANKING",
-    "ScoredTask",
-    "OpenScenario",
-    "load_scored_task",
-    "ranking_metric",
-]
-
-
 BLOCK_BYTES = 1 << 20
 """True positions are read in blocks of about this size: a call for each frame costs more than its bytes."""
 

@@ -20,8 +20,6 @@ from lagbench.submission.findings import Finding, Severity
 
 from .task import ScoredTask, load_scored_task, ranking_metric
 
-__all__ = ["few_nodes", "unusable"]
-
 OF_NODES = "vorticity_nrmse"
 """The ranking metric that needs nodes."""
 

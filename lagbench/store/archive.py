@@ -38,8 +38,6 @@ from .objects import (
     open_object,
 )
 
-__all__ = ["RELEASES", "RELEASES_VARIABLE", "archive_name", "fetch_archive", "releases", "write_archive"]
-
 RELEASES = "https://lagbench.invalid/releases"
 """Folder of the released archives; a placeholder as long as its host is .invalid (RFC 2606)."""
 

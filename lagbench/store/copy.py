@@ -32,25 +32,6 @@ from lagbench.work.machine import may_differ
 from .fetch import Wanted, fetch_scenarios, fetch_text
 from .objects import HTTP, NotDataError, NotInStoreError, Objects, WrongContentError, check_bucket
 
-__all__ = [
-    "address_of",
-    "bring",
-    "fetch_entries",
-    "folder_of",
-    "gather",
-    "is_here",
-    "is_right",
-    "join",
-    "parse_manifest",
-    "quietly",
-    "refuse_strangers",
-    "remote_manifest",
-    "scenario_files",
-    "unstored",
-    "with_local",
-    "writing",
-]
-
 FRESH = 30.0  # how long a store's manifest is not asked for again by this process [s]
 MANIFEST_LIMIT = 64 << 20  # longest manifest that is read [bytes]
 

@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from lagbench.data.layout import ScenarioKey
     from lagbench.data.manifest import Manifest
 
-__all__ = ["list_splits", "load_manifest", "open_split"]
-
 
 CHUNK_BYTES = 4 << 20  # Dask reads position and velocity in chunks of about this size [bytes]
 PADDING = -1  # material of particles that a scenario does not have

@@ -35,20 +35,6 @@ from .objects import (
     open_object,
 )
 
-__all__ = [
-    "BLOCK",
-    "CONNECTIONS",
-    "Pace",
-    "Wanted",
-    "accept",
-    "fetch_scenarios",
-    "fetch_text",
-    "insist",
-    "partial_name",
-    "received",
-    "saving",
-]
-
 CONNECTIONS = 4  # objects that are fetched side by side
 BLOCK = 1 << 18  # bytes read at a time
 LEAST_RATE = 4096.0  # bytes per second below which a store is refused, each object by itself

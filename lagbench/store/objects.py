@@ -22,23 +22,6 @@ from typing import Any
 from lagbench.atomic import atomic_path, write_atomically
 from lagbench.errors import DataError, LagbenchError, UsageError, WorkFailedError, require
 
-__all__ = [
-    "HTTP",
-    "Answer",
-    "BrokenError",
-    "ConnectionLostError",
-    "NotDataError",
-    "NotInStoreError",
-    "Objects",
-    "StoreUnreachableError",
-    "TooSlowError",
-    "TruncatedError",
-    "WrongContentError",
-    "WrongLengthError",
-    "check_bucket",
-    "open_object",
-]
-
 TIMEOUT = 30.0  # how long a store may be silent [s]
 HTTP = ("http://", "https://")
 S3 = ("s3://", "s3a://")

@@ -23,8 +23,6 @@ from lagbench.errors import DataError, LagbenchError
 from .copy import fetch_entries, folder_of, is_here, is_right, join, remote_manifest, with_local, writing
 from .objects import NotDataError, Objects
 
-__all__ = ["Publication", "look_at", "publication"]
-
 EVERY = 10.0  # least time between two manifests while scenarios are being finished [s]
 
 

@@ -25,8 +25,6 @@ from .copy import scenario_files
 if TYPE_CHECKING:
     import h5py
 
-__all__ = ["CACHE_BYTES", "FrameStore", "Window", "WindowReader", "Windows", "window_of", "windows"]
-
 Floats = NDArray[np.float32]
 
 CACHE_BYTES = 256 << 20  # frames kept decompressed, by default [bytes]

@@ -6,8 +6,6 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 
-__all__ = ["MOST_VALIDATIONS", "Budget", "Track", "budget_in", "track_of"]
-
 Track = Literal["equal compute", "converged"]
 """What trainings are compared by: the same processor time, or until more of it brings nothing."""
 

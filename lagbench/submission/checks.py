@@ -16,16 +16,6 @@ from .predictions import Predictions
 from .start import JUMP, Start
 from .truth import Truth, squared_lengths
 
-__all__ = [
-    "MAX_DISTANCE",
-    "Survey",
-    "check_domain",
-    "check_finite",
-    "check_frozen",
-    "check_jumps",
-    "survey",
-]
-
 MAX_DISTANCE = 10.0
 """Farthest outside the walls that a position may be [length]; the box has length 1."""
 

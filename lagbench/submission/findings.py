@@ -9,8 +9,6 @@ from pathlib import Path
 
 from lagbench.errors import ChecksFailedError, DataError, LagbenchError, UnreadableFileError
 
-__all__ = ["CHECKS", "Finding", "Findings", "Severity", "ValidationResult", "quoted"]
-
 CHECKS = (
     "readable",
     "format",

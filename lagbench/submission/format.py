@@ -29,28 +29,6 @@ from lagbench.errors import UnreadableFileError, nearest
 from .budget import Budget, budget_in
 from .findings import Findings, quoted
 
-__all__ = [
-    "DIMS",
-    "FORMAT",
-    "MAX_NAME",
-    "NEVER",
-    "OPTIONAL",
-    "REQUIRED",
-    "SPACE",
-    "WRITE",
-    "Anatomy",
-    "Header",
-    "check_dims",
-    "check_dtype",
-    "check_format",
-    "check_marks",
-    "dissect",
-    "fits",
-    "header_of",
-    "kind_of",
-    "refuse_other_kinds",
-]
-
 FORMAT = 1
 """Number of the file layout; stored as attribute ``lagbench_format``."""
 

@@ -32,8 +32,6 @@ from .format import (
     header_of,
 )
 
-__all__ = ["Predictions", "attach", "open_predictions"]
-
 BLOCK_BYTES = 1 << 20
 """Blocks have about this size [bytes]."""
 

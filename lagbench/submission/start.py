@@ -20,8 +20,6 @@ from .findings import Findings
 from .predictions import Predictions
 from .truth import Truth, squared_steps
 
-__all__ = ["JUMP", "NEARER", "Mistake", "Start", "check_start", "mistake", "read_starts", "shift"]
-
 JUMP = 10.0
 """A step is suspect beyond this many of the truth's largest per-frame displacement."""
 

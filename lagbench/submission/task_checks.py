@@ -17,18 +17,6 @@ from lagbench.errors import DataError, UnreadableFileError, UsageError
 from .findings import Findings, quoted
 from .format import Anatomy
 
-__all__ = [
-    "check_dataset",
-    "check_frames",
-    "check_particles",
-    "check_scenarios",
-    "check_split",
-    "dataset_hash_of",
-    "frames_to_predict",
-    "guess_frames",
-    "guess_scenarios",
-]
-
 _VERSION = re.compile(r"[1-9]\d{0,5}\.\d{1,6}\.\d{1,6}")
 _HASH = re.compile(r"[0-9a-f]{64}")
 

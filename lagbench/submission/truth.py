@@ -14,8 +14,6 @@ from lagbench.data.registry import Size, spell_ids
 from lagbench.data.scenario import ScenarioFile, check_scenario, read_scenario
 from lagbench.errors import DataError
 
-__all__ = ["Truth", "squared_lengths", "squared_steps"]
-
 BLOCK = 16
 """Frames that are read at a time."""
 

@@ -39,8 +39,6 @@ from .start import check_start, read_starts
 from .task_checks import check_dataset, check_frames, check_particles, check_scenarios, check_split
 from .truth import Truth
 
-__all__ = ["CPU_SECONDS", "WALL_SECONDS", "seconds_for", "validate"]
-
 CPU_SECONDS = 5.0
 """Computing time for a small file, the start of the child aside [s]; a sound one takes 2 on a busy core."""
 

@@ -22,8 +22,6 @@ from .format import DIMS, FORMAT, NEVER, OPTIONAL, SPACE, fits, kind_of
 from .task_checks import dataset_hash_of, frames_to_predict
 from .truth import Truth
 
-__all__ = ["Label", "PredictionsWriter", "TemplateResult", "template", "write"]
-
 CHUNK_CACHE = 1 << 20
 """Chunk cache while writing [bytes]; frames are written once, in order."""
 

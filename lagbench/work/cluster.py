@@ -33,8 +33,6 @@ from lagbench.errors import LagbenchError, UsageError, WorkFailedError, require
 from .machine import environment_of
 from .pool import Event, Task, crashed
 
-__all__ = ["Client", "Cluster", "Mark", "await_file", "marked", "run_task"]
-
 PATIENCE = 30.0  # how long a file of another machine may take to appear [s]
 PAUSE = 0.1  # pause between two looks for a file [s]
 TELL_SECONDS = 0.5  # time between two events that tell how far a task is [s]

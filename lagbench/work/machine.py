@@ -34,19 +34,6 @@ except ImportError:
 else:
     LIMITS = True
 
-__all__ = [
-    "LIMITS",
-    "MEMORY",
-    "Answers",
-    "available_cores",
-    "environment_of",
-    "in_child",
-    "limit_process",
-    "may_differ",
-    "promises_bits",
-    "serve",
-]
-
 _MACHINES = {"x86_64", "amd64"}
 _DEVICES = {"cpu", "parallel"}
 _LIBRARIES = ("lagbench", "numpy", "netCDF4", "taichi")

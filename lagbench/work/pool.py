@@ -31,9 +31,6 @@ from lagbench.errors import LagbenchError, UsageError, WorkFailedError
 
 from .machine import available_cores
 
-__all__ = ["ATTEMPTS", "AVAILABLE", "Event", "Pool", "Report", "Task", "crashed", "serve", "worker_count"]
-
-
 AVAILABLE = os.name == "posix"
 """Whether workers can be started here: they inherit a socket, which Windows cannot hand on."""
 

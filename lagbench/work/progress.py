@@ -6,8 +6,6 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-__all__ = ["Meter", "Progress"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Progress:

@@ -14,8 +14,6 @@ from . import pool
 from .cluster import Cluster
 from .pool import Pool, Report, Task
 
-__all__ = ["ONE_THREAD", "read_many", "run_all"]
-
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
