@@ -13,7 +13,7 @@ import shutil
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import chain, count, islice
 from pathlib import Path
 
@@ -174,7 +174,7 @@ def train(
         reseed(seed_of(plan.training.seed))
         model = entry.model.build(plan.model, facts)
         ledger, steps = (fit if getattr(model, "closed_form", False) else descend)(job, model)
-        budget, said = job.budget(ledger), ledger.as_json()
+        budget = job.budget(ledger)
         return TrainingResult(
             baseline=plan.baseline,
             split=facts.split,
@@ -188,7 +188,18 @@ def train(
             device=budget.device or "",
             threads=budget.threads or 0,
             track=track_of(facts.size, budget),
-            **{field.name: said[field.name] for field in fields(TrainingResult) if field.name in said},
+            state=ledger.state,
+            step=ledger.step,
+            loss=ledger.loss,
+            windows_seen=ledger.windows_seen,
+            epochs=ledger.epochs,
+            metric=ledger.metric,
+            best_value=ledger.best_value,
+            best_step=ledger.best_step,
+            cpu_seconds=ledger.cpu_seconds,
+            validation_cpu_seconds=ledger.validation_cpu_seconds,
+            gpu_seconds=ledger.gpu_seconds,
+            wall_seconds=ledger.wall_seconds,
         )
 
 

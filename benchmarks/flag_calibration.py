@@ -12,7 +12,7 @@ between true frames, a moving average.
 
 ``--trained`` adds predictions of trained models to the honest ones.
 
-The thresholds in lagbench/flags.py lie between the extremes that this prints.
+The thresholds in lagbench/scoring/flags.py lie between the extremes that this prints.
 """
 
 from __future__ import annotations

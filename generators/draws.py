@@ -20,22 +20,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from lagbench.errors import WorkFailedError
 
-__all__ = [
-    "QUANTUM",
-    "RandomSource",
-    "choice",
-    "direction",
-    "entropy",
-    "fill",
-    "fill_grid",
-    "generator",
-    "log_uniform",
-    "normal",
-    "quantise",
-    "seed_text",
-    "uniform",
-]
-
 QUANTUM = 2.0**-20  # grain of everything that enters the solver; multiples below 16 are exact in float32
 _LARGEST = 16.0
 _PRECISE = Context(prec=50)

@@ -275,10 +275,22 @@ def roll_out(step: Step, given: Batch, frames: int) -> Tensor:
 
     Returns:
         Positions of the frames after the given ones [length], shape [particle, frame, 2].
+
+    Raises:
+        UsageError: no frame is asked for, or the model returns another shape than [particle, 2].
     """
-    predicted = []
+    if frames < 1:
+        raise UsageError("no frame to predict", where="roll_out", expected="frames from 1", got=frames)
+    predicted, expected = [], given.position[:, -1].shape
     for _ in range(frames):
         position = step(given)
+        if position.shape != expected:
+            raise UsageError(
+                "a model returned no positions of the next frame",
+                where="roll_out, step",
+                expected=f"shape {list(expected)}: [particle, 2]",
+                got=f"shape {list(position.shape)}",
+            )
         given = given.followed_by(position)
         predicted.append(position)
     return torch.stack(predicted, dim=1)
@@ -315,7 +327,8 @@ def predict(
         [frame, particle, 2].
 
     Raises:
-        UsageError: unknown split, size or subset, or fewer frames are given than the model is to see.
+        UsageError: unknown split, size or subset, fewer frames are given than the model is to see, or a
+            scenario has fewer than the task; raised, like all, when the first scenario is asked for.
         DataError: scenarios are missing; the message has the command that makes them.
     """
     data = WindowDataset(split, subset=subset, size=size, root=root, future=0, registry=registry)
@@ -328,7 +341,16 @@ def predict(
             got=history,
         )
     seen = slice(task.input_frames - (history or task.input_frames), None)
+    needed = task.input_frames + task.horizon
     for scenario, first in zip(data.scenarios, data.starts, strict=False):
+        if (held := data.size.frame_count(scenario)) < needed:
+            raise UsageError(
+                "a scenario is too short to be predicted",
+                where=f"predict, {data.size.split} {data.size.name}, scenario {scenario}",
+                expected=f"{needed} frames",
+                got=held,
+                fix="predict the subset test, whose scenarios are long enough",
+            )
         _, walls = data.store.constants(scenario)
         # The forcing is given for all frames, unlike the positions.
         forcing = None if walls is None else torch.from_numpy(walls.copy())

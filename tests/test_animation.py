@@ -84,6 +84,12 @@ def test_vorticity_of_a_rotating_disc_is_red_inside(swirl: Path) -> None:
     assert tuple(image[12, 115]) == tuple(style.rgb(style.PAPER))
 
 
+def test_speeds_are_symmetric_about_the_middle(swirl: Path) -> None:
+    """A turning disc is dark in the middle and bright at the rim."""
+    image = paint(swirl, Panel.SPEED, 2).astype(int)
+    assert image[64, 64].sum() < image[64, 64 + 48].sum()
+
+
 def test_mp4_has_every_frame_and_an_even_size(swirl: Path, tmp_path: Path) -> None:
     """Eight frames at 30 a second, even sides; no date, so that the same frames give the same bytes."""
     first, second = (animate(swirl, tmp_path / name) for name in ("a.mp4", "b.mp4"))

@@ -261,6 +261,40 @@ def test_links_are_not_followed(written: tuple[Path, str], link: object) -> None
         read_scenario(path)
 
 
+def test_no_member_is_beyond_the_count(written: tuple[Path, str]) -> None:
+    """Behind a thousand groups nothing hides: neither a link nor a variable."""
+    path, _ = written
+    with h5py.File(path, "r+") as file:
+        del file["frame"]
+        file["frame"] = h5py.ExternalLink("other.nc", "/frame")
+        for number in range(1000):
+            file.create_group(f"a{number:04d}")
+    with pytest.raises(DataError, match="damaged"):
+        read_scenario(path)
+
+
+def test_a_variable_is_no_mere_dimension_by_its_name(written: tuple[Path, str]) -> None:
+    """Values that are called a dimension's, but are no scale, are hashed: netCDF shows them."""
+    path, content = written
+    with h5py.File(path, "r+") as file:
+        file["spin"] = np.zeros((4, 8), np.float32)
+        file["spin"].attrs["NAME"] = "This is a netCDF dimension but not a netCDF variable.         4"
+    with pytest.raises(DataError):
+        check_scenario(path, content)
+
+
+def test_texts_that_are_no_texts_are_damage(written: tuple[Path, str]) -> None:
+    """Bytes that are no UTF-8 in a text of no set length change the hash, and raise nothing else."""
+    path, content = written
+    with h5py.File(path, "r+") as file:
+        kind = h5py.string_dtype("utf-8")
+        del file.attrs["seed"]
+        file.attrs.create("seed", b"\xff\xfe", dtype=kind)
+    assert rehash(path) != content
+    with pytest.raises(DataError):
+        check_scenario(path)
+
+
 def test_values_in_other_files_are_refused(written: tuple[Path, str]) -> None:
     """A virtual data set reads another file, which need not be there."""
     path, _ = written

@@ -92,6 +92,8 @@ def test_students_quantile_is_scipys() -> None:
     """For whole degrees of freedom, for whole ones but for rounding, and for others."""
     for freedom in (*range(3, 60), 500, 1000, 1001, 19.000000000000004, 2.5, 7.3):
         assert student_quantile(freedom, 0.975) == pytest.approx(stdtrit(freedom, 0.975), rel=1e-12)
+    for freedom in (np.inf, np.nan):
+        assert student_quantile(freedom, 0.975) == pytest.approx(stdtrit(freedom, 0.975), nan_ok=True)
 
 
 @pytest.mark.parametrize("count", [2, 3, 101, 10_000])

@@ -227,6 +227,23 @@ def test_link_loss_starts_low() -> None:
     assert 0.3 < SuperGAT(256, 128, 128)(*inputs)[1]["link"].item() < 3.0
 
 
+def test_link_loss_decreases() -> None:
+    """Trained on one graph, SuperGAT learns which particles are neighbours."""
+    torch.manual_seed(0)
+    inputs, layer = graph(40, 200, node=32, edge=16), SuperGAT(32, 16, 16)
+    inputs.node.mul_(8.0)  # sums of about 8 normalised messages
+    source = torch.Generator().manual_seed(0)
+    optimizer = torch.optim.Adam(layer.parameters(), lr=1e-2)
+    course = []
+    for _ in range(60):
+        loss = layer(*inputs, generator=source)[1]["link"]
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        course.append(loss.item())
+    assert np.mean(course[-5:]) < 0.75 * np.mean(course[:5])
+
+
 def test_draws_leave_global_sources_alone() -> None:
     """Training SuperGAT draws from the given generator only, the same for the same seed."""
     inputs, layer = small(), built(SuperGAT, scale=0.4)

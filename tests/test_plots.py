@@ -18,7 +18,7 @@ from swirls import OMEGA, TOP_TO_THE_RIGHT, write_swirl
 from lagbench import errors
 from lagbench.draw import style
 from lagbench.draw.panels import Panel, draw_walls, limit_of
-from lagbench.draw.plot import KINDS, contact_sheet, plot_frame
+from lagbench.draw.plot import KINDS, contact_sheet, describe, plot_frame
 from lagbench.draw.recording import open_recording
 from lagbench.draw.style import figure, pixels_of
 from lagbench.errors import DataError, UsageError
@@ -133,6 +133,22 @@ def test_the_scale_of_speeds_leaves_out_the_extreme_per_cent(swirl: Path) -> Non
         scene = recording.scene(1)
         expected = OMEGA / recording.size.frame_interval * 0.4 * np.sqrt(0.99)
         assert limit_of(Panel.SPEED, scene) == pytest.approx(expected, rel=1e-3)
+
+
+def test_dpi_scales_a_picture(swirl: Path, tmp_path: Path) -> None:
+    """Twice the pixels per inch are twice the pixels a side."""
+    one, two = (plot_frame(swirl, 0, tmp_path / f"{dpi}.png", dpi=dpi) for dpi in (64, 128))
+    with Image.open(one) as small, Image.open(two) as large:
+        assert large.size == pytest.approx((2 * small.width, 2 * small.height), abs=1)
+
+
+def test_captions_say_what_sets_a_scenario_apart(swirl: Path, tmp_path: Path) -> None:
+    """Reynolds number, family or frequency stand beside split, size and id."""
+    with open_recording(swirl) as recording:
+        assert describe(recording) == "cavity tiny  ·  scenario 0  ·  Re 100"
+    splash = write_swirl(tmp_path, "fluid", 3, walls=None, parameters={"family": "splash"})
+    with open_recording(splash) as recording:
+        assert describe(recording) == "fluid tiny  ·  scenario 3  ·  family splash"
 
 
 def test_a_frame_counts_from_the_end_or_is_refused(swirl: Path, tmp_path: Path) -> None:

@@ -453,6 +453,18 @@ def test_a_rollout_feeds_on_itself(train: Open) -> None:
     assert torch.equal(x0.grad, torch.full_like(x0, -3.0))
 
 
+@pytest.mark.parametrize("wrong", [lambda p: p[None], lambda p: p[:-1], lambda p: p[:, :1]])
+def test_what_a_model_returns_has_the_shape_of_positions(
+    train: Open, wrong: Callable[[torch.Tensor], torch.Tensor]
+) -> None:
+    """[window, particle, 2], a particle too few and one axis are refused, and so are no frames."""
+    given = collate([train(history=2, future=2)[0]]).part(slice(2))
+    with pytest.raises(UsageError):
+        roll_out(lambda seen: wrong(seen.position[:, -1]), given, 2)
+    with pytest.raises(UsageError):
+        roll_out(drifting, given, 0)
+
+
 @pytest.mark.parametrize("history", [None, 2])
 def test_predictions_are_rollouts_from_what_the_task_gives(
     root: Path, registry: Registry, history: int | None

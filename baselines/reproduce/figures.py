@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,9 +30,6 @@ from .drawing import (
 )
 from .runs import Plan
 from .thesis import LOSS_SNAPSHOTS, TABLE_4_8, colour, key_frame, label, number, predicted, scenario_of
-
-if TYPE_CHECKING:
-    pass
 
 TIMES = 6  # columns of a picture that shows a whole rollout
 

@@ -21,7 +21,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,9 +35,6 @@ from lagbench.scoring.tables import Table
 from .drawing import Figure, Sheet
 from .runs import Plan
 from .thesis import SECTION_4_8_3, number
-
-if TYPE_CHECKING:
-    pass
 
 TRAIN, VALID = 0.70, 0.15
 """Shares of the frames that are fitted and forecast."""

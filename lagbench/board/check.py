@@ -26,7 +26,7 @@ from lagbench.scoring.floors import measured_again
 from lagbench.submission.findings import Finding
 from lagbench.work.progress import Progress
 
-from .against import TOLERANCE, Confirmation, Rescoring, check_base
+from .audit import TOLERANCE, Confirmation, Rescoring, check_base
 from .entry import Entry, EntryBudget, Status, Summary
 from .entry_file import examine, load_plain, read_verified, record, verification_of
 from .findings import finding, finding_of, impossible, print_of, skeleton

@@ -86,7 +86,7 @@ def overview(board: Board) -> Markup:
         for method, held in rows.items()
     }
 
-    # What is not handed in counts as the best floor: who dares more data sets loses nothing by them.
+    # a gap counts as the best floor, so that nobody leads by the one data set that suits
     means = {method: sum(held) / len(board.tabs) for method, held in skills.items()}
 
     def order(method: str) -> tuple[bool, float, str]:
@@ -106,7 +106,7 @@ def overview(board: Board) -> Markup:
         lines.append(tag("tr", head, tag("td", mean, of), *cells))
     caption = (
         "Skill on every data set (0: the best floor, 1: perfect) where it is known, and rank; bold leads."
-        " Methods stand in the order of the first column, the mean of the row with 0 where there is no entry."
+        " Methods stand in the order of their mean skill, in which a gap counts 0."
     )
     first = [tag("th", "method", scope="col", class_="method"), tag("th", "mean skill", scope="col")]
     table = tag(

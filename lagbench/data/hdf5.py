@@ -256,7 +256,7 @@ def attribute_of(owner: h5py.HLObject, name: str) -> object:
 
 
 def layout_of(dataset: h5py.Dataset) -> str:
-    """Return how the values are stored: one of :data:`INSIDE`, "virtual" or "external files"."""
+    """Return how the values are stored: one of :data:`INSIDE`, "virtual", "external files" or "unknown"."""
     plist = dataset.id.get_create_plist()
     return "external files" if plist.get_external_count() else LAYOUTS.get(plist.get_layout(), "unknown")
 

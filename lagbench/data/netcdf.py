@@ -25,9 +25,12 @@ NO_VARIABLE = "This is a netCDF dimension but not a netCDF variable"
 
 
 def variables(file: h5py.File) -> dict[str, h5py.Dataset]:
-    """Return the variables beside each other in a file; refuse what lies in other files."""
+    """Return the variables beside each other in a file; refuse links and what lies in other files."""
+    members, count = members_of(file)
+    if count > len(members):
+        raise DataError(f"{count} members, of which {len(members)} are looked at")
     found = {}
-    for name, kind in members_of(file)[0].items():
+    for name, kind in members.items():
         if kind.endswith("link"):
             raise DataError(f"{name!r} is a {kind}")
         if kind != "variable":
@@ -36,7 +39,8 @@ def variables(file: h5py.File) -> dict[str, h5py.Dataset]:
         layout = layout_of(variable)
         if layout not in INSIDE:
             raise DataError(f"the values of {name!r} lie elsewhere: {layout}")
-        if not str(attribute(variable, "NAME")).startswith(NO_VARIABLE):
+        scale = attribute(variable, "CLASS") == "DIMENSION_SCALE"
+        if not (scale and str(attribute(variable, "NAME")).startswith(NO_VARIABLE)):
             found[name] = variable
     return found
 
@@ -68,4 +72,6 @@ def attribute(owner: h5py.HLObject, name: str) -> object:
         return "" if value.dtype.kind in "SO" else np.empty(0, value.dtype)
     if isinstance(value, np.ndarray) and value.size == 1:
         value = value.reshape(-1)[0]
+    if isinstance(value, str):  # damaged bytes of texts of no set length come as lone surrogates
+        value = value.encode("utf-8", "surrogateescape")
     return value.decode("utf-8", "replace").replace("\0", "") if isinstance(value, bytes) else value

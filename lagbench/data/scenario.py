@@ -124,7 +124,7 @@ class ScenarioFile:
         with _damage(path):
             self._variables = variables(file)
             _check_lengths(path, self._variables)
-            self.header = _header(file)
+            self.header = _header(file, self._variables)
 
     def __enter__(self) -> Self:
         """Return the file itself."""
@@ -246,11 +246,13 @@ def _mismatch(what: str, where: str, expected: object, got: str) -> DataError:
 
 def _check_lengths(path: Path, variables: Mapping[str, h5py.Dataset]) -> None:
     """Refuse lengths that no file of this size can hold, before memory is asked for them."""
-    from .netcdf import is_text
+    import h5py
 
     largest = DEFLATE_RATIO * path.stat().st_size
     for name, variable in variables.items():
-        held = variable.size * (1 if is_text(variable) else variable.dtype.itemsize)
+        text = h5py.check_string_dtype(variable.dtype)
+        free = text is not None and text.length is None  # how long its values are, they say themselves
+        held = variable.size * (1 if free else variable.dtype.itemsize)
         if held > largest:
             raise DataError(
                 "a variable is larger than its file can hold",
@@ -261,7 +263,7 @@ def _check_lengths(path: Path, variables: Mapping[str, h5py.Dataset]) -> None:
             )
 
 
-def _header(file: h5py.File) -> ScenarioHeader:
+def _header(file: h5py.File, variables: Mapping[str, h5py.Dataset]) -> ScenarioHeader:
     from .netcdf import attribute
 
     def said(name: str) -> Any:  # noqa: ANN401 - a text or a number
@@ -281,8 +283,8 @@ def _header(file: h5py.File) -> ScenarioHeader:
         seed=str(said("seed")),
         parameters={name: plain(said(name)) for name in str(said("hashed_parameters")).split()},
         content_sha256=str(said("content_sha256")),
-        frames=file["frame"].shape[0],
-        particles=file["particle"].shape[0],
+        frames=variables["frame"].shape[0],
+        particles=variables["particle"].shape[0],
         device=str(said("device")),
         generator=str(said("generator")),
         lagbench_version=str(said("lagbench_version")),

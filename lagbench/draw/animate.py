@@ -42,10 +42,7 @@ from .style import (
 if TYPE_CHECKING:
     from lagbench.data.registry import Registry
 
-__all__ = [
-    *("KINDS", "SUFFIXES", "Packed", "Painter", "Write", "animate", "check_ending", "halve", "open_video"),
-    *("pack", "unpack"),
-]
+__all__ = ["KINDS", "SUFFIXES", "animate", "check_ending"]
 
 Packed = NDArray[np.uint32]
 

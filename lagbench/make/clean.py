@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -55,14 +55,17 @@ def clean(
     if not folder.is_dir():
         return CleanResult(removed=(), bytes=0, dry_run=dry_run)
     with nullcontext() if dry_run else dataset_lock(home, tier.split, tier.name, tier.major, timeout=0):
-        found = set(folder.rglob(f".*{SUFFIX}"))
+        found = {path for path in folder.rglob(f".*{SUFFIX}") if path.is_file()}
         if not leftovers:
             ours = {folder / subset / f"{i:04d}.nc" for subset, ids in tier.subsets.items() for i in ids}
             ours |= {folder / name for name in CARDS}
             if not tier.simulated:  # the description of a local split says nothing without its data
                 ours.add(folder.parents[1] / DESCRIPTION)
             found |= {path for path in ours if path.is_file()}
-        length = sum(path.stat().st_size for path in found)
+        length = 0
+        for path in found:
+            with suppress(FileNotFoundError):  # a dry run may stand beside a writer
+                length += path.stat().st_size
         for path in () if dry_run else found:
             try:
                 path.unlink(missing_ok=True)

@@ -178,7 +178,7 @@ def quantile(ordered: Floats, share: float) -> float:
 
 @functools.cache
 def student_quantile(freedom: float, share: float) -> float:
-    """Return the quantile of Student's distribution, to rounding what SciPy returns.
+    """Return the quantile of Student's distribution, for shares up to 0.999 what SciPy returns to rounding.
 
     For whole degrees of freedom, which those of a single seed are, by Newton's method on the
     finite sums 26.7.3 and 26.7.4 of Abramowitz and Stegun: SciPy takes a quarter of a second to import.
@@ -187,8 +187,8 @@ def student_quantile(freedom: float, share: float) -> float:
         freedom: degrees of freedom, above 0.
         share: of the distribution that lies below, from 0.5 to 1.
     """
-    whole = round(freedom)
-    if abs(freedom - whole) > 1e-9 or not 3 <= whole <= MOST_FREEDOM:
+    whole = round(freedom) if 3 <= freedom <= MOST_FREEDOM else 0  # nan and inf are not rounded
+    if not whole or abs(freedom - whole) > 1e-9:
         from scipy.special import stdtrit
 
         return float(stdtrit(freedom, share))

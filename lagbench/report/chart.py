@@ -213,7 +213,7 @@ class Plot:
         self._linked = True
         columns, rows = self._columns([s.x for s in spots]), self._rows([s.y for s in spots])
         places = list(zip(columns.tolist(), rows.tolist(), strict=True))
-        names = self._names.beside([clipped(spot.name, 22) for spot in spots], places)
+        names, leads = self._names.beside([clipped(spot.name, 22) for spot in spots], places)
         for spot, (x, y), name in zip(spots, places, names, strict=True):
             drawn = [
                 tag("title", spot.said),
@@ -227,7 +227,7 @@ class Plot:
             else:
                 mark = tag("a", *drawn, class_=kind, href=spot.href, aria_label=spot.said)
             self._marks.append(mark)
-        self._marks += self._names.leads
+        self._marks += leads  # above the dots
 
     def svg(self, title: str, description: str) -> Markup:
         """Return the chart."""

@@ -215,10 +215,8 @@ SHOWN = (
 
 def bar_figures(subject: Subject) -> Iterator[Figure]:
     """Yield one figure per metric that is defined in this split."""
-    frame, unknown = (
-        subject.key_frame,
-        [np.nan] * len(subject.scenarios),
-    )  # of shipped floors the mean is kept
+    frame = subject.key_frame
+    unknown = [np.nan] * len(subject.scenarios)  # of shipped floors the mean is kept
     for name, title, thesis in SHOWN:
         rows = [row for row in subject.rows if name in row.scores]
         if not rows:

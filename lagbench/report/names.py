@@ -49,7 +49,7 @@ class Names:
     def __init__(self, across: float, down: float) -> None:
         self._size = (across, down)
         self._taken: list[Box] = []
-        self.leads: list[Markup] = []  # lines from dots to names, to be drawn above the dots
+        self._leads: list[Markup] = []
 
     def take(self, name: str, place: Place) -> None:
         """Note what is written there anyway."""
@@ -59,8 +59,12 @@ class Names:
         """Keep names off a line."""
         self._taken += _along(one, other)
 
-    def beside(self, names: Sequence[str], places: Sequence[Point]) -> list[Markup]:
-        """Return the names of dots, first come first; empty where there is no room."""
+    def beside(self, names: Sequence[str], places: Sequence[Point]) -> tuple[list[Markup], list[Markup]]:
+        """Return the names of dots, empty where there is no room, and lines to those that stand aside.
+
+        First come first, but of those that do not touch their dot the longest.
+        """
+        self._leads = []
         dots = [(x - DOT, y - DOT, x + DOT, y + DOT) for x, y in places]
         found: dict[int, Markup] = {}
         order = list(range(len(names)))
@@ -70,8 +74,8 @@ class Names:
                 if (drawn := choose(names[number], places[number], others)) is not None:
                     found[number] = drawn
             # Of those without a place the longest are the hardest to find one for.
-            order = sorted(set(order) - found.keys(), key=lambda number: -len(names[number]))
-        return [found.get(number, Markup("")) for number in range(len(names))]
+            order = sorted((n for n in order if n not in found), key=lambda number: -len(names[number]))
+        return [found.get(number, Markup("")) for number in range(len(names))], self._leads
 
     def _touching(self, name: str, dot: Point, others: Sequence[Box]) -> Markup | None:
         """Return a name in the first free place that touches its dot."""
@@ -99,7 +103,7 @@ class Names:
             return None
         place, end, lead = best
         self._taken += lead
-        self.leads.append(tag("path", d=path_data([dot, end]), class_="mark"))
+        self._leads.append(tag("path", d=path_data([dot, end]), class_="mark"))
         return self._write(name, place)
 
     def _free(self, name: str, dot: Point, others: Sequence[Box], tries: Sequence[Place]) -> Iterator[Place]:

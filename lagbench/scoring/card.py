@@ -190,6 +190,7 @@ def write_json(card: ScoreCard, path: Path) -> None:
     write_atomically(path, f"{text}\n".encode(), option="--output")
 
 
+LARGEST = float(np.finfo(np.float32).max)  # a value of a score file at most
 MAX_BYTES = 64 << 20
 """Longest scores.json that is read [bytes]; those of ours take less than 2 MB."""
 
@@ -282,6 +283,6 @@ def _floats(values: Iterable[float | None]) -> list[float]:
     found = [math.nan if value is None else float(value) for value in held]
     if any(isinstance(value, bool) for value in held):
         raise ValueError("a value that is no number")
-    if any(math.isinf(value) for value in found):
-        raise ValueError("an infinite value")
+    if any(abs(value) > LARGEST for value in found):
+        raise ValueError(f"a value beyond {LARGEST:.3g}, which scores do not exceed")
     return found

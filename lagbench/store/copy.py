@@ -90,12 +90,12 @@ def scenario_files(size: Size, root: Path, subsets: Sequence[str]) -> dict[int, 
     bring(size, root, paths)
     missing = [i for i, path in paths.items() if not path.is_file()]
     if missing:
-        option = (f"--subset {subsets[0]}",) if len(subsets) == 1 else ()
+        lacking = ",".join(subset for subset in subsets if not set(missing).isdisjoint(size.subsets[subset]))
         raise DataError(
             f"{len(missing)} of {len(paths)} scenarios are not there",
             where=str(size.folder(root)),
-            got=f"missing: {spell_ids(missing)}",
-            fix=remedy_of(size, *option, root=root),
+            got=f"missing: {spell_ids(missing)} of {lacking}",
+            fix=remedy_of(size, f"--subset {lacking}", root=root),
         )
     return paths
 

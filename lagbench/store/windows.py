@@ -122,15 +122,18 @@ class FrameStore:
         """Open a file; refuse one of another scenario, version or content."""
         import h5py
 
+        from lagbench.data.netcdf import variables
+
         size, path = self._size, self._paths[scenario]
         if not path.is_file():
             raise DataError("a scenario file is missing", where=str(path), fix=self._remedy(scenario))
         # Frames are cached here: HDF5 need not keep chunks too.
         file = h5py.File(path, "r", rdcc_nbytes=0)
-        held, position = file.attrs, file["position"]
+        values, held = variables(file), file.attrs
+        position = values["position"]
         # netCDF4 stores ASCII text as bytes.
         split, tier, version, content = (
-            value.decode() if isinstance(value := held[name], bytes) else str(value)
+            text.decode() if isinstance(text := held[name], bytes) else str(text)
             for name in ("split", "size", "version", "content_sha256")
         )
         found = (split, tier, major_of(version), int(np.asarray(held["scenario"]).item()), len(position))
@@ -145,7 +148,7 @@ class FrameStore:
                 got=f"{found}, content hash {content[:16]}",
                 fix=self._remedy(scenario),
             )
-        material, walls = file.get("material"), file.get("wall_velocity")
+        material, walls = values.get("material"), values.get("wall_velocity")
         return _Open(
             file,
             position,

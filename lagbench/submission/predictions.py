@@ -133,7 +133,7 @@ def open_predictions(path: str | Path, *, checked: Anatomy | None = None) -> Pre
 
     Args:
         path: the file.
-        checked: the anatomy of this very file when it was opened before; it is not checked again.
+        checked: the anatomy of this very file when it was opened before: one as long is not checked again.
 
     Raises:
         UnreadableFileError: missing, not netCDF4, or damaged.
@@ -142,7 +142,9 @@ def open_predictions(path: str | Path, *, checked: Anatomy | None = None) -> Pre
     path = Path(path)
     with ExitStack() as stack:
         file = stack.enter_context(opened(path, fix=WRITE))
-        return attach(file, path, checked or _checked(file, path), stack)
+        if checked is None or checked.length != path.stat().st_size:
+            checked = _checked(file, path)
+        return attach(file, path, checked, stack)
 
 
 def _checked(file: h5py.File, path: Path) -> Anatomy:

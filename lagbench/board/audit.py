@@ -1,4 +1,4 @@
-"""Check a leaderboard against what lies outside it: predictions scored again, and the base of a change.
+"""Audit a leaderboard: predictions scored again, and what a change does to the entries of others.
 
 Scoring again is the proof of a score. A pull request adds; whoever alters what others submitted has to be
 seen, so the folder is compared with the commit at which the change left the base.
