@@ -20,10 +20,7 @@ from lagbench.generators import draws
 from lagbench.generators.split import ClosedBoxParameters
 
 GENERATORS = Path(draws.__file__).parent
-DRAWN = (
-    "draws", "lattice", "noise", "shapes", "constants", "cavity", "curl_noise", "fluid",
-    "multimaterial",
-)  # fmt: skip
+DRAWN = ("draws", "noise", "shapes", "constants", "cavity", "curl_noise", "fluid", "multimaterial")
 
 
 @pytest.mark.parametrize(("split", "size"), EVERY)

@@ -83,7 +83,8 @@ def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[obje
     from rich.text import Text
 
     cells = [[str(cell) for cell in row] for row in rows]
-    table = Table(title=Text(title) if title else None, box=SIMPLE_HEAD, title_justify="left", pad_edge=False)
+    heading = Text(title) if title else None
+    table = Table(title=heading, box=SIMPLE_HEAD, title_justify="left", pad_edge=False, show_edge=False)
     for number, column in enumerate(columns, start=1):
         numeric = all(row[number - 1][:1] in "0123456789-" for row in cells)
         table.add_column(Text(column), justify="right" if numeric else "left", no_wrap=number < len(columns))
@@ -95,7 +96,7 @@ def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[obje
     # On a narrow terminal long lines run on to the next: a number cut short would be worse.
     widths = [max(map(len, column)) for column in zip(columns, *cells, strict=True)]
     least = sum(widths[:-1]) + min(widths[-1], LAST_COLUMN) + COLUMN_GAP * len(widths)
-    Console(width=max(width, least)).print(table)
+    Console(width=max(width, least)).print(table, "")
 
 
 def spell_bytes(count: float) -> str:

@@ -75,7 +75,7 @@ def _score_rows(subject: Subject, names: Sequence[str]) -> Markup:
 
 
 def _heading(row: Row) -> Markup:
-    return tag("span", row.name) if row.entry else tag("span", row.name, class_="muted n")
+    return tag("span", row.name) if row.entry else tag("span", row.name, class_="muted whole")
 
 
 def _best(metric: Metric, means: Sequence[float]) -> frozenset[int]:
