@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from lagbench.data.registry import Size, load
-from lagbench.data.writer import ScenarioKey, read_scenario, scenario_path
+from lagbench.data.writer import read_scenario
 
 NAMES = ("wall", "motion", "reynolds_number", "start_frame")
 
@@ -29,7 +29,7 @@ def main() -> int:
     given = parser.parse_args()
     size = load().size("cavity", given.size)
     ids = size.subsets[given.subset]
-    rows = [_row(size, given.root, given.subset, scenario) for scenario in ids]
+    rows = [_row(size, given.root, scenario) for scenario in ids]
     print(
         "| id | walls | motion | Re | start frame | RMS speed [length/s] | reversals | mean kinetic energy |"
     )
@@ -44,11 +44,8 @@ def main() -> int:
     return 1 if alike else 0
 
 
-def _row(size: Size, root: Path, subset: str, scenario: int) -> tuple:
-    key = ScenarioKey(
-        split=size.split, size=size.name, version=size.version, scenario=scenario, subset=subset
-    )
-    with read_scenario(scenario_path(root, key)) as file:
+def _row(size: Size, root: Path, scenario: int) -> tuple:
+    with read_scenario(size.path(root, scenario)) as file:
         drawn = tuple(file.header.parameters[name] for name in NAMES)
         energy = [
             0.5 * float((file.read("velocity", f).astype(np.float64) ** 2).sum(-1).mean())

@@ -18,7 +18,7 @@ from scipy.integrate import cumulative_trapezoid
 
 from lagbench.data.grid import Grid, fields
 from lagbench.data.registry import Size, load
-from lagbench.data.writer import ScenarioKey, read_scenario, scenario_path
+from lagbench.data.writer import read_scenario
 
 
 def main() -> int:
@@ -32,7 +32,7 @@ def main() -> int:
         size = load().size("curl-noise", name)
         found = defaultdict(list)
         for scenario in size.subsets[given.subset]:
-            frequency, *fit = _fit(size, given.root, given.subset, scenario)
+            frequency, *fit = _fit(size, given.root, scenario)
             found[frequency].append(fit)
         for frequency, fits in sorted(found.items()):
             viscosity, left = np.mean(fits, axis=0)
@@ -44,16 +44,13 @@ def main() -> int:
     return 0
 
 
-def _fit(size: Size, root: Path, subset: str, scenario: int) -> tuple[int, float, float]:
+def _fit(size: Size, root: Path, scenario: int) -> tuple[int, float, float]:
     """Return frequency, viscosity [length^2/s] and the share of energy left."""
-    key = ScenarioKey(
-        split=size.split, size=size.name, version=size.version, scenario=scenario, subset=subset
-    )
     grid = Grid(size.task.score_grid.cells, size.task.score_grid.placement)
     (low, high), _ = size.bounds
     full = grid.full_weight(size.particles, (high - low) ** 2)
     energy, enstrophy = [], []
-    with read_scenario(scenario_path(root, key)) as file:
+    with read_scenario(size.path(root, scenario)) as file:
         for frame in range(size.task.input_frames + size.task.horizon):
             position = file.read("position", frame).astype(np.float64)
             velocity = file.read("velocity", frame).astype(np.float64)

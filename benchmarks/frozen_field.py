@@ -23,7 +23,7 @@ from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
 from lagbench.data.grid import Grid, fields
 from lagbench.data.registry import Size, load
-from lagbench.data.writer import ScenarioFile, ScenarioKey, read_scenario, scenario_path
+from lagbench.data.writer import ScenarioFile, read_scenario
 from lagbench.metrics.vorticity import pearson
 
 Array = NDArray[np.float64]
@@ -51,11 +51,7 @@ def main() -> int:
 
 
 def _open(size: Size, root: Path, scenario: int) -> ScenarioFile:
-    subset = size.subset_of(scenario)
-    key = ScenarioKey(
-        split=size.split, size=size.name, version=size.version, scenario=scenario, subset=subset
-    )
-    return read_scenario(scenario_path(root, key))
+    return read_scenario(size.path(root, scenario))
 
 
 def _frozen(size: Size, root: Path, each: bool) -> bool:

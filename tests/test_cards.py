@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from swirls import write_swirl
 
 from lagbench.data import registry
-from lagbench.data.layout import ScenarioKey, dataset_folder
+from lagbench.data.layout import dataset_folder
 from lagbench.data.manifest import Manifest, describe_file, merge
 from lagbench.data.registry import Size
 from lagbench.draw.markdown import escape, table
@@ -41,10 +41,8 @@ def make(
     size = registry.load().size(split, "tiny")
     entries = []
     for scenario in scenarios:
-        subset = size.subset_of(scenario)
         write_swirl(root, split, scenario, frames=4)
-        key = ScenarioKey(split=split, size="tiny", version=size.version, scenario=scenario, subset=subset)
-        entries.append(describe_file(root, key, {"kinetic_energy_first": 0.125 + scenario}))
+        entries.append(describe_file(root, size.key(scenario), {"kinetic_energy_first": 0.125 + scenario}))
     manifest = merge(
         None,
         entries,

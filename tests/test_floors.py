@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 from score_bench import ScoreBench, straight
 
-from lagbench.data.layout import ScenarioKey, major_of, scenario_path
+from lagbench.data.layout import major_of
 from lagbench.data.registry import Size, load
 from lagbench.data.scenario import read_scenario
 from lagbench.errors import DataError
@@ -167,10 +167,8 @@ def test_the_field_is_linear_and_has_no_holes() -> None:
 
 def opened(root: Path, size: Size, scenario: int) -> tuple[Given, NDArray[np.float32]]:
     """Return what a scenario of a generated data set gives, and its future."""
-    told = {"split": size.split, "size": size.name, "version": size.version}
-    key = ScenarioKey(**told, scenario=scenario, subset=size.subset_of(scenario))
     n = size.task.input_frames
-    with read_scenario(scenario_path(root, key)) as file:
+    with read_scenario(size.path(root, scenario)) as file:
         future = file.read("position", slice(n, n + size.task.horizon))
         return given_in(file, size, root), future
 

@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lagbench.data.layout import ScenarioKey, resolve_root, scenario_path
+from lagbench.data.layout import resolve_root
 from lagbench.data.registry import Registry, load
 from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError, check_installed
 from lagbench.make.generate import GenerationResult, generate
@@ -86,10 +86,8 @@ def demo(
     verification.check()
     pictures = folder / "pictures"
     pictures.mkdir(exist_ok=True)
-    first: dict[str, Any] = {"scenario": size.subsets["test"][0], "subset": "test"}
-    key = ScenarioKey(split=size.split, size=size.name, version=size.version, **first)
-    frame = size.task.frames_of_interest[-1]
-    picture = plot_frame(scenario_path(folder, key), frame, pictures / f"{split}.png")
+    first, frame = size.subsets["test"][0], size.task.frames_of_interest[-1]
+    picture = plot_frame(size.path(folder, first), frame, pictures / f"{split}.png")
     return DemoResult(generation=generation, verification=verification, picture=picture)
 
 

@@ -30,7 +30,6 @@ def _source(
     name: str | None, split: str | None, size: str | None, scenario: int | None, root: Path | None
 ) -> Path:
     """Return the scenario file that a user means by its path or by split, size and id."""
-    from lagbench.data.layout import ScenarioKey, scenario_path
     from lagbench.data.local import locate, remedy
     from lagbench.store.copy import bring
 
@@ -40,8 +39,7 @@ def _source(
     wanted = tier.subsets["test"][0] if scenario is None else scenario
     subset = tier.subset_of(wanted)
     bring(tier, folder, [wanted])
-    key = ScenarioKey(split=tier.split, size=tier.name, version=tier.version, scenario=wanted, subset=subset)
-    path = scenario_path(folder, key)
+    path = tier.path(folder, wanted)
     if not path.is_file():
         option = f"--subset {subset}" if scenario is None else f"--scenarios {wanted}"
         raise DataError(

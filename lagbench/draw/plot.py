@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lagbench.data.layout import ScenarioKey, scenario_path
 from lagbench.data.local import locate, remedy
 from lagbench.data.registry import Registry, Size
 from lagbench.errors import DataError, UsageError, nearest
@@ -117,12 +116,8 @@ def contact_sheet(
 
 def scenario_files(size: Size, root: Path) -> list[Path]:
     """Return the scenario files that are there: train, valid, test, extra, each by id."""
-    keys = (
-        ScenarioKey(split=size.split, size=size.name, version=size.version, scenario=i, subset=subset)
-        for subset, ids in size.subsets.items()
-        for i in sorted(ids)
-    )
-    return [path for path in (scenario_path(root, key) for key in keys) if path.is_file()]
+    paths = (size.path(root, i) for ids in size.subsets.values() for i in sorted(ids))
+    return [path for path in paths if path.is_file()]
 
 
 def _first_of_each_kind(files: Sequence[Path], splits: Registry) -> dict[str, Path]:

@@ -22,7 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.grid import Grid, Placement, node_velocity, transfer
-from lagbench.data.layout import ScenarioKey, scenario_path
 from lagbench.data.scenario import ScenarioFile, read_scenario
 from lagbench.errors import DataError
 from lagbench.store.copy import bring
@@ -143,9 +142,7 @@ def _frame(file: ScenarioFile, frame: int) -> Floats:
 
 
 def _open(given: Given, scenario: int) -> ScenarioFile:
-    size = given.size
-    names = {"split": size.split, "size": size.name, "version": size.version, "subset": "train"}
-    return read_scenario(scenario_path(given.root, ScenarioKey(scenario=scenario, **names)))
+    return read_scenario(given.size.path(given.root, scenario))
 
 
 FLOOR = Floor(

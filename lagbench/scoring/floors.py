@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.atomic import atomic_path
-from lagbench.data.layout import ScenarioKey, scenario_path
 from lagbench.data.registry import Registry, Size, load
 from lagbench.floors.floor import Floor, given_in
 from lagbench.floors.shipped import FloorScores, correlation_of, shipped
@@ -50,11 +49,8 @@ def _possible(size: Size, root: Path) -> list[Floor]:
 
 def _has(size: Size, root: Path, subset: str) -> bool:
     """Tell whether all files of a subset, which is not empty, are there."""
-    keys = [
-        ScenarioKey(split=size.split, size=size.name, version=size.version, scenario=i, subset=subset)
-        for i in size.subsets.get(subset, ())
-    ]
-    return bool(keys) and all(scenario_path(root, key).is_file() for key in keys)
+    ids = size.subsets.get(subset, ())
+    return bool(ids) and all(size.path(root, i).is_file() for i in ids)
 
 
 def measured_sizes(

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.data.layout import ScenarioKey, dataset_folder, scenario_path
+from lagbench.data.layout import dataset_folder
 from lagbench.data.local import remedy
 from lagbench.data.manifest import note, noted_content, read_manifest
 from lagbench.data.registry import Size, spell_ids
@@ -93,11 +93,11 @@ class Truth:
 
     def path(self, scenario: int) -> Path:
         """Return where a scenario lies."""
-        return scenario_path(self.root, self._key(scenario))
+        return self.size.path(self.root, scenario)
 
     def open(self, scenario: int) -> ScenarioFile:
         """Open a scenario; check that it is the one that the registry means."""
-        path, key = self.path(scenario), self._key(scenario)
+        path, key = self.path(scenario), self.size.key(scenario)
         file = read_scenario(path)
         header = file.header
         found = (header.key.split, header.key.size, header.key.major, header.key.scenario)
@@ -153,12 +153,6 @@ class Truth:
                 if largest >= enough:
                     break
         return largest
-
-    def _key(self, scenario: int) -> ScenarioKey:
-        size = self.size
-        return ScenarioKey(
-            split=size.split, size=size.name, version=size.version, scenario=scenario, subset=self.subset
-        )
 
     def _hash(self, scenario: int) -> str:
         measured = self.size.measured
