@@ -230,7 +230,7 @@ def info(
         text = textwrap.fill(entry.description, 79, break_on_hyphens=False)
         yield f"{entry.title} ({split_name} {entry.version}, {entry.licence})\n{text}\n"
         print_table("Sizes", ("split", "size", *_COLUMNS), [_row(one) for one in found])
-        yield from _origin(found)
+        yield from (*_origin(found), "")
         tiers = [registry.size(split_name, one) for one in entry.sizes]
         parameters = [
             (name, *(tier.value(name) for tier in tiers), f"[{parameter.unit}] {parameter.description}")
