@@ -92,7 +92,7 @@ def test_panel_draws_everything(page: Page, board: Board) -> None:
         page,
         "document.querySelector('#panel [data-figure=errors] select').dispatchEvent(new Event('change'))",
     )
-    assert "stable above 0.8" in page.value(
+    assert "stable above 0.95" in page.value(
         "document.querySelector('#panel [data-figure=errors]').textContent"
     )
 

@@ -52,7 +52,8 @@ of the thesis (D. Dharma, PhD thesis, University of Leeds, 2025). Written by
 
 How to read it. `skill` is 1 - score / score of the best floor: 1 perfect, 0 nothing learned, below 0 worse
 than what costs no learning. Cells are means over test scenarios with 95 % bootstrap intervals, and ± the
-deviation over seeds where there are several. Differences are tested by the exact sign-flip test over
+deviation over seeds where there are several; intervals here are those over scenarios, those of the board
+resample seeds too and are wider where there are few. Differences are tested by the exact sign-flip test over
 scenarios, two-sided, corrected for the number of rivals (Holm); with fewer than six scenarios nothing is
 claimed. The thesis trained on its own data, at what is here size `full`, for hours on GPUs, and prints one
 scenario per table: its absolute numbers are beside ours for orientation, and only orders can be compared

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from lagbench.metrics.aggregate import Score, bootstrap_interval
 from lagbench.metrics.metric import Direction, mean
+from lagbench.metrics.vorticity import STABLE_PEARSON
 
 from .chart import Bar, Plot, Scale, bar_chart, linear, spanning
 from .html import Markup, clipped, html, join, quantity, sentence, tag, text, words
@@ -18,7 +19,6 @@ from .subject import Gallery, Moment, Row, Subject, kind_of
 Floats = NDArray[np.float64]
 
 Series = Sequence[tuple[str, str, Floats]]  # label, classes and values over frames of each line
-STABLE = 0.8  # correlation below which a rollout no longer counts as stable
 TOLERATED = 3.0  # the axis of energies reaches so many times the truth's greatest; what is beyond is cut off
 
 
@@ -79,7 +79,7 @@ def method_curves(subject: Subject) -> Iterator[Figure]:
         if twinned:
             plot.line(subject.frames, twin, "twin", "the solver after a nudge of 2^-20")
         if name == "vorticity_pearson":
-            plot.level(STABLE, f"stable above {STABLE}")
+            plot.level(STABLE_PEARSON, f"stable above {STABLE_PEARSON}")
         yield _figure(
             subject,
             f"methods-{name.replace('_', '-')}",

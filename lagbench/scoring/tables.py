@@ -192,7 +192,10 @@ def comparison_tables(result: ComparisonResult, *, every: bool = False) -> Itera
         )
         for found in shown.values()
     )
-    yield Table(title, ("metric", "loss difference [95 %]", "p"), differences)
+    # a loss is what is less for the better one, also where more of the metric is better
+    yield Table(
+        f"{title}; below 0 the first is better", ("metric", "loss difference [95 %]", "p"), differences
+    )
     means = tuple(
         (_named(found.metric), _number(found.first), _number(found.second)) for found in shown.values()
     )

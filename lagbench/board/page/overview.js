@@ -23,7 +23,7 @@ function lineChart(tab, by, lines, banded = []) {
   curves.filter(({ row }) => banded.includes(row)).forEach(({ frames, low, high, kind }) => plot.band(frames, low, high, kind));
   [...curves].reverse().forEach(({ frames, mean, kind, row }) => plot.line(frames, mean, kind, short(row.name)));
   plot.series.reverse();
-  if (by === "vorticity_pearson") plot.level(0.8, "stable above 0.8");
+  if (by === "vorticity_pearson") plot.level(0.95, "stable above 0.95");
   return plot.draw(`${columnOf(tab, by).label} over frames`, `One line each for ${lines.map(([, row]) => short(row.name)).join(", ")}.`);
 }
 
