@@ -90,11 +90,13 @@ def _mark() -> str:
 
 
 def _refused(target: Path, option: str, error: OSError) -> WorkFailedError:
+    in_the_way = isinstance(error, (FileExistsError, NotADirectoryError))
+    remedy = "a file is where a folder has to be: remove it" if in_the_way else "free disk space"
     return WorkFailedError(
         "cannot write there",
         where=str(target),
         got=error.strerror or error,
-        fix=f"free disk space, or name a folder that you may write to: {option}",
+        fix=f"{remedy}, or name a folder that you may write to: {option}",
     )
 
 

@@ -50,8 +50,9 @@ def test_a_folder_is_tried_before_the_work(tmp_path: Path) -> None:
     check_writable(tmp_path / "deep" / "folder")
     assert list((tmp_path / "deep" / "folder").iterdir()) == []
     (tmp_path / "file").touch()
-    for folder in (tmp_path / "file", tmp_path / "file" / "below", Path("/proc/self")):
-        with pytest.raises(WorkFailedError, match=r"(?s)cannot write.*--output"):
+    file = tmp_path / "file"
+    for folder, remedy in ((file, "remove it"), (file / "below", "remove it"), (Path("/proc/self"), "free")):
+        with pytest.raises(WorkFailedError, match=rf"(?s)cannot write.*{remedy}.*--output"):
             check_writable(folder, option="--output")
 
 
