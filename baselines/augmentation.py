@@ -80,7 +80,9 @@ def image(batch: Batch, matrix: Tensor, bounds: Bounds) -> Batch:
         )
     matrix = matrix.to(batch.position)
     centre = batch.position.new_tensor([(low + high) / 2 for low, high in bounds])
-    position = _turned(matrix[batch.sample][:, None], batch.position - centre) + centre
+    turn = matrix[batch.sample]
+    position = _turned(turn[:, None], batch.position - centre) + centre
+    first = None if batch.origin is None else _turned(turn, batch.origin - centre) + centre
     walls = batch.wall_velocity
     if walls is not None:  # wall k becomes the one that the image of its normal points at
         normals = _NORMALS.to(matrix)
@@ -88,7 +90,7 @@ def image(batch: Batch, matrix: Tensor, bounds: Bounds) -> Batch:
         origin = (images[:, None] * normals[:, None]).sum(dim=-1).argmax(dim=2)
         walls = _turned(matrix[:, None, None], walls)
         walls = walls.gather(2, origin[:, None, :, None].expand_as(walls))
-    return replace(batch, position=position, wall_velocity=walls)
+    return replace(batch, position=position, wall_velocity=walls, origin=first)
 
 
 def _turned(matrix: Tensor, vector: Tensor) -> Tensor:
