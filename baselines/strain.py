@@ -22,7 +22,7 @@ from .particle_grid import ParticleGrid, Stencil
 UNIT = 0.2
 """Strain that looks like 1 [1]; far beyond it all strains look alike."""
 
-SLACK = 0.01
+SLACK = 1e-3
 """Share of a cell's square that is added to the spread of the nodes: it bounds F where they lie on a line."""
 
 
