@@ -8,6 +8,11 @@ With noise a model learns to undo its own rollout errors (Sanchez-Gonzalez et al
 velocities of the given frames are moved by a random walk, the positions by its sum. The frames to
 predict move with the last given position, so that the target is the true next velocity, and the
 acceleration that leads to it undoes the noise.
+
+What rollouts come to is farther off than any noise. Where a training rolls its windows out for a
+random number of steps without gradients first (the pushforward trick of Brandstetter, Worrall and
+Welling 2022, arXiv 2202.03376), the model learns from there, and what it is to do there is to come
+back: :func:`way_back` is added to the true velocity.
 """
 
 from __future__ import annotations
@@ -116,6 +121,24 @@ def noisy(position: Tensor, history: int, std: float, generator: torch.Generator
     walk = random_walk(len(position), history, std, generator).to(position)
     after = walk[:, -1:].expand(-1, position.shape[1] - history, -1)
     return position + torch.cat([walk, after], dim=1)
+
+
+LOST = 3.0
+"""Greatest velocity back to the true path, in deviations of accelerations: what is lost is not run after."""
+
+
+def way_back(gap: Tensor, frames: float | None, *, change: float) -> Tensor:
+    """Return the velocity that leads back to the true path [length/frame], shape [particle, 2].
+
+    Args:
+        gap: true less reached positions [length], shape [particle, 2].
+        frames: frames in which to be back, if nothing else moved; None for no way back.
+        change: deviation of accelerations [length/frame^2].
+    """
+    if frames is None:
+        return torch.zeros_like(gap)
+    back, most = gap / frames, LOST * change
+    return back * (most / back.norm(dim=1, keepdim=True).clamp(min=most))
 
 
 def disturbed(

@@ -22,7 +22,7 @@ from torch.nn.functional import gelu
 
 from lagbench.errors import DataError, UsageError
 
-from .augmentation import Symmetry, disturbed
+from .augmentation import Symmetry, disturbed, way_back
 from .baseline import Baseline, Batch, Facts, Options, check_moving_walls, last_velocities
 from .graph import MATERIALS
 from .particle_grid import ParticleGrid, Stencil
@@ -31,7 +31,6 @@ from .strain import Rest, first_frame
 EMPTY = 1e-3  # below this weight, in units of particles a radius apart, a node's velocity fades to 0
 REACH = 4  # cells over which the U-Net sees how far a wall is
 LIQUID = 0  # material without a shape to come back to
-LOST = 3.0  # greatest velocity back to the true path, in deviations of accelerations
 COARSEST = 4  # nodes of the U-Net's finest level to one of its coarsest, along each axis
 
 
@@ -224,18 +223,11 @@ class NeuralMPM(Baseline):
             state, frames = self.call(state)
             for position, velocity in frames:
                 path = batch.position[:, following + len(errors) - 1 : following + len(errors) + 1]
-                wanted = path[:, 1] - path[:, 0] + self._back(path[:, 0] - reached.detach())
+                gap = path[:, 0] - reached.detach()
+                wanted = path[:, 1] - path[:, 0] + way_back(gap, options.recovery, change=self.change)
                 errors.append(((velocity - wanted) / self.change).square().mean())
                 reached = position
         return {"velocity": torch.stack(errors).mean()}
-
-    def _back(self, gap: Tensor) -> Tensor:
-        """Return the velocity that leads back to the true path [length/frame], bounded where it is lost."""
-        if self.options.recovery is None:
-            return torch.zeros_like(gap)
-        back = gap / self.options.recovery
-        most = LOST * self.change
-        return back * (most / back.norm(dim=1, keepdim=True).clamp(min=most))
 
     def start(self, given: Batch) -> GridState:
         """Return the state after the given frames; where they are few, the first velocity repeats."""
