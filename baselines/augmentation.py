@@ -138,7 +138,7 @@ def way_back(gap: Tensor, frames: float | None, *, change: float) -> Tensor:
     if frames is None:
         return torch.zeros_like(gap)
     back, most = gap / frames, LOST * change
-    speed = torch.linalg.vector_norm(back, dim=1, keepdim=True)
+    speed: Tensor = torch.linalg.vector_norm(back, dim=1, keepdim=True)
     return back * most / speed.clamp(min=most)
 
 
