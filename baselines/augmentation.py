@@ -8,6 +8,11 @@ With noise a model learns to undo its own rollout errors (Sanchez-Gonzalez et al
 velocities of the given frames are moved by a random walk, the positions by its sum. The frames to
 predict move with the last given position, so that the target is the true next velocity, and the
 acceleration that leads to it undoes the noise.
+
+What rollouts come to is farther off than any noise. Where a training rolls its windows out for a
+random number of steps without gradients first (the pushforward trick of Brandstetter, Worrall and
+Welling 2022, arXiv 2202.03376), the model learns from there, and what it is to do there is to come
+back: :func:`way_back` is added to the true velocity.
 """
 
 from __future__ import annotations
@@ -80,7 +85,9 @@ def image(batch: Batch, matrix: Tensor, bounds: Bounds) -> Batch:
         )
     matrix = matrix.to(batch.position)
     centre = batch.position.new_tensor([(low + high) / 2 for low, high in bounds])
-    position = _turned(matrix[batch.sample][:, None], batch.position - centre) + centre
+    turn = matrix[batch.sample]
+    position = _turned(turn[:, None], batch.position - centre) + centre
+    first = None if batch.origin is None else _turned(turn, batch.origin - centre) + centre
     walls = batch.wall_velocity
     if walls is not None:  # wall k becomes the one that the image of its normal points at
         normals = _NORMALS.to(matrix)
@@ -88,7 +95,7 @@ def image(batch: Batch, matrix: Tensor, bounds: Bounds) -> Batch:
         origin = (images[:, None] * normals[:, None]).sum(dim=-1).argmax(dim=2)
         walls = _turned(matrix[:, None, None], walls)
         walls = walls.gather(2, origin[:, None, :, None].expand_as(walls))
-    return replace(batch, position=position, wall_velocity=walls)
+    return replace(batch, position=position, wall_velocity=walls, origin=first)
 
 
 def _turned(matrix: Tensor, vector: Tensor) -> Tensor:
@@ -114,6 +121,25 @@ def noisy(position: Tensor, history: int, std: float, generator: torch.Generator
     walk = random_walk(len(position), history, std, generator).to(position)
     after = walk[:, -1:].expand(-1, position.shape[1] - history, -1)
     return position + torch.cat([walk, after], dim=1)
+
+
+LOST = 3.0
+"""Greatest velocity back to the true path, in deviations of accelerations: what is lost is not run after."""
+
+
+def way_back(gap: Tensor, frames: float | None, *, change: float) -> Tensor:
+    """Return the velocity that leads back to the true path [length/frame], shape [particle, 2].
+
+    Args:
+        gap: true less reached positions [length], shape [particle, 2].
+        frames: frames in which to be back, if nothing else moved; None for no way back.
+        change: deviation of accelerations [length/frame^2].
+    """
+    if frames is None:
+        return torch.zeros_like(gap)
+    back, most = gap / frames, LOST * change
+    speed: Tensor = torch.linalg.vector_norm(back, dim=1, keepdim=True)
+    return back * most / speed.clamp(min=most)
 
 
 def disturbed(

@@ -71,6 +71,11 @@ class Baseline(nn.Module):
         """Frames of a training window after the given ones: 1, or more with rollout losses."""
         return 1
 
+    @property
+    def origin(self) -> bool:
+        """Whether training windows hold the positions in the scenario's first frame."""
+        return False
+
     @abstractmethod
     def forward(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """Return every term of the training loss, raw: weights are applied by the trainer.

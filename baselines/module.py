@@ -34,6 +34,7 @@ from .machine import return_memory
 from .recipe import TrainingOptions
 from .rollout import Validation
 
+MEAN = "mean"  # name of a weight's running mean in the optimiser's state
 TOTAL = "total"  # name of the weighted sum among the loss terms
 
 
@@ -83,12 +84,12 @@ class TrainingModule(LightningModule):
 
     def configure_optimizers(self) -> Optimizer:
         """Return AdamW, which is Adam where weights do not decay, as an earlier run left it."""
-        optimizer = AdamW(
+        self._optimizer = AdamW(
             self.model.parameters(), lr=self._rate, weight_decay=self.recipe.weight_decay, fused=True
         )
         if self._resumed is not None:
-            optimizer.load_state_dict(dict(self._resumed))
-        return optimizer
+            self._optimizer.load_state_dict(dict(self._resumed))
+        return self._optimizer
 
     def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
         """Return the batch on the device; Lightning knows no dataclasses."""
@@ -128,9 +129,32 @@ class TrainingModule(LightningModule):
             group["lr"] = self.learning_rate
 
     def optimizer_step(self, *args: Any, **kwargs: Any) -> None:  # noqa: ANN401 (Lightning's)
-        """Make a step and count it."""
+        """Make a step, count it, and let the mean of the weights follow.
+
+        The mean is kept in the optimiser's state, which checkpoints hold. It follows faster at first:
+        where training starts is soon forgotten.
+        """
         super().optimizer_step(*args, **kwargs)
         self.step += 1
+        kept = min(self.recipe.ema, self.step / (self.step + 9.0))
+        if self.recipe.ema > 0.0:
+            for parameter, state in self._optimizer.state.items():
+                mean = state.setdefault(MEAN, parameter.detach().clone())
+                mean.lerp_(parameter.detach(), 1.0 - kept)
+
+    @contextmanager
+    def published(self) -> Iterator[Baseline]:
+        """Put the mean of the weights in their place for a while, where one is kept."""
+        kept = {parameter: state[MEAN] for parameter, state in self._optimizer.state.items() if MEAN in state}
+        last = {parameter: parameter.detach().clone() for parameter in kept}
+        with torch.no_grad():
+            for parameter, mean in kept.items():
+                parameter.copy_(mean)
+            try:
+                yield self.model
+            finally:
+                for parameter, value in last.items():
+                    parameter.copy_(value)
 
     def not_finite(self) -> WorkFailedError:
         """Return the error that names step and terms."""
@@ -234,17 +258,23 @@ class TrainingCallback(Callback):
         value = 0.0
         with self.ledger.validating(trainer.world_size, device=self.job.device):
             if trainer.is_global_zero:
-                value = validation(module.model)
+                with module.published() as model:
+                    value = validation(model)
             value = float(trainer.strategy.broadcast(value))
         better = self.ledger.validated(validation.metric, value)
         if trainer.logger is not None:
             trainer.logger.log_metrics({f"validation/{validation.metric}": value}, step=module.step)
         if better and trainer.is_global_zero:
-            save(self.job.folder.weights, self.job.checkpoint(self.ledger, rounded_weights(module.model)))
+            self._publish(module)
         patience = module.recipe.patience
         if patience is not None and self.ledger.since_best() >= patience and module.step < module.steps:
             self.ledger.state = STOPPED_EARLY
             trainer.should_stop = True
+
+    def _publish(self, module: TrainingModule) -> None:
+        """Write the weights to predict from."""
+        with module.published() as model:
+            save(self.job.folder.weights, self.job.checkpoint(self.ledger, rounded_weights(model)))
 
     def _store(self, trainer: Trainer, module: TrainingModule) -> None:
         """Write checkpoint and record; a model whose weights are not finite is not stored."""
@@ -260,7 +290,7 @@ class TrainingCallback(Callback):
         optimizer = trainer.optimizers[0].state_dict()
         save(folder.checkpoint, self.job.checkpoint(self.ledger, state, optimizer))
         if self.ledger.best_step is None or not folder.weights.exists():
-            save(folder.weights, self.job.checkpoint(self.ledger, rounded_weights(module.model)))
+            self._publish(module)
         else:  # the weights stay those of the best step, their budget is that of the training
             best = load(folder.weights)
             budget = self.job.budget(self.ledger).model_dump(mode="json")

@@ -22,13 +22,15 @@ from torch.nn.functional import gelu
 
 from lagbench.errors import DataError, UsageError
 
-from .augmentation import Symmetry, disturbed
+from .augmentation import Symmetry, disturbed, way_back
 from .baseline import Baseline, Batch, Facts, Options, check_moving_walls, last_velocities
 from .graph import MATERIALS
 from .particle_grid import ParticleGrid, Stencil
+from .strain import Rest, first_frame
 
 EMPTY = 1e-3  # below this weight, in units of particles a radius apart, a node's velocity fades to 0
 REACH = 4  # cells over which the U-Net sees how far a wall is
+LIQUID = 0  # material without a shape to come back to
 COARSEST = 4  # nodes of the U-Net's finest level to one of its coarsest, along each axis
 
 
@@ -40,11 +42,17 @@ class NeuralMPMOptions(Options):
     velocities: int = Field(default=5, ge=1)  # last velocities that the U-Net sees
     bundle: int = Field(default=4, ge=1)  # frames that one call predicts
     calls: int = Field(default=2, ge=1)  # calls that training unrolls; gradients pass through all
+    # most calls before those, without gradients: training sees what rollouts come to
+    pushforward: int = Field(default=0, ge=0)
+    # frames in which particles off the true path are to come back to it; None asks for true velocities alone
+    recovery: float | None = Field(default=None, gt=1.0, allow_inf_nan=False)
     smoothing: float = Field(default=0.2, ge=0.0, le=1.0)  # share s of the grid's velocity per frame
     noise_std: float = Field(default=1e-4, ge=0.0, allow_inf_nan=False)  # on the last velocity [length/frame]
     context: int = Field(default=0, ge=0)  # numbers read off the given frames and kept, such as a viscosity
     materials: tuple[int, ...] = (0,)  # materials that have density and velocity of their own
     wall_velocity: bool = False  # whether the velocity of the walls in the coming frames is a channel
+    # whether the U-Net sees how far solids are strained since the scenario's first frame
+    strain: bool = False
     symmetry: Symmetry = Symmetry.NONE  # images that training windows are replaced by at random
 
 
@@ -59,6 +67,8 @@ class GridState:
     # velocities of the walls from the last frame on [length/frame], shape [window, frame, wall, 2]
     walls: Tensor
     context: Tensor  # what the given frames told, shape [window, context]
+    rest: Rest | None = None  # None where strain is not asked for
+    solid: Tensor | None = None  # 1 for solids, 0 for liquid, shape [particle, 1]
     coming: tuple[Tensor, ...] = ()  # predicted positions that are not yet given out
 
 
@@ -167,7 +177,7 @@ class NeuralMPM(Baseline):
         self.register_buffer("geometry", geometry, persistent=False)
         self.register_buffer("beside", self.grid.beside_walls(), persistent=False)
         kinds, frames = len(options.materials), options.bundle
-        seen = kinds * (1 + 2 * options.velocities) + len(geometry)
+        seen = kinds * (1 + 2 * options.velocities + 3 * options.strain) + len(geometry)
         self.context = Context(seen, options.context, options.width) if options.context else None
         forcing = 2 * frames * options.wall_velocity
         self.network = UNet(seen + forcing + options.context, 2 * kinds * frames, options.width)
@@ -180,7 +190,12 @@ class NeuralMPM(Baseline):
     @property
     def future(self) -> int:
         """Frames of all calls that training unrolls."""
-        return self.options.bundle * self.options.calls
+        return self.options.bundle * (self.options.calls + self.options.pushforward)
+
+    @property
+    def origin(self) -> bool:
+        """Strain is counted from the scenario's first frame."""
+        return self.options.strain
 
     def forward(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """Return the squared error of velocity over the deviation of accelerations, mean over frames [1]."""
@@ -195,13 +210,23 @@ class NeuralMPM(Baseline):
                 noise_std=options.noise_std,
             )
         state = self.start(batch.part(slice(self.history)))
-        target = batch.position[:, self.history - 1 :].diff(dim=1)
+        following = self.history  # the first frame whose error counts
+        if generator is not None and options.pushforward:
+            most = options.pushforward + 1
+            with torch.no_grad():
+                for _ in range(int(torch.randint(most, (), generator=generator, device=generator.device))):
+                    state, frames = self.call(state)
+                    following += len(frames)
         errors: list[Tensor] = []
+        reached = state.position
         for _ in range(options.calls):
             state, frames = self.call(state)
-            for _, velocity in frames:
-                error = (velocity - target[:, len(errors)]) / self.change
-                errors.append(error.square().mean())
+            for position, velocity in frames:
+                path = batch.position[:, following + len(errors) - 1 : following + len(errors) + 1]
+                gap = path[:, 0] - reached.detach()
+                wanted = path[:, 1] - path[:, 0] + way_back(gap, options.recovery, change=self.change)
+                errors.append(((velocity - wanted) / self.change).square().mean())
+                reached = position
         return {"velocity": torch.stack(errors).mean()}
 
     def start(self, given: Batch) -> GridState:
@@ -227,6 +252,10 @@ class NeuralMPM(Baseline):
             walls=walls,
             context=position.new_zeros(given.windows, 0),
         )
+        if self.options.strain:
+            layers = given.windows * len(self.options.materials)
+            rest = Rest.of(self.grid, first_frame(given), state.layer, layers)
+            state = replace(state, rest=rest, solid=(given.material != LIQUID).to(position.dtype)[:, None])
         if self.context is None:
             return state
         fields, _ = self._fields(state, self.grid.stencil(state.position, state.layer))
@@ -276,12 +305,17 @@ class NeuralMPM(Baseline):
         """
         windows = len(state.walls)
         layers = windows * len(self.options.materials)
-        carried = torch.cat([torch.ones_like(state.position[:, :1]), state.velocity.flatten(1)], dim=1)
-        sums = self.grid.spread(stencil, carried, layers)
+        carried = [torch.ones_like(state.position[:, :1]), state.velocity.flatten(1)]
+        if state.rest is not None and state.solid is not None:
+            carried.append(state.rest.strain(state.position) * state.solid)
+        sums = self.grid.spread(stencil, torch.cat(carried, dim=1), layers)
         weight = sums[:, :1] / self.unit
-        velocity = sums[:, 1:] / self.unit / weight.clamp(min=EMPTY)
-        velocity = velocity.reshape(layers, -1, 2, *self.grid.shape)
+        means = sums[:, 1:] / self.unit / weight.clamp(min=EMPTY)
+        shown = 2 * self.options.velocities
+        velocity = means[:, :shown].reshape(layers, -1, 2, *self.grid.shape)
         changes = velocity.diff(dim=1) / self.change
-        seen = torch.cat([weight, velocity[:, -1] / self.speed, changes.flatten(1, 2)], dim=1)
+        seen = torch.cat(
+            [weight, velocity[:, -1] / self.speed, changes.flatten(1, 2), means[:, shown:]], dim=1
+        )
         geometry = self.geometry.expand(windows, -1, -1, -1)
         return torch.cat([seen.reshape(windows, -1, *self.grid.shape), geometry], dim=1), velocity[:, -1]

@@ -101,6 +101,13 @@ class ParticleGrid(nn.Module):
         nodes = field.permute(0, 2, 3, 1).reshape(-1, channels).index_select(0, stencil.node)
         return (stencil.weight[:, :, None] * nodes.view(-1, 9, channels)).sum(dim=1)
 
+    def offsets(self, stencil: Stencil, position: Tensor) -> Tensor:
+        """Return how far the nine nodes lie from each particle [length], shape [particle, 9, 2]."""
+        columns, rows = self.shape
+        node = stencil.node.view(-1, 9) % (columns * rows)
+        places = torch.stack([self.axis_x[node // rows], self.axis_y[node % rows]], dim=2)
+        return places - position[:, None]
+
     def wall_distance(self, reach: float) -> Tensor:
         """Return the distances to left, right, bottom and top wall over a reach, within [-1, 1].
 

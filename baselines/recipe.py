@@ -91,6 +91,9 @@ class TrainingOptions(_Strict):
         Schedule, BeforeValidator(lambda value: {"kind": value} if isinstance(value, str) else value)
     ] = Schedule()  # the rate over the steps
     warmup_steps: int = Field(default=0, ge=0)  # steps over which the rate rises from 0
+    # share of itself that the running mean of the weights keeps in a step; it is validated and published.
+    # With 0 the weights themselves are
+    ema: float = Field(default=0.0, ge=0.0, lt=1.0)
     # largest norm of the gradient; None clips nothing
     clip: float | None = Field(default=None, gt=0, allow_inf_nan=False)
     # 'bf16' runs matrix products in bfloat16, weights stay float32; 'auto' does so where the

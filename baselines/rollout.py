@@ -81,6 +81,7 @@ def single(batch: Batch, window: int) -> Batch:
         wall_velocity=None if walls is None else walls[window : window + 1],
         scenario=batch.scenario[window : window + 1],
         frame=batch.frame[window : window + 1],
+        origin=None if batch.origin is None else batch.origin[mine],
     )
 
 

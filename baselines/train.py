@@ -238,6 +238,7 @@ def descend(job: TrainingJob, model: Baseline) -> tuple[TrainingRecord, int]:
         registry=job.registry,
         history=model.history,
         future=model.future,
+        origin=model.origin,
     )
     steps = options.total_steps(len(data), processes=job.processes)
     ledger, earlier = job.ledger(), job.earlier

@@ -52,6 +52,8 @@ class Window(NamedTuple):
     wall_velocity: Tensor | None
     scenario: int  # scenario id
     frame: int  # absolute number of the first frame
+    # particle positions in the scenario's first frame [length], shape [particle, 2]; None unless asked for
+    origin: Tensor | None = None
 
 
 def tensors(window: Arrays) -> Window:
@@ -63,6 +65,7 @@ def tensors(window: Arrays) -> Window:
         None if walls is None else torch.from_numpy(walls),
         window.scenario,
         window.frame,
+        None if window.origin is None else torch.from_numpy(window.origin),
     )
 
 
@@ -82,6 +85,7 @@ class WindowDataset(WindowReader, Dataset[Window]):
         future: frames after them.
         registry: what describes the data set; ours by default.
         cache_bytes: frames kept decompressed [bytes]; with less, reading is slower, never different.
+        origin: whether windows hold the positions in the scenario's first frame too.
 
     Raises:
         UsageError: unknown split, size or subset, or no scenario is long enough.
@@ -106,6 +110,8 @@ class Batch:
     wall_velocity: Tensor | None
     scenario: Tensor  # scenario id of each window, int64, shape [window]
     frame: Tensor  # absolute number of each window's first frame, int64, shape [window]
+    # particle positions in the scenario's first frame [length], shape [particle, 2]; None unless asked for
+    origin: Tensor | None = None
 
     @property
     def windows(self) -> int:
@@ -150,13 +156,15 @@ class Batch:
 def collate(windows: Sequence[Window]) -> Batch:
     """Put windows side by side."""
     walls = [window.wall_velocity for window in windows if window.wall_velocity is not None]
+    origins = [window.origin for window in windows if window.origin is not None]
     frames = {window.position.shape[1] for window in windows}
-    if len(frames) != 1 or len(walls) not in (0, len(windows)):
+    if len(frames) != 1 or not {len(walls), len(origins)} <= {0, len(windows)}:
         raise UsageError(
             "windows do not fit side by side",
             where="collate",
             expected="windows of one split and one length",
-            got=f"lengths {sorted(frames)}, {len(walls)} of {len(windows)} with moving walls",
+            got=f"lengths {sorted(frames)}, {len(walls)} of {len(windows)} with moving walls,"
+            f" {len(origins)} with their first frame",
         )
     particles = torch.tensor([len(window.material) for window in windows])
     return Batch(
@@ -166,6 +174,7 @@ def collate(windows: Sequence[Window]) -> Batch:
         wall_velocity=torch.stack([wall[: min(map(len, walls))] for wall in walls]) if walls else None,
         scenario=torch.tensor([window.scenario for window in windows]),
         frame=torch.tensor([window.frame for window in windows]),
+        origin=torch.cat(origins) if origins else None,
     )
 
 

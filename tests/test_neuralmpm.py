@@ -100,6 +100,41 @@ def test_training_unrolls_the_rollout() -> None:
     assert found == pytest.approx(float(error.square().mean()) / ((2e-4**2 + 1e-4**2) / 2), rel=1e-3)
 
 
+def test_training_starts_where_rollouts_come_to() -> None:
+    """After none or one call without gradients, the loss is that of the rollout's next frames."""
+    window = batch(swirl(0, 9))
+    model = surrogate(awake=0.1, pushforward=1)
+    path = torch.cat([window.position[:, 2:3], rolled(model, window.part(slice(3)), 6)], dim=1)
+    error = (path.diff(dim=1) - window.position[:, 2:].diff(dim=1)).square() / ((2e-4**2 + 1e-4**2) / 2)
+    expected = [float(error[:, start : start + 4].mean()) for start in (0, 2)]
+    with torch.no_grad():
+        found = {float(model(window, torch.Generator().manual_seed(seed))["velocity"]) for seed in range(12)}
+    assert sorted(found) == pytest.approx(sorted(expected), rel=1e-3)
+
+
+def test_the_way_back_is_asked_for() -> None:
+    """An untrained model goes on as before; the truth goes on faster: how far it is behind counts too."""
+    given, after, frames = 2e-3, 2.2e-3, np.arange(1.0, 5.0)
+    travelled = np.concatenate([given * np.arange(3.0), 2 * given + after * frames])
+    window = batch(jittered(0, low=0.3, high=0.6) + travelled[:, None, None] * np.array([1.0, 0.0]))
+    model = surrogate(smoothing=0.0, recovery=4.0)
+    behind = (after - given) * np.arange(4.0)
+    wanted = after + np.minimum(behind / 4.0, 3.0 * model.change)
+    expected = ((wanted - given) ** 2 / 2).mean() / model.change**2  # nothing moves along y
+    with torch.no_grad():
+        assert float(model(window)["velocity"]) == pytest.approx(expected, rel=1e-2)
+
+
+def test_solids_show_their_strain() -> None:
+    """A strained first frame matters where a body is solid; liquid has no shape to come back to."""
+    model, given = surrogate(awake=0.1, strain=True), batch(swirl(0, 3))
+    origin = 0.9 * (given.position[:, 0] - 0.5) + 0.5
+    for material, differs in ((0, False), (1, True)):
+        alike = replace(given, material=torch.full_like(given.material, material))
+        strained = rolled(model, replace(alike, origin=origin), 2)
+        assert torch.equal(rolled(model, alike, 2), strained) is not differs
+
+
 class Drag(nn.Module):
     """Stands for the U-Net: every frame's acceleration is -rate times the velocity on the grid."""
 

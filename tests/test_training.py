@@ -16,6 +16,7 @@ from typing import Any
 
 import netCDF4
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from simple_models import FACTS, Drift, trainer
@@ -101,6 +102,11 @@ def test_resumed_equals_uninterrupted(run: Run, baseline: str, tmp_path: Path) -
     """Interrupted twice and resumed, a training ends with the bits of an uninterrupted one."""
     settings = ("steps=7", "validate_every=3", "schedule=cosine")
     settings += ("model.noise_std=1e-4",) if baseline != "drift" else ()
+    settings += (
+        ("ema=0.9", "model.strain=true", "model.pushforward=2", "model.recovery=4")
+        if baseline == "neuralmpm"
+        else ()
+    )
     whole = run(baseline, *settings, to="whole")
     for step in (2, 5):
         with pytest.raises(KeyboardInterrupt):
@@ -229,6 +235,26 @@ def test_gradients_are_clipped(run: Run, monkeypatch: pytest.MonkeyPatch) -> Non
     run("drift", "steps=2", "validate_every=0", "clip=0.001", to="clipped")
     assert min(seen[:2]) > 0.001
     assert seen[2:] == pytest.approx([0.001, 0.001], rel=1e-3)
+
+
+def test_the_mean_of_the_weights_is_published(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is what pandas makes of the weights after each step; training goes on from the last ones."""
+    seen: list[float] = []
+    step = torch.optim.AdamW.step
+
+    def watched(self: torch.optim.AdamW, *args: Any, **kwargs: Any) -> Any:
+        out = step(self, *args, **kwargs)
+        seen.append(float(self.param_groups[0]["params"][0]))
+        return out
+
+    monkeypatch.setattr(torch.optim.AdamW, "step", watched)
+    result = run("drift", "steps=6", "learning_rate=0.1", "validate_every=2", "ema=0.1")
+    means = pd.Series(seen).ewm(alpha=0.9, adjust=False).mean().tolist()
+    assert float(weights(result.checkpoint)["a"]) == pytest.approx(seen[-1], rel=1e-6)
+    best = means[(result.best_step or 0) - 1]
+    assert float(weights(result.weights)["a"]) == float(torch.tensor(best).bfloat16())
+    stored = load(result.checkpoint).optimizer or {}
+    assert float(stored["state"][0]["mean"]) == pytest.approx(means[-1], rel=1e-6)
 
 
 @pytest.mark.parametrize("ranks", [1, 3])

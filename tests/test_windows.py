@@ -102,6 +102,20 @@ def test_material_and_walls(train: Open) -> None:
     assert window.wall_velocity.tolist() == 2 * [[[0, 0], [0, 0], [0, 0], [0.125, 0]]]
 
 
+def test_the_first_frame_comes_along_where_it_is_asked_for(train: Open) -> None:
+    """Every window of a scenario holds the scenario's frame 0; batches put them side by side."""
+    data = train(origin=True)
+    window, other = data[3], data[40]
+    assert window.origin is not None
+    for one in (window, other):
+        frames = frames_of(one.scenario, FRAMES[one.scenario], PARTICLES[one.scenario])
+        np.testing.assert_array_equal(one.origin, frames[0])
+    assert collate([window, other]).origin[len(window.origin) :].equal(other.origin)
+    assert train()[3].origin is None
+    with pytest.raises(UsageError):
+        collate([window, train()[40]])
+
+
 def test_files_without_material_or_moving_walls(tmp_path: Path, train: Open) -> None:
     """Without material all is liquid, without moving walls there is no velocity of walls."""
     for i, frames in FRAMES.items():

@@ -185,6 +185,8 @@ class Window(NamedTuple):
     wall_velocity: NDArray[np.float32] | None
     scenario: int  # scenario id
     frame: int  # absolute number of the first frame
+    # particle positions in the scenario's first frame [length], shape [particle, 2]; None unless asked for
+    origin: NDArray[np.float32] | None = None
 
 
 class WindowReader:
@@ -206,6 +208,7 @@ class WindowReader:
         future: int = 1,
         registry: Registry | None = None,
         cache_bytes: int = CACHE_BYTES,
+        origin: bool = False,
     ) -> None:
         entry, folder, _ = locate(split, size, root=root, registry=registry)
         names = (subset,) if isinstance(subset, str) else tuple(subset)
@@ -214,6 +217,7 @@ class WindowReader:
         self.history = entry.task.input_frames if history is None else history  # frames that a model is given
         self.future = future  # frames after them
         self.length = self.history + future  # frames in a window
+        self.origin = origin  # whether windows hold the scenario's first frame too
         self.scenarios = tuple(paths)
         self.frame_bytes = 8 * entry.particles
         frames = [entry.frame_count(i) for i in paths]
@@ -270,7 +274,10 @@ class WindowReader:
         frames = self.store.frames(scenario, frame, frame + self.length)
         material, walls = self.store.constants(scenario)
         part = None if walls is None else walls[frame : frame + self.length]
-        return window_of(frames, material, part, scenario, frame)
+        window = window_of(frames, material, part, scenario, frame)
+        if not self.origin:
+            return window
+        return window._replace(origin=self.store.frames(scenario, 0, 1)[0].copy())
 
 
 class Windows(WindowReader):
