@@ -91,6 +91,11 @@ CLAIMS = (
         rivals=OPERATORS,
     ),
     Claim(
+        question="Is it better for NeuralMPM to learn from its own rollouts than from more calls unrolled?",
+        first="neuralmpm-long",
+        rivals=("neuralmpm-unrolled",),
+    ),
+    Claim(
         question="Does LSTM + MLP come first among the frame models (Table 4.8: it does)?",
         first="lstm-mlp",
         rivals=tuple(name for name in FRAME_MODELS if name != "lstm-mlp"),

@@ -195,6 +195,13 @@ _MODELS = (
     Model("gns-l1", "GNS, L1 loss", varied="gns", settings=("model.loss_norm=l1",)),
     Model("gns-unrolled", "GNS, loss over three steps", varied="gns", recipe="unrolled"),
     Model("neuralmpm", "NeuralMPM", "#000000"),
+    Model("neuralmpm-long", "NeuralMPM from its own rollouts", varied="neuralmpm", recipe="long"),
+    Model(
+        "neuralmpm-unrolled",
+        "NeuralMPM, 16 frames unrolled",
+        varied="neuralmpm",
+        settings=("model.calls=4",),
+    ),
     Model("mlp", "MLP", "#0072b2"),
     Model("lstm", "LSTM", "#009e73"),
     Model("lstm-mlp", "LSTM + MLP", "#d55e00"),
