@@ -185,14 +185,16 @@ def _tiles(tab: Tab, metrics: Mapping[str, Metric]) -> Iterator[Markup]:
         if known and metrics[tab.ranking].direction is Direction.LOWER:
             best = min(known, key=lambda name: known[name])
             yield _tile("leader beside the best floor", f"{text(value / known[best], 2)}×", best)
-    fast = [row for row in ranked if row.entry.cost and row.entry.cost.speed_up]
+    # who is fast and learned nothing is no example
+    learned = [row for row in ranked if row.skill and row.skill.mean > 0.0]
+    fast = [row for row in learned if row.entry.cost and row.entry.cost.speed_up]
     if fast:
         row = max(fast, key=lambda one: value_of(one, speed_up))
         speed = float(value_of(row, speed_up))
         beside = "slower" if speed < 1.0 else "faster"
         device = row.entry.cost.device if row.entry.cost else ""
         yield _tile(
-            "speed of the fastest entry, solver = 1×",
+            "speed of the fastest entry with skill, solver = 1×",
             written(speed, "factor"),
             f"{beside} than the solver: {_short(row)}, {device}; self-reported",
         )

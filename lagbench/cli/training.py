@@ -88,8 +88,9 @@ def train(
     split = chosen(name, split)
     for module in ("torch", "torch_geometric", "pytorch_lightning"):
         check_installed(module, extra=EXTRA)
-    from lagbench.baselines.machine import is_helper
-    from lagbench.baselines.train import train as run
+    with progress_bar(quiet=quiet):  # PyTorch takes seconds to load
+        from lagbench.baselines.machine import is_helper
+        from lagbench.baselines.train import train as run
 
     quiet = quiet or is_helper()
     if not is_helper():

@@ -136,7 +136,8 @@ def _per_scenario(card: ScoreCard, floors: Collection[str]) -> Table:
 
 
 def flag_lines(card: ScoreCard) -> Iterator[str]:
-    """Yield what is undefined, and what flags, warnings and floors say, one line each."""
+    """Yield what marks mean, what is undefined, and what flags, warnings and floors say, one line each."""
+    yield "↑ more is better, ↓ less is, ◎ nearer to the perfect value is"
     lost = {name: sum(score.undefined) for name, score in card.submission.items() if name in CHOSEN}
     if any(lost.values()):
         frames = len(card.scenarios) * card.setting.horizon
