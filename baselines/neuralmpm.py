@@ -51,6 +51,8 @@ class NeuralMPMOptions(Options):
     context: int = Field(default=0, ge=0)  # numbers read off the given frames and kept, such as a viscosity
     materials: tuple[int, ...] = (0,)  # materials that have density and velocity of their own
     wall_velocity: bool = False  # whether the velocity of the walls in the coming frames is a channel
+    # whether particles are damped towards the velocity of all materials together: one grid carries them all
+    mixture: bool = False
     # whether the U-Net sees how far solids are strained since the scenario's first frame
     strain: bool = False
     symmetry: Symmetry = Symmetry.NONE  # images that training windows are replaced by at random
@@ -318,4 +320,10 @@ class NeuralMPM(Baseline):
             [weight, velocity[:, -1] / self.speed, changes.flatten(1, 2), means[:, shown:]], dim=1
         )
         geometry = self.geometry.expand(windows, -1, -1, -1)
-        return torch.cat([seen.reshape(windows, -1, *self.grid.shape), geometry], dim=1), velocity[:, -1]
+        fields = torch.cat([seen.reshape(windows, -1, *self.grid.shape), geometry], dim=1)
+        if not self.options.mixture:
+            return fields, velocity[:, -1]
+        kinds = len(self.options.materials)
+        whole = sums[:, : 1 + shown].view(windows, kinds, -1, *self.grid.shape).sum(dim=1) / self.unit
+        mean = whole[:, -2:] / whole[:, :1].clamp(min=EMPTY)
+        return fields, mean.repeat_interleave(kinds, dim=0)

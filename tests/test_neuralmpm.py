@@ -125,6 +125,22 @@ def test_the_way_back_is_asked_for() -> None:
         assert float(model(window)["velocity"]) == pytest.approx(expected, rel=1e-2)
 
 
+def test_materials_in_one_place_come_to_one_velocity() -> None:
+    """Two clouds that lie in each other and part are held together by a grid that they share."""
+    rng = np.random.default_rng(0)
+    side = np.where(np.arange(256) % 2, 1.0, -1.0)[:, None] * np.array([1e-3, 0.0])
+    given = batch(rng.uniform(0.3, 0.7, (256, 2)) + np.arange(3)[:, None, None] * side)
+    given = replace(given, material=torch.arange(256) % 2)
+
+    def gap(**options: object) -> float:
+        found = rolled(surrogate(smoothing=0.5, **options), given, 6).diff(dim=1).double()
+        assert float(found.mean(dim=0).abs().max()) < 2e-4
+        return float(found[1::2, -1, 0].mean() - found[::2, -1, 0].mean())
+
+    assert gap() == pytest.approx(2e-3, rel=0.02)
+    assert abs(gap(mixture=True)) < 0.3 * 2e-3
+
+
 def test_solids_show_their_strain() -> None:
     """A strained first frame matters where a body is solid; liquid has no shape to come back to."""
     model, given = surrogate(awake=0.1, strain=True), batch(swirl(0, 3))
