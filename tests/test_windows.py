@@ -132,8 +132,9 @@ def test_files_without_material_or_moving_walls(tmp_path: Path, train: Open) -> 
 def test_arrays_tensors_and_open_split_agree(generated: GenerationResult, unmeasured: Registry) -> None:
     """Both public routes give, value for value, the frames of the lazy xarray data set."""
     options: dict[str, Any] = {"subset": "valid", "size": "tiny", "root": generated.root, "history": 3}
-    arrays = lagbench.windows("curl-noise", **options, future=2, registry=unmeasured)
-    tensors = WindowDataset("curl-noise", **options, future=2, registry=unmeasured)
+    options |= {"future": 2, "origin": True, "registry": unmeasured}
+    arrays = lagbench.windows("curl-noise", **options)
+    tensors = WindowDataset("curl-noise", **options)
     truth = lagbench.open_split("curl-noise", subset="valid", size="tiny", root=generated.root)
     assert len(arrays) == len(tensors) == sum(truth.frame_count.values - 4)
     for number, (array, tensor) in enumerate(zip(arrays, tensors, strict=True)):
@@ -142,6 +143,9 @@ def test_arrays_tensors_and_open_split_agree(generated: GenerationResult, unmeas
         expected = frames.position.transpose("particle", "frame", "space").values
         np.testing.assert_array_equal(array.position, expected)
         np.testing.assert_array_equal(tensor.position.numpy(), expected)
+        first = truth.position.sel(scenario=array.scenario).isel(frame=0).values
+        np.testing.assert_array_equal(array.origin, first)
+        np.testing.assert_array_equal(tensor.origin, first)
         np.testing.assert_array_equal(array.material, frames.material)
         np.testing.assert_array_equal(tensor.material.numpy(), frames.material)
         assert array.wall_velocity is not None

@@ -298,6 +298,7 @@ def windows(
     future: int = 1,
     registry: Registry | None = None,
     cache_bytes: int = CACHE_BYTES,
+    origin: bool = False,
 ) -> Windows:
     """Open all windows of consecutive frames as NumPy arrays, without PyTorch.
 
@@ -315,6 +316,7 @@ def windows(
         future: frames after them.
         registry: what describes the data set; ours by default.
         cache_bytes: frames kept decompressed [bytes]; with less, reading is slower, never different.
+        origin: whether windows hold the positions in the scenario's first frame too, as ``origin``.
 
     Raises:
         UsageError: unknown split, size or subset, or no scenario is long enough.
@@ -329,6 +331,7 @@ def windows(
         future=future,
         registry=registry,
         cache_bytes=cache_bytes,
+        origin=origin,
     )
 
 
