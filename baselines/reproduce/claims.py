@@ -96,6 +96,11 @@ CLAIMS = (
         rivals=("neuralmpm-unrolled",),
     ),
     Claim(
+        question="Does NeuralMPM gain by one grid of velocities for all materials, at no more steps?",
+        first="neuralmpm",
+        rivals=("neuralmpm-unmixed",),
+    ),
+    Claim(
         question="Does LSTM + MLP come first among the frame models (Table 4.8: it does)?",
         first="lstm-mlp",
         rivals=tuple(name for name in FRAME_MODELS if name != "lstm-mlp"),

@@ -197,6 +197,12 @@ _MODELS = (
     Model("neuralmpm", "NeuralMPM", "#000000"),
     Model("neuralmpm-long", "NeuralMPM from its own rollouts", varied="neuralmpm", recipe="long"),
     Model(
+        "neuralmpm-unmixed",
+        "NeuralMPM from its own rollouts, materials apart",
+        varied="neuralmpm",
+        settings=("model.mixture=false",),
+    ),
+    Model(
         "neuralmpm-unrolled",
         "NeuralMPM, 16 frames unrolled",
         varied="neuralmpm",
