@@ -92,9 +92,9 @@ def image(batch: Batch, matrix: Tensor, bounds: Bounds) -> Batch:
     if walls is not None:  # wall k becomes the one that the image of its normal points at
         normals = _NORMALS.to(matrix)
         images = _turned(matrix[:, None], normals)  # of window and wall
-        origin = (images[:, None] * normals[:, None]).sum(dim=-1).argmax(dim=2)
+        source = (images[:, None] * normals[:, None]).sum(dim=-1).argmax(dim=2)
         walls = _turned(matrix[:, None, None], walls)
-        walls = walls.gather(2, origin[:, None, :, None].expand_as(walls))
+        walls = walls.gather(2, source[:, None, :, None].expand_as(walls))
     return replace(batch, position=position, wall_velocity=walls, origin=first)
 
 

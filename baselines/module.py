@@ -136,11 +136,12 @@ class TrainingModule(LightningModule):
         """
         super().optimizer_step(*args, **kwargs)
         self.step += 1
-        kept = min(self.recipe.ema, self.step / (self.step + 9.0))
         if self.recipe.ema > 0.0:
+            kept = min(self.recipe.ema, self.step / (self.step + 9.0))
             for parameter, state in self._optimizer.state.items():
-                mean = state.setdefault(MEAN, parameter.detach().clone())
-                mean.lerp_(parameter.detach(), 1.0 - kept)
+                if MEAN not in state:
+                    state[MEAN] = parameter.detach().clone()
+                state[MEAN].lerp_(parameter.detach(), 1.0 - kept)
 
     @contextmanager
     def published(self) -> Iterator[Baseline]:

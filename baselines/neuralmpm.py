@@ -4,11 +4,11 @@
     v(f+k) = (1 - s) v(f+k-1) + G2P(s u(f+k-1) + a(f+k)),  u(f+k) = u(f+k-1) + a(f+k)
     x(f+k) = x(f+k-1) + v(f+k)
 
-after Rochman Sharabi, Lewin and Louppe (2024), arXiv 2408.15753. u is the velocity on the grid:
-only what particles have beyond it is damped, so that rollouts keep their energy. A node's
-accelerations are those of the matter that is there in frame f, wherever it goes in the bundle: one
-transfer each way serves all of its frames. Training unrolls several calls. The U-Net's last layer
-starts at zero: an untrained model keeps every velocity.
+after Rochman Sharabi, Lewin and Louppe (2024), arXiv 2408.15753. u is the velocity on the grid,
+of a material or of all together: only what particles have beyond it is damped, so that rollouts
+keep their energy. A node's accelerations are those of the matter that is there in frame f, wherever
+it goes in the bundle: one transfer each way serves all of its frames. Training unrolls several
+calls. The U-Net's last layer starts at zero: an untrained model keeps every velocity.
 """
 
 from __future__ import annotations
@@ -200,7 +200,10 @@ class NeuralMPM(Baseline):
         return self.options.strain
 
     def forward(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
-        """Return the squared error of velocity over the deviation of accelerations, mean over frames [1]."""
+        """Return the squared error of velocity over the deviation of accelerations, mean over frames [1].
+
+        With ``recovery`` the true velocity has the way back to the true path added to it.
+        """
         options = self.options
         if generator is not None:
             batch = disturbed(

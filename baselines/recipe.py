@@ -91,8 +91,8 @@ class TrainingOptions(_Strict):
         Schedule, BeforeValidator(lambda value: {"kind": value} if isinstance(value, str) else value)
     ] = Schedule()  # the rate over the steps
     warmup_steps: int = Field(default=0, ge=0)  # steps over which the rate rises from 0
-    # share of itself that the running mean of the weights keeps in a step; it is validated and published.
-    # With 0 the weights themselves are
+    # share of itself that the running mean of the weights keeps in a step, less at first: n / (n + 9) after n
+    # steps. The mean is validated and published; with 0 the weights themselves are
     ema: float = Field(default=0.0, ge=0.0, lt=1.0)
     # largest norm of the gradient; None clips nothing
     clip: float | None = Field(default=None, gt=0, allow_inf_nan=False)
@@ -154,6 +154,12 @@ class TrainingOptions(_Strict):
         return self.validate_every > 0 and (step >= steps or step % self.validate_every == 0)
 
 
+LATER: Mapping[str, object] = {
+    **{"compile": False, "ema": 0.0},
+    **{"pushforward": 0, "recovery": None, "strain": False, "mixture": False},
+}
+"""Options that records of earlier trainings lack, with what they did: such trainings can go on."""
+
 Layer = dict[str, Any]
 ANY = "*"
 Checked = TypeVar("Checked", bound=BaseModel)
@@ -170,10 +176,11 @@ class Recipe:
 
     def as_json(self) -> dict[str, Any]:
         """Return plain values."""
-        training = self.training.model_dump(mode="json")
-        if not self.training.compile:
-            del training["compile"]  # a record without the key is of a training that compiles nothing
-        return {"baseline": self.baseline, "name": self.name, "model": dict(self.model), "training": training}
+        model, training = (
+            {key: value for key, value in part.items() if key not in LATER or value != LATER[key]}
+            for part in (self.model, self.training.model_dump(mode="json"))
+        )
+        return {"baseline": self.baseline, "name": self.name, "model": model, "training": training}
 
 
 class _Part(BaseModel):

@@ -27,7 +27,7 @@ from torch import Tensor, nn
 from lagbench.baselines.operators.operator import Losses, Operator
 from lagbench.data.grid import Grid, Placement
 
-from .augmentation import Symmetry, disturbed, way_back
+from .augmentation import Symmetry, disturbed
 from .baseline import Baseline, Batch, Facts, Options, check_moving_walls, last_velocities
 from .graph import EDGE_FEATURES, NodeFeatures, Scale, edge_features, radius_graph
 from .network import EncodeProcessDecode
@@ -194,8 +194,6 @@ class GraphNetworkOptions(Options):
     rollout_loss_steps: int = Field(default=1, ge=1)
     # most own steps before those, without gradients: training sees what rollouts come to
     pushforward: int = Field(default=0, ge=0)
-    # frames in which particles off the true path are to come back to it; None asks for true velocities alone
-    recovery: float | None = Field(default=None, gt=1.0, allow_inf_nan=False)
     wall_velocity: bool = False  # whether the velocities of moving walls in the next frame are features
     # how far a particle sees a wall [radius]; the solver's grid carries a wall's effect beyond one radius
     wall_reach: float = Field(default=3.0, gt=0.0, allow_inf_nan=False)
@@ -303,12 +301,10 @@ class GraphNetwork(Baseline):
                     state, _ = self.step(state)
                     first += 1
         steps = []
-        change = float(self.acceleration.std.square().mean().sqrt())
         for frame in range(first, first + options.rollout_loss_steps):
             following, own = self.step(state, generator)
-            target, before = batch.position[:, frame], batch.position[:, frame - 1]
-            gap = before - state.position.detach()
-            velocity = target - before + way_back(gap, options.recovery, change=change)
+            target = batch.position[:, frame]
+            velocity = target - batch.position[:, frame - 1]
             # both accelerations start from the state's velocity
             last, predicted = state.velocity[:, -1], following.velocity[:, -1]
             terms = loss_terms(

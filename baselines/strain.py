@@ -4,7 +4,8 @@
 
 with X the positions in the first frame. A model that carries no stress of its own, as grids and
 graphs do not, can tell by it which way elastic bodies push back. F is the least-squares gradient of
-the mean displacements at the nodes around X: exact for affine motion, whatever the edges of a body.
+the mean displacements at the nodes around X, good for affine motion up to the edges of a body. What is
+thinner than a cell and turns far looks strained.
 """
 
 from __future__ import annotations
@@ -44,9 +45,11 @@ class Rest:
         stencil = grid.stencil(position, layer)
         count = grid.spread(stencil, torch.ones_like(position[:, :1]), layers)
         offsets = stencil.weight[:, :, None] * grid.offsets(stencil, position)
-        spread = torch.einsum("pnd,pne->pde", _around(grid, stencil, count, position), offsets)
         slack = SLACK * grid.spacing**2 * torch.eye(2, device=position.device)
-        return cls(grid, position, stencil, count, offsets @ torch.linalg.inv(spread + slack))
+        with torch.autocast(position.device.type, enabled=False):  # three digits are too few for a strain
+            spread = torch.einsum("pnd,pne->pde", _around(grid, stencil, count, position), offsets)
+            lever = offsets @ torch.linalg.inv(spread + slack)
+        return cls(grid, position, stencil, count, lever)
 
     def strain(self, position: Tensor) -> Tensor:
         """Return ``tanh(e / 0.2)`` as (xx, xy, yy) [1], shape [particle, 3].
@@ -55,8 +58,9 @@ class Rest:
             position: x, positions of the same particles now [length], shape [particle, 2].
         """
         moved = _around(self.grid, self.stencil, self.count, position - self.position)
-        gradient = torch.einsum("pnd,pne->pde", moved, self.lever)  # F - 1
-        strain = 0.5 * (gradient + gradient.mT + gradient @ gradient.mT)
+        with torch.autocast(position.device.type, enabled=False):
+            gradient = torch.einsum("pnd,pne->pde", moved, self.lever)  # F - 1
+            strain = 0.5 * (gradient + gradient.mT + gradient @ gradient.mT)
         return (strain.flatten(1)[:, [0, 1, 3]] / UNIT).tanh()
 
 

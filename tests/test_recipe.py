@@ -72,6 +72,17 @@ def test_layers(entry: Entry) -> None:
     assert (long.training.schedule.factor, long.training.schedule.every) == (0.5, 10)
 
 
+def test_trainings_of_before_an_option_go_on() -> None:
+    """A record says an option that came later only where it is not what was done before."""
+    entry = find("neuralmpm")
+    before = recipe_for(entry, "fluid", "tiny").as_json()
+    assert not {"strain", "mixture", "pushforward", "recovery"} & set(before["model"])
+    assert not {"ema", "compile"} & set(before["training"])
+    after = recipe_for(entry, "fluid", "tiny", settings=["model.strain=true", "training.ema=0.9"]).as_json()
+    assert (after["model"].pop("strain"), after["training"].pop("ema")) == (True, 0.9)
+    assert after == before
+
+
 def test_steps_and_epochs_replace_each_other(entry: Entry) -> None:
     """A later layer that counts epochs drops the steps below it."""
     changed = recipe_for(entry, "cavity", "tiny", settings=["training.epochs=2"]).training

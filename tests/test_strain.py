@@ -50,6 +50,16 @@ def test_affine_motion_has_the_strain_of_its_matrix(gradient: list[list[float]])
     np.testing.assert_allclose(found.mean(dim=0).numpy(), expected, rtol=0, atol=0.02)
 
 
+def test_half_precision_is_none_of_a_strain() -> None:
+    """Where layers multiply in bfloat16, strain has the bits that it has in a rollout."""
+    first = cloud(0)
+    turned = (first - 0.5) @ torch.tensor([[0.0, 1.0], [-1.0, 0.0]]) + 0.5
+    expected = rest(first).strain(turned)
+    with torch.autocast("cpu", torch.bfloat16):
+        found = rest(first).strain(turned)
+    assert torch.equal(found, expected)
+
+
 def test_bodies_in_layers_of_their_own_fly_apart_unstrained() -> None:
     """Two that lie in each other at first and part: neither is strained."""
     first = cloud(0)

@@ -198,7 +198,7 @@ _MODELS = (
     Model("neuralmpm-long", "NeuralMPM from its own rollouts", varied="neuralmpm", recipe="long"),
     Model(
         "neuralmpm-unmixed",
-        "NeuralMPM from its own rollouts, materials apart",
+        "NeuralMPM, materials apart",
         varied="neuralmpm",
         settings=("model.mixture=false",),
     ),
@@ -206,7 +206,7 @@ _MODELS = (
         "neuralmpm-unrolled",
         "NeuralMPM, 16 frames unrolled",
         varied="neuralmpm",
-        settings=("model.calls=4",),
+        recipe="unrolled",
     ),
     Model("mlp", "MLP", "#0072b2"),
     Model("lstm", "LSTM", "#009e73"),
