@@ -244,7 +244,7 @@ def test_the_mean_of_the_weights_is_published(run: Run, monkeypatch: pytest.Monk
 
     def watched(self: torch.optim.AdamW, *args: Any, **kwargs: Any) -> Any:
         out = step(self, *args, **kwargs)
-        seen.append(float(self.param_groups[0]["params"][0]))
+        seen.append(float(self.param_groups[0]["params"][0].detach()))
         return out
 
     monkeypatch.setattr(torch.optim.AdamW, "step", watched)
