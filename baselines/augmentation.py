@@ -9,10 +9,9 @@ velocities of the given frames are moved by a random walk, the positions by its 
 predict move with the last given position, so that the target is the true next velocity, and the
 acceleration that leads to it undoes the noise.
 
-What rollouts come to is farther off than any noise. Where a training rolls its windows out for a
-random number of steps without gradients first (the pushforward trick of Brandstetter, Worrall and
-Welling 2022, arXiv 2202.03376), the model learns from there, and what it is to do there is to come
-back: :func:`way_back` is added to the true velocity.
+What rollouts come to is farther off than any noise. Where a training rolls its windows out without
+gradients first (the pushforward trick of Brandstetter, Worrall and Welling 2022, arXiv 2202.03376),
+the model learns from there to come back: :func:`way_back` is added to the true velocity.
 """
 
 from __future__ import annotations

@@ -70,7 +70,6 @@ class GridState:
     walls: Tensor
     context: Tensor  # what the given frames told, shape [window, context]
     rest: Rest | None = None  # None where strain is not asked for
-    solid: Tensor | None = None  # 1 for solids, 0 for liquid, shape [particle, 1]
     coming: tuple[Tensor, ...] = ()  # predicted positions that are not yet given out
 
 
@@ -191,7 +190,7 @@ class NeuralMPM(Baseline):
 
     @property
     def future(self) -> int:
-        """Frames of all calls that training unrolls."""
+        """Frames of the calls that training makes: those without gradients and those it unrolls."""
         return self.options.bundle * (self.options.calls + self.options.pushforward)
 
     @property
@@ -259,8 +258,10 @@ class NeuralMPM(Baseline):
         )
         if self.options.strain:
             layers = given.windows * len(self.options.materials)
-            rest = Rest.of(self.grid, first_frame(given), state.layer, layers)
-            state = replace(state, rest=rest, solid=(given.material != LIQUID).to(position.dtype)[:, None])
+            solid = given.material != LIQUID
+            state = replace(
+                state, rest=Rest.of(self.grid, first_frame(given), state.layer, layers, solid=solid)
+            )
         if self.context is None:
             return state
         fields, _ = self._fields(state, self.grid.stencil(state.position, state.layer))
@@ -311,8 +312,8 @@ class NeuralMPM(Baseline):
         windows = len(state.walls)
         layers = windows * len(self.options.materials)
         carried = [torch.ones_like(state.position[:, :1]), state.velocity.flatten(1)]
-        if state.rest is not None and state.solid is not None:
-            carried.append(state.rest.strain(state.position) * state.solid)
+        if state.rest is not None:
+            carried.append(state.rest.strain(state.position))
         sums = self.grid.spread(stencil, torch.cat(carried, dim=1), layers)
         weight = sums[:, :1] / self.unit
         means = sums[:, 1:] / self.unit / weight.clamp(min=EMPTY)

@@ -192,8 +192,6 @@ class GraphNetworkOptions(Options):
     link_weight: float | None = Field(default=None, ge=0.0, allow_inf_nan=False)
     # own steps that the loss is averaged over; gradients pass through all
     rollout_loss_steps: int = Field(default=1, ge=1)
-    # most own steps before those, without gradients: training sees what rollouts come to
-    pushforward: int = Field(default=0, ge=0)
     wall_velocity: bool = False  # whether the velocities of moving walls in the next frame are features
     # how far a particle sees a wall [radius]; the solver's grid carries a wall's effect beyond one radius
     wall_reach: float = Field(default=3.0, gt=0.0, allow_inf_nan=False)
@@ -261,8 +259,8 @@ class GraphNetwork(Baseline):
 
     @property
     def future(self) -> int:
-        """Frames to predict in training: the steps without gradients and those of the loss."""
-        return self.options.pushforward + self.options.rollout_loss_steps
+        """Frames to predict in training: as many as the loss has rollout steps."""
+        return self.options.rollout_loss_steps
 
     @property
     def weights(self) -> Mapping[str, float]:
@@ -293,15 +291,8 @@ class GraphNetwork(Baseline):
         state = self.start(batch.part(slice(self.history)))
         if generator is not None and options.forgetful > 0.0:
             state = self._forgetful(state, batch.windows, generator)
-        first = self.history
-        if generator is not None and options.pushforward:
-            most = options.pushforward + 1
-            with torch.no_grad():
-                for _ in range(int(torch.randint(most, (), generator=generator, device=generator.device))):
-                    state, _ = self.step(state)
-                    first += 1
         steps = []
-        for frame in range(first, first + options.rollout_loss_steps):
+        for frame in range(self.history, self.history + self.future):
             following, own = self.step(state, generator)
             target = batch.position[:, frame]
             velocity = target - batch.position[:, frame - 1]

@@ -39,8 +39,18 @@ class Rest:
     lever: Tensor
 
     @classmethod
-    def of(cls, grid: ParticleGrid, position: Tensor, layer: Tensor, layers: int) -> Rest:
-        """Return what F needs; bodies that do not mix have layers of their own."""
+    def of(
+        cls, grid: ParticleGrid, position: Tensor, layer: Tensor, layers: int, *, solid: Tensor | None = None
+    ) -> Rest:
+        """Return what F needs.
+
+        Args:
+            grid: where displacements are averaged.
+            position: X [length], shape [particle, 2].
+            layer: layer of each particle, int64, shape [particle]; bodies that do not mix have their own.
+            layers: number of layers.
+            solid: who shows a strain, bool, shape [particle]; all by default.
+        """
         position = position.clamp(grid.low, grid.high)
         stencil = grid.stencil(position, layer)
         count = grid.spread(stencil, torch.ones_like(position[:, :1]), layers)
@@ -49,6 +59,8 @@ class Rest:
         with torch.autocast(position.device.type, enabled=False):  # three digits are too few for a strain
             spread = torch.einsum("pnd,pne->pde", _around(grid, stencil, count, position), offsets)
             lever = offsets @ torch.linalg.inv(spread + slack)
+        if solid is not None:
+            lever = lever * solid[:, None, None]
         return cls(grid, position, stencil, count, lever)
 
     def strain(self, position: Tensor) -> Tensor:

@@ -19,6 +19,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from scipy.special import comb
 from simple_models import FACTS, Drift, trainer
 from torch import Tensor
 
@@ -237,8 +238,22 @@ def test_gradients_are_clipped(run: Run, monkeypatch: pytest.MonkeyPatch) -> Non
     assert seen[2:] == pytest.approx([0.001, 0.001], rel=1e-3)
 
 
-def test_the_mean_of_the_weights_is_published(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is what pandas makes of the weights after each step; training goes on from the last ones."""
+def constant(seen: list[float]) -> list[float]:
+    """Return the means that keep a tenth of themselves, by pandas."""
+    return [float(mean) for mean in pd.Series(seen).ewm(alpha=0.9, adjust=False).mean()]
+
+
+def rising(seen: list[float]) -> list[float]:
+    """Return the means that keep n / (n + 9): binomial weights C(k + 8, 8), which sum to C(n + 9, 9)."""
+    weighted = [seen[0], *(comb(k + 8, 8) * x for k, x in enumerate(seen, start=1))]
+    return [float(sum(weighted[: n + 1]) / comb(n + 9, 9)) for n in range(1, len(seen) + 1)]
+
+
+@pytest.mark.parametrize(("ema", "expected"), [(0.1, constant), (0.9, rising)])
+def test_the_mean_of_the_weights_is_published(
+    run: Run, monkeypatch: pytest.MonkeyPatch, ema: float, expected: Callable[[list[float]], list[float]]
+) -> None:
+    """Bounded by a share, rising towards it; training goes on from the last weights."""
     seen: list[float] = []
     step = torch.optim.AdamW.step
 
@@ -248,8 +263,8 @@ def test_the_mean_of_the_weights_is_published(run: Run, monkeypatch: pytest.Monk
         return out
 
     monkeypatch.setattr(torch.optim.AdamW, "step", watched)
-    result = run("drift", "steps=6", "learning_rate=0.1", "validate_every=2", "ema=0.1")
-    means = pd.Series(seen).ewm(alpha=0.9, adjust=False).mean().tolist()
+    result = run("drift", "steps=6", "learning_rate=0.1", "validate_every=2", f"ema={ema}")
+    means = expected(seen)
     assert float(weights(result.checkpoint)["a"]) == pytest.approx(seen[-1], rel=1e-6)
     best = means[(result.best_step or 0) - 1]
     assert float(weights(result.weights)["a"]) == float(torch.tensor(best).bfloat16())
