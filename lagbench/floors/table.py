@@ -7,13 +7,20 @@ from types import MappingProxyType
 
 from lagbench.data.registry import Size
 
-from . import analog, coarse_solver, constant_velocity, free_flight, frozen_field, persistence
+from . import analog, coarse_solver, extrapolation, frozen_field
 from .floor import Floor
 
 FLOORS: Mapping[str, Floor] = MappingProxyType(
     {
-        module.FLOOR.name: module.FLOOR
-        for module in (persistence, constant_velocity, frozen_field, free_flight, analog, coarse_solver)
+        floor.name: floor
+        for floor in (
+            extrapolation.PERSISTENCE,
+            extrapolation.CONSTANT_VELOCITY,
+            frozen_field.FLOOR,
+            extrapolation.FREE_FLIGHT,
+            analog.FLOOR,
+            coarse_solver.FLOOR,
+        )
     }
 )
 """All floors by name, in the order in which they are shown."""

@@ -12,7 +12,7 @@ from lagbench.data.layout import resolve_root
 from lagbench.data.local import rooted
 from lagbench.data.registry import Registry
 from lagbench.errors import UnreadableFileError, UsageError, nearest
-from lagbench.floors import persistence
+from lagbench.floors import extrapolation
 from lagbench.floors.shipped import shipped
 from lagbench.metrics.aggregate import Score, Tally, aggregate
 from lagbench.metrics.metric import Metric
@@ -222,6 +222,6 @@ def _flags(
     traces = [outcome.trace for outcome in outcomes]
     error, still = (
         np.asarray(np.mean(scores[row]["position_rmse"].per_frame, axis=0))
-        for row in (SUBMISSION, persistence.FLOOR.name)
+        for row in (SUBMISSION, extrapolation.PERSISTENCE.name)
     )
     return copy_suspect(traces), below_twin_floor(error, still, task.twin_floor), physics(traces)

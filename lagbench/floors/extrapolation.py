@@ -1,0 +1,66 @@
+"""Extrapolations: every particle goes on by itself, and stops at the walls.
+
+With n given frames, u = x(n-1) - x(n-2) and g = -gravity * frame_interval^2, k frames on:
+
+    persistence        x(n-1)
+    constant velocity  x(n-1) + k u
+    free flight        x(n-1) + k u + g k (k + 1) / 2
+
+Free flight is exact until a body meets a wall or another body.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lagbench.data.registry import Size
+
+from .floor import Floor, Given, Prediction, fills_box
+
+
+def at_rest(given: Given) -> Prediction:
+    """Yield the last given positions."""
+    last = given.last.astype("float32")
+    return (last for _ in given.predicted_frames)
+
+
+def on_lines(given: Given) -> Prediction:
+    """Yield positions on straight lines."""
+    for k, _ in enumerate(given.predicted_frames, start=1):
+        yield given.inside(given.last + k * given.step).astype("float32")
+
+
+def on_parabolas(given: Given) -> Prediction:
+    """Yield positions on parabolas."""
+    g = np.array([0.0, -float(given.size.value("gravity"))]) * given.size.frame_interval**2
+    for k, _ in enumerate(given.predicted_frames, start=1):
+        yield given.inside(given.last + k * given.step + g * (k * (k + 1) / 2)).astype("float32")
+
+
+def _falls(size: Size) -> bool:
+    return not fills_box(size) and "gravity" in size.parameters
+
+
+PERSISTENCE = Floor(
+    name="persistence",
+    title="Persistence",
+    definition="The last given frame, repeated.",
+    applies=lambda _: True,
+    predict=at_rest,
+)
+
+CONSTANT_VELOCITY = Floor(
+    name="constant-velocity",
+    title="Constant velocity",
+    definition="Every particle keeps its last given velocity and stops at the walls.",
+    applies=lambda _: True,
+    predict=on_lines,
+)
+
+FREE_FLIGHT = Floor(
+    name="free-flight",
+    title="Free flight",
+    definition="Every particle falls freely from its last given velocity and stops at the walls.",
+    applies=_falls,
+    predict=on_parabolas,
+)
