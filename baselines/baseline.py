@@ -42,6 +42,7 @@ class Baseline(nn.Module):
     Class attributes:
         Options: the model's options, a subclass of :class:`Options`; recipes fill it.
         method: what the board calls it.
+        any_size: whether weights of one size can be run at another: more particles, closer to each other.
 
     Args:
         options: the model's options.
@@ -50,6 +51,7 @@ class Baseline(nn.Module):
 
     Options: ClassVar[type[Options]] = Options
     method: ClassVar[str]
+    any_size: ClassVar[bool] = False
 
     def __init__(self, options: Any, facts: Facts) -> None:  # noqa: ANN401 (each has its own)
         super().__init__()

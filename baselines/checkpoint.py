@@ -33,7 +33,7 @@ from torch.nn.parameter import is_lazy
 from lagbench.atomic import atomic_path
 from lagbench.data.hdf5 import check_regular
 from lagbench.data.registry import Registry
-from lagbench.errors import DataError, LagbenchError, UnreadableFileError, WorkFailedError
+from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError, WorkFailedError
 
 from .baseline import Baseline, Facts, facts_of
 from .catalogue import find
@@ -253,17 +253,54 @@ def rounded_weights(model: nn.Module) -> dict[str, Tensor]:
     }
 
 
-def check_data(checkpoint: Checkpoint, *, root: Path, registry: Registry | None = None, where: str) -> Facts:
-    """Check that the data at hand are those that the model was trained on; return their facts."""
+def check_data(
+    checkpoint: Checkpoint,
+    *,
+    root: Path,
+    registry: Registry | None = None,
+    size: str | None = None,
+    where: str,
+) -> Facts:
+    """Check that a model can be run on the data at hand; return their facts.
+
+    Args:
+        checkpoint: the model and the facts of what it was trained on.
+        root: folder of all data sets.
+        registry: where splits are described; ours when None.
+        size: size of the split to run it on; that of its training when None.
+        where: what errors name.
+
+    Raises:
+        DataError: the data are not there, or not of the version that it was trained on.
+        UsageError: the model knows one size only, or box or frames of the other are not those of its own.
+    """
     trained = checkpoint.facts
-    here = facts_of(trained.split, trained.size, root=root, registry=registry)
-    if here.dataset_sha256 != trained.dataset_sha256:
+    other = size is not None and size != trained.size
+    entry = find(checkpoint.baseline)
+    if other and not entry.model.any_size:
+        raise UsageError(
+            f"{entry.model.method} has weights for the particles of one size",
+            where="--size",
+            expected=trained.size,
+            got=size,
+            fix=f"train it there: lagbench train --baseline {entry.name} {trained.split} --size {size}",
+        )
+    here = facts_of(trained.split, size or trained.size, root=root, registry=registry)
+    if here.version != trained.version if other else here.dataset_sha256 != trained.dataset_sha256:
         raise DataError(
             "the model was trained on another version of the data set",
             where=where,
             expected=f"{trained.split} {trained.size} {trained.version}, hash {trained.dataset_sha256}",
             got=f"{here.version}, hash {here.dataset_sha256}",
             fix="train again on the data at hand, or generate the version that it was trained on",
+        )
+    if (here.bounds, here.frame_interval) != (trained.bounds, trained.frame_interval):
+        raise UsageError(
+            f"sizes {trained.size} and {here.size} of {trained.split} differ in more than resolution",
+            where="--size",
+            expected=f"box {trained.bounds}, {trained.frame_interval:g} s between frames",
+            got=f"box {here.bounds}, {here.frame_interval:g} s",
+            fix=f"train at size {here.size}",
         )
     return here
 

@@ -148,6 +148,7 @@ class NeuralMPM(Baseline):
     Options = NeuralMPMOptions
     options: NeuralMPMOptions
     method = "NeuralMPM"
+    any_size = True
 
     slot: Tensor
     geometry: Tensor

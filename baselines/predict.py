@@ -10,7 +10,7 @@ import json
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +65,7 @@ def predict(
     output: str | Path = "predictions.nc",
     *,
     root: str | Path | None = None,
+    size: str | None = None,
     device: str = "auto",
     threads: int | None = None,
     batch: int | None = None,
@@ -73,7 +74,9 @@ def predict(
     progress: Callable[[Progress], None] | None = None,
     registry: Registry | None = None,
 ) -> PredictionResult:
-    """Predict every test scenario of the data set that a model was trained on.
+    """Predict every test scenario of the data set that a model was trained on, or of another size of it.
+
+    At another size the connectivity radius is that size's; statistics stay those of the training.
 
     Where a training.json beside the checkpoint says that its training is not over, there is an
     :class:`UnfinishedWarning`.
@@ -82,6 +85,7 @@ def predict(
         checkpoint: weights.pt or checkpoint.pt of a training.
         output: file to write; ``<name>.json`` beside it says what it cost.
         root: folder of all data sets; else ``LAGBENCH_ROOT``, else the user data folder.
+        size: size of the split to predict; that of the training when None.
         device: ``cpu``, ``cuda`` or ``auto``.
         threads: threads on the CPU; one per core by default.
         batch: scenarios side by side; 1 on a CPU and all on a GPU by default.
@@ -94,7 +98,7 @@ def predict(
     Raises:
         UnreadableFileError: the checkpoint is damaged or unsafe.
         DataError: the data set is missing, damaged, or not the one of the training.
-        UsageError: the model's baseline is not installed, or no such device.
+        UsageError: the model's baseline is not installed, no such device, or weights for one size only.
         WorkFailedError: out of memory, or the disk is full.
     """
     found = load(checkpoint)
@@ -109,7 +113,9 @@ def predict(
         )
     home = resolve_root(root)
     known = rooted(home, registry)
-    facts = check_data(found, root=home, registry=known, where=str(checkpoint))
+    facts = check_data(found, root=home, registry=known, size=size, where=str(checkpoint))
+    provenance = _provenance(found)
+    found = replace(found, facts=replace(found.facts, radius=facts.radius, particles=facts.particles))
     machine = chosen_device(device)
     bound_memory()
     tests = scenario_paths(facts.split, subset="test", size=facts.size, root=home, registry=known)
@@ -130,7 +136,7 @@ def predict(
             registry=known,
             device=hardware_label,
             parameters=count,
-            **_provenance(found),
+            **provenance,
         )
         meter, timed = Meter(progress), None
         meter.begin("predicting", total=len(paths), scenarios=len(paths))

@@ -211,6 +211,7 @@ class GraphNetwork(Baseline):
 
     Options = GraphNetworkOptions
     options: GraphNetworkOptions
+    any_size = True
     operator: ClassVar[type[Operator]]
 
     def __init__(self, options: GraphNetworkOptions, facts: Facts) -> None:

@@ -6,6 +6,7 @@ import json
 import os
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -18,7 +19,7 @@ from simple_models import FACTS, Bursting, Drift, State, install
 from torch import Tensor
 
 from lagbench.baselines import predict as prediction
-from lagbench.baselines.baseline import Batch, facts_of
+from lagbench.baselines.baseline import Batch, Facts, facts_of
 from lagbench.baselines.checkpoint import Checkpoint, save
 from lagbench.baselines.job import MOST_RECORD, OVER
 from lagbench.baselines.machine import threads_used
@@ -41,16 +42,28 @@ UNFINISHED = {
 """Record of a training whose weights the fixture has, and which goes on."""
 
 
+class Scaled(Drift):
+    """A Drift that may be run at any size, and keeps the facts that it was last told."""
+
+    any_size = True
+    told: Facts
+
+    def __init__(self, options: Any, facts: Facts) -> None:
+        super().__init__(options, facts)
+        Scaled.told = facts
+
+
 @pytest.fixture
 def run(
     generated: GenerationResult, unmeasured: Registry, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Predict:
     """Predict with an untrained simple model on one thread."""
-    install(monkeypatch, drift=Drift, bursting=Bursting)
+    install(monkeypatch, drift=Drift, bursting=Bursting, scaled=Scaled)
 
     def call(baseline: str = "drift", start: float = 1.0, **options: Any) -> PredictionResult:
         root = options.pop("root", generated.root)
-        facts = facts_of("curl-noise", "tiny", root=root, registry=unmeasured)
+        here = facts_of("curl-noise", "tiny", root=root, registry=unmeasured)
+        facts = options.pop("facts", here)
         model = Drift.build({"start": start, **options.pop("model", {})}, facts)
         stored = Checkpoint(
             baseline=baseline,
@@ -247,6 +260,29 @@ def test_mistakes(run: Predict, generated: GenerationResult, tmp_path: Path) -> 
         predict(tmp_path / "none.pt", result.path, root=generated.root)
     with pytest.raises(UsageError, match="no device 'tpu'"):
         run(device="tpu")
+
+
+def test_another_size_than_that_of_the_training(
+    run: Predict, generated: GenerationResult, unmeasured: Registry
+) -> None:
+    """A model of any size is told the radius and the particles there; its statistics are its own."""
+    here = facts_of("curl-noise", "tiny", root=generated.root, registry=unmeasured)
+    trained = replace(here, size="mini", dataset_sha256="0" * 64, particles=7, radius=0.5)
+    trained = replace(trained, statistics=dict.fromkeys(here.statistics, (1.0, 1.0)))
+    result = run("scaled", start=0.5, facts=trained, size="tiny")
+    told = Scaled.told
+    assert (result.size, told.radius, told.particles) == ("tiny", here.radius, here.particles)
+    assert told.statistics == trained.statistics
+    assert np.array_equal(written(result.path), written(run(start=0.5, name="own.nc").path))
+    report = examine(result.path, root=generated.root, registry=unmeasured)
+    assert report.valid, report.findings
+    other = replace(trained, frame_interval=2.0 * here.frame_interval)
+    for name, facts in (("drift", trained), ("scaled", other)):
+        with pytest.raises(UsageError) as refused:
+            run(name, size="tiny", facts=facts)
+        assert refused.value.where == "--size"
+    with pytest.raises(DataError):
+        run("scaled", size="tiny", facts=replace(trained, version="0.9.0"))
 
 
 def test_out_of_memory(run: Predict, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -205,6 +205,10 @@ def predict(
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="File to write.")] = Path(
         "predictions.nc"
     ),
+    size: Annotated[
+        str | None,
+        typer.Option("--size", metavar="NAME", help="Another size than that of the training, as in full."),
+    ] = None,
     root: RootOption = None,
     device: DeviceOption = "auto",
     threads: ThreadsOption = None,
@@ -240,6 +244,7 @@ def predict(
             checkpoint,
             output,
             root=root,
+            size=size,
             device=device,
             threads=threads,
             batch=batch,
