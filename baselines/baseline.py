@@ -42,7 +42,7 @@ class Baseline(nn.Module):
     Class attributes:
         Options: the model's options, a subclass of :class:`Options`; recipes fill it.
         method: what the board calls it.
-        any_size: whether weights of one size can be run at another: more particles, closer to each other.
+        any_size: whether weights of one size can be run at another: other particles, other distances.
 
     Args:
         options: the model's options.

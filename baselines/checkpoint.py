@@ -33,6 +33,7 @@ from torch.nn.parameter import is_lazy
 from lagbench.atomic import atomic_path
 from lagbench.data.hdf5 import check_regular
 from lagbench.data.registry import Registry
+from lagbench.data.registry import load as load_registry
 from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError, WorkFailedError
 
 from .baseline import Baseline, Facts, facts_of
@@ -272,35 +273,45 @@ def check_data(
 
     Raises:
         DataError: the data are not there, or not of the version that it was trained on.
-        UsageError: the model knows one size only, or box or frames of the other are not those of its own.
+        UsageError: no such size, the model knows one only, or box or frames there are others.
     """
-    trained = checkpoint.facts
-    other = size is not None and size != trained.size
-    entry = find(checkpoint.baseline)
-    if other and not entry.model.any_size:
-        raise UsageError(
-            f"{entry.model.method} has weights for the particles of one size",
-            where="--size",
-            expected=trained.size,
-            got=size,
-            fix=f"train it there: lagbench train --baseline {entry.name} {trained.split} --size {size}",
-        )
-    here = facts_of(trained.split, size or trained.size, root=root, registry=registry)
-    if here.version != trained.version if other else here.dataset_sha256 != trained.dataset_sha256:
+    trained, known = checkpoint.facts, registry or load_registry()
+    if size in (None, trained.size):
+        here = facts_of(trained.split, trained.size, root=root, registry=known)
+        expected, got = trained.dataset_sha256, here.dataset_sha256
+    else:
+        here = _facts_at(checkpoint, known.size(trained.split, str(size)).name, root=root, registry=known)
+        measured = known.size(trained.split, trained.size).measured
+        if measured is not None:
+            expected, got = trained.dataset_sha256, measured.dataset_sha256
+        else:
+            expected, got = (one.version.partition(".")[0] for one in (trained, here))
+    if expected != got:
         raise DataError(
             "the model was trained on another version of the data set",
             where=where,
-            expected=f"{trained.split} {trained.size} {trained.version}, hash {trained.dataset_sha256}",
-            got=f"{here.version}, hash {here.dataset_sha256}",
+            expected=f"{trained.split} {trained.size} {trained.version}, {expected}",
+            got=f"{here.version}, {got}",
             fix="train again on the data at hand, or generate the version that it was trained on",
         )
+    return here
+
+
+def _facts_at(checkpoint: Checkpoint, size: str, *, root: Path, registry: Registry) -> Facts:
+    """Return the facts of another size than that of the training, for a model that can be run there."""
+    trained, entry = checkpoint.facts, find(checkpoint.baseline)
+    train = f"train it there: lagbench train --baseline {entry.name} {trained.split} --size {size}"
+    if not entry.model.any_size:
+        message = f"{entry.model.method} has weights for the particles of one size"
+        raise UsageError(message, where="--size", expected=trained.size, got=size, fix=train)
+    here = facts_of(trained.split, size, root=root, registry=registry)
     if (here.bounds, here.frame_interval) != (trained.bounds, trained.frame_interval):
         raise UsageError(
-            f"sizes {trained.size} and {here.size} of {trained.split} differ in more than resolution",
+            f"sizes {trained.size} and {size} of {trained.split} differ in more than resolution",
             where="--size",
             expected=f"box {trained.bounds}, {trained.frame_interval:g} s between frames",
             got=f"box {here.bounds}, {here.frame_interval:g} s",
-            fix=f"train at size {here.size}",
+            fix=train,
         )
     return here
 

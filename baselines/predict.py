@@ -7,6 +7,7 @@ step to warm up; that of the neighbour search is measured on frames of the same 
 from __future__ import annotations
 
 import json
+import math
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
@@ -45,6 +46,7 @@ class PredictionResult:
     path: Path  # the predictions.nc
     split: str  # name of the split
     size: str  # name of the size
+    trained_size: str  # name of the size that the model was trained at
     method: str  # what made it
     scenarios: int  # scenarios predicted
     frames: int  # frames of each
@@ -76,7 +78,8 @@ def predict(
 ) -> PredictionResult:
     """Predict every test scenario of the data set that a model was trained on, or of another size of it.
 
-    At another size the connectivity radius is that size's; statistics stay those of the training.
+    At another size the connectivity radius keeps its ratio to the distance of particles, and statistics stay
+    those of the training.
 
     Where a training.json beside the checkpoint says that its training is not over, there is an
     :class:`UnfinishedWarning`.
@@ -97,8 +100,8 @@ def predict(
 
     Raises:
         UnreadableFileError: the checkpoint is damaged or unsafe.
-        DataError: the data set is missing, damaged, or not the one of the training.
-        UsageError: the model's baseline is not installed, no such device, or weights for one size only.
+        DataError: the data set is missing, damaged, or of another version than that of the training.
+        UsageError: the model's baseline is not installed, no such device, or weights of no use at the size.
         WorkFailedError: out of memory, or the disk is full.
     """
     found = load(checkpoint)
@@ -114,8 +117,9 @@ def predict(
     home = resolve_root(root)
     known = rooted(home, registry)
     facts = check_data(found, root=home, registry=known, size=size, where=str(checkpoint))
-    provenance = _provenance(found)
-    found = replace(found, facts=replace(found.facts, radius=facts.radius, particles=facts.particles))
+    provenance, trained_size = _provenance(found, facts), found.facts.size
+    if facts.size != found.facts.size:
+        found = replace(found, facts=_rescaled(found.facts, facts))
     machine = chosen_device(device)
     bound_memory()
     tests = scenario_paths(facts.split, subset="test", size=facts.size, root=home, registry=known)
@@ -151,6 +155,7 @@ def predict(
         path=Path(output),
         split=facts.split,
         size=facts.size,
+        trained_size=trained_size,
         method=label,
         scenarios=len(paths),
         frames=facts.horizon,
@@ -222,8 +227,20 @@ class _Rollouts:
         return time.process_time() if self.clock == "processor" else time.perf_counter()
 
 
-def _provenance(checkpoint: Checkpoint) -> dict[str, Any]:
-    """Return seed, training in words and its budget, for the file's attributes."""
+def _rescaled(trained: Facts, here: Facts) -> Facts:
+    """Return the facts of a size for weights of another: what they multiply stays as it was trained.
+
+    Bodies fill the same area with more or fewer particles: their distance goes with the root of that.
+    """
+    radius = trained.radius * math.sqrt(trained.particles / here.particles)
+    return replace(here, radius=radius, statistics=trained.statistics)
+
+
+def _provenance(checkpoint: Checkpoint, here: Facts) -> dict[str, Any]:
+    """Return seed, training in words and its budget, for the file's attributes.
+
+    Validations at another size than the one predicted are left out: they compare with none there.
+    """
     facts, done = checkpoint.facts, checkpoint.training
     recipe = done.get("recipe", {})
     options = recipe.get("training", {})
@@ -231,4 +248,10 @@ def _provenance(checkpoint: Checkpoint) -> dict[str, Any]:
     words = f"{facts.split} {facts.size} {subsets}, recipe {recipe.get('name')}, step {done.get('step', 0)}"
     found: dict[str, Any] = {"training": words, "seed": int(options.get("seed", 0))}
     budget = budget_in(json.dumps(done.get("budget")))
-    return found if budget is None else {**found, "budget": budget.model_dump_json(exclude_defaults=True)}
+    if budget is None:
+        return found
+    if here.size != facts.size:
+        budget = budget.model_copy(
+            update=dict.fromkeys(("metric", "best", "best_step")) | {"validations": ()}
+        )
+    return {**found, "budget": budget.model_dump_json(exclude_defaults=True)}

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from lagbench.baselines import predict as prediction
 from lagbench.baselines.baseline import Batch, Facts, facts_of
+from lagbench.baselines.catalogue import every_entry
 from lagbench.baselines.checkpoint import Checkpoint, save
 from lagbench.baselines.job import MOST_RECORD, OVER
 from lagbench.baselines.machine import threads_used
@@ -265,24 +266,63 @@ def test_mistakes(run: Predict, generated: GenerationResult, tmp_path: Path) -> 
 def test_another_size_than_that_of_the_training(
     run: Predict, generated: GenerationResult, unmeasured: Registry
 ) -> None:
-    """A model of any size is told the radius and the particles there; its statistics are its own."""
+    """Four times as many particles are half as far apart; figures there, statistics of the training."""
     here = facts_of("curl-noise", "tiny", root=generated.root, registry=unmeasured)
-    trained = replace(here, size="mini", dataset_sha256="0" * 64, particles=7, radius=0.5)
-    trained = replace(trained, statistics=dict.fromkeys(here.statistics, (1.0, 1.0)))
-    result = run("scaled", start=0.5, facts=trained, size="tiny")
-    told = Scaled.told
-    assert (result.size, told.radius, told.particles) == ("tiny", here.radius, here.particles)
-    assert told.statistics == trained.statistics
+    ones = dict.fromkeys(here.statistics, (1.0, 1.0))
+    trained = replace(here, size="mini", dataset_sha256="0" * 64, radius=0.5, horizon=3, statistics=ones)
+    trained = replace(trained, particles=4 * here.particles)
+    budget = {
+        "cpu_hours": 0.1,
+        "steps": 9,
+        "metric": "vorticity_nrmse",
+        "best": 0.2,
+        "validations": [[9, 0.2]],
+    }
+    result = run("scaled", start=0.5, facts=trained, size="tiny", training={"budget": budget})
+    assert (result.size, result.trained_size) == ("tiny", "mini")
+    assert Scaled.told == replace(here, radius=1.0, statistics=ones)
     assert np.array_equal(written(result.path), written(run(start=0.5, name="own.nc").path))
     report = examine(result.path, root=generated.root, registry=unmeasured)
     assert report.valid, report.findings
+    with netCDF4.Dataset(result.path) as data:
+        assert json.loads(data.getncattr("budget")) == {"cpu_hours": 0.1, "steps": 9}
+        assert data.getncattr("training").startswith("curl-noise mini train")
     other = replace(trained, frame_interval=2.0 * here.frame_interval)
-    for name, facts in (("drift", trained), ("scaled", other)):
-        with pytest.raises(UsageError) as refused:
-            run(name, size="tiny", facts=facts)
-        assert refused.value.where == "--size"
+    for name, facts, size in (
+        ("drift", trained, "tiny"),
+        ("scaled", other, "tiny"),
+        ("scaled", trained, "small"),
+    ):
+        with pytest.raises(UsageError):
+            run(name, size=size, facts=facts)
     with pytest.raises(DataError):
         run("scaled", size="tiny", facts=replace(trained, version="0.9.0"))
+
+
+def test_at_its_own_size_a_model_keeps_its_radius(run: Predict, generated: GenerationResult) -> None:
+    """Hashes do not hold the radius: that of the training counts."""
+    here = facts_of("curl-noise", "tiny", root=generated.root)
+    run("scaled", facts=replace(here, radius=0.5))
+    assert Scaled.told.radius == 0.5
+
+
+def test_models_of_any_size_have_the_same_weights_at_each() -> None:
+    """No parameter of theirs depends on the number of particles; MLPs and the like are not among them."""
+    statistics = {
+        f"{name}_{of}": (0.5, 0.5)
+        for name in ("position", "velocity", "acceleration")
+        for of in ("mean", "std")
+    }
+    small = replace(FACTS, statistics=statistics)
+    large = replace(small, size="full", particles=12, radius=0.05)
+    models = {name: entry.model for name, entry in every_entry().items() if entry.model.any_size}
+    assert {"neuralmpm", "gns", "supergat"} <= set(models) <= set(every_entry()) - {"mlp", "lstm", "var"}
+    for model in models.values():
+        shapes = [
+            {name: value.shape for name, value in model.build({}, facts).state_dict().items()}
+            for facts in (small, large)
+        ]
+        assert shapes[0] == shapes[1], model.method
 
 
 def test_out_of_memory(run: Predict, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -207,7 +207,7 @@ def predict(
     ),
     size: Annotated[
         str | None,
-        typer.Option("--size", metavar="NAME", help="Another size than that of the training, as in full."),
+        typer.Option("--size", metavar="NAME", help="Another size than that of the training."),
     ] = None,
     root: RootOption = None,
     device: DeviceOption = "auto",
@@ -278,8 +278,9 @@ def _solver_time(split: str, size: str, *, quiet: bool) -> SolverBench | None:
 
 
 def _predicted(result: PredictionResult, solver: SolverBench | None, where: str) -> list[str]:
+    trained = f", trained at {result.trained_size}" if result.trained_size != result.size else ""
     lines = [
-        f"{result.path}: {result.method}, {result.scenarios} scenarios, {result.frames} frames",
+        f"{result.path}: {result.method}{trained}, {result.scenarios} scenarios, {result.frames} frames",
         f"  model   {result.seconds_per_frame:.3g} s per frame ({result.seconds_without_search:.3g} s"
         f" without the neighbour search) on {result.device}",
     ]
