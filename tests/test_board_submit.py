@@ -95,6 +95,7 @@ def tree(folder: Path) -> set[str]:
     "keys",
     [
         *({"authors": ()}, {"command": ""}, {"method": "noisy"}, {"method": "persistence"}),
+        *({"name": "NO\u0406SY"}, {"name": "Free Flight"}),
         {"urls": ("https://a.org/1", "https://a.org/2")},
     ],
 )
@@ -118,8 +119,9 @@ def test_files_that_do_not_belong_together(own: BoardBench, monkeypatch: pytest.
     monkeypatch.setattr(submitting, "score", _never)
     plain, other = own.predict(still, "plain"), own.predict(noisy, "other")
     same = own.predict(still, "same", seed=4)
+    two = own.predict(still, "one", seed=0), own.predict(noisy, "another", seed=1)
     odd = own.data.submit(own.folder.parent / "odd.nc", still, "My Model!")
-    for files, keys in (((plain, other), {"method": "both"}), ((same, same), {}), ((odd,), {})):
+    for files, keys in (((plain, other), {"method": "both"}), ((same, same), {}), ((odd,), {}), (two, {"method": "both"})):
         with pytest.raises(UsageError):
             own.submit(*files, **keys)
 

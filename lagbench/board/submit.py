@@ -13,6 +13,7 @@ import os
 import re
 import tempfile
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -22,7 +23,7 @@ import numpy as np
 from lagbench.atomic import write_atomically
 from lagbench.data.checksums import file_sha256
 from lagbench.data.registry import Registry, Size, load
-from lagbench.errors import ChecksFailedError, UsageError, WorkFailedError
+from lagbench.errors import ChecksFailedError, UnreadableFileError, UsageError, WorkFailedError
 from lagbench.floors.table import FLOORS
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.score import score
@@ -48,8 +49,10 @@ from .entry import (
     Prediction,
     ScoreBlock,
     ScoredFile,
+    Status,
 )
 from .entry_file import examine, listed, read_entry, spell
+from .findings import skeleton
 from .folder import SUBMISSIONS, Folder, Place, entry_path, score_paths
 from .ranking import combine, summarise, write_floors
 from .score_file import MAX_SCORE_BYTES, read_stored
@@ -108,7 +111,8 @@ def submit(
 
     Raises:
         UsageError: a key is missing, the entry is there already, the files do not belong
-            together, the method has the name of a floor, or there is no leaderboard.
+            together, the method has the name of a floor or looks like another's, or there is no
+            leaderboard.
         UnreadableFileError: predictions or weights cannot be read.
         ChecksFailedError: they are not valid.
         DataError: the test subset is missing, or they were made from another data set.
@@ -135,12 +139,9 @@ def submit(
             warned = any(found.check == OUTSIDE for found in result.warnings)
             outside.append(_outside(opened, size) if warned else None)
     seeds = _seeds(headers)
-    place = (headers[0].split, headers[0].size, _method(headers[0], meta))
-    if (folder.path / entry_path(place)).exists() and not replace:
-        where = str(folder.path / entry_path(place))
-        fix = "replace it with --replace, or name this one otherwise: --method NAME"
-        raise UsageError("there is such an entry already", where=where, fix=fix)
     about = _about(headers, meta)
+    place = (headers[0].split, headers[0].size, _method(headers[0], meta))
+    _require_free(folder, place, about, replace=replace)
     if meta.urls and len(meta.urls) != len(headers):
         raise UsageError(
             "addresses and files differ in number",
@@ -190,11 +191,11 @@ def _seeds(headers: Sequence[Header]) -> tuple[int | None, ...]:
     """Return the seeds of files that belong together; refuse those that do not."""
     if not 1 <= len(headers) <= MOST_SEEDS:
         raise UsageError("too many files", expected=f"1 to {MOST_SEEDS}, one per seed", got=len(headers))
-    for name in ("split", "size", "dataset_sha256"):
+    for name in ("split", "size", "dataset_sha256", "method"):
         found = dict.fromkeys(getattr(header, name) for header in headers)
         if len(found) > 1:
             fix = "submit each on its own"
-            raise UsageError(f"the files differ in {name}", got=", ".join(found), fix=fix)
+            raise UsageError(f"the files differ in {name}", got=", ".join(map(ascii, found)), fix=fix)
     seeds = tuple(header.seed for header in headers)
     if any(seed is not None and not 0 <= seed < 2**63 for seed in seeds):
         raise UsageError("a seed does not fit", expected="0 to 2^63 - 1", got=seeds)
@@ -221,6 +222,25 @@ def _method(header: Header, meta: Meta) -> str:
         fix = "name your method otherwise; the floors are added by themselves"
         raise UsageError(f"{name!r} is the name of a floor", where="--method", fix=fix)
     return name
+
+
+def _require_free(folder: Folder, place: Place, about: About, *, replace: bool) -> None:
+    """Refuse the place of another entry, unless it is to be replaced, and a name that looks like another's."""
+    own = entry_path(place)
+    if (folder.path / own).exists() and not replace:
+        fix = "replace it with --replace, or name this one otherwise: --method NAME"
+        raise UsageError("there is such an entry already", where=str(folder.path / own), fix=fix)
+    names = {floor: f"the floor {floor}" for floor in FLOORS}
+    for path in folder.entries():
+        if path.parts[1:3] == place[:2] and path != own:
+            with suppress(ChecksFailedError, UnreadableFileError):  # `leaderboard check` tells of those
+                other = read_entry(folder.path / path)
+                if other.status is Status.ACTIVE:
+                    names[other.name] = str(path)
+    for name, holder in names.items():
+        if skeleton(name) == skeleton(about.name):
+            fix = "choose another, or say what differs: --name 'GNS, six terms'"
+            raise UsageError("the name looks like another's", where=holder, got=ascii(about.name), fix=fix)
 
 
 def _about(headers: Sequence[Header], meta: Meta) -> About:
