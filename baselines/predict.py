@@ -117,16 +117,14 @@ def predict(
     home = resolve_root(root)
     known = rooted(home, registry)
     facts = check_data(found, root=home, registry=known, size=size, where=str(checkpoint))
-    provenance, trained_size = _provenance(found, facts), found.facts.size
-    if facts.size != found.facts.size:
-        found = replace(found, facts=_rescaled(found.facts, facts))
     machine = chosen_device(device)
     bound_memory()
     tests = scenario_paths(facts.split, subset="test", size=facts.size, root=home, registry=known)
     paths = list(tests.values())
     side = min(batch or (1 if machine == "cpu" else len(paths)), len(paths))
     with threads_used(threads), memory_errors_told("lower --batch"):
-        model = restore(found, where=str(checkpoint)).to(machine)
+        scaled = replace(found, facts=_rescaled(found.facts, facts))
+        model = restore(scaled, where=str(checkpoint)).to(machine)
         work = _Rollouts(model, facts, paths, side, machine)
         label, count, here = method or model.method, parameter_count(model), hardware(machine)
         on_cpu = f"{here['processor']}, {here['threads']} thread{'s' if here['threads'] > 1 else ''}"
@@ -140,7 +138,7 @@ def predict(
             registry=known,
             device=hardware_label,
             parameters=count,
-            **provenance,
+            **_provenance(found, facts),
         )
         meter, timed = Meter(progress), None
         meter.begin("predicting", total=len(paths), scenarios=len(paths))
@@ -155,7 +153,7 @@ def predict(
         path=Path(output),
         split=facts.split,
         size=facts.size,
-        trained_size=trained_size,
+        trained_size=found.facts.size,
         method=label,
         scenarios=len(paths),
         frames=facts.horizon,
@@ -232,6 +230,8 @@ def _rescaled(trained: Facts, here: Facts) -> Facts:
 
     Bodies fill the same area with more or fewer particles: their distance goes with the root of that.
     """
+    if trained.size == here.size:
+        return trained
     radius = trained.radius * math.sqrt(trained.particles / here.particles)
     return replace(here, radius=radius, statistics=trained.statistics)
 

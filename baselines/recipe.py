@@ -227,15 +227,17 @@ def recipe_for(
     name = f"{split}/{wanted}"
     part = file.recipes.get(name) or file.recipes.get(f"{ANY}/{wanted}")
     if part is None and file.recipes:
-        known = sorted(file.recipes)
-        same_split = [other for other in known if other.split("/")[0] == split]
-        write = "write your own: --recipe FILE.yaml, see docs/baselines.md"
+        same_split = [other for other in file.recipes if other.split("/")[0] == split]
+        fix = f"{nearest(name, same_split or file.recipes)}; or "
+        if variant and not own_file:
+            parts = [other.split("/")[1] for other in file.recipes if other.split("/")[0] in (split, ANY)]
+            variants = [other.removeprefix(f"{size}-") for other in parts if other.startswith(f"{size}-")]
+            fix = f"{nearest(variant, variants)}; or " if variants else ""
+            fix += f"leave --recipe out, for that of {size}; or " if size in parts else ""
         raise UsageError(
             f"{entry.name} has no recipe {name!r}",
             where="--split, --size, --recipe",
-            fix=f"{nearest(name, same_split)}; or {write}"
-            if same_split
-            else f"{write}; known: {', '.join(known)}",
+            fix=f"{fix}write your own: --recipe FILE.yaml, see docs/baselines.md",
         )
     part = part or _Shared()
     model, training = _merge(file.model, part.model), _merge(file.training, part.training)

@@ -121,7 +121,12 @@ def test_files_that_do_not_belong_together(own: BoardBench, monkeypatch: pytest.
     same = own.predict(still, "same", seed=4)
     two = own.predict(still, "one", seed=0), own.predict(noisy, "another", seed=1)
     odd = own.data.submit(own.folder.parent / "odd.nc", still, "My Model!")
-    for files, keys in (((plain, other), {"method": "both"}), ((same, same), {}), ((odd,), {}), (two, {"method": "both"})):
+    for files, keys in (
+        ((plain, other), {"method": "both"}),
+        ((same, same), {}),
+        ((odd,), {}),
+        (two, {"method": "both"}),
+    ):
         with pytest.raises(UsageError):
             own.submit(*files, **keys)
 

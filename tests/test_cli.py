@@ -262,6 +262,8 @@ def test_plot_and_animate_name_their_files(
     drawn = run("plot", SPLIT, *options, "--frame", 5, "--kind", "speed")
     assert drawn.exit_code == 0, drawn.output
     assert (tmp_path / "curl-noise-tiny-0003-frame5.png").read_bytes()[:4] == b"\x89PNG"
+    assert run("plot", SPLIT, *options, "--kind", "speed").exit_code == 0  # the last of 26 frames
+    assert (tmp_path / "curl-noise-tiny-0003-frame25.png").is_file()
     source = generated.folder / "test" / "0003.nc"
     second = generated.folder / "test" / "0004.nc"
     film = run("animate", source, second, "--every", 13, "-o", "two.gif", "--json")

@@ -139,7 +139,7 @@ def test_mistakes_in_settings(entry: Entry, settings: list[str], message: str) -
 
 def test_no_such_recipe(entry: Entry) -> None:
     """A split or variant without a recipe is a usage error that names the nearest."""
-    with pytest.raises(UsageError, match="did you mean 'cavity/tiny-long'"):
+    with pytest.raises(UsageError, match="did you mean 'long'"):
         recipe_for(entry, "cavity", "tiny", variant="lon")
     with pytest.raises(UsageError, match="cavity/tiny"):
         recipe_for(entry, "curl-noise", "full")

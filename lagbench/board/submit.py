@@ -225,7 +225,7 @@ def _method(header: Header, meta: Meta) -> str:
 
 
 def _require_free(folder: Folder, place: Place, about: About, *, replace: bool) -> None:
-    """Refuse the place of another entry, unless it is to be replaced, and a name that looks like another's."""
+    """Refuse the place of another entry, unless that is to be replaced, and a name like another's."""
     own = entry_path(place)
     if (folder.path / own).exists() and not replace:
         fix = "replace it with --replace, or name this one otherwise: --method NAME"

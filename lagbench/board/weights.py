@@ -60,21 +60,14 @@ def require_weights(weights: Sequence[str | Path], headers: Sequence[Header]) ->
         facts = held.facts
         got = (facts.split, facts.size, facts.dataset_sha256, seed)
         expected = (header.split, header.size, header.dataset_sha256, header.seed or 0)
-        if (got[0], got[3]) == (expected[0], expected[3]) and got[1] != expected[1]:
-            raise UsageError(
-                "weights lie beside entries of the size that they were trained at",
-                where=str(path),
-                expected=f"{expected[0]} {expected[1]}",
-                got=f"{got[0]} {got[1]}",
-                fix="leave --weights out and name the file in --command",
-            )
         if got != expected:
             raise UsageError(
-                "the weights did not make the predictions",
+                "the weights did not make the predictions at the size that they were trained at",
                 where=str(path),
                 expected=f"{expected[0]} {expected[1]}, data set {expected[2][:16]}, seed {expected[3]}",
                 got=f"{got[0]} {got[1]}, data set {got[2][:16]}, seed {got[3]}",
-                fix="give --weights in the order of the predictions",
+                fix="give --weights in the order of the predictions; leave those of another size out"
+                " and name their file in --command",
             )
     return paths
 

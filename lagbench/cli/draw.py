@@ -103,6 +103,7 @@ def plot(
     """Draw one frame of a scenario: particles, vorticity, streamlines."""
     from lagbench.data.local import locate
     from lagbench.draw.plot import check_kind, contact_sheet, plot_frame
+    from lagbench.draw.recording import open_recording
 
     if sheet:
         chosen_split = chosen(name, split)
@@ -113,8 +114,10 @@ def plot(
         return
     check_kind(kind)
     source = _source(name, split, size, scenario, root)
-    target = _target(output or _default_name(source, f"-frame{frame}.png"))
     with _told_as_given(name):
+        with open_recording(source) as recording:
+            number = recording.scene(frame).frame
+        target = _target(output or _default_name(source, f"-frame{number}.png"))
         plot_frame(source, frame, target, kind=kind, dpi=dpi)
     show({"output": target}, [str(target)], as_json=as_json, quiet=quiet)
 

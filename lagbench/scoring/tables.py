@@ -161,10 +161,13 @@ def _against(card: ScoreCard, row: str) -> str:
     low, high = found.interval
     if math.isnan(found.difference):
         return f"{card.ranking} cannot be compared"
+    ours, theirs = (card.scores[name][card.ranking].mean for name in (SUBMISSION, row))
+    if math.isclose(ours, theirs, rel_tol=1e-12):  # sums of the same numbers in another order
+        return f"{card.ranking} is the same"
     if found.difference < 0.0:
         word, low, high = "better", -high, -low  # the bounds of what is printed: how much better
     else:
-        word = "worse" if found.difference > 0.0 else "equal"
+        word = "worse"
     spread = [] if math.isnan(low) else [f"{_number(low)} to {_number(high)}"]
     spread += [
         f"{len(found.scenarios)} scenarios: no p-value" if math.isnan(found.p) else f"p = {found.p:.3g}"
