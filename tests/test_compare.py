@@ -54,6 +54,7 @@ def test_six_wins_of_six(tmp_path: Path) -> None:
     assert (found.test.difference, found.first, found.second) == pytest.approx((-7 / 6, 21 / 6, 28 / 6))
     assert result.verdict.startswith("mse_avg: a is better (p = 0.0312, 6 scenarios, one seed each")
     assert compare(b, a).verdict == result.verdict
+    assert result.verdict in repr(result)
     assert result.seeds == (1, 1)
     c = published(tmp_path, [1, 1, 1, 1, 1, 3], method="c")
     result = compare(c, published(tmp_path, [2] * 6, method="d"))

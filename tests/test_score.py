@@ -70,6 +70,13 @@ def test_position_rmse_by_xarray(bench: ScoreBench, standing: ScoreCard) -> None
     data.close()
 
 
+def test_a_card_is_shown_in_one_line(standing: ScoreCard) -> None:
+    """A notebook shows the method, the ranking metric and the skill, not thousands of numbers."""
+    shown = repr(standing)
+    assert len(shown) < 200
+    assert all(word in shown for word in (standing.header.method, standing.ranking, str(standing.skill)))
+
+
 def test_json_says_what_the_card_says(standing: ScoreCard) -> None:
     """Means, intervals, values per scenario and frames of interest stand in scores.json, nine digits each."""
     said = held(standing)

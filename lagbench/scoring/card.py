@@ -45,7 +45,7 @@ IDENTITY = ("split", "size", "dataset_version", "dataset_sha256", "method")
 LABELS = ("seconds_per_frame", "device", "seed", "parameters", "training")
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class ScoreCard:
     """What the scorer says of one submission."""
 
@@ -60,6 +60,12 @@ class ScoreCard:
     warnings: tuple[Finding, ...]  # findings of the validation that do not reject
     preview: Preview  # pictures of the first scenario
     files: tuple[Path, ...] = ()  # scores.json and scores.nc, where they were written
+
+    def __repr__(self) -> str:
+        """Return whose card it is, the ranking metric and the skill; the values are too many."""
+        header, mean = self.header, self.submission[self.ranking].mean
+        whose = f"{header.method!r} on {header.split} {header.size}"
+        return f"<{type(self).__name__}: {whose}, {self.ranking} {mean:.4g}, skill {self.skill}>"
 
     @property
     def scenarios(self) -> tuple[int, ...]:

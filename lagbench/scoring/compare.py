@@ -67,7 +67,7 @@ class MetricComparison:
     test: Comparison  # difference, interval and p-value, in the metric's loss
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class ComparisonResult:
     """How two methods compare."""
 
@@ -80,6 +80,11 @@ class ComparisonResult:
     scenarios: int  # how many both have in that metric
     seeds: tuple[int, int]  # of either side
     metrics: Mapping[str, MetricComparison]  # the ranking one first; observables are left out
+
+    def __repr__(self) -> str:
+        """Return who is compared and the verdict; the values are too many."""
+        who = f"{self.first!r} and {self.second!r} on {self.split} {self.size}"
+        return f"<{type(self).__name__}: {who}: {self.verdict}>"
 
     @property
     def verdict(self) -> str:
