@@ -132,7 +132,7 @@ def test_folders_files_and_predictions_agree(bench: ScoreBench, scored: dict[str
 def test_floors_stand_in_the_scores(scored: dict[str, Path]) -> None:
     """A floor's name compares with the row beside the submission: equal to having submitted it.
 
-    A misspelt metric is a usage error with the nearest name.
+    A misspelt metric or floor is a usage error with the nearest name.
     """
     by_name = compare(scored["still"], "constant-velocity").as_json()
     by_file = compare(scored["still"], scored["straight"]).as_json()
@@ -140,6 +140,8 @@ def test_floors_stand_in_the_scores(scored: dict[str, Path]) -> None:
     assert (by_name["second"], by_file["second"]) == ("constant-velocity", "straight")
     with pytest.raises(UsageError, match="vorticity_rmse"):
         compare(scored["still"], scored["straight"], metrics=["vorticity_rsme"])
+    with pytest.raises(UsageError, match="'constant-velocity'"):
+        compare(scored["still"], "constant-velocty")
     only: ComparisonResult = compare(scored["still"], scored["straight"], metrics=["mse_end"])
     assert list(only.metrics) == ["vorticity_nrmse", "mse_end"]
 

@@ -150,12 +150,16 @@ def compare(
         registry: where splits are described; ours when None.
 
     Raises:
-        UsageError: an unknown metric, or the two belong to different splits or sizes.
+        UsageError: an unknown metric or floor, or the two belong to different splits or sizes.
         DataError: they belong to data sets of different hashes.
         UnreadableFileError: a file is neither scores nor predictions.
     """
     one = _contestant(first, root, workers, registry)
     floor = str(second) if str(second) in one.floors else None
+    bare = Path(second).name == str(second) and not Path(second).suffix
+    if floor is None and bare and not os.path.lexists(second):
+        fix = f"{nearest(str(second), one.floors)}; or name scores, predictions or a folder of them"
+        raise UsageError("neither a floor nor a file", where=str(first), got=ascii(str(second)), fix=fix)
     two = _contestant(second, root, workers, registry) if floor is None else _floor(one, floor)
     _check_same(one, two)
     judged = _judged(one, two)
