@@ -63,6 +63,7 @@ class TrainingResult:
     weights: Path  # weights to predict from
     checkpoint: Path  # last state, to go on from
     state: str  # finished, stopped early or interrupted
+    first_step: int  # optimiser steps that were there when this call began
     step: int  # optimiser steps made
     steps: int  # steps of the whole training
     parameters: int  # trainable parameters
@@ -189,6 +190,7 @@ def train(
             threads=budget.threads or 0,
             track=track_of(facts.size, budget),
             state=ledger.state,
+            first_step=int(earlier.training.get("step", 0)) if earlier else 0,
             step=ledger.step,
             loss=ledger.loss,
             windows_seen=ledger.windows_seen,

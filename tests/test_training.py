@@ -112,7 +112,7 @@ def test_resumed_equals_uninterrupted(run: Run, baseline: str, tmp_path: Path) -
         stopped = json.loads((tmp_path / "parts/training.json").read_text())
         assert (stopped["state"], stopped["step"]) == ("interrupted", step)
     parts = run(baseline, *settings, to="parts")
-    assert (parts.state, parts.step) == ("finished", 7)
+    assert (parts.state, parts.first_step, parts.step) == ("finished", 5, 7)
     assert same(whole.checkpoint, parts.checkpoint)
     assert same(whole.weights, parts.weights)
     assert (whole.best_value, whole.best_step) == (parts.best_value, parts.best_step)
@@ -123,7 +123,7 @@ def test_a_finished_training_is_not_repeated(run: Run) -> None:
     first = run("drift", "steps=3")
     before = first.checkpoint.read_bytes()
     again = run("drift", "steps=3")
-    assert (again.state, again.step) == ("finished", 3)
+    assert (again.state, again.first_step, again.step) == ("finished", 3, 3)
     assert first.checkpoint.read_bytes() == before
 
 

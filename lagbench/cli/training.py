@@ -179,6 +179,10 @@ def _trained(result: TrainingResult, where: str) -> list[str]:
     time = f"{spell_seconds(result.wall_seconds)}, {spell_seconds(result.cpu_seconds)} of processor time"
     if result.gpu_seconds:
         time += f", {spell_seconds(result.gpu_seconds)} of GPU time"
+    if result.first_step == result.step:
+        time += "; it was over before, --fresh trains anew"
+    elif result.first_step:
+        time += f"; this call went on from step {result.first_step}"
     lines = [
         f"{result.baseline} on {result.recipe}: {result.state}, step {result.step} of {result.steps}, {time}",
         f"  parameters {result.parameters}",
