@@ -60,6 +60,28 @@ def check_symmetry(symmetry: object, size: Size) -> None:
         )
 
 
+def images(symmetry: Symmetry) -> Tensor:
+    """Return all images, the identity first, as matrices of shape [image, 2, 2]."""
+    flips = {Symmetry.NONE: [(1, 1)], Symmetry.MIRROR: [(1, 1), (-1, 1)]}
+    signs = flips.get(symmetry, [(1, 1), (-1, 1), (1, -1), (-1, -1)])
+    upright = torch.diag_embed(torch.tensor(signs, dtype=torch.float32))
+    return torch.cat([upright, upright.flip(2)]) if symmetry is Symmetry.SQUARE else upright
+
+
+def turned_field(field: Tensor, matrix: Tensor, channels: Tensor) -> Tensor:
+    """Return the image of a field on a grid that lies in its box as its images do.
+
+    Args:
+        field: values at the nodes, shape [window, channel, x node, y node].
+        matrix: image, a signed permutation of the axes, shape [2, 2].
+        channels: what it does to the values of a node, shape [channel, channel].
+    """
+    moved = torch.einsum("dc,wcxy->wdxy", channels.to(field), field)
+    if bool(matrix[0, 1] != 0.0):
+        moved = moved.transpose(2, 3)
+    return moved.flip([2 + axis for axis in range(2) if float(matrix[axis].sum()) < 0.0])
+
+
 def draw(symmetry: Symmetry, windows: int, generator: torch.Generator) -> Tensor:
     """Return one image per window, drawn evenly, as matrices of shape [window, 2, 2]."""
     device = generator.device
@@ -89,12 +111,24 @@ def image(batch: Batch, matrix: Tensor, bounds: Bounds) -> Batch:
     first = None if batch.origin is None else _turned(turn, batch.origin - centre) + centre
     walls = batch.wall_velocity
     if walls is not None:  # wall k becomes the one that the image of its normal points at
-        normals = _NORMALS.to(matrix)
-        images = _turned(matrix[:, None], normals)  # of window and wall
-        source = (images[:, None] * normals[:, None]).sum(dim=-1).argmax(dim=2)
+        source = of_walls(matrix).argmax(dim=2)
         walls = _turned(matrix[:, None, None], walls)
         walls = walls.gather(2, source[:, None, :, None].expand_as(walls))
     return replace(batch, position=position, wall_velocity=walls, origin=first)
+
+
+def of_walls(matrix: Tensor) -> Tensor:
+    """Return which wall an image puts in the place of which, 1 or 0, shape [..., wall there, wall here]."""
+    normals = _NORMALS.to(matrix)
+    there = _turned(matrix[..., None, :, :], normals)  # normals of the images, shape [..., wall, 2]
+    return ((normals[:, None] * there[..., None, :, :]).sum(dim=-1) > 0.5).to(matrix)
+
+
+def of_strain(matrix: Tensor) -> Tensor:
+    """Return what an image does to the components (xx, xy, yy) of a symmetric tensor, shape [3, 3]."""
+    (a, b), (c, d) = matrix
+    rows = [[a * a, 2 * a * b, b * b], [a * c, a * d + b * c, b * d], [c * c, 2 * c * d, d * d]]
+    return torch.stack([torch.stack(row) for row in rows])
 
 
 def _turned(matrix: Tensor, vector: Tensor) -> Tensor:

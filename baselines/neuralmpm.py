@@ -22,7 +22,7 @@ from torch.nn.functional import gelu
 
 from lagbench.errors import DataError, UsageError
 
-from .augmentation import Symmetry, disturbed, way_back
+from .augmentation import Symmetry, disturbed, images, of_strain, of_walls, turned_field, way_back
 from .baseline import Baseline, Batch, Facts, Options, check_moving_walls, last_velocities
 from .graph import MATERIALS
 from .particle_grid import ParticleGrid, Stencil
@@ -56,6 +56,8 @@ class NeuralMPMOptions(Options):
     # whether the U-Net sees how far solids are strained since the scenario's first frame
     strain: bool = False
     symmetry: Symmetry = Symmetry.NONE  # images that training windows are replaced by at random
+    # whether a call of a rollout is the mean over those images, at as many times the cost; training is not
+    average: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -266,16 +268,21 @@ class NeuralMPM(Baseline):
         if self.context is None:
             return state
         fields, _ = self._fields(state, self.grid.stencil(state.position, state.layer))
-        return replace(state, context=self.context(fields))
+        turned = [fields]
+        if self.options.average:
+            turned = [turned_field(fields, one, self._turn(one)) for one in images(self.options.symmetry)]
+        return replace(state, context=torch.stack([self.context(each) for each in turned]).mean(dim=0))
 
     def advance(self, state: GridState) -> tuple[GridState, Tensor]:
         """Advance by one frame, calling the U-Net once for every bundle of them."""
         if not state.coming:
-            state, frames = self.call(state)
+            state, frames = self.call(state, average=self.options.average)
             state = replace(state, coming=tuple(position for position, _ in frames))
         return replace(state, coming=state.coming[1:]), state.coming[0]
 
-    def call(self, state: GridState) -> tuple[GridState, list[tuple[Tensor, Tensor]]]:
+    def call(
+        self, state: GridState, *, average: bool = False
+    ) -> tuple[GridState, list[tuple[Tensor, Tensor]]]:
         """Return the state after a bundle of frames, and position and velocity in each of them."""
         share = self.options.smoothing
         stencil = self.grid.stencil(state.position, state.layer)
@@ -285,7 +292,8 @@ class NeuralMPM(Baseline):
             coming = torch.arange(1, self.options.bundle + 1, device=fields.device)
             moved = state.walls[:, coming.clamp(max=state.walls.shape[1] - 1)] / self.speed
             parts.append(torch.einsum("fmwc,wxy->fmcxy", moved, self.beside).flatten(1, 2))
-        output: Tensor = self.network(torch.cat(parts, dim=1)) * self.change
+        seen = torch.cat(parts, dim=1)
+        output = (self._mean_call(seen) if average else self.network(seen)) * self.change
         # accelerations in the coming frames [length/frame^2], shape [layer, 2 bundle, x node, y node]
         changes = output.reshape(-1, 2 * self.options.bundle, *self.grid.shape)
         predicted = torch.cat([on_grid, changes], dim=1)
@@ -304,6 +312,27 @@ class NeuralMPM(Baseline):
         velocities = torch.cat([state.velocity, last], dim=1)[:, -self.options.velocities :]
         walls = state.walls[:, min(len(frames), state.walls.shape[1] - 1) :]
         return replace(state, position=position, velocity=velocities, walls=walls), frames
+
+    def _mean_call(self, seen: Tensor) -> Tensor:
+        """Return the mean over all images of what the U-Net says of one, turned back.
+
+        A rollout of an image is then the image of the rollout: frame averaging over the whole group
+        (Puny et al. 2022, arXiv 2110.03336).
+        """
+        options, outputs = self.options, []
+        for matrix in images(options.symmetry):
+            forcing = [matrix] * options.bundle if options.wall_velocity else []
+            blocks = [self._turn(matrix), torch.eye(options.context), *forcing]
+            said = self.network(turned_field(seen, matrix, torch.block_diag(*blocks)))
+            back = torch.block_diag(*[matrix.T] * (len(options.materials) * options.bundle))
+            outputs.append(turned_field(said, matrix.T, back))
+        return torch.stack(outputs).mean(dim=0)
+
+    def _turn(self, matrix: Tensor) -> Tensor:
+        """Return what an image does to the channels of :meth:`_fields`, shape [channel, channel]."""
+        one = [torch.ones(1, 1), *[matrix] * self.options.velocities]
+        one += [of_strain(matrix)] if self.options.strain else []
+        return torch.block_diag(*one * len(self.options.materials), of_walls(matrix))
 
     def _fields(self, state: GridState, stencil: Stencil) -> tuple[Tensor, Tensor]:
         """Return what the U-Net sees of the particles, and the last velocity on the grid [length/frame].

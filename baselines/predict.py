@@ -10,7 +10,7 @@ import json
 import math
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,15 +21,18 @@ from lagbench.atomic import write_atomically
 from lagbench.data.layout import resolve_root
 from lagbench.data.local import rooted
 from lagbench.data.registry import Registry
+from lagbench.errors import UnreadableFileError, UsageError
 from lagbench.submission.budget import budget_in
 from lagbench.submission.writer import PredictionsWriter
 from lagbench.work.progress import Meter, Progress
 
 from .baseline import Baseline, Facts
+from .catalogue import find
 from .checkpoint import Checkpoint, check_data, load, restore
 from .graph import radius_graph
 from .job import RunFolder, parameter_count
 from .machine import bound_memory, chosen_device, hardware, memory_errors_told, threads_used
+from .recipe import changed_options
 from .rollout import Rollout, roll_out, scenario_batch, scenario_paths
 
 SEARCHES = 5  # frames of a rollout on which the neighbour search is timed alone
@@ -68,6 +71,7 @@ def predict(
     *,
     root: str | Path | None = None,
     size: str | None = None,
+    settings: Sequence[str] = (),
     device: str = "auto",
     threads: int | None = None,
     batch: int | None = None,
@@ -89,6 +93,7 @@ def predict(
         output: file to write; ``<name>.json`` beside it says what it cost.
         root: folder of all data sets; else ``LAGBENCH_ROOT``, else the user data folder.
         size: size of the split to predict; that of the training when None.
+        settings: changes of options that have no weights, as in ``model.average=true``.
         device: ``cpu``, ``cuda`` or ``auto``.
         threads: threads on the CPU; one per core by default.
         batch: scenarios side by side; 1 on a CPU and all on a GPU by default.
@@ -101,7 +106,8 @@ def predict(
     Raises:
         UnreadableFileError: the checkpoint is damaged or unsafe.
         DataError: the data set is missing, damaged, or of another version than that of the training.
-        UsageError: the model's baseline is not installed, no such device, or weights of no use at the size.
+        UsageError: the model's baseline is not installed, no such device, or weights of no use at the size
+            or with the settings.
         WorkFailedError: out of memory, or the disk is full.
     """
     found = load(checkpoint)
@@ -123,8 +129,7 @@ def predict(
     paths = list(tests.values())
     side = min(batch or (1 if machine == "cpu" else len(paths)), len(paths))
     with threads_used(threads), memory_errors_told("lower --batch"):
-        scaled = replace(found, facts=_rescaled(found.facts, facts))
-        model = restore(scaled, where=str(checkpoint)).to(machine)
+        model = _model(found, facts, settings, where=str(checkpoint)).to(machine)
         work = _Rollouts(model, facts, paths, side, machine)
         label, count, here = method or model.method, parameter_count(model), hardware(machine)
         on_cpu = f"{here['processor']}, {here['threads']} thread{'s' if here['threads'] > 1 else ''}"
@@ -138,7 +143,7 @@ def predict(
             registry=known,
             device=hardware_label,
             parameters=count,
-            **_provenance(found, facts),
+            **_provenance(found, facts, settings),
         )
         meter, timed = Meter(progress), None
         meter.begin("predicting", total=len(paths), scenarios=len(paths))
@@ -225,6 +230,23 @@ class _Rollouts:
         return time.process_time() if self.clock == "processor" else time.perf_counter()
 
 
+def _model(found: Checkpoint, facts: Facts, settings: Sequence[str], *, where: str) -> Baseline:
+    """Return the model of a checkpoint for a size, with settings."""
+    scaled = replace(found, facts=_rescaled(found.facts, facts))
+    if not settings:
+        return restore(scaled, where=where)
+    options = changed_options(find(found.baseline), found.options, settings)
+    try:
+        return restore(replace(scaled, options=options), where=where)
+    except UnreadableFileError as error:
+        raise UsageError(
+            "the weights do not fit the model with these settings",
+            where="--set",
+            got=", ".join(settings),
+            fix="set what changes no weights, as in model.average=true; or train with the settings",
+        ) from error
+
+
 def _rescaled(trained: Facts, here: Facts) -> Facts:
     """Return the facts of a size for weights of another: what they multiply stays as it was trained.
 
@@ -236,7 +258,7 @@ def _rescaled(trained: Facts, here: Facts) -> Facts:
     return replace(here, radius=radius, statistics=trained.statistics)
 
 
-def _provenance(checkpoint: Checkpoint, here: Facts) -> dict[str, Any]:
+def _provenance(checkpoint: Checkpoint, here: Facts, settings: Sequence[str]) -> dict[str, Any]:
     """Return seed, training in words and its budget, for the file's attributes.
 
     Validations at another size than the one predicted are left out: they compare with none there.
@@ -246,6 +268,7 @@ def _provenance(checkpoint: Checkpoint, here: Facts) -> dict[str, Any]:
     options = recipe.get("training", {})
     subsets = "+".join(options.get("windows", ("train",)))
     words = f"{facts.split} {facts.size} {subsets}, recipe {recipe.get('name')}, step {done.get('step', 0)}"
+    words += "".join(f", {setting}" for setting in settings)
     found: dict[str, Any] = {"training": words, "seed": int(options.get("seed", 0))}
     budget = budget_in(json.dumps(done.get("budget")))
     if budget is None:

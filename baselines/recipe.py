@@ -156,7 +156,7 @@ class TrainingOptions(_Strict):
 
 LATER: Mapping[str, object] = {
     **{"compile": False, "ema": 0.0},
-    **{"pushforward": 0, "recovery": None, "strain": False, "mixture": False},
+    **{"pushforward": 0, "recovery": None, "strain": False, "mixture": False, "average": False},
 }
 """Options that records of earlier trainings lack, with what they did: such trainings can go on."""
 
@@ -262,6 +262,18 @@ def recipe_for(
         model=_checked(entry.model.Options, model, "model", where).model_dump(mode="json"),
         training=_checked(TrainingOptions, training, "training", where),
     )
+
+
+def changed_options(entry: Entry, options: Mapping[str, Any], settings: Iterable[str]) -> Layer:
+    """Return the options of a trained model with settings such as ``model.average=true``."""
+    changed = dict(options)
+    for setting in settings:
+        group, changes = _setting(setting)
+        if group != "model":
+            fix = "set options of the model: --set model.KEY=VALUE"
+            raise UsageError("the training is over", where="--set", got=setting, fix=fix)
+        changed = _merge(changed, changes)
+    return _checked(entry.model.Options, changed, "model", "--set").model_dump(mode="json")
 
 
 def _read(path: Path) -> _File:

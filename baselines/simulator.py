@@ -27,7 +27,7 @@ from torch import Tensor, nn
 from lagbench.baselines.operators.operator import Losses, Operator
 from lagbench.data.grid import Grid, Placement
 
-from .augmentation import Symmetry, disturbed, way_back
+from .augmentation import Symmetry, disturbed
 from .baseline import Baseline, Batch, Facts, Options, check_moving_walls, last_velocities
 from .graph import EDGE_FEATURES, NodeFeatures, Scale, edge_features, radius_graph
 from .network import EncodeProcessDecode
@@ -192,10 +192,6 @@ class GraphNetworkOptions(Options):
     link_weight: float | None = Field(default=None, ge=0.0, allow_inf_nan=False)
     # own steps that the loss is averaged over; gradients pass through all
     rollout_loss_steps: int = Field(default=1, ge=1)
-    # most own steps before those, without gradients: training sees what rollouts come to
-    pushforward: int = Field(default=0, ge=0)
-    # frames in which particles off the true path are to come back to it; None asks for true positions
-    recovery: float | None = Field(default=None, gt=1.0, allow_inf_nan=False)
     wall_velocity: bool = False  # whether the velocities of moving walls in the next frame are features
     # how far a particle sees a wall [radius]; the solver's grid carries a wall's effect beyond one radius
     wall_reach: float = Field(default=3.0, gt=0.0, allow_inf_nan=False)
@@ -229,7 +225,6 @@ class GraphNetwork(Baseline):
         self.acceleration = Scale(
             statistics["acceleration_mean"], statistics["acceleration_std"], noise=noise
         )
-        self.change = float(self.acceleration.std.square().mean().sqrt())
         self.features = NodeFeatures(
             facts.bounds,
             self.velocity,
@@ -265,8 +260,8 @@ class GraphNetwork(Baseline):
 
     @property
     def future(self) -> int:
-        """Frames to predict in training: those without gradients and those of the loss."""
-        return self.options.pushforward + self.options.rollout_loss_steps
+        """Frames to predict in training: as many as the loss has rollout steps."""
+        return self.options.rollout_loss_steps
 
     @property
     def weights(self) -> Mapping[str, float]:
@@ -281,10 +276,7 @@ class GraphNetwork(Baseline):
         self.network.compile_layers()
 
     def forward(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
-        """Return the six terms of Eq. 5.35 and the operator's own, raw, means over the steps.
-
-        With ``recovery`` the true velocity has the way back to the true path added to it.
-        """
+        """Return the six terms of Eq. 5.35 and the operator's own, raw, means over the steps."""
         options = self.options
         if generator is not None:
             batch = disturbed(
@@ -300,22 +292,11 @@ class GraphNetwork(Baseline):
         state = self.start(batch.part(slice(self.history)))
         if generator is not None and options.forgetful > 0.0:
             state = self._forgetful(state, batch.windows, generator)
-        first, steps = self.history, []
-        if generator is not None and options.pushforward:
-            device = generator.device
-            alone = int(torch.randint(options.pushforward + 1, (), generator=generator, device=device))
-            first += alone
-            with torch.no_grad():
-                for _ in range(alone):
-                    state, _ = self.step(state)
-        for frame in range(first, first + options.rollout_loss_steps):
-            reached = state.position.detach()
+        steps = []
+        for frame in range(self.history, self.history + self.future):
             following, own = self.step(state, generator)
-            before, target = batch.position[:, frame - 1], batch.position[:, frame]
-            velocity = target - before
-            if options.recovery is not None:
-                velocity += way_back(before - reached, options.recovery, change=self.change)
-                target = reached + velocity
+            target = batch.position[:, frame]
+            velocity = target - batch.position[:, frame - 1]
             # both accelerations start from the state's velocity
             last, predicted = state.velocity[:, -1], following.velocity[:, -1]
             terms = loss_terms(

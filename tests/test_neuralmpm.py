@@ -12,7 +12,7 @@ import torch
 from simple_models import batch, facts, jittered, rolled, swirl
 from torch import Tensor, nn
 
-from lagbench.baselines.augmentation import image
+from lagbench.baselines.augmentation import Symmetry, image, images
 from lagbench.baselines.catalogue import find
 from lagbench.baselines.neuralmpm import NeuralMPM
 from lagbench.baselines.recipe import recipe_for
@@ -124,6 +124,26 @@ def test_the_way_back_is_asked_for(after: float) -> None:
     expected = ((wanted - given) ** 2 / 2).mean() / model.change**2  # nothing moves along y
     with torch.no_grad():
         assert float(model(window)["velocity"]) == pytest.approx(expected, rel=1e-2)
+
+
+@pytest.mark.parametrize("number", range(8))
+def test_the_mean_over_images_has_the_symmetry_of_the_box(number: int) -> None:
+    """Strain, walls that move and context included, the rollout of an image is the image of the rollout."""
+    matrix = images(Symmetry.SQUARE)[number]
+    options = {"strain": True, "wall_velocity": True, "context": 3, "symmetry": "square", "awake": 0.1}
+    given = replace(
+        batch(swirl(0, 3), walls=True), origin=0.9 * (batch(swirl(0, 3)).position[:, 0] - 0.5) + 0.5
+    )
+    given = replace(given, material=torch.arange(len(given.material)) % 4)
+
+    def apart(*, average: bool) -> float:
+        model = surrogate(**options, average=average)
+        nn.init.normal_(model.context.numbers[-1].weight, std=3.0)
+        here, there = (rolled(model, one, 4) for one in (given, image(given, matrix[None], facts().bounds)))
+        return float((there - ((here - 0.5) @ matrix.T + 0.5)).abs().max())
+
+    assert apart(average=True) < 2e-6
+    assert (apart(average=False) > 1e-5) is (number > 0)  # the weights have no symmetry
 
 
 def test_materials_in_one_place_come_to_one_velocity() -> None:

@@ -54,6 +54,19 @@ class Scaled(Drift):
         Scaled.told = facts
 
 
+class Several(Drift):
+    """A Drift with as many weights as asked for."""
+
+    class Options(Drift.Options):
+        """See above."""
+
+        count: int = 1
+
+    def __init__(self, options: Any, facts: Facts) -> None:
+        super().__init__(options, facts)
+        self.a = torch.nn.Parameter(torch.full((options.count,), options.start))
+
+
 @pytest.fixture
 def run(
     generated: GenerationResult, unmeasured: Registry, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -297,6 +310,23 @@ def test_another_size_than_that_of_the_training(
             run(name, size=size, facts=facts)
     with pytest.raises(DataError):
         run("scaled", size="tiny", facts=replace(trained, version="0.9.0"))
+
+
+def test_a_model_is_changed_where_that_needs_no_weights(
+    run: Predict, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An option of the model is as if it had been trained with, and the file says so; others are refused."""
+    result = run(settings=["model.explode_at=3"])
+    assert np.array_equal(
+        written(result.path), written(run(model={"explode_at": 3}, name="trained.nc").path), equal_nan=True
+    )
+    assert set(result.diverged.values()) == {8}
+    with netCDF4.Dataset(result.path) as data:
+        assert data.getncattr("training").endswith("model.explode_at=3")
+    install(monkeypatch, several=Several)
+    for setting in ("training.steps=3", "model.explode=1", "model.count=2"):
+        with pytest.raises(UsageError):
+            run("several", settings=[setting])
 
 
 def test_at_its_own_size_a_model_keeps_its_radius(run: Predict, generated: GenerationResult) -> None:

@@ -278,22 +278,6 @@ def test_forgetful_windows_know_what_a_rollout_knows_at_its_start() -> None:
     assert torch.equal(seen[1].velocity, starts[-1])
 
 
-@pytest.mark.parametrize("after", [2.2e-3, 6e-3])
-def test_training_starts_where_rollouts_come_to_and_asks_for_the_way_back(after: float) -> None:
-    """An untrained model goes on as before, the truth faster: how far it is behind counts, to a bound."""
-    given, frames = 2e-3, np.arange(1.0, 5.0)
-    travelled = np.concatenate([given * np.arange(2.0), given + after * frames])
-    window = batch(jittered(0, low=0.3, high=0.6) + travelled[:, None, None] * np.array([1.0, 0.0]))
-    model = network(velocities=1, pushforward=3, recovery=4.0, noise_std=0.0)
-    behind = (after - given) * np.arange(4.0)
-    wanted = after + np.minimum(behind / 4.0, 3.0 * model.change)
-    std = model.acceleration.std.double().numpy()
-    expected = ((wanted - given) / std[0]) ** 2  # nothing moves along y
-    with torch.no_grad():
-        terms = [model(window, torch.Generator().manual_seed(seed)) for seed in range(30)]
-    assert {f"{float(one['acceleration']):.3g}" for one in terms} == {f"{each:.3g}" for each in expected}
-
-
 def test_half_precision_moves_particles_in_full() -> None:
     """Under bf16 autocast positions stay float32; a step and the loss differ by bf16's rounding only."""
     given = batch(swirl(0, 6))

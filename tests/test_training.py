@@ -103,8 +103,11 @@ def test_resumed_equals_uninterrupted(run: Run, baseline: str, tmp_path: Path) -
     """Interrupted twice and resumed, a training ends with the bits of an uninterrupted one."""
     settings = ("steps=7", "validate_every=3", "schedule=cosine")
     settings += ("model.noise_std=1e-4",) if baseline != "drift" else ()
-    settings += ("model.pushforward=2", "model.recovery=4") if baseline != "drift" else ()
-    settings += ("ema=0.9", "model.strain=true") if baseline == "neuralmpm" else ()
+    settings += (
+        ("ema=0.9", "model.strain=true", "model.pushforward=2", "model.recovery=4")
+        if baseline == "neuralmpm"
+        else ()
+    )
     whole = run(baseline, *settings, to="whole")
     for step in (2, 5):
         with pytest.raises(KeyboardInterrupt):

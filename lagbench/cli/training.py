@@ -213,6 +213,10 @@ def predict(
         str | None,
         typer.Option("--size", metavar="NAME", help="Another size than that of the training."),
     ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Change the model: model.average=true; repeatable."),
+    ] = None,
     root: RootOption = None,
     device: DeviceOption = "auto",
     threads: ThreadsOption = None,
@@ -249,6 +253,7 @@ def predict(
             output,
             root=root,
             size=size,
+            settings=tuple(settings or ()),
             device=device,
             threads=threads,
             batch=batch,
