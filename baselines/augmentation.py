@@ -76,7 +76,8 @@ def turned_field(field: Tensor, matrix: Tensor, channels: Tensor) -> Tensor:
         matrix: image, a signed permutation of the axes, shape [2, 2].
         channels: what it does to the values of a node, shape [channel, channel].
     """
-    moved = torch.einsum("dc,wcxy->wdxy", channels.to(field), field)
+    with torch.autocast(field.device.type, enabled=False):
+        moved = torch.einsum("dc,wcxy->wdxy", channels.to(field), field)
     if bool(matrix[0, 1] != 0.0):
         moved = moved.transpose(2, 3)
     return moved.flip([2 + axis for axis in range(2) if float(matrix[axis].sum()) < 0.0])

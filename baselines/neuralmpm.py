@@ -56,7 +56,7 @@ class NeuralMPMOptions(Options):
     # whether the U-Net sees how far solids are strained since the scenario's first frame
     strain: bool = False
     symmetry: Symmetry = Symmetry.NONE  # images that training windows are replaced by at random
-    # whether a call of a rollout is the mean over those images, at as many times the cost; training is not
+    # whether calls of rollouts are means over those images, at as many times the cost; those of training are not
     average: bool = False
 
 
@@ -167,6 +167,14 @@ class NeuralMPM(Baseline):
                 expected=f"some of {list(range(MATERIALS))}",
                 got=list(options.materials),
             )
+        if options.average and options.symmetry is Symmetry.NONE:
+            raise UsageError(
+                "there are no images to take the mean of",
+                where="model.average",
+                expected=f"model.symmetry {Symmetry.MIRROR} or {Symmetry.SQUARE}",
+                got=str(options.symmetry),
+                fix="set model.symmetry=mirror too, or leave model.average out",
+            )
         self.grid = ParticleGrid(facts.bounds, options.cells, multiple=COARSEST)
         self.unit = (self.grid.spacing / facts.radius) ** 2
         # One scale for x and y: a model that is trained on turned windows must not tell them apart.
@@ -216,7 +224,7 @@ class NeuralMPM(Baseline):
                 history=self.history,
                 noise_std=options.noise_std,
             )
-        state = self.start(batch.part(slice(self.history)))
+        state = self.start(batch.part(slice(self.history)), average=False)
         following = self.history  # the first frame whose error counts
         if generator is not None and options.pushforward:
             most = options.pushforward + 1
@@ -236,7 +244,7 @@ class NeuralMPM(Baseline):
                 reached = position
         return {"velocity": torch.stack(errors).mean()}
 
-    def start(self, given: Batch) -> GridState:
+    def start(self, given: Batch, *, average: bool = True) -> GridState:
         """Return the state after the given frames; where they are few, the first velocity repeats."""
         position = given.position[:, -self.history :].clamp(self.grid.low, self.grid.high)
         velocity = last_velocities(position, self.options.velocities)
@@ -269,7 +277,7 @@ class NeuralMPM(Baseline):
             return state
         fields, _ = self._fields(state, self.grid.stencil(state.position, state.layer))
         turned = [fields]
-        if self.options.average:
+        if average and self.options.average:
             turned = [turned_field(fields, one, self._turn(one)) for one in images(self.options.symmetry)]
         return replace(state, context=torch.stack([self.context(each) for each in turned]).mean(dim=0))
 

@@ -26,6 +26,7 @@ from lagbench.submission.budget import budget_in
 from lagbench.submission.writer import PredictionsWriter
 from lagbench.work.progress import Meter, Progress
 
+from .augmentation import check_symmetry
 from .baseline import Baseline, Facts
 from .catalogue import find
 from .checkpoint import Checkpoint, check_data, load, restore
@@ -129,7 +130,9 @@ def predict(
     paths = list(tests.values())
     side = min(batch or (1 if machine == "cpu" else len(paths)), len(paths))
     with threads_used(threads), memory_errors_told("lower --batch"):
-        model = _model(found, facts, settings, where=str(checkpoint)).to(machine)
+        model = _model(found, facts, settings, where=str(checkpoint))
+        check_symmetry(getattr(model.options, "symmetry", None), known.size(facts.split, facts.size))
+        model = model.to(machine)
         work = _Rollouts(model, facts, paths, side, machine)
         label, count, here = method or model.method, parameter_count(model), hardware(machine)
         on_cpu = f"{here['processor']}, {here['threads']} thread{'s' if here['threads'] > 1 else ''}"
@@ -233,8 +236,9 @@ class _Rollouts:
 def _model(found: Checkpoint, facts: Facts, settings: Sequence[str], *, where: str) -> Baseline:
     """Return the model of a checkpoint for a size, with settings."""
     scaled = replace(found, facts=_rescaled(found.facts, facts))
+    model = restore(scaled, where=where)  # refuses a damaged file, whatever is set
     if not settings:
-        return restore(scaled, where=where)
+        return model
     options = changed_options(find(found.baseline), found.options, settings)
     try:
         return restore(replace(scaled, options=options), where=where)

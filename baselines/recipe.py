@@ -232,7 +232,7 @@ def recipe_for(
         if variant and not own_file:
             parts = [other.split("/")[1] for other in file.recipes if other.split("/")[0] in (split, ANY)]
             variants = [other.removeprefix(f"{size}-") for other in parts if other.startswith(f"{size}-")]
-            fix = f"{nearest(variant, variants)}; or " if variants else ""
+            fix = f"{nearest(variant, variants)}; or " if variants else "" if size in parts else fix
             fix += f"leave --recipe out, for that of {size}; or " if size in parts else ""
         raise UsageError(
             f"{entry.name} has no recipe {name!r}",

@@ -14,6 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from unittest.mock import Mock
 
+import netCDF4
 import pytest
 import torch
 from click.testing import Result
@@ -70,7 +71,16 @@ def test_from_a_name_to_scores_in_words(lagbench: Command) -> None:
     )
     assert "next: lagbench predict runs/curl-noise/tiny/gns-0/weights.pt" in trained.stdout
     assert "hint: tiny is for tests" in trained.stdout
-    predicted = lagbench("predict", "runs/curl-noise/tiny/gns-0/weights.pt", "--threads", "1", "--no-bench")
+    again = lagbench(
+        "train", "curl-noise", "--size", "tiny", "--baseline", "gns", "--set", "training.steps=1"
+    )
+    assert "it was over before" in again.stdout
+    assert "it was over before" not in trained.stdout
+    predict = ("predict", "runs/curl-noise/tiny/gns-0/weights.pt", "--threads", "1", "--no-bench")
+    assert lagbench(*predict, "--set", "model.latent=7").exit_code == 2
+    predicted = lagbench(*predict, "--set", "model.clamp=false")
+    with netCDF4.Dataset("predictions.nc") as data:
+        assert "model.clamp=false" in data.getncattr("training")
     assert "without the neighbour search" in predicted.stdout
     assert "next: lagbench score predictions.nc" in predicted.stdout
     scored = lagbench("score", "predictions.nc", "--workers", "1", "--json")

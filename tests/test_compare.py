@@ -267,7 +267,9 @@ def test_how_much_better_is_said(
 ) -> None:
     """The printed number is the size of the difference, and the word its sign."""
     card = bench.evaluate(bench.submit(tmp_path / "predictions.nc", predict))
-    line = [line for line in flag_lines(card) if line.startswith("against ")][row]
+    lines = [line for line in flag_lines(card) if line.startswith("against ")]
+    assert lines[0].endswith("is the same") is (predict is still)  # persistence
+    line = lines[row]
     found = re.search(rf"{word} by ([\d.e-]+) \(2 scenarios: no p-value\)", line)
     assert found, line
     against = card.against(list(card.scores)[1 + row])

@@ -143,6 +143,10 @@ def test_no_such_recipe(entry: Entry) -> None:
         recipe_for(entry, "cavity", "tiny", variant="lon")
     with pytest.raises(UsageError, match="cavity/tiny"):
         recipe_for(entry, "curl-noise", "full")
+    with pytest.raises(UsageError, match="leave --recipe out"):
+        recipe_for(entry, "curl-noise", "mini", variant="long")  # of any split there is one without a variant
+    with pytest.raises(UsageError, match="cavity/tiny"):
+        recipe_for(entry, "cavity", "huge", variant="long")
 
 
 @pytest.mark.parametrize(

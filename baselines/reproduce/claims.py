@@ -101,6 +101,11 @@ CLAIMS = (
         rivals=("neuralmpm-unmixed",),
     ),
     Claim(
+        question="Does NeuralMPM gain by the mean over the images of the box, with the same weights?",
+        first="neuralmpm-averaged",
+        rivals=("neuralmpm",),
+    ),
+    Claim(
         question="Does LSTM + MLP come first among the frame models (Table 4.8: it does)?",
         first="lstm-mlp",
         rivals=tuple(name for name in FRAME_MODELS if name != "lstm-mlp"),

@@ -195,6 +195,8 @@ def _seeds(headers: Sequence[Header]) -> tuple[int | None, ...]:
         found = dict.fromkeys(getattr(header, name) for header in headers)
         if len(found) > 1:
             fix = "submit each on its own"
+            if name == "method":
+                fix += "; or write seeds of one method under one name: lagbench predict --method NAME"
             raise UsageError(f"the files differ in {name}", got=", ".join(map(ascii, found)), fix=fix)
     seeds = tuple(header.seed for header in headers)
     if any(seed is not None and not 0 <= seed < 2**63 for seed in seeds):

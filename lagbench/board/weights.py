@@ -62,7 +62,7 @@ def require_weights(weights: Sequence[str | Path], headers: Sequence[Header]) ->
         expected = (header.split, header.size, header.dataset_sha256, header.seed or 0)
         if got != expected:
             raise UsageError(
-                "the weights did not make the predictions at the size that they were trained at",
+                "the weights do not belong to these predictions",
                 where=str(path),
                 expected=f"{expected[0]} {expected[1]}, data set {expected[2][:16]}, seed {expected[3]}",
                 got=f"{got[0]} {got[1]}, data set {got[2][:16]}, seed {got[3]}",

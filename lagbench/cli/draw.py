@@ -115,9 +115,10 @@ def plot(
     check_kind(kind)
     source = _source(name, split, size, scenario, root)
     with _told_as_given(name):
-        with open_recording(source) as recording:
-            number = recording.scene(frame).frame
-        target = _target(output or _default_name(source, f"-frame{number}.png"))
+        if output is None:
+            with open_recording(source) as recording:
+                output = _default_name(source, f"-frame{recording.frame_number(frame)}.png")
+        target = _target(output)
         plot_frame(source, frame, target, kind=kind, dpi=dpi)
     show({"output": target}, [str(target)], as_json=as_json, quiet=quiet)
 

@@ -158,8 +158,9 @@ def compare(
     floor = str(second) if str(second) in one.floors else None
     bare = Path(second).name == str(second) and not Path(second).suffix
     if floor is None and bare and not os.path.lexists(second):
-        fix = f"{nearest(str(second), one.floors)}; or name scores, predictions or a folder of them"
-        raise UsageError("neither a floor nor a file", where=str(first), got=ascii(str(second)), fix=fix)
+        floors = f"{nearest(str(second), one.floors)}; or " if one.floors else ""
+        fix = f"{floors}name scores, predictions or a folder of them"
+        raise UsageError("neither a floor nor a file", got=ascii(str(second)), fix=fix)
     two = _contestant(second, root, workers, registry) if floor is None else _floor(one, floor)
     _check_same(one, two)
     judged = _judged(one, two)

@@ -161,8 +161,8 @@ def _against(card: ScoreCard, row: str) -> str:
     low, high = found.interval
     if math.isnan(found.difference):
         return f"{card.ranking} cannot be compared"
-    ours, theirs = (card.scores[name][card.ranking].mean for name in (SUBMISSION, row))
-    if math.isclose(ours, theirs, rel_tol=1e-12):  # sums of the same numbers in another order
+    # sums of the same numbers in another order
+    if abs(found.difference) <= 1e-12 * abs(card.scores[row][card.ranking].mean):
         return f"{card.ranking} is the same"
     if found.difference < 0.0:
         word, low, high = "better", -high, -low  # the bounds of what is printed: how much better
