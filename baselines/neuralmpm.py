@@ -56,7 +56,7 @@ class NeuralMPMOptions(Options):
     # whether the U-Net sees how far solids are strained since the scenario's first frame
     strain: bool = False
     symmetry: Symmetry = Symmetry.NONE  # images that training windows are replaced by at random
-    # whether calls of rollouts are means over those images, at as many times the cost; those of training are not
+    # whether calls of rollouts, not of training, are means over those images, at as many times the cost
     average: bool = False
 
 
