@@ -20,7 +20,7 @@ import torch
 from lagbench.atomic import write_atomically
 from lagbench.data.layout import resolve_root
 from lagbench.data.local import rooted
-from lagbench.data.registry import Registry
+from lagbench.data.registry import Registry, Size
 from lagbench.errors import UnreadableFileError, UsageError
 from lagbench.submission.budget import budget_in
 from lagbench.submission.writer import PredictionsWriter
@@ -51,6 +51,7 @@ class PredictionResult:
     split: str  # name of the split
     size: str  # name of the size
     trained_size: str  # name of the size that the model was trained at
+    settings: tuple[str, ...]  # changes of its options, as in model.average=true
     method: str  # what made it
     scenarios: int  # scenarios predicted
     frames: int  # frames of each
@@ -130,9 +131,8 @@ def predict(
     paths = list(tests.values())
     side = min(batch or (1 if machine == "cpu" else len(paths)), len(paths))
     with threads_used(threads), memory_errors_told("lower --batch"):
-        model = _model(found, facts, settings, where=str(checkpoint))
-        check_symmetry(getattr(model.options, "symmetry", None), known.size(facts.split, facts.size))
-        model = model.to(machine)
+        tier = known.size(facts.split, facts.size)
+        model = _model(found, facts, tier, settings, where=str(checkpoint)).to(machine)
         work = _Rollouts(model, facts, paths, side, machine)
         label, count, here = method or model.method, parameter_count(model), hardware(machine)
         on_cpu = f"{here['processor']}, {here['threads']} thread{'s' if here['threads'] > 1 else ''}"
@@ -162,6 +162,7 @@ def predict(
         split=facts.split,
         size=facts.size,
         trained_size=found.facts.size,
+        settings=tuple(settings),
         method=label,
         scenarios=len(paths),
         frames=facts.horizon,
@@ -233,13 +234,14 @@ class _Rollouts:
         return time.process_time() if self.clock == "processor" else time.perf_counter()
 
 
-def _model(found: Checkpoint, facts: Facts, settings: Sequence[str], *, where: str) -> Baseline:
+def _model(found: Checkpoint, facts: Facts, size: Size, settings: Sequence[str], *, where: str) -> Baseline:
     """Return the model of a checkpoint for a size, with settings."""
     scaled = replace(found, facts=_rescaled(found.facts, facts))
     model = restore(scaled, where=where)  # refuses a damaged file, whatever is set
     if not settings:
         return model
     options = changed_options(find(found.baseline), found.options, settings)
+    check_symmetry(options.get("symmetry"), size)
     try:
         return restore(replace(scaled, options=options), where=where)
     except UnreadableFileError as error:
@@ -247,7 +249,7 @@ def _model(found: Checkpoint, facts: Facts, settings: Sequence[str], *, where: s
             "the weights do not fit the model with these settings",
             where="--set",
             got=", ".join(settings),
-            fix="set what changes no weights, as in model.average=true; or train with the settings",
+            fix="set what changes no weights, or train with these settings",
         ) from error
 
 

@@ -121,7 +121,9 @@ def test_files_that_do_not_belong_together(own: BoardBench, monkeypatch: pytest.
     same = own.predict(still, "same", seed=4)
     two = own.predict(still, "one", seed=0), own.predict(noisy, "another", seed=1)
     odd = own.data.submit(own.folder.parent / "odd.nc", still, "My Model!")
+    small, large = (own.predict(still, "sized", seed=n, parameters=9 + n) for n in (0, 1))
     for files, keys in (
+        ((small, large), {}),
         ((plain, other), {"method": "both"}),
         ((same, same), {}),
         ((odd,), {}),

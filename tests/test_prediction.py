@@ -24,6 +24,7 @@ from lagbench.baselines.catalogue import every_entry
 from lagbench.baselines.checkpoint import Checkpoint, save
 from lagbench.baselines.job import MOST_RECORD, OVER
 from lagbench.baselines.machine import threads_used
+from lagbench.baselines.neuralmpm import NeuralMPM
 from lagbench.baselines.predict import PredictionResult, UnfinishedWarning, predict
 from lagbench.baselines.rollout import as_published, roll_out, single
 from lagbench.data.registry import Registry
@@ -327,6 +328,20 @@ def test_a_model_is_changed_where_that_needs_no_weights(
     for setting in ("training.steps=3", "model.explode=1", "model.count=2"):
         with pytest.raises(UsageError):
             run("several", settings=[setting])
+
+
+def test_no_image_falls_sideways(tiny_split: Callable[..., GenerationResult], tmp_path: Path) -> None:
+    """Where gravity points down, images of the square are refused at prediction as in training."""
+    root = tiny_split("fluid").root
+    model = NeuralMPM.build({"symmetry": "mirror"}, facts_of("fluid", "tiny", root=root))
+    options = model.options.model_dump(mode="json")
+    stored = Checkpoint(
+        baseline="neuralmpm", options=options, facts=model.facts, weights=model.state_dict(), training={}
+    )
+    save(tmp_path / "weights.pt", stored)
+    with pytest.raises(UsageError, match="gravity"):
+        predict(tmp_path / "weights.pt", tmp_path / "p.nc", root=root, settings=["model.symmetry=square"])
+    assert not (tmp_path / "p.nc").exists()
 
 
 def test_at_its_own_size_a_model_keeps_its_radius(run: Predict, generated: GenerationResult) -> None:

@@ -29,8 +29,8 @@ from .model import Board
 from .payload import FINENESS, Fineness, embedded, payload
 from .sections import empty, lede, navigation, overview, section, stage
 
-BUDGET = 30_000  # bytes that an entry shall take, all in all; more only where its coarsest data need them
-FEWEST = 66  # fewer entries than these share what so many may take, 2 MB
+BUDGET = 40_000  # bytes that an entry shall take, all in all; more only where its coarsest data need them
+FEWEST = 50  # fewer entries than these share what so many may take, 2 MB
 
 SCRIPTS = (
     *("codec", "text", "scale", "chart", "state", "table"),

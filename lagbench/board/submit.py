@@ -191,8 +191,8 @@ def _seeds(headers: Sequence[Header]) -> tuple[int | None, ...]:
     """Return the seeds of files that belong together; refuse those that do not."""
     if not 1 <= len(headers) <= MOST_SEEDS:
         raise UsageError("too many files", expected=f"1 to {MOST_SEEDS}, one per seed", got=len(headers))
-    for name in ("split", "size", "dataset_sha256", "method"):
-        found = dict.fromkeys(getattr(header, name) for header in headers)
+    for name in ("split", "size", "dataset_sha256", "method", "parameters"):
+        found = dict.fromkeys(str(getattr(header, name)) for header in headers)
         if len(found) > 1:
             fix = "submit each on its own"
             if name == "method":
@@ -230,7 +230,7 @@ def _require_free(folder: Folder, place: Place, about: About, *, replace: bool) 
     """Refuse the place of another entry, unless that is to be replaced, and a name like another's."""
     own = entry_path(place)
     if (folder.path / own).exists() and not replace:
-        fix = "replace it with --replace, or name this one otherwise: --method NAME"
+        fix = "replace it with --replace, or give this one another --method, and another name: in meta.yaml"
         raise UsageError("there is such an entry already", where=str(folder.path / own), fix=fix)
     names = {floor: f"the floor {floor}" for floor in FLOORS}
     for path in folder.entries():
@@ -241,7 +241,7 @@ def _require_free(folder: Folder, place: Place, about: About, *, replace: bool) 
                     names[other.name] = str(path)
     for name, holder in names.items():
         if skeleton(name) == skeleton(about.name):
-            fix = "choose another, or say what differs: --name 'GNS, six terms'"
+            fix = "choose another, or say what differs, in meta.yaml: `name: GNS, six terms`"
             raise UsageError("the name looks like another's", where=holder, got=ascii(about.name), fix=fix)
 
 

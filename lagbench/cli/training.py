@@ -288,6 +288,7 @@ def _solver_time(split: str, size: str, *, quiet: bool) -> SolverBench | None:
 
 def _predicted(result: PredictionResult, solver: SolverBench | None, where: str) -> list[str]:
     trained = f", trained at {result.trained_size}" if result.trained_size != result.size else ""
+    trained += "".join(f", {setting}" for setting in result.settings)
     lines = [
         f"{result.path}: {result.method}{trained}, {result.scenarios} scenarios, {result.frames} frames",
         f"  model   {result.seconds_per_frame:.3g} s per frame ({result.seconds_without_search:.3g} s"
