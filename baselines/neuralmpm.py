@@ -13,6 +13,7 @@ calls. The U-Net's last layer starts at zero: an untrained model keeps every vel
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -331,8 +332,8 @@ class NeuralMPM(Baseline):
         for matrix in images(options.symmetry):
             forcing = [matrix] * options.bundle if options.wall_velocity else []
             blocks = [self._turn(matrix), torch.eye(options.context), *forcing]
-            said = self.network(turned_field(seen, matrix, torch.block_diag(*blocks)))
-            back = torch.block_diag(*[matrix.T] * (len(options.materials) * options.bundle))
+            said = self.network(turned_field(seen, matrix, _diagonal(blocks)))
+            back = _diagonal([matrix.T] * (len(options.materials) * options.bundle))
             outputs.append(turned_field(said, matrix.T, back))
         return torch.stack(outputs).mean(dim=0)
 
@@ -340,7 +341,7 @@ class NeuralMPM(Baseline):
         """Return what an image does to the channels of :meth:`_fields`, shape [channel, channel]."""
         one = [torch.ones(1, 1), *[matrix] * self.options.velocities]
         one += [of_strain(matrix)] if self.options.strain else []
-        return torch.block_diag(*one * len(self.options.materials), of_walls(matrix))
+        return _diagonal([*one * len(self.options.materials), of_walls(matrix)])
 
     def _fields(self, state: GridState, stencil: Stencil) -> tuple[Tensor, Tensor]:
         """Return what the U-Net sees of the particles, and the last velocity on the grid [length/frame].
@@ -369,3 +370,9 @@ class NeuralMPM(Baseline):
         whole = sums[:, : 1 + shown].view(windows, kinds, -1, *self.grid.shape).sum(dim=1) / self.unit
         mean = whole[:, -2:] / whole[:, :1].clamp(min=EMPTY)
         return fields, mean.repeat_interleave(kinds, dim=0)
+
+
+def _diagonal(blocks: Sequence[Tensor]) -> Tensor:
+    """Return the matrix that has blocks on its diagonal."""
+    matrix: Tensor = torch.block_diag(*blocks)  # type: ignore[no-untyped-call]
+    return matrix

@@ -240,7 +240,7 @@ def _require_free(folder: Folder, place: Place, about: About, *, replace: bool) 
                 if other.status is Status.ACTIVE:
                     names[other.name] = str(path)
     for name, holder in names.items():
-        if skeleton(name) == skeleton(about.name):
+        if skeleton(name) == skeleton(about.name or ""):
             fix = "choose another, or say what differs, in meta.yaml: `name: GNS, six terms`"
             raise UsageError("the name looks like another's", where=holder, got=ascii(about.name), fix=fix)
 
