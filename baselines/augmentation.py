@@ -62,14 +62,15 @@ def check_symmetry(symmetry: object, size: Size) -> None:
 
 def images(symmetry: Symmetry) -> Tensor:
     """Return all images, the identity first, as matrices of shape [image, 2, 2]."""
-    flips = {Symmetry.NONE: [(1, 1)], Symmetry.MIRROR: [(1, 1), (-1, 1)]}
-    signs = flips.get(symmetry, [(1, 1), (-1, 1), (1, -1), (-1, -1)])
-    upright = torch.diag_embed(torch.tensor(signs, dtype=torch.float32))
-    return torch.cat([upright, upright.flip(2)]) if symmetry is Symmetry.SQUARE else upright
+    signs = [(1.0, 1.0), (-1.0, 1.0), (1.0, -1.0), (-1.0, -1.0)]
+    upright = torch.diag_embed(torch.tensor(signs))
+    if symmetry is Symmetry.SQUARE:
+        return torch.cat([upright, upright.flip(2)])
+    return upright[: 2 if symmetry is Symmetry.MIRROR else 1]
 
 
-def turned_field(field: Tensor, matrix: Tensor, channels: Tensor) -> Tensor:
-    """Return the image of a field on a grid that lies in its box as its images do.
+def field_image(field: Tensor, matrix: Tensor, channels: Tensor) -> Tensor:
+    """Return the image of a field on a grid that lies in its box as its images do, x and y as they lie there.
 
     Args:
         field: values at the nodes, shape [window, channel, x node, y node].
@@ -112,20 +113,20 @@ def image(batch: Batch, matrix: Tensor, bounds: Bounds) -> Batch:
     first = None if batch.origin is None else _turned(turn, batch.origin - centre) + centre
     walls = batch.wall_velocity
     if walls is not None:  # wall k becomes the one that the image of its normal points at
-        source = of_walls(matrix).argmax(dim=2)
+        source = wall_permutation(matrix).argmax(dim=2)
         walls = _turned(matrix[:, None, None], walls)
         walls = walls.gather(2, source[:, None, :, None].expand_as(walls))
     return replace(batch, position=position, wall_velocity=walls, origin=first)
 
 
-def of_walls(matrix: Tensor) -> Tensor:
+def wall_permutation(matrix: Tensor) -> Tensor:
     """Return which wall an image puts in the place of which, 1 or 0, shape [..., wall there, wall here]."""
     normals = _NORMALS.to(matrix)
     there = _turned(matrix[..., None, :, :], normals)  # normals of the images, shape [..., wall, 2]
     return ((normals[:, None] * there[..., None, :, :]).sum(dim=-1) > 0.5).to(matrix)
 
 
-def of_strain(matrix: Tensor) -> Tensor:
+def strain_image(matrix: Tensor) -> Tensor:
     """Return what an image does to the components (xx, xy, yy) of a symmetric tensor, shape [3, 3]."""
     (a, b), (c, d) = matrix
     rows = [[a * a, 2 * a * b, b * b], [a * c, a * d + b * c, b * d], [c * c, 2 * c * d, d * d]]

@@ -23,7 +23,7 @@ from torch.nn.functional import gelu
 
 from lagbench.errors import DataError, UsageError
 
-from .augmentation import Symmetry, disturbed, images, of_strain, of_walls, turned_field, way_back
+from .augmentation import Symmetry, disturbed, field_image, images, strain_image, wall_permutation, way_back
 from .baseline import Baseline, Batch, Facts, Options, check_moving_walls, last_velocities
 from .graph import MATERIALS
 from .particle_grid import ParticleGrid, Stencil
@@ -231,12 +231,12 @@ class NeuralMPM(Baseline):
             most = options.pushforward + 1
             with torch.no_grad():
                 for _ in range(int(torch.randint(most, (), generator=generator, device=generator.device))):
-                    state, frames = self.call(state)
+                    state, frames = self.call(state, average=False)
                     following += len(frames)
         errors: list[Tensor] = []
         reached = state.position
         for _ in range(options.calls):
-            state, frames = self.call(state)
+            state, frames = self.call(state, average=False)
             for position, velocity in frames:
                 path = batch.position[:, following + len(errors) - 1 : following + len(errors) + 1]
                 gap = path[:, 0] - reached.detach()
@@ -246,7 +246,10 @@ class NeuralMPM(Baseline):
         return {"velocity": torch.stack(errors).mean()}
 
     def start(self, given: Batch, *, average: bool = True) -> GridState:
-        """Return the state after the given frames; where they are few, the first velocity repeats."""
+        """Return the state after the given frames; where they are few, the first velocity repeats.
+
+        ``average=False``, as in training, takes no means over images, whatever the options say.
+        """
         position = given.position[:, -self.history :].clamp(self.grid.low, self.grid.high)
         velocity = last_velocities(position, self.options.velocities)
         slot = self.slot[given.material]
@@ -279,20 +282,23 @@ class NeuralMPM(Baseline):
         fields, _ = self._fields(state, self.grid.stencil(state.position, state.layer))
         turned = [fields]
         if average and self.options.average:
-            turned = [turned_field(fields, one, self._turn(one)) for one in images(self.options.symmetry)]
+            turned = [field_image(fields, one, self._turn(one)) for one in images(self.options.symmetry)]
         return replace(state, context=torch.stack([self.context(each) for each in turned]).mean(dim=0))
 
     def advance(self, state: GridState) -> tuple[GridState, Tensor]:
         """Advance by one frame, calling the U-Net once for every bundle of them."""
         if not state.coming:
-            state, frames = self.call(state, average=self.options.average)
+            state, frames = self.call(state)
             state = replace(state, coming=tuple(position for position, _ in frames))
         return replace(state, coming=state.coming[1:]), state.coming[0]
 
     def call(
-        self, state: GridState, *, average: bool = False
+        self, state: GridState, *, average: bool = True
     ) -> tuple[GridState, list[tuple[Tensor, Tensor]]]:
-        """Return the state after a bundle of frames, and position and velocity in each of them."""
+        """Return the state after a bundle of frames, and position and velocity in each of them.
+
+        ``average`` as in :meth:`start`.
+        """
         share = self.options.smoothing
         stencil = self.grid.stencil(state.position, state.layer)
         fields, on_grid = self._fields(state, stencil)
@@ -302,7 +308,8 @@ class NeuralMPM(Baseline):
             moved = state.walls[:, coming.clamp(max=state.walls.shape[1] - 1)] / self.speed
             parts.append(torch.einsum("fmwc,wxy->fmcxy", moved, self.beside).flatten(1, 2))
         seen = torch.cat(parts, dim=1)
-        output = (self._mean_call(seen) if average else self.network(seen)) * self.change
+        whole = average and self.options.average
+        output = (self._mean_over_images(seen) if whole else self.network(seen)) * self.change
         # accelerations in the coming frames [length/frame^2], shape [layer, 2 bundle, x node, y node]
         changes = output.reshape(-1, 2 * self.options.bundle, *self.grid.shape)
         predicted = torch.cat([on_grid, changes], dim=1)
@@ -322,26 +329,27 @@ class NeuralMPM(Baseline):
         walls = state.walls[:, min(len(frames), state.walls.shape[1] - 1) :]
         return replace(state, position=position, velocity=velocities, walls=walls), frames
 
-    def _mean_call(self, seen: Tensor) -> Tensor:
+    def _mean_over_images(self, seen: Tensor) -> Tensor:
         """Return the mean over all images of what the U-Net says of one, turned back.
 
-        A rollout of an image is then the image of the rollout: frame averaging over the whole group
-        (Puny et al. 2022, arXiv 2110.03336).
+        Fields in and out have the shape [window, channel, x node, y node] and no unit. A rollout of an
+        image is then the image of the rollout: frame averaging over the whole group (Puny et al. 2022,
+        arXiv 2110.03336).
         """
         options, outputs = self.options, []
         for matrix in images(options.symmetry):
             forcing = [matrix] * options.bundle if options.wall_velocity else []
             blocks = [self._turn(matrix), torch.eye(options.context), *forcing]
-            said = self.network(turned_field(seen, matrix, _diagonal(blocks)))
+            said = self.network(field_image(seen, matrix, _diagonal(blocks)))
             back = _diagonal([matrix.T] * (len(options.materials) * options.bundle))
-            outputs.append(turned_field(said, matrix.T, back))
+            outputs.append(field_image(said, matrix.T, back))
         return torch.stack(outputs).mean(dim=0)
 
     def _turn(self, matrix: Tensor) -> Tensor:
         """Return what an image does to the channels of :meth:`_fields`, shape [channel, channel]."""
         one = [torch.ones(1, 1), *[matrix] * self.options.velocities]
-        one += [of_strain(matrix)] if self.options.strain else []
-        return _diagonal([*one * len(self.options.materials), of_walls(matrix)])
+        one += [strain_image(matrix)] if self.options.strain else []
+        return _diagonal([*one * len(self.options.materials), wall_permutation(matrix)])
 
     def _fields(self, state: GridState, stencil: Stencil) -> tuple[Tensor, Tensor]:
         """Return what the U-Net sees of the particles, and the last velocity on the grid [length/frame].

@@ -20,7 +20,7 @@ import torch
 from lagbench.atomic import write_atomically
 from lagbench.data.layout import resolve_root
 from lagbench.data.local import rooted
-from lagbench.data.registry import Registry, Size
+from lagbench.data.registry import Registry
 from lagbench.errors import UnreadableFileError, UsageError
 from lagbench.submission.budget import budget_in
 from lagbench.submission.writer import PredictionsWriter
@@ -108,8 +108,7 @@ def predict(
     Raises:
         UnreadableFileError: the checkpoint is damaged or unsafe.
         DataError: the data set is missing, damaged, or of another version than that of the training.
-        UsageError: the model's baseline is not installed, no such device, or weights of no use at the size
-            or with the settings.
+        UsageError: the baseline is not installed, no such device, or weights of no use at the size or as set.
         WorkFailedError: out of memory, or the disk is full.
     """
     found = load(checkpoint)
@@ -131,8 +130,7 @@ def predict(
     paths = list(tests.values())
     side = min(batch or (1 if machine == "cpu" else len(paths)), len(paths))
     with threads_used(threads), memory_errors_told("lower --batch"):
-        tier = known.size(facts.split, facts.size)
-        model = _model(found, facts, tier, settings, where=str(checkpoint)).to(machine)
+        model = _model(found, facts, settings, known, where=str(checkpoint)).to(machine)
         work = _Rollouts(model, facts, paths, side, machine)
         label, count, here = method or model.method, parameter_count(model), hardware(machine)
         on_cpu = f"{here['processor']}, {here['threads']} thread{'s' if here['threads'] > 1 else ''}"
@@ -234,14 +232,16 @@ class _Rollouts:
         return time.process_time() if self.clock == "processor" else time.perf_counter()
 
 
-def _model(found: Checkpoint, facts: Facts, size: Size, settings: Sequence[str], *, where: str) -> Baseline:
-    """Return the model of a checkpoint for a size, with settings."""
+def _model(
+    found: Checkpoint, facts: Facts, settings: Sequence[str], known: Registry, *, where: str
+) -> Baseline:
+    """Return the model of a checkpoint for the size that facts tell of, with settings."""
     scaled = replace(found, facts=_rescaled(found.facts, facts))
     model = restore(scaled, where=where)  # refuses a damaged file, whatever is set
     if not settings:
         return model
     options = changed_options(find(found.baseline), found.options, settings)
-    check_symmetry(options.get("symmetry"), size)
+    check_symmetry(options.get("symmetry"), known.size(facts.split, facts.size))
     try:
         return restore(replace(scaled, options=options), where=where)
     except UnreadableFileError as error:

@@ -32,9 +32,9 @@ from lagbench.torch import Window, WindowDataset, WindowSampler, collate
 from lagbench.work.progress import Meter, Progress
 
 from .augmentation import check_symmetry
-from .baseline import Baseline, facts_of
+from .baseline import Baseline, Facts, facts_of
 from .catalogue import find
-from .checkpoint import load_weights, rounded_weights, save
+from .checkpoint import Checkpoint, load_weights, rounded_weights, save
 from .job import STOPPED_EARLY, RunFolder, TrainingJob, TrainingRecord, parameter_count
 from .machine import (
     bound_memory,
@@ -139,22 +139,8 @@ def train(
     check_writable(folder.path, option="--output")
     shared = int(os.environ.get("WORLD_SIZE", processes))
     earlier = folder.earlier(plan, resume=resume, fresh=fresh)
-    if earlier is not None and earlier.facts.dataset_sha256 != facts.dataset_sha256:
-        raise DataError(
-            "the training began on another version of the data set",
-            where=str(folder.path),
-            expected=earlier.facts.dataset_sha256,
-            got=facts.dataset_sha256,
-            fix="train anew with --fresh",
-        )
-    if earlier is not None and earlier.training.get("processes") != shared:
-        raise UsageError(
-            "the training began with another number of processes",
-            where="--processes",
-            expected=earlier.training.get("processes"),
-            got=shared,
-            fix="the learning rate and the order of windows follow from it; or train anew with --fresh",
-        )
+    if earlier is not None:
+        _check_same_conditions(earlier, facts, processes=shared, where=str(folder.path))
     if earlier is None and not is_helper():
         folder.clear()
     job = TrainingJob(
@@ -202,6 +188,26 @@ def train(
             validation_cpu_seconds=ledger.validation_cpu_seconds,
             gpu_seconds=ledger.gpu_seconds,
             wall_seconds=ledger.wall_seconds,
+        )
+
+
+def _check_same_conditions(earlier: Checkpoint, facts: Facts, *, processes: int, where: str) -> None:
+    """Refuse to go on with other data, or with another number of processes, than a training began with."""
+    if earlier.facts.dataset_sha256 != facts.dataset_sha256:
+        raise DataError(
+            "the training began on another version of the data set",
+            where=where,
+            expected=earlier.facts.dataset_sha256,
+            got=facts.dataset_sha256,
+            fix="train anew with --fresh",
+        )
+    if earlier.training.get("processes") != processes:
+        raise UsageError(
+            "the training began with another number of processes",
+            where="--processes",
+            expected=earlier.training.get("processes"),
+            got=processes,
+            fix="the learning rate and the order of windows follow from it; or train anew with --fresh",
         )
 
 

@@ -70,7 +70,7 @@ lagbench submit runs/cavity/mini/supergat-0/predictions.nc --from meta.yaml
 ```
 
 All models, tables and figures of a size, resumable: `python -m lagbench.baselines.reproduce --size mini
---root DATA --runs runs`; `lagbench submit` makes entries of them. Variants change one option:"""
+--root DATA --runs runs`; `lagbench submit` makes entries of them. Variants change an option or two:"""
 
 
 def render(sources: Sources, sizes: Sequence[str] = SIZES) -> str:
@@ -82,8 +82,10 @@ def render(sources: Sources, sizes: Sequence[str] = SIZES) -> str:
     protocols = [part for size in sizes for part in _protocol(sources, size)]
     parts += ["## VAR by the thesis's protocol (section 4.8.3)", *protocols] if protocols else []
     variants = (
-        f"- `{model.name}`: `--baseline {model.baseline} --{'recipe' if model.recipe else 'set'}"
-        f" {model.recipe or ' --set '.join(model.settings)}`"
+        f"- `{model.name}`: `--baseline {model.baseline}"
+        + (f" --recipe {model.recipe}" if model.recipe else "")
+        + "".join(f" --set {setting}" for setting in model.settings)
+        + "`"
         for model in ROSTER.values()
         if model.varied
     )

@@ -111,8 +111,7 @@ def submit(
 
     Raises:
         UsageError: a key is missing, the entry is there already, the files do not belong
-            together, the method has the name of a floor or looks like another's, or there is no
-            leaderboard.
+            together, the name is taken or looks like another's, or there is no leaderboard.
         UnreadableFileError: predictions or weights cannot be read.
         ChecksFailedError: they are not valid.
         DataError: the test subset is missing, or they were made from another data set.
