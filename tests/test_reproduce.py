@@ -129,6 +129,24 @@ def test_the_page_tells_what_there_is(sources: Sources) -> None:
     assert page == results.render(sources, (SIZE,))
 
 
+def test_studies_stand_beside_the_thesis(sources: Sources, tmp_path: Path) -> None:
+    """A table of which a row was committed is shown with what the thesis prints, and no other."""
+    assert "Table 4.3 on" not in results.render(sources, (SIZE,))
+    training = {"parameters": 1234, "step": 7, "windows": 100, "cpu_seconds": 36.0}
+    training |= {"dataset_sha256": "f" * 64, "recipe": {"training": {"batch": 32}}}
+    held = {"training": training, "train": 0.25, "valid": 0.5, "seed": 0}
+    home = tmp_path / "none" / "fluid" / SIZE
+    home.mkdir(parents=True)
+    (home / "mlp_studies.json").write_text(json.dumps({"mlp-4-3-2": held}))
+    rows = markdown_rows(results.render(sources, (SIZE,)), "train, thesis")
+    (ours,) = (row for row in rows if row["train, ours"] != "-")
+    heads = ("hidden layers", "parameters, ours", "steps x batch, ours")
+    assert [ours[head] for head in heads] == ["200 x 200 x 200", "1,234", "7 x 32"]
+    heads = ("train, thesis", "train, ours", "valid, thesis", "valid, ours")
+    assert [ours[head] for head in heads] == ["0.1147", "0.25", "0.1194", "0.5"]
+    assert len(rows) == 6  # the widths of Table 4.3
+
+
 def test_what_is_missing_is_listed_with_its_command(plan: Plan, tmp_path: Path) -> None:
     """Where entries are missing stands the command; a training whose predictions were refused is no gap."""
     (tmp_path / SPLIT / SIZE).mkdir(parents=True)

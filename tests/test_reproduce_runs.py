@@ -89,7 +89,10 @@ def test_what_is_there_is_what_was_asked_for(
 def test_studies_are_what_was_asked_for(
     generated: GenerationResult, unmeasured: Registry, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Errors of an MLP with another recipe are not taken for those that were asked for."""
+    """Errors of an MLP with another recipe are not taken for those that were asked for.
+
+    What a row came to lies in one file, which suffices for its table, unless it is of other data.
+    """
     monkeypatch.setattr(tables, "TABLES", {"table_4_2": ("4.2", SPLIT)})
     monkeypatch.setattr(tables, "study_rows", lambda _: STUDIES[:1])
     for steps in (1, 2):
@@ -105,7 +108,16 @@ def test_studies_are_what_was_asked_for(
         )
         if steps == 1:
             tables.make_studies(plan, "table_4_2")
-            assert list((tmp_path / "runs").rglob("errors.json"))
+            home = plan.home(SPLIT)
+            first = {path: path.stat().st_mtime_ns for path in home.rglob("*.*")}
+            tables.make_studies(plan, "table_4_2")
+            assert {path: path.stat().st_mtime_ns for path in home.rglob("*.*")} == first
+            known = tables.known_studies([home], plan.hash(SPLIT))
+            assert known["mlp-4-2-1"]["train"] > 0.0
+            assert known["mlp-4-2-1"]["training"]["step"] == 1
+            (row,) = tables.studies_beside_thesis("table_4_2", "tiny", known).tables[0].rows
+            assert f"{known['mlp-4-2-1']['valid']:.3g}" in row
+            assert tables.known_studies([home], "f" * 64) == {}
         else:
             with pytest.raises(UsageError):
                 tables.make_studies(plan, "table_4_2")

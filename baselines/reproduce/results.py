@@ -27,7 +27,7 @@ from lagbench.scoring.tables import ARROWS, Table
 from .claims import CLAIMS, answer, claim_rows, comparison_table, floors_ahead
 from .evidence import BOARD, WEIGHTS, Evidence, Method, Sources, read_json
 from .runs import budget, hardware
-from .tables import rollout_table
+from .tables import TABLES, known_studies, rollout_table, studies_beside_thesis, study_name, study_rows
 from .thesis import (
     EXPECTED,
     OPERATORS,
@@ -81,6 +81,8 @@ def render(sources: Sources, sizes: Sequence[str] = SIZES) -> str:
     parts = [HEAD, *_claims(learned), *(part for evidence in known for part in _chapter(evidence))]
     protocols = [part for size in sizes for part in _protocol(sources, size)]
     parts += ["## VAR by the thesis's protocol (section 4.8.3)", *protocols] if protocols else []
+    studies = [part for size in sizes for part in _studies(sources, size)]
+    parts += ["## MLPs from frame to frame (Tables 4.2 to 4.5)", *studies] if studies else []
     variants = (
         f"- `{model.name}`: `--baseline {model.baseline}"
         + (f" --recipe {model.recipe}" if model.recipe else "")
@@ -267,6 +269,17 @@ def _protocol(sources: Sources, size: str) -> Iterator[str]:
             sheet = beside_thesis(read_json(path))
             yield "\n\n".join([*sheet.notes, *map(_markdown, sheet.tables)])
             return
+
+
+def _studies(sources: Sources, size: str) -> Iterator[str]:
+    """Yield Tables 4.2 to 4.5, those of which a row was trained."""
+    for name, (_, split) in TABLES.items():
+        homes = [home / split / size for home in (sources.weights, sources.runs) if home]
+        measured = sources.size(split, size).measured
+        known = known_studies(homes, measured.dataset_sha256 if measured else None)
+        if any(study_name(study) in known for study in study_rows(name)):
+            sheet = studies_beside_thesis(name, size, known)
+            yield "\n\n".join([*sheet.notes, *map(_markdown, sheet.tables)])
 
 
 def _missing(found: Sequence[Evidence]) -> Iterator[str]:

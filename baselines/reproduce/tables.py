@@ -11,8 +11,9 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -232,13 +233,17 @@ SHARES: Mapping[str, tuple[float, int]] = {"mini": (0.1, 16), "tiny": (0.01, 64)
 
 WINDOWS = 4096  # most windows of a subset that an error is measured over, evenly spaced
 
-FILE = "errors.json"
+FILE = "mlp_studies.json"  # what the rows came to, in a folder of runs and beside committed weights
+
+
+def study_name(study: Study) -> str:
+    """Return what a row is called in files and folders, as in ``mlp-4-2-1``."""
+    return f"mlp-{study.table.replace('.', '-')}-{study.row}"
 
 
 def study_model(plan: Plan, study: Study) -> Model:
     """Return what to train for a row: at ``full`` its own recipe, else the size's recipe with changes."""
-    name = f"mlp-{study.table.replace('.', '-')}-{study.row}"
-    unvalidated = "training.validate_every=0"
+    name, unvalidated = study_name(study), "training.validate_every=0"
     if plan.size == "full":
         # what tells a row's recipe from the others of its table
         ends = {"4.2": study.activation, "4.3": study.widths[0], "4.4": len(study.widths), "4.5": study.row}
@@ -264,19 +269,38 @@ def study_rows(name: str) -> tuple[Study, ...]:
 
 def study_folder(plan: Plan, name: str, study: Study) -> Path:
     """Return the folder of a row's training; it lies apart from the runs that are scored."""
-    return plan.home(TABLES[name][1]) / "studies" / f"{study_model(plan, study).name}-{plan.seeds[0]}"
+    return plan.home(TABLES[name][1]) / "studies" / f"{study_name(study)}-{plan.seeds[0]}"
 
 
 def make_studies(plan: Plan, name: str) -> None:
     """Train the rows of a table and measure their errors, unless that was done."""
-    split = TABLES[name][1]
+    split, seed = TABLES[name][1], plan.seeds[0]
+    path = plan.home(split) / FILE
     for study in study_rows(name):
-        folder, model = study_folder(plan, name, study), study_model(plan, study)
-        check_training(plan, split, model, plan.seeds[0], folder=folder)
-        if not (folder / FILE).is_file():
-            make_training(plan, split, model, plan.seeds[0], folder=folder)
-            found = {subset: one_step_error(plan, split, folder, subset) for subset in ("train", "valid")}
-            write_atomically(folder / FILE, json.dumps(found).encode())
+        folder, model, held = study_folder(plan, name, study), study_model(plan, study), read_json(path)
+        check_training(plan, split, model, seed, folder=folder)
+        if held.get(model.name, {}).get("seed") == seed and (folder / "weights.pt").is_file():
+            continue
+        make_training(plan, split, model, seed, folder=folder)
+        errors = {subset: one_step_error(plan, split, folder, subset) for subset in ("train", "valid")}
+        held[model.name] = {"seed": seed, **errors, "training": read_json(folder / RECORD_NAME)}
+        write_atomically(path, json.dumps(held, indent=1, sort_keys=True).encode())
+
+
+def known_studies(homes: Iterable[Path], data: str | None) -> dict[str, Any]:
+    """Return what rows came to, by :func:`study_name`: ``train``, ``valid`` and the record of ``training``.
+
+    A row of a later folder goes before that of an earlier one; rows of data with another hash are left out.
+    """
+    held: dict[str, Any] = {}
+    for home in homes:
+        held |= read_json(home / FILE)
+    return {name: row for name, row in held.items() if data in (None, row["training"]["dataset_sha256"])}
+
+
+def _known(plan: Plan, figure: Figure) -> dict[str, Any]:
+    split = TABLES[figure.studies][1]
+    return known_studies((plan.weights / split / plan.size, plan.home(split)), plan.hash(split))
 
 
 def one_step_error(plan: Plan, split: str, folder: Path, subset: str) -> float:
@@ -303,10 +327,15 @@ def one_step_error(plan: Plan, split: str, folder: Path, subset: str) -> float:
 
 def studies(plan: Plan, figure: Figure) -> Sheet:
     """Return Table 4.2, 4.3, 4.4 or 4.5 with ours beside it."""
-    (printed, split), rows = TABLES[figure.studies], []
-    for study in study_rows(figure.studies):
-        folder = study_folder(plan, figure.studies, study)
-        errors, record = read_json(folder / FILE), read_json(folder / RECORD_NAME)
+    return studies_beside_thesis(figure.studies, plan.size, _known(plan, figure))
+
+
+def studies_beside_thesis(name: str, size: str, known: Mapping[str, Any]) -> Sheet:
+    """Return the rows of a table, those of :func:`known_studies` with what they came to."""
+    (printed, split), rows = TABLES[name], []
+    for study in study_rows(name):
+        held = known.get(study_name(study), {})
+        record = held.get("training", {})
         rows.append(
             (
                 str(study.row),
@@ -318,9 +347,9 @@ def studies(plan: Plan, figure: Figure) -> Sheet:
                 budget(record),
                 number(record["cpu_seconds"] / 3600.0 if record else None),
                 number(study.train, 4),
-                number(errors.get("train")),
+                number(held.get("train")),
                 number(study.valid, 4),
-                number(errors.get("valid")),
+                number(held.get("valid")),
             )
         )
     heads = (
@@ -328,9 +357,9 @@ def studies(plan: Plan, figure: Figure) -> Sheet:
         *("epochs x batch, thesis", "steps x batch, ours", "CPU hours"),
         *("train, thesis", "train, ours", "valid, thesis", "valid, ours"),
     )
-    share, _ = SHARES.get(plan.size, (1.0, 1))
+    share, _ = SHARES.get(size, (1.0, 1))
     note = (
-        f"Table {printed} on {split} {plan.size}: mean squared error of one step [standardised^2]; {share:g}"
+        f"Table {printed} on {split} {size}: mean squared error of one step [standardised^2]; {share:g}"
         " of the thesis's epochs, constant rate 1e-3. Standardisation and data differ from the thesis's:"
         " compare orders."
     )
@@ -342,7 +371,8 @@ def study_losses(plan: Plan, figure: Figure) -> Sheet:
     studies = study_rows(figure.studies)
     names = [s.activation if s.table == "4.2" else f"3 x {s.widths[0]}" for s in studies]
     folders = [study_folder(plan, figure.studies, study) for study in studies]
-    errors = [read_json(folder / FILE) for folder in folders]
+    known = _known(plan, figure)
+    errors = [known.get(study_name(study), {}) for study in studies]
     curves = {name: (None, *loss_over_steps(folder)) for name, folder in zip(names, folders, strict=True)}
     with charts(2, 2) as drawn:
         over_steps, after = drawn
