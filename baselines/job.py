@@ -20,6 +20,7 @@ from typing import Any, Self
 from torch import Tensor
 
 from lagbench.atomic import write_atomically
+from lagbench.data.checksums import round_digits
 from lagbench.data.hdf5 import check_regular
 from lagbench.data.registry import Registry
 from lagbench.errors import UnreadableFileError, UsageError
@@ -245,11 +246,11 @@ class TrainingJob:
         seconds = None if self.workers else ledger.cpu_seconds - ledger.validation_cpu_seconds
         return Budget(
             windows=ledger.windows_seen or None,
-            epochs=_rounded(ledger.epochs),
+            epochs=round_digits(ledger.epochs, 6),
             steps=ledger.step,
-            cpu_hours=None if seconds is None else _rounded(seconds / 3600.0),
-            validation_hours=_rounded(ledger.validation_cpu_seconds / 3600.0),
-            gpu_hours=_rounded(ledger.gpu_seconds / 3600.0),
+            cpu_hours=None if seconds is None else round_digits(seconds / 3600.0, 6),
+            validation_hours=round_digits(ledger.validation_cpu_seconds / 3600.0, 6),
+            gpu_hours=round_digits(ledger.gpu_seconds / 3600.0, 6),
             device=device.encode("ascii", "replace").decode()[:100],
             threads=machine["threads"],
             metric=ledger.metric,
@@ -301,10 +302,6 @@ class TrainingJob:
             **more,
             **ledger.as_json(),
         }
-
-
-def _rounded(value: float) -> float:
-    return float(f"{value:.6g}")
 
 
 def parameter_count(model: Baseline) -> int:

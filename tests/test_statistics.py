@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenario_factory import frames_of, make_key, write_scenario
 
+from lagbench.data.checksums import round_digits
 from lagbench.data.statistics import (
     MomentStream,
     combine,
     file_statistics,
-    round_digits,
     scenario_moments,
     statistics,
 )

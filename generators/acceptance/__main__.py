@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import Progress
 
+from lagbench.data.checksums import round_digits
 from lagbench.errors import LagbenchError, UsageError, WorkFailedError
 from lagbench.generators.solver import Device
 
@@ -106,7 +107,7 @@ def check_outputs(given: argparse.Namespace) -> None:
 def rounded(value: object) -> object:
     """Return a JSON value with its floats cut to significant digits, NaN as null."""
     if isinstance(value, float):
-        return float(f"{value:.{DIGITS}g}") if math.isfinite(value) else None
+        return round_digits(value, DIGITS) if math.isfinite(value) else None
     if isinstance(value, dict):
         return {key: rounded(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -28,6 +28,7 @@ from pydantic import (
     model_validator,
 )
 
+from lagbench.data.checksums import round_digits
 from lagbench.submission.budget import Budget, Track, track_of
 
 from .folder import Place, entry_path, score_paths, weights_path
@@ -202,7 +203,7 @@ class EntryBudget(Budget):
             values = [value for seed in known if (value := getattr(seed, name)) is not None]
             if len(values) == len(known):
                 mean = sum(values) / len(values)
-                held[name] = round(mean) if name in ("windows", "steps") else float(f"{mean:.6g}")
+                held[name] = round(mean) if name in ("windows", "steps") else round_digits(mean, 6)
         for name in ("device", "threads", "metric"):
             if len({getattr(seed, name) for seed in known}) == 1:
                 held[name] = getattr(known[0], name)

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lagbench.data.checksums import round_digits
 from lagbench.report.html import MISSING as NOTHING
 from lagbench.report.html import text, words
 
@@ -74,7 +75,7 @@ def payload(board: Board, fineness: Fineness = FINENESS[0]) -> dict[str, Any]:
 
 def _numbers(values: Sequence[float]) -> list[float | str | None]:
     """Return numbers as JSON knows them: None for NaN, text for what is infinite."""
-    return [None if math.isnan(x) else rounded(x, 4) if math.isfinite(x) else f"{x}" for x in values]
+    return [None if math.isnan(x) else round_digits(x, 4) if math.isfinite(x) else f"{x}" for x in values]
 
 
 @dataclass
@@ -168,7 +169,8 @@ class _Writer:
         }
 
     def _histogram(self, histogram: Histogram) -> list[Any]:
-        return [rounded(histogram.low), rounded(histogram.high), self._packed(histogram.shares)]
+        low, high = round_digits(histogram.low, 6), round_digits(histogram.high, 6)
+        return [low, high, self._packed(histogram.shares)]
 
     def _pictures(self, pictures: Pictures, scale: float) -> dict[str, Any]:
         """Return maps and film; values beyond four times the truth's greatest are cut off."""
@@ -217,7 +219,7 @@ def pack(values: ArrayLike, *, limits: tuple[float, float] | None = None, log: b
         share = _share(np.clip(x, low, high), low, high)
     steps = np.where(np.isfinite(x), np.rint(np.nan_to_num(share) * LEVELS), MISSING).astype(np.int64)
     letters = np.stack([DIGITS[steps >> 6], DIGITS[steps & 63]], axis=-1)
-    return [letters.tobytes().decode("ascii"), rounded(low), rounded(high), int(logarithmic)]
+    return [letters.tobytes().decode("ascii"), round_digits(low, 6), round_digits(high, 6), int(logarithmic)]
 
 
 def pack_film(film: ArrayLike, *, limits: tuple[float, float] = (-0.5, 1.5)) -> PackedFilm:
@@ -238,26 +240,17 @@ def pack_film(film: ArrayLike, *, limits: tuple[float, float] = (-0.5, 1.5)) -> 
     going = np.diff(wanted, 2, axis=0, prepend=wanted[:1])  # beside standing still, then constant velocity
     # No letter is off by more than 30.5 / 31^2 of the reach; three such errors stand before a letter.
     farthest = float(np.abs(going).max(initial=0.0)) + 1.5 * (high - low) / LEVELS
-    reach = rounded(1.01 * farthest / (1.0 - 3.0 * 30.5 / MOST_STEPS**2))
+    reach = round_digits(1.01 * farthest / (1.0 - 3.0 * 30.5 / MOST_STEPS**2), 6)
     for position in wanted[1:]:
         share = np.clip((position - (2.0 * now - before)) / reach, -1.0, 1.0)
         steps = np.sign(share) * np.rint(MOST_STEPS * np.sqrt(np.abs(share)))
         before, now = now, 2.0 * now - before + reach * steps * np.abs(steps) / MOST_STEPS**2
         letters.append(DIGITS[steps.astype(np.int64) + MOST_STEPS].tobytes().decode("ascii"))
-    return ["".join(letters), rounded(low), rounded(high), 2, wanted.shape[1], reach]
+    return ["".join(letters), round_digits(low, 6), round_digits(high, 6), 2, wanted.shape[1], reach]
 
 
 def _share(x: NDArray[np.float64], low: float, high: float) -> NDArray[np.float64]:
     return (x - low) / (high - low) if high > low else np.zeros_like(x)
-
-
-def rounded(value: float, digits: int = 6) -> float:
-    """Return a number with so many significant digits; what is not finite stays.
-
-    >>> rounded(0.123456789), rounded(float("inf"))
-    (0.123457, inf)
-    """
-    return float(f"{value:.{digits}g}") if math.isfinite(value) else value
 
 
 def spaced(length: int, count: int) -> list[int]:

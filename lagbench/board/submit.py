@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from lagbench.atomic import write_atomically
-from lagbench.data.checksums import file_sha256
+from lagbench.data.checksums import file_sha256, round_digits
 from lagbench.data.registry import Registry, Size, load
 from lagbench.errors import ChecksFailedError, UnreadableFileError, UsageError, WorkFailedError
 from lagbench.floors.table import FLOORS
@@ -279,7 +279,7 @@ def _cost(headers: Sequence[Header], meta: Meta) -> Cost | None:
 
 
 def _mean(values: Sequence[float]) -> float:
-    return float(f"{sum(values) / len(values):.6g}")
+    return round_digits(sum(values) / len(values), 6)
 
 
 def _outside(opened: Predictions, size: Size) -> float:
@@ -290,7 +290,7 @@ def _outside(opened: Predictions, size: Size) -> float:
         for _, block in opened.blocks(scenario):
             beyond = ((block < low) | (block > high)).any(axis=-1)
             found, count = found + int(beyond.sum()), count + beyond.size
-    return float(f"{found / max(1, count):.4g}")
+    return round_digits(found / max(1, count), 4)
 
 
 def _publish(

@@ -10,15 +10,13 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from types import MappingProxyType
 
+from lagbench.data.checksums import round_digits
 from lagbench.metrics.metric import Direction, Metric
 from lagbench.report.html import MISSING, Markup, interval, join, tag, text
 
 from .columns import Column, columns_of, held, presets_of, value_of, written
 from .folder import weights_path
 from .model import Floor, Row, Tab
-from .payload import rounded
-
-MEAN_DIGITS = 9  # significant digits of means, as in scores.json
 
 MOST_REASONS = 4
 """Reasons of a warning that are told; those of other scenarios say the same with other numbers."""
@@ -136,7 +134,7 @@ class _Shades:
 
 def _cell(row: Row | Floor, column: Column, shades: _Shades, *, main: bool, ranks: bool) -> Markup:
     value, found = value_of(row, column), held(row, column.key)
-    plain = rounded(value, MEAN_DIGITS) if isinstance(value, float) else value
+    plain = round_digits(value) if isinstance(value, float) else value
     ends = (found.low, found.high) if found else (math.nan, math.nan)
     bounds = interval(ends)
     title = [] if not bounds else [f"95 %: {text(ends[0])} … {text(ends[1])}"]
@@ -155,7 +153,7 @@ def _cell(row: Row | Floor, column: Column, shades: _Shades, *, main: bool, rank
         bounds if ranks else "",
         class_=" ".join([*kind, *shades.classes(row)]) or None,
         title="; ".join(title) or None,
-        data_value=(plain if isinstance(plain, str) else f"{plain:.{MEAN_DIGITS}g}") if known else None,
+        data_value=(plain if isinstance(plain, str) else f"{plain:.9g}") if known else None,
         data_low=f"{ends[0]:.6g}" if ranks and bounds else None,
         data_high=f"{ends[1]:.6g}" if ranks and bounds else None,
         hidden=not main,

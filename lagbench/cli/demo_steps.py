@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lagbench.data.checksums import round_digits
 from lagbench.data.layout import resolve_root
 from lagbench.data.registry import Registry, load
 from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError, check_installed
@@ -180,5 +181,5 @@ def _said(training: TrainingResult, prediction: PredictionResult, solver: Solver
         notes="Trained for seconds to show the way; it says little of what such a model can do.",
         hardware=prediction.device,
         command="lagbench demo",
-        solver_seconds_per_frame=None if solver is None else float(f"{solver.seconds_per_frame:.6g}"),
+        solver_seconds_per_frame=None if solver is None else round_digits(solver.seconds_per_frame, 6),
     )

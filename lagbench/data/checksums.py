@@ -73,6 +73,17 @@ def plain(value: object) -> object:
     )
 
 
+def round_digits(value: float, digits: int = 9) -> float:
+    """Return a number rounded to significant digits, nine as in every published statistic.
+
+    What is not finite stays; -0.0 becomes 0.0.
+
+    >>> round_digits(2 / 3), round_digits(2 / 3, 4), round_digits(float("inf"))
+    (0.666666667, 0.6667, inf)
+    """
+    return float(f"{value:.{digits}g}") + 0.0 if math.isfinite(value) else value
+
+
 def canonical_json(value: object) -> bytes:
     """Return the one JSON text of a value, as UTF-8.
 

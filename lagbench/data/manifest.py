@@ -20,11 +20,10 @@ from lagbench.atomic import write_atomically
 from lagbench.errors import DataError, WorkFailedError
 from lagbench.work.machine import may_differ
 
-from .checksums import HASHED_SUBSETS, dataset_hash, file_sha256, subset_hash
+from .checksums import HASHED_SUBSETS, dataset_hash, file_sha256, round_digits, subset_hash
 from .layout import MANIFEST_NAME, NOTES_NAME, ScenarioKey, dataset_folder, major_of, scenario_path
 from .registry import Size
 from .scenario import read_scenario
-from .statistics import round_digits
 
 Hash = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]*$")]

@@ -25,13 +25,11 @@ from numpy.typing import NDArray
 
 from lagbench.errors import DataError
 
+from .checksums import round_digits
 from .scenario import read_scenario
 
 QUANTITIES = ("position", "velocity", "acceleration")
 """Order of the quantities: differences of order 0, 1 and 2 over frames."""
-
-DIGITS = 9
-"""Significant digits of every published statistic."""
 
 
 @dataclass(frozen=True)
@@ -118,15 +116,6 @@ def file_statistics(paths: Sequence[Path]) -> dict[str, tuple[float, ...]]:
     if not paths:
         raise DataError("no scenario files", expected="at least one file for statistics")
     return statistics([file_moments(path) for path in paths])
-
-
-def round_digits(value: float) -> float:
-    """Return a number rounded to nine significant digits.
-
-    >>> round_digits(2 / 3)
-    0.666666667
-    """
-    return float(f"{value:.{DIGITS - 1}e}") + 0.0
 
 
 def file_moments(path: Path, report: Callable[[int], None] = lambda _: None) -> dict[str, Moments]:

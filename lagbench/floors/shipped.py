@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.atomic import write_atomically
+from lagbench.data.checksums import round_digits
 from lagbench.data.registry import Size
 from lagbench.errors import DataError
 from lagbench.metrics.aggregate import Score
@@ -198,7 +199,7 @@ def _mean(values: NDArray[np.float64]) -> float:
 
 
 def _number(value: float, digits: int) -> float | None:
-    return float(f"{value:.{digits}g}") if math.isfinite(value) else None
+    return round_digits(value, digits) if math.isfinite(value) else None
 
 
 def _spelled(value: object, depth: int = 0) -> str:

@@ -17,12 +17,13 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from lagbench.atomic import remove_leftovers
+from lagbench.data.checksums import round_digits
 from lagbench.data.layout import MANIFEST_NAME
 from lagbench.data.local import locate_new
 from lagbench.data.lock import dataset_lock
 from lagbench.data.manifest import Manifest, describe_file, merged, note, read_or_empty, write_manifest
 from lagbench.data.registry import Registry, Size, Split, spell_ids
-from lagbench.data.statistics import file_moments, round_digits, statistics
+from lagbench.data.statistics import file_moments, statistics
 from lagbench.errors import UsageError, check_installed, nearest
 from lagbench.generators.batch import SimulationJob
 from lagbench.generators.simulate import Pace, Simulated, simulate, twin_floors, twin_substeps

@@ -186,7 +186,7 @@ def header_of(anatomy: Anatomy) -> Header:
     marks = anatomy.integers.get("diverged_at", ())
     labels: dict[str, Any] = {name: str(anatomy.attributes[name]) for name in REQUIRED}
     labels |= {name: _optional(anatomy.attributes[name], kind) for name, kind in OPTIONAL.items()}
-    labels["budget"] = budget_in(labels["budget"] or "")
+    labels["budget"] = budget_in(labels["budget"]) if labels["budget"] else None
     return Header(
         **labels,
         scenarios=scenarios,
