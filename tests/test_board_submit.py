@@ -91,6 +91,19 @@ def tree(folder: Path) -> set[str]:
     return {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
 
 
+@pytest.mark.usefixtures("as_shipped")
+def test_predictions_are_submitted_once(own: BoardBench) -> None:
+    """Those of another entry or of another seed are refused under any label; its own entry is replaced."""
+    own.submit(own.predict(nearer, "first"))
+    before = tree(own.folder)
+    again = own.predict(nearer, "second")
+    for files in ((again,), tuple(own.predict(still, "third", seed=seed) for seed in (0, 1))):
+        with pytest.raises(UsageError):
+            own.submit(*files)
+    assert tree(own.folder) == before
+    assert own.submit(again, method="first", replace=True).method == "first"
+
+
 @pytest.mark.parametrize(
     "keys",
     [
@@ -238,8 +251,8 @@ def test_no_board_is_begun_by_mistake(own: BoardBench, predictions: Path, tmp_pa
 
 def test_what_is_not_given(own: BoardBench) -> None:
     """The date is today's in UTC; seeds timed on different machines have no cost."""
-    first = own.predict(damped, "mixed", seed=0, device="one", seconds_per_frame=0.25)
-    second = own.predict(noisy, "mixed", seed=1, device="two", seconds_per_frame=0.25)
+    first = own.predict(nearer, "mixed", seed=0, device="one", seconds_per_frame=0.25)
+    second = own.predict(still, "mixed", seed=1, device="two", seconds_per_frame=0.25)
     own.submit(first, second, date=None)
     entry = read_entry(own.entry("mixed"))
     assert entry.cost is None

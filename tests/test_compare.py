@@ -152,12 +152,13 @@ def test_equal_names_are_told_apart(tmp_path: Path) -> None:
     b = published(tmp_path / "b", [2, 3, 4, 5, 6, 8], method="toy", predictions_sha256="b")
     result = compare(a, b)
     assert (result.first, result.second) == ("toy (1)", "toy (2)")
+    assert result.namesakes
     assert "toy (1) is better" in result.verdict
     assert list(comparison_tables(result))[1].columns[1:] == ("toy (1)", "toy (2)")
     rows = json.loads(a.read_text())["rows"]
     borrowed = published(tmp_path, [1] * 6, method="floor", rows={**rows, "floor": rows["submission"]})
     result = compare(borrowed, "floor")
-    assert (result.first, result.second) == ("floor (1)", "floor")
+    assert (result.first, result.second, result.namesakes) == ("floor (1)", "floor", False)
 
 
 def row_of(values: list[object], undefined: list[object] | None = None) -> dict[str, object]:

@@ -85,6 +85,15 @@ def test_the_interval_is_that_of_resampled_ratios() -> None:
     assert found.interval == pytest.approx(expected, abs=0.1 * (expected[1] - expected[0]))
 
 
+def test_the_interval_of_skill_stays_below_one() -> None:
+    """No ratio of means is negative, whatever of six scenarios is drawn; a perfect one is certain."""
+    base = [1.0, 1.1, 0.9, 1.2, 0.8, 1.0]
+    wild = skill([scored([0.01, 0.02, 0.01, 9.0, 0.03, 0.02])], {"analog": scored(base)})
+    assert wild.interval[0] < wild.value < wild.interval[1] < 1.0
+    perfect = skill([scored([0.0] * 6)], {"analog": scored(base)})
+    assert (perfect.value, perfect.interval) == (1.0, (1.0, 1.0))
+
+
 def test_seeds_widen_the_interval_of_skill() -> None:
     """Where scenarios agree and seeds do not, the interval is that of the seeds: Student's, two degrees."""
     base, share = np.full(12, 4.0), np.array([0.4, 0.5, 0.9])
@@ -92,7 +101,8 @@ def test_seeds_widen_the_interval_of_skill() -> None:
     found = skill(seeds, {"analog": scored(base.tolist())})
     assert (found.value, found.std) == pytest.approx((0.4, np.std(share, ddof=1)))
     reach = np.std(share, ddof=1) / math.sqrt(3) * scipy.stats.t.ppf(0.975, 2)
-    assert found.interval[1] - found.interval[0] == pytest.approx(2 * reach, rel=0.15)
+    reaches = [math.log((1.0 - bound) / (1.0 - found.value)) for bound in found.interval]
+    assert reaches[0] - reaches[1] == pytest.approx(2 * reach / 0.6, rel=0.15)
     alone = skill(seeds[:1], {"analog": scored(base.tolist())})
     assert alone.interval == pytest.approx((0.6, 0.6))
 

@@ -12,7 +12,7 @@ import datetime
 import os
 import re
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -52,10 +52,10 @@ from .entry import (
     Status,
 )
 from .entry_file import examine, listed, read_entry, spell
-from .findings import skeleton
+from .findings import print_of, skeleton
 from .folder import SUBMISSIONS, Folder, Place, entry_path, score_paths
 from .ranking import combine, summarise, write_floors
-from .score_file import MAX_SCORE_BYTES, read_stored
+from .score_file import MAX_SCORE_BYTES, Stored, read_stored
 from .weights import copy_weights, named_weights, require_weights
 
 BOARD = Path("leaderboard")  # the leaderboard's folder, from the root of the repository
@@ -111,7 +111,7 @@ def submit(
 
     Raises:
         UsageError: a key is missing, the entry is there already, the files do not belong
-            together, the name is taken or looks like another's, or there is no leaderboard.
+            together, name or predictions are another's, or there is no leaderboard.
         UnreadableFileError: predictions or weights cannot be read.
         ChecksFailedError: they are not valid.
         DataError: the test subset is missing, or they were made from another data set.
@@ -140,7 +140,8 @@ def submit(
     seeds = _seeds(headers)
     about = _about(headers, meta)
     place = (headers[0].split, headers[0].size, _method(headers[0], meta))
-    _require_free(folder, place, about, replace=replace)
+    others = _others(folder, place)
+    _require_free(folder, place, about, others, replace=replace)
     if meta.urls and len(meta.urls) != len(headers):
         raise UsageError(
             "addresses and files differ in number",
@@ -176,7 +177,7 @@ def submit(
             )
         )
     try:
-        return _publish(place, about, cards, made, folder, outside, sources)
+        return _publish(place, about, cards, made, folder, outside, sources, others)
     except OSError as error:
         raise WorkFailedError(
             "cannot write there",
@@ -225,23 +226,43 @@ def _method(header: Header, meta: Meta) -> str:
     return name
 
 
-def _require_free(folder: Folder, place: Place, about: About, *, replace: bool) -> None:
+def _others(folder: Folder, place: Place) -> dict[Path, Entry]:
+    """Return the other active entries of a split and size."""
+    found = {}
+    for path in folder.entries():
+        if path.parts[1:3] == place[:2] and path != entry_path(place):
+            with suppress(ChecksFailedError, UnreadableFileError):  # `leaderboard check` tells of those
+                found[path] = read_entry(folder.path / path)
+    return {path: entry for path, entry in found.items() if entry.status is Status.ACTIVE}
+
+
+def _require_free(
+    folder: Folder, place: Place, about: About, others: Mapping[Path, Entry], *, replace: bool
+) -> None:
     """Refuse the place of another entry, unless that is to be replaced, and a name like another's."""
     own = entry_path(place)
     if (folder.path / own).exists() and not replace:
         fix = "replace it with --replace, or give this one another --method, and another name: in meta.yaml"
         raise UsageError("there is such an entry already", where=str(folder.path / own), fix=fix)
     names = {floor: f"the floor {floor}" for floor in FLOORS}
-    for path in folder.entries():
-        if path.parts[1:3] == place[:2] and path != own:
-            with suppress(ChecksFailedError, UnreadableFileError):  # `leaderboard check` tells of those
-                other = read_entry(folder.path / path)
-                if other.status is Status.ACTIVE:
-                    names[other.name] = str(path)
+    names |= {entry.name: str(path) for path, entry in others.items()}
     for name, holder in names.items():
         if skeleton(name) == skeleton(about.name or ""):
             fix = "choose another, or say what differs, in meta.yaml: `name: GNS, six terms`"
             raise UsageError("the name looks like another's", where=holder, got=ascii(about.name), fix=fix)
+
+
+def _require_new(stored: Sequence[Stored], folder: Folder, others: Mapping[Path, Entry]) -> None:
+    """Refuse predictions that another entry has, or another seed of this one, whatever they are called."""
+    known = {}
+    for path in (path for entry in others.values() for path in entry.score_paths):
+        with suppress(UnreadableFileError):  # `leaderboard check` tells of those
+            known[print_of(read_stored(folder.path / path))] = str(path)
+    for place, held in enumerate(stored):
+        if (found := print_of(held)) in known:
+            fix = "submit them once; to rename an entry, submit them under its method with --replace"
+            raise UsageError(f"predictions {place + 1} are there already", where=known[found], fix=fix)
+        known[found] = f"predictions {place + 1}"
 
 
 def _about(headers: Sequence[Header], meta: Meta) -> About:
@@ -301,6 +322,7 @@ def _publish(
     folder: Folder,
     outside: Sequence[float | None],
     sources: Sequence[Path],
+    others: Mapping[Path, Entry],
 ) -> SubmitResult:
     """Write score files, then the entry that names them; remove those that only the old entry had."""
     names, yaml_path = score_paths(place, [one.seed for one in made]), entry_path(place)
@@ -319,6 +341,8 @@ def _publish(
                     got=f"{length} bytes",
                     fix="uninstall packages that add metrics, and submit again",
                 )
+        stored = [read_stored(target) for target in staged]
+        _require_new(stored, folder, others)
         files = tuple(map(scored_file, cards, staged, outside))
         kept = named_weights(place, [one.seed for one in made], sources)
         made = [one.model_copy(update={"weights": held}) for one, held in zip(made, kept, strict=True)]
@@ -328,7 +352,7 @@ def _publish(
             dataset_sha256=header.dataset_sha256,
             ranking_metric=cards[0].ranking,
             files=files,
-            metrics=summarise(combine([read_stored(target).scores for target in staged])),
+            metrics=summarise(combine([held.scores for held in stored])),
         )
         held = {name: getattr(about, name) for name in About.model_fields}
         held |= dict(zip(("format", "split", "size", "method"), (2, *place), strict=True))

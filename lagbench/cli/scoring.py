@@ -260,5 +260,8 @@ def compare(
     elif not quiet:
         from lagbench.scoring.tables import comparison_tables
 
+        if result.namesakes:
+            say(f"{result.first}: {first}")
+            say(f"{result.second}: {second}")
         print_blocks(comparison_tables(result, every=every or bool(metric)))
         say(result.verdict)

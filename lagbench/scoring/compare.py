@@ -75,6 +75,7 @@ class ComparisonResult:
     size: str  # of both
     first: str  # method of the first, told apart from that of the second
     second: str  # method of the second, likewise, or the name of the floor
+    namesakes: bool  # whether both methods have one name, so that a number tells them apart
     same_predictions: bool  # whether both hold the same positions
     ranking: str  # name of the metric that ranks
     scenarios: int  # how many both have in that metric
@@ -174,6 +175,7 @@ def compare(
         size=one.identity["size"],
         first=names[0],
         second=names[1],
+        namesakes=floor is None and methods[0] == methods[1],
         same_predictions=set(one.predictions) == set(two.predictions),
         ranking=one.ranking,
         scenarios=len(found[one.ranking].test.scenarios),

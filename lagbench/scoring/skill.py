@@ -46,9 +46,10 @@ def best_floor(floors: Mapping[str, Score]) -> str | None:
 def skill(seeds: Sequence[Score], floors: Mapping[str, Score]) -> Skill | None:
     """Return the skill of a method beside the scores of the floors in the same metric.
 
-    The interval is that of the ratio of means r = A / B, by its linear part: the two-way bootstrap
-    of (a_si - r b_i) / B, with a_si the score of seed s and b_i that of the floor in scenario i.
-    It is finite whatever is drawn, and none at all where the ratio is the same everywhere.
+    The interval is that of the ratio of means r = A / B, by the linear part of its logarithm: with
+    e the two-way bootstrap of (a_si - r b_i) / (r B), where a_si is the score of seed s and b_i that of
+    the floor in scenario i, it is 1 - r exp(e). So it never passes 1, is finite whatever is drawn,
+    and no interval at all where the ratio is the same everywhere.
 
     Args:
         seeds: score of each seed, over the same scenarios.
@@ -70,12 +71,12 @@ def skill(seeds: Sequence[Score], floors: Mapping[str, Score]) -> Skill | None:
         return None
     scale = float(np.mean(base))
     ratio = float(np.mean(mean_over_seeds(own))) / scale
-    low, high = bootstrap_interval((own - ratio * base) / scale)
+    low, high = bootstrap_interval((own / ratio - base) / scale) if ratio > 0.0 else (0.0, 0.0)
     with_all = own[~np.isnan(own).any(axis=1)]
     return Skill(
         metric=metric.name,
         floor=name,
         value=1.0 - ratio,
-        interval=(1.0 - ratio - high, 1.0 - ratio - low),
+        interval=(1.0 - ratio * math.exp(high), 1.0 - ratio * math.exp(low)),
         std=float(np.std(np.mean(with_all, axis=1) / scale, ddof=1)) if len(with_all) > 1 else math.nan,
     )
