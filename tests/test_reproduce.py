@@ -6,6 +6,7 @@ import csv
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -135,10 +136,12 @@ def test_studies_stand_beside_the_thesis(sources: Sources, tmp_path: Path) -> No
     training = {"parameters": 1234, "step": 7, "windows": 100, "cpu_seconds": 36.0}
     training |= {"dataset_sha256": "f" * 64, "recipe": {"training": {"batch": 32}}}
     held = {"training": training, "train": 0.25, "valid": 0.5, "seed": 0}
-    home = tmp_path / "none" / "fluid" / SIZE
+    home = tmp_path / "studies" / "fluid" / SIZE
     home.mkdir(parents=True)
     (home / "mlp_studies.json").write_text(json.dumps({"mlp-4-3-2": held}))
-    rows = markdown_rows(results.render(sources, (SIZE,)), "train, thesis")
+    rows = markdown_rows(
+        results.render(replace(sources, studies=tmp_path / "studies"), (SIZE,)), "train, thesis"
+    )
     (ours,) = (row for row in rows if row["train, ours"] != "-")
     heads = ("hidden layers", "parameters, ours", "steps x batch, ours")
     assert [ours[head] for head in heads] == ["200 x 200 x 200", "1,234", "7 x 32"]

@@ -35,6 +35,9 @@ BOARD = Path("leaderboard")
 WEIGHTS = BOARD / "weights"
 """Where committed weights and the records of their trainings lie, as `lagbench submit --weights` put them."""
 
+STUDIES = Path("docs/studies")
+"""Where committed results lie that are no entries: of studies and protocols of the thesis."""
+
 RUN = re.compile(r"([a-z0-9]+(?:-[a-z0-9]+)*?)-(\d+)")
 RECORD_NAME = "training.json"
 COST_NAME = "predictions.json"
@@ -151,6 +154,7 @@ class Sources:
     board: Path | None = BOARD  # the leaderboard's folder; None to use runs alone
     weights: Path = WEIGHTS  # folder of committed weights and what their trainings recorded
     runs: Path | None = None  # folder of runs; None to use committed files alone
+    studies: Path = STUDIES  # folder of committed results that are no entries
     recipe: str | None = None  # variant of the recipes whose runs to read; None for the size's own
     registry: Registry | None = None  # where splits are described; ours when None
 

@@ -263,7 +263,7 @@ def agreement(first: Sequence[float], second: Sequence[float]) -> float:
 
 def _protocol(sources: Sources, size: str) -> Iterator[str]:
     """Yield what the thesis's own protocol gave for VAR, where it was measured."""
-    for home in (sources.weights, sources.runs):
+    for home in (sources.studies, sources.runs):
         path = home / "fluid" / size / FILE if home else None
         if path and path.is_file():
             sheet = beside_thesis(read_json(path))
@@ -274,7 +274,7 @@ def _protocol(sources: Sources, size: str) -> Iterator[str]:
 def _studies(sources: Sources, size: str) -> Iterator[str]:
     """Yield Tables 4.2 to 4.5, those of which a row was trained."""
     for name, (_, split) in TABLES.items():
-        homes = [home / split / size for home in (sources.weights, sources.runs) if home]
+        homes = [home / split / size for home in (sources.studies, sources.runs) if home]
         measured = sources.size(split, size).measured
         known = known_studies(homes, measured.dataset_sha256 if measured else None)
         if any(study_name(study) in known for study in study_rows(name)):

@@ -19,7 +19,7 @@ from lagbench.scoring.score_file import NETCDF_NAME, read_statistics
 from lagbench.scoring.task import ScoredTask, load_scored_task
 from lagbench.submission.predictions import open_predictions
 
-from .evidence import RECORD_NAME, WEIGHTS, Evidence, Sources, read_json
+from .evidence import RECORD_NAME, STUDIES, WEIGHTS, Evidence, Sources, read_json
 from .thesis import Model
 
 if TYPE_CHECKING:
@@ -39,6 +39,7 @@ class Plan:
     runs: Path  # folder of runs; what is there is not made again
     output: Path  # folder of tables and pictures
     weights: Path = WEIGHTS  # folder of committed weights
+    studies: Path = STUDIES  # folder of committed results that are no entries
     seeds: tuple[int, ...] = (0,)  # seeds of every training; pictures show the first
     recipe: str | None = None  # variant of the recipes, as in short; None for the size's own
     settings: tuple[str, ...] = ()  # changes to every recipe, as in training.steps=100

@@ -233,7 +233,7 @@ SHARES: Mapping[str, tuple[float, int]] = {"mini": (0.1, 16), "tiny": (0.01, 64)
 
 WINDOWS = 4096  # most windows of a subset that an error is measured over, evenly spaced
 
-FILE = "mlp_studies.json"  # what the rows came to, in a folder of runs and beside committed weights
+FILE = "mlp_studies.json"  # what the rows came to, in a folder of runs or of committed studies
 
 
 def study_name(study: Study) -> str:
@@ -300,7 +300,7 @@ def known_studies(homes: Iterable[Path], data: str | None) -> dict[str, Any]:
 
 def _known(plan: Plan, figure: Figure) -> dict[str, Any]:
     split = TABLES[figure.studies][1]
-    return known_studies((plan.weights / split / plan.size, plan.home(split)), plan.hash(split))
+    return known_studies((plan.studies / split / plan.size, plan.home(split)), plan.hash(split))
 
 
 def one_step_error(plan: Plan, split: str, folder: Path, subset: str) -> float:
@@ -361,7 +361,7 @@ def studies_beside_thesis(name: str, size: str, known: Mapping[str, Any]) -> She
     note = (
         f"Table {printed} on {split} {size}: mean squared error of one step [standardised^2]; {share:g}"
         " of the thesis's epochs, constant rate 1e-3. Standardisation and data differ from the thesis's:"
-        " compare orders."
+        " compare orders. Our valid are scenarios that training never saw."
     )
     return Sheet(notes=(note,), tables=(Table("", heads, tuple(rows)),))
 

@@ -39,7 +39,7 @@ from .thesis import SECTION_4_8_3, number
 TRAIN, VALID = 0.70, 0.15
 """Shares of the frames that are fitted and forecast."""
 
-FILE = "var_protocol.json"  # what ``--json`` prints, in a folder of runs and beside committed weights
+FILE = "var_protocol.json"  # what ``--json`` prints, in a folder of runs or of committed studies
 
 GROWTH_FRAMES = 100
 
