@@ -71,8 +71,9 @@ lagbench submit runs/cavity/mini/supergat-0/predictions.nc --from meta.yaml
 
 All models, tables and figures of a size, resumable: `python -m lagbench.baselines.reproduce --size mini
 --root DATA --runs runs`; `lagbench submit` makes entries of them. What is no entry is
-read from `docs/studies/<split>/<size>/`: `mlp_studies.json`, as in the folder of runs, and `var_protocol.json`,
-as `python -m lagbench.baselines.reproduce.var_protocol --size mini --json` prints it. Variants change an option or two:"""
+read from `docs/studies/<split>/<size>/`: `mlp_studies.json`, as in the folder of runs, and
+`var_protocol.json`, as `python -m lagbench.baselines.reproduce.var_protocol --size mini --json` prints it.
+Variants change an option or two:"""
 
 
 def render(sources: Sources, sizes: Sequence[str] = SIZES) -> str:
