@@ -31,9 +31,14 @@ __all__ = ["Baseline", "Batch", "Facts", "Options", "check_moving_walls", "facts
 
 
 class Options(BaseModel):
-    """Base of the options of a model: frozen, unknown keys are errors."""
+    """Base of the options of a model: frozen, unknown keys are errors.
+
+    Class attributes:
+        in_training: names of the options of the training; a trained model refuses changes of them.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
+    in_training: ClassVar[frozenset[str]] = frozenset()
 
 
 class Baseline(nn.Module):

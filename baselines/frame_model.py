@@ -175,6 +175,8 @@ class FrameNetworkOptions(baseline.Options):
     the error of the whole state; a change keeps what it does not know.
     """
 
+    in_training = frozenset({"noise_std"})
+
     # the next state, or its change in units of the change's deviation over train
     target: Target = Target.STATE
     material: bool = False  # give the material as a fifth, constant feature of every particle

@@ -38,6 +38,8 @@ COARSEST = 4  # nodes of the U-Net's finest level to one of its coarsest, along 
 class NeuralMPMOptions(Options):
     """Options of the grid surrogate."""
 
+    in_training = frozenset({"calls", "pushforward", "recovery", "noise_std"})
+
     cells: int = Field(default=18, ge=4, le=256)  # cells of the network's grid across the box
     width: int = Field(default=32, ge=4, multiple_of=4)  # channels of the finest level
     velocities: int = Field(default=5, ge=1)  # last velocities that the U-Net sees

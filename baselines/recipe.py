@@ -273,7 +273,15 @@ def changed_options(entry: Entry, options: Mapping[str, Any], settings: Iterable
             fix = "set options of the model: --set model.KEY=VALUE"
             raise UsageError("the training is over", where="--set", got=setting, fix=fix)
         changed = _merge(changed, changes)
-    return _checked(entry.model.Options, changed, "model", "--set").model_dump(mode="json")
+    before, after = (
+        _checked(entry.model.Options, layer, "model", "--set").model_dump(mode="json")
+        for layer in (dict(options), changed)
+    )
+    idle = sorted(name for name in entry.model.Options.in_training if before[name] != after[name])
+    if idle:
+        fix = "leave out what belongs to the training, or train with it"
+        raise UsageError("the training is over", where="--set", got=", ".join(idle), fix=fix)
+    return after
 
 
 def _read(path: Path) -> _File:

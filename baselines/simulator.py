@@ -175,6 +175,10 @@ class LossWeights(Options):
 class GraphNetworkOptions(Options):
     """Options of a graph network."""
 
+    in_training = frozenset(
+        {"forgetful", "noise_std", "loss", "loss_norm", "link_weight", "rollout_loss_steps", "symmetry"}
+    )
+
     latent: int = Field(default=128, ge=1)  # width of nodes, edges and hidden layers
     layers: int = Field(default=10, ge=1)  # processor layers
     # whether the sums of a node's messages are inputs of its operator; not for GNS, which is the sum itself

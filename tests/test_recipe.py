@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from simple_models import Drift, install
+from simple_models import Drift, batch, facts, install, rolled, swirl
 
 from lagbench.baselines.catalogue import Entry, every_entry, find, names
-from lagbench.baselines.recipe import Schedule, TrainingOptions, recipe_for, recipe_names
+from lagbench.baselines.recipe import Schedule, TrainingOptions, changed_options, recipe_for, recipe_names
 from lagbench.data.registry import load
 from lagbench.errors import UnreadableFileError, UsageError
 
@@ -59,6 +60,38 @@ def test_operators_share_their_recipes() -> None:
             budgets = [one.training.model_copy(update={"steps": 1}) for one in found]
             assert all(one.model == found[0].model for one in found)
             assert all(one == budgets[0] for one in budgets)
+
+
+OTHER = {
+    **{"calls": 3, "pushforward": 2, "recovery": 4.0, "noise_std": 0.5, "forgetful": 0.7, "loss_norm": "l1"},
+    **{"loss": {"vorticity": 3.0}, "link_weight": 2.0, "rollout_loss_steps": 3, "symmetry": "square"},
+}
+
+
+@pytest.mark.parametrize("name", ["neuralmpm", "supergat", "mlp"])
+def test_options_of_the_training(name: str) -> None:
+    """A trained model refuses options of the training; rollouts are the same to the bit whatever they are.
+
+    But the noise of a graph network, which its scales know.
+    """
+    baseline = find(name)
+    torch.manual_seed(0)
+    plain = baseline.model.build({}, facts())
+    for part in plain.parameters():  # an untrained NeuralMPM changes nothing
+        torch.nn.init.normal_(part, std=0.05)
+    changes = {option: OTHER[option] for option in baseline.model.Options.in_training}
+    unseen = {key: value for key, value in changes.items() if (name, key) != ("supergat", "noise_std")}
+    other = baseline.model.build(unseen, facts())
+    other.load_state_dict(plain.state_dict())
+    given = batch(swirl(0, plain.history))
+    given = replace(given, material=torch.zeros_like(given.material))
+    assert torch.equal(rolled(plain, given, 6), rolled(other, given, 6))
+    stored = plain.options.model_dump(mode="json")
+    for option in changes:
+        setting = f"model.{option}={json.dumps(OTHER[option])}"
+        with pytest.raises(UsageError):
+            changed_options(baseline, stored, [setting])
+    assert changed_options(baseline, stored, []) == stored
 
 
 def test_layers(entry: Entry) -> None:
