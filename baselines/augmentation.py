@@ -70,7 +70,7 @@ def images(symmetry: Symmetry) -> Tensor:
 
 
 def field_image(field: Tensor, matrix: Tensor, channels: Tensor) -> Tensor:
-    """Return the image of a field on a grid that lies in its box as its images do, x and y as they lie there.
+    """Return the image of a field on a grid that lies in its box as its images do.
 
     Args:
         field: values at the nodes, shape [window, channel, x node, y node].

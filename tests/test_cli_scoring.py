@@ -224,6 +224,14 @@ def test_a_reader_that_leaves_early_leaves_the_report(
     assert (predictions.parent / "rep" / "index.html").is_file()
 
 
+def test_namesakes_are_told_apart(run: Run, two: list[Path]) -> None:
+    """Two files of one method are (1) and (2), and a line says which is which."""
+    result = run("compare", *two)
+    assert result.exit_code == 0, result.stderr
+    for number, path in enumerate(two, start=1):
+        assert f"({number}): {path}" in result.stdout
+
+
 def test_scores_never_share_a_folder(run: Run, two: list[Path], tmp_path: Path) -> None:
     """Two files whose scores would overwrite each other are a usage error before any is scored."""
     for words in ((*two, "--output", tmp_path / "rep"), (two[0], two[0])):

@@ -118,6 +118,12 @@ def test_studies_are_what_was_asked_for(
             (row,) = tables.studies_beside_thesis("table_4_2", "tiny", known).tables[0].rows
             assert f"{known['mlp-4-2-1']['valid']:.3g}" in row
             assert tables.known_studies([home], "f" * 64) == {}
+            stale = {"mlp-4-2-1": {**known["mlp-4-2-1"], "training": {"dataset_sha256": "f" * 64}}}
+            (tmp_path / "mlp_studies.json").write_text(json.dumps(stale))
+            assert tables.known_studies([home, tmp_path], plan.hash(SPLIT)) == known
+            later = {"mlp-4-2-1": {**known["mlp-4-2-1"], "train": 9.0}}
+            (tmp_path / "mlp_studies.json").write_text(json.dumps(later))
+            assert tables.known_studies([home, tmp_path], plan.hash(SPLIT)) == later
         else:
             with pytest.raises(UsageError):
                 tables.make_studies(plan, "table_4_2")

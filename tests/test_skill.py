@@ -92,6 +92,9 @@ def test_the_interval_of_skill_stays_below_one() -> None:
     assert wild.interval[0] < wild.value < wild.interval[1] < 1.0
     perfect = skill([scored([0.0] * 6)], {"analog": scored(base)})
     assert (perfect.value, perfect.interval) == (1.0, (1.0, 1.0))
+    few = skill([scored([0.0] * 3)], {"analog": scored(base[:3])})
+    assert few.value == 1.0
+    assert all(math.isnan(bound) for bound in few.interval)
 
 
 def test_seeds_widen_the_interval_of_skill() -> None:

@@ -5,7 +5,7 @@
 What is there is not made again; interrupted, it goes on. Writes Markdown, CSV and PNG to
 ``RUNS/reproduce/<size>/`` and prints the Markdown. ``--list`` says what there is, ``--dry-run`` what would be
 trained; ``--no-training`` shows what the runs that are there allow, and what committed weights do, whose
-predictions are made on the spot.
+predictions are made on the spot, and committed studies.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from lagbench.errors import LagbenchError, UsageError, nearest
 
 from .catalogue import FIGURES
 from .drawing import Figure, write_sheet
-from .evidence import WEIGHTS
+from .evidence import STUDIES, WEIGHTS
 from .runs import Plan, budget, make_run, outlook, score_committed
 from .tables import TABLES, make_studies
 from .thesis import EXPECTED, ROSTER, Model, label
@@ -46,6 +46,7 @@ def main(arguments: Sequence[str] | None = None, *, registry: Registry | None = 
             runs=given.runs,
             output=given.output or given.runs / "reproduce" / given.size,
             weights=given.weights,
+            studies=given.studies,
             seeds=_seeds(given.seeds),
             recipe=given.recipe,
             settings=tuple(given.set),
@@ -213,12 +214,13 @@ def _parser() -> argparse.ArgumentParser:
     add("--runs", type=Path, default=Path("runs"), help="folder of runs")
     add("--output", "-o", type=Path, help="RUNS/reproduce/<size> by default")
     add("--weights", type=Path, default=WEIGHTS, help="folder of committed weights")
+    add("--studies", type=Path, default=STUDIES, help="folder of committed results that are no entries")
     add("--seeds", default="0", help="seeds of every training, as in 0,1")
     add("--recipe", metavar="NAME", help="variant of the recipes, as in short")
     add("--set", action="append", default=[], metavar="KEY=VALUE", help="change every recipe; repeatable")
     add("--device", default="auto", help="cpu, cuda or auto")
     add("--threads", type=int, help="CPU threads; one per core by default")
-    add("--no-training", action="store_true", help="train nothing: runs that are there, committed weights")
+    add("--no-training", action="store_true", help="train nothing: runs that are there, what is committed")
     add("--dry-run", action="store_true", help="make nothing, say what would be trained")
     add("--list", action="store_true", help="list tables and figures, and what they need")
     return parser

@@ -1,7 +1,7 @@
 """Write docs/results.md from committed files: claims, scores beside the thesis's numbers, costs.
 
     python -m lagbench.baselines.reproduce.results -o docs/results.md [--board leaderboard]
-        [--weights FOLDER] [--runs RUNS] [--check]
+        [--weights FOLDER] [--runs RUNS] [--studies FOLDER] [--check]
 
 Score files and entries of the leaderboard and what trainings recorded suffice: no data set is read.
 ``--runs`` adds what is not committed yet. The same files give the same bytes; ``--check`` writes nothing
@@ -12,20 +12,21 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 from lagbench.atomic import write_atomically
 from lagbench.draw.markdown import table
-from lagbench.errors import LagbenchError
+from lagbench.errors import LagbenchError, UsageError
 from lagbench.floors.table import FLOORS
 from lagbench.metrics.metric import Direction, Metric
 from lagbench.metrics.table import CHOSEN
 from lagbench.scoring.tables import ARROWS, Table
 
 from .claims import CLAIMS, answer, claim_rows, comparison_table, floors_ahead
-from .evidence import BOARD, WEIGHTS, Evidence, Method, Sources, read_json
+from .evidence import BOARD, STUDIES, WEIGHTS, Evidence, Method, Sources, read_json
 from .runs import budget, hardware
 from .tables import TABLES, known_studies, rollout_table, studies_beside_thesis, study_name, study_rows
 from .thesis import (
@@ -85,7 +86,7 @@ def render(sources: Sources, sizes: Sequence[str] = SIZES) -> str:
     protocols = [part for size in sizes for part in _protocol(sources, size)]
     parts += ["## VAR by the thesis's protocol (section 4.8.3)", *protocols] if protocols else []
     studies = [part for size in sizes for part in _studies(sources, size)]
-    parts += ["## MLPs from frame to frame (Tables 4.2 to 4.5)", *studies] if studies else []
+    parts += ["## MLPs from frame to frame", *studies] if studies else []
     variants = (
         f"- `{model.name}`: `--baseline {model.baseline}"
         + (f" --recipe {model.recipe}" if model.recipe else "")
@@ -189,7 +190,7 @@ def _chapter(evidence: Evidence) -> Iterator[str]:
             [
                 label(name),
                 record.get("recipe", {}).get("name", "-"),
-                "; ".join(ROSTER[name].settings if name in ROSTER else ()) or "-",
+                "; ".join(changes(record)) or "-",
                 "-" if method.parameters is None else f"{method.parameters:,}",
                 ", ".join("-" if held.seed is None else str(held.seed) for held in method.seeds),
                 number(method.cpu_hours),
@@ -198,6 +199,38 @@ def _chapter(evidence: Evidence) -> Iterator[str]:
             ]
         )
     yield table(("model", *heads, "speed-up"), rows)
+
+
+UNTOLD = (
+    *("seed", "compile", "log_every", "checkpoint_every"),
+    *("validate_every", "validation_frames", "validation_scenarios"),
+)
+"""Options of a training that do not say what was learned."""
+
+
+def changes(record: Mapping[str, Any]) -> list[str]:
+    """Return what a training changed of the recipe that it names; nothing where that is unknown."""
+    from lagbench.baselines.catalogue import find
+    from lagbench.baselines.recipe import recipe_for
+
+    held = record.get("recipe", {})
+    split, _, where = held.get("name", "").partition("/")
+    size, _, variant = where.partition("-")
+    try:
+        shipped = recipe_for(find(held["baseline"]), split, size, variant=variant or None).as_json()
+    except (KeyError, UsageError):  # a stranger's baseline, or a recipe that was given as a file
+        return []
+    wanted, got = (dict(_options(recipe)) for recipe in (shipped, held))
+    return [f"{key}={value}" for key, value in got.items() if key in wanted and wanted[key] != value]
+
+
+def _options(recipe: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the options of a recipe with their paths, as in model.loss.vorticity."""
+    for key, value in recipe.items():
+        if isinstance(value, Mapping):
+            yield from _options(value, f"{path}{key}.")
+        elif key not in UNTOLD:
+            yield f"{path}{key}", value
 
 
 def _horizon(evidence: Evidence) -> str:
@@ -317,11 +350,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--board", type=Path, default=BOARD)
     parser.add_argument("--weights", type=Path, default=WEIGHTS)
     parser.add_argument("--runs", type=Path, help="folder of runs that are not committed yet")
+    parser.add_argument("--studies", type=Path, default=STUDIES, help="committed results that are no entries")
     parser.add_argument("--root", type=Path, help="not needed: no data set is read")
     parser.add_argument("--check", action="store_true", help="write nothing; fail where it is stale")
     given = parser.parse_args(arguments)
     try:
-        page = render(Sources(board=given.board, weights=given.weights, runs=given.runs)).encode()
+        sources = Sources(board=given.board, weights=given.weights, runs=given.runs, studies=given.studies)
+        page = render(sources).encode()
         if given.check:
             stale = not given.output.is_file() or given.output.read_bytes() != page
             sys.stdout.write(f"{given.output}: {'stale' if stale else 'up to date'}\n")

@@ -104,7 +104,12 @@ class Plan:
     def sources(self) -> Sources:
         """Where the evidence of these runs lies."""
         return Sources(
-            board=None, weights=self.weights, runs=self.runs, recipe=self.recipe, registry=self.described
+            board=None,
+            weights=self.weights,
+            runs=self.runs,
+            recipe=self.recipe,
+            registry=self.described,
+            studies=self.studies,
         )
 
     def evidence(self, split: str) -> Evidence:

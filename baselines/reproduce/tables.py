@@ -294,13 +294,18 @@ def known_studies(homes: Iterable[Path], data: str | None) -> dict[str, Any]:
     """
     held: dict[str, Any] = {}
     for home in homes:
-        held |= read_json(home / FILE)
-    return {name: row for name, row in held.items() if data in (None, row["training"]["dataset_sha256"])}
+        rows = read_json(home / FILE).items()
+        held |= {name: row for name, row in rows if data in (None, row["training"]["dataset_sha256"])}
+    return held
 
 
 def _known(plan: Plan, figure: Figure) -> dict[str, Any]:
+    """Return what the rows of a figure came to with the plan's seed; committed ones are by plain recipes."""
     split = TABLES[figure.studies][1]
-    return known_studies((plan.studies / split / plan.size, plan.home(split)), plan.hash(split))
+    plain = not plan.settings and plan.recipe is None
+    homes = ([plan.studies / split / plan.size] if plain else []) + [plan.home(split)]
+    known = known_studies(homes, plan.hash(split))
+    return {name: row for name, row in known.items() if row["seed"] == plan.seeds[0]}
 
 
 def one_step_error(plan: Plan, split: str, folder: Path, subset: str) -> float:

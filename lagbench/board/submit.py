@@ -55,7 +55,7 @@ from .entry_file import examine, listed, read_entry, spell
 from .findings import print_of, skeleton
 from .folder import SUBMISSIONS, Folder, Place, entry_path, score_paths
 from .ranking import combine, summarise, write_floors
-from .score_file import MAX_SCORE_BYTES, Stored, read_stored
+from .score_file import MAX_SCORE_BYTES, read_stored
 from .weights import copy_weights, named_weights, require_weights
 
 BOARD = Path("leaderboard")  # the leaderboard's folder, from the root of the repository
@@ -125,7 +125,7 @@ def submit(
         raise UsageError("the entry lacks what readers need", expected=" and ".join(missing), fix=fix)
     if not new_board:
         folder.require("run it from the root of a clone, name it with --board, or begin one: --new-board")
-    headers, outside, results, described = [], [], [], registry or load()
+    headers, hashes, outside, results, described = [], [], [], [], registry or load()
     for path in paths:
         result = validate(path, root=root, require_truth=True, registry=registry)
         if examined is not None:
@@ -134,6 +134,7 @@ def submit(
         results.append(result)
         with open_predictions(path) as opened:
             headers.append(opened.header)
+            hashes.append(opened.content_sha256())
             size = described.size(opened.header.split, opened.header.size)
             warned = any(found.check == OUTSIDE for found in result.warnings)
             outside.append(_outside(opened, size) if warned else None)
@@ -142,6 +143,8 @@ def submit(
     place = (headers[0].split, headers[0].size, _method(headers[0], meta))
     others = _others(folder, place)
     _require_free(folder, place, about, others, replace=replace)
+    taken = {made.sha256: str(where) for where, entry in others.items() for made in entry.predictions}
+    _require_new(hashes, paths, taken)
     if meta.urls and len(meta.urls) != len(headers):
         raise UsageError(
             "addresses and files differ in number",
@@ -177,7 +180,7 @@ def submit(
             )
         )
     try:
-        return _publish(place, about, cards, made, folder, outside, sources, others)
+        return _publish(place, about, cards, made, folder, outside, sources, others, paths)
     except OSError as error:
         raise WorkFailedError(
             "cannot write there",
@@ -252,17 +255,24 @@ def _require_free(
             raise UsageError("the name looks like another's", where=holder, got=ascii(about.name), fix=fix)
 
 
-def _require_new(stored: Sequence[Stored], folder: Folder, others: Mapping[Path, Entry]) -> None:
-    """Refuse predictions that another entry has, or another seed of this one, whatever they are called."""
-    known = {}
+def _require_new(prints: Sequence[str], paths: Sequence[Path], known: Mapping[str, str]) -> None:
+    """Refuse files that another entry or another seed has: `known` says whose a print is."""
+    found = dict(known)
+    for print_, path in zip(prints, paths, strict=True):
+        if print_ in found:
+            fix = "submit the file of each seed once; what goes by a new name supersedes its old entry"
+            got = f"those of {found[print_]}"
+            raise UsageError("the same predictions are there", where=str(path), got=got, fix=fix)
+        found[print_] = str(path)
+
+
+def _prints(folder: Folder, others: Mapping[Path, Entry]) -> dict[str, str]:
+    """Return what only the same predictions share, whatever they are called, and where."""
+    found = {}
     for path in (path for entry in others.values() for path in entry.score_paths):
         with suppress(UnreadableFileError):  # `leaderboard check` tells of those
-            known[print_of(read_stored(folder.path / path))] = str(path)
-    for place, held in enumerate(stored):
-        if (found := print_of(held)) in known:
-            fix = "submit them once; to rename an entry, submit them under its method with --replace"
-            raise UsageError(f"predictions {place + 1} are there already", where=known[found], fix=fix)
-        known[found] = f"predictions {place + 1}"
+            found[print_of(read_stored(folder.path / path))] = str(path)
+    return found
 
 
 def _about(headers: Sequence[Header], meta: Meta) -> About:
@@ -323,6 +333,7 @@ def _publish(
     outside: Sequence[float | None],
     sources: Sequence[Path],
     others: Mapping[Path, Entry],
+    paths: Sequence[Path],
 ) -> SubmitResult:
     """Write score files, then the entry that names them; remove those that only the old entry had."""
     names, yaml_path = score_paths(place, [one.seed for one in made]), entry_path(place)
@@ -342,7 +353,7 @@ def _publish(
                     fix="uninstall packages that add metrics, and submit again",
                 )
         stored = [read_stored(target) for target in staged]
-        _require_new(stored, folder, others)
+        _require_new([print_of(held) for held in stored], paths, _prints(folder, others))
         files = tuple(map(scored_file, cards, staged, outside))
         kept = named_weights(place, [one.seed for one in made], sources)
         made = [one.model_copy(update={"weights": held}) for one, held in zip(made, kept, strict=True)]
