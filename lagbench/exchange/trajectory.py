@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, TypeAdapter, ValidationError, with_config
 from typing_extensions import TypedDict  # pydantic reads that of Python 3.12 and later only
 
+from lagbench.data.checksums import round_digits
 from lagbench.data.local import is_name
 from lagbench.data.yamlfile import read_yaml
 from lagbench.errors import DataError, UnreadableFileError, UsageError
@@ -199,7 +200,7 @@ class Description:
     @property
     def rate(self) -> float:
         """Frames per second to 12 digits: 1 / (0.1 / 12 * 12) is 10."""
-        return float(f"{1.0 / self.frame_interval:.12g}")
+        return round_digits(1.0 / self.frame_interval, 12)
 
 
 def estimate_spacing(position: Array, radius: float) -> float:
