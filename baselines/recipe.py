@@ -277,10 +277,10 @@ def changed_options(entry: Entry, options: Mapping[str, Any], settings: Iterable
         _checked(entry.model.Options, layer, "model", "--set").model_dump(mode="json")
         for layer in (dict(options), changed)
     )
-    idle = sorted(name for name in entry.model.Options.in_training if before[name] != after[name])
+    idle = sorted(f"model.{name}" for name in entry.model.Options.in_training if before[name] != after[name])
     if idle:
-        fix = "leave out what belongs to the training, or train with it"
-        raise UsageError("the training is over", where="--set", got=", ".join(idle), fix=fix)
+        fix = "leave it out, or train with it; docs/baselines.md says what a trained model takes"
+        raise UsageError("an option of the training", where="--set", got=", ".join(idle), fix=fix)
     return after
 
 

@@ -180,7 +180,11 @@ def _chapter(evidence: Evidence) -> Iterator[str]:
         yield _markdown(rollout_table(evidence, TABLE_4_8[size.split]))
     else:
         yield from _vorticity_at(evidence)
-    yield "Cost. Speed-up: our solver's time for a frame on one core over the model's, same machine."
+    yield (
+        "Cost. Recipe, and what the training changed of it; a dash where no record lies beside the entry, as"
+        " of those that run another entry's weights. Speed-up: our solver's time for a frame on one core over"
+        " the model's, same machine."
+    )
     heads = ("recipe", "changed", "parameters", "seeds", "CPU hours", "hardware", "s/frame", "solver s/frame")
     rows = []
     for name, method in evidence.models.items():

@@ -221,7 +221,7 @@ def _method(header: Header, meta: Meta) -> str:
             "the label of the predictions cannot name an entry",
             expected="small letters, digits and single hyphens",
             got=ascii(name),
-            fix="name it: --method my-model",
+            fix=f"name it: --method {re.sub('[^a-z0-9]+', '-', name.lower()).strip('-') or 'my-model'}",
         )
     if name in FLOORS:
         fix = "name your method otherwise; the floors are added by themselves"
