@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import json
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -287,6 +289,15 @@ def test_unknown_names_are_answered_with_the_nearest(capsys: pytest.CaptureFixtu
         assert word in capsys.readouterr().err
     assert main(["--list", "--split", "fluid"]) == 0
     assert "table_4_8" in capsys.readouterr().out
+
+
+def test_a_reader_that_leaves_stops_nothing() -> None:
+    """``--list | head -1``: exit code 0 and no traceback."""
+    words = [sys.executable, "-m", "lagbench.baselines.reproduce", "--list"]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as child:
+        child.stdout.close()
+        assert child.stderr.read() == ""
+    assert child.returncode == 0
 
 
 def test_what_fails_is_said_and_the_rest_is_made(

@@ -11,6 +11,7 @@ predictions are made on the spot, and committed studies.
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
@@ -189,7 +190,12 @@ def _seeds(text: str) -> tuple[int, ...]:
 
 
 def _say(text: str) -> None:
-    sys.stdout.write(text + "\n")
+    """Print a text; where the reader has left, as ``head`` does, the work goes on without."""
+    try:
+        sys.stdout.write(text + "\n")
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _note(text: str) -> None:
