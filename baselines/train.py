@@ -235,6 +235,19 @@ class StepBatches(Sampler[list[int]]):
             yield list(islice(drawn, self.batch))
 
 
+def _check_compiler(device: str) -> None:
+    """Refuse to compile layers for a CPU without a C++ compiler."""
+    compiler = os.environ.get("CXX") or "g++"  # the one that torch takes
+    if device == "cpu" and shutil.which(compiler) is None:
+        raise UsageError(
+            "no C++ compiler",
+            where="training.compile",
+            expected="g++ on the PATH, or another in CXX",
+            got=f"no {compiler}",
+            fix="install it, or leave the option out",
+        )
+
+
 def descend(job: TrainingJob, model: Baseline) -> tuple[TrainingRecord, int]:
     """Train a model; return the ledger and the steps of the whole training."""
     facts, options = job.facts, job.recipe.training
@@ -257,15 +270,7 @@ def descend(job: TrainingJob, model: Baseline) -> tuple[TrainingRecord, int]:
     if ledger.state != "running":
         return ledger, steps
     if options.compile:
-        compiler = os.environ.get("CXX") or "g++"  # the one that torch takes
-        if job.device == "cpu" and shutil.which(compiler) is None:
-            raise UsageError(
-                "no C++ compiler",
-                where="training.compile",
-                expected="g++ on the PATH, or another in CXX",
-                got=f"no {compiler}",
-                fix="install it, or leave the option out",
-            )
+        _check_compiler(job.device)
         model.compile_layers()
 
     def loader(rank: int, ranks: int) -> DataLoader[Window]:

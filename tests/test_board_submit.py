@@ -92,14 +92,22 @@ def tree(folder: Path) -> set[str]:
 
 
 @pytest.mark.usefixtures("as_shipped")
-def test_predictions_are_submitted_once(own: BoardBench) -> None:
-    """Those of another entry or of another seed are refused under any label; its own entry is replaced."""
-    own.submit(own.predict(nearer, "first"))
+def test_predictions_are_submitted_once(own: BoardBench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of another entry or of another seed are refused under any label; its own entry is replaced.
+
+    One file under two names, or for two seeds, is told before the work.
+    """
+    first = own.predict(nearer, "first")
+    own.submit(first)
     before = tree(own.folder)
     again = own.predict(nearer, "second")
-    for files in ((again,), tuple(own.predict(still, "third", seed=seed) for seed in (0, 1))):
-        with pytest.raises(UsageError):
-            own.submit(*files)
+    with pytest.raises(UsageError):
+        own.submit(again)
+    with monkeypatch.context() as patch:
+        patch.setattr(submitting, "score", _never)
+        for files in ((first,), tuple(own.predict(still, "third", seed=seed) for seed in (0, 1))):
+            with pytest.raises(UsageError):
+                own.submit(*files, method="other", name="Other")
     assert tree(own.folder) == before
     assert own.submit(again, method="first", replace=True).method == "first"
 

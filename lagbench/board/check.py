@@ -227,7 +227,7 @@ class _Look:
                 self.add("values", inner, wrong[0] + f" and {len(wrong) - 1} more" * (len(wrong) > 1))
             else:
                 stored.append(one)
-            for print_ in (made.sha256, print_of(one)):
+            for print_ in (made.sha256, print_of(one.scores.tallies)):
                 self.prints.setdefault(print_, []).append((entry, inner))
         if entry.score.dataset_sha256 != entry.dataset.sha256:
             self.add("score", f"{path}, score", entry.score.dataset_sha256, expected=entry.dataset.sha256)

@@ -30,6 +30,7 @@ from pydantic import (
 
 from lagbench.data.checksums import round_digits
 from lagbench.submission.budget import Budget, Track, track_of
+from lagbench.submission.format import Header
 
 from .folder import Place, entry_path, score_paths, weights_path
 
@@ -177,6 +178,23 @@ class Cost(Strict):
     seconds_per_frame: Seconds
     device: Short
     solver_seconds_per_frame: Seconds | None = None
+
+    @classmethod
+    def of(cls, headers: Sequence[Header], solver: float | None = None) -> Self | None:
+        """Return the mean cost over files of predictions; None unless all tell it and one machine.
+
+        The solver's time is the one that is given, else the mean of those that the files tell [s].
+        """
+        times = [header.seconds_per_frame for header in headers if header.seconds_per_frame is not None]
+        device = headers[0].device
+        if len(times) < len(headers) or not device or any(header.device != device for header in headers):
+            return None
+        told = [held for one in headers if (held := one.solver_seconds_per_frame) is not None]
+        return cls(
+            seconds_per_frame=round_digits(sum(times) / len(times), 6),
+            device=device[:100],
+            solver_seconds_per_frame=solver or (round_digits(sum(told) / len(told), 6) if told else None),
+        )
 
     @property
     def speed_up(self) -> float | None:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lagbench.errors import LagbenchError
+from lagbench.metrics.aggregate import Tally
 from lagbench.metrics.metric import Direction
 from lagbench.metrics.table import METRICS
 from lagbench.submission.findings import Finding, Severity
@@ -217,10 +218,10 @@ def finding_of(check: str, error: LagbenchError, where: object) -> Finding:
     return finding(check, where, error.got, what=error.what, expected=error.expected, fix=error.fix)
 
 
-def print_of(held: Stored) -> str:
+def print_of(tallies: Mapping[int, Tally]) -> str:
     """Return what only the same predictions share: their errors in every scenario and frame."""
     digest = hashlib.sha256()
-    for scenario, tally in sorted(held.scores.tallies.items()):
+    for scenario, tally in sorted(tallies.items()):
         digest.update(f"{scenario} {tally.names} {tally.frames}".encode())
         digest.update(np.ascontiguousarray(tally.total.astype(np.float32)).tobytes())
     return digest.hexdigest()

@@ -26,6 +26,7 @@ from lagbench.data.registry import Registry, Size, load
 from lagbench.errors import ChecksFailedError, UnreadableFileError, UsageError, WorkFailedError
 from lagbench.floors.table import FLOORS
 from lagbench.scoring.card import ScoreCard
+from lagbench.scoring.scenario import SUBMISSION
 from lagbench.scoring.score import score
 from lagbench.scoring.score_file import write_statistics
 from lagbench.submission.findings import ValidationResult
@@ -145,15 +146,7 @@ def submit(
     _require_free(folder, place, about, others, replace=replace)
     taken = {made.sha256: str(where) for where, entry in others.items() for made in entry.predictions}
     _require_new(hashes, paths, taken)
-    if meta.urls and len(meta.urls) != len(headers):
-        raise UsageError(
-            "addresses and files differ in number",
-            where="--url",
-            expected=len(headers),
-            got=len(meta.urls),
-            fix="give one address per file, in their order, or none",
-        )
-    urls = meta.urls or (None,) * len(headers)
+    urls = _urls(meta, len(headers))
     sources = require_weights(weights, headers)
     cards, made = [], []
     for path, result, header, seed, url in zip(paths, results, headers, seeds, urls, strict=True):
@@ -179,8 +172,9 @@ def submit(
                 budget=header.budget,
             )
         )
+    _require_new([print_of(card.tallies[SUBMISSION]) for card in cards], paths, _prints(folder, others))
     try:
-        return _publish(place, about, cards, made, folder, outside, sources, others, paths)
+        return _publish(place, about, cards, made, folder, outside, sources)
     except OSError as error:
         raise WorkFailedError(
             "cannot write there",
@@ -211,6 +205,16 @@ def _seeds(headers: Sequence[Header]) -> tuple[int | None, ...]:
             fix="write them with submission.write(..., seed=0), seed=1 and so on",
         )
     return seeds
+
+
+def _urls(meta: Meta, count: int) -> Sequence[str | None]:
+    """Return the address of each file, None where none are given."""
+    if meta.urls and len(meta.urls) != count:
+        fix = "give one address per file, in their order, or none"
+        raise UsageError(
+            "addresses and files differ in number", where="--url", expected=count, got=len(meta.urls), fix=fix
+        )
+    return meta.urls or (None,) * count
 
 
 def _method(header: Header, meta: Meta) -> str:
@@ -271,7 +275,7 @@ def _prints(folder: Folder, others: Mapping[Path, Entry]) -> dict[str, str]:
     found = {}
     for path in (path for entry in others.values() for path in entry.score_paths):
         with suppress(UnreadableFileError):  # `leaderboard check` tells of those
-            found[print_of(read_stored(folder.path / path))] = str(path)
+            found[print_of(read_stored(folder.path / path).scores.tallies)] = str(path)
     return found
 
 
@@ -284,7 +288,7 @@ def _about(headers: Sequence[Header], meta: Meta) -> About:
     held["training"] = meta.training or (first.training or "")[:LONGEST_TEXT]
     if meta.parameters is None:
         held["parameters"] = first.parameters
-    held["cost"] = meta.cost or _cost(headers, meta)
+    held["cost"] = meta.cost or Cost.of(headers, meta.solver_seconds_per_frame)
     if meta.budget is not None and meta.budget.track is not None:
         raise UsageError(
             "a track is not stated",
@@ -293,24 +297,6 @@ def _about(headers: Sequence[Header], meta: Meta) -> About:
         )
     held["budget"] = EntryBudget.of(first.size, [header.budget for header in headers]) or meta.budget
     return About(**held)
-
-
-def _cost(headers: Sequence[Header], meta: Meta) -> Cost | None:
-    """Return the mean cost over the files, and the solver's; None unless all tell it and one machine."""
-    times = [header.seconds_per_frame for header in headers if header.seconds_per_frame is not None]
-    device = headers[0].device
-    if len(times) < len(headers) or not device or any(header.device != device for header in headers):
-        return None
-    solver = [held for one in headers if (held := one.solver_seconds_per_frame) is not None]
-    return Cost(
-        seconds_per_frame=_mean(times),
-        device=device[:100],
-        solver_seconds_per_frame=meta.solver_seconds_per_frame or (_mean(solver) if solver else None),
-    )
-
-
-def _mean(values: Sequence[float]) -> float:
-    return round_digits(sum(values) / len(values), 6)
 
 
 def _outside(opened: Predictions, size: Size) -> float:
@@ -332,8 +318,6 @@ def _publish(
     folder: Folder,
     outside: Sequence[float | None],
     sources: Sequence[Path],
-    others: Mapping[Path, Entry],
-    paths: Sequence[Path],
 ) -> SubmitResult:
     """Write score files, then the entry that names them; remove those that only the old entry had."""
     names, yaml_path = score_paths(place, [one.seed for one in made]), entry_path(place)
@@ -352,8 +336,6 @@ def _publish(
                     got=f"{length} bytes",
                     fix="uninstall packages that add metrics, and submit again",
                 )
-        stored = [read_stored(target) for target in staged]
-        _require_new([print_of(held) for held in stored], paths, _prints(folder, others))
         files = tuple(map(scored_file, cards, staged, outside))
         kept = named_weights(place, [one.seed for one in made], sources)
         made = [one.model_copy(update={"weights": held}) for one, held in zip(made, kept, strict=True)]
@@ -363,7 +345,7 @@ def _publish(
             dataset_sha256=header.dataset_sha256,
             ranking_metric=cards[0].ranking,
             files=files,
-            metrics=summarise(combine([held.scores for held in stored])),
+            metrics=summarise(combine([read_stored(target).scores for target in staged])),
         )
         held = {name: getattr(about, name) for name in About.model_fields}
         held |= dict(zip(("format", "split", "size", "method"), (2, *place), strict=True))

@@ -48,8 +48,8 @@ def skill(seeds: Sequence[Score], floors: Mapping[str, Score]) -> Skill | None:
 
     The interval is that of the ratio of means r = A / B, by the linear part of its logarithm: with
     e the two-way bootstrap of (a_si - r b_i) / (r B), where a_si is the score of seed s and b_i that of
-    the floor in scenario i, it is 1 - r exp(e). So it never passes 1, and is
-    one point where the ratio is the same everywhere. Two seeds say little: its lower end may lie far down.
+    the floor in scenario i, it is 1 - r exp(e). So it never passes 1, and is one point where the ratio is
+    the same everywhere. Two seeds say little: its lower end may lie far down.
 
     Args:
         seeds: score of each seed, over the same scenarios.
