@@ -33,7 +33,7 @@ from .checkpoint import Checkpoint, check_data, load, restore
 from .graph import radius_graph
 from .job import RunFolder, parameter_count
 from .machine import bound_memory, chosen_device, hardware, memory_errors_told, threads_used
-from .recipe import changed_options
+from .recipe import changed_options, settings_of
 from .rollout import Rollout, roll_out, scenario_batch, scenario_paths
 
 SEARCHES = 5  # frames of a rollout on which the neighbour search is timed alone
@@ -274,7 +274,7 @@ def _provenance(checkpoint: Checkpoint, here: Facts, settings: Sequence[str]) ->
     options = recipe.get("training", {})
     subsets = "+".join(options.get("windows", ("train",)))
     words = f"{facts.split} {facts.size} {subsets}, recipe {recipe.get('name')}, step {done.get('step', 0)}"
-    words += "".join(f", {setting}" for setting in settings)
+    words += "".join(f", {setting}" for setting in dict.fromkeys([*settings_of(recipe), *settings]))
     found: dict[str, Any] = {"training": words, "seed": int(options.get("seed", 0))}
     budget = budget_in(json.dumps(done.get("budget")))
     if budget is None:

@@ -19,8 +19,9 @@ Later layers win: defaults, recipe, what it says of the baseline by name, ``--se
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -31,7 +32,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from lagbench.data.yamlfile import read_yaml
 from lagbench.errors import LagbenchError, UnreadableFileError, UsageError, nearest
 
-from .catalogue import Entry, names
+from .catalogue import Entry, find, names
 
 
 class _Strict(BaseModel):
@@ -154,11 +155,17 @@ class TrainingOptions(_Strict):
         return self.validate_every > 0 and (step >= steps or step % self.validate_every == 0)
 
 
-LATER: Mapping[str, object] = {
-    **{"compile": False, "ema": 0.0},
-    **{"pushforward": 0, "recovery": None, "strain": False, "mixture": False, "average": False},
+LATER: Mapping[str, Mapping[str, object]] = {
+    "training": {"compile": False, "ema": 0.0},
+    "model": {"pushforward": 0, "recovery": None, "strain": False, "mixture": False, "average": False},
 }
 """Options that records of earlier trainings lack, with what they did: such trainings can go on."""
+
+UNTOLD = (
+    *("seed", "compile", "log_every", "checkpoint_every"),
+    *("validate_every", "validation_frames", "validation_scenarios"),
+)
+"""Options of a training that do not say what was learned."""
 
 Layer = dict[str, Any]
 ANY = "*"
@@ -176,11 +183,12 @@ class Recipe:
 
     def as_json(self) -> dict[str, Any]:
         """Return plain values."""
-        model, training = (
-            {key: value for key, value in part.items() if key not in LATER or value != LATER[key]}
-            for part in (self.model, self.training.model_dump(mode="json"))
-        )
-        return {"baseline": self.baseline, "name": self.name, "model": model, "training": training}
+        parts = {"model": self.model, "training": self.training.model_dump(mode="json")}
+        told = {
+            group: {key: value for key, value in part.items() if (key, value) not in LATER[group].items()}
+            for group, part in parts.items()
+        }
+        return {"baseline": self.baseline, "name": self.name, **told}
 
 
 class _Part(BaseModel):
@@ -282,6 +290,33 @@ def changed_options(entry: Entry, options: Mapping[str, Any], settings: Iterable
         fix = "leave it out, or train with it; docs/baselines.md says what a trained model takes"
         raise UsageError("an option of the training", where="--set", got=", ".join(idle), fix=fix)
     return after
+
+
+def settings_of(recipe: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return what a training changed of the shipped recipe that it names, as ``--set`` takes it.
+
+    ``recipe`` is what a record of a training or its weights hold; nothing is known of a stranger's baseline
+    or of a recipe that is not shipped.
+    """
+    split, _, where = str(recipe.get("name", "")).partition("/")
+    size, _, variant = where.partition("-")
+    try:
+        shipped = recipe_for(find(str(recipe.get("baseline"))), split, size, variant=variant or None).as_json()
+    except UsageError:
+        return ()
+    wanted, got = (dict(_paths(LATER)) | dict(_paths(layer)) for layer in (shipped, recipe))
+    changed = sorted(key for key in wanted.keys() & got.keys() if wanted[key] != got[key])
+    values = {key: got[key] if isinstance(got[key], str) else json.dumps(got[key]) for key in changed}
+    return tuple(f"{key}={value}" for key, value in values.items())
+
+
+def _paths(layer: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the options of a recipe with their paths, as in model.loss.vorticity."""
+    for key, value in layer.items():
+        if isinstance(value, Mapping):
+            yield from _paths(value, f"{path}{key}.")
+        elif key not in UNTOLD:
+            yield f"{path}{key}", value
 
 
 def _read(path: Path) -> _File:

@@ -12,7 +12,14 @@ import torch
 from simple_models import Drift, batch, facts, install, rolled, swirl
 
 from lagbench.baselines.catalogue import Entry, every_entry, find, names
-from lagbench.baselines.recipe import Schedule, TrainingOptions, changed_options, recipe_for, recipe_names
+from lagbench.baselines.recipe import (
+    Schedule,
+    TrainingOptions,
+    changed_options,
+    recipe_for,
+    recipe_names,
+    settings_of,
+)
 from lagbench.data.registry import load
 from lagbench.errors import UnreadableFileError, UsageError
 
@@ -114,6 +121,32 @@ def test_trainings_of_before_an_option_go_on() -> None:
     after = recipe_for(entry, "fluid", "tiny", settings=["model.strain=true", "training.ema=0.9"]).as_json()
     assert (after["model"].pop("strain"), after["training"].pop("ema")) == (True, 0.9)
     assert after == before
+
+
+@pytest.mark.parametrize(
+    ("name", "given"),
+    [
+        ("gns", ("model.loss_norm=l1", "model.loss.vorticity=0.5", "training.steps=70")),
+        ("supergat", ("model.sum_messages=false", "training.epochs=2")),
+        ("neuralmpm", ("model.pushforward=2", "training.ema=0.9", "training.windows=[train, extra]")),
+        ("neuralmpm", ()),
+    ],
+)
+def test_settings_lead_back_to_the_recipe(name: str, given: tuple[str, ...]) -> None:
+    """What a training changed, read off its record, makes its recipe again; seeds and looks are no change."""
+    entry = find(name)
+    recipe = recipe_for(entry, "cavity", "mini", settings=[*given, "training.log_every=3"], seed=5)
+    record = json.loads(json.dumps(recipe.as_json()))
+    told = settings_of(record)
+    assert {one.partition("=")[0] for one in given} <= {one.partition("=")[0] for one in told}
+    assert recipe_for(entry, "cavity", "mini", settings=[*told, "training.log_every=3"], seed=5) == recipe
+    assert settings_of(recipe_for(entry, "cavity", "mini", settings=["training.log_every=3"]).as_json()) == ()
+
+
+@pytest.mark.parametrize("record", [{}, {"name": "cavity/mini"}, {"name": "a/b", "baseline": "gns"}])
+def test_nothing_is_told_of_a_recipe_that_is_not_ours(record: dict[str, str]) -> None:
+    """A stranger's baseline, or a recipe that is not shipped, has no settings."""
+    assert settings_of(record) == ()
 
 
 def test_steps_and_epochs_replace_each_other(entry: Entry) -> None:

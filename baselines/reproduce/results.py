@@ -165,6 +165,8 @@ def _training_rows(evidence: Evidence) -> Iterator[list[str]]:
 
 def _chapter(evidence: Evidence) -> Iterator[str]:
     """Yield what was scored on one split and size: over the horizon, beside the thesis, costs."""
+    from lagbench.baselines.recipe import settings_of  # loads torch, which the imports of this page do not
+
     size, task = evidence.size, evidence.size.task
     yield f"## {evidence.where}"
     yield (
@@ -194,7 +196,7 @@ def _chapter(evidence: Evidence) -> Iterator[str]:
             [
                 label(name),
                 record.get("recipe", {}).get("name", "-"),
-                "; ".join(changes(record)) or "-",
+                "; ".join(settings_of(record.get("recipe", {}))) or "-",
                 "-" if method.parameters is None else f"{method.parameters:,}",
                 ", ".join("-" if held.seed is None else str(held.seed) for held in method.seeds),
                 number(method.cpu_hours),
@@ -203,38 +205,6 @@ def _chapter(evidence: Evidence) -> Iterator[str]:
             ]
         )
     yield table(("model", *heads, "speed-up"), rows)
-
-
-UNTOLD = (
-    *("seed", "compile", "log_every", "checkpoint_every"),
-    *("validate_every", "validation_frames", "validation_scenarios"),
-)
-"""Options of a training that do not say what was learned."""
-
-
-def changes(record: Mapping[str, Any]) -> list[str]:
-    """Return what a training changed of the recipe that it names; nothing where that is unknown."""
-    from lagbench.baselines.catalogue import find
-    from lagbench.baselines.recipe import recipe_for
-
-    held = record.get("recipe", {})
-    split, _, where = held.get("name", "").partition("/")
-    size, _, variant = where.partition("-")
-    try:
-        shipped = recipe_for(find(held["baseline"]), split, size, variant=variant or None).as_json()
-    except (KeyError, UsageError):  # a stranger's baseline, or a recipe that was given as a file
-        return []
-    wanted, got = (dict(_options(recipe)) for recipe in (shipped, held))
-    return [f"{key}={value}" for key, value in got.items() if key in wanted and wanted[key] != value]
-
-
-def _options(recipe: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the options of a recipe with their paths, as in model.loss.vorticity."""
-    for key, value in recipe.items():
-        if isinstance(value, Mapping):
-            yield from _options(value, f"{path}{key}.")
-        elif key not in UNTOLD:
-            yield f"{path}{key}", value
 
 
 def _horizon(evidence: Evidence) -> str:
