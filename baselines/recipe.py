@@ -301,7 +301,9 @@ def settings_of(recipe: Mapping[str, Any]) -> tuple[str, ...]:
     split, _, where = str(recipe.get("name", "")).partition("/")
     size, _, variant = where.partition("-")
     try:
-        shipped = recipe_for(find(str(recipe.get("baseline"))), split, size, variant=variant or None).as_json()
+        shipped = recipe_for(
+            find(str(recipe.get("baseline"))), split, size, variant=variant or None
+        ).as_json()
     except UsageError:
         return ()
     wanted, got = (dict(_paths(LATER)) | dict(_paths(layer)) for layer in (shipped, recipe))

@@ -72,6 +72,36 @@ class UsageError(LagbenchError):
     exit_code = 2
 
 
+class Mistakes:
+    """Usage errors gathered from several ``with`` blocks, to be told together."""
+
+    def __init__(self) -> None:
+        self._found: list[UsageError] = []
+
+    def __enter__(self) -> None:
+        """Begin what may be a mistake."""
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> bool:
+        """Keep a usage error and go on after the block; anything else is raised."""
+        if not isinstance(error, UsageError):
+            return False
+        self._found.append(error)
+        return True
+
+    def tell(self) -> None:
+        """Raise what was found, if anything.
+
+        Raises:
+            UsageError: the one mistake, or all of them numbered.
+        """
+        if len(self._found) == 1:
+            raise self._found[0]
+        if self._found:
+            told = (str(error).replace("\n", "\n   ") for error in self._found)
+            lines = (f"\n  {number}. {text}" for number, text in enumerate(told, 1))
+            raise UsageError(f"{len(self._found)} mistakes" + "".join(lines))
+
+
 class UnreadableFileError(LagbenchError):
     """A file that the user gave cannot be read."""
 

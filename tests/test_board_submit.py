@@ -131,6 +131,21 @@ def test_refused_before_the_work(
     assert tree(own.folder) == before
 
 
+def test_mistakes_are_told_together(own: BoardBench, predictions: Path) -> None:
+    """All that is wrong with an entry is in one error: whoever mends it all can submit."""
+    keys = {"authors": (), "urls": ("https://a.org/1", "https://a.org/2"), "method": "persistence"}
+    mended = {"authors": ("A",), "urls": (), "method": "fine"}
+    alone = []
+    for key, value in keys.items():
+        with pytest.raises(UsageError) as told:
+            own.submit(predictions, **{**mended, key: value})
+        alone.append(told.value.what)
+    with pytest.raises(UsageError) as together:
+        own.submit(predictions, **keys)
+    assert all(what in str(together.value) for what in alone)
+    assert own.submit(predictions, **mended).method == "fine"
+
+
 def _never(*_: object, **__: object) -> None:
     raise AssertionError
 

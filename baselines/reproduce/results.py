@@ -12,14 +12,13 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import combinations
 from pathlib import Path
-from typing import Any
 
 from lagbench.atomic import write_atomically
 from lagbench.draw.markdown import table
-from lagbench.errors import LagbenchError, UsageError
+from lagbench.errors import LagbenchError
 from lagbench.floors.table import FLOORS
 from lagbench.metrics.metric import Direction, Metric
 from lagbench.metrics.table import CHOSEN

@@ -159,19 +159,29 @@ def draw(plan: Plan, figure: Figure) -> Sheet:
 
 def beside_thesis(held: Mapping[str, Any]) -> Sheet:
     """Return what was measured beside the thesis's figures."""
-    ours = {"minutes": held["fit_seconds"] / 60.0, "gigabytes": held["peak_gb"], "mse": held["forecast_mse"]}
-    rows = [(what, number(SECTION_4_8_3[what]), number(value)) for what, value in ours.items()]
-    more = ("frames", "cpu_seconds", "condition", "floor", "fit_mse", "growth", "persistence_mse")
-    rows += [(what, "-", number(float(held[what]), 6)) for what in more]
+    thesis, unit = SECTION_4_8_3, "[standardised^2]"
+    rows: list[tuple[str, float | None, float]] = [
+        ("time of the fit [min]", thesis["minutes"], held["fit_seconds"] / 60.0),
+        ("processor time of the fit [s]", None, held["cpu_seconds"]),
+        ("memory, thesis: virtual, ours: largest resident [GB]", thesis["gigabytes"], held["peak_gb"]),
+        ("frames fitted", None, held["frames"]),
+        ("condition number of the regressors", None, held["condition"]),
+        ("share of its largest eigenvalue that was added to the Gram matrix", None, held["floor"]),
+        (f"squared error of one step, over the frames fitted {unit}", None, held["fit_mse"]),
+        (f"squared error of the forecast {unit}", thesis["mse"], held["forecast_mse"]),
+        (f"squared error of the last frame fitted, kept {unit}", None, held["persistence_mse"]),
+        ("factor by which the forecast grows per frame at its end", None, held["growth"]),
+    ]
     at = sorted((int(frame), value) for frame, value in held["mse_at"].items())
-    rows += [(f"mse after {frame} frames", "-", number(value)) for frame, value in at]
+    rows += [(f"squared error in frame {frame} of the forecast {unit}", None, value) for frame, value in at]
     answer = "diverges" if held["growth"] > 1.0 else "does not diverge"
     note = (
         f"VAR of {held['features']} dimensions on {held['split']} {held['size']} by the thesis's protocol:"
         f" all frames concatenated, the first 70 % fitted, the next {held['forecast_frames']} forecast."
         f" The forecast {answer}: at its end it grows by a factor of {number(held['growth'], 5)} per frame."
     )
-    return Sheet(notes=(note,), tables=(Table("", ("", "thesis", "ours"), tuple(rows)),))
+    cells = [(what, number(theirs), number(ours, 4)) for what, theirs, ours in rows]
+    return Sheet(notes=(note,), tables=(Table("", ("", "thesis", "ours"), tuple(cells)),))
 
 
 def table(result: ProtocolResult) -> str:

@@ -1,9 +1,9 @@
 """Score predictions and write the entry: ``lagbench submit``.
 
-What can be refused is refused before the work. Then score files are written, and last the YAML
-file, which names them by SHA-256, each atomically: what an interruption leaves behind is a
-score file without an entry, which ``lagbench leaderboard check`` finds. The board's page is not
-touched; ``lagbench leaderboard build`` draws it.
+What can be refused is refused before the work, all of it together. Then score files are written,
+and last the YAML file, which names them by SHA-256, each atomically: what an interruption leaves
+behind is a score file without an entry, which ``lagbench leaderboard check`` finds. The board's
+page is not touched; ``lagbench leaderboard build`` draws it.
 """
 
 from __future__ import annotations
@@ -17,13 +17,14 @@ from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from lagbench.atomic import write_atomically
 from lagbench.data.checksums import file_sha256, round_digits
 from lagbench.data.registry import Registry, Size, load
-from lagbench.errors import ChecksFailedError, UnreadableFileError, UsageError, WorkFailedError
+from lagbench.errors import ChecksFailedError, Mistakes, UnreadableFileError, UsageError, WorkFailedError
 from lagbench.floors.table import FLOORS
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.scenario import SUBMISSION
@@ -121,11 +122,14 @@ def submit(
     folder, paths = Folder(board), [Path(path) for path in predictions]
     needed = {"authors": "--author NAME", "command": "--command 'what makes the predictions again'"}
     missing = [option for key, option in needed.items() if not getattr(meta, key)]
-    if missing:
-        fix = "give them as options, or authors and command in a file: --from meta.yaml"
-        raise UsageError("the entry lacks what readers need", expected=" and ".join(missing), fix=fix)
-    if not new_board:
-        folder.require("run it from the root of a clone, name it with --board, or begin one: --new-board")
+    mistakes = Mistakes()
+    with mistakes:
+        if missing:
+            fix = "give them as options, or authors and command in a file: --from meta.yaml"
+            raise UsageError("the entry lacks what readers need", expected=" and ".join(missing), fix=fix)
+    with mistakes:
+        if not new_board:
+            folder.require("run it from the root of a clone, name it with --board, or begin one: --new-board")
     headers, hashes, outside, results, described = [], [], [], [], registry or load()
     for path in paths:
         result = validate(path, root=root, require_truth=True, registry=registry)
@@ -139,26 +143,25 @@ def submit(
             size = described.size(opened.header.split, opened.header.size)
             warned = any(found.check == OUTSIDE for found in result.warnings)
             outside.append(_outside(opened, size) if warned else None)
-    seeds = _seeds(headers)
-    about = _about(headers, meta)
-    place = (headers[0].split, headers[0].size, _method(headers[0], meta))
-    others = _others(folder, place)
-    _require_free(folder, place, about, others, replace=replace)
-    taken = {made.sha256: str(where) for where, entry in others.items() for made in entry.predictions}
-    _require_new(hashes, paths, taken)
-    urls = _urls(meta, len(headers))
-    sources = require_weights(weights, headers)
+    with mistakes:
+        seeds = _seeds(headers)
+    with mistakes:
+        about = _about(headers, meta)
+    with mistakes:
+        urls = _urls(meta, len(headers))
+    with mistakes:
+        sources = require_weights(weights, headers)
+    with mistakes:
+        place = (headers[0].split, headers[0].size, _method(headers[0], meta))
+        others = _others(folder, place)
+        _require_free(folder, place, (meta.name or headers[0].method)[:100], others, replace=replace)
+        taken = {made.sha256: str(where) for where, entry in others.items() for made in entry.predictions}
+        _require_new(hashes, paths, taken)
+    mistakes.tell()
     cards, made = [], []
+    options: Any = {"root": root, "workers": workers, "registry": registry, "progress": progress}
     for path, result, header, seed, url in zip(paths, results, headers, seeds, urls, strict=True):
-        card = score(
-            path,
-            root=root,
-            workers=workers,
-            registry=registry,
-            progress=progress,
-            write=False,
-            validated=result,
-        )
+        card = score(path, **options, write=False, validated=result)
         inside, whole = path.resolve(), folder.path.resolve()
         kept = inside.relative_to(whole).as_posix() if inside.is_relative_to(whole) else None
         cards.append(card)
@@ -244,7 +247,7 @@ def _others(folder: Folder, place: Place) -> dict[Path, Entry]:
 
 
 def _require_free(
-    folder: Folder, place: Place, about: About, others: Mapping[Path, Entry], *, replace: bool
+    folder: Folder, place: Place, label: str, others: Mapping[Path, Entry], *, replace: bool
 ) -> None:
     """Refuse the place of another entry, unless that is to be replaced, and a name like another's."""
     own = entry_path(place)
@@ -254,9 +257,9 @@ def _require_free(
     names = {floor: f"the floor {floor}" for floor in FLOORS}
     names |= {entry.name: str(path) for path, entry in others.items()}
     for name, holder in names.items():
-        if skeleton(name) == skeleton(about.name or ""):
+        if skeleton(name) == skeleton(label):
             fix = "choose another, or say what differs, in meta.yaml: `name: GNS, six terms`"
-            raise UsageError("the name looks like another's", where=holder, got=ascii(about.name), fix=fix)
+            raise UsageError("the name looks like another's", where=holder, got=ascii(label), fix=fix)
 
 
 def _require_new(prints: Sequence[str], paths: Sequence[Path], known: Mapping[str, str]) -> None:

@@ -105,9 +105,12 @@ def _generated(result: GenerationResult) -> list[str]:
             f"  time    about {spell_seconds(result.seconds_expected)} with {result.workers} workers"
             f" ({MEASURED if result.measured else ESTIMATED})",
         ]
+    took = f"in {result.seconds:.1f} s"
+    done = f"{to_do} scenarios simulated {took}, {len(result.kept)} kept"
+    if not to_do:
+        done = f"nothing to simulate, {len(result.kept)} scenarios are there; checked {took}"
     lines = [
-        f"{result.split} {result.size}: {to_do} scenarios simulated in {result.seconds:.1f} s,"
-        f" {len(result.kept)} kept",
+        f"{result.split} {result.size}: {done}",
         f"  folder  {result.folder}",
     ]
     if (url := url_of(result.root)) is not None:
