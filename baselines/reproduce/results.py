@@ -35,6 +35,7 @@ from .thesis import (
     SIZES,
     TABLE_4_8,
     TABLE_5_4,
+    Model,
     interval,
     key_frame,
     label,
@@ -86,14 +87,7 @@ def render(sources: Sources, sizes: Sequence[str] = SIZES) -> str:
     parts += ["## VAR by the thesis's protocol (section 4.8.3)", *protocols] if protocols else []
     studies = [part for size in sizes for part in _studies(sources, size)]
     parts += ["## MLPs from frame to frame", *studies] if studies else []
-    variants = (
-        f"- `{model.name}`: `--baseline {model.baseline}"
-        + (f" --recipe {model.recipe}" if model.recipe else "")
-        + "".join(f" --set {setting}" for setting in model.settings)
-        + "`"
-        for model in ROSTER.values()
-        if model.varied
-    )
+    variants = (f"- `{model.name}`: {_how(model)}" for model in ROSTER.values() if model.varied)
     parts += [COMMANDS, "\n".join(variants), "## Missing", "\n".join(_missing(found)) or "Nothing."]
     return "\n\n".join(parts) + "\n"
 
@@ -306,6 +300,15 @@ def _missing(found: Sequence[Evidence]) -> Iterator[str]:
             yield f"- {evidence.where}: {what}: `{command}`, then `lagbench submit`."
         if evidence.stale:
             yield f"- {evidence.where}: {len(evidence.stale)} score files of other data, left out."
+
+
+def _how(model: Model) -> str:
+    """Return what makes a variant, as it is typed."""
+    settings = "".join(f" --set {setting}" for setting in model.settings)
+    if model.weights:
+        return f"`lagbench predict{settings}` with weights of `{model.weights}`"
+    recipe = f" --recipe {model.recipe}" if model.recipe else ""
+    return f"`--baseline {model.baseline}{recipe}{settings}`"
 
 
 def _markdown(held: Table) -> str:

@@ -160,6 +160,7 @@ class Model:
     varied: str = ""  # baseline of which it is a variant
     settings: tuple[str, ...] = ()  # changes to the recipe, as in model.loss.vorticity=0
     recipe: str | None = None  # variant of the recipe, as in change; None for the size's own
+    weights: str = ""  # model of the roster whose weights it runs with these settings; empty for its own
 
     @property
     def baseline(self) -> str:
@@ -213,6 +214,7 @@ _MODELS = (
         "NeuralMPM, mean over images",
         varied="neuralmpm",
         settings=("model.average=true",),
+        weights="neuralmpm",
     ),
     Model(
         "neuralmpm-long-averaged",
@@ -220,6 +222,7 @@ _MODELS = (
         varied="neuralmpm",
         settings=("model.average=true",),
         recipe="long",
+        weights="neuralmpm-long",
     ),
     Model("mlp", "MLP", "#0072b2"),
     Model("lstm", "LSTM", "#009e73"),
