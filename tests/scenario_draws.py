@@ -7,7 +7,9 @@ import functools
 import hashlib
 import importlib
 import subprocess
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +21,7 @@ from lagbench.generators.split import InitialState
 
 SPLITS = ("cavity", "curl-noise", "fluid", "multimaterial")
 SIZES = ("full", "mini", "tiny")
+Case = TypeVar("Case")
 EVERY = [(split, size) for split in SPLITS for size in SIZES]
 
 
@@ -27,6 +30,12 @@ def turn() -> int:
     asked = ["git", "rev-list", "--count", "HEAD"]
     told = subprocess.run(asked, cwd=Path(__file__).parent, capture_output=True, text=True, check=False)
     return int(told.stdout) if told.returncode == 0 else 0
+
+
+def of_this_turn(cases: Sequence[Case], *, turns: int) -> list[Case]:
+    """Return every so many-th case, others at every commit: so many commits look at all of them."""
+    now = turn()
+    return [case for place, case in enumerate(cases) if (place + now) % turns == 0]
 
 
 class OnlyRandom:

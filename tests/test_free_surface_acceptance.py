@@ -1,6 +1,7 @@
 """Acceptance of the free-surface solver (design 4.4) on scenarios of the registry and set pieces.
 
-Sloshing is chaotic, so the bounds are statistical; every family and pair runs at least twice.
+Sloshing is chaotic, so the bounds are statistical; every family and pair runs at least twice, in three
+commits.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy as np
 import pytest
 from free_surface_scenarios import Part, parameters, scenario, start
 from numpy.typing import NDArray
-from scenario_draws import state_of
+from scenario_draws import of_this_turn, state_of
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import minimum_spanning_tree
 from scipy.spatial import Delaunay, cKDTree
@@ -32,6 +33,7 @@ FRAME = 20
 LIQUID_IDS = (0, 1, 2, 3, 4, 5, 6, 7)
 PAIR_IDS = (48, 49, 50, 51, 52, 53, 54, 55, 56, 57, 58, 59)
 EVERY = [("fluid", i) for i in LIQUID_IDS] + [("multimaterial", i) for i in PAIR_IDS]
+SETTLING = [("fluid", i) for i in (4, 5, 6, 7)] + [("multimaterial", 53)]
 SMALL = [("fluid", size, i) for size in ("mini", "tiny") for i in range(4)]
 SMALL += [("multimaterial", size, i) for size in ("mini", "tiny") for i in range(6)]
 
@@ -156,7 +158,7 @@ def assert_sound(run: History) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("split", "scenario_id"), EVERY)
+@pytest.mark.parametrize(("split", "scenario_id"), of_this_turn(EVERY, turns=3))
 def test_scenarios_are_sound(split: str, scenario_id: int) -> None:
     """A scenario keeps box, CFL bound and falling energy, its motion dies out, its rope stays in one piece.
 
@@ -175,9 +177,7 @@ def test_scenarios_are_sound(split: str, scenario_id: int) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("split", "scenario_id"), [("fluid", i) for i in (4, 5, 6, 7)] + [("multimaterial", 53)]
-)
+@pytest.mark.parametrize(("split", "scenario_id"), of_this_turn(SETTLING, turns=3))
 def test_settled_liquid(split: str, scenario_id: int) -> None:
     """After 1500 frames: rest density, even depth, hydrostatic pressure.
 
@@ -261,7 +261,7 @@ def test_bar_rings_at_its_frequency(material: Material, young: float) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("split", "size", "scenario_id"), SMALL)
+@pytest.mark.parametrize(("split", "size", "scenario_id"), of_this_turn(SMALL, turns=3))
 def test_small_sizes_are_sound(split: str, size: str, scenario_id: int) -> None:
     """With the constants of ``full``, mini and tiny keep box, CFL bound and falling energy."""
     assert_sound(history(split, size, scenario_id, 300))
