@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float32]
 
 CACHE_BYTES = 256 << 20  # frames kept decompressed, by default [bytes]
-OPEN_FILES = 32  # files kept open in one process, about 0.6 MB each
+OPEN_FILES = 128  # files kept open in one process, about 0.6 MB each: all that a split trains on
 
 
 @dataclass(frozen=True)
