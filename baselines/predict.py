@@ -274,7 +274,8 @@ def _provenance(checkpoint: Checkpoint, here: Facts, settings: Sequence[str]) ->
     options = recipe.get("training", {})
     subsets = "+".join(options.get("windows", ("train",)))
     words = f"{facts.split} {facts.size} {subsets}, recipe {recipe.get('name')}, step {done.get('step', 0)}"
-    words += "".join(f", {setting}" for setting in dict.fromkeys([*settings_of(recipe), *settings]))
+    words += "".join(f", {setting}" for setting in settings_of(recipe))
+    words += f", predicted with {', '.join(settings)}" if settings else ""
     found: dict[str, Any] = {"training": words, "seed": int(options.get("seed", 0))}
     budget = budget_in(json.dumps(done.get("budget")))
     if budget is None:

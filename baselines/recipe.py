@@ -161,11 +161,10 @@ LATER: Mapping[str, Mapping[str, object]] = {
 }
 """Options that records of earlier trainings lack, with what they did: such trainings can go on."""
 
-UNTOLD = (
-    *("seed", "compile", "log_every", "checkpoint_every"),
-    *("validate_every", "validation_frames", "validation_scenarios"),
-)
+UNTOLD = ("seed", "compile", "log_every", "checkpoint_every")
 """Options of a training that do not say what was learned."""
+
+LONGEST_VALUE = 200  # letters of a changed option that are told
 
 Layer = dict[str, Any]
 ANY = "*"
@@ -292,24 +291,29 @@ def changed_options(entry: Entry, options: Mapping[str, Any], settings: Iterable
     return after
 
 
-def settings_of(recipe: Mapping[str, Any]) -> tuple[str, ...]:
+def settings_of(recipe: object) -> tuple[str, ...]:
     """Return what a training changed of the shipped recipe that it names, as ``--set`` takes it.
 
-    ``recipe`` is what a record of a training or its weights hold; nothing is known of a stranger's baseline
-    or of a recipe that is not shipped.
+    ``recipe`` is what a record of a training or its weights hold, of a stranger perhaps: options that are
+    unknown here, and whatever names no shipped recipe, are passed over, long values are not told.
     """
-    split, _, where = str(recipe.get("name", "")).partition("/")
+    held = recipe if isinstance(recipe, Mapping) else {}
+    got = {group: held.get(group) for group in LATER}
+    split, _, where = str(held.get("name")).partition("/")
     size, _, variant = where.partition("-")
-    try:
-        shipped = recipe_for(
-            find(str(recipe.get("baseline"))), split, size, variant=variant or None
-        ).as_json()
-    except UsageError:
+    if not all(isinstance(part, Mapping) for part in got.values()):
         return ()
-    wanted, got = (dict(_paths(LATER)) | dict(_paths(layer)) for layer in (shipped, recipe))
-    changed = sorted(key for key in wanted.keys() & got.keys() if wanted[key] != got[key])
-    values = {key: got[key] if isinstance(got[key], str) else json.dumps(got[key]) for key in changed}
-    return tuple(f"{key}={value}" for key, value in values.items())
+    try:
+        entry = find(str(held.get("baseline")))
+        if not {f"{split}/{where}", f"{ANY}/{where}"} & set(recipe_names(entry)):
+            return ()
+        shipped = recipe_for(entry, split, size, variant=variant or None)
+    except LagbenchError:
+        return ()
+    wanted = {"model": shipped.model, "training": shipped.training.model_dump(mode="json")}
+    before, after = (dict(_paths(LATER)) | dict(_paths(layer)) for layer in (wanted, got))
+    changed = sorted(key for key in before.keys() & after.keys() if before[key] != after[key])
+    return tuple(f"{key}={_spelled(after[key])}" for key in changed)
 
 
 def _paths(layer: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
@@ -319,6 +323,16 @@ def _paths(layer: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]
             yield from _paths(value, f"{path}{key}.")
         elif key not in UNTOLD:
             yield f"{path}{key}", value
+
+
+def _spelled(value: object) -> str:
+    """Return a value in a line of YAML, quoted only where it would be read as something else."""
+    try:
+        bare = isinstance(value, str) and value.isprintable() and yaml.safe_load(value) == value
+    except yaml.YAMLError:
+        bare = False
+    text = str(value) if bare else json.dumps(value)
+    return text if len(text) <= LONGEST_VALUE else "..."
 
 
 def _read(path: Path) -> _File:
@@ -333,8 +347,11 @@ def _merge(below: Layer, above: Layer) -> Layer:
     """Return two layers joined; mappings are joined key by key."""
     joined = dict(below)
     for key, value in above.items():
-        both = isinstance(value, Mapping) and isinstance(joined.get(key), Mapping)
-        joined[key] = _merge(joined[key], dict(value)) if both else value
+        held = joined.get(key)
+        if key == "schedule" and isinstance(held, str):  # its kind alone
+            held = {"kind": held}
+        both = isinstance(value, Mapping) and isinstance(held, Mapping)
+        joined[key] = _merge(dict(held or {}), dict(value)) if both else value
     for key, other in (("steps", "epochs"), ("epochs", "steps")):
         if above.get(key) is not None and above.get(other) is None:
             joined.pop(other, None)

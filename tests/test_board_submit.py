@@ -133,8 +133,8 @@ def test_refused_before_the_work(
 
 def test_mistakes_are_told_together(own: BoardBench, predictions: Path) -> None:
     """All that is wrong with an entry is in one error: whoever mends it all can submit."""
-    keys = {"authors": (), "urls": ("https://a.org/1", "https://a.org/2"), "method": "persistence"}
-    mended = {"authors": ("A",), "urls": (), "method": "fine"}
+    keys = {"name": "NO\u0406SY", "urls": ("https://a.org/1", "https://a.org/2")}
+    mended = {"name": "Fine", "urls": (), "method": "fine"}
     alone = []
     for key, value in keys.items():
         with pytest.raises(UsageError) as told:
@@ -151,7 +151,7 @@ def _never(*_: object, **__: object) -> None:
 
 
 def test_files_that_do_not_belong_together(own: BoardBench, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Several files need seeds that differ; a label that is no id needs --method."""
+    """Several files need seeds that differ; a label that is no id needs --method; no file is no entry."""
     monkeypatch.setattr(submitting, "score", _never)
     plain, other = own.predict(still, "plain"), own.predict(noisy, "other")
     same = own.predict(still, "same", seed=4)
@@ -159,6 +159,7 @@ def test_files_that_do_not_belong_together(own: BoardBench, monkeypatch: pytest.
     odd = own.data.submit(own.folder.parent / "odd.nc", still, "My Model!")
     small, large = (own.predict(still, "sized", seed=n, parameters=9 + n) for n in (0, 1))
     for files, keys in (
+        ((), {}),
         ((small, large), {}),
         ((plain, other), {"method": "both"}),
         ((same, same), {}),

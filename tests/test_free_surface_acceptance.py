@@ -30,8 +30,9 @@ Array = NDArray[np.float64]
 
 FULL = parameters(particles=1250, grid=64, dt=1 / 1200, wall=3)
 FRAME = 20
-LIQUID_IDS = (0, 1, 2, 3, 4, 5, 6, 7)
-PAIR_IDS = (48, 49, 50, 51, 52, 53, 54, 55, 56, 57, 58, 59)
+LIQUID_IDS = (0, 4, 1, 5, 2, 6, 3, 7)
+PAIR_IDS = (48, 54, 49, 55, 50, 56, 51, 57, 52, 58, 53, 59)
+# Equals stand side by side: families repeat with the id by 4, pairs by 6, and a commit takes every third.
 EVERY = [("fluid", i) for i in LIQUID_IDS] + [("multimaterial", i) for i in PAIR_IDS]
 SETTLING = [("fluid", i) for i in (4, 5, 6, 7)] + [("multimaterial", 53)]
 SMALL = [("fluid", size, i) for size in ("mini", "tiny") for i in range(4)]
@@ -261,7 +262,7 @@ def test_bar_rings_at_its_frequency(material: Material, young: float) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("split", "size", "scenario_id"), of_this_turn(SMALL, turns=3))
+@pytest.mark.parametrize(("split", "size", "scenario_id"), of_this_turn(SMALL, turns=3, shift=1))
 def test_small_sizes_are_sound(split: str, size: str, scenario_id: int) -> None:
     """With the constants of ``full``, mini and tiny keep box, CFL bound and falling energy."""
     assert_sound(history(split, size, scenario_id, 300))

@@ -20,12 +20,13 @@ from torch import Tensor
 
 from lagbench.baselines import predict as prediction
 from lagbench.baselines.baseline import Batch, Facts, facts_of
-from lagbench.baselines.catalogue import every_entry
+from lagbench.baselines.catalogue import every_entry, find
 from lagbench.baselines.checkpoint import Checkpoint, save
 from lagbench.baselines.job import MOST_RECORD, OVER
 from lagbench.baselines.machine import threads_used
 from lagbench.baselines.neuralmpm import NeuralMPM
 from lagbench.baselines.predict import PredictionResult, UnfinishedWarning, predict
+from lagbench.baselines.recipe import recipe_for
 from lagbench.baselines.rollout import as_published, roll_out, single
 from lagbench.data.registry import Registry
 from lagbench.errors import DataError, UnreadableFileError, UsageError, WorkFailedError
@@ -311,6 +312,18 @@ def test_another_size_than_that_of_the_training(
             run(name, size=size, facts=facts)
     with pytest.raises(DataError):
         run("scaled", size="tiny", facts=replace(trained, version="0.9.0"))
+
+
+def test_what_the_training_changed_is_told(run: Predict) -> None:
+    """The file says by which ``--set`` the recipe became another, apart from changes of the prediction."""
+    recipe = recipe_for(find("gns"), "curl-noise", "tiny", settings=["training.steps=77"]).as_json()
+    result = run(training={"recipe": recipe}, settings=["model.explode_at=3"])
+    with netCDF4.Dataset(result.path) as data:
+        told = data.getncattr("training")
+    before, _, after = told.partition("predicted with")
+    assert "training.steps=77" in before
+    assert "model.explode_at=3" not in before
+    assert "model.explode_at=3" in after
 
 
 def test_a_model_is_changed_where_that_needs_no_weights(

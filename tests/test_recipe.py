@@ -129,6 +129,7 @@ def test_trainings_of_before_an_option_go_on() -> None:
         ("gns", ("model.loss_norm=l1", "model.loss.vorticity=0.5", "training.steps=70")),
         ("supergat", ("model.sum_messages=false", "training.epochs=2")),
         ("neuralmpm", ("model.pushforward=2", "training.ema=0.9", "training.windows=[train, extra]")),
+        ("neuralmpm", ("training.schedule.floor=0.1", "training.validate_every=0")),
         ("neuralmpm", ()),
     ],
 )
@@ -143,10 +144,24 @@ def test_settings_lead_back_to_the_recipe(name: str, given: tuple[str, ...]) -> 
     assert settings_of(recipe_for(entry, "cavity", "mini", settings=["training.log_every=3"]).as_json()) == ()
 
 
-@pytest.mark.parametrize("record", [{}, {"name": "cavity/mini"}, {"name": "a/b", "baseline": "gns"}])
-def test_nothing_is_told_of_a_recipe_that_is_not_ours(record: dict[str, str]) -> None:
-    """A stranger's baseline, or a recipe that is not shipped, has no settings."""
-    assert settings_of(record) == ()
+def test_nothing_is_told_of_a_recipe_that_is_not_ours(tmp_path: Path) -> None:
+    """Strangers' records: no such recipe or baseline, options that do not fit, a path for a name."""
+    own = tmp_path / "own.yaml"
+    own.write_text("format: 1\nrecipes: {cavity/mini: {training: {steps: 1}}}\n")
+    good = recipe_for(find("gns"), "cavity", "mini", settings=["training.steps=7"]).as_json()
+    assert settings_of(good) == ("training.steps=7",)
+    for change in (
+        *({"name": f"cavity/mini-{path}"} for path in (own, tmp_path / "absent.yaml")),
+        *({"name": "cavity/none"}, {"name": 3}, {"baseline": "other"}, {"baseline": ["gns"]}),
+        *({"model": None}, {"training": [1]}),
+    ):
+        assert settings_of({**good, **change}) == (), change
+    for odd in ("x" * 1000, "a\n\x1b[31m\ud800", [[0] * 1000], {"steps": {"a": "b"}}):
+        (told,) = settings_of({**good, "training": {**good["training"], "steps": odd, "unknown": 1}}) or ("",)
+        assert len(told) < 250
+        assert told.isprintable()
+        assert told.isascii()
+    assert settings_of(None) == settings_of([good]) == ()
 
 
 def test_steps_and_epochs_replace_each_other(entry: Entry) -> None:

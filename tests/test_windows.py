@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import pickle
+import resource
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +25,7 @@ from lagbench import torch as lagbench_torch
 from lagbench.baselines.rollout import scenario_batch, scenario_paths
 from lagbench.data.registry import Registry, load
 from lagbench.data.yamlfile import read_yaml
-from lagbench.errors import DataError, LagbenchError, UsageError
+from lagbench.errors import DataError, LagbenchError, UsageError, WorkFailedError
 from lagbench.make.generate import GenerationResult
 from lagbench.store import windows as store_windows
 from lagbench.torch import Batch, Window, WindowDataset, WindowSampler, collate, predict, roll_out
@@ -232,6 +234,21 @@ def test_open_files_are_bounded(train: Open, monkeypatch: pytest.MonkeyPatch) ->
         assert data[i].scenario == data.place(i)[0]
         assert len(data.store._open) == 1
         assert len(open_scenarios() - before) <= 1
+
+
+def test_the_systems_limit_of_files_is_no_damage(train: Open) -> None:
+    """Where the system opens no more files, the error says that, and reading goes on once it does."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    data = train()
+    with open(os.devnull) as lowest:
+        free = lowest.fileno()
+    resource.setrlimit(resource.RLIMIT_NOFILE, (free, hard))
+    try:
+        with pytest.raises(WorkFailedError):
+            data[0]
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    assert data[0].scenario == data.place(0)[0]
 
 
 def test_several_subsets(train: Open) -> None:

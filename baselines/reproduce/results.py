@@ -176,20 +176,21 @@ def _chapter(evidence: Evidence) -> Iterator[str]:
     else:
         yield from _vorticity_at(evidence)
     yield (
-        "Cost. Recipe, and what the training changed of it; a dash where no record lies beside the entry, as"
-        " of those that run another entry's weights. Speed-up: our solver's time for a frame on one core over"
-        " the model's, same machine."
+        "Cost. Recipe, and what the training changed of it, seeds apart where they differ; a dash where no"
+        " record lies beside the entry, as of those that run another entry's weights. Speed-up: our solver's"
+        " time for a frame on one core over the model's, same machine."
     )
     heads = ("recipe", "changed", "parameters", "seeds", "CPU hours", "hardware", "s/frame", "solver s/frame")
     rows = []
     for name, method in evidence.models.items():
         record, cost = method.seeds[0].record, method.cost
+        recipes = [held.record.get("recipe", {}) for held in method.seeds]
         paid = (cost.seconds_per_frame, cost.solver_seconds_per_frame, cost.speed_up) if cost else (None,) * 3
         rows.append(
             [
                 label(name),
-                record.get("recipe", {}).get("name", "-"),
-                "; ".join(settings_of(record.get("recipe", {}))) or "-",
+                " / ".join(dict.fromkeys(recipe.get("name", "-") for recipe in recipes)),
+                " / ".join(dict.fromkeys("; ".join(settings_of(recipe)) or "-" for recipe in recipes)),
                 "-" if method.parameters is None else f"{method.parameters:,}",
                 ", ".join("-" if held.seed is None else str(held.seed) for held in method.seeds),
                 number(method.cpu_hours),

@@ -160,7 +160,8 @@ class Model:
     varied: str = ""  # baseline of which it is a variant
     settings: tuple[str, ...] = ()  # changes to the recipe, as in model.loss.vorticity=0
     recipe: str | None = None  # variant of the recipe, as in change; None for the size's own
-    weights: str = ""  # model of the roster whose weights it runs with these settings; empty for its own
+    # model whose weights its entry runs with these settings, empty for its own; a reproduction trains anew
+    weights: str = ""
 
     @property
     def baseline(self) -> str:

@@ -180,7 +180,10 @@ def beside_thesis(held: Mapping[str, Any]) -> Sheet:
         f" all frames concatenated, the first 70 % fitted, the next {held['forecast_frames']} forecast."
         f" The forecast {answer}: at its end it grows by a factor of {number(held['growth'], 5)} per frame."
     )
-    cells = [(what, number(theirs), number(ours, 4)) for what, theirs, ours in rows]
+    cells = [
+        (what, number(theirs), f"{ours:,}" if isinstance(ours, int) else number(ours, 6))
+        for what, theirs, ours in rows
+    ]
     return Sheet(notes=(note,), tables=(Table("", ("", "thesis", "ours"), tuple(cells)),))
 
 

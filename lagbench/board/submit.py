@@ -1,9 +1,9 @@
 """Score predictions and write the entry: ``lagbench submit``.
 
-What can be refused is refused before the work, all of it together. Then score files are written,
-and last the YAML file, which names them by SHA-256, each atomically: what an interruption leaves
-behind is a score file without an entry, which ``lagbench leaderboard check`` finds. The board's
-page is not touched; ``lagbench leaderboard build`` draws it.
+What can be refused is refused before the work: together what needs no file, then together what the
+files must be for. Then score files are written, and last the YAML file, which names them by SHA-256,
+each atomically: what an interruption leaves behind is a score file without an entry, which
+``lagbench leaderboard check`` finds. ``lagbench leaderboard build`` draws the board's page anew.
 """
 
 from __future__ import annotations
@@ -17,22 +17,20 @@ from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from lagbench.atomic import write_atomically
-from lagbench.data.checksums import file_sha256, round_digits
-from lagbench.data.registry import Registry, Size, load
+from lagbench.data.checksums import file_sha256
+from lagbench.data.registry import Registry, load
 from lagbench.errors import ChecksFailedError, Mistakes, UnreadableFileError, UsageError, WorkFailedError
 from lagbench.floors.table import FLOORS
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.scenario import SUBMISSION
 from lagbench.scoring.score import score
 from lagbench.scoring.score_file import write_statistics
+from lagbench.submission.checks import outside_share
 from lagbench.submission.findings import ValidationResult
 from lagbench.submission.format import Header
-from lagbench.submission.predictions import Predictions, open_predictions
+from lagbench.submission.predictions import open_predictions
 from lagbench.submission.validation import validate
 from lagbench.work.progress import Progress
 
@@ -63,8 +61,7 @@ from .weights import copy_weights, named_weights, require_weights
 BOARD = Path("leaderboard")  # the leaderboard's folder, from the root of the repository
 OUTSIDE = "in_domain"  # the warning that comes with a share of the positions
 
-STAGE = ".submit-"
-"""First letters of the folder in which score files are prepared; a killed process leaves it behind."""
+STAGE = ".submit-"  # begins the folder in which score files are prepared; a killed process leaves it behind
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,6 +127,11 @@ def submit(
     with mistakes:
         if not new_board:
             folder.require("run it from the root of a clone, name it with --board, or begin one: --new-board")
+    with mistakes:
+        if not 1 <= len(paths) <= MOST_SEEDS:
+            what = "too many files" if paths else "no predictions"
+            raise UsageError(what, expected=f"1 to {MOST_SEEDS}, one per seed", got=len(paths))
+    mistakes.tell()
     headers, hashes, outside, results, described = [], [], [], [], registry or load()
     for path in paths:
         result = validate(path, root=root, require_truth=True, registry=registry)
@@ -142,7 +144,7 @@ def submit(
             hashes.append(opened.content_sha256())
             size = described.size(opened.header.split, opened.header.size)
             warned = any(found.check == OUTSIDE for found in result.warnings)
-            outside.append(_outside(opened, size) if warned else None)
+            outside.append(outside_share(opened, size) if warned else None)
     with mistakes:
         seeds = _seeds(headers)
     with mistakes:
@@ -154,14 +156,21 @@ def submit(
     with mistakes:
         place = (headers[0].split, headers[0].size, _method(headers[0], meta))
         others = _others(folder, place)
-        _require_free(folder, place, (meta.name or headers[0].method)[:100], others, replace=replace)
-        taken = {made.sha256: str(where) for where, entry in others.items() for made in entry.predictions}
-        _require_new(hashes, paths, taken)
+        _require_free(folder, place, _name(headers[0], meta), others, replace=replace)
     mistakes.tell()
+    taken = {made.sha256: str(where) for where, entry in others.items() for made in entry.predictions}
+    _require_new(hashes, paths, taken)
     cards, made = [], []
-    options: Any = {"root": root, "workers": workers, "registry": registry, "progress": progress}
     for path, result, header, seed, url in zip(paths, results, headers, seeds, urls, strict=True):
-        card = score(path, **options, write=False, validated=result)
+        card = score(
+            path,
+            root=root,
+            workers=workers,
+            registry=registry,
+            progress=progress,
+            write=False,
+            validated=result,
+        )
         inside, whole = path.resolve(), folder.path.resolve()
         kept = inside.relative_to(whole).as_posix() if inside.is_relative_to(whole) else None
         cards.append(card)
@@ -189,8 +198,6 @@ def submit(
 
 def _seeds(headers: Sequence[Header]) -> tuple[int | None, ...]:
     """Return the seeds of files that belong together; refuse those that do not."""
-    if not 1 <= len(headers) <= MOST_SEEDS:
-        raise UsageError("too many files", expected=f"1 to {MOST_SEEDS}, one per seed", got=len(headers))
     for name in ("split", "size", "dataset_sha256", "method", "parameters"):
         found = dict.fromkeys(str(getattr(header, name)) for header in headers)
         if len(found) > 1:
@@ -234,6 +241,11 @@ def _method(header: Header, meta: Meta) -> str:
         fix = "name your method otherwise; the floors are added by themselves"
         raise UsageError(f"{name!r} is the name of a floor", where="--method", fix=fix)
     return name
+
+
+def _name(header: Header, meta: Meta) -> str:
+    """Return what the board calls the method."""
+    return meta.name or header.method[:100]
 
 
 def _others(folder: Folder, place: Place) -> dict[Path, Entry]:
@@ -286,7 +298,7 @@ def _about(headers: Sequence[Header], meta: Meta) -> About:
     """Return what is said of the method, with what the predictions say where nothing is."""
     first = headers[0]
     held = {name: getattr(meta, name) for name in About.model_fields}
-    held["name"] = meta.name or first.method[:100]
+    held["name"] = _name(first, meta)
     held["date"] = meta.date or datetime.datetime.now(datetime.UTC).date()
     held["training"] = meta.training or (first.training or "")[:LONGEST_TEXT]
     if meta.parameters is None:
@@ -300,17 +312,6 @@ def _about(headers: Sequence[Header], meta: Meta) -> About:
         )
     held["budget"] = EntryBudget.of(first.size, [header.budget for header in headers]) or meta.budget
     return About(**held)
-
-
-def _outside(opened: Predictions, size: Size) -> float:
-    """Return the share of positions that lie more than a solver cell outside the box."""
-    low, high = np.array(size.bounds).T + np.array([[-1.0], [1.0]]) / size.grid
-    found, count = 0, 0
-    for scenario in opened.header.scenarios:
-        for _, block in opened.blocks(scenario):
-            beyond = ((block < low) | (block > high)).any(axis=-1)
-            found, count = found + int(beyond.sum()), count + beyond.size
-    return round_digits(found / max(1, count), 4)
 
 
 def _publish(

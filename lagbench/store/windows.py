@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from bisect import bisect_right
 from collections import OrderedDict
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from lagbench.data.layout import major_of
 from lagbench.data.local import locate, remedy
 from lagbench.data.registry import Registry, Size
-from lagbench.errors import DataError, LagbenchError, UsageError
+from lagbench.errors import DataError, LagbenchError, UsageError, WorkFailedError
 
 from .copy import scenario_files
 
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float32]
 
 CACHE_BYTES = 256 << 20  # frames kept decompressed, by default [bytes]
-OPEN_FILES = 128  # files kept open in one process, about 0.6 MB each: all that a split trains on
+OPEN_FILES = 128  # files that a store keeps open, about 0.6 MB each; our splits train on up to 63
 
 
 @dataclass(frozen=True)
@@ -164,6 +165,13 @@ class FrameStore:
         except LagbenchError:
             raise
         except Exception as error:  # no list of types holds: damage surfaces as nearly any of them
+            if isinstance(error, OSError) and error.errno in (errno.EMFILE, errno.ENFILE):
+                raise WorkFailedError(
+                    "the system opens no more files",
+                    where=str(self._paths[scenario]),
+                    got=f"{len(self._open)} scenario files are open",
+                    fix="allow more, as by `ulimit -n 4096`, or open fewer data sets at a time",
+                ) from error
             raise DataError(
                 "a scenario file is damaged or not one of lagbench",
                 where=str(self._paths[scenario]),
@@ -192,7 +200,7 @@ class Window(NamedTuple):
 class WindowReader:
     """All windows of ``history + future`` consecutive frames of a data set's subsets, by number.
 
-    Files are opened by the process that reads from them, at most 32 at a time; decompressed
+    Files are opened by the process that reads from them, at most 128 at a time; decompressed
     frames are kept up to `cache_bytes` in each process. Stored data are never changed: every
     window is a copy. `windows` says what the arguments are.
     """

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.data.checksums import round_digits
 from lagbench.data.registry import Size
 
 from .findings import Findings
@@ -217,3 +218,14 @@ def check_jumps(surveys: list[Survey], starts: Mapping[int, Start], truth: Truth
                 fix="check the rollout for instability, and that particles keep their order",
             )
     out.made("max_displacement")
+
+
+def outside_share(opened: Predictions, size: Size) -> float:
+    """Return the share of positions that lie more than a solver cell outside the box."""
+    low, high = np.array(size.bounds).T + np.array([[-1.0], [1.0]]) / size.grid
+    found, count = 0, 0
+    for scenario in opened.header.scenarios:
+        for _, block in opened.blocks(scenario):
+            beyond = ((block < low) | (block > high)).any(axis=-1)
+            found, count = found + int(beyond.sum()), count + beyond.size
+    return round_digits(found / max(1, count), 4)
