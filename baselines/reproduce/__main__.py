@@ -138,9 +138,12 @@ def _runs(plan: Plan, figures: Sequence[Figure], split: str | None) -> list[tupl
 
 
 def _studies(plan: Plan, figures: Sequence[Figure]) -> Iterator[str]:
-    """Yield the tables of MLPs to train; all are left out where MLPs have no such variant."""
+    """Yield the tables of MLPs to train; all are left out where MLPs have no such variant.
+
+    At full their rows have recipes of their own, of no variant.
+    """
     for study in dict.fromkeys(figure.studies for figure in figures if figure.studies):
-        if plan.has_recipe(TABLES[study][1], ROSTER["mlp"]):
+        if plan.has_recipe(TABLES[study][1], ROSTER["mlp"]) and not (plan.recipe and plan.size == "full"):
             yield study
         else:
             _leave_out(plan, f"studies of {study}", "mlp")
