@@ -358,6 +358,7 @@ def test_a_pool_shares_its_frames(train: Open, monkeypatch: pytest.MonkeyPatch) 
     assert len(read) <= 2 * WINDOWS
 
 
+@pytest.mark.filterwarnings("ignore:This DataLoader will create:UserWarning")  # on one core
 def test_worker_processes_read_the_same(train: Open) -> None:
     """Two forked workers, after this process has opened the files, give the batches of none."""
     data = train()
