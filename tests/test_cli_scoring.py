@@ -112,6 +112,7 @@ def terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("rich.console.Console.is_terminal", property(lambda _: True))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("terminal")
 def test_tables_fit_eighty_columns(run: Run, predictions: Path) -> None:
     """No line of any table is wider, with every metric and every floor too."""

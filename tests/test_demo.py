@@ -94,6 +94,7 @@ def test_without_the_extra_the_data_are_made_and_one_line_says_how_to_get_the_re
 
 
 @pytest.mark.usefixtures("only_one")
+@pytest.mark.slow
 def test_the_demo_ends_with_a_leaderboard_of_its_own(run: Run, copied: Callable[[], Path]) -> None:
     """Model and floors are on the page that it names; nothing is written in the current folder.
 
