@@ -35,10 +35,12 @@ class Options(BaseModel):
 
     Class attributes:
         in_training: names of the options of the training; a trained model refuses changes of them.
+        of_weights: names of options that say what weights mean where their shapes do not tell; likewise.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     in_training: ClassVar[frozenset[str]] = frozenset()
+    of_weights: ClassVar[frozenset[str]] = frozenset()
 
 
 class Baseline(nn.Module):

@@ -176,6 +176,7 @@ class FrameNetworkOptions(baseline.Options):
     """
 
     in_training = frozenset({"noise_std"})
+    of_weights = frozenset({"target"})
 
     # the next state, or its change in units of the change's deviation over train
     target: Target = Target.STATE

@@ -49,6 +49,8 @@ class MLP(FrameNetwork):
     class Options(FrameNetworkOptions):
         """Options of the MLP."""
 
+        of_weights = FrameNetworkOptions.of_weights | {"activation"}
+
         widths: tuple[PositiveInt, ...] = (2500, 1250, 1250, 2500)  # units of each hidden layer
         activation: Activation = Activation.ELU  # elu, relu, tanh or sigmoid
 

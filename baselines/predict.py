@@ -264,19 +264,28 @@ def _rescaled(trained: Facts, here: Facts) -> Facts:
     return replace(here, radius=radius, statistics=trained.statistics)
 
 
+WITH = ", predicted with "
+"""What comes between the words of a training and the settings of a prediction."""
+
+
+def training_words(checkpoint: Checkpoint) -> str:
+    """Return what weights were trained on, by which recipe with which changes, and how long."""
+    facts, done = checkpoint.facts, checkpoint.training
+    recipe = done.get("recipe", {})
+    subsets = "+".join(recipe.get("training", {}).get("windows", ("train",)))
+    words = f"{facts.split} {facts.size} {subsets}, recipe {recipe.get('name')}, step {done.get('step', 0)}"
+    return words + "".join(f", {setting}" for setting in settings_of(recipe))
+
+
 def _provenance(checkpoint: Checkpoint, here: Facts, settings: Sequence[str]) -> dict[str, Any]:
     """Return seed, training in words and its budget, for the file's attributes.
 
     Validations at another size than the one predicted are left out: they compare with none there.
     """
     facts, done = checkpoint.facts, checkpoint.training
-    recipe = done.get("recipe", {})
-    options = recipe.get("training", {})
-    subsets = "+".join(options.get("windows", ("train",)))
-    words = f"{facts.split} {facts.size} {subsets}, recipe {recipe.get('name')}, step {done.get('step', 0)}"
-    words += "".join(f", {setting}" for setting in settings_of(recipe))
-    words += f", predicted with {', '.join(settings)}" if settings else ""
-    found: dict[str, Any] = {"training": words, "seed": int(options.get("seed", 0))}
+    words = training_words(checkpoint) + (f"{WITH}{', '.join(settings)}" if settings else "")
+    seed = done.get("recipe", {}).get("training", {}).get("seed", 0)
+    found: dict[str, Any] = {"training": words, "seed": int(seed)}
     budget = budget_in(json.dumps(done.get("budget")))
     if budget is None:
         return found

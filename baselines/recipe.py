@@ -284,7 +284,8 @@ def changed_options(entry: Entry, options: Mapping[str, Any], settings: Iterable
         _checked(entry.model.Options, layer, "model", "--set").model_dump(mode="json")
         for layer in (dict(options), changed)
     )
-    idle = sorted(f"model.{name}" for name in entry.model.Options.in_training if before[name] != after[name])
+    fixed = entry.model.Options.in_training | entry.model.Options.of_weights
+    idle = sorted(f"model.{name}" for name in fixed if before[name] != after[name])
     if idle:
         fix = "leave it out, or train with it; docs/baselines.md says what a trained model takes"
         raise UsageError("an option of the training", where="--set", got=", ".join(idle), fix=fix)

@@ -178,6 +178,7 @@ class GraphNetworkOptions(Options):
     in_training = frozenset(
         {"forgetful", "noise_std", "loss", "loss_norm", "link_weight", "rollout_loss_steps", "symmetry"}
     )
+    of_weights = frozenset({"target"})
 
     latent: int = Field(default=128, ge=1)  # width of nodes, edges and hidden layers
     layers: int = Field(default=10, ge=1)  # processor layers

@@ -32,11 +32,15 @@ def own(home: Path, tmp_path: Path) -> BoardBench:
     return copied(home, tmp_path)
 
 
-def trained(own: BoardBench, seed: int) -> Path:
+def trained(own: BoardBench, seed: int, training: str = "") -> Path:
     """Write the weights of a run, with its record beside them and its predictions."""
     folder = own.folder.parent / f"drift-{seed}"
     folder.mkdir()
-    labels = {"seed": seed, "budget": BUDGET.model_dump_json()}
+    labels = {
+        "seed": seed,
+        "budget": BUDGET.model_dump_json(),
+        **({"training": training} if training else {}),
+    }
     share = 0.6 + 0.1 * seed
 
     def between(truth: Any, n: int, h: int) -> Any:
@@ -100,6 +104,28 @@ def test_a_later_entry_takes_its_files_along(own: BoardBench) -> None:
     submitted(own, run, weights=(), replace=True)
     assert not list((own.folder / "weights").rglob("*.*"))
     assert found(own) == set()
+
+
+@pytest.mark.parametrize(
+    ("training", "fits"),
+    [
+        ("cavity tiny train, recipe cavity/tiny, step 6", True),
+        ("cavity tiny train, recipe cavity/tiny, step 6, predicted with model.average=true", True),
+        ("three nights on my own cluster", True),
+        ("cavity tiny train, recipe cavity/tiny, step 60", False),
+        ("cavity tiny train, recipe cavity/tiny-change, step 6", False),
+        ("cavity tiny train, recipe cavity/tiny, step 6, model.target=change", False),
+    ],
+)
+def test_weights_are_those_of_the_predictions(own: BoardBench, training: str, fits: bool) -> None:
+    """What predictions say of their training is what the weights say; others' own words are no matter."""
+    run = trained(own, 0, training)
+    if fits:
+        submitted(own, run)
+        return
+    with pytest.raises(UsageError) as caught:
+        submitted(own, run)
+    assert caught.value.where == str(run / "weights.pt")
 
 
 def test_other_weights_are_refused(own: BoardBench) -> None:

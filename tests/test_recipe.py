@@ -101,6 +101,23 @@ def test_options_of_the_training(name: str) -> None:
     assert changed_options(baseline, stored, []) == stored
 
 
+@pytest.mark.parametrize(
+    ("name", "setting"),
+    [
+        *(("mlp", "model.target=change"), ("mlp", "model.activation=tanh")),
+        *(("lstm", "model.target=change"), ("gns", "model.target=velocity")),
+    ],
+)
+def test_weights_keep_their_meaning(name: str, setting: str) -> None:
+    """A trained model refuses options that its weights were made for, though they would fit."""
+    baseline = find(name)
+    stored = baseline.model.Options().model_dump(mode="json")
+    with pytest.raises(UsageError):
+        changed_options(baseline, stored, [setting])
+    group, _, value = setting.partition("=")
+    assert changed_options(baseline, {**stored, group.partition(".")[2]: value}, [setting])
+
+
 def test_layers(entry: Entry) -> None:
     """Settings win over the recipe, and the recipe over the defaults of the file."""
     plain = recipe_for(entry, "cavity", "tiny")

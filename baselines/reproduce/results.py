@@ -100,8 +100,8 @@ def _claims(learned: Sequence[Evidence]) -> Iterator[str]:
         return
     rows = {claim: {e.where: claim_rows(claim, e) for e in learned} for claim in CLAIMS}
     yield (
-        "By the ranking metric over the horizon: ahead in the mean; better and worse at 5 %. A dash where an"
-        " entry is missing."
+        "By the ranking metric over the horizon: ahead in the mean; better (yes) and worse (no) at 5 %, open"
+        " otherwise. Two methods are compared by the seeds that both have. A dash where an entry is missing."
     )
     yield table(
         ["", *(e.where for e in learned)],
@@ -124,9 +124,10 @@ def _claims(learned: Sequence[Evidence]) -> Iterator[str]:
     yield "### What does a CPU hour buy?"
     yield (
         "Validation: the least value up to a quarter, half and all of the steps, and what the last doubling"
-        " gained; of the first seed. Models whose last doubling gained more than 2 % have not converged."
+        " gained, of the first seed, in the metric that was validated. Models whose last doubling gained more"
+        " than 2 % have not converged."
     )
-    heads = ("model", "steps x windows", "epochs", "CPU hours per seed", "skill")
+    heads = ("model", "steps x windows", "epochs", "CPU hours per seed", "skill", "validated")
     learning = ("validation at 1/4", "1/2", "1", "last doubling")
     yield table(("where", *heads, *learning), [row for e in learned for row in _training_rows(e)])
 
@@ -151,6 +152,7 @@ def _training_rows(evidence: Evidence) -> Iterator[list[str]]:
             number(seen / record["windows"] if seen else None),
             number(None if hours is None else hours / len(method.seeds)),
             number(evidence.skill(name)),
+            next((name for entry in record.get("validation", ()) for name in entry if name != "step"), "-"),
             *map(number, best),
             "-" if gain is None else f"{100.0 * gain:.2g} %",
         ]
@@ -176,21 +178,31 @@ def _chapter(evidence: Evidence) -> Iterator[str]:
     else:
         yield from _vorticity_at(evidence)
     yield (
-        "Cost. Recipe, and what the training changed of it, seeds apart where they differ; a dash where no"
-        " record lies beside the entry, as of those that run another entry's weights. Speed-up: our solver's"
+        "Cost. Recipe, and what the training changed of it (`none`: nothing), seeds in their order where they"
+        " differ; a dash where no record of a training lies beside the entry. Speed-up: our solver's"
         " time for a frame on one core over the model's, same machine."
     )
-    heads = ("recipe", "changed", "parameters", "seeds", "CPU hours", "hardware", "s/frame", "solver s/frame")
+    heads = (
+        "recipe",
+        "changed",
+        "parameters",
+        "seeds",
+        "CPU hours, all seeds",
+        "hardware",
+        "s/frame",
+        "solver s/frame",
+    )
     rows = []
     for name, method in evidence.models.items():
         record, cost = method.seeds[0].record, method.cost
         recipes = [held.record.get("recipe", {}) for held in method.seeds]
+        changed = ["; ".join(settings_of(recipe)) or ("none" if recipe else "-") for recipe in recipes]
         paid = (cost.seconds_per_frame, cost.solver_seconds_per_frame, cost.speed_up) if cost else (None,) * 3
         rows.append(
             [
                 label(name),
                 " / ".join(dict.fromkeys(recipe.get("name", "-") for recipe in recipes)),
-                " / ".join(dict.fromkeys("; ".join(settings_of(recipe)) or "-" for recipe in recipes)),
+                " / ".join(dict.fromkeys(changed)),
                 "-" if method.parameters is None else f"{method.parameters:,}",
                 ", ".join("-" if held.seed is None else str(held.seed) for held in method.seeds),
                 number(method.cpu_hours),

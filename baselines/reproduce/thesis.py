@@ -225,6 +225,8 @@ _MODELS = (
         recipe="long",
         weights="neuralmpm-long",
     ),
+    Model("neuralmpm-of-mini", "NeuralMPM trained at mini"),
+    Model("neuralmpm-of-mini-averaged", "NeuralMPM trained at mini, mean over images"),
     Model("mlp", "MLP", "#0072b2"),
     Model("lstm", "LSTM", "#009e73"),
     Model("lstm-mlp", "LSTM + MLP", "#d55e00"),

@@ -169,7 +169,11 @@ def beside_thesis(held: Mapping[str, Any]) -> Sheet:
         ("share of its largest eigenvalue that was added to the Gram matrix", None, held["floor"]),
         (f"squared error of one step, over the frames fitted {unit}", None, held["fit_mse"]),
         (f"squared error of the forecast {unit}", thesis["mse"], held["forecast_mse"]),
-        (f"squared error of the last frame fitted, kept {unit}", None, held["persistence_mse"]),
+        (
+            f"squared error of standing still after those frames {unit}",
+            None,
+            held["persistence_mse"],
+        ),
         ("factor by which the forecast grows per frame at its end", None, held["growth"]),
     ]
     at = sorted((int(frame), value) for frame, value in held["mse_at"].items())
@@ -177,11 +181,12 @@ def beside_thesis(held: Mapping[str, Any]) -> Sheet:
     answer = "diverges" if held["growth"] > 1.0 else "does not diverge"
     note = (
         f"VAR of {held['features']} dimensions on {held['split']} {held['size']} by the thesis's protocol:"
-        f" all frames concatenated, the first 70 % fitted, the next {held['forecast_frames']} forecast."
-        f" The forecast {answer}: at its end it grows by a factor of {number(held['growth'], 5)} per frame."
+        f" all frames concatenated, the first 70 % fitted, the next 15 %, {held['forecast_frames']} frames,"
+        f" forecast. The forecast {answer}: at its end it grows by a factor of {number(held['growth'], 5)}"
+        " per frame."
     )
     cells = [
-        (what, number(theirs), f"{ours:,}" if isinstance(ours, int) else number(ours, 6))
+        (what, number(theirs), f"{ours:,}" if isinstance(ours, int) else number(ours, 5))
         for what, theirs, ours in rows
     ]
     return Sheet(notes=(note,), tables=(Table("", ("", "thesis", "ours"), tuple(cells)),))
