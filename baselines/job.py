@@ -17,20 +17,22 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Self
 
+import yaml
 from torch import Tensor
 
 from lagbench.atomic import write_atomically
 from lagbench.data.checksums import round_digits
 from lagbench.data.hdf5 import check_regular
 from lagbench.data.registry import Registry
-from lagbench.errors import UnreadableFileError, UsageError
+from lagbench.errors import LagbenchError, UnreadableFileError, UsageError
 from lagbench.submission.budget import MOST_VALIDATIONS, Budget, track_of
 from lagbench.work.progress import Meter
 
 from .baseline import Baseline, Facts
+from .catalogue import find
 from .checkpoint import Checkpoint, load
 from .machine import hardware
-from .recipe import Recipe
+from .recipe import ANY, LATER, Recipe, recipe_for, recipe_names
 
 STOPPED_EARLY = "stopped early"  # state of a training whose validations brought nothing new; it is over
 MOST_RECORD = 4 << 20  # longest training.json that is read [bytes]
@@ -206,6 +208,59 @@ def first_difference(wanted: dict[str, Any], found: object, path: str = "") -> s
                 return first_difference(mine, other, f"{path}{key}.")
             return f"{path}{key} = {mine!r}, as asked for; the folder has {other!r}"
     return "the same recipe"
+
+
+UNTOLD = ("seed", "compile", "log_every", "checkpoint_every")
+"""Options of a training that do not say what was learned."""
+
+LONGEST_VALUE = 200  # letters of a changed option that are told
+
+
+def settings_of(recipe: object) -> tuple[str, ...]:
+    """Return what a training changed of the shipped recipe that it names, as ``--set`` takes it.
+
+    ``recipe`` is what a record of a training or its weights hold, of a stranger perhaps: options that are
+    unknown here, and whatever names no shipped recipe, are passed over, long values are not told.
+    """
+    held = recipe if isinstance(recipe, Mapping) else {}
+    split, _, where = str(held.get("name")).partition("/")
+    size, _, variant = where.partition("-")
+    try:
+        entry = find(str(held.get("baseline")))
+        if not {f"{split}/{where}", f"{ANY}/{where}"} & set(recipe_names(entry)):
+            return ()
+        shipped = recipe_for(entry, split, size, variant=variant or None)
+    except LagbenchError:
+        return ()
+    parts = {"model": shipped.model, "training": shipped.training.model_dump(mode="json")}
+    return tuple(sorted(f"{key}={_spelled(value)}" for key, value in _changes(parts, held, LATER)))
+
+
+def _changes(
+    shipped: Mapping[str, Any], held: object, missing: Mapping[str, Any], path: str = ""
+) -> Iterator[tuple[str, Any]]:
+    """Yield where a record differs from the shipped options, with paths as in model.loss.vorticity."""
+    if not isinstance(held, Mapping):
+        return
+    for key, value in shipped.items():
+        got = held.get(key, missing.get(key, value))
+        if isinstance(value, Mapping):
+            yield from _changes(value, got, missing.get(key, {}), f"{path}{key}.")
+        elif key not in UNTOLD and got != value:
+            yield f"{path}{key}", got
+
+
+def _spelled(value: object) -> str:
+    """Return a value in a line of YAML, quoted only where it would be read as something else."""
+    plain = isinstance(value, str) and value.isascii() and value.isprintable()
+    text = str(value) if plain else json.dumps(value)
+    if len(text) > LONGEST_VALUE:
+        return "..."
+    try:
+        bare = not plain or yaml.safe_load(text) == value
+    except (yaml.YAMLError, ValueError):  # the latter of what looks like a date and is none
+        bare = False
+    return text if bare else json.dumps(value)
 
 
 FORMAT = 1

@@ -31,9 +31,9 @@ from .baseline import Baseline, Facts
 from .catalogue import find
 from .checkpoint import Checkpoint, check_data, load, restore
 from .graph import radius_graph
-from .job import RunFolder, parameter_count
+from .job import RunFolder, parameter_count, settings_of
 from .machine import bound_memory, chosen_device, hardware, memory_errors_told, threads_used
-from .recipe import changed_options, settings_of
+from .recipe import changed_options
 from .rollout import Rollout, roll_out, scenario_batch, scenario_paths
 
 SEARCHES = 5  # frames of a rollout on which the neighbour search is timed alone
@@ -264,8 +264,8 @@ def _rescaled(trained: Facts, here: Facts) -> Facts:
     return replace(here, radius=radius, statistics=trained.statistics)
 
 
-WITH = ", predicted with "
-"""What comes between the words of a training and the settings of a prediction."""
+RECIPE, PREDICTED_WITH = ", recipe ", ", predicted with "
+"""What comes before a recipe's name and before the settings of a prediction, in the words for a training."""
 
 
 def training_words(checkpoint: Checkpoint) -> str:
@@ -273,8 +273,14 @@ def training_words(checkpoint: Checkpoint) -> str:
     facts, done = checkpoint.facts, checkpoint.training
     recipe = done.get("recipe", {})
     subsets = "+".join(recipe.get("training", {}).get("windows", ("train",)))
-    words = f"{facts.split} {facts.size} {subsets}, recipe {recipe.get('name')}, step {done.get('step', 0)}"
+    words = f"{facts.split} {facts.size} {subsets}{RECIPE}{recipe.get('name')}, step {done.get('step', 0)}"
     return words + "".join(f", {setting}" for setting in settings_of(recipe))
+
+
+def fits(training: str, checkpoint: Checkpoint) -> bool:
+    """Tell whether what predictions say of their training is what weights say; words of others always fit."""
+    said, _, _ = training.partition(PREDICTED_WITH)
+    return RECIPE not in said or said == training_words(checkpoint)
 
 
 def _provenance(checkpoint: Checkpoint, here: Facts, settings: Sequence[str]) -> dict[str, Any]:
@@ -283,7 +289,7 @@ def _provenance(checkpoint: Checkpoint, here: Facts, settings: Sequence[str]) ->
     Validations at another size than the one predicted are left out: they compare with none there.
     """
     facts, done = checkpoint.facts, checkpoint.training
-    words = training_words(checkpoint) + (f"{WITH}{', '.join(settings)}" if settings else "")
+    words = training_words(checkpoint) + (f"{PREDICTED_WITH}{', '.join(settings)}" if settings else "")
     seed = done.get("recipe", {}).get("training", {}).get("seed", 0)
     found: dict[str, Any] = {"training": words, "seed": int(seed)}
     budget = budget_in(json.dumps(done.get("budget")))

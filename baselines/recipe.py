@@ -19,9 +19,8 @@ Later layers win: defaults, recipe, what it says of the baseline by name, ``--se
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -32,7 +31,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from lagbench.data.yamlfile import read_yaml
 from lagbench.errors import LagbenchError, UnreadableFileError, UsageError, nearest
 
-from .catalogue import Entry, find, names
+from .catalogue import Entry, names
 
 
 class _Strict(BaseModel):
@@ -161,11 +160,6 @@ LATER: Mapping[str, Mapping[str, object]] = {
 }
 """Options that records of earlier trainings lack, with what they did: such trainings can go on."""
 
-UNTOLD = ("seed", "compile", "log_every", "checkpoint_every")
-"""Options of a training that do not say what was learned."""
-
-LONGEST_VALUE = 200  # letters of a changed option that are told
-
 Layer = dict[str, Any]
 ANY = "*"
 Checked = TypeVar("Checked", bound=BaseModel)
@@ -284,56 +278,11 @@ def changed_options(entry: Entry, options: Mapping[str, Any], settings: Iterable
         _checked(entry.model.Options, layer, "model", "--set").model_dump(mode="json")
         for layer in (dict(options), changed)
     )
-    fixed = entry.model.Options.in_training | entry.model.Options.of_weights
-    idle = sorted(f"model.{name}" for name in fixed if before[name] != after[name])
-    if idle:
+    kept = entry.model.Options.in_training | entry.model.Options.of_weights
+    if idle := sorted(f"model.{name}" for name in kept if before[name] != after[name]):
         fix = "leave it out, or train with it; docs/baselines.md says what a trained model takes"
         raise UsageError("an option of the training", where="--set", got=", ".join(idle), fix=fix)
     return after
-
-
-def settings_of(recipe: object) -> tuple[str, ...]:
-    """Return what a training changed of the shipped recipe that it names, as ``--set`` takes it.
-
-    ``recipe`` is what a record of a training or its weights hold, of a stranger perhaps: options that are
-    unknown here, and whatever names no shipped recipe, are passed over, long values are not told.
-    """
-    held = recipe if isinstance(recipe, Mapping) else {}
-    got = {group: held.get(group) for group in LATER}
-    split, _, where = str(held.get("name")).partition("/")
-    size, _, variant = where.partition("-")
-    if not all(isinstance(part, Mapping) for part in got.values()):
-        return ()
-    try:
-        entry = find(str(held.get("baseline")))
-        if not {f"{split}/{where}", f"{ANY}/{where}"} & set(recipe_names(entry)):
-            return ()
-        shipped = recipe_for(entry, split, size, variant=variant or None)
-    except LagbenchError:
-        return ()
-    wanted = {"model": shipped.model, "training": shipped.training.model_dump(mode="json")}
-    before, after = (dict(_paths(LATER)) | dict(_paths(layer)) for layer in (wanted, got))
-    changed = sorted(key for key in before.keys() & after.keys() if before[key] != after[key])
-    return tuple(f"{key}={_spelled(after[key])}" for key in changed)
-
-
-def _paths(layer: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the options of a recipe with their paths, as in model.loss.vorticity."""
-    for key, value in layer.items():
-        if isinstance(value, Mapping):
-            yield from _paths(value, f"{path}{key}.")
-        elif key not in UNTOLD:
-            yield f"{path}{key}", value
-
-
-def _spelled(value: object) -> str:
-    """Return a value in a line of YAML, quoted only where it would be read as something else."""
-    try:
-        bare = isinstance(value, str) and value.isprintable() and yaml.safe_load(value) == value
-    except yaml.YAMLError:
-        bare = False
-    text = str(value) if bare else json.dumps(value)
-    return text if len(text) <= LONGEST_VALUE else "..."
 
 
 def _read(path: Path) -> _File:

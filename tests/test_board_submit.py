@@ -17,7 +17,7 @@ from lagbench.board.entry import Meta
 from lagbench.board.entry_file import read_entry
 from lagbench.board.score_file import read_stored
 from lagbench.data.checksums import file_sha256
-from lagbench.errors import ChecksFailedError, UnreadableFileError, UsageError, WorkFailedError
+from lagbench.errors import ChecksFailedError, LagbenchError, UnreadableFileError, UsageError, WorkFailedError
 from lagbench.floors import floors_of
 from lagbench.submission import open_predictions
 
@@ -129,6 +129,15 @@ def test_refused_before_the_work(
     with pytest.raises(UsageError):
         own.submit(predictions, **keys)
     assert tree(own.folder) == before
+
+
+@pytest.mark.parametrize("text", ["a\x07b", "\u2800"])
+def test_words_of_predictions_that_cannot_be_shown(own: BoardBench, text: str) -> None:
+    """What predictions say of their training may be anything; an entry that cannot hold it is refused."""
+    before = tree(own.folder)
+    with pytest.raises(LagbenchError):
+        own.submit(own.predict(nearer, "odd", training=text))
+    assert {path for path in tree(own.folder) if "odd" in path} <= before
 
 
 def test_mistakes_are_told_together(own: BoardBench, predictions: Path) -> None:

@@ -12,13 +12,13 @@ import torch
 from simple_models import Drift, batch, facts, install, rolled, swirl
 
 from lagbench.baselines.catalogue import Entry, every_entry, find, names
+from lagbench.baselines.job import settings_of
 from lagbench.baselines.recipe import (
     Schedule,
     TrainingOptions,
     changed_options,
     recipe_for,
     recipe_names,
-    settings_of,
 )
 from lagbench.data.registry import load
 from lagbench.errors import UnreadableFileError, UsageError
@@ -170,10 +170,11 @@ def test_nothing_is_told_of_a_recipe_that_is_not_ours(tmp_path: Path) -> None:
     for change in (
         *({"name": f"cavity/mini-{path}"} for path in (own, tmp_path / "absent.yaml")),
         *({"name": "cavity/none"}, {"name": 3}, {"baseline": "other"}, {"baseline": ["gns"]}),
-        *({"model": None}, {"training": [1]}),
+        {"training": [1]},
     ):
         assert settings_of({**good, **change}) == (), change
-    for odd in ("x" * 1000, "a\n\x1b[31m\ud800", [[0] * 1000], {"steps": {"a": "b"}}):
+    assert settings_of({**good, "model": None}) == ("training.steps=7",)
+    for odd in ("x" * 1000, "a\n\x1b[31m\ud800", "2026-99-99", "\u00e4", [[0] * 1000], {"steps": {"a": "b"}}):
         (told,) = settings_of({**good, "training": {**good["training"], "steps": odd, "unknown": 1}}) or ("",)
         assert len(told) < 250
         assert told.isprintable()

@@ -160,7 +160,7 @@ def _training_rows(evidence: Evidence) -> Iterator[list[str]]:
 
 def _chapter(evidence: Evidence) -> Iterator[str]:
     """Yield what was scored on one split and size: over the horizon, beside the thesis, costs."""
-    from lagbench.baselines.recipe import settings_of  # loads torch, which the imports of this page do not
+    from lagbench.baselines.job import settings_of  # loads torch, which the imports of this page do not
 
     size, task = evidence.size, evidence.size.task
     yield f"## {evidence.where}"

@@ -32,7 +32,6 @@ from .entry_file import MAX_ENTRY_BYTES
 from .findings import FLOORS_ANEW, finding
 from .folder import FLOORS, SCORES, SUBMISSIONS, VERIFIED, WEIGHTS, Folder
 from .score_file import read_stored
-from .submit import scored_file
 
 TOLERANCE = 1e-6
 """Relative difference up to which two numbers are equal; NumPy versions may differ in the last bits."""
@@ -126,7 +125,7 @@ class Rescoring:
         with tempfile.TemporaryDirectory() as scratch:
             file = Path(scratch) / "scores.nc"
             write_statistics(card, file)
-            ours, stored = scored_file(card, file), read_stored(file)
+            ours, stored = ScoredFile.of(card, file), read_stored(file)
         differing, difference = _unlike(dict(stored.scores.tallies), theirs.scores)
         step = max(stored.precision, theirs.precision)
         for name, room in {"vorticity": 1.01 * step, "film": 1.01 * FILM_STEP}.items():

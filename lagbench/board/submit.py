@@ -19,7 +19,6 @@ from importlib.metadata import version
 from pathlib import Path
 
 from lagbench.atomic import write_atomically
-from lagbench.data.checksums import file_sha256
 from lagbench.data.registry import Registry, load
 from lagbench.errors import ChecksFailedError, Mistakes, UnreadableFileError, UsageError, WorkFailedError
 from lagbench.floors.table import FLOORS
@@ -39,19 +38,19 @@ from .entry import (
     LONGEST_ID,
     LONGEST_TEXT,
     MOST_SEEDS,
+    OUTSIDE,
     About,
     Cost,
     DataSet,
     Entry,
     EntryBudget,
-    Flag,
     Meta,
     Prediction,
     ScoreBlock,
     ScoredFile,
     Status,
 )
-from .entry_file import examine, listed, read_entry, spell
+from .entry_file import Model, examine, listed, read_entry, spell
 from .findings import print_of, skeleton
 from .folder import SUBMISSIONS, Folder, Place, entry_path, score_paths
 from .ranking import combine, summarise, write_floors
@@ -59,7 +58,6 @@ from .score_file import MAX_SCORE_BYTES, read_stored
 from .weights import copy_weights, named_weights, require_weights
 
 BOARD = Path("leaderboard")  # the leaderboard's folder, from the root of the repository
-OUTSIDE = "in_domain"  # the warning that comes with a share of the positions
 
 STAGE = ".submit-"  # begins the folder in which score files are prepared; a killed process leaves it behind
 
@@ -117,20 +115,14 @@ def submit(
         WorkFailedError: the disk is full or not writable, or a score file became too long.
     """
     folder, paths = Folder(board), [Path(path) for path in predictions]
-    needed = {"authors": "--author NAME", "command": "--command 'what makes the predictions again'"}
-    missing = [option for key, option in needed.items() if not getattr(meta, key)]
     mistakes = Mistakes()
     with mistakes:
-        if missing:
-            fix = "give them as options, or authors and command in a file: --from meta.yaml"
-            raise UsageError("the entry lacks what readers need", expected=" and ".join(missing), fix=fix)
+        _require_said(meta)
     with mistakes:
         if not new_board:
             folder.require("run it from the root of a clone, name it with --board, or begin one: --new-board")
     with mistakes:
-        if not 1 <= len(paths) <= MOST_SEEDS:
-            what = "too many files" if paths else "no predictions"
-            raise UsageError(what, expected=f"1 to {MOST_SEEDS}, one per seed", got=len(paths))
+        _require_files(paths)
     mistakes.tell()
     headers, hashes, outside, results, described = [], [], [], [], registry or load()
     for path in paths:
@@ -194,6 +186,22 @@ def submit(
             got=error.strerror or error,
             fix="free disk space, or name a folder that you may write to: --board",
         ) from error
+
+
+def _require_said(meta: Meta) -> None:
+    """Refuse an entry that lacks what readers need."""
+    needed = {"authors": "--author NAME", "command": "--command 'what makes the predictions again'"}
+    missing = [option for key, option in needed.items() if not getattr(meta, key)]
+    if missing:
+        fix = "give them as options, or authors and command in a file: --from meta.yaml"
+        raise UsageError("the entry lacks what readers need", expected=" and ".join(missing), fix=fix)
+
+
+def _require_files(paths: Sequence[Path]) -> None:
+    """Refuse no files, and more than an entry may have."""
+    if not 1 <= len(paths) <= MOST_SEEDS:
+        what = "too many files" if paths else "no predictions"
+        raise UsageError(what, expected=f"1 to {MOST_SEEDS}, one per seed", got=len(paths))
 
 
 def _seeds(headers: Sequence[Header]) -> tuple[int | None, ...]:
@@ -311,7 +319,16 @@ def _about(headers: Sequence[Header], meta: Meta) -> About:
             fix="leave it out: it follows from the budget that `lagbench predict` writes into predictions.nc",
         )
     held["budget"] = EntryBudget.of(first.size, [header.budget for header in headers]) or meta.budget
-    return About(**held)
+    return _fitting(About, held)
+
+
+def _fitting(kind: type[Model], held: Mapping[str, object]) -> Model:
+    """Return what an entry says, or what of it its schema refuses."""
+    found, mistakes = examine(kind, held)
+    if found is None:
+        fix = "say it otherwise in --from meta.yaml; docs/submitting.md describes the keys"
+        raise ChecksFailedError("the entry does not fit the schema", got=listed(mistakes), fix=fix)
+    return found
 
 
 def _publish(
@@ -340,7 +357,7 @@ def _publish(
                     got=f"{length} bytes",
                     fix="uninstall packages that add metrics, and submit again",
                 )
-        files = tuple(map(scored_file, cards, staged, outside))
+        files = tuple(map(ScoredFile.of, cards, staged, outside))
         kept = named_weights(place, [one.seed for one in made], sources)
         made = [one.model_copy(update={"weights": held}) for one, held in zip(made, kept, strict=True)]
         header = cards[0].header
@@ -354,10 +371,7 @@ def _publish(
         held = {name: getattr(about, name) for name in About.model_fields}
         held |= dict(zip(("format", "split", "size", "method"), (2, *place), strict=True))
         held["dataset"] = DataSet(version=header.dataset_version, sha256=header.dataset_sha256)
-        entry, mistakes = examine(Entry, {**held, "predictions": tuple(made), "score": block})
-        if entry is None:
-            fix = "say it otherwise in --from meta.yaml; docs/submitting.md describes the keys"
-            raise ChecksFailedError("the entry does not fit the schema", got=listed(mistakes), fix=fix)
+        entry = _fitting(Entry, {**held, "predictions": tuple(made), "score": block})
         for source, name in zip(staged, names, strict=True):
             (folder.path / name).parent.mkdir(parents=True, exist_ok=True)
             os.replace(source, folder.path / name)
@@ -379,22 +393,4 @@ def _publish(
         flags=tuple(dict.fromkeys(flag.name for file in entry.score.files for flag in file.flags)),
         board=folder.path,
         files=(*filter(Path.is_file, (folder.path / name for name in (yaml_path, *entry.files))), *floors),
-    )
-
-
-def scored_file(card: ScoreCard, path: Path, outside: float | None = None) -> ScoredFile:
-    """Return what an entry says of the score file that was written from a card."""
-
-    def flag(name: str, reasons: Sequence[str], share: float | None = None) -> Flag:
-        return Flag(name=name, reasons=tuple(said[:LONGEST_TEXT] for said in reasons), share=share)
-
-    return ScoredFile(
-        sha256=file_sha256(path),
-        predictions_sha256=card.predictions_sha256,
-        diverged_at=dict(sorted(card.header.diverged_at.items())),
-        flags=tuple(flag(one.name, one.reasons) for one in card.flags if one.raised),
-        warnings=tuple(
-            flag(one.check, (f"{one.what}: {one.got}",), outside if one.check == OUTSIDE else None)
-            for one in card.warnings
-        ),
     )

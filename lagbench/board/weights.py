@@ -28,8 +28,6 @@ MOST_RECORD = 256 << 10  # longest record of a training beside its weights [byte
 
 RECORD = "training.json"
 
-RECIPE = ", recipe "  # in what predictions by `lagbench predict` say of their training
-
 
 def require_weights(weights: Sequence[str | Path], headers: Sequence[Header]) -> tuple[Path, ...]:
     """Refuse weights that cannot have made the predictions, one file for each; return their paths."""
@@ -54,7 +52,7 @@ def require_weights(weights: Sequence[str | Path], headers: Sequence[Header]) ->
         )
     check_installed("torch", extra="baselines")
     from lagbench.baselines.checkpoint import load
-    from lagbench.baselines.predict import WITH, training_words
+    from lagbench.baselines.predict import fits, training_words
 
     paths = tuple(map(Path, weights))
     for path, header in zip(paths, headers, strict=True):
@@ -72,13 +70,12 @@ def require_weights(weights: Sequence[str | Path], headers: Sequence[Header]) ->
                 fix="give --weights in the order of the predictions; leave those of another size out"
                 " and name their file in --command",
             )
-        words = training_words(held)
-        if RECIPE in (header.training or "") and (header.training or "").partition(WITH)[0] != words:
+        if not fits(header.training or "", held):
             raise UsageError(
                 "the weights did not make these predictions",
                 where=str(path),
                 expected=ascii(header.training),
-                got=ascii(words),
+                got=ascii(training_words(held)),
                 fix="give the weights that `lagbench predict` was given, or predict with these",
             )
     return paths
