@@ -101,8 +101,8 @@ def _claims(learned: Sequence[Evidence]) -> Iterator[str]:
     rows = {claim: {e.where: claim_rows(claim, e) for e in learned} for claim in CLAIMS}
     yield (
         "By the ranking metric over the horizon: ahead in the mean; better (yes) and worse (no) at 5 %, open"
-        " otherwise. Two methods are compared by the seeds that both have, by all where they share none. A dash"
-        " where an entry is missing."
+        " otherwise. Two methods are compared by the seeds that both have, by all where they share none. A"
+        " dash where an entry is missing."
     )
     yield table(
         ["", *(e.where for e in learned)],
