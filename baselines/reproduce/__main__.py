@@ -166,7 +166,7 @@ def _head(plan: Plan, figure: Figure) -> str:
             which = ", ".join(str(held.seed) for held in seeds)
             lines.append(
                 f"- {split}, {label(name)}: seeds {which}; {budget(seeds[0].record)} steps x windows;"
-                f" {known[name].cpu_hours or 0.0:.3g} CPU hours"
+                f" {known[name].hours_per_seed or 0.0:.3g} CPU hours per seed"
             )
     return "\n".join(lines)
 

@@ -16,6 +16,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import numpy as np
@@ -92,10 +93,10 @@ class Method:
         return {name: _joined([held.scores[name] for held in self.seeds]) for name in common}
 
     @property
-    def cpu_hours(self) -> float | None:
-        """Processor time of all trainings [h]; None where none was recorded."""
+    def hours_per_seed(self) -> float | None:
+        """Processor time of a training [h], the mean of those recorded; None where none was."""
         known = [hours for held in self.seeds if (hours := held.cpu_hours) is not None]
-        return sum(known) if known else None
+        return fmean(known) if known else None
 
     def of_seeds(self, seeds: Collection[int | None]) -> Method:
         """Return this model with the trainings of some seeds only."""

@@ -137,7 +137,7 @@ def _training_rows(evidence: Evidence) -> Iterator[list[str]]:
     """Yield what each model was trained for and what that brought, best first."""
     for name in evidence.order(evidence.models):
         method = evidence.models[name]
-        record, hours = method.seeds[0].record, method.cpu_hours
+        record = method.seeds[0].record
         # beside the step an entry holds one number, the metric that was validated
         held = [(e["step"], v) for e in record.get("validation", ()) for n, v in e.items() if n != "step"]
         best = [
@@ -151,7 +151,7 @@ def _training_rows(evidence: Evidence) -> Iterator[list[str]]:
             label(name),
             budget(record),
             number(seen / record["windows"] if seen else None),
-            number(None if hours is None else hours / len(method.seeds)),
+            number(method.hours_per_seed),
             number(evidence.skill(name)),
             next((name for entry in record.get("validation", ()) for name in entry if name != "step"), "-"),
             *map(number, best),
@@ -188,7 +188,7 @@ def _chapter(evidence: Evidence) -> Iterator[str]:
         "changed",
         "parameters",
         "seeds",
-        "CPU hours, all seeds",
+        "CPU hours per seed",
         "hardware",
         "s/frame",
         "solver s/frame",
@@ -206,7 +206,7 @@ def _chapter(evidence: Evidence) -> Iterator[str]:
                 " / ".join(dict.fromkeys(changed)),
                 "-" if method.parameters is None else f"{method.parameters:,}",
                 ", ".join("-" if held.seed is None else str(held.seed) for held in method.seeds),
-                number(method.cpu_hours),
+                number(method.hours_per_seed),
                 hardware(record),
                 *map(number, paid),
             ]

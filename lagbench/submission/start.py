@@ -127,7 +127,8 @@ def _check_continuity(scenario: int, start: Start, truth: Truth, frame: int, out
             expected=f"root mean square distance at most {limit:.3g},"
             f" {JUMP:g} times the truth's largest displacement in a frame",
             got=f"{distance:.3g}",
-            fix="predict what follows the last given frame, particle by particle",
+            fix="predict what follows the last given frame, particle by particle; "
+            "where the model itself jumps, leave it: it is scored, and flagged on the board",
         )
 
 
