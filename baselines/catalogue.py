@@ -11,10 +11,10 @@ from __future__ import annotations
 import inspect
 import warnings
 from dataclasses import dataclass
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
-from lagbench.data.registry import PluginWarning
+from lagbench.data.registry import PluginWarning, installed
 from lagbench.errors import LagbenchError, UsageError, nearest
 
 from .baseline import Baseline
@@ -71,7 +71,7 @@ def every_entry() -> dict[str, Entry]:
 def _points() -> dict[str, EntryPoint]:
     """Return the entry points by name; ours are not to be replaced."""
     found: dict[str, EntryPoint] = {}
-    for point in sorted(entry_points(group=GROUP), key=lambda point: not point.value.startswith(OWN)):
+    for point in sorted(installed(GROUP), key=lambda point: not point.value.startswith(OWN)):
         held = found.setdefault(point.name, point)
         if held.value != point.value:
             message = f"package {_package(point)} adds no baseline {point.name!r}: its name is taken"

@@ -115,13 +115,13 @@ class Bursting(Drift):
 
 def install(monkeypatch: pytest.MonkeyPatch, **models: type) -> None:
     """Let packages seem installed that add baselines, by name."""
-    own = tuple(catalogue.entry_points(group=catalogue.GROUP))
+    own = tuple(catalogue.installed(catalogue.GROUP))
     added = tuple(
         EntryPoint(name.replace("_", "-"), f"{model.__module__}:{model.__name__}", catalogue.GROUP)
         for name, model in models.items()
     )
     find: Callable[..., Any] = lambda group: own + added  # noqa: E731
-    monkeypatch.setattr(catalogue, "entry_points", find)
+    monkeypatch.setattr(catalogue, "installed", find)
 
 
 def trainer(

@@ -12,11 +12,12 @@ import pytest
 from made_up import PLACE, BoardBench, copied, master, noisy
 
 from lagbench.board.collect import CURVE_FRAMES, RESIDUAL_BINS, collect, curve, residuals
+from lagbench.board.folder import Folder
 from lagbench.board.model import Board, Row
 from lagbench.board.page import build
 from lagbench.board.ranking import Combined, combine
 from lagbench.board.score_file import read_stored
-from lagbench.board.show import as_plain, chosen_tabs, tables
+from lagbench.board.show import as_plain, chosen_data_sets, tables
 from lagbench.errors import ChecksFailedError, UsageError
 from lagbench.floors.table import FLOORS
 from lagbench.metrics import METRICS, Score, bootstrap_interval
@@ -217,9 +218,17 @@ def test_an_entry_in_another_place_is_refused(own: BoardBench) -> None:
         collect(own.folder / "nothing", registry=own.registry)
 
 
+def test_some_data_sets_are_read_alone(board: Board, bench: BoardBench) -> None:
+    """What was not asked for is not read; what was is as in the whole board."""
+    nothing = collect(bench.folder, only=[("cavity", "mini")], registry=bench.registry)
+    assert (nothing.tabs, nothing.empty) == ((), (("cavity", "mini"),))
+    some = collect(bench.folder, only=Folder(bench.folder).data_sets(), registry=bench.registry)
+    assert as_plain(some) == as_plain(board)
+
+
 def test_tables_and_json(board: Board) -> None:
     """The terminal shows ranks, spread, cost, floors and flags; JSON has the same numbers."""
-    (table,) = tables(board, chosen_tabs(board, "cavity", None), ["position_rmse"])
+    (table,) = tables(board, ["position_rmse"])
     assert table.columns[:5] == ("rank", "method", "skill", "vorticity_nrmse", "position_rmse")
     rows = {row[1]: row for row in table.rows}
     measured = sorted(floor.name for floor in board.tabs[0].floors)
@@ -228,15 +237,15 @@ def test_tables_and_json(board: Board) -> None:
     assert rows["damped"][0] == str(row_of(board, "damped").rank)
     assert " ± " in rows["damped"][3]
     assert rows["damped"][5:7] == ("0.5", "4")
-    (plain,) = as_plain(board.tabs)["tabs"]
+    (plain,) = as_plain(board)["tabs"]
     means = {row["id"]: row["metrics"]["position_rmse"]["mean"] for row in plain["rows"]}
     assert means["damped"] == digits(row_of(board, "damped").values["position_rmse"].mean)
     assert [floor["id"] for floor in plain["floors"]] == measured
     assert {row["id"]: row["cost"] for row in plain["rows"]}["damped"]["speed_up"] == 4.0
     with pytest.raises(UsageError, match="did you mean 'cavity tiny'"):
-        chosen_tabs(board, "cavity", "tyni")
+        chosen_data_sets([("cavity", "tiny")], "cavity", "tyni")
     with pytest.raises(UsageError, match="no metric"):
-        list(tables(board, board.tabs, ["position_rmsee"]))
+        list(tables(board, ["position_rmsee"]))
 
 
 def test_boards_without_an_entry_are_named(bench: BoardBench, board: Board, tmp_path: Path) -> None:
@@ -247,5 +256,5 @@ def test_boards_without_an_entry_are_named(bench: BoardBench, board: Board, tmp_
     empty = collect(tmp_path, registry=bench.registry)
     assert empty.tabs == ()
     assert set(board.empty) <= set(empty.empty)
-    assert chosen_tabs(empty, None, None) == ()
+    assert chosen_data_sets([], None, None) == ()
     assert build(tmp_path, registry=bench.registry).rows == 0

@@ -271,7 +271,7 @@ NO_METRIC = ("vorticity",)
 def with_entry_point(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     """Pretend that another package registers a name of this module."""
     point = EntryPoint(name="others", value=f"{__name__}:{name}", group=table_module.GROUP)
-    monkeypatch.setattr(table_module, "entry_points", lambda group: [point])
+    monkeypatch.setattr(table_module, "installed", lambda group: [point])
 
 
 def test_another_package_adds_a_metric(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -281,7 +283,7 @@ def plugged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Plug]:
         for name, source in sources.items():
             (tmp_path / f"{name}_split.py").write_text(source)
             points += 2 * [EntryPoint(name, f"{name}_split", registry.GROUP)]  # found on two paths
-        monkeypatch.setattr(registry, "entry_points", lambda group: points)
+        monkeypatch.setattr(registry, "installed", lambda group: points)
         registry._load.cache_clear()
         return load()
 
@@ -330,6 +332,21 @@ def test_a_broken_package_is_left_out(
         found = plugged(**{name: source.format(theirs=theirs)})
     assert len(told) == 1
     assert found.splits == load(default_path()).splits
+
+
+def test_packages_come_and_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A package installed after the first look is found, and one that was uninstalled is not."""
+    monkeypatch.syspath_prepend(tmp_path)
+    os.utime(tmp_path, (0, 0))  # times of change have some milliseconds of grain
+    assert registry.installed("some.group") == ()
+    folder = tmp_path / "wave_splits-1.0.dist-info"
+    folder.mkdir()
+    (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: wave-splits\nVersion: 1.0\n")
+    (folder / "entry_points.txt").write_text("[some.group]\nwaves = wave_splits\n")
+    assert [point.name for point in registry.installed("some.group")] == ["waves"]
+    shutil.rmtree(folder)
+    os.utime(tmp_path, (0, 0))
+    assert registry.installed("some.group") == ()
 
 
 def test_a_broken_package_breaks_no_command(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -68,6 +68,7 @@ class _Held:
 def collect(
     folder: str | Path,
     *,
+    only: Collection[tuple[str, str]] | None = None,
     registry: Registry | None = None,
     report: Callable[[int], None] = lambda _: None,
 ) -> Board:
@@ -75,6 +76,7 @@ def collect(
 
     Args:
         folder: the leaderboard's folder.
+        only: the (split, size) to read; all when None.
         registry: where splits are described; ours when None.
         report: told the entries done.
 
@@ -87,6 +89,8 @@ def collect(
     place.require()
     found: dict[tuple[str, str], list[_Held]] = {}
     for path in place.entries():
+        if only is not None and path.parts[1:3] not in only:
+            continue
         entry = read_entry(place.path / path)
         if entry.yaml_path != path:
             raise ChecksFailedError(
@@ -119,6 +123,8 @@ def collect(
     verified, tabs, empty = read_verified(place), [], []
     for split, about in described.splits.items():
         for name in about.sizes:
+            if only is not None and (split, name) not in only:
+                continue
             size = described.size(split, name)
             if (split, name) in found:
                 floors = read_floors(place, size)

@@ -88,6 +88,11 @@ class Folder:
         """Return the YAML files of entries, relative to the folder, in the order of their names."""
         return self._sound(SUBMISSIONS)
 
+    def data_sets(self) -> tuple[tuple[str, str], ...]:
+        """Return the (split, size) that have entries."""
+        self.require()
+        return tuple(dict.fromkeys((path.parts[1], path.parts[2]) for path in self.entries()))
+
     def score_files(self) -> tuple[Path, ...]:
         """Return the score files, relative to the folder, in the order of their names."""
         return self._sound(SCORES)

@@ -11,34 +11,30 @@ from lagbench.scoring.card import digits
 from lagbench.scoring.tables import Table
 
 from .columns import held
-from .model import Board, Floor, Row, Tab, Value
+from .model import Board, Floor, Row, Value
 
 
-def chosen_tabs(board: Board, split: str | None, size: str | None) -> tuple[Tab, ...]:
-    """Return the tabs of a split, of a size, or all.
+def chosen_data_sets(
+    known: Collection[tuple[str, str]], split: str | None, size: str | None
+) -> tuple[tuple[str, str], ...]:
+    """Return those of a split, of a size, or all of the (split, size) that have entries.
 
     Raises:
         UsageError: there is none.
     """
-    found = tuple(
-        tab for tab in board.tabs if split in (None, tab.size.split) and size in (None, tab.size.name)
-    )
+    found = tuple(one for one in known if split in (None, one[0]) and size in (None, one[1]))
     if found or (split is None and size is None):
         return found
-    known = [f"{tab.size.split} {tab.size.name}" for tab in board.tabs]
     wanted = " ".join(name for name in (split, size) if name)
-    fix = nearest(wanted, known) if known else "submit something: lagbench submit"
-    raise UsageError("no entries there", where=f"leaderboard {wanted}".strip(), fix=fix)
+    fix = nearest(wanted, map(" ".join, known)) if known else "submit something: lagbench submit"
+    raise UsageError("no entries there", where=f"leaderboard {wanted}", fix=fix)
 
 
-def tables(
-    board: Board, tabs: Collection[Tab], metrics: Collection[str] = (), *, wide: bool = False
-) -> Iterator[Table]:
+def tables(board: Board, metrics: Collection[str] = (), *, wide: bool = False) -> Iterator[Table]:
     """Yield a table per tab: ranked rows, then floors, then what is not ranked.
 
     Args:
         board: the board.
-        tabs: its tabs to show.
         metrics: names of metrics to show beside skill and the ranking one.
         wide: whether to show the tab's first metrics too.
 
@@ -48,7 +44,7 @@ def tables(
     for name in metrics:
         if name not in board.metrics:
             raise UsageError(f"no metric {name!r} here", where="--metric", fix=nearest(name, board.metrics))
-    for tab in tabs:
+    for tab in board.tabs:
         skill = ("skill",) if any(row.skill for row in tab.rows) else ()
         names = list(dict.fromkeys((*skill, tab.ranking, *metrics, *(tab.columns if wide else ()))))
         claim = "" if tab.decided else ", too few scenarios to tell entries apart"
@@ -65,8 +61,8 @@ def tables(
         )
 
 
-def as_plain(tabs: Collection[Tab]) -> dict[str, Any]:
-    """Return tabs as JSON may hold them; what is undefined is None."""
+def as_plain(board: Board) -> dict[str, Any]:
+    """Return a board as JSON may hold it; what is undefined is None."""
     return {
         "tabs": [
             {
@@ -77,7 +73,7 @@ def as_plain(tabs: Collection[Tab]) -> dict[str, Any]:
                 "rows": [_plain_row(row) for row in tab.rows],
                 "floors": [{"id": floor.name, "metrics": _plain_values(floor)} for floor in tab.floors],
             }
-            for tab in tabs
+            for tab in board.tabs
         ]
     }
 

@@ -239,7 +239,8 @@ def picture(
     from lagbench.board.cost import picture as draw
     from lagbench.data.local import locate_new
 
-    drawn = draw(collect(board), locate_new(chosen(name, split), size).size)
+    wanted = locate_new(chosen(name, split), size).size
+    drawn = draw(collect(board, only=[(wanted.split, wanted.name)]), wanted)
     write_atomically(output, drawn.encode(), option="--output")
     say(str(output), quiet=quiet)
 
@@ -260,13 +261,14 @@ def show(
 ) -> None:
     """Print the tables of the leaderboard."""
     from lagbench.board.collect import collect
-    from lagbench.board.show import as_plain, chosen_tabs, tables
+    from lagbench.board.folder import Folder
+    from lagbench.board.show import as_plain, chosen_data_sets, tables
 
-    held = collect(board)
-    tabs = chosen_tabs(held, chosen(name, split) if name or split else None, size)
+    known = Folder(board).data_sets()
+    held = collect(board, only=chosen_data_sets(known, chosen(name, split) if name or split else None, size))
     if as_json:
-        print_json(as_plain(tabs))
+        print_json(as_plain(held))
         return
-    print_blocks(tables(held, tabs, metric or (), wide=wide))
-    if not tabs:
+    print_blocks(tables(held, metric or (), wide=wide))
+    if not held.tabs:
         say(f"{board}: no entries yet; the first: lagbench submit predictions.nc --from meta.yaml")

@@ -8,9 +8,10 @@ registered the same way.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint
 from types import MappingProxyType
 
+from lagbench.data.registry import installed
 from lagbench.errors import UsageError, nearest
 
 from . import bodies, conservation, distributions, pointwise, transport, vorticity
@@ -50,7 +51,7 @@ CHOSEN = (
 def available() -> dict[str, Metric]:
     """Return all metrics by name, those of other installed packages last."""
     known = dict(METRICS)
-    for point in sorted(entry_points(group=GROUP), key=lambda point: point.name):
+    for point in sorted(installed(GROUP), key=lambda point: point.name):
         if point.value.startswith(f"{__package__}."):
             continue  # ours stand in METRICS, whatever version of lagbench is installed
         for metric in _load(point):
