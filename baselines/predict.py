@@ -270,24 +270,17 @@ RECIPE, PREDICTED_WITH = ", recipe ", ", predicted with "
 
 def training_words(checkpoint: Checkpoint) -> str:
     """Return what weights were trained on, by which recipe with which changes, and how long."""
-    changed = settings_of(checkpoint.training.get("recipe", {}))
-    return _unchanged_words(checkpoint) + "".join(f", {setting}" for setting in changed)
-
-
-def _unchanged_words(checkpoint: Checkpoint) -> str:
     facts, done = checkpoint.facts, checkpoint.training
     recipe = done.get("recipe", {})
     subsets = "+".join(recipe.get("training", {}).get("windows", ("train",)))
-    return f"{facts.split} {facts.size} {subsets}{RECIPE}{recipe.get('name')}, step {done.get('step', 0)}"
+    words = f"{facts.split} {facts.size} {subsets}{RECIPE}{recipe.get('name')}, step {done.get('step', 0)}"
+    return words + "".join(f", {setting}" for setting in settings_of(recipe))
 
 
 def fits(training: str, checkpoint: Checkpoint) -> bool:
-    """Tell whether what predictions say of their training is what weights say; words of others always fit.
-
-    Predictions of earlier versions do not say what the training changed of its recipe.
-    """
+    """Tell whether what predictions say of their training is what weights say; words of others always fit."""
     said, _, _ = training.partition(PREDICTED_WITH)
-    return RECIPE not in said or said in (training_words(checkpoint), _unchanged_words(checkpoint))
+    return RECIPE not in said or said == training_words(checkpoint)
 
 
 def _provenance(checkpoint: Checkpoint, here: Facts, settings: Sequence[str]) -> dict[str, Any]:

@@ -241,18 +241,19 @@ def recipe_for(
             fix=f"{fix}write your own: --recipe FILE.yaml, see docs/baselines.md",
         )
     part = part or _Shared()
-    model, training = _merge(file.model, part.model), _merge_training(file.training, part.training)
+    model, training = _merge(file.model, part.model), _merge(file.training, part.training)
     for other in part.baselines:
         if other not in names():
             where = f"{path}, {name}, baselines"
             raise UnreadableFileError(f"unknown baseline {other!r}", where=where, fix=nearest(other, names()))
     own = part.baselines.get(entry.name, _Part())
-    asked: dict[str, Layer] = {"model": {}, "training": {}}
+    model, training = _merge(model, own.model), _merge(training, own.training)
     for setting in settings:
         group, changes = _setting(setting)
-        asked[group] = _merge(asked[group], changes)
-    model = _merge(_merge(model, own.model), asked["model"])
-    training = _merge_training(_merge_training(training, own.training), asked["training"])
+        if group == "model":
+            model = _merge(model, changes)
+        else:
+            training = _merge(training, changes)
     if seed is not None:
         training["seed"] = seed
     where = f"{path.name if path else entry.name}, {name}"
@@ -301,12 +302,6 @@ def _merge(below: Layer, above: Layer) -> Layer:
             held = {"kind": held}
         both = isinstance(value, Mapping) and isinstance(held, Mapping)
         joined[key] = _merge(dict(held or {}), dict(value)) if both else value
-    return joined
-
-
-def _merge_training(below: Layer, above: Layer) -> Layer:
-    """Return two layers of a training joined: steps take the place of epochs, and the other way round."""
-    joined = _merge(below, above)
     for key, other in (("steps", "epochs"), ("epochs", "steps")):
         if above.get(key) is not None and above.get(other) is None:
             joined.pop(other, None)

@@ -1,4 +1,4 @@
-"""Build a leaderboard of 50 made-up entries and say how long it takes and how large the page is.
+"""Build a leaderboard of made-up entries, 50 by default, and say how long it takes and how large the page is.
 
     python benchmarks/board.py [--entries 50] [--output FOLDER]
 

@@ -18,7 +18,7 @@ from lagbench.board.page import build
 from lagbench.board.ranking import Combined, combine
 from lagbench.board.score_file import read_stored
 from lagbench.board.show import as_plain, chosen_data_sets, tables
-from lagbench.errors import ChecksFailedError, UsageError
+from lagbench.errors import ChecksFailedError, LagbenchError, UsageError
 from lagbench.floors.table import FLOORS
 from lagbench.metrics import METRICS, Score, bootstrap_interval
 from lagbench.scoring.card import ScoreCard, digits
@@ -218,12 +218,15 @@ def test_an_entry_in_another_place_is_refused(own: BoardBench) -> None:
         collect(own.folder / "nothing", registry=own.registry)
 
 
-def test_some_data_sets_are_read_alone(board: Board, bench: BoardBench) -> None:
-    """What was not asked for is not read; what was is as in the whole board."""
-    nothing = collect(bench.folder, only=[("cavity", "mini")], registry=bench.registry)
-    assert (nothing.tabs, nothing.empty) == ((), (("cavity", "mini"),))
-    some = collect(bench.folder, only=Folder(bench.folder).data_sets(), registry=bench.registry)
+def test_some_data_sets_are_read_alone(board: Board, own: BoardBench) -> None:
+    """What was not asked for is not even read; what was is as in the whole board."""
+    some = collect(own.folder, only=Folder(own.folder).data_sets(), registry=own.registry)
     assert as_plain(some) == as_plain(board)
+    own.entry("noisy").write_text("no entry")
+    nothing = collect(own.folder, only=[("cavity", "mini")], registry=own.registry)
+    assert (nothing.tabs, nothing.empty) == ((), (("cavity", "mini"),))
+    with pytest.raises(LagbenchError):
+        collect(own.folder, only=[("cavity", "tiny")], registry=own.registry)
 
 
 def test_tables_and_json(board: Board) -> None:

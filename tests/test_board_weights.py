@@ -13,7 +13,6 @@ from made_up import BoardBench, copied, noisy
 from simple_models import FACTS, Drift
 
 from lagbench.baselines.checkpoint import Checkpoint, save
-from lagbench.baselines.predict import fits
 from lagbench.board import weights as kept
 from lagbench.board.check import check_board
 from lagbench.board.entry import Meta
@@ -127,22 +126,6 @@ def test_weights_are_those_of_the_predictions(own: BoardBench, training: str, fi
     with pytest.raises(UsageError) as caught:
         submitted(own, run)
     assert caught.value.where == str(run / "weights.pt")
-
-
-@pytest.mark.parametrize(
-    ("said", "answer"), [("", True), (", model.target=change", True), (", model.target=state", False)]
-)
-def test_changes_of_the_recipe_are_compared_where_they_are_told(said: str, answer: bool) -> None:
-    """Predictions of an earlier version, which did not tell them, fit too."""
-    recipe = {"baseline": "mlp", "name": "cavity/tiny", "model": {"target": "change"}, "training": {}}
-    weights = Checkpoint(
-        baseline="mlp",
-        options={},
-        facts=replace(FACTS, split="cavity", size="tiny"),
-        weights={},
-        training={"step": 6, "recipe": recipe},
-    )
-    assert fits(f"cavity tiny train, recipe cavity/tiny, step 6{said}", weights) is answer
 
 
 def test_other_weights_are_refused(own: BoardBench) -> None:

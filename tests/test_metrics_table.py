@@ -145,6 +145,17 @@ def test_means_over_frames_come_before_those_over_scenarios(
     np.testing.assert_equal(found.interval, bootstrap_interval(found.values))
 
 
+@pytest.mark.parametrize("holes", [0, 3])
+def test_means_of_many_frames_have_the_bits_of_one_at_a_time(holes: int) -> None:
+    """However many scenarios are reduced at once; 1201 frames are summed in blocks."""
+    rng = np.random.Generator(np.random.PCG64(5))
+    values = 10.0 ** rng.uniform(-8, 8, (5, 1201))
+    values[0, :holes] = math.nan
+    found = score(METRICS["vorticity_pearson"], {i: of_pearson(*row) for i, row in enumerate(values)})
+    expected = [np.mean(row[~np.isnan(row)].copy()) for row in values]
+    np.testing.assert_array_equal(found.values, expected)
+
+
 def test_a_horizon_beyond_the_series_is_undefined() -> None:
     """The mean of the first five of three frames does not exist; of the first two it does."""
     assert math.isnan(FirstFrames(5)(np.arange(3.0)))

@@ -21,7 +21,7 @@ from lagbench.baselines.reproduce import results
 from lagbench.baselines.reproduce.__main__ import main
 from lagbench.baselines.reproduce.catalogue import FIGURES
 from lagbench.baselines.reproduce.drawing import opened
-from lagbench.baselines.reproduce.evidence import Evidence, Sources
+from lagbench.baselines.reproduce.evidence import Evidence, Method, Seeded, Sources
 from lagbench.baselines.reproduce.runs import Plan
 from lagbench.baselines.reproduce.thesis import EXPECTED, ROSTER
 from lagbench.data.grid import fields
@@ -60,6 +60,14 @@ def test_runs_are_read_with_their_costs(plan: Plan) -> None:
     assert held.cost is not None
     assert held.cost.seconds_per_frame == 0.5
     assert held.cost.speed_up is None
+
+
+def test_hours_are_the_mean_of_the_trainings_that_tell_theirs() -> None:
+    """1 h, 3 h and none are 2 h; of none known there is no mean."""
+    told: list[dict[str, float]] = [{"cpu_seconds": 3600.0}, {"cpu_seconds": 10_800.0}, {}]
+    seeds = [Seeded(seed=i, scores={}, record=one, path=Path()) for i, one in enumerate(told)]
+    assert Method(name="gns", seeds=tuple(seeds)).hours_per_seed == 2.0
+    assert Method(name="gns", seeds=tuple(seeds[2:])).hours_per_seed is None
 
 
 def test_the_board_comes_first(plan: Plan, tmp_path: Path) -> None:
@@ -268,7 +276,7 @@ def test_tables_and_figures_are_written(plan: Plan, cavity: ScoreBench) -> None:
                 assert min(image.size) > 150
                 assert len(set(np.asarray(image.convert("RGB")).reshape(-1, 3).sum(axis=1).tolist())) > 10
     text = (drawn / "table_5_4.md").read_text()
-    assert "cavity, GNS: seeds 0; 40 x 2 steps x windows; 2 CPU hours" in text
+    assert "cavity, GNS: seeds 0; 40 x 2 steps x windows; 2 CPU hours per seed" in text
     with (drawn / "table_5_4-1.csv").open() as file:
         rows = {row["model"]: row for row in csv.DictReader(file)}
     expected = plan.evidence(SPLIT).methods["gns"].at("vorticity_mae", 15)

@@ -184,7 +184,9 @@ def test_the_way_to_full_is_told_without_data(tmp_path: Path, capsys: pytest.Cap
     assert "fluid full mlp-0: to train, fluid/full-short: 1,500 steps" in told.out
     assert "studies of table_4_2: left out" in told.err
     assert command.main([*places, "--recipe", "short", "--dry-run", "--split", "cavity"]) == 0
-    assert "cavity full mlp: left out" in capsys.readouterr().err
+    told = capsys.readouterr()
+    assert "cavity full mlp-0: to train, cavity/full-short: 1,000 steps" in told.out
+    assert "cavity full var: left out" in told.err
     assert command.main([*places, "--dry-run", "--split", "fluid"]) == 0
     told = capsys.readouterr()
     assert "fluid full mlp-0: to train, fluid/full: 600 epochs" in told.out

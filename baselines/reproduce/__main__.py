@@ -26,7 +26,7 @@ from .drawing import Figure, write_sheet
 from .evidence import STUDIES, WEIGHTS
 from .runs import Plan, budget, make_run, outlook, score_committed
 from .tables import TABLES, make_studies
-from .thesis import EXPECTED, ROSTER, Model, label
+from .thesis import EXPECTED, ROSTER, Model, label, number
 
 
 def main(arguments: Sequence[str] | None = None, *, registry: Registry | None = None) -> int:
@@ -166,7 +166,7 @@ def _head(plan: Plan, figure: Figure) -> str:
             which = ", ".join(str(held.seed) for held in seeds)
             lines.append(
                 f"- {split}, {label(name)}: seeds {which}; {budget(seeds[0].record)} steps x windows;"
-                f" {known[name].hours_per_seed or 0.0:.3g} CPU hours per seed"
+                f" {number(known[name].hours_per_seed)} CPU hours per seed"
             )
     return "\n".join(lines)
 

@@ -270,5 +270,7 @@ def show(
         print_json(as_plain(held))
         return
     print_blocks(tables(held, metric or (), wide=wide))
-    if not held.tabs:
+    if known and not held.tabs:
+        say(f"{board}: scores of earlier tasks alone; score predictions for today's: lagbench submit")
+    elif not held.tabs:
         say(f"{board}: no entries yet; the first: lagbench submit predictions.nc --from meta.yaml")

@@ -88,15 +88,20 @@ class Tally:
         """Value and whether it was measured, by statistic, each of shape [frame]."""
         values = np.full(self.total.shape, np.nan)
         np.divide(self.total, self.weight, out=values, where=self.weight > 0)
-        values.flags.writeable = False
-        return dict(zip(self.names, zip(values, self.weight + self.undefined > 0, strict=True), strict=True))
+        measured = self.weight + self.undefined > 0
+        values.flags.writeable = measured.flags.writeable = False
+        return dict(zip(self.names, zip(values, measured, strict=True), strict=True))
+
+    def __getstate__(self) -> dict[str, object]:
+        """Leave out what is read off the sums when they go to another process."""
+        return {name: value for name, value in self.__dict__.items() if name != "_rows"}
 
     def series(self, name: str) -> Floats:
-        """Return a statistic per frame, NaN where it has no value, shape [frame]; not to be written to."""
+        """Return a statistic per frame, NaN where it has no value: shape [frame], read alone."""
         return self._rows[name][0]
 
     def measured(self, name: str) -> NDArray[np.bool_]:
-        """Tell at which frames a statistic was measured, defined or not, shape [frame]."""
+        """Tell at which frames a statistic was measured, defined or not: shape [frame], read alone."""
         return self._rows[name][1]
 
 
