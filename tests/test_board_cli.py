@@ -134,6 +134,25 @@ def test_the_page_of_docs_is_true(run: Run) -> None:
         assert result.exit_code == 0, words
 
 
+def test_scores_of_earlier_tasks_alone(run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Scores that do not fit the task of today are no table, and are not taken for no entries at all."""
+    make_toy(monkeypatch)
+    assert run("submit", "predictions.nc", "--from", TOY / "meta.yaml", "--new-board").exit_code == 0
+    board = tmp_path / "leaderboard"
+    entry = board / "submissions" / SPLIT / SIZE / "toy-model.yaml"
+    held = yaml.safe_load(entry.read_text())
+    held["dataset"]["version"] = "1.0.0"
+    entry.write_text(yaml.safe_dump(held))
+    (board / "scores" / SPLIT / SIZE / "toy-model.nc").write_bytes(b"of an earlier format")
+    for words in ((), (SPLIT, "--size", SIZE)):
+        result = run("leaderboard", "show", *words)
+        assert result.exit_code == 0, result.output
+        assert "scores of earlier tasks" in result.output
+    result = run("leaderboard", "show", "fluid")
+    assert result.exit_code == 2
+    assert f"{SPLIT} {SIZE}" in result.stderr  # what there is
+
+
 def test_an_empty_board_is_well(run: Run, tmp_path: Path) -> None:
     """Without any entry it is built, checked and shown."""
     (tmp_path / "leaderboard" / "submissions").mkdir(parents=True)

@@ -97,11 +97,11 @@ class Tally:
         return {name: value for name, value in self.__dict__.items() if name != "_rows"}
 
     def series(self, name: str) -> Floats:
-        """Return a statistic per frame, NaN where it has no value: shape [frame], read alone."""
+        """Return a statistic per frame, NaN where it has no value: shape [frame], read-only."""
         return self._rows[name][0]
 
     def measured(self, name: str) -> NDArray[np.bool_]:
-        """Tell at which frames a statistic was measured, defined or not: shape [frame], read alone."""
+        """Tell at which frames a statistic was measured, defined or not: shape [frame], read-only."""
         return self._rows[name][1]
 
 
@@ -320,7 +320,7 @@ def _measured(metric: Metric, tally: Tally) -> NDArray[np.bool_]:
 
 def _over_frames(metric: Metric, series: Floats) -> Floats:
     if metric.over_frames is mean and not np.isnan(series).any():
-        return np.asarray(series.mean(axis=1))  # the bits of a mean per row, many times as fast
+        return np.asarray(series.mean(axis=1))  # all rows at once, to the same bits
     return np.array([metric.over_frames(row) for row in series])
 
 

@@ -133,7 +133,7 @@ class Metric:
     applies: Callable[[FramePair], bool] = always  # whether the statistic is measured for a frame pair
     defined: Callable[[FramePair], bool] = always  # whether it is defined there; otherwise it is NaN
     of: tuple[str, ...] = ()  # statistics that ``series`` takes, its own by default
-    series: Callable[..., Floats] = identity  # value per frame from those (read alone), shape [frame]
+    series: Callable[..., Floats] = identity  # value per frame from those, which are read-only, shape [frame]
     over_frames: Callable[[Floats], float] = mean  # one number of a scenario from the value per frame
     per_frame: bool = True  # whether the value at a single frame means anything
     horizon: int = 1  # predicted frames needed; smaller tasks do not have the metric
