@@ -22,7 +22,7 @@ from lagbench.baselines.reproduce.__main__ import main
 from lagbench.baselines.reproduce.catalogue import FIGURES
 from lagbench.baselines.reproduce.drawing import opened
 from lagbench.baselines.reproduce.evidence import Evidence, Method, Seeded, Sources
-from lagbench.baselines.reproduce.runs import Plan
+from lagbench.baselines.reproduce.runs import Plan, budget
 from lagbench.baselines.reproduce.thesis import EXPECTED, ROSTER
 from lagbench.data.grid import fields
 from lagbench.data.registry import Registry, Size, load
@@ -91,6 +91,27 @@ def test_the_board_comes_first(plan: Plan, tmp_path: Path) -> None:
     # another entry's solver may have run on another machine
     assert held["gat"].cost is not None
     assert held["gat"].cost.speed_up is None
+
+
+@pytest.mark.parametrize("split", ["fluid", "multimaterial"])
+def test_an_entry_tells_what_its_record_tells(split: str, tmp_path: Path) -> None:
+    """Of our committed entries: hours, steps, epochs, recipe and validations are the same without records."""
+    board = Path(__file__).parent.parent / "leaderboard"
+    recorded = Evidence(Sources(board=board, weights=board / "weights"), split, "mini").models
+    told = Evidence(Sources(board=board, weights=tmp_path), split, "mini").models
+    compared = 0
+    for name, method in recorded.items():
+        for held, other in zip(method.seeds, told[name].seeds, strict=True):
+            if not held.record.get("validation") or not other.record.get("validation"):
+                continue  # older trainings kept none, or their entry
+            compared += 1
+            assert other.cpu_hours == pytest.approx(held.cpu_hours, rel=1e-5)
+            assert budget(other.record) == budget(held.record)
+            for key in ("windows", "validation"):
+                assert other.record.get(key) == held.record.get(key)
+            # an entry's words are those of one of its seeds
+            assert other.record["recipe"]["name"] in {s.record["recipe"]["name"] for s in method.seeds}
+    assert compared > 3
 
 
 def test_scores_of_other_data_are_left_out(runs: Path) -> None:

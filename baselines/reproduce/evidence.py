@@ -40,6 +40,9 @@ STUDIES = Path("docs/studies")
 """Where committed results lie that are no entries: of studies and protocols of the thesis."""
 
 RUN = re.compile(r"([a-z0-9]+(?:-[a-z0-9]+)*?)-(\d+)")
+WORDS = re.compile(r"recipe (\S+), step \d+(?:, (?:predicted with )?(.*))?$")
+"""What predictions say of a training by one of our recipes: its name and what was changed."""
+
 RECORD_NAME = "training.json"
 COST_NAME = "predictions.json"
 
@@ -67,12 +70,12 @@ class Seeded:
 
     seed: int | None  # None for what has none
     scores: Mapping[str, Score]  # by metric
-    record: Mapping[str, Any]  # what training.json says; empty where it is not there
+    record: Mapping[str, Any]  # what training.json or else the entry says of it; empty where none does
     path: Path  # file of the scores
 
     @property
     def cpu_hours(self) -> float | None:
-        """Processor time of the training [h]."""
+        """Processor time of the training, validations among it [h]."""
         seconds = self.record.get("cpu_seconds")
         return None if seconds is None else float(seconds) / 3600.0
 
@@ -202,10 +205,10 @@ class Evidence:
             entry = read_yaml(path)
             files = list(_score_files(path, entry))  # refuses what is no entry
             cost = Cost(**entry["cost"]) if entry.get("cost") else None
-            for seed, file in files:
-                self._add(
-                    name, seed, file, sources.record(split, size, name, seed), cost, entry.get("parameters")
-                )
+            for made, file in files:
+                seed = made.get("seed")
+                record = sources.record(split, size, name, seed) or _told(entry, made)
+                self._add(name, seed, file, record, cost, entry.get("parameters"))
         committed = {(name, held.seed) for name, method in self.methods.items() for held in method.seeds}
         for name, seed, folder in sources.run_folders(split, size):
             file = folder / NETCDF_NAME
@@ -291,16 +294,37 @@ class Evidence:
         return any(self._weights.glob(f"{name}_[0-9]*.json"))
 
 
-def _score_files(path: Path, entry: Any) -> Iterator[tuple[int | None, Path]]:  # noqa: ANN401
-    """Yield seed and score file of every prediction of an entry, submissions/<split>/<size>/<name>.yaml."""
+def _score_files(path: Path, entry: Any) -> Iterator[tuple[Mapping[str, Any], Path]]:  # noqa: ANN401
+    """Yield every prediction of an entry, submissions/<split>/<size>/<name>.yaml, and its score file."""
     try:
-        seeds = [made.get("seed") for made in entry["predictions"]]
+        seeds = {made.get("seed"): made for made in entry["predictions"]}
     except (TypeError, KeyError, AttributeError) as error:
         raise UnreadableFileError("no entry of a leaderboard", where=str(path), got=error) from None
     board = path.parents[3]
     scores = board / "scores" / path.parent.relative_to(board / "submissions")
-    for seed in seeds:
-        yield seed, scores / (f"{path.stem}.nc" if len(seeds) == 1 else f"{path.stem}_{seed}.nc")
+    for seed, made in seeds.items():
+        yield made, scores / (f"{path.stem}.nc" if len(seeds) == 1 else f"{path.stem}_{seed}.nc")
+
+
+def _told(entry: Mapping[str, Any], made: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what an entry says of a training by one of our recipes, in the terms of training.json."""
+    words, paid = WORDS.search(entry.get("training") or ""), made.get("budget") or entry.get("budget") or {}
+    if not words or not paid.get("steps") or paid.get("cpu_hours") is None:
+        return {}
+    device, windows = paid.get("device") or entry.get("hardware"), paid.get("windows")
+    batch = round((windows or 0) / paid["steps"])
+    told = {
+        "step": paid["steps"],
+        "cpu_seconds": 3600.0 * (paid["cpu_hours"] + (paid.get("validation_hours") or 0.0)),
+        "validation": [{"step": step, paid["metric"]: value} for step, value in paid.get("validations", ())],
+        "recipe": {"name": words[1], "changed": words[2], "training": {"batch": batch}},
+        "hardware": {
+            "device": device if paid.get("gpu_hours") else "cpu",
+            "processor": device,
+            "threads": paid.get("threads", 1),
+        },
+    }
+    return told | ({"windows": round(windows / paid["epochs"])} if windows and paid.get("epochs") else {})
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -180,8 +180,8 @@ def _chapter(evidence: Evidence) -> Iterator[str]:
         yield from _vorticity_at(evidence)
     yield (
         "Cost. Recipe, and what the training changed of it (`none`: nothing), seeds in their order where they"
-        " differ; a dash where no record of a training lies beside the entry. Speed-up: our solver's"
-        " time for a frame on one core over the model's, same machine."
+        " differ, from the entry's words where no record of the training lies beside it. Speed-up: our"
+        " solver's time for a frame on one core over the model's, same machine."
     )
     heads = (
         "recipe",
@@ -197,7 +197,10 @@ def _chapter(evidence: Evidence) -> Iterator[str]:
     for name, method in evidence.models.items():
         record, cost = method.seeds[0].record, method.cost
         recipes = [held.record.get("recipe", {}) for held in method.seeds]
-        changed = ["; ".join(settings_of(recipe)) or ("none" if recipe else "-") for recipe in recipes]
+        changed = [
+            recipe.get("changed") or "; ".join(settings_of(recipe)) or ("none" if recipe else "-")
+            for recipe in recipes
+        ]
         paid = (cost.seconds_per_frame, cost.solver_seconds_per_frame, cost.speed_up) if cost else (None,) * 3
         rows.append(
             [

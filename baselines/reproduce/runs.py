@@ -286,7 +286,7 @@ def _complete(folder: Path) -> bool:
 def budget(record: Mapping[str, Any]) -> str:
     """Return steps and windows of a step, as in "5,000 x 2"; a dash where unknown."""
     if "windows" not in record:
-        return "closed form" if record else "-"
+        return "closed form" if record.get("step") == 1 else "-"
     return f"{record['step']:,} x {record['recipe']['training']['batch']}"
 
 
