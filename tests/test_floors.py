@@ -20,7 +20,7 @@ from lagbench.data.registry import Size, load
 from lagbench.data.scenario import read_scenario
 from lagbench.errors import DataError
 from lagbench.floors import FLOORS, Given, floors_of, given_in, shipped
-from lagbench.floors.analog import assigned, nearest
+from lagbench.floors.analog import DIRECTIONS, Start, assigned, distance, nearest, start_of
 from lagbench.floors.carried import linear_field, mirrored
 from lagbench.floors.coarse_solver import coarser, predict_with, spread_subset
 from lagbench.floors.frozen_field import decay
@@ -187,6 +187,20 @@ def test_analogs_of_a_copy_and_of_another(bench: ScoreBench) -> None:
     found = predicted("analog", held)
     assert found.shape == future.shape
     assert np.abs(found[0] - held.last).max() < 0.1
+
+
+def test_a_start_is_as_near_wherever_in_the_box_it_is(bench: ScoreBench) -> None:
+    """Moved together two clouds stay as far apart; 0.1 over the deviation along a direction."""
+    held, _ = opened(bench.root, bench.size, bench.size.subsets["test"][0])
+    start = start_of(held)
+
+    def moved(by: Floats) -> Start:
+        return replace(start, clouds={kind: c + by @ DIRECTIONS for kind, c in start.clouds.items()})
+
+    near = distance(start, moved(np.array([0.1, 0.0])))
+    assert distance(moved(np.array([0.3, -0.2])), moved(np.array([0.4, -0.2]))) == pytest.approx(near)
+    # on the mean over directions 0.1 along x has half its square, and the cloud half of its variances' sum
+    assert near == pytest.approx(0.1 / np.sqrt(held.last.var(axis=0).sum()), rel=0.01)
 
 
 def test_assignment_goes_by_material() -> None:

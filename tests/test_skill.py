@@ -16,7 +16,7 @@ from score_bench import ScoreBench, right, still, straight
 
 from lagbench.data.registry import Measured, Size
 from lagbench.floors import FLOORS, floors_of, shipped
-from lagbench.floors.shipped import shipped_path, write_shipped
+from lagbench.floors.shipped import shipped_path, write_shipped, write_solver_seconds
 from lagbench.metrics import METRICS, Score
 from lagbench.scoring import floors as floors_of_scoring
 from lagbench.scoring import score as scoring
@@ -149,6 +149,25 @@ def test_shipped_scores_are_the_measured_ones(
     assert path == shipped_path(size, tmp_path)
     assert shipped(recorded(bench.size, "b" * 64), tmp_path) is None
     assert shipped(bench.size, tmp_path) is None
+
+
+def test_one_floor_measured_anew_leaves_the_others(
+    bench: ScoreBench, measured_floors: dict[str, Any], tmp_path: Path
+) -> None:
+    """Its scores change; order, the others, its cost and the solver's stay, which one run has measured."""
+    size, known = recorded(bench.size), {"dataset_sha256": "a" * 64, "reported": (15,), "folder": tmp_path}
+    path = write_shipped(size, measured_floors, **known)
+    write_solver_seconds(size, 0.5, tmp_path)
+    before = json.loads(path.read_text())
+    other = replace(measured_floors["persistence"], name="analog", seconds_per_frame=9.0)
+    write_shipped(size, {"analog": other}, **known)
+    after = json.loads(path.read_text())
+    assert list(after["floors"]) == list(before["floors"])
+    assert after["floors"]["analog"].pop("values") == before["floors"]["persistence"]["values"]
+    assert after["floors"]["analog"]["seconds_per_frame"] == before["floors"]["analog"]["seconds_per_frame"]
+    for held in (before, after):
+        del held["floors"]["analog"]
+    assert after == before
 
 
 def test_a_forged_shipped_score_is_found(

@@ -2,13 +2,14 @@
 
 After Lorenz, J. Atmos. Sci. 26 (1969) 636. Scenarios are compared at the last given frame by
 
-    d^2 = W2^2(positions) / std(x)^2 + mean |u_a - u_b|^2 / std(u)^2,
+    d^2 = W2^2(positions) / std(x)^2 + mean |u_a - u_b|^2 / mean |u_a|^2,
 
-the sliced Wasserstein distance of their clouds (material by material where both have the same)
-and the difference of their velocity fields on the score grid, each over the spread of what is
-given here. In a full box the analog's motion carries the particles: from frame to frame they
-move as the analog does where they are. On a free surface the analog's particles are assigned to
-those given so that the sum of squared distances is least, and their paths are the answer.
+the sliced Wasserstein distance of their clouds (material by material where both have the same),
+over the variance of a cloud along a direction (wherever in the box it is), and the difference of
+their velocity fields on the score grid over the square of those given here. In a full box the
+analog's motion carries the particles: from frame to frame they move as the analog does where they
+are. On a free surface the analog's particles are assigned to those given so that the sum of squared
+distances is least, and their paths are the answer.
 
 Memorising looks like this, and so does a leak from train to test.
 """
@@ -64,7 +65,7 @@ def distance(one: Start, other: Start) -> float:
     if one.clouds.keys() != other.clouds.keys():
         return float("inf")
     apart = sum(one.shares[k] * np.mean((c - other.clouds[k]) ** 2) for k, c in one.clouds.items())
-    spread = sum(one.shares[k] * np.var(c) for k, c in one.clouds.items())
+    spread = sum(one.shares[k] * np.mean(np.var(c, axis=0)) for k, c in one.clouds.items())
     differ = np.mean((one.field - other.field) ** 2)
     speed = np.mean(one.field**2)
     return float(np.sqrt(apart / spread + differ / (speed or 1.0)))

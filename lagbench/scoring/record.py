@@ -1,12 +1,13 @@
 """Measure the floors of data sets and write what the package ships of them.
 
 usage: python -m lagbench.scoring.record [--split cavity] [--size mini] [--root FOLDER]
-           [--workers 2] [--solver]
+           [--workers 2] [--floor analog ...] [--solver]
 
-All splits and sizes whose data are there, or those named. What is measured is kept under the
+All splits and sizes whose data are there, or those named. With --floor only these are measured
+anew, the others, and all costs, stay as they are. What is measured is kept under the
 root folder scenario by scenario: an interrupted run goes on where it stopped. Last the solver
-itself is timed (``lagbench bench solver``); with --solver nothing else is done. What is shipped
-is checked by ``lagbench leaderboard check --root FOLDER``.
+itself is timed (``lagbench bench solver``); with --solver nothing else is done. What is
+shipped is checked by ``lagbench leaderboard check --root FOLDER``.
 """
 
 from __future__ import annotations
@@ -16,19 +17,27 @@ import json
 import shutil
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 from lagbench.data.layout import resolve_root
 from lagbench.data.registry import Size
 from lagbench.errors import DataError, LagbenchError, WorkFailedError
-from lagbench.floors.shipped import FOLDER, write_shipped, write_solver_seconds
+from lagbench.floors.shipped import FOLDER, shipped_path, write_shipped, write_solver_seconds
+from lagbench.floors.table import FLOORS
 
 from .floors import kept_in, measure, measured_sizes
 from .task import load_scored_task
 
 
-def record(size: Size, root: Path, *, workers: int = 1, folder: Path = FOLDER) -> Path:
+def record(
+    size: Size,
+    root: Path,
+    *,
+    workers: int = 1,
+    folder: Path = FOLDER,
+    floors: Collection[str] | None = None,
+) -> Path:
     """Measure the floors of a data set and write them to the folder of shipped scores.
 
     Raises:
@@ -40,12 +49,12 @@ def record(size: Size, root: Path, *, workers: int = 1, folder: Path = FOLDER) -
     reported = sorted(setting.slow_frames.intersection(setting.predicted_frames))
     path = write_shipped(
         size,
-        measure(size, root, workers=workers, resume=True),
+        measure(size, root, floors=floors, workers=workers, resume=floors is None),
         dataset_sha256=size.measured.dataset_sha256,
         reported=reported,
         folder=folder,
     )
-    shutil.rmtree(kept_in(size, root))
+    shutil.rmtree(kept_in(size, root), ignore_errors=floors is not None)
     return path
 
 
@@ -72,14 +81,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--size")
     parser.add_argument("--root", type=Path)
     parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--floor", nargs="+", choices=sorted(FLOORS))
     parser.add_argument("--solver", action="store_true")
     options = parser.parse_args(arguments)
     root = resolve_root(options.root)
     try:
         for size in measured_sizes(root, split=options.split, name=options.size):
             if not options.solver:
-                record(size, root, workers=options.workers)
-            path = time_solver(size)
+                record(size, root, workers=options.workers, floors=options.floor)
+            if not options.floor:
+                time_solver(size)
+            path = shipped_path(size)
             sys.stdout.write(f"{size.split} {size.name}: {path.name}, {path.stat().st_size} bytes\n")
             sys.stdout.flush()
     except LagbenchError as error:
