@@ -91,16 +91,21 @@ def measured_scatter(methods: dict[str, Floats]) -> Scatter:
     return Scatter(root(seeds), root(rests), root(gaps))
 
 
-def share_told_apart(scatter: Scatter, scenarios: int, difference: float, seeds: int) -> float:
-    """Return the share of draws of two methods so far apart that the test tells apart."""
+def share_told_apart(
+    scatter: Scatter, scenarios: int, difference: float, seeds: int, others: int | None = None
+) -> float:
+    """Return the share of draws of two methods so far apart that the test tells apart.
+
+    The second has as many seeds as the first, or others.
+    """
     rng = np.random.Generator(np.random.PCG64(0))
     told = 0
     for _ in range(DRAWS):
         sides = []
-        for level in (1.0, 1.0 - difference):
+        for level, count in ((1.0, seeds), (1.0 - difference, others or seeds)):
             own = rng.normal(0.0, scatter.method if difference else 0.0, scenarios)
-            seed = rng.normal(0.0, scatter.seed, (seeds, 1))
-            sides.append(level * (1.0 + own + seed + rng.normal(0.0, scatter.rest, (seeds, scenarios))))
+            seed = rng.normal(0.0, scatter.seed, (count, 1))
+            sides.append(level * (1.0 + own + seed + rng.normal(0.0, scatter.rest, (count, scenarios))))
         told += differ(*sides) < SIGNIFICANCE
     return told / DRAWS
 
@@ -128,7 +133,8 @@ def tables() -> str:
         spread = " | ".join(f"{100 * value:.1f} %" for value in astuple(scatter))
         power = " | ".join(f"{share_told_apart(scatter, scenarios, d, SEEDS):.2f}" for d in DIFFERENCES)
         rows.append(f"| {name} | {scenarios} | {spread} | {power} |")
-        false = [100 * share_told_apart(scatter, scenarios, 0.0, seeds) for seeds in (1, 2, 3, 5)]
+        sides = ((1, 1), (1, SEEDS), (2, 2), (3, 3), (5, 5))
+        false = [100 * share_told_apart(scatter, scenarios, 0.0, *seeds) for seeds in sides]
         wrong.append(f"| {name} | {' | '.join(f'{share:.1f} %' for share in false)} |")
     pairs, differing = pairs_of_seeds()
     return f"""# Power: what the test can tell apart
@@ -153,10 +159,11 @@ more seeds. A board that ranks by hundredths ranks by chance.
 
 Both sides are seeds of one method: at most 5 % may differ (give or take 1.4, the error of so many draws).
 With one seed a side the test is the sign-flip test over scenarios. It is right about those weights, and
-wrong about the method as often as the first column says: why such a row says "these weights".
+wrong about the method as often as the first column says: why such a row says "these weights". So does a
+row of one seed beside one of several, whose scatter alone is known.
 
-| case | 1 seed a side | 2 | 3 | 5 |
-|---|---|---|---|---|
+| case | 1 seed a side | 1 and {SEEDS} | 2 | 3 | 5 |
+|---|---|---|---|---|---|
 {chr(10).join(wrong)}
 
 The score files have {pairs} pairs of single seeds of one method; {differing} of them differ as weights.

@@ -211,6 +211,22 @@ def test_floors_are_judged_like_entries(board: Board) -> None:
     assert '<td class="rank" data-value="0"></td>' in first[0]
 
 
+def test_beside_and_beyond_an_aim_do_not_cancel(board: Board) -> None:
+    """Energy ratios 0 and 2 have the mean 1 and are no aim reached: 0.9 and 0.9 are nearer."""
+    rows = [
+        replace(row, values={**row.values, "energy_ratio": replace(value, mean=mean, per_scenario=scenarios)})
+        for row, mean, scenarios in zip(
+            board.tabs[0].rows, (1.0, 0.9, 0.5), ((0.0, 2.0), (0.9, 0.9), (0.5, 0.5)), strict=False
+        )
+        if (value := row.values["energy_ratio"])
+    ]
+    page = with_rows(board, *rows, floors=())
+    found = dict(re.findall(r'<td class="([^"]*)"[^>]*data-value="(1|0\.9|0\.5)"[^>]*>(?:1|0\.9|0\.5)', page))
+    shades = {value: kind for kind, value in found.items()}
+    assert "best" in shades["0.9"]
+    assert "best" not in shades.get("1", "")
+
+
 def test_rows_lead_to_code_paper_and_weights(board: Board, page: str) -> None:
     """A link each where the entry has one, and to nothing but the web."""
     for row in board.tabs[0].rows:

@@ -81,6 +81,39 @@ def test_a_folder_of_seeds_is_a_method(tmp_path: Path) -> None:
     assert result.as_json()["seeds"] == [3, 2]
 
 
+def test_copies_are_no_seeds(tmp_path: Path) -> None:
+    """One file three times is one training: neither side takes it for several."""
+    other = published(tmp_path, [2.0] * 6, method="other")
+    for i in range(3):
+        path = published(tmp_path / "copies" / str(i), [1.0] * 6, method="a")
+        path.rename(tmp_path / "copies" / str(i) / "scores.json")
+    for sides in ((tmp_path / "copies", other), (other, tmp_path / "copies")):
+        with pytest.raises(UsageError, match="the same predictions twice"):
+            compare(*sides)
+
+
+def test_one_seed_against_several_speaks_of_its_weights(tmp_path: Path) -> None:
+    """The verdict says so; several against several are methods."""
+    for method, seeds in {"a": 3, "b": 1, "c": 2}.items():
+        for i in range(seeds):
+            place, row = tmp_path / method / str(i), [1.0 + i, 2.0, 3.0, 4.0, 5.0, 6.0]
+            path = published(place, row, method=method, predictions_sha256=f"{method}{i}")
+            path.rename(place / "scores.json")
+    said = {name: compare(tmp_path / "a", tmp_path / name).verdict for name in ("b", "c")}
+    assert ["weights" in verdict for verdict in said.values()] == [True, False]
+
+
+def test_frames_without_a_value_are_told(tmp_path: Path) -> None:
+    """A mean over few frames is no merit: how many were left out stands beside it."""
+    row = {"values": [1.0] * 6, "undefined": [0, 0, 0, 0, 12, 7]}
+    frozen = published(tmp_path, [1.0] * 6, method="a", rows={"submission": {"mse_avg": row}})
+    result = compare(frozen, published(tmp_path, [2.0] * 6, method="b"))
+    assert result.metrics["mse_avg"].undefined == (19, 0)
+    (shown,) = [row for table in comparison_tables(result) if table.title == "means" for row in table.rows]
+    assert "19 frames undefined" in shown[1]
+    assert "undefined" not in shown[2]
+
+
 def test_seeds_of_two_methods_are_not_one(tmp_path: Path) -> None:
     """A folder that mixes methods is refused: the mean over them is that of neither."""
     for method in ("a", "b"):

@@ -253,6 +253,21 @@ def test_scores_on_the_page_are_those_of_the_card(
         assert flag.name.replace("_", " ") in everything
 
 
+def test_floors_have_no_rank(bench_of: Callable[[str], ReportBench], tmp_path: Path) -> None:
+    """Two submissions, both worse than the floors, are ranked 1 and 2, and floors stand below without."""
+    bench = bench_of("curl-noise")
+    paths = [bench.submit(tmp_path / f"{i}.nc", noisy, f"m{i}") for i in range(2)]
+    cards = [bench.card(path) for path in paths]
+    page = write_report(tmp_path, cards, paths, root=bench.root, registry=bench.registry).read_text("utf-8")
+    part = re.search(r'aria-label="Comparison".*?</table>', page, re.DOTALL)
+    assert part is not None
+    rows = [re.findall(r"<t[hd][^>]*>(.*?)</t[hd]>", row) for row in re.findall(r"<tr>(.*?)</tr>", part[0])]
+    ranks = [row[1] for row in rows[1:]]
+    assert ranks[:2] == ["1", "2"]
+    assert set(ranks[2:]) == {""}
+    assert len(ranks) > 4
+
+
 def test_methods_of_one_name_are_told_apart(bench_of: Callable[[str], ReportBench], tmp_path: Path) -> None:
     """Two files of one method get numbers, so does one with a floor's name."""
     bench = bench_of("curl-noise")

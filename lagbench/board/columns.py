@@ -7,7 +7,9 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
-from lagbench.metrics.metric import Direction, Metric
+import numpy as np
+
+from lagbench.metrics.metric import Direction, Metric, mean
 from lagbench.report.html import MISSING, sentence, text, words
 
 from .entry import EntryBudget
@@ -187,6 +189,17 @@ def value_of(row: Row | Floor, column: Column) -> float | str:
     if column.form == "text":
         return str(found or "")
     return math.nan if found is None else float(str(found))
+
+
+def loss_of(row: Row | Floor, column: Column) -> float:
+    """Return what a row loses in a column, smaller is better; NaN where nothing is judged.
+
+    Of a metric that aims at a value the mean of the scenarios' losses: beside and beyond do not cancel.
+    """
+    value, found = value_of(row, column), held(row, column.key)
+    if column.direction is Direction.TARGET and found is not None:
+        return mean(np.array([column.loss(one) for one in found.per_scenario]))
+    return math.nan if isinstance(value, str) else column.loss(value)
 
 
 def held(row: Row | Floor, key: str) -> Value | None:

@@ -14,7 +14,7 @@ from lagbench.data.checksums import round_digits
 from lagbench.metrics.metric import Direction, Metric
 from lagbench.report.html import MISSING, Markup, interval, join, tag, text
 
-from .columns import Column, columns_of, held, presets_of, value_of, written
+from .columns import Column, columns_of, held, loss_of, presets_of, value_of, written
 from .folder import weights_path
 from .model import Floor, Row, Tab
 
@@ -108,25 +108,20 @@ class _Shades:
     def __init__(self, tab: Tab, column: Column) -> None:
         # the floors' costs are measured, and no merit
         judged = [row for row in tab.lines if (row.active if isinstance(row, Row) else not column.reported)]
-        values = [float(value_of(row, column)) for row in judged if column.form != "text"]
-        losses = [column.loss(value) for value in values]
         self._column = column
-        self._known = sorted(loss for loss in losses if math.isfinite(loss))
-        best = [v for v, loss in zip(values, losses, strict=True) if self._known and loss == self._known[0]]
-        self._best = {written(value, column.form) for value in best}  # what reads the same is no worse
+        self._known = sorted(loss for row in judged if math.isfinite(loss := loss_of(row, column)))
 
     def classes(self, row: Row | Floor) -> Iterator[str]:
         """Yield the classes of a row's cell."""
-        value = value_of(row, self._column)
         aside = not row.active if isinstance(row, Row) else self._column.reported
-        loss = math.nan if isinstance(value, str) else self._column.loss(value)
+        loss = loss_of(row, self._column)
         if aside or not math.isfinite(loss) or len(self._known) < 2:
             return
         low, high = self._known[0], self._known[-1]
+        if written(loss, self._column.form) == written(low, self._column.form):
+            yield "best"  # what reads the same is no worse
         if self._column.key == "skill":  # 0 is nothing learned: no entry looks better for a worse one
             high = min(high, 0.0)
-        if written(value, self._column.form) in self._best:
-            yield "best"
         if high > low and len(self._known) >= FEWEST_SHADED:
             bend = math.log if low > 0.0 else float
             yield f"heat{min(SHADES - 1, int(SHADES * (bend(loss) - bend(low)) / (bend(high) - bend(low))))}"

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from lagbench.metrics.aggregate import Score, bootstrap_interval
+from lagbench.metrics.frame import Floats
 from lagbench.metrics.metric import Direction, Metric, mean
 from lagbench.metrics.significance import FEWEST_SCENARIOS, compare, standings
 from lagbench.metrics.table import CHOSEN, FAMILIES
@@ -63,7 +64,7 @@ def _score_rows(subject: Subject, names: Sequence[str]) -> Markup:
     for name in names:
         scores = [row.scores.get(name) for row in rows]
         metric = rows[0].scores[name].metric
-        best = _best(metric, [math.nan if score is None else score.mean for score in scores])
+        best = _best(metric, [[] if score is None else score.values for score in scores])
         line: list[object] = [_named(metric, ranks=name == subject.ranking.name)]
         for i, score in enumerate(scores):
             undefined = sum(score.undefined) if score else 0
@@ -78,12 +79,18 @@ def _heading(row: Row) -> Markup:
     return tag("span", row.name) if row.entry else tag("span", row.name, class_="muted whole")
 
 
-def _best(metric: Metric, means: Sequence[float]) -> frozenset[int]:
-    """Return which are best, those that read the same included; none where nothing is judged or defined."""
-    if metric.direction is Direction.NONE or not np.isfinite(means).any():
+def _best(metric: Metric, values: Sequence[Sequence[float] | Floats]) -> frozenset[int]:
+    """Return which are best by the mean of the scenarios' losses; none where nothing is judged or defined.
+
+    Those that read the same are included. Beside and beyond what a metric aims at do not cancel.
+    """
+    if metric.direction is Direction.NONE:
         return frozenset()
-    least = text(means[int(np.nanargmin([metric.loss(value) for value in means]))])
-    return frozenset(i for i, value in enumerate(means) if text(value) == least)
+    losses = [mean(np.array([metric.loss(value) for value in held])) for held in values]
+    if not np.isfinite(losses).any():
+        return frozenset()
+    least = text(float(np.nanmin(losses)))
+    return frozenset(i for i, loss in enumerate(losses) if text(loss) == least)
 
 
 def _named(metric: Metric, *, ranks: bool) -> Markup:
@@ -99,8 +106,9 @@ def frame_table(subject: Subject) -> Markup:
     chosen = AT_FRAMES if subject.full_box else AT_FRAMES_FREE
     names = [name for name in chosen if _anywhere(subject, name)]
     frame = subject.key_frame
-    means = {name: [mean(row.scores[name].at(frame)) for row in subject.rows] for name in names}
-    best = {n: _best(subject.rows[0].scores[n].metric, values) for n, values in means.items()}
+    held = {name: [row.scores[name].at(frame) for row in subject.rows] for name in names}
+    means = {name: [mean(values) for values in rows] for name, rows in held.items()}
+    best = {n: _best(subject.rows[0].scores[n].metric, rows) for n, rows in held.items()}
     cells = []
     for i, row in enumerate(subject.rows):
         numbers = [tag("span", text(means[n][i]), class_="n best" if i in best[n] else "n") for n in names]
@@ -118,14 +126,17 @@ def scenario_table(subject: Subject) -> Markup:
 
 
 def verdict_table(subject: Subject) -> Markup:
-    """Return how all compare with the leader: sign-flip tests of these weights, corrected by Holm."""
+    """Return how entries compare with the leader: sign-flip tests of these weights, corrected by Holm.
+
+    Floors follow, and have no rank.
+    """
     name = subject.ranking.name
-    by_name = {row.name: row for row in subject.rows}
-    placed = standings({row.name: row.scores[name] for row in subject.rows})
-    leader = by_name[next(iter(placed))]
+    entries = {row.name: row for row in subject.rows if row.entry}
+    placed = standings({method: row.scores[name] for method, row in entries.items()})
+    leader = entries[next(iter(placed))]
     cells = []
     for method, place in placed.items():
-        row, same = by_name[method], place.rank == 1
+        row, same = entries[method], place.rank == 1
         found = compare(row.scores[name], leader.scores[name])
         cells.append(
             [
@@ -138,6 +149,11 @@ def verdict_table(subject: Subject) -> Markup:
                 tag("span", "no", class_="muted") if place.tied else "" if same else "yes",
             ]
         )
+    for row in subject.rows:
+        if not row.entry:
+            found = compare(row.scores[name], leader.scores[name])
+            apart = [html(found.difference), interval(found.interval), "", ""]
+            cells.append([_heading(row), "", html(row.scores[name].mean), *apart])
     head = ["method", "rank", words(name), "loss above leader", "95 % interval", "p", "told from the leader"]
     count = len(subject.scenarios)
     few = f" Under {FEWEST_SCENARIOS} scenarios nothing is claimed." if count < FEWEST_SCENARIOS else ""

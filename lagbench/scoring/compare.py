@@ -64,6 +64,7 @@ class MetricComparison:
     metric: Metric
     first: float  # mean of the first over seeds and scenarios
     second: float  # mean of the second
+    undefined: tuple[int, int]  # frames of either side without a value, which are left out of its mean
     test: Comparison  # difference, interval and p-value, in the metric's loss
 
 
@@ -80,6 +81,7 @@ class ComparisonResult:
     ranking: str  # name of the metric that ranks
     scenarios: int  # how many both have in that metric
     seeds: tuple[int, int]  # of either side
+    floor: bool  # whether the second is a floor, which has no seeds
     metrics: Mapping[str, MetricComparison]  # the ranking one first; observables are left out
 
     def __repr__(self) -> str:
@@ -106,8 +108,13 @@ class ComparisonResult:
     def _sample(self) -> str:
         """What a verdict rests on, and what it is about."""
         p, one, two = self.metrics[self.ranking].test.p, *self.seeds
-        single = one == two == 1
-        what = "one seed each: these weights, not the methods" if single else f"{one} and {two} seeds"
+        if self.floor:
+            what = f"{one} seeds" if one > 1 else "one seed: these weights, not the method"
+        elif one == two == 1:
+            what = "one seed each: these weights, not the methods"
+        else:
+            single = 1 in self.seeds
+            what = f"{one} and {two} seeds" + (": of one seed its weights, not the method" if single else "")
         return f"p = {p:.3g}, {self.scenarios} scenarios, {what}"
 
     def as_json(self) -> dict[str, Any]:
@@ -117,6 +124,7 @@ class ComparisonResult:
                 "unit": found.metric.unit,
                 "first": digits(found.first),
                 "second": digits(found.second),
+                "undefined": list(found.undefined),
                 "difference": digits(found.test.difference),
                 "interval": [digits(bound) for bound in found.test.interval],
                 "p": digits(found.test.p),
@@ -180,6 +188,7 @@ def compare(
         ranking=one.ranking,
         scenarios=len(found[one.ranking].test.scenarios),
         seeds=(len(one.predictions), len(two.predictions)),
+        floor=floor is not None,
         metrics=found,
     )
 
@@ -210,6 +219,13 @@ def _contestant(
     ]
     for side in sides[1:]:
         _check_same(sides[0], side, more=("method",))
+    if len({one.predictions_sha256 for one in held}) < len(held):
+        raise UsageError(
+            "the same predictions twice",
+            where=str(source),
+            expected="another seed of the method in each folder",
+            fix="one file stands for one training: leave copies out",
+        )
     common = [name for name in first.scores[SUBMISSION] if all(name in side.scores for side in sides)]
     return replace(
         sides[0],
@@ -288,4 +304,11 @@ def _known(name: str, judged: Collection[str]) -> str:
 
 def _compared(first: tuple[Score, ...], second: tuple[Score, ...]) -> MetricComparison:
     one, two = (mean(mean_over_seeds([score.values for score in side])) for side in (first, second))
-    return MetricComparison(metric=first[0].metric, first=one, second=two, test=compare_scores(first, second))
+    lost = [sum(sum(score.undefined) for score in side) for side in (first, second)]
+    return MetricComparison(
+        metric=first[0].metric,
+        first=one,
+        second=two,
+        undefined=(lost[0], lost[1]),
+        test=compare_scores(first, second),
+    )

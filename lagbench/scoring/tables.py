@@ -6,6 +6,7 @@ import math
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 
+from lagbench.floors.shipped import DIGITS
 from lagbench.metrics.aggregate import Score
 from lagbench.metrics.metric import Direction, Metric, mean
 from lagbench.metrics.table import CHOSEN
@@ -161,8 +162,8 @@ def _against(card: ScoreCard, row: str) -> str:
     low, high = found.interval
     if math.isnan(found.difference):
         return f"{card.ranking} cannot be compared"
-    # sums of the same numbers in another order
-    if abs(found.difference) <= 1e-12 * abs(card.scores[row][card.ranking].mean):
+    # to the digits that floors are shipped with
+    if abs(found.difference) <= 5.0 * 10.0**-DIGITS * abs(card.scores[row][card.ranking].mean):
         return f"{card.ranking} is the same"
     if found.difference < 0.0:
         word, low, high = "better", -high, -low  # the bounds of what is printed: how much better
@@ -201,7 +202,14 @@ def comparison_tables(result: ComparisonResult, *, every: bool = False) -> Itera
         f"{title}; below 0 the first is better", ("metric", "loss difference [95 %]", "p"), differences
     )
     means = tuple(
-        (_named(found.metric), _number(found.first), _number(found.second)) for found in shown.values()
+        (
+            _named(found.metric),
+            *(
+                _number(value) + (f" ({lost} frames undefined)" if lost else "")
+                for value, lost in zip((found.first, found.second), found.undefined, strict=True)
+            ),
+        )
+        for found in shown.values()
     )
     yield Table("means", ("metric", _head(result.first), _head(result.second)), means)
 
