@@ -167,7 +167,8 @@ def way_back(gap: Tensor, frames: float | None, *, change: float) -> Tensor:
 
     Args:
         gap: true less reached positions [length], shape [particle, 2].
-        frames: frames in which to be back, if nothing else moved; None for no way back.
+        frames: what the gap is divided by: formed anew each frame, it closes by 1/frames of what is left,
+            to a third in as many frames; None for no way back.
         change: deviation of accelerations [length/frame^2].
     """
     if frames is None:

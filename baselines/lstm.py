@@ -34,6 +34,8 @@ class LSTM(FrameNetwork):
     class Options(FrameNetworkOptions):
         """Options of both LSTMs."""
 
+        in_training = FrameNetworkOptions.in_training | {"dropout", "density_weight"}
+
         latent: PositiveInt = 1250  # length of the latent vector of a frame and width of both LSTM layers
         encoder: tuple[PositiveInt, ...] = ()  # widths of pointwise layers before the latent one
         decoder: tuple[PositiveInt, ...] = (1250,)  # widths of hidden layers after the second LSTM layer

@@ -40,14 +40,16 @@ class NeuralMPMOptions(Options):
 
     in_training = frozenset({"calls", "pushforward", "recovery", "noise_std"})
 
-    cells: int = Field(default=18, ge=4, le=256)  # cells of the network's grid across the box
+    # cells of the network's grid across the box; even, so that walls lie between two nodes on all sides
+    cells: int = Field(default=18, ge=4, le=256, multiple_of=2)
     width: int = Field(default=32, ge=4, multiple_of=4)  # channels of the finest level
     velocities: int = Field(default=5, ge=1)  # last velocities that the U-Net sees
     bundle: int = Field(default=4, ge=1)  # frames that one call predicts
     calls: int = Field(default=2, ge=1)  # calls that training unrolls; gradients pass through all
     # most calls before those, without gradients: training sees what rollouts come to
     pushforward: int = Field(default=0, ge=0)
-    # frames in which particles off the true path are to come back to it; None asks for true velocities alone
+    # each frame the gap to the true path is to close by 1/recovery of it: a third is left after so many
+    # frames; None asks for true velocities alone
     recovery: float | None = Field(default=None, gt=1.0, allow_inf_nan=False)
     smoothing: float = Field(default=0.2, ge=0.0, le=1.0)  # share s of the grid's velocity per frame
     noise_std: float = Field(default=1e-4, ge=0.0, allow_inf_nan=False)  # on the last velocity [length/frame]

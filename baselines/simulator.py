@@ -295,7 +295,7 @@ class GraphNetwork(Baseline):
             if options.noise_std > 0.0:
                 batch = replace(batch, position=self._inside(batch.position))
         state = self.start(batch.part(slice(self.history)))
-        if generator is not None and options.forgetful > 0.0:
+        if generator is not None and options.forgetful > 0.0 and options.velocities > 1:
             state = self._forgetful(state, batch.windows, generator)
         steps = []
         for frame in range(self.history, self.history + self.future):
@@ -320,7 +320,7 @@ class GraphNetwork(Baseline):
     def _forgetful(self, state: State, windows: int, generator: torch.Generator) -> State:
         """Return a state in which some windows know their last velocities only; the first one repeats."""
         count, device = self.options.velocities, generator.device
-        forgotten = torch.randint(count, (windows,), generator=generator, device=device)
+        forgotten = torch.randint(1, count, (windows,), generator=generator, device=device)
         forgotten *= torch.rand(windows, generator=generator, device=device) < self.options.forgetful
         first = forgotten.to(state.sample.device)[state.sample]
         index = torch.arange(count, device=first.device).expand(len(first), -1).clamp(min=first[:, None])

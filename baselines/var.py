@@ -155,6 +155,8 @@ class StableVAR(Fitted):
     class Options(baseline.Options):
         """Options of the stable VAR."""
 
+        in_training = frozenset({"ridge"})
+
         rank: PositiveInt = 200  # principal directions kept; all there are if they are fewer
         # added to the variance of each direction [standardised^2]
         ridge: float = Field(default=0.1, ge=0, allow_inf_nan=False)

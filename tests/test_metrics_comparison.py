@@ -248,6 +248,21 @@ def test_ranks_without_significance_or_values() -> None:
     assert list(standings({"gappy": gappy, "even": [score_of(2.2, 2.2)]})) == ["even", "gappy"]
 
 
+def test_one_training_used_in_two_ways_is_paired() -> None:
+    """Seeds that scatter alike on both sides cancel: SciPy's t-test of the seeds' differences is left."""
+    gains, scatter = np.array([0.021, 0.014, 0.026]), np.array([0.2, 0.5, 0.35])
+    base = np.linspace(1.0, 2.0, 20)
+    ways = [
+        [score_of(*(base + a - gain)) for a, gain in zip(scatter, by, strict=True)]
+        for by in (gains, 0 * gains)
+    ]
+    found = compare(*ways, paired=True)
+    assert found.p == pytest.approx(scipy.stats.ttest_1samp(-gains, 0.0).pvalue)
+    assert found.difference == pytest.approx(-gains.mean())
+    assert found.interval[0] < found.difference < found.interval[1] < 0.0
+    assert compare(*ways).p > 0.5
+
+
 def test_seeds_of_a_method_are_compared_together() -> None:
     """Two seeds against one: means over seeds, number of seeds stated, p of the two-way test."""
     seeds = [score_of(*(v + s for v in range(1, 8))) for s in (0.0, 1.0)]

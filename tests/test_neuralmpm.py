@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from pydantic import ValidationError
 from simple_models import batch, facts, jittered, rolled, swirl
 from torch import Tensor, nn
 
@@ -269,6 +270,16 @@ def test_options_that_do_not_fit_are_refused(options: dict[str, object], where: 
     with pytest.raises(UsageError) as told:
         surrogate(changes={"moving_walls": False}, **options)
     assert told.value.where == where
+
+
+@pytest.mark.parametrize("cells", [18, 20, 22, 30, 38, 42])
+def test_walls_are_felt_alike_on_all_sides(cells: int) -> None:
+    """As many rows of nodes beside each wall; with an odd number walls lay on nodes: refused."""
+    held = surrogate(cells=cells).grid
+    beside = [int(side.count_nonzero()) for side in held.beside_walls()]
+    assert len(set(beside)) == 1
+    with pytest.raises(ValidationError):
+        surrogate(cells=cells + 1)
 
 
 def test_learns_a_swirl() -> None:

@@ -72,10 +72,11 @@ def test_operators_share_their_recipes() -> None:
 OTHER = {
     **{"calls": 3, "pushforward": 2, "recovery": 4.0, "noise_std": 0.5, "forgetful": 0.7, "loss_norm": "l1"},
     **{"loss": {"vorticity": 3.0}, "link_weight": 2.0, "rollout_loss_steps": 3, "symmetry": "square"},
+    **{"dropout": [0.5, 0.5], "density_weight": 5.0, "ridge": 50.0},
 }
 
 
-@pytest.mark.parametrize("name", ["neuralmpm", "supergat", "mlp"])
+@pytest.mark.parametrize("name", ["neuralmpm", "supergat", "mlp", "lstm", "var-stable"])
 def test_options_of_the_training(name: str) -> None:
     """A trained model refuses options of the training; rollouts are the same to the bit whatever they are.
 

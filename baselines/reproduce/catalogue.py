@@ -164,7 +164,7 @@ _ALL = (
         needs={"cavity": ("gns-novorticity", "gns")},
         panels=("vorticity", "streamlines"),
         said="Thesis: without the vorticity loss GNS develops fewer or weaker vortices than the truth; with"
-        " it they align significantly better. Ours: one model, one budget, weight 0 and 1.",
+        " it they align significantly better. Ours: one model, one budget, weight 0 and 0.1.",
     ),
     replace(
         _CURVES,
@@ -200,10 +200,11 @@ _ALL = (
     ),
     Figure(
         name="fig_5_21",
-        title="Training loss on curl noise, sum of six terms",
+        title="Training loss on curl noise, the weighted sum that is learned from",
         draw=figures.losses,
         needs={"curl-noise": OPERATORS},
-        said="Thesis: the total is 0.302 at step 507 and 0.644 at the end: it rises, so it is no yardstick.",
+        said="Thesis: the sum of six terms, without weights, is 0.302 at step 507 and 0.644 at the end: it"
+        " rises, so it is no yardstick.",
     ),
     replace(_FLOW, name="fig_5_22", panels=("quiver",)),
     replace(_FLOW, name="fig_5_23", cases=(0, 3), panels=("streamlines",)),

@@ -1,9 +1,10 @@
 """What the scores say of the thesis's claims and of ours: rows of one kind of comparison.
 
-A comparison is the exact sign-flip test over test scenarios, two-sided, in the metric's loss, between the
-means over the seeds that both have (over all seeds where they share none). The p-values of one model against
-several are corrected together (Holm 1979). Scenarios are the sample: with one training per model a difference
-is one between two trainings, which another seed may turn.
+A comparison is two-sided, in the metric's loss, of the seeds that both have (of all where they share none):
+the exact sign-flip test over test scenarios where both have one seed, else the two-way bootstrap over
+scenarios and seeds, of the differences seed by seed where both are the same weights used in two ways. The
+p-values of one model against several are corrected together (Holm 1979). With one training per model a
+difference is one between two trainings, which another seed may turn.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from lagbench.metrics.table import CHOSEN
 from lagbench.scoring.tables import Table
 
 from .evidence import Evidence, ordered
-from .thesis import FRAME_MODELS, OPERATORS, key_frame, label, number
+from .thesis import FRAME_MODELS, OPERATORS, ROSTER, key_frame, label, number
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,7 +174,8 @@ def compared(
 
 def _pair(evidence: Evidence, first: str, second: str, metric: str, frame: int | None) -> Compared | None:
     one, two = evidence.methods[first], evidence.methods[second]
-    if common := {held.seed for held in one.seeds} & {held.seed for held in two.seeds}:
+    common = {held.seed for held in one.seeds} & {held.seed for held in two.seeds}
+    if common:
         one, two = one.of_seeds(common), two.of_seeds(common)
     if metric not in one.scores or metric not in two.scores:
         return None
@@ -182,7 +184,8 @@ def _pair(evidence: Evidence, first: str, second: str, metric: str, frame: int |
     if frame is not None:
         scores = [replace(score, values=score.at(frame)) for score in scores]
         sides = [[replace(score, values=score.at(frame)) for score in side] for side in sides]
-    test = compare(*sides)
+    same_weights = bool(common) and first in ROSTER and ROSTER[first].weights == second
+    test = compare(*sides, paired=same_weights)
     losses = [[score.metric.loss(value) for value in score.values.tolist()] for score in scores]
     return Compared(
         where=evidence.where,

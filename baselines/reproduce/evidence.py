@@ -32,6 +32,8 @@ from lagbench.scoring.score_file import NETCDF_NAME, read_statistics
 from lagbench.scoring.skill import best_floor
 from lagbench.scoring.task import ranking_metric
 
+from .thesis import ROSTER
+
 BOARD = Path("leaderboard")
 WEIGHTS = BOARD / "weights"
 """Where committed weights and the records of their trainings lie, as `lagbench submit --weights` put them."""
@@ -75,9 +77,11 @@ class Seeded:
 
     @property
     def cpu_hours(self) -> float | None:
-        """Processor time of the training, validations among it [h]."""
+        """Processor time of the training without its validations, as entries tell it [h]."""
         seconds = self.record.get("cpu_seconds")
-        return None if seconds is None else float(seconds) / 3600.0
+        if seconds is None:
+            return None
+        return (float(seconds) - float(self.record.get("validation_cpu_seconds") or 0.0)) / 3600.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -208,6 +212,8 @@ class Evidence:
             for made, file in files:
                 seed = made.get("seed")
                 record = sources.record(split, size, name, seed) or _told(entry, made)
+                if not record and name in ROSTER and ROSTER[name].weights:
+                    record = sources.record(split, size, ROSTER[name].weights, seed)
                 self._add(name, seed, file, record, cost, entry.get("parameters"))
         committed = {(name, held.seed) for name, method in self.methods.items() for held in method.seeds}
         for name, seed, folder in sources.run_folders(split, size):
@@ -308,14 +314,16 @@ def _score_files(path: Path, entry: Any) -> Iterator[tuple[Mapping[str, Any], Pa
 
 def _told(entry: Mapping[str, Any], made: Mapping[str, Any]) -> dict[str, Any]:
     """Return what an entry says of a training by one of our recipes, in the terms of training.json."""
-    words, paid = WORDS.search(entry.get("training") or ""), made.get("budget") or entry.get("budget") or {}
+    words, paid = WORDS.search(entry.get("training") or ""), made.get("budget") or {}
+    if not paid and len(entry["predictions"]) == 1:  # of several seeds the entry has the mean
+        paid = entry.get("budget") or {}
     if not words or not paid.get("steps") or paid.get("cpu_hours") is None:
         return {}
     device, windows = paid.get("device") or entry.get("hardware"), paid.get("windows")
     batch = round((windows or 0) / paid["steps"])
     told = {
         "step": paid["steps"],
-        "cpu_seconds": 3600.0 * (paid["cpu_hours"] + (paid.get("validation_hours") or 0.0)),
+        "cpu_seconds": 3600.0 * paid["cpu_hours"],
         "validation": [{"step": step, paid["metric"]: value} for step, value in paid.get("validations", ())],
         "recipe": {"name": words[1], "changed": words[2], "training": {"batch": batch}},
         "hardware": {

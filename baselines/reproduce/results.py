@@ -54,11 +54,12 @@ of the thesis (D. Dharma, PhD thesis, University of Leeds, 2025). Written by
 How to read it. `skill` is 1 - score / score of the best floor: 1 perfect, 0 nothing learned, below 0 worse
 than what costs no learning. Cells are means over test scenarios with 95 % bootstrap intervals, and ± the
 deviation over seeds where there are several; intervals here are those over scenarios, those of the board
-resample seeds too and are wider where there are few. Differences are tested by the exact sign-flip test over
-scenarios, two-sided, corrected for the number of rivals (Holm); with fewer than six scenarios nothing is
-claimed. The thesis trained on its own data, at what is here size `full`, for hours on GPUs, and prints one
-scenario per table: its absolute numbers are beside ours for orientation, and only orders can be compared
-at size `mini` (a quarter of the particles, half the grid). `docs/scoring.md` defines every metric."""
+resample seeds too and are wider where there are few. Differences are tested by the exact sign-flip test
+over scenarios where both have one seed, else by the two-way bootstrap over scenarios and seeds, two-sided,
+corrected for the number of rivals (Holm); with fewer than six scenarios nothing is claimed. The thesis
+trained on its own data, at what is here size `full`, for hours on GPUs, and prints one scenario per table:
+its absolute numbers are beside ours for orientation, and only orders can be compared at size `mini` (a
+quarter of the particles, half the grid). `docs/scoring.md` defines every metric."""
 
 COMMANDS = """## How to make these again
 
@@ -126,7 +127,7 @@ def _claims(learned: Sequence[Evidence]) -> Iterator[str]:
     yield (
         "Validation: the least value up to a quarter, half and all of the steps, and what the last doubling"
         " gained, of the first seed, in the metric that was validated. Models whose last doubling gained more"
-        " than 2 % have not converged."
+        " than 2 % have not converged. Hours are without validations, as in entries."
     )
     heads = ("model", "steps x windows", "epochs", "CPU hours per seed", "skill", "validated")
     learning = ("validation at 1/4", "1/2", "1", "last doubling")
@@ -181,7 +182,7 @@ def _chapter(evidence: Evidence) -> Iterator[str]:
     yield (
         "Cost. Recipe, and what the training changed of it (`none`: nothing), seeds in their order where they"
         " differ, from the entry's words where no record of the training lies beside it. Speed-up: our"
-        " solver's time for a frame on one core over the model's, same machine."
+        " solver's time for a frame on one core over the model's, same machine. Hours: without validations."
     )
     heads = (
         "recipe",

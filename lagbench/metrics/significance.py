@@ -127,8 +127,15 @@ Seeds = Score | Sequence[Score]
 """Score of one seed, or of each seed of a method."""
 
 
-def compare(first: Seeds, second: Seeds) -> Comparison:
-    """Compare two methods in one metric over the scenarios that both have."""
+def compare(first: Seeds, second: Seeds, *, paired: bool = False) -> Comparison:
+    """Compare two methods in one metric over the scenarios that both have.
+
+    Args:
+        first: scores of a method's seeds.
+        second: those of another.
+        paired: whether seed s of both is one training, used in two ways: its scatter then cancels, and
+            the differences seed by seed are tested.
+    """
     sides = [_listed(first), _listed(second)]
     names = {score.metric.name for side in sides for score in side}
     if len(names) != 1:
@@ -137,13 +144,15 @@ def compare(first: Seeds, second: Seeds) -> Comparison:
     defined = [set().union(*side) for side in losses]
     common = tuple(sorted(defined[0] & defined[1]))
     one, two = (_table(side, common) for side in losses)
-    found = resample(one, two) if common else None
+    difference = mean(mean_over_seeds(one) - mean_over_seeds(two))
+    tested = (one - two, np.zeros((1, len(common)))) if paired else (one, two)
+    found = resample(*tested) if common else None
     return Comparison(
         metric=names.pop(),
         scenarios=common,
-        difference=mean(mean_over_seeds(one) - mean_over_seeds(two)),
+        difference=difference,
         interval=(math.nan, math.nan) if found is None else found.interval,
-        p=differ(one, two) if common else math.nan,
+        p=differ(*tested) if common else math.nan,
         seeds=(len(one), len(two)),
     )
 
