@@ -11,13 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+import netCDF4
 import numpy as np
 import pytest
 from exchange_readers import straight_runs
 from exchange_writers import METADATA, write_gns, write_h5
 
 from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError
-from lagbench.exchange import import_split, trajectory
+from lagbench.exchange import adopt, import_split, trajectory
 
 
 class _Trap:
@@ -286,3 +287,90 @@ def test_a_file_that_leads_elsewhere_is_refused(tmp_path: Path, way: str) -> Non
     with pytest.raises(UnreadableFileError) as caught:
         import_split(source, format="lagrangebench-h5", output=tmp_path / "own")
     assert "00000" in str(caught.value.where)
+
+
+BASIC: dict[str, Any] = {"radius": 0.1, "frame_interval": 0.25}
+
+
+def with_good(tmp_path: Path, bad: Path) -> list[Path]:
+    """Return two files with a trajectory each, then a bad one."""
+    (tmp_path / "in").mkdir(exist_ok=True)
+    for number, run in enumerate(straight_runs(2)):
+        np.save(tmp_path / "in" / f"{number}.npy", run)
+    return [*sorted((tmp_path / "in").glob("?.npy")), bad]
+
+
+@pytest.mark.parametrize("way", ["link", "group", "virtual", "raw"])
+def test_adopted_netcdf_reads_no_other_file(tmp_path: Path, way: str) -> None:
+    """NetCDF's own reader would take positions from wherever a stranger's file points to."""
+    (tmp_path / "in").mkdir()
+    bad, other, run = tmp_path / "in" / "bad.nc", tmp_path / "in" / "other", straight_runs(1)[0]
+    with h5py.File(other, "w") as file:
+        file["position"] = run
+    with h5py.File(bad, "w") as file:
+        if way == "link":
+            file["position"] = h5py.ExternalLink(str(other), "position")
+        elif way == "group":
+            file["position"] = run
+            file["a/wall_velocity"] = h5py.ExternalLink(str(other), "position")
+        elif way == "virtual":
+            layout = h5py.VirtualLayout(shape=run.shape, dtype="f4")
+            layout[:] = h5py.VirtualSource(str(other), "position", shape=run.shape)
+            file.create_virtual_dataset("position", layout)
+        else:
+            other.write_bytes(run.tobytes())
+            file.create_dataset("position", run.shape, "f4", external=[(str(other), 0, run.nbytes)])
+    with pytest.raises(UnreadableFileError) as caught:
+        adopt(with_good(tmp_path, bad), output=tmp_path / "own", **BASIC)
+    assert "bad.nc" in str(caught.value.where)
+    assert not (tmp_path / "own").exists()
+
+
+@pytest.mark.parametrize("kind", ["empty chunks", "a hole", "classic", "npy", "rows"])
+def test_a_sparse_file_fills_no_memory(tmp_path: Path, kind: str) -> None:
+    """A few bytes on disk that claim 10^9 particles, or 10^12 trajectories, are refused by their header."""
+    (tmp_path / "in").mkdir()
+    bad = tmp_path / "in" / ("bad.npy" if kind in ("npy", "rows") else "bad.nc")
+    shape = (12, 10**9, 2)
+    if kind == "classic":
+        with netCDF4.Dataset(bad, "w", format="NETCDF3_64BIT_DATA") as file:
+            file.set_fill_off()
+            names = [file.createDimension(f"n{n}", n).name for n in shape]
+            file.createVariable("position", "f4", names)
+    elif kind in ("npy", "rows"):
+        claimed = shape if kind == "npy" else (10**12, 0, 2, 2)
+        with bad.open("wb") as stream:
+            header = {"descr": "<f4", "fortran_order": False, "shape": claimed}
+            np.lib.format.write_array_header_1_0(stream, header)
+            stream.truncate(stream.tell() + 4 * int(np.prod(claimed)))
+    else:
+        with h5py.File(bad, "w") as file:
+            if kind == "a hole":
+                created = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+                created.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
+                created.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
+                space = h5py.h5s.create_simple(shape)
+                h5py.h5d.create(file.id, b"position", h5py.h5t.IEEE_F32LE, space, dcpl=created)
+            else:
+                file.create_dataset("position", shape, "f4", chunks=(1, 10**6, 2))
+    assert bad.stat().st_blocks * 512 < 1 << 20
+    with pytest.raises((UnreadableFileError, DataError)) as caught:
+        adopt(with_good(tmp_path, bad), output=tmp_path / "own", **BASIC)
+    assert bad.name in str(caught.value.where)
+    assert not (tmp_path / "own").exists()
+
+
+@pytest.mark.parametrize("form", ["NETCDF3_CLASSIC", "NETCDF3_64BIT_OFFSET", "NETCDF4"])
+def test_every_netcdf_format_is_adopted(tmp_path: Path, form: Any) -> None:
+    """Older formats too, and files with texts, a group and dimensions without values beside positions."""
+    (tmp_path / "in").mkdir()
+    path, run = tmp_path / "in" / "own.nc", straight_runs(1)[0]
+    with netCDF4.Dataset(path, "w", format=form) as file:
+        names = [file.createDimension(name, n).name for name, n in zip("fps", run.shape, strict=True)]
+        file.createVariable("position", "f4", names)[:] = run
+        file.createVariable("letters", "S1", names[-1:])
+        if form == "NETCDF4":
+            file.createVariable("names", str, names[-1:])[:] = np.array(["x", "y"], object)
+            file.createGroup("more").createVariable("note", "i4", ())
+    made = adopt(with_good(tmp_path, path), output=tmp_path / "own", **BASIC)
+    assert made.scenarios == {"train": 1, "valid": 1, "test": 1}

@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.checksums import HASHED_SUBSETS, file_sha256
+from lagbench.data.hdf5 import Structure, check_structure, opened
+from lagbench.data.registry import MAX_ID
 from lagbench.data.scenario import MATERIALS
 from lagbench.errors import DataError, UnreadableFileError, UsageError
 from lagbench.work.progress import Progress
@@ -26,6 +28,11 @@ from .trajectory import Description, Frame, Trajectory, Wishes, check_array, che
 
 READABLE = (".npy", ".npz", ".nc")  # files that are adopted: an array, named arrays, netCDF
 ARRAYS = POSITION, VELOCITY, MATERIAL, WALLS = "position", "velocity", "material", "wall_velocity"
+CLASSIC = b"CDF"
+"""First bytes of the older netCDF formats, which cannot point to other files."""
+
+NETCDF = Structure(groups=None, texts=True, cache=1 << 30)
+"""What may be in a netCDF-4 file; chunks by default span many frames, so that more of them stay unpacked."""
 
 Read = Callable[[str], NDArray[Any]]
 
@@ -227,7 +234,13 @@ def _rows(path: Path) -> list[Row]:
     if path.suffix != ".npy":
         return [(path, None)]
     shape = _array(path).shape
-    return [(path, row) for row in range(shape[0])] if len(shape) == 4 else [(path, None)]
+    if len(shape) != 4:
+        return [(path, None)]
+    if shape[0] > MAX_ID + 1:
+        raise DataError(
+            "too many trajectories", where=str(path), expected=f"at most {MAX_ID + 1}", got=shape[0]
+        )
+    return [(path, row) for row in range(shape[0])]
 
 
 def _open(path: Path, row: int | None, interval: float | None) -> Trajectory:
@@ -330,6 +343,11 @@ def _netcdf(path: Path, interval: float | None) -> Trajectory:
     import netCDF4
 
     try:
+        with path.open("rb") as stream:
+            classic = stream.read(len(CLASSIC)) == CLASSIC
+        if not classic:  # netCDF would follow links and read other files
+            with opened(path) as held:
+                check_structure(held, path, NETCDF)
         file = netCDF4.Dataset(path, "r")
     except (OSError, RuntimeError) as error:
         raise _unreadable(path, error) from error
@@ -344,16 +362,16 @@ def _netcdf(path: Path, interval: float | None) -> Trajectory:
                 expected="positions as they are, float32 or float64",
                 fix="write them again without scale_factor and add_offset",
             )
-    held = {name: file.variables[name] for name in ARRAYS if name in file.variables}
+    arrays = {name: file.variables[name] for name in ARRAYS if name in file.variables}
 
     def read() -> Iterator[Frame]:
         try:
-            yield from _frames(held)
+            yield from _frames(arrays)
         except (OSError, RuntimeError) as error:
             raise _unreadable(path, error) from error
 
     try:
-        return _trajectory(str(path), held, read, interval)
+        return _trajectory(str(path), arrays, read, interval)
     except (OSError, RuntimeError) as error:
         raise _unreadable(path, error) from error
 

@@ -14,6 +14,7 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError, with_config
 from typing_extensions import TypedDict  # pydantic reads that of Python 3.12 and later only
 
 from lagbench.data.checksums import round_digits
+from lagbench.data.limits import FRAMES, NEEDED
 from lagbench.data.local import is_name
 from lagbench.data.yamlfile import read_yaml
 from lagbench.errors import DataError, UnreadableFileError, UsageError
@@ -227,7 +228,7 @@ def estimate_spacing(position: Array, radius: float) -> float:
 
 
 def check_array(name: str, shape: tuple[int, ...], dtype: np.dtype[np.generic]) -> None:
-    """Refuse positions that are no floats of two components over frames and particles."""
+    """Refuse positions that are no floats of two components, or of more particles than a split may have."""
     if len(shape) != 3 or dtype.kind != "f":
         raise UnreadableFileError(
             "these are no positions",
@@ -246,6 +247,11 @@ def check_array(name: str, shape: tuple[int, ...], dtype: np.dtype[np.generic]) 
         )
     if shape[0] < 2 or shape[1] < 1:
         raise DataError("too little for a trajectory", where=name, expected="2 frames, 1 particle", got=shape)
+    for what, limit, count in zip(
+        ("frames", "particles"), (FRAMES, NEEDED["particles"]), shape, strict=False
+    ):
+        if not limit.holds(count):
+            raise DataError(f"too many {what} for a trajectory", where=name, expected=limit, got=count)
 
 
 def check_inflation(where: str, *, packed: int, unpacked: int) -> None:
