@@ -374,3 +374,47 @@ def test_every_netcdf_format_is_adopted(tmp_path: Path, form: Any) -> None:
             file.createGroup("more").createVariable("note", "i4", ())
     made = adopt(with_good(tmp_path, path), output=tmp_path / "own", **BASIC)
     assert made.scenarios == {"train": 1, "valid": 1, "test": 1}
+
+
+def write_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    """Write named arrays to an .npz file, or as netCDF's reader takes them."""
+    if path.suffix == ".npz":
+        np.savez(path, **arrays)  # type: ignore[arg-type]
+        return
+    with h5py.File(path, "w") as file:
+        for name, values in arrays.items():
+            file[name] = values.astype(object) if values.dtype.kind == "U" else values
+
+
+WALLS = np.zeros((4, 2))
+
+
+@pytest.mark.parametrize("ending", ["npz", "nc"])
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("wall_velocity", np.where(np.arange(8).reshape(4, 2) == 3, np.nan, WALLS)),
+        ("wall_velocity", WALLS + np.inf),
+        ("wall_velocity", WALLS + 1e300),  # beyond float32, as which it is stored
+        ("wall_velocity", WALLS + 1j),
+        ("wall_velocity", WALLS.astype(str)),
+        ("wall_velocity", WALLS > 1),
+        ("wall_velocity", WALLS[:3]),
+        ("velocity", np.zeros((12, 40, 2), complex)),
+        ("velocity", np.full((12, 40, 2), "fast")),
+        ("velocity", np.full((12, 40, 2), np.nan)),
+        ("material", np.full(40, "liquid")),
+        ("position", np.full((12, 40, 2), "here")),
+    ],
+)
+def test_arrays_that_are_no_numbers_are_refused(
+    tmp_path: Path, ending: str, name: str, values: np.ndarray
+) -> None:
+    """Texts, complex and missing numbers would fail halfway, or enter the hashes."""
+    (tmp_path / "in").mkdir()
+    bad = tmp_path / "in" / f"bad.{ending}"
+    write_arrays(bad, {"position": straight_runs(1)[0], name: values})
+    with pytest.raises((UnreadableFileError, DataError)) as caught:
+        adopt(with_good(tmp_path, bad), output=tmp_path / "own", as_is=True, **BASIC)
+    assert bad.name in str(caught.value.where)
+    assert not (tmp_path / "own").exists()

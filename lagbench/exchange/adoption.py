@@ -287,34 +287,54 @@ def _trajectory(
             "there are no positions", where=name, expected=f"an array {POSITION!r}", got=", ".join(arrays)
         )
     shape = tuple(arrays[POSITION].shape)
-    check_array(name, shape, arrays[POSITION].dtype)
+    check_array(name, shape, _dtype(arrays[POSITION]))
     frames, particles = shape[:2]
-    if VELOCITY in arrays and tuple(arrays[VELOCITY].shape) != shape:
-        raise DataError(
-            "velocities have another shape", where=name, expected=shape, got=tuple(arrays[VELOCITY].shape)
-        )
-    material = np.asarray(arrays[MATERIAL][...]) if MATERIAL in arrays else np.zeros(particles, np.int8)
-    known = material.dtype.kind in "iu" and material.shape == (particles,)
-    if not known or not np.isin(material, range(len(MATERIALS))).all():
-        raise DataError(
-            "these are no materials",
-            where=f"{name}, {MATERIAL}",
-            expected=f"{particles} integers: " + ", ".join(f"{i} {m}" for i, m in enumerate(MATERIALS)),
-            got=f"{material.dtype} of shape {material.shape}",
-        )
-    walls = np.asarray(arrays[WALLS][...], np.float64) if WALLS in arrays else None
-    if walls is not None and walls.shape not in ((4, 2), (frames, 4, 2)):
-        raise DataError(
-            "these are no walls",
-            where=f"{name}, {WALLS}",
-            expected="shape (4, 2) or (frame, 4, 2)",
-            got=walls.shape,
-        )
+    if VELOCITY in arrays:
+        _check_numbers(f"{name}, {VELOCITY}", arrays[VELOCITY], "velocities", shape)
+    material = np.zeros(particles, np.int8)
+    if MATERIAL in arrays:
+        what = "materials: " + ", ".join(f"{i} {m}" for i, m in enumerate(MATERIALS))
+        _check_numbers(f"{name}, {MATERIAL}", arrays[MATERIAL], what, (particles,), kinds="iu")
+        material = np.asarray(arrays[MATERIAL][...])
+        if not np.isin(material, range(len(MATERIALS))).all():
+            raise DataError(f"these are no {what}", where=f"{name}, {MATERIAL}")
+    walls = None
+    if WALLS in arrays:
+        where = f"{name}, {WALLS}"
+        _check_numbers(where, arrays[WALLS], "walls", (4, 2), (frames, 4, 2))
+        walls = np.asarray(arrays[WALLS][...], np.float64)
+        with np.errstate(over="ignore"):  # they are stored as float32
+            if not np.isfinite(walls.astype(np.float32)).all():
+                raise DataError("a velocity of a wall is not finite", where=where)
     if interval is not None:
         check_meaning(name, arrays[POSITION], arrays.get(VELOCITY), interval)
     return Trajectory(
         name=name, frames=frames, material=material.astype(np.int8), read=read, wall_velocity=walls
     )
+
+
+def _check_numbers(
+    where: str,
+    array: Any,  # noqa: ANN401 (arrays, also netCDF's)
+    what: str,
+    *shapes: tuple[int, ...],
+    kinds: str = "iuf",
+) -> None:
+    """Refuse an array of another shape or other kinds of values, by what its file declares."""
+    if tuple(array.shape) not in shapes or _dtype(array).kind not in kinds:
+        raise DataError(
+            f"these are no {what}",
+            where=where,
+            expected=("integers" if kinds == "iu" else "real numbers")
+            + f" of shape {' or '.join(map(str, shapes))}",
+            got=f"{_dtype(array)} of shape {tuple(array.shape)}",
+        )
+
+
+def _dtype(array: Any) -> np.dtype[Any]:  # noqa: ANN401
+    """Return the type of values; netCDF has types of its own for texts and lists, here objects."""
+    stored = getattr(array, "datatype", array.dtype)
+    return stored if isinstance(stored, np.dtype) else np.dtype(object)
 
 
 def _array(path: Path) -> NDArray[Any]:

@@ -203,7 +203,11 @@ class _Building:
             position = self.about.measure.place(raw)
             self._check(trajectory, number, position)
             if own is not None:
-                yield position, (own / self.about.measure.scale).astype(np.float32)
+                with np.errstate(over="ignore"):  # what is beyond float32 becomes infinite
+                    velocity = (own / self.about.measure.scale).astype(np.float32)
+                if not np.isfinite(velocity).all():
+                    raise DataError("a velocity is not finite", where=f"{trajectory.name}, frame {number}")
+                yield position, velocity
             elif before is not None:
                 velocity = ((position.astype(np.float64) - before) * self.about.rate).astype(np.float32)
                 if number == 1:
