@@ -418,3 +418,50 @@ def test_arrays_that_are_no_numbers_are_refused(
         adopt(with_good(tmp_path, bad), output=tmp_path / "own", as_is=True, **BASIC)
     assert bad.name in str(caught.value.where)
     assert not (tmp_path / "own").exists()
+
+
+@pytest.mark.parametrize(
+    "fault", ["stream", "encrypted", "method", "claim", "product", "negative", "version"]
+)
+def test_a_damaged_npz_is_told_when_adopted(tmp_path: Path, fault: str) -> None:
+    """Zip files and headers of arrays that are wrong in themselves, or want more memory than they fill."""
+    (tmp_path / "in").mkdir()
+    bad = tmp_path / "in" / "bad.npz"
+    shapes = {"claim": (99999999999, 4, 2), "product": (2**40, 2**40, 2**40), "negative": (-12, -40, 2)}
+    with (
+        zipfile.ZipFile(bad, "w", zipfile.ZIP_DEFLATED) as archive,
+        archive.open("position.npy", "w") as stream,
+    ):
+        header = {"descr": "<f4", "fortran_order": False, "shape": shapes.get(fault, (12, 40, 2))}
+        np.lib.format.write_array_header_1_0(stream, header)
+        stream.write(straight_runs(1)[0].tobytes())
+    raw = bytearray(bad.read_bytes())
+    start, central = 30 + len("position.npy"), raw.index(b"PK\x01\x02")
+    match fault:
+        case "stream":
+            raw[start + 5 : start + 90] = b"\xff" * 85
+        case "encrypted":
+            raw[6] |= 1
+            raw[central + 8] |= 1
+        case "method":
+            raw[8] = raw[central + 10] = 97
+        case "version":
+            raw[central + 6] = 99
+    bad.write_bytes(raw)
+    with pytest.raises(UnreadableFileError) as caught:
+        adopt(with_good(tmp_path, bad), output=tmp_path / "own", **BASIC)
+    assert bad.name in str(caught.value.where)
+    assert not (tmp_path / "own").exists()
+
+
+@pytest.mark.parametrize("shape", [(99999999999, 4, 2), (2**40, 2**40, 2**40), (-12, -40, 2)])
+def test_a_damaged_npy_is_told_when_adopted(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    """A header that claims other values than follow it."""
+    (tmp_path / "in").mkdir()
+    bad = tmp_path / "in" / "bad.npy"
+    with bad.open("wb") as stream:
+        np.lib.format.write_array_header_1_0(stream, {"descr": "<f4", "fortran_order": False, "shape": shape})
+        stream.write(straight_runs(1)[0].tobytes())
+    with pytest.raises(UnreadableFileError) as caught:
+        adopt(with_good(tmp_path, bad), output=tmp_path / "own", **BASIC)
+    assert bad.name in str(caught.value.where)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import re
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any, Unpack
@@ -16,7 +18,7 @@ from lagbench.data.checksums import HASHED_SUBSETS, file_sha256
 from lagbench.data.hdf5 import Structure, check_structure, opened
 from lagbench.data.registry import MAX_ID
 from lagbench.data.scenario import MATERIALS
-from lagbench.errors import DataError, UnreadableFileError, UsageError
+from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError
 from lagbench.work.progress import Progress
 
 from . import gns_npz, lagrangebench_h5
@@ -254,18 +256,16 @@ def _open(path: Path, row: int | None, interval: float | None) -> Trajectory:
         held = {POSITION: array if row is None else array[row]}
         return _trajectory(name, held, lambda: _frames(held), interval)
     if path.suffix == ".npz":
-        try:
+        with _reading(path):
             with zipfile.ZipFile(path) as archive:
                 for member in archive.infolist():
                     name = f"{path}, {member.filename}"
                     check_inflation(name, packed=member.compress_size, unpacked=member.file_size)
                     if member.filename.removesuffix(".npy") in ARRAYS:
                         with archive.open(member) as stream:
-                            _refuse_objects(name, stream)
+                            _check_header(name, stream, member.file_size)
             with np.load(path, allow_pickle=False) as file:
                 arrays = {name: file[name] for name in ARRAYS if name in file}
-        except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-            raise _unreadable(path, error) from error
         return _trajectory(str(path), arrays, lambda: _frames(arrays), interval)
     return _netcdf(path, interval)
 
@@ -339,17 +339,19 @@ def _dtype(array: Any) -> np.dtype[Any]:  # noqa: ANN401
 
 def _array(path: Path) -> NDArray[Any]:
     """Return the mapped array of a .npy file."""
-    try:
+    with _reading(path):
         with path.open("rb") as stream:
-            _refuse_objects(str(path), stream)
+            _check_header(str(path), stream, path.stat().st_size)
         array: NDArray[Any] = np.lib.format.open_memmap(path, mode="r")
-    except (OSError, ValueError, EOFError) as error:
-        raise _unreadable(path, error) from error
     return array
 
 
-def _refuse_objects(name: str, stream: IO[bytes]) -> None:
-    _, _, dtype = gns_npz.read_header(stream)
+def _check_header(name: str, stream: IO[bytes], length: int) -> None:
+    """Refuse objects, and more values than a .npy stream of some length [bytes] can hold.
+
+    NumPy reserves memory for what the header claims before it reads.
+    """
+    shape, _, dtype = gns_npz.read_header(stream)
     if dtype.hasobject:
         raise UnreadableFileError(
             "the file holds pickled objects",
@@ -357,52 +359,61 @@ def _refuse_objects(name: str, stream: IO[bytes]) -> None:
             expected="arrays of numbers",
             fix="lagbench import --format gns-npz reads trajectories of GNS code bases",
         )
+    held = length - stream.tell()
+    if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize > held:
+        raise UnreadableFileError(
+            "the array claims more than the file holds",
+            where=name,
+            expected=f"{held} bytes",
+            got=f"{dtype} of shape {shape}",
+        )
 
 
 def _netcdf(path: Path, interval: float | None) -> Trajectory:
     import netCDF4
 
-    try:
+    with _reading(path):
         with path.open("rb") as stream:
             classic = stream.read(len(CLASSIC)) == CLASSIC
         if not classic:  # netCDF would follow links and read other files
             with opened(path) as held:
                 check_structure(held, path, NETCDF)
         file = netCDF4.Dataset(path, "r")
-    except (OSError, RuntimeError) as error:
-        raise _unreadable(path, error) from error
-    file.set_auto_maskandscale(False)
-    # Values that stand for others are refused: they are read as they are stored.
-    for name in (POSITION, VELOCITY, WALLS):
-        packed = name in file.variables and {"scale_factor", "add_offset"} & set(file[name].ncattrs())
-        if packed:
-            raise UnreadableFileError(
-                "the values are packed",
-                where=f"{path}, {name}, {', '.join(sorted(packed))}",
-                expected="positions as they are, float32 or float64",
-                fix="write them again without scale_factor and add_offset",
-            )
-    arrays = {name: file.variables[name] for name in ARRAYS if name in file.variables}
+        file.set_auto_maskandscale(False)
+        arrays = {name: file.variables[name] for name in ARRAYS if name in file.variables}
+        # Values that stand for others are refused: they are read as they are stored.
+        for name, stored in arrays.items():
+            packed = {"scale_factor", "add_offset"} & set(stored.ncattrs())
+            if packed and name != MATERIAL:
+                raise UnreadableFileError(
+                    "the values are packed",
+                    where=f"{path}, {name}, {', '.join(sorted(packed))}",
+                    expected="positions as they are, float32 or float64",
+                    fix="write them again without scale_factor and add_offset",
+                )
 
     def read() -> Iterator[Frame]:
-        try:
+        with _reading(path):
             yield from _frames(arrays)
-        except (OSError, RuntimeError) as error:
-            raise _unreadable(path, error) from error
 
-    try:
+    with _reading(path):
         return _trajectory(str(path), arrays, read, interval)
-    except (OSError, RuntimeError) as error:
-        raise _unreadable(path, error) from error
 
 
-def _unreadable(path: Path, error: Exception) -> UnreadableFileError:
-    return UnreadableFileError(
-        "cannot read the file",
-        where=str(path),
-        expected="arrays of numbers",
-        got=f"{type(error).__name__}: {error}",
-    )
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Turn what damaged bytes raise, which is nearly any type, into an UnreadableFileError."""
+    try:
+        yield
+    except LagbenchError:
+        raise
+    except Exception as error:
+        raise UnreadableFileError(
+            "cannot read the file",
+            where=str(path),
+            expected="arrays of numbers",
+            got=f"{type(error).__name__}: {error}",
+        ) from error
 
 
 def _unbroken(trajectory: Trajectory, stated: Source) -> Trajectory:
