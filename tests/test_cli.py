@@ -147,7 +147,7 @@ def test_errors_of_files_exit_3(run: Run, tmp_path: Path, monkeypatch: pytest.Mo
 @pytest.mark.parametrize(
     ("error", "code", "said"),
     [
-        (RuntimeError("out of luck"), 5, "unexpected RuntimeError: out of luck"),
+        (RuntimeError("out of\x1b[2J luck"), 5, r"unexpected RuntimeError: out of\x1b[2J luck"),
         (KeyboardInterrupt(), 130, "interrupted"),  # Ctrl-C is no error to trace
     ],
 )

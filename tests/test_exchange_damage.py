@@ -16,7 +16,9 @@ import numpy as np
 import pytest
 from exchange_readers import straight_runs
 from exchange_writers import METADATA, write_gns, write_h5
+from typer.testing import CliRunner
 
+from lagbench.cli.app import app
 from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError
 from lagbench.exchange import adopt, import_split, trajectory
 
@@ -465,3 +467,31 @@ def test_a_damaged_npy_is_told_when_adopted(tmp_path: Path, shape: tuple[int, ..
     with pytest.raises(UnreadableFileError) as caught:
         adopt(with_good(tmp_path, bad), output=tmp_path / "own", **BASIC)
     assert bad.name in str(caught.value.where)
+
+
+ESCAPES = "\x1b]0;pwned\x07\x1b[2J\x9b2J\u202e\r\udc9bx"
+
+
+@pytest.mark.parametrize("place", ["metadata", "pickle", "describe"])
+def test_no_file_reaches_the_terminal(tmp_path: Path, place: str) -> None:
+    """What a stranger's file says is shown with its control characters spelled out."""
+    source = write_gns(
+        tmp_path / "in", straight_runs(3), **({"bounds": ESCAPES} if place == "metadata" else {})
+    )
+    words = ["import", str(source), "--format", "gns-npz", "--allow-pickle", "-o", str(tmp_path / "own")]
+    if place == "pickle":
+        with (
+            zipfile.ZipFile(source / "train.npz", "w") as archive,
+            archive.open("simulation_0.npy", "w") as stream,
+        ):
+            header = {"descr": "|O", "fortran_order": False, "shape": (2,)}
+            np.lib.format.write_array_header_1_0(stream, header)
+            name = ESCAPES[:-2].encode()
+            stream.write(b"\x80\x04\x8c" + bytes([len(name)]) + name + b"\x8c\x01x\x93.")
+    elif place == "describe":
+        (tmp_path / "data.yaml").write_text(json.dumps({"radius": ESCAPES[:-2]}))
+        words += ["--describe", str(tmp_path / "data.yaml")]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code in (2, 3)
+    assert r"\x1b]0;pwned\x07\x1b[2J\x9b2J\u202e\r" in done.output
+    assert all(line.isprintable() for line in done.output.split("\n"))
