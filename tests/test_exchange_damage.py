@@ -21,6 +21,7 @@ from typer.testing import CliRunner
 from lagbench.cli.app import app
 from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError
 from lagbench.exchange import adopt, import_split, trajectory
+from lagbench.exchange.metadata import parse_kinds
 
 
 class _Trap:
@@ -495,3 +496,44 @@ def test_no_file_reaches_the_terminal(tmp_path: Path, place: str) -> None:
     assert done.exit_code in (2, 3)
     assert r"\x1b]0;pwned\x07\x1b[2J\x9b2J\u202e\r" in done.output
     assert all(line.isprintable() for line in done.output.split("\n"))
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        (5, (1, np.array([1.0, 2.0]))),  # ragged
+        ((1, np.array([1, 2])), 0.5),
+        (5, 10**400),  # beyond any float
+        (10**5000, 0.5),  # beyond what Python spells
+        (5, float("nan")),
+        (5, np.array([np.inf])),
+    ],
+)
+def test_odd_parts_of_a_pickled_trajectory(tmp_path: Path, parts: tuple[Any, Any]) -> None:
+    """Kinds and a material property that are no numbers are told by the key they stand at."""
+    source = write_gns(tmp_path / "in", straight_runs(3))
+    item = np.empty(3, dtype=object)
+    item[0], item[1], item[2] = straight_runs(1)[0], *parts
+    np.savez(source / "train.npz", simulation_0=item)
+    with pytest.raises((UnreadableFileError, DataError)) as caught:
+        import_split(source, format="gns-npz", output=tmp_path / "own", allow_pickle=True)
+    assert "simulation_0" in str(caught.value.where)
+    assert not (tmp_path / "own").exists()
+
+
+def test_a_number_for_a_trajectory(tmp_path: Path) -> None:
+    """A joint array may hold numbers of more digits than Python spells."""
+    source = write_gns(tmp_path / "in", straight_runs(3))
+    np.savez(source / "train.npz", gns_data=np.array([10**5000, None], dtype=object)[:1])
+    with pytest.raises(UnreadableFileError, match="no trajectory"):
+        import_split(source, format="gns-npz", output=tmp_path / "own", allow_pickle=True)
+
+
+@pytest.mark.parametrize(
+    "text", ["--5=drop", f"{'9' * 5000}=drop", "5-=drop", "\u0663=drop", "=drop", "-=drop"]
+)
+def test_kinds_that_are_no_numbers(text: str) -> None:
+    """Only plain digits with one sign are numbers of kinds."""
+    with pytest.raises(UsageError) as caught:
+        parse_kinds(text)
+    assert caught.value.where == "--kinds"
