@@ -206,6 +206,8 @@ def test_bibtex_is_what_citation_cff_says(run: Run, monkeypatch: pytest.MonkeyPa
     assert len(hashes) == sum(value in split["note"] for value in hashes) == 3
     assert "Ghia" in run("cite", "cavity").stdout
     assert json.loads(run("cite", "cavity", "--json").stdout)["licence"] == "CC-BY-4.0"
+    for words in (("--bibtex",), ("cavity", "--bibtex")):
+        assert json.loads(run("cite", *words, "--json").stdout) == {"bibtex": run("cite", *words).stdout[:-1]}
 
 
 def test_doctor_finds_this_machine_fit(run: Run, tmp_path: Path) -> None:

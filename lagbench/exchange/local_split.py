@@ -316,7 +316,7 @@ class _Building:
     def _task(self, *, shortest: int) -> dict[str, object]:
         """Return the task, as far as the shortest test scenario allows one."""
         about = self.about
-        horizon = about.horizon or shortest - about.input_frames
+        horizon = shortest - about.input_frames if about.horizon is None else about.horizon
         last = about.input_frames + horizon - 1
         if horizon < 1 or last >= shortest:
             raise UsageError(

@@ -188,6 +188,13 @@ class Description:
         for option, value in positive.items():
             if not (LEAST <= value <= MOST):
                 raise UsageError("not a number above 0 that computes", where=option, got=value)
+        for option, count, least in (
+            ("--input-frames", self.input_frames, 2),
+            ("--horizon", self.horizon, 1),
+        ):
+            if count is not None and count < least:
+                expected = f"at least {least}"
+                raise UsageError("too few frames for a task", where=option, expected=expected, got=count)
         if self.bounds is not None and any(not -MOST <= low < high <= MOST for low, high in self.bounds):
             raise UsageError("bounds run from low to high", where="--bounds", got=self.bounds)
         if self.cells is not None and not FEWEST_CELLS <= self.cells <= MOST_CELLS:
