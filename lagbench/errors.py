@@ -42,11 +42,24 @@ class LagbenchError(Exception):
         parts = [self.what]
         labelled = {"where": self.where, "expected": self.expected, "got": self.got, "fix": self.fix}
         parts += [f"{label}: {text}" for label, text in labelled.items() if text is not None]
-        return "\n  ".join(parts)
+        return printable("\n  ".join(parts))
 
     def __reduce__(self) -> tuple[object, ...]:
         """Rebuild with keyword arguments, so that errors cross process borders."""
         return _rebuild, (type(self), self.what, self.where, self.expected, self.got, self.fix)
+
+
+def printable(text: str) -> str:
+    r"""Spell out what is no printable character: in a stranger's words it would command the terminal.
+
+    >>> print(printable("a\x1b[2J\nb"))
+    a\x1b[2J
+    b
+    """
+    return "".join(
+        letter if letter.isprintable() or letter == "\n" else letter.encode("unicode_escape").decode("ascii")
+        for letter in text
+    )
 
 
 def _rebuild(

@@ -147,7 +147,7 @@ def test_errors_of_files_exit_3(run: Run, tmp_path: Path, monkeypatch: pytest.Mo
 @pytest.mark.parametrize(
     ("error", "code", "said"),
     [
-        (RuntimeError("out of luck"), 5, "unexpected RuntimeError: out of luck"),
+        (RuntimeError("out of\x1b[2J luck"), 5, r"unexpected RuntimeError: out of\x1b[2J luck"),
         (KeyboardInterrupt(), 130, "interrupted"),  # Ctrl-C is no error to trace
     ],
 )
@@ -206,6 +206,8 @@ def test_bibtex_is_what_citation_cff_says(run: Run, monkeypatch: pytest.MonkeyPa
     assert len(hashes) == sum(value in split["note"] for value in hashes) == 3
     assert "Ghia" in run("cite", "cavity").stdout
     assert json.loads(run("cite", "cavity", "--json").stdout)["licence"] == "CC-BY-4.0"
+    for words in (("--bibtex",), ("cavity", "--bibtex")):
+        assert json.loads(run("cite", *words, "--json").stdout) == {"bibtex": run("cite", *words).stdout[:-1]}
 
 
 def test_doctor_finds_this_machine_fit(run: Run, tmp_path: Path) -> None:

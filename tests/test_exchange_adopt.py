@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -296,6 +297,9 @@ def test_what_is_no_trajectory_leaves_nothing(tmp_path: Path, kind: str) -> None
         ({"radius": None}, "the radius is not known"),
         ({"radius": -1.0}, "not a number above 0"),
         ({"horizon": 7}, "too short for the task"),
+        ({"horizon": 0}, "where: --horizon"),
+        ({"horizon": -1}, "where: --horizon"),
+        ({"input_frames": 1}, "where: --input-frames"),
         ({"input_frames": 12}, "too short for the task"),
         ({"test": 3, "valid": 3}, "each subset needs a trajectory"),
         ({"rescale": True}, "fit the unit box"),
@@ -332,6 +336,17 @@ def test_command(tmp_path: Path) -> None:
     refused = CliRunner().invoke(app, ["generate", "--split", str(target)])
     assert refused.exit_code == 2
     assert "cannot be simulated" in refused.output
+
+
+@pytest.mark.parametrize("text", ["x", "8-", "9-8", "8,8"])
+def test_bad_frames_of_interest_name_their_option(tmp_path: Path, text: str) -> None:
+    """The list is read as one of scenarios is, and the message speaks of frames."""
+    paths = save_runs(tmp_path / "in", straight_runs(3))
+    options = ["-o", str(tmp_path / "mine"), "--radius", "0.1", "--frame-interval", "0.25"]
+    done = CliRunner().invoke(app, ["adopt", *map(str, paths), *options, "--frames-of-interest", text])
+    assert done.exit_code == 2
+    assert "where: --frames-of-interest" in done.output
+    assert not re.search("scenario|id", done.output)
 
 
 def test_a_file_describes_the_data_and_options_win(tmp_path: Path) -> None:

@@ -11,13 +11,17 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+import netCDF4
 import numpy as np
 import pytest
 from exchange_readers import straight_runs
 from exchange_writers import METADATA, write_gns, write_h5
+from typer.testing import CliRunner
 
+from lagbench.cli.app import app
 from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError
-from lagbench.exchange import import_split, trajectory
+from lagbench.exchange import adopt, import_split, trajectory
+from lagbench.exchange.metadata import parse_kinds
 
 
 class _Trap:
@@ -286,3 +290,250 @@ def test_a_file_that_leads_elsewhere_is_refused(tmp_path: Path, way: str) -> Non
     with pytest.raises(UnreadableFileError) as caught:
         import_split(source, format="lagrangebench-h5", output=tmp_path / "own")
     assert "00000" in str(caught.value.where)
+
+
+BASIC: dict[str, Any] = {"radius": 0.1, "frame_interval": 0.25}
+
+
+def with_good(tmp_path: Path, bad: Path) -> list[Path]:
+    """Return two files with a trajectory each, then a bad one."""
+    (tmp_path / "in").mkdir(exist_ok=True)
+    for number, run in enumerate(straight_runs(2)):
+        np.save(tmp_path / "in" / f"{number}.npy", run)
+    return [*sorted((tmp_path / "in").glob("?.npy")), bad]
+
+
+@pytest.mark.parametrize("way", ["link", "group", "virtual", "raw"])
+def test_adopted_netcdf_reads_no_other_file(tmp_path: Path, way: str) -> None:
+    """NetCDF's own reader would take positions from wherever a stranger's file points to."""
+    (tmp_path / "in").mkdir()
+    bad, other, run = tmp_path / "in" / "bad.nc", tmp_path / "in" / "other", straight_runs(1)[0]
+    with h5py.File(other, "w") as file:
+        file["position"] = run
+    with h5py.File(bad, "w") as file:
+        if way == "link":
+            file["position"] = h5py.ExternalLink(str(other), "position")
+        elif way == "group":
+            file["position"] = run
+            file["a/wall_velocity"] = h5py.ExternalLink(str(other), "position")
+        elif way == "virtual":
+            layout = h5py.VirtualLayout(shape=run.shape, dtype="f4")
+            layout[:] = h5py.VirtualSource(str(other), "position", shape=run.shape)
+            file.create_virtual_dataset("position", layout)
+        else:
+            other.write_bytes(run.tobytes())
+            file.create_dataset("position", run.shape, "f4", external=[(str(other), 0, run.nbytes)])
+    with pytest.raises(UnreadableFileError) as caught:
+        adopt(with_good(tmp_path, bad), output=tmp_path / "own", **BASIC)
+    assert "bad.nc" in str(caught.value.where)
+    assert not (tmp_path / "own").exists()
+
+
+@pytest.mark.parametrize("kind", ["empty chunks", "a hole", "classic", "npy", "rows"])
+def test_a_sparse_file_fills_no_memory(tmp_path: Path, kind: str) -> None:
+    """A few bytes on disk that claim 10^9 particles, or 10^12 trajectories, are refused by their header."""
+    (tmp_path / "in").mkdir()
+    bad = tmp_path / "in" / ("bad.npy" if kind in ("npy", "rows") else "bad.nc")
+    shape = (12, 10**9, 2)
+    if kind == "classic":
+        with netCDF4.Dataset(bad, "w", format="NETCDF3_64BIT_DATA") as file:
+            file.set_fill_off()
+            names = [file.createDimension(f"n{n}", n).name for n in shape]
+            file.createVariable("position", "f4", names)
+    elif kind in ("npy", "rows"):
+        claimed = shape if kind == "npy" else (10**12, 0, 2, 2)
+        with bad.open("wb") as stream:
+            header = {"descr": "<f4", "fortran_order": False, "shape": claimed}
+            np.lib.format.write_array_header_1_0(stream, header)
+            stream.truncate(stream.tell() + 4 * int(np.prod(claimed)))
+    else:
+        with h5py.File(bad, "w") as file:
+            if kind == "a hole":
+                created = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+                created.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
+                created.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
+                space = h5py.h5s.create_simple(shape)
+                h5py.h5d.create(file.id, b"position", h5py.h5t.IEEE_F32LE, space, dcpl=created)
+            else:
+                file.create_dataset("position", shape, "f4", chunks=(1, 10**6, 2))
+    assert bad.stat().st_blocks * 512 < 1 << 20
+    with pytest.raises((UnreadableFileError, DataError)) as caught:
+        adopt(with_good(tmp_path, bad), output=tmp_path / "own", **BASIC)
+    assert bad.name in str(caught.value.where)
+    assert not (tmp_path / "own").exists()
+
+
+@pytest.mark.parametrize("form", ["NETCDF3_CLASSIC", "NETCDF3_64BIT_OFFSET", "NETCDF4"])
+def test_every_netcdf_format_is_adopted(tmp_path: Path, form: Any) -> None:
+    """Older formats too, and files with texts, a group and dimensions without values beside positions."""
+    (tmp_path / "in").mkdir()
+    path, run = tmp_path / "in" / "own.nc", straight_runs(1)[0]
+    with netCDF4.Dataset(path, "w", format=form) as file:
+        names = [file.createDimension(name, n).name for name, n in zip("fps", run.shape, strict=True)]
+        file.createVariable("position", "f4", names)[:] = run
+        file.createVariable("letters", "S1", names[-1:])
+        if form == "NETCDF4":
+            file.createVariable("names", str, names[-1:])[:] = np.array(["x", "y"], object)
+            file.createGroup("more").createVariable("note", "i4", ())
+    made = adopt(with_good(tmp_path, path), output=tmp_path / "own", **BASIC)
+    assert made.scenarios == {"train": 1, "valid": 1, "test": 1}
+
+
+def write_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    """Write named arrays to an .npz file, or as netCDF's reader takes them."""
+    if path.suffix == ".npz":
+        np.savez(path, **arrays)  # type: ignore[arg-type]
+        return
+    with h5py.File(path, "w") as file:
+        for name, values in arrays.items():
+            file[name] = values.astype(object) if values.dtype.kind == "U" else values
+
+
+WALLS = np.zeros((4, 2))
+
+
+@pytest.mark.parametrize("ending", ["npz", "nc"])
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("wall_velocity", np.where(np.arange(8).reshape(4, 2) == 3, np.nan, WALLS)),
+        ("wall_velocity", WALLS + np.inf),
+        ("wall_velocity", WALLS + 1e300),  # beyond float32, as which it is stored
+        ("wall_velocity", WALLS + 1j),
+        ("wall_velocity", WALLS.astype(str)),
+        ("wall_velocity", WALLS > 1),
+        ("wall_velocity", WALLS[:3]),
+        ("velocity", np.zeros((12, 40, 2), complex)),
+        ("velocity", np.full((12, 40, 2), "fast")),
+        ("velocity", np.full((12, 40, 2), np.nan)),
+        ("material", np.full(40, "liquid")),
+        ("position", np.full((12, 40, 2), "here")),
+    ],
+)
+def test_arrays_that_are_no_numbers_are_refused(
+    tmp_path: Path, ending: str, name: str, values: np.ndarray
+) -> None:
+    """Texts, complex and missing numbers would fail halfway, or enter the hashes."""
+    (tmp_path / "in").mkdir()
+    bad = tmp_path / "in" / f"bad.{ending}"
+    write_arrays(bad, {"position": straight_runs(1)[0], name: values})
+    with pytest.raises((UnreadableFileError, DataError)) as caught:
+        adopt(with_good(tmp_path, bad), output=tmp_path / "own", as_is=True, **BASIC)
+    assert bad.name in str(caught.value.where)
+    assert not (tmp_path / "own").exists()
+
+
+@pytest.mark.parametrize(
+    "fault", ["stream", "encrypted", "method", "claim", "product", "negative", "version"]
+)
+def test_a_damaged_npz_is_told_when_adopted(tmp_path: Path, fault: str) -> None:
+    """Zip files and headers of arrays that are wrong in themselves, or want more memory than they fill."""
+    (tmp_path / "in").mkdir()
+    bad = tmp_path / "in" / "bad.npz"
+    shapes = {"claim": (99999999999, 4, 2), "product": (2**40, 2**40, 2**40), "negative": (-12, -40, 2)}
+    with (
+        zipfile.ZipFile(bad, "w", zipfile.ZIP_DEFLATED) as archive,
+        archive.open("position.npy", "w") as stream,
+    ):
+        header = {"descr": "<f4", "fortran_order": False, "shape": shapes.get(fault, (12, 40, 2))}
+        np.lib.format.write_array_header_1_0(stream, header)
+        stream.write(straight_runs(1)[0].tobytes())
+    raw = bytearray(bad.read_bytes())
+    start, central = 30 + len("position.npy"), raw.index(b"PK\x01\x02")
+    match fault:
+        case "stream":
+            raw[start + 5 : start + 90] = b"\xff" * 85
+        case "encrypted":
+            raw[6] |= 1
+            raw[central + 8] |= 1
+        case "method":
+            raw[8] = raw[central + 10] = 97
+        case "version":
+            raw[central + 6] = 99
+    bad.write_bytes(raw)
+    with pytest.raises(UnreadableFileError) as caught:
+        adopt(with_good(tmp_path, bad), output=tmp_path / "own", **BASIC)
+    assert bad.name in str(caught.value.where)
+    assert not (tmp_path / "own").exists()
+
+
+@pytest.mark.parametrize("shape", [(99999999999, 4, 2), (2**40, 2**40, 2**40), (-12, -40, 2)])
+def test_a_damaged_npy_is_told_when_adopted(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    """A header that claims other values than follow it."""
+    (tmp_path / "in").mkdir()
+    bad = tmp_path / "in" / "bad.npy"
+    with bad.open("wb") as stream:
+        np.lib.format.write_array_header_1_0(stream, {"descr": "<f4", "fortran_order": False, "shape": shape})
+        stream.write(straight_runs(1)[0].tobytes())
+    with pytest.raises(UnreadableFileError) as caught:
+        adopt(with_good(tmp_path, bad), output=tmp_path / "own", **BASIC)
+    assert bad.name in str(caught.value.where)
+
+
+ESCAPES = "\x1b]0;pwned\x07\x1b[2J\x9b2J\u202e\r\udc9bx"
+
+
+@pytest.mark.parametrize("place", ["metadata", "pickle", "describe"])
+def test_no_file_reaches_the_terminal(tmp_path: Path, place: str) -> None:
+    """What a stranger's file says is shown with its control characters spelled out."""
+    source = write_gns(
+        tmp_path / "in", straight_runs(3), **({"bounds": ESCAPES} if place == "metadata" else {})
+    )
+    words = ["import", str(source), "--format", "gns-npz", "--allow-pickle", "-o", str(tmp_path / "own")]
+    if place == "pickle":
+        with (
+            zipfile.ZipFile(source / "train.npz", "w") as archive,
+            archive.open("simulation_0.npy", "w") as stream,
+        ):
+            header = {"descr": "|O", "fortran_order": False, "shape": (2,)}
+            np.lib.format.write_array_header_1_0(stream, header)
+            name = ESCAPES[:-2].encode()
+            stream.write(b"\x80\x04\x8c" + bytes([len(name)]) + name + b"\x8c\x01x\x93.")
+    elif place == "describe":
+        (tmp_path / "data.yaml").write_text(json.dumps({"radius": ESCAPES[:-2]}))
+        words += ["--describe", str(tmp_path / "data.yaml")]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code in (2, 3)
+    assert r"\x1b]0;pwned\x07\x1b[2J\x9b2J\u202e\r" in done.output
+    assert all(line.isprintable() for line in done.output.split("\n"))
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        (5, (1, np.array([1.0, 2.0]))),  # ragged
+        ((1, np.array([1, 2])), 0.5),
+        (5, 10**400),  # beyond any float
+        (10**5000, 0.5),  # beyond what Python spells
+        (5, float("nan")),
+        (5, np.array([np.inf])),
+    ],
+)
+def test_odd_parts_of_a_pickled_trajectory(tmp_path: Path, parts: tuple[Any, Any]) -> None:
+    """Kinds and a material property that are no numbers are told by the key they stand at."""
+    source = write_gns(tmp_path / "in", straight_runs(3))
+    item = np.empty(3, dtype=object)
+    item[0], item[1], item[2] = straight_runs(1)[0], *parts
+    np.savez(source / "train.npz", simulation_0=item)
+    with pytest.raises((UnreadableFileError, DataError)) as caught:
+        import_split(source, format="gns-npz", output=tmp_path / "own", allow_pickle=True)
+    assert "simulation_0" in str(caught.value.where)
+    assert not (tmp_path / "own").exists()
+
+
+def test_a_number_for_a_trajectory(tmp_path: Path) -> None:
+    """A joint array may hold numbers of more digits than Python spells."""
+    source = write_gns(tmp_path / "in", straight_runs(3))
+    np.savez(source / "train.npz", gns_data=np.array([10**5000, None], dtype=object)[:1])
+    with pytest.raises(UnreadableFileError, match="no trajectory"):
+        import_split(source, format="gns-npz", output=tmp_path / "own", allow_pickle=True)
+
+
+@pytest.mark.parametrize(
+    "text", ["--5=drop", f"{'9' * 5000}=drop", "5-=drop", "\u0663=drop", "=drop", "-=drop"]
+)
+def test_kinds_that_are_no_numbers(text: str) -> None:
+    """Only plain digits with one sign are numbers of kinds."""
+    with pytest.raises(UsageError) as caught:
+        parse_kinds(text)
+    assert caught.value.where == "--kinds"

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from lagbench.errors import LagbenchError
+from lagbench.errors import LagbenchError, printable
 
 from . import board, data, draw, exchange, scoring, training
 from . import demo as tour
@@ -42,7 +42,7 @@ class _Commands(TyperGroup):
             if usage or os.environ.get("LAGBENCH_DEBUG") == "1":
                 raise
             typer.echo(
-                f"lagbench: unexpected {type(error).__name__}: {error}\n"
+                f"lagbench: unexpected {type(error).__name__}: {printable(str(error))}\n"
                 "  fix: this is a fault of lagbench; please report it with the output of\n"
                 f"       LAGBENCH_DEBUG=1 lagbench {' '.join(sys.argv[1:])}",
                 err=True,

@@ -29,7 +29,7 @@ from .options import (
     WorkersOption,
     chosen,
 )
-from .output import print_json, print_table, progress_bar, say, show, spell_bytes, spell_seconds
+from .output import print_json, print_table, progress_bar, show, spell_bytes, spell_seconds
 
 if TYPE_CHECKING:
     from lagbench.data.registry import Registry, Size
@@ -293,7 +293,8 @@ def cite(
     from lagbench.data.local import home
 
     if bibtex and not (name or split):
-        say(_bibtex("software", "lagbench", title=TITLE, version=lagbench.__version__))
+        text = _bibtex("software", "lagbench", title=TITLE, version=lagbench.__version__)
+        show({"bibtex": text}, [text], as_json=as_json)
         return
     split_name, _, registry = home(chosen(name, split), root=root)
     entry = registry.split(split_name)
@@ -305,7 +306,8 @@ def cite(
         note = f"After {entry.citation}. SHA-256 of the data sets: {held}"
         title = f"{entry.title}: split {split_name} of lagbench"
         fields = {"title": title, "version": entry.version, "license": entry.licence, "note": note}
-        say(_bibtex("misc", f"lagbench-{split_name}", **fields))
+        text = _bibtex("misc", f"lagbench-{split_name}", **fields)
+        show({"bibtex": text}, [text], as_json=as_json)
         return
     words = [
         f"lagbench, split {split_name!r} ({entry.title}), version {entry.version}, {entry.licence}.",

@@ -272,7 +272,8 @@ def _wishes(ctx: typer.Context) -> Any:  # noqa: ANN401 (the functions type them
             raise UsageError("bad bounds", where="--bounds", expected=expected, got=said["bounds"]) from None
         said["bounds"] = (left, right), (bottom, top)
     if "frames_of_interest" in said:
-        said["frames_of_interest"] = parse_ids(said["frames_of_interest"])
+        given = said["frames_of_interest"]
+        said["frames_of_interest"] = parse_ids(given, where="--frames-of-interest", noun="frame")
     return said if file is None else {**read_wishes(file), **said}
 
 

@@ -338,10 +338,11 @@ def cache_of(array: Array) -> tuple[int, int]:
     return kept * array.chunk_bytes, kept
 
 
-def storage_problems(array: Array, *, length: int | None = None) -> list[Problem]:
+def storage_problems(array: Array, *, length: int | None = None, cache: int = MAX_CACHE) -> list[Problem]:
     """Return why an array reaches outside its file, needs plug-ins, or is a trap.
 
-    ``length`` is that of the file [bytes]: chunks may overlap, and then promise more than it has.
+    ``length`` is that of the file [bytes]: chunks may overlap, and then promise more than it has;
+    ``cache`` the most memory for chunks that must stay unpacked [bytes].
     """
     if array.shape is None:
         away = "file" in array.layout or array.layout == "virtual"
@@ -359,10 +360,10 @@ def storage_problems(array: Array, *, length: int | None = None) -> list[Problem
     if length is not None and array.packed > length:
         got = f"{array.packed} bytes in a file of {length}"
         return [Problem("the values claim more room than the file has", f"at most {length} bytes", got)]
-    return _chunk_problems(array)
+    return _chunk_problems(array, cache)
 
 
-def _chunk_problems(array: Array) -> list[Problem]:
+def _chunk_problems(array: Array, cache: int) -> list[Problem]:
     if array.chunks is None or array.shape is None or len(array.shape) != len(array.chunks):
         return []
     count = math.prod(-(-n // c) for n, c in zip(array.shape, array.chunks, strict=True))
@@ -374,11 +375,9 @@ def _chunk_problems(array: Array) -> list[Problem]:
         got = f"{array.largest_chunk} bytes"
         return [Problem("a chunk is longer packed than unpacked", f"about {whole} bytes at most", got)]
     size = cache_of(array)[0]
-    if size > MAX_CACHE:
+    if size > cache:
         got = f"chunks {array.chunks}: {size} bytes"
-        return [
-            Problem("frames cannot be read without unpacking much more", f"at most {MAX_CACHE} bytes", got)
-        ]
+        return [Problem("frames cannot be read without unpacking much more", f"at most {cache} bytes", got)]
     return []
 
 
@@ -390,6 +389,7 @@ class Structure:
     groups: Collection[str] | None = ()  # groups below the root that it may have; None: any
     texts: bool = False  # whether arrays may hold texts; these share one heap of any length
     unpacked: int | None = None  # most bytes that all arrays together may become
+    cache: int = MAX_CACHE  # most bytes of chunks that must stay unpacked while frames are read in order
 
 
 def check_structure(file: h5py.File, path: Path, expected: Structure) -> dict[str, Array]:
@@ -403,8 +403,8 @@ def check_structure(file: h5py.File, path: Path, expected: Structure) -> dict[st
     with reading(path):
         for name in _arrays(file, path, expected):
             array = found[name] = describe(file[name], name)
-            problems = storage_problems(array, length=length) or _type_problems(array, expected)
-            problems = problems or _inflation(file[name], array)
+            problems = storage_problems(array, length=length, cache=expected.cache)
+            problems = problems or _type_problems(array, expected) or _inflation(file[name], array)
             if problems:
                 raise _refused(path, name, problems[0])
     total = sum(array.unpacked + array.chunk_bytes for array in found.values())

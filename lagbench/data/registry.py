@@ -65,11 +65,13 @@ MAX_ID = 9999
 _PART = re.compile(r"(\d{1,4})(?:-(\d{1,4}))?")
 
 
-def parse_ids(text: str | int) -> tuple[int, ...]:
+def parse_ids(text: str | int, *, where: str = "--scenarios", noun: str = "id") -> tuple[int, ...]:
     """Return the scenario ids that a text names, in its order.
 
     Args:
         text: comma-separated ids and inclusive ranges; an int stands for itself.
+        where: option that gave the text, for messages.
+        noun: what the numbers are, for messages.
 
     Raises:
         UsageError: the text is no list of ids, a range runs backwards, or an id stands twice.
@@ -77,17 +79,26 @@ def parse_ids(text: str | int) -> tuple[int, ...]:
     >>> parse_ids("0,3-5")
     (0, 3, 4, 5)
     """
+
+    def bad(got: str) -> UsageError:
+        return UsageError(
+            f"bad list of {noun}s {text!r}",
+            where=where,
+            expected=f"{noun}s and ranges from 0 to {MAX_ID}, as in 0,3-5",
+            got=got,
+        )
+
     ids: list[int] = []
     for part in str(text).replace(" ", "").split(","):
         match = _PART.fullmatch(part)
         if match is None:
-            raise _bad(text, f"{part!r} is no id and no range")
+            raise bad(f"{part!r} is no {noun} and no range")
         first, last = int(match[1]), int(match[2] or match[1])
         if last < first:
-            raise _bad(text, f"{part!r} runs backwards")
+            raise bad(f"{part!r} runs backwards")
         ids.extend(range(first, last + 1))
     if len(set(ids)) != len(ids):
-        raise _bad(text, "an id stands twice")
+        raise bad("a number stands twice")
     return tuple(ids)
 
 
@@ -104,15 +115,6 @@ def spell_ids(ids: Iterable[int]) -> str:
         else:
             runs.append([i])
     return ",".join(f"{run[0]}-{run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs)
-
-
-def _bad(text: str | int, got: str) -> UsageError:
-    return UsageError(
-        f"bad scenario list {text!r}",
-        where="--scenarios",
-        expected=f"ids and ranges from 0 to {MAX_ID}, as in 0,3-5",
-        got=got,
-    )
 
 
 GROUP = "lagbench.generators"

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import re
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any, Unpack
@@ -13,8 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.checksums import HASHED_SUBSETS, file_sha256
+from lagbench.data.hdf5 import Structure, check_structure, opened
+from lagbench.data.registry import MAX_ID
 from lagbench.data.scenario import MATERIALS
-from lagbench.errors import DataError, UnreadableFileError, UsageError
+from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError
 from lagbench.work.progress import Progress
 
 from . import gns_npz, lagrangebench_h5
@@ -26,6 +30,11 @@ from .trajectory import Description, Frame, Trajectory, Wishes, check_array, che
 
 READABLE = (".npy", ".npz", ".nc")  # files that are adopted: an array, named arrays, netCDF
 ARRAYS = POSITION, VELOCITY, MATERIAL, WALLS = "position", "velocity", "material", "wall_velocity"
+CLASSIC = b"CDF"
+"""First bytes of the older netCDF formats, which cannot point to other files."""
+
+NETCDF = Structure(groups=None, texts=True, cache=1 << 30)
+"""What may be in a netCDF-4 file; chunks by default span many frames, so that more of them stay unpacked."""
 
 Read = Callable[[str], NDArray[Any]]
 
@@ -227,7 +236,13 @@ def _rows(path: Path) -> list[Row]:
     if path.suffix != ".npy":
         return [(path, None)]
     shape = _array(path).shape
-    return [(path, row) for row in range(shape[0])] if len(shape) == 4 else [(path, None)]
+    if len(shape) != 4:
+        return [(path, None)]
+    if shape[0] > MAX_ID + 1:
+        raise DataError(
+            "too many trajectories", where=str(path), expected=f"at most {MAX_ID + 1}", got=shape[0]
+        )
+    return [(path, row) for row in range(shape[0])]
 
 
 def _open(path: Path, row: int | None, interval: float | None) -> Trajectory:
@@ -241,18 +256,16 @@ def _open(path: Path, row: int | None, interval: float | None) -> Trajectory:
         held = {POSITION: array if row is None else array[row]}
         return _trajectory(name, held, lambda: _frames(held), interval)
     if path.suffix == ".npz":
-        try:
+        with _reading(path):
             with zipfile.ZipFile(path) as archive:
                 for member in archive.infolist():
                     name = f"{path}, {member.filename}"
                     check_inflation(name, packed=member.compress_size, unpacked=member.file_size)
                     if member.filename.removesuffix(".npy") in ARRAYS:
                         with archive.open(member) as stream:
-                            _refuse_objects(name, stream)
+                            _check_header(name, stream, member.file_size)
             with np.load(path, allow_pickle=False) as file:
                 arrays = {name: file[name] for name in ARRAYS if name in file}
-        except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-            raise _unreadable(path, error) from error
         return _trajectory(str(path), arrays, lambda: _frames(arrays), interval)
     return _netcdf(path, interval)
 
@@ -274,29 +287,25 @@ def _trajectory(
             "there are no positions", where=name, expected=f"an array {POSITION!r}", got=", ".join(arrays)
         )
     shape = tuple(arrays[POSITION].shape)
-    check_array(name, shape, arrays[POSITION].dtype)
+    check_array(name, shape, _dtype(arrays[POSITION]))
     frames, particles = shape[:2]
-    if VELOCITY in arrays and tuple(arrays[VELOCITY].shape) != shape:
-        raise DataError(
-            "velocities have another shape", where=name, expected=shape, got=tuple(arrays[VELOCITY].shape)
-        )
-    material = np.asarray(arrays[MATERIAL][...]) if MATERIAL in arrays else np.zeros(particles, np.int8)
-    known = material.dtype.kind in "iu" and material.shape == (particles,)
-    if not known or not np.isin(material, range(len(MATERIALS))).all():
-        raise DataError(
-            "these are no materials",
-            where=f"{name}, {MATERIAL}",
-            expected=f"{particles} integers: " + ", ".join(f"{i} {m}" for i, m in enumerate(MATERIALS)),
-            got=f"{material.dtype} of shape {material.shape}",
-        )
-    walls = np.asarray(arrays[WALLS][...], np.float64) if WALLS in arrays else None
-    if walls is not None and walls.shape not in ((4, 2), (frames, 4, 2)):
-        raise DataError(
-            "these are no walls",
-            where=f"{name}, {WALLS}",
-            expected="shape (4, 2) or (frame, 4, 2)",
-            got=walls.shape,
-        )
+    if VELOCITY in arrays:
+        _check_numbers(f"{name}, {VELOCITY}", arrays[VELOCITY], "velocities", shape)
+    material = np.zeros(particles, np.int8)
+    if MATERIAL in arrays:
+        what = "materials: " + ", ".join(f"{i} {m}" for i, m in enumerate(MATERIALS))
+        _check_numbers(f"{name}, {MATERIAL}", arrays[MATERIAL], what, (particles,), kinds="iu")
+        material = np.asarray(arrays[MATERIAL][...])
+        if not np.isin(material, range(len(MATERIALS))).all():
+            raise DataError(f"these are no {what}", where=f"{name}, {MATERIAL}")
+    walls = None
+    if WALLS in arrays:
+        where = f"{name}, {WALLS}"
+        _check_numbers(where, arrays[WALLS], "walls", (4, 2), (frames, 4, 2))
+        walls = np.asarray(arrays[WALLS][...], np.float64)
+        with np.errstate(over="ignore"):  # they are stored as float32
+            if not np.isfinite(walls.astype(np.float32)).all():
+                raise DataError("a velocity of a wall is not finite", where=where)
     if interval is not None:
         check_meaning(name, arrays[POSITION], arrays.get(VELOCITY), interval)
     return Trajectory(
@@ -304,19 +313,45 @@ def _trajectory(
     )
 
 
+def _check_numbers(
+    where: str,
+    array: Any,  # noqa: ANN401 (arrays, also netCDF's)
+    what: str,
+    *shapes: tuple[int, ...],
+    kinds: str = "iuf",
+) -> None:
+    """Refuse an array of another shape or other kinds of values, by what its file declares."""
+    if tuple(array.shape) not in shapes or _dtype(array).kind not in kinds:
+        raise DataError(
+            f"these are no {what}",
+            where=where,
+            expected=("integers" if kinds == "iu" else "real numbers")
+            + f" of shape {' or '.join(map(str, shapes))}",
+            got=f"{_dtype(array)} of shape {tuple(array.shape)}",
+        )
+
+
+def _dtype(array: Any) -> np.dtype[Any]:  # noqa: ANN401
+    """Return the type of values; netCDF has types of its own for texts and lists, here objects."""
+    stored = getattr(array, "datatype", array.dtype)
+    return stored if isinstance(stored, np.dtype) else np.dtype(object)
+
+
 def _array(path: Path) -> NDArray[Any]:
     """Return the mapped array of a .npy file."""
-    try:
+    with _reading(path):
         with path.open("rb") as stream:
-            _refuse_objects(str(path), stream)
+            _check_header(str(path), stream, path.stat().st_size)
         array: NDArray[Any] = np.lib.format.open_memmap(path, mode="r")
-    except (OSError, ValueError, EOFError) as error:
-        raise _unreadable(path, error) from error
     return array
 
 
-def _refuse_objects(name: str, stream: IO[bytes]) -> None:
-    _, _, dtype = gns_npz.read_header(stream)
+def _check_header(name: str, stream: IO[bytes], length: int) -> None:
+    """Refuse objects, and more values than a .npy stream of some length [bytes] can hold.
+
+    NumPy reserves memory for what the header claims before it reads.
+    """
+    shape, _, dtype = gns_npz.read_header(stream)
     if dtype.hasobject:
         raise UnreadableFileError(
             "the file holds pickled objects",
@@ -324,47 +359,61 @@ def _refuse_objects(name: str, stream: IO[bytes]) -> None:
             expected="arrays of numbers",
             fix="lagbench import --format gns-npz reads trajectories of GNS code bases",
         )
+    held = length - stream.tell()
+    if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize > held:
+        raise UnreadableFileError(
+            "the array claims more than the file holds",
+            where=name,
+            expected=f"{held} bytes",
+            got=f"{dtype} of shape {shape}",
+        )
 
 
 def _netcdf(path: Path, interval: float | None) -> Trajectory:
     import netCDF4
 
-    try:
+    with _reading(path):
+        with path.open("rb") as stream:
+            classic = stream.read(len(CLASSIC)) == CLASSIC
+        if not classic:  # netCDF would follow links and read other files
+            with opened(path) as held:
+                check_structure(held, path, NETCDF)
         file = netCDF4.Dataset(path, "r")
-    except (OSError, RuntimeError) as error:
-        raise _unreadable(path, error) from error
-    file.set_auto_maskandscale(False)
-    # Values that stand for others are refused: they are read as they are stored.
-    for name in (POSITION, VELOCITY, WALLS):
-        packed = name in file.variables and {"scale_factor", "add_offset"} & set(file[name].ncattrs())
-        if packed:
-            raise UnreadableFileError(
-                "the values are packed",
-                where=f"{path}, {name}, {', '.join(sorted(packed))}",
-                expected="positions as they are, float32 or float64",
-                fix="write them again without scale_factor and add_offset",
-            )
-    held = {name: file.variables[name] for name in ARRAYS if name in file.variables}
+        file.set_auto_maskandscale(False)
+        arrays = {name: file.variables[name] for name in ARRAYS if name in file.variables}
+        # Values that stand for others are refused: they are read as they are stored.
+        for name, stored in arrays.items():
+            packed = {"scale_factor", "add_offset"} & set(stored.ncattrs())
+            if packed and name != MATERIAL:
+                raise UnreadableFileError(
+                    "the values are packed",
+                    where=f"{path}, {name}, {', '.join(sorted(packed))}",
+                    expected="positions as they are, float32 or float64",
+                    fix="write them again without scale_factor and add_offset",
+                )
 
     def read() -> Iterator[Frame]:
-        try:
-            yield from _frames(held)
-        except (OSError, RuntimeError) as error:
-            raise _unreadable(path, error) from error
+        with _reading(path):
+            yield from _frames(arrays)
 
+    with _reading(path):
+        return _trajectory(str(path), arrays, read, interval)
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Turn what damaged bytes raise, which is nearly any type, into an UnreadableFileError."""
     try:
-        return _trajectory(str(path), held, read, interval)
-    except (OSError, RuntimeError) as error:
-        raise _unreadable(path, error) from error
-
-
-def _unreadable(path: Path, error: Exception) -> UnreadableFileError:
-    return UnreadableFileError(
-        "cannot read the file",
-        where=str(path),
-        expected="arrays of numbers",
-        got=f"{type(error).__name__}: {error}",
-    )
+        yield
+    except LagbenchError:
+        raise
+    except Exception as error:
+        raise UnreadableFileError(
+            "cannot read the file",
+            where=str(path),
+            expected="arrays of numbers",
+            got=f"{type(error).__name__}: {error}",
+        ) from error
 
 
 def _unbroken(trajectory: Trajectory, stated: Source) -> Trajectory:

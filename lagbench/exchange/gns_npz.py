@@ -97,11 +97,21 @@ def _trajectory(name: str, item: object, given: Mapping[int, str]) -> Trajectory
     parts = list(item) if several else []  # type: ignore[call-overload]
     if len(parts) not in (2, 3) or not isinstance(parts[0], np.ndarray):
         raise UnreadableFileError(
-            "this is no trajectory", where=name, expected="positions, kinds[, a material property]", got=item
+            "this is no trajectory",
+            where=name,
+            expected="positions, kinds[, a material property]",
+            got=f"{type(item).__name__} of {len(parts)}" if several else type(item).__name__,
         )
     position = parts[0]
     check_array(name, position.shape, position.dtype)
-    numbers, particles = np.asarray(parts[1]), position.shape[1]
+    particles = position.shape[1]
+    try:
+        numbers = np.asarray(parts[1])
+        values = np.unique(np.asarray(parts[2:], dtype=np.float64))
+    except (ValueError, TypeError, OverflowError) as error:
+        raise UnreadableFileError(
+            "these are no kinds and no material property", where=name, expected="numbers", got=error
+        ) from error
     if numbers.dtype.kind not in "iu" or numbers.shape not in ((), (1,), (particles,)):
         raise UnreadableFileError(
             "these are no kinds of particles",
@@ -111,7 +121,8 @@ def _trajectory(name: str, item: object, given: Mapping[int, str]) -> Trajectory
         )
     numbers = np.broadcast_to(numbers, (particles,))
     material, kept = materials_of(Format.GNS_NPZ, numbers, given=given, where=name)
-    values = np.unique(np.asarray(parts[2:], dtype=np.float64))
+    if len(values) == 1 and not np.isfinite(values[0]):
+        raise UnreadableFileError("the material property is not finite", where=name, got=values[0])
     chosen = position if kept.all() else position[:, kept]
     return Trajectory(
         name=name,

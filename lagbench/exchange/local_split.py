@@ -203,7 +203,11 @@ class _Building:
             position = self.about.measure.place(raw)
             self._check(trajectory, number, position)
             if own is not None:
-                yield position, (own / self.about.measure.scale).astype(np.float32)
+                with np.errstate(over="ignore"):  # what is beyond float32 becomes infinite
+                    velocity = (own / self.about.measure.scale).astype(np.float32)
+                if not np.isfinite(velocity).all():
+                    raise DataError("a velocity is not finite", where=f"{trajectory.name}, frame {number}")
+                yield position, velocity
             elif before is not None:
                 velocity = ((position.astype(np.float64) - before) * self.about.rate).astype(np.float32)
                 if number == 1:
@@ -312,7 +316,7 @@ class _Building:
     def _task(self, *, shortest: int) -> dict[str, object]:
         """Return the task, as far as the shortest test scenario allows one."""
         about = self.about
-        horizon = about.horizon or shortest - about.input_frames
+        horizon = shortest - about.input_frames if about.horizon is None else about.horizon
         last = about.input_frames + horizon - 1
         if horizon < 1 or last >= shortest:
             raise UsageError(

@@ -14,6 +14,7 @@ from __future__ import annotations
 import enum
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
@@ -126,7 +127,7 @@ def parse_kinds(text: str | None) -> dict[int, str]:
     kinds: dict[int, str] = {}
     for part in text.split(",") if text else ():
         number, _, name = part.strip().partition("=")
-        if not number.lstrip("-").isdecimal():
+        if not re.fullmatch(r"-?[0-9]{1,9}", number):
             raise UsageError("bad kinds", where="--kinds", expected="as in 3=jelly,0=drop", got=text)
         if name != DROP:
             _code(name)

@@ -14,6 +14,7 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError, with_config
 from typing_extensions import TypedDict  # pydantic reads that of Python 3.12 and later only
 
 from lagbench.data.checksums import round_digits
+from lagbench.data.limits import FRAMES, NEEDED
 from lagbench.data.local import is_name
 from lagbench.data.yamlfile import read_yaml
 from lagbench.errors import DataError, UnreadableFileError, UsageError
@@ -187,6 +188,13 @@ class Description:
         for option, value in positive.items():
             if not (LEAST <= value <= MOST):
                 raise UsageError("not a number above 0 that computes", where=option, got=value)
+        for option, count, least in (
+            ("--input-frames", self.input_frames, 2),
+            ("--horizon", self.horizon, 1),
+        ):
+            if count is not None and count < least:
+                expected = f"at least {least}"
+                raise UsageError("too few frames for a task", where=option, expected=expected, got=count)
         if self.bounds is not None and any(not -MOST <= low < high <= MOST for low, high in self.bounds):
             raise UsageError("bounds run from low to high", where="--bounds", got=self.bounds)
         if self.cells is not None and not FEWEST_CELLS <= self.cells <= MOST_CELLS:
@@ -227,7 +235,7 @@ def estimate_spacing(position: Array, radius: float) -> float:
 
 
 def check_array(name: str, shape: tuple[int, ...], dtype: np.dtype[np.generic]) -> None:
-    """Refuse positions that are no floats of two components over frames and particles."""
+    """Refuse positions that are no floats of two components, or of more particles than a split may have."""
     if len(shape) != 3 or dtype.kind != "f":
         raise UnreadableFileError(
             "these are no positions",
@@ -246,6 +254,11 @@ def check_array(name: str, shape: tuple[int, ...], dtype: np.dtype[np.generic]) 
         )
     if shape[0] < 2 or shape[1] < 1:
         raise DataError("too little for a trajectory", where=name, expected="2 frames, 1 particle", got=shape)
+    for what, limit, count in zip(
+        ("frames", "particles"), (FRAMES, NEEDED["particles"]), shape, strict=False
+    ):
+        if not limit.holds(count):
+            raise DataError(f"too many {what} for a trajectory", where=name, expected=limit, got=count)
 
 
 def check_inflation(where: str, *, packed: int, unpacked: int) -> None:
