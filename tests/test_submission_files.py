@@ -14,6 +14,7 @@ import pytest
 import xarray as xr
 from bad_submissions import FAULTS
 from faulty import positions, rows, store
+from full_disk import largest_file
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -137,8 +138,20 @@ def test_velocities_and_frozen_rollouts_are_recorded(bench: Bench) -> None:
     with open_predictions(path) as predictions:
         assert predictions.header.diverged_at == {5: 7}
     assert not bench.validate(path).findings
-    with pytest.raises(WorkFailedError, match="cannot write"):  # a parent that is a file
+    with pytest.raises(WorkFailedError, match="cannot write") as told:  # a parent that is a file
         write(bench.valid / "p.nc", RIGHT, **options(bench))
+    assert "--output" in str(told.value.fix)
+
+
+@pytest.mark.parametrize("size", [0, 5_000])
+@pytest.mark.parametrize("whole", [True, False])
+def test_a_full_disk_is_said(bench: Bench, tmp_path: Path, size: int, whole: bool) -> None:
+    """Wherever the disk fills up, that is said and nothing is left, whatever the values lack."""
+    values = RIGHT if whole else {TESTS[0]: RIGHT[TESTS[0]]}
+    with largest_file(size), pytest.raises(WorkFailedError) as told:
+        write(tmp_path / "p.nc", values, **options(bench))
+    assert "--output" in str(told.value.fix)
+    assert not list(tmp_path.iterdir())
 
 
 def test_labels_may_come_while_writing(bench: Bench) -> None:

@@ -347,7 +347,7 @@ def _publish(
     with tempfile.TemporaryDirectory(prefix=STAGE, dir=folder.path) as stage:
         staged = [Path(stage) / name.name for name in names]
         for card, target in zip(cards, staged, strict=True):
-            write_statistics(card, target)
+            write_statistics(card, target, option="--board")
             length = target.stat().st_size
             if length > MAX_SCORE_BYTES:
                 raise WorkFailedError(

@@ -159,7 +159,7 @@ _NO_DATES = ["-fflags", "+bitexact", "-flags:v", "+bitexact"]
 @contextmanager
 def open_video(path: Path, size: tuple[int, int], frames_per_second: float) -> Iterator[Write]:
     """Yield a function that appends a frame; the file appears when the body ends well."""
-    with atomic_path(path) as temporary:
+    with atomic_path(path, option="--output") as temporary:
         gif = path.suffix.lower() == ".gif"
         coder = _gif(temporary, frames_per_second) if gif else _mp4(temporary, size, frames_per_second)
         with coder as write:

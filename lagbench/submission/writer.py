@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -101,13 +101,13 @@ class PredictionsWriter:
         import netCDF4
 
         with ExitStack() as stack:
-            temporary = stack.enter_context(atomic_path(self.path))
+            temporary = stack.enter_context(atomic_path(self.path, option="--output"))
             try:
                 self._file = netCDF4.Dataset(temporary, "w", format="NETCDF4")
-            except OSError as error:
+                stack.callback(self._abandon)
+                self._define()
+            except (OSError, RuntimeError) as error:
                 raise self._refused(error) from error
-            stack.callback(lambda: self._file.isopen() and self._file.close())
-            self._define()
             self._stack = stack.pop_all()
         return self
 
@@ -166,13 +166,19 @@ class PredictionsWriter:
                     expected=spell_ids(self._rows),
                     got=f"missing: {spell_ids(missing)}",
                 )
-            if (self._diverged != NEVER).any():
-                self._create("diverged_at", "i4", ("scenario",), self._diverged)
-            self._file.setncatts(self._labels)
             try:
+                if (self._diverged != NEVER).any():
+                    self._create("diverged_at", "i4", ("scenario",), self._diverged)
+                self._file.setncatts(self._labels)
                 self._file.close()
             except (OSError, RuntimeError) as failure:
                 raise self._refused(failure) from failure
+
+    def _abandon(self) -> None:
+        """Close a file that goes; that it cannot be written either must not hide the error before."""
+        if self._file.isopen():
+            with suppress(OSError, RuntimeError):
+                self._file.close()
 
     def _checked(self, name: str, scenario: int, values: ArrayLike) -> NDArray[np.float32]:
         where = f"{name} of scenario {scenario}"
@@ -239,7 +245,7 @@ class PredictionsWriter:
             variable[:] = values
 
     def _refused(self, error: Exception) -> WorkFailedError:
-        fix = "free disk space, or name a folder that you may write to"
+        fix = "free disk space, or name a folder that you may write to: --output"
         return WorkFailedError("cannot write the predictions", where=str(self.path), got=error, fix=fix)
 
 
