@@ -111,8 +111,17 @@ def _nan(values: np.ndarray) -> np.ndarray:
         ({}, {"seed": "three"}, "an integer"),
         ({}, {"seed": True}, "an integer"),
         ({}, {"parameters": -5}, "an integer >= 0"),
+        ({}, {"seed": 2**70}, "an integer"),
+        ({}, {"seconds_per_frame": 10**400}, "positive"),
+        ({}, {"device": "\udcff"}, "text"),
+        ({}, {"training": "x" * 70_000}, "text"),
+        *(({}, {"method": name}, "printable text") for name in ("", " ", "a\x07", "\udcff", "x" * 201, None)),
+        *(({}, {"dataset_sha256": held}, "64 hex digits") for held in ("zz", "", 5)),
         ({}, {"seconds_per_frame": -1}, "positive"),
         ({}, {"seconds_per_frame": float("inf")}, "positive"),
+        # rows instead of ids
+        (RIGHT, {"diverged_at": {0: 10}}, "by id"),
+        (RIGHT, {"velocities": RIGHT | {0: RIGHT[3]}}, "by id"),
         # a mark before motion that goes on, beyond the horizon, or in the given frames
         (RIGHT, {"diverged_at": {4: 7}}, "frame 8 differs"),
         *((RIGHT, {"diverged_at": {4: mark}}, "no such frame") for mark in (100_000, GIVEN - 1, -5)),

@@ -18,8 +18,9 @@ from lagbench.data.registry import Registry, Size, spell_ids
 from lagbench.errors import DataError, UsageError, WorkFailedError, nearest
 from lagbench.store.copy import bring
 
+from .findings import quoted
 from .format import DIMS, FORMAT, NEVER, OPTIONAL, SPACE, fits, kind_of
-from .task_checks import dataset_hash_of, frames_to_predict
+from .task_checks import HASH, dataset_hash_of, frames_to_predict
 from .truth import Truth
 
 CHUNK_CACHE = 1 << 20
@@ -66,7 +67,10 @@ class PredictionsWriter:
     ) -> None:
         self.path = Path(path)
         self.size, folder, _ = locate(split, size, root=root, registry=registry)
-        self._hash = dataset_sha256 or _known_hash(self.size, folder)
+        self._hash = _known_hash(self.size, folder) if dataset_sha256 is None else dataset_sha256
+        if not isinstance(self._hash, str) or not HASH.fullmatch(self._hash):
+            raise UsageError("dataset_sha256 does not fit", expected="64 hex digits", got=quoted(self._hash))
+        _require_fit("method", method)
         self._names = ("position", "velocity") if velocity else ("position",)
         self._rows = {scenario: row for row, scenario in enumerate(sorted(self.size.subsets["test"]))}
         self._written: set[int] = set()
@@ -92,8 +96,7 @@ class PredictionsWriter:
         for name, value in labels.items():
             if name not in OPTIONAL:
                 raise UsageError(f"no label {name!r}", fix=nearest(name, OPTIONAL))
-            if not fits(name, value):
-                raise UsageError(f"the label {name!r} does not fit", expected=kind_of(name), got=repr(value))
+            _require_fit(name, value)
             self._labels[name] = value
 
     def __enter__(self) -> Self:
@@ -258,6 +261,12 @@ _ATTRIBUTES: Mapping[str, Mapping[str, str]] = {
 }
 
 
+def _require_fit(name: str, value: object) -> None:
+    """Refuse what `validate` would refuse of the file."""
+    if not fits(name, value):
+        raise UsageError(f"the label {name!r} does not fit", expected=kind_of(name), got=quoted(value))
+
+
 def _known_hash(size: Size, root: Path) -> str:
     bring(size, root)
     known = dataset_hash_of(size, root)
@@ -305,7 +314,7 @@ def write(
         The path.
 
     Raises:
-        UsageError: unknown names, wrong shapes, missing scenarios, values that are not finite.
+        UsageError: unknown names or scenarios, wrong shapes, missing scenarios, values that are not finite.
         DataError: the hash of the data set is not known.
         WorkFailedError: the disk is full or not writable.
     """
@@ -322,6 +331,15 @@ def write(
     )
     ids = sorted(writer.size.subsets["test"])
     placed, moving = _by_id(positions, ids), None if velocities is None else _by_id(velocities, ids)
+    for name, held in (("velocities", moving), ("diverged_at", diverged_at)):
+        if unknown := [scenario for scenario in held or {} if scenario not in ids]:
+            raise UsageError(
+                "no such test scenario",
+                where=name,
+                expected=spell_ids(ids),
+                got=", ".join(map(quoted, unknown[:5])),
+                fix="name scenarios by id, not by row",
+            )
     with writer:
         for scenario, values in placed.items():
             velocity = None if moving is None else moving.get(scenario)
