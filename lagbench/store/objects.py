@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from lagbench.atomic import atomic_path, write_atomically
 from lagbench.errors import DataError, LagbenchError, UsageError, WorkFailedError, require
@@ -177,12 +177,18 @@ def _refusal_of_status(error: urllib.error.HTTPError, url: str, offset: int, rem
 class _Redirections(urllib.request.HTTPRedirectHandler):
     """Tells a store that leads to no address from an address that the user mistyped."""
 
-    def http_error_302(self, *answer: Any) -> Any:  # noqa: ANN401
+    def http_error_302(
+        self,
+        req: urllib.request.Request,
+        fp: IO[bytes],
+        code: int,
+        msg: str,
+        headers: http.client.HTTPMessage,
+    ) -> Any:  # noqa: ANN401
         try:
-            return super().http_error_302(*answer)
+            return super().http_error_302(req, fp, code, msg, headers)
         except (ValueError, http.client.InvalidURL) as error:
-            asked = answer[0].full_url
-            raise NotDataError("the store leads to no address", where=asked, got=str(error)) from error
+            raise NotDataError("the store leads to no address", where=req.full_url, got=str(error)) from error
 
     http_error_301 = http_error_303 = http_error_307 = http_error_308 = http_error_302
 
