@@ -1,6 +1,6 @@
 """``python -m lagbench`` is the command line."""
 
-from .cli.app import app
+from .cli import main
 
 if __name__ == "__main__":
-    app()
+    main()

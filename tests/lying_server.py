@@ -58,6 +58,8 @@ class _Handler(BaseHTTPRequestHandler):
             return self._send(403, b"no")
         if fault == "elsewhere":
             return self._send(302, b"", {"Location": "file:///etc/passwd"})
+        if fault == "nowhere":
+            return self._send(302, b"", {"Location": "http://[::1"})
         if fault == "busy once" and self.mirror.count(self.path) == 1:
             return self._send(503, b"later")
         if fault == "gone" or not path.is_file():
@@ -93,6 +95,8 @@ class _Handler(BaseHTTPRequestHandler):
                 return self._send(status, body[: len(body) // 2], headers, length=-1)
             case "wrong range" if start:
                 headers["Content-Range"] = f"bytes {start + 7}-{whole - 1}/{whole}"
+            case "announces a number without end":
+                return self._send(status, body, {**headers, "Content-Length": "9" * 5000}, length=-1)
             case "endless":
                 return self._endless()
             case "slow":

@@ -151,6 +151,13 @@ def test_ffmpeg_that_fails_is_reported(swirl: Path, tmp_path: Path, monkeypatch:
     assert not list(tmp_path.iterdir())
 
 
+def test_a_film_that_cannot_be_written_names_its_option(swirl: Path) -> None:
+    """Where a file is in the way, the remedy is the option that names the film."""
+    with pytest.raises(WorkFailedError) as told:
+        animate(swirl, swirl / "x.gif", every=5)
+    assert "--output" in str(told.value.fix)
+
+
 def test_no_progress_without_a_terminal(
     swirl: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

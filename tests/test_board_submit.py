@@ -140,6 +140,26 @@ def test_words_of_predictions_that_cannot_be_shown(own: BoardBench, text: str) -
     assert {path for path in tree(own.folder) if "odd" in path} <= before
 
 
+@pytest.mark.parametrize(
+    ("key", "labels"),
+    [
+        ("cost.device", {"device": "bad\x1b[31m\ndev"}),
+        ("cost.device", {"device": "   "}),
+        ("cost.seconds_per_frame", {"seconds_per_frame": 1e-9}),
+        ("cost.solver_seconds_per_frame", {"solver_seconds_per_frame": 1e300}),
+    ],
+)
+def test_a_cost_of_predictions_that_no_entry_can_hold(
+    own: BoardBench, key: str, labels: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Valid predictions may tell a cost beyond what the board takes: the key is named before the work."""
+    monkeypatch.setattr(submitting, "score", _never)
+    path = own.predict(nearer, "odd", **{"device": "a laptop", "seconds_per_frame": 0.25, **labels})
+    with pytest.raises(ChecksFailedError) as told:
+        own.submit(path)
+    assert f"{key}: " in str(told.value.got)
+
+
 def test_mistakes_are_told_together(own: BoardBench, predictions: Path) -> None:
     """All that is wrong with an entry is in one error: whoever mends it all can submit."""
     keys = {"name": "NO\u0406SY", "urls": ("https://a.org/1", "https://a.org/2")}

@@ -2,27 +2,32 @@
 
 from __future__ import annotations
 
+import io
 import json
+import os
 import re
 import shutil
 import subprocess
+import sys
 import tomllib
 from collections.abc import Callable
 from importlib.metadata import requires
 from pathlib import Path
 
 import pytest
+import typer
 import yaml
 from conftest import SIZE, SPLIT
 from typer.main import get_command
 from typer.testing import Result
 
+from lagbench.cli import main
 from lagbench.cli.app import app
 from lagbench.cli.machine import NEEDED
 from lagbench.cli.output import progress_bar
 from lagbench.data.registry import default_path, load
 from lagbench.make.generate import GenerationResult
-from lagbench.work.progress import Progress
+from lagbench.work.progress import Progress, watched
 
 Run = Callable[..., Result]
 
@@ -343,3 +348,44 @@ def test_pictures_go_to_folders_that_are_there(
     assert result.exit_code == 2, result.output
     assert str(lost) in result.stderr
     assert not lost.exists()
+
+
+COMMAND = [sys.executable, "-m", "lagbench"]
+
+
+@pytest.mark.parametrize("words", [("--help",), ("list",), ("list", "--json")])
+def test_a_reader_that_has_left(words: tuple[str, ...]) -> None:
+    """Text, tables and help into a pipe that nobody reads end in silence, as the shell's commands do."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "w") as pipe:
+        done = subprocess.run([*COMMAND, *words], stdout=pipe, stderr=subprocess.PIPE, check=False)
+    assert (done.returncode, done.stderr) == (141, b"")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
+def test_output_that_finds_no_space() -> None:
+    """That is work that failed, and no fault of lagbench."""
+    with open("/dev/full", "w") as full:
+        done = subprocess.run([*COMMAND, "--version"], stdout=full, stderr=subprocess.PIPE, check=False)
+    assert done.returncode == 5
+    assert b"free disk space" in done.stderr
+    assert b"unexpected" not in done.stderr
+
+
+def test_letters_that_a_stream_has_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are escaped: what was computed is told all the same."""
+    held = io.BytesIO()
+    with io.TextIOWrapper(held, encoding="latin-1") as stream:
+        monkeypatch.setattr(sys, "stdout", stream)
+        monkeypatch.setattr("lagbench.cli.app.app", lambda: typer.echo("a \u2265 b"))
+        main()
+        assert held.getvalue() == b"a \\u2265 b\n"
+
+
+def test_work_goes_on_without_stderr(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where it is closed, Python has no such stream."""
+    monkeypatch.setattr(sys, "stderr", None)
+    assert not watched()
+    with progress_bar(quiet=False) as tell:
+        assert tell is not None

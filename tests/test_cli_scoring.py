@@ -221,7 +221,7 @@ def test_a_reader_that_leaves_early_leaves_the_report(
         raise BrokenPipeError
 
     monkeypatch.setattr(typer, "echo", gone)
-    run("score", predictions, "--report", predictions.parent / "rep")
+    assert run("score", predictions, "--report", predictions.parent / "rep").exit_code == 141
     assert (predictions.parent / "rep" / "index.html").is_file()
 
 

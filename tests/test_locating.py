@@ -11,8 +11,10 @@ import platformdirs
 import pytest
 from exchange_readers import straight_runs
 from scenario_factory import make_key
+from typer.testing import CliRunner
 
 import lagbench
+from lagbench.cli.app import app
 from lagbench.data.layout import dataset_folder, resolve_root, scenario_path
 from lagbench.data.local import home, is_name, locate, locate_new, rooted
 from lagbench.data.registry import load
@@ -38,12 +40,22 @@ def test_root_given_then_environment_then_platform(monkeypatch: pytest.MonkeyPat
     assert scenario_path(Path("r"), make_key(7)).as_posix() == "r/cavity/tiny/v2/test/0007.nc"
 
 
-@pytest.mark.parametrize("root", ["x" * 300, "a/" * 3000, "nul\0"])
+@pytest.mark.parametrize(
+    "root", ["x" * 300, "a/" * 3000, "nul\0", "", " ", "s3://", "s3:", "file:///", "~nobodyx/y"]
+)
 def test_a_root_that_no_folder_can_be_named_is_ours_to_refuse(root: str) -> None:
-    """A component of 300 characters, a path of 6000, a NUL: exit code 2."""
+    """Too long, a NUL, nothing, a scheme alone, the home of nobody: exit code 2."""
     with pytest.raises(UsageError) as caught:
         resolve_root(root)
     assert "--root" in str(caught.value.where)
+
+
+def test_an_empty_option_is_not_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A path made of nothing is ".", so the command line looks before."""
+    monkeypatch.chdir(tmp_path)
+    done = CliRunner().invoke(app, ["list", "--root", ""])
+    assert done.exit_code == 2
+    assert CliRunner().invoke(app, ["list", "--root", "."]).exit_code == 0
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,7 @@ from lagbench.draw.panels import Panel, draw_walls, limit_of
 from lagbench.draw.plot import KINDS, contact_sheet, describe, plot_frame
 from lagbench.draw.recording import open_recording
 from lagbench.draw.style import figure, pixels_of
-from lagbench.errors import DataError, UsageError
+from lagbench.errors import DataError, UsageError, WorkFailedError
 from lagbench.store.dataset import open_split
 
 PNG_HEAD = b"\x89PNG\r\n\x1a\n"
@@ -193,6 +193,13 @@ def test_only_known_endings_are_taken(swirl: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError):
         plot_frame(swirl, 0, tmp_path / "x.jpg")
     assert not list(tmp_path.iterdir())
+
+
+def test_a_picture_that_cannot_be_written_names_its_option(swirl: Path) -> None:
+    """Where a file is in the way, the remedy is the option that names the picture."""
+    with pytest.raises(WorkFailedError) as told:
+        plot_frame(swirl, 0, swirl / "x.png")
+    assert "--output" in str(told.value.fix)
 
 
 def test_without_matplotlib_the_extra_is_named(

@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from full_disk import largest_file
 from score_bench import ScoreBench, straight
 
-from lagbench.errors import UnreadableFileError
+from lagbench.errors import UnreadableFileError, WorkFailedError
 from lagbench.metrics import Tally, aggregate, select
 from lagbench.metrics.distributions import histograms
 from lagbench.scoring.card import ScoreCard, digits, read_scores
@@ -89,6 +90,16 @@ def test_full_submissions_take_300_kb(card: ScoreCard, tmp_path: Path) -> None:
     path = tmp_path / "scores.nc"
     write_statistics(noisy(card), path)
     assert 200_000 < path.stat().st_size <= 300_000
+
+
+@pytest.mark.parametrize("size", [0, 20_000])
+def test_a_full_disk_is_said(card: ScoreCard, tmp_path: Path, size: int) -> None:
+    """Most bytes are written when the file is closed: what is refused then is told too, with the remedy."""
+    with largest_file(size), pytest.raises(WorkFailedError) as told:
+        write_statistics(noisy(card), tmp_path / "scores.nc", option="--board")
+    assert told.value.where == str(tmp_path / "scores.nc")
+    assert "--board" in str(told.value.fix)
+    assert not list(tmp_path.iterdir())
 
 
 def test_stored_statistics_are_rounded() -> None:

@@ -144,7 +144,9 @@ def test_what_is_no_manifest_is_told_at_once(store: Store, here: Path) -> None:
     assert caught.value.where == f"{store.url}/own/full/v1/manifest.json"
 
 
-@pytest.mark.parametrize("fault", ["drops", "no ranges", "busy once", "wrong range"])
+@pytest.mark.parametrize(
+    "fault", ["drops", "no ranges", "busy once", "wrong range", "announces a number without end"]
+)
 def test_a_bad_line_costs_time_only(server: Mirror, here: Path, fault: str) -> None:
     """Broken connections are taken up by range, or from the start where the server knows no ranges."""
     server.faults = {FIRST: fault}
@@ -178,6 +180,7 @@ def test_an_interrupted_download_goes_on(server: Mirror, here: Path) -> None:
     [
         ("page", objects.NotDataError),
         ("hidden page", objects.NotDataError),
+        ("nowhere", objects.NotDataError),
         ("announces more", objects.WrongLengthError),
         ("announces less", objects.WrongLengthError),
         ("chopped", objects.WrongLengthError),
@@ -299,6 +302,25 @@ def test_nobody_answers(here: Path) -> None:
         with pytest.raises(objects.StoreUnreachableError) as caught:
             download("own", root=here, mirror=address, or_generate=False)
     assert str(caught.value.where).startswith(address)
+
+
+@pytest.mark.parametrize(
+    "address", ["http://[::1", "http://host:abc/data", "http://exa mple/data", "http:///data", "http://a..b/"]
+)
+def test_what_is_no_address(here: Path, address: str) -> None:
+    """It is told at once, as the user's, and names what was typed."""
+    with pytest.raises(UsageError) as caught:
+        download("own", root=here, mirror=address, or_generate=False)
+    assert str(caught.value.where).startswith(address)
+
+
+def test_addresses_are_percent_encoded(original: LocalSplit, here: Path) -> None:
+    """A folder of any name can be asked for; what is encoded already is asked for as it stands."""
+    with serving(original.folder.parent) as running:
+        for typed, asked in (("\u20ac x", "%E2%82%AC%20x"), ("%E2%82%AC", "%E2%82%AC")):
+            with pytest.raises(objects.NotInStoreError):
+                download("own", root=here, mirror=f"{running.url}/{typed}", or_generate=False)
+            assert running.asked.pop()[0].startswith(f"/{asked}/own/full/v1/")
 
 
 def test_simulated_splits_come_from_a_store_or_are_simulated(

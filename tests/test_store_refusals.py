@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 import lagbench
 from lagbench.cli.app import app
+from lagbench.data.layout import CACHE_VARIABLE
 from lagbench.errors import DataError, LagbenchError, UsageError, WorkFailedError
 from lagbench.exchange import download
 from lagbench.make.generate import generate
@@ -91,6 +92,17 @@ def test_no_such_kind(use: Use) -> None:
     """A scheme that fsspec does not know is a usage error."""
     with pytest.raises(UsageError, match="no such kind of address"):
         use("nonsense://data/x")
+
+
+@pytest.mark.parametrize("root", ["http://host/data", "nonsense://data/x"])
+def test_where_nothing_can_be_written_nothing_is_kept(
+    root: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The address is judged before its working copy is made."""
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
+    with pytest.raises(UsageError):
+        generate(SPLIT, SIZE, root=root, dry_run=True)
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_command_line_says_it_too(s3: str) -> None:

@@ -14,6 +14,7 @@ import pytest
 import xarray as xr
 from bad_submissions import FAULTS
 from faulty import positions, rows, store
+from full_disk import largest_file
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -110,8 +111,17 @@ def _nan(values: np.ndarray) -> np.ndarray:
         ({}, {"seed": "three"}, "an integer"),
         ({}, {"seed": True}, "an integer"),
         ({}, {"parameters": -5}, "an integer >= 0"),
+        ({}, {"seed": 2**70}, "an integer"),
+        ({}, {"seconds_per_frame": 10**400}, "positive"),
+        ({}, {"device": "\udcff"}, "text"),
+        ({}, {"training": "x" * 70_000}, "text"),
+        *(({}, {"method": name}, "printable text") for name in ("", " ", "a\x07", "\udcff", "x" * 201, None)),
+        *(({}, {"dataset_sha256": held}, "64 hex digits") for held in ("zz", "", 5)),
         ({}, {"seconds_per_frame": -1}, "positive"),
         ({}, {"seconds_per_frame": float("inf")}, "positive"),
+        # rows instead of ids
+        (RIGHT, {"diverged_at": {0: 10}}, "by id"),
+        (RIGHT, {"velocities": RIGHT | {0: RIGHT[3]}}, "by id"),
         # a mark before motion that goes on, beyond the horizon, or in the given frames
         (RIGHT, {"diverged_at": {4: 7}}, "frame 8 differs"),
         *((RIGHT, {"diverged_at": {4: mark}}, "no such frame") for mark in (100_000, GIVEN - 1, -5)),
@@ -137,8 +147,20 @@ def test_velocities_and_frozen_rollouts_are_recorded(bench: Bench) -> None:
     with open_predictions(path) as predictions:
         assert predictions.header.diverged_at == {5: 7}
     assert not bench.validate(path).findings
-    with pytest.raises(WorkFailedError, match="cannot write"):  # a parent that is a file
+    with pytest.raises(WorkFailedError, match="cannot write") as told:  # a parent that is a file
         write(bench.valid / "p.nc", RIGHT, **options(bench))
+    assert "--output" in str(told.value.fix)
+
+
+@pytest.mark.parametrize("size", [0, 5_000])
+@pytest.mark.parametrize("whole", [True, False])
+def test_a_full_disk_is_said(bench: Bench, tmp_path: Path, size: int, whole: bool) -> None:
+    """Wherever the disk fills up, that is said and nothing is left, whatever the values lack."""
+    values = RIGHT if whole else {TESTS[0]: RIGHT[TESTS[0]]}
+    with largest_file(size), pytest.raises(WorkFailedError) as told:
+        write(tmp_path / "p.nc", values, **options(bench))
+    assert "--output" in str(told.value.fix)
+    assert not list(tmp_path.iterdir())
 
 
 def test_labels_may_come_while_writing(bench: Bench) -> None:

@@ -5,10 +5,8 @@ from __future__ import annotations
 import json
 import os
 import random
-import resource
 import signal
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -19,6 +17,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from full_disk import largest_file
 from scipy.special import comb
 from simple_models import FACTS, Drift, trainer
 from torch import Tensor
@@ -350,17 +349,6 @@ def test_gravity_has_no_square_of_images(split: str, tmp_path: Path) -> None:
         train("gns", split, "tiny", root=tmp_path, settings=("model.symmetry=mirror",))
     with pytest.raises(DataError):
         train("gns", "cavity", "tiny", **there)
-
-
-@contextmanager
-def largest_file(size: int) -> Iterator[None]:
-    """Let the system refuse files above a size, as it refuses them on a full disk [byte]."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def test_a_full_disk(run: Run) -> None:

@@ -184,22 +184,23 @@ class Cost(Strict):
     device: Short
     solver_seconds_per_frame: Seconds | None = None
 
-    @classmethod
-    def of(cls, headers: Sequence[Header], solver: float | None = None) -> Self | None:
+    @staticmethod
+    def told(headers: Sequence[Header], solver: float | None = None) -> dict[str, object] | None:
         """Return the mean cost over files of predictions; None unless all tell it and one machine.
 
         The solver's time is the one that is given, else the mean of those that the files tell [s].
+        Predictions may say what no entry may, so these are keys and values to examine, not a cost.
         """
         times = [header.seconds_per_frame for header in headers if header.seconds_per_frame is not None]
         device = headers[0].device
         if len(times) < len(headers) or not device or any(header.device != device for header in headers):
             return None
         told = [held for one in headers if (held := one.solver_seconds_per_frame) is not None]
-        return cls(
-            seconds_per_frame=round_digits(sum(times) / len(times), 6),
-            device=device[:100],
-            solver_seconds_per_frame=solver or (round_digits(sum(told) / len(told), 6) if told else None),
-        )
+        return {
+            "seconds_per_frame": round_digits(sum(times) / len(times), 6),
+            "device": device[:100],
+            "solver_seconds_per_frame": solver or (round_digits(sum(told) / len(told), 6) if told else None),
+        }
 
     @property
     def speed_up(self) -> float | None:

@@ -140,6 +140,6 @@ def write_floors(card: ScoreCard, folder: Folder) -> tuple[Path, ...]:
         tallies = {SUBMISSION: card.tallies[name]}
         named, nobody = replace(header, method=name), "0" * 64
         floor = replace(card, header=named, predictions_sha256=nobody, tallies=tallies, preview=truth)
-        write_statistics(floor, path)
+        write_statistics(floor, path, option="--board")
         written.append(path)
     return tuple(sorted(written))

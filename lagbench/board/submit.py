@@ -311,7 +311,7 @@ def _about(headers: Sequence[Header], meta: Meta) -> About:
     held["training"] = meta.training or (first.training or "")[:LONGEST_TEXT]
     if meta.parameters is None:
         held["parameters"] = first.parameters
-    held["cost"] = meta.cost or Cost.of(headers, meta.solver_seconds_per_frame)
+    held["cost"] = meta.cost or Cost.told(headers, meta.solver_seconds_per_frame)
     if meta.budget is not None and meta.budget.track is not None:
         raise UsageError(
             "a track is not stated",
@@ -347,7 +347,7 @@ def _publish(
     with tempfile.TemporaryDirectory(prefix=STAGE, dir=folder.path) as stage:
         staged = [Path(stage) / name.name for name in names]
         for card, target in zip(cards, staged, strict=True):
-            write_statistics(card, target)
+            write_statistics(card, target, option="--board")
             length = target.stat().st_size
             if length > MAX_SCORE_BYTES:
                 raise WorkFailedError(

@@ -6,6 +6,9 @@ and rich only.
 
 from __future__ import annotations
 
+import io
+import sys
+
 __all__ = ["main"]
 
 
@@ -13,4 +16,7 @@ def main() -> None:
     """Run the command line; the entry point ``lagbench``."""
     from .app import app
 
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a letter that a stream has not shall not end the work
+            stream.reconfigure(errors="backslashreplace")
     app()

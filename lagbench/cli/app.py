@@ -2,31 +2,38 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
-from lagbench.errors import LagbenchError, printable
+from lagbench.errors import LagbenchError, WorkFailedError, printable
 
 from . import board, data, draw, exchange, scoring, training
 from . import demo as tour
 
 INTERRUPTED = 130
 FAILED = 5
+UNREAD = 141  # what shells say of a command whose reader left, 128 + SIGPIPE
+FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 
 class _Commands(TyperGroup):
     """Turns whatever a command raises into a message on stderr and an exit code."""
 
+    def make_context(self, *args: Any, **extra: Any) -> Any:  # noqa: ANN401
+        with _refused_output():  # --help and --version print here
+            return super().make_context(*args, **extra)
+
     def invoke(self, ctx: Any) -> Any:  # noqa: ANN401 (typer and click disagree on its type)
         try:
-            with _plain_warnings():
+            with _plain_warnings(), _refused_output():
                 return super().invoke(ctx)
         except LagbenchError as error:
             typer.echo(f"lagbench: {error}", err=True)
@@ -34,7 +41,7 @@ class _Commands(TyperGroup):
         except KeyboardInterrupt:
             typer.echo("lagbench: interrupted; the same command goes on where it stopped", err=True)
             raise typer.Exit(INTERRUPTED) from None
-        except (typer.Exit, typer.Abort, BrokenPipeError):
+        except (typer.Exit, typer.Abort):
             raise
         except Exception as error:
             # click's usage errors, or typer's own copy of them, are typer's to show
@@ -48,6 +55,28 @@ class _Commands(TyperGroup):
                 err=True,
             )
             raise typer.Exit(FAILED) from error
+
+
+@contextmanager
+def _refused_output() -> Iterator[None]:
+    """End in silence where the reader of a pipe has left; say that there is no space to write to."""
+    try:
+        yield
+    except (BrokenPipeError, SystemExit) as left:
+        # rich makes one of the other
+        if isinstance(left, SystemExit) and not isinstance(left.__context__, BrokenPipeError):
+            raise
+        with suppress(AttributeError, OSError):  # what is still buffered would fail again at the end
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise typer.Exit(UNREAD) from None
+    except OSError as error:
+        if error.errno not in FULL:
+            raise
+        where = error.filename or "standard output, or another file that is written"
+        fix = "free disk space"
+        told = WorkFailedError("cannot write there", where=where, got=error.strerror, fix=fix)
+        typer.echo(f"lagbench: {told}", err=True)
+        raise typer.Exit(told.exit_code) from error
 
 
 @contextmanager

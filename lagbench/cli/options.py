@@ -9,6 +9,14 @@ import typer
 
 from lagbench.errors import UsageError
 
+
+def _root(text: str) -> Path:
+    """Return a root; an empty one would be the current folder as a path."""
+    if not text.strip():
+        raise typer.BadParameter("it is empty: name a folder, or leave it out")
+    return Path(text)
+
+
 SplitArgument = Annotated[str | None, typer.Argument(metavar="SPLIT", help="The same as --split.")]
 SplitOption = Annotated[
     str | None, typer.Option("--split", metavar="NAME", help="Data set; `lagbench list` names them.")
@@ -31,6 +39,7 @@ RootOption = Annotated[
     Path | None,
     typer.Option(
         "--root",
+        parser=_root,
         metavar="FOLDER",
         help="Where data sets live, or s3://bucket/prefix; else LAGBENCH_ROOT, else user data.",
     ),

@@ -8,7 +8,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -16,6 +15,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
+
+from lagbench.work.progress import watched
 
 if TYPE_CHECKING:
     from lagbench.scoring.tables import Table
@@ -137,7 +138,7 @@ def progress_bar(*, quiet: bool, counted: str = "scenarios") -> Iterator[Callabl
         with quietly():
             yield None
         return
-    if not sys.stderr.isatty():
+    if not watched():
         yield _in_lines(counted)
         return
     from rich.console import Console

@@ -30,6 +30,7 @@ CACHE_VARIABLE = "LAGBENCH_CACHE"
 MARK = "store.json"
 """Name of the file that says what a folder is a working copy of."""
 
+_NO_REST = re.compile(r"[a-z][a-z0-9+.-]+:/*")
 _URL = re.compile(r"([a-z][a-z0-9+.-]+):/(.*)", re.DOTALL)
 
 
@@ -89,7 +90,7 @@ def cache_folder(part: str) -> Path:
     """Return a folder of the user's cache, or the one that ``LAGBENCH_CACHE`` names for every part."""
     given = os.environ.get(CACHE_VARIABLE)
     if given:
-        return Path(given).expanduser().absolute()
+        return expanded(given, CACHE_VARIABLE)
     import platformdirs
 
     return platformdirs.user_cache_path("lagbench", appauthor=False) / part
@@ -97,6 +98,8 @@ def cache_folder(part: str) -> Path:
 
 ROOT_VARIABLE = "LAGBENCH_ROOT"
 """Environment variable that names the root folder."""
+
+_ROOT = f"--root or {ROOT_VARIABLE}"
 
 MANIFEST_NAME = "manifest.json"
 
@@ -153,15 +156,41 @@ def resolve_root(root: str | Path | None = None) -> Path:
         UsageError: no file system can have a folder of that name.
         WorkFailedError: the working copy of a URL cannot be made.
     """
-    given = root or os.environ.get(ROOT_VARIABLE)
-    if given:
-        url = as_url(given)
-        if url is not None:
-            return open_copy(url)
-        return _nameable(Path(given).expanduser().absolute())
-    import platformdirs
+    given = _given(root)
+    if given is None:
+        import platformdirs
 
-    return platformdirs.user_data_path("lagbench", appauthor=False)
+        return platformdirs.user_data_path("lagbench", appauthor=False)
+    url = as_url(given)
+    return _nameable(expanded(given, _ROOT)) if url is None else open_copy(url)
+
+
+def root_url(root: str | Path | None) -> str | None:
+    """Return the URL that the root of :func:`resolve_root` is; None for a folder. No copy is made."""
+    given = _given(root)
+    return None if given is None else as_url(given)
+
+
+def _given(root: str | Path | None) -> str | Path | None:
+    """Return the root that is given; refuse one that names nothing."""
+    given = os.environ.get(ROOT_VARIABLE) or None if root is None else root
+    if given is not None and (not str(given).strip() or _NO_REST.fullmatch(str(given))):
+        raise UsageError(
+            "that names no root",
+            where=_ROOT,
+            expected="a folder, or s3://bucket/prefix",
+            got=ascii(str(given)),
+        )
+    return given
+
+
+def expanded(path: str | Path, where: str) -> Path:
+    """Return a path made absolute, ~ replaced by the home folder; refuse the home of nobody."""
+    try:
+        return Path(path).expanduser().absolute()
+    except RuntimeError as error:
+        got = ascii(str(path))
+        raise UsageError("there is no such home folder", where=where, got=got, fix="write it out") from error
 
 
 def _nameable(folder: Path) -> Path:
@@ -173,7 +202,7 @@ def _nameable(folder: Path) -> Path:
         if too_long or isinstance(error, ValueError):
             raise UsageError(
                 "no folder can have that name",
-                where=f"--root or {ROOT_VARIABLE}",
+                where=_ROOT,
                 expected="a path",
                 got=f"{str(folder)[:60]!a}..., {len(str(folder))} characters",
             ) from error

@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 from lagbench.errors import UnreadableFileError, UsageError, nearest
 
-from .layout import dataset_folder, resolve_root, url_of
+from .layout import dataset_folder, expanded, resolve_root, url_of
 from .registry import NO_GENERATOR, Measured, Registry, Size, Split, load
 
 DESCRIPTION = "split.yaml"
@@ -114,7 +114,7 @@ def home(split: str, *, root: str | Path | None = None, registry: Registry | Non
         UsageError: unknown split, no local split at the path, or a path and another root.
         UnreadableFileError: the description of the local split is not right.
     """
-    path = Path(os.path.abspath(Path(split).expanduser()))
+    path = Path(os.path.abspath(expanded(split, "--split")))
     if "/" in split or os.sep in split or split in {".", "..", "~"}:
         return _at(path, root, registry)
     folder = resolve_root(root)

@@ -9,7 +9,6 @@ which smooths the rims of the dots. Pixels are packed into one integer, ``red + 
 from __future__ import annotations
 
 import subprocess
-import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -22,6 +21,7 @@ from numpy.typing import NDArray
 
 from lagbench.atomic import atomic_path
 from lagbench.errors import UsageError, WorkFailedError, nearest, require
+from lagbench.work.progress import watched
 
 from .panels import DOT, Panel, box_of, colour_bar, draw_walls, limit_of, material_key
 from .plot import describe
@@ -159,7 +159,7 @@ _NO_DATES = ["-fflags", "+bitexact", "-flags:v", "+bitexact"]
 @contextmanager
 def open_video(path: Path, size: tuple[int, int], frames_per_second: float) -> Iterator[Write]:
     """Yield a function that appends a frame; the file appears when the body ends well."""
-    with atomic_path(path) as temporary:
+    with atomic_path(path, option="--output") as temporary:
         gif = path.suffix.lower() == ".gif"
         coder = _gif(temporary, frames_per_second) if gif else _mp4(temporary, size, frames_per_second)
         with coder as write:
@@ -302,7 +302,7 @@ def check_ending(path: Path) -> None:
 
 def _counted(numbers: range, path: Path, *, quiet: bool) -> Iterator[int]:
     """Yield frame numbers; show how far the work is where somebody can see it."""
-    if quiet or not sys.stderr.isatty():
+    if quiet or not watched():
         yield from numbers
         return
     from rich.console import Console

@@ -181,5 +181,5 @@ def save(drawn: Figure, output: str | Path) -> Path:
             expected=f"a name ending in {', '.join(ENDINGS)}",
             got=path,
         )
-    write_atomically(path, file_bytes(drawn, ending))
+    write_atomically(path, file_bytes(drawn, ending), option="--output")
     return path

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from lagbench.atomic import temporary_name
 from lagbench.data.checksums import HASHED_SUBSETS
 from lagbench.data.grid import Placement
-from lagbench.data.layout import ScenarioKey, scenario_path
+from lagbench.data.layout import ScenarioKey, expanded, scenario_path
 from lagbench.data.local import DESCRIPTION
 from lagbench.data.manifest import FileEntry, Manifest, describe_file, merge, write_manifest
 from lagbench.data.registry import MAX_ID, NO_GENERATOR, load, spell_ids
@@ -64,7 +64,7 @@ class LocalSplit:
 
 def output_name(output: str | Path) -> str:
     """Return the name of the split that a folder to make stands for: its last part."""
-    return Path(os.path.abspath(Path(output).expanduser())).name
+    return Path(os.path.abspath(expanded(output, "--output"))).name
 
 
 def make_local_split(
@@ -81,7 +81,7 @@ def make_local_split(
     The last part of ``output`` is the name of the split, ``command`` stands in the head of its description;
     ``counts`` are the trajectories of each subset, where they are known before.
     """
-    folder = Path(os.path.abspath(Path(output).expanduser()))
+    folder = Path(os.path.abspath(expanded(output, "--output")))
     if about.name in load().splits:
         raise UsageError(
             f"{about.name!r} is one of the splits of lagbench", where="--output", fix="use another name"

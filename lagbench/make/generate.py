@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 
 from lagbench.atomic import remove_leftovers
 from lagbench.data.checksums import round_digits
-from lagbench.data.layout import MANIFEST_NAME
+from lagbench.data.layout import MANIFEST_NAME, expanded
 from lagbench.data.local import locate_new
 from lagbench.data.lock import dataset_lock
 from lagbench.data.manifest import Manifest, describe_file, merged, note, read_or_empty, write_manifest
@@ -29,7 +29,7 @@ from lagbench.generators.batch import SimulationJob
 from lagbench.generators.simulate import Pace, Simulated, simulate, twin_floors, twin_substeps
 from lagbench.generators.solver import Device
 from lagbench.store.copy import gather
-from lagbench.store.publication import Publication, look_at, publication
+from lagbench.store.publication import Publication, check_address, look_at, publication
 from lagbench.work.cluster import Cluster, await_file
 from lagbench.work.machine import environment_of, promises_bits
 from lagbench.work.pool import Pool, Report, Task, worker_count
@@ -310,6 +310,7 @@ def generate(
         DataError: the result has other hashes than datasets.yaml, or there is no such bucket.
     """
     started = time.monotonic()
+    check_address(root)
     tier, folder, splits = locate_new(split, size, root=root, registry=registry)
     wanted = select(tier, subset=subset, scenarios=scenarios)
     devices = [known.value for known in Device]
@@ -326,7 +327,7 @@ def generate(
         Meter(progress),
         split=splits.split(tier.split),
         scheduler=scheduler,
-        sources=[Path(source).expanduser().absolute() for source in gather],
+        sources=[expanded(source, "--gather") for source in gather],
     )
     if dry_run:
         generation.store = look_at(tier, folder)

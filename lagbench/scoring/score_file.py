@@ -10,7 +10,6 @@ the ranking metric stands beside them, so that the skill can be formed again.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -46,17 +45,19 @@ _PREVIEW: Mapping[str, tuple[tuple[str, ...], str]] = {
 }
 
 
-def write_statistics(card: ScoreCard, path: Path) -> None:
-    """Write scores.nc, whole or not at all; equal cards give equal bytes."""
+def write_statistics(card: ScoreCard, path: Path, *, option: str = "--output") -> None:
+    """Write scores.nc, whole or not at all; equal cards give equal bytes.
+
+    ``option`` is what the user names another folder with, for the message.
+    """
     import netCDF4
 
-    with atomic_path(path, option="--output") as temporary, ExitStack() as stack:
+    with atomic_path(path, option=option) as temporary:
         try:
-            file = netCDF4.Dataset(temporary, "w", format="NETCDF4")
-            stack.callback(file.close)
-            _define(file, card)
+            with netCDF4.Dataset(temporary, "w", format="NETCDF4") as file:  # closing it writes most of it
+                _define(file, card)
         except (OSError, RuntimeError) as error:
-            fix = "free disk space, or name a folder that you may write to: --output"
+            fix = f"free disk space, or name a folder that you may write to: {option}"
             raise WorkFailedError("cannot write scores", where=str(path), got=error, fix=fix) from error
 
 

@@ -28,6 +28,7 @@ from lagbench.data.registry import Size, spell_ids
 from lagbench.data.scenario import check_scenario
 from lagbench.errors import DataError, UsageError, nearest
 from lagbench.work.machine import may_differ
+from lagbench.work.progress import watched
 
 from .fetch import Wanted, fetch_scenarios, fetch_text
 from .objects import HTTP, NotDataError, NotInStoreError, Objects, WrongContentError, check_bucket
@@ -297,7 +298,7 @@ class _Ticker:
         self._url, self._objects, self._length = url, objects, length
         self.finished = self._arrived = 0
         self._last = 0.0
-        self._watched = sys.stderr.isatty() and not _quiet.get()
+        self._watched = watched() and not _quiet.get()
 
     def __enter__(self) -> _Ticker:
         self._tell()

@@ -11,13 +11,15 @@ import http.client
 import os
 import re
 import shutil
+import string
 import urllib.error
+import urllib.parse
 import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from lagbench.atomic import atomic_path, write_atomically
 from lagbench.errors import DataError, LagbenchError, UsageError, WorkFailedError, require
@@ -35,7 +37,8 @@ FIX_BUCKET = "create the bucket, or correct the address: --root or LAGBENCH_ROOT
 
 _GONE = {404, 410}
 _BUSY = {408, 425, 429, 500, 502, 503, 504}
-_RANGE = re.compile(r"bytes (\d+)-(\d+)/(\d+|\*)")
+_LENGTH = re.compile(r"\d{1,18}")  # no object has more bytes, and Python reads no endless number
+_RANGE = re.compile(r"bytes (\d{1,18})-(\d{1,18})/(\d{1,18}|\*)")
 _PAGE = ("text/html", "application/xhtml+xml")
 
 _systems: dict[tuple[object, ...], Any] = {}
@@ -106,10 +109,14 @@ def _open_http(url: str, offset: int, remedy: str) -> Answer:
     if offset:
         headers["Range"] = f"bytes={offset}-"
     try:
-        response = _OPENER.open(urllib.request.Request(url, headers=headers), timeout=TIMEOUT)
+        response = _OPENER.open(urllib.request.Request(_encoded(url), headers=headers), timeout=TIMEOUT)
     except urllib.error.HTTPError as error:
         with closing(error):
             raise _refusal_of_status(error, url, offset, remedy) from None
+    except (ValueError, http.client.InvalidURL) as error:  # time would not mend it
+        raise UsageError(
+            "not the address of a store", where=url, expected="http://host/path", got=str(error)
+        ) from error
     except (OSError, http.client.HTTPException) as error:
         reason = getattr(error, "reason", error)
         raise BrokenError(
@@ -132,9 +139,19 @@ def _open_http(url: str, offset: int, remedy: str) -> Answer:
         read=response.read1,
         close=response.close,
         start=start,
-        total=int(total) if total is not None and total.isdecimal() else None,
+        total=int(total) if total is not None and _LENGTH.fullmatch(total) else None,
         page=response.headers.get_content_type() in _PAGE,
     )
+
+
+def _encoded(url: str) -> str:
+    """Return an address with its path percent-encoded; one without a host is a ValueError."""
+    parts = urllib.parse.urlsplit(url)
+    if not parts.hostname:
+        raise ValueError("it names no host")
+    path = urllib.parse.quote(parts.path, safe=string.punctuation)  # what is encoded already stays
+    query = urllib.parse.quote(parts.query, safe=string.punctuation)
+    return parts._replace(path=path, query=query).geturl()
 
 
 def _refusal_of_status(error: urllib.error.HTTPError, url: str, offset: int, remedy: str) -> Exception:
@@ -157,13 +174,32 @@ def _refusal_of_status(error: urllib.error.HTTPError, url: str, offset: int, rem
     return BrokenError(refused) if code in _BUSY else refused
 
 
+class _Redirections(urllib.request.HTTPRedirectHandler):
+    """Tells a store that leads to no address from an address that the user mistyped."""
+
+    def http_error_302(
+        self,
+        req: urllib.request.Request,
+        fp: IO[bytes],
+        code: int,
+        msg: str,
+        headers: http.client.HTTPMessage,
+    ) -> Any:  # noqa: ANN401
+        try:
+            return super().http_error_302(req, fp, code, msg, headers)
+        except (ValueError, http.client.InvalidURL) as error:
+            raise NotDataError("the store leads to no address", where=req.full_url, got=str(error)) from error
+
+    http_error_301 = http_error_303 = http_error_307 = http_error_308 = http_error_302
+
+
 # For http and https alone: a redirection leads to no file of this machine.
 _OPENER = urllib.request.OpenerDirector()
 for _handler in (
     urllib.request.ProxyHandler,
     urllib.request.HTTPHandler,
     urllib.request.HTTPSHandler,
-    urllib.request.HTTPRedirectHandler,
+    _Redirections,
     urllib.request.HTTPDefaultErrorHandler,
     urllib.request.HTTPErrorProcessor,
     urllib.request.UnknownHandler,

@@ -15,7 +15,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from lagbench.data.checksums import file_sha256
-from lagbench.data.layout import MANIFEST_NAME, url_of
+from lagbench.data.layout import MANIFEST_NAME, root_url, url_of
 from lagbench.data.manifest import FileEntry, Manifest, merged, write_manifest
 from lagbench.data.registry import Size
 from lagbench.errors import DataError, LagbenchError
@@ -129,6 +129,13 @@ class Publication:
         except NotDataError:  # it is written anew from the files
             found = None
         return found or merged(self._size, None)
+
+
+def check_address(root: str | Path | None) -> None:
+    """Refuse a root that is an address where nothing can be written, before a copy of it is made."""
+    url = root_url(root)
+    if url is not None:
+        Objects(url, "")
 
 
 def look_at(size: Size, root: Path) -> Publication | None:

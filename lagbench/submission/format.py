@@ -7,6 +7,7 @@ read at all raises.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from typing import Any
 import h5py
 
 from lagbench.data.hdf5 import (
+    MAX_ATTRIBUTE,
     MAX_LINKS,
     Array,
     Odd,
@@ -78,6 +80,7 @@ WRITE = "write it with lagbench.submission.write, or fill what `lagbench templat
 """How to get a right file."""
 
 _WRITE = "write it with lagbench.submission.write, or with chunks (1, 1, particle, space)"
+_SURROGATES = re.compile("[\ud800-\udfff]")  # what no UTF-8 has
 _KINDS = {str: "text", int: "an integer", float: "a positive number"}
 
 
@@ -117,24 +120,31 @@ class Anatomy:
 
 
 def kind_of(name: str) -> str:
-    """Return in words what an optional attribute must be.
+    """Return in words what an attribute must be.
 
     >>> kind_of("seed"), kind_of("parameters")
     ('an integer', 'an integer >= 0')
     """
+    if name in REQUIRED:
+        return f"printable text of 1 to {MAX_NAME} characters"
     if name == "budget":
         return "JSON of a training's budget"
     return f"{_KINDS[OPTIONAL[name]]}{' >= 0' if name == 'parameters' else ''}"
 
 
 def fits(name: str, value: object) -> bool:
-    """Tell whether an optional attribute may have a value.
+    """Tell whether an attribute may have a value.
 
-    >>> fits("seed", -5), fits("parameters", -5), fits("parameters", 0)
-    (True, False, True)
+    >>> fits("seed", -5), fits("parameters", -5), fits("parameters", 0), fits("method", " ")
+    (True, False, True, False)
     """
-    if isinstance(value, bool):
+    if name in REQUIRED:
+        text = value if isinstance(value, str) else ""
+        return bool(text.strip()) and len(text) <= MAX_NAME and text.isprintable()
+    if isinstance(value, bool) or (isinstance(value, int) and not -(2**63) <= value < 2**64):
         return False
+    if isinstance(value, str) and (len(value) > MAX_ATTRIBUTE or _SURROGATES.search(value)):
+        return False  # HDF5 stores UTF-8
     if OPTIONAL[name] is float:
         return isinstance(value, (int, float)) and 0 < value < math.inf
     if name == "budget":
@@ -276,9 +286,8 @@ def _check_attributes(anatomy: Anatomy, out: Findings) -> None:
         _bad_attribute("lagbench_format", FORMAT, number, out)
     for name in REQUIRED:
         value = anatomy.attributes[name]
-        text = value if isinstance(value, str) else ""
-        if not text.strip() or len(text) > MAX_NAME or not text.isprintable():
-            _bad_attribute(name, f"printable text of 1 to {MAX_NAME} characters", value, out)
+        if not fits(name, value):
+            _bad_attribute(name, kind_of(name), value, out)
     for name in OPTIONAL:
         value = anatomy.attributes[name]
         if value is not None and not fits(name, value):

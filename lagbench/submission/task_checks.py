@@ -18,7 +18,7 @@ from .findings import Findings, quoted
 from .format import Anatomy
 
 _VERSION = re.compile(r"[1-9]\d{0,5}\.\d{1,6}\.\d{1,6}")
-_HASH = re.compile(r"[0-9a-f]{64}")
+HASH = re.compile(r"[0-9a-f]{64}")
 
 MAX_SPELLED = 60
 """Longest list of numbers in a message [characters]."""
@@ -66,7 +66,7 @@ def check_dataset(anatomy: Anatomy, size: Size, root: Path, out: Findings) -> No
             fix=remake,
         )
     expected = dataset_hash_of(size, root)
-    if expected is None and _HASH.fullmatch(got):
+    if expected is None and HASH.fullmatch(got):
         out.warning(
             "dataset",
             "the data set hash cannot be compared",

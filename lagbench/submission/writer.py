@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -18,8 +18,9 @@ from lagbench.data.registry import Registry, Size, spell_ids
 from lagbench.errors import DataError, UsageError, WorkFailedError, nearest
 from lagbench.store.copy import bring
 
+from .findings import quoted
 from .format import DIMS, FORMAT, NEVER, OPTIONAL, SPACE, fits, kind_of
-from .task_checks import dataset_hash_of, frames_to_predict
+from .task_checks import HASH, dataset_hash_of, frames_to_predict
 from .truth import Truth
 
 CHUNK_CACHE = 1 << 20
@@ -66,7 +67,10 @@ class PredictionsWriter:
     ) -> None:
         self.path = Path(path)
         self.size, folder, _ = locate(split, size, root=root, registry=registry)
-        self._hash = dataset_sha256 or _known_hash(self.size, folder)
+        self._hash = _known_hash(self.size, folder) if dataset_sha256 is None else dataset_sha256
+        if not isinstance(self._hash, str) or not HASH.fullmatch(self._hash):
+            raise UsageError("dataset_sha256 does not fit", expected="64 hex digits", got=quoted(self._hash))
+        _require_fit("method", method)
         self._names = ("position", "velocity") if velocity else ("position",)
         self._rows = {scenario: row for row, scenario in enumerate(sorted(self.size.subsets["test"]))}
         self._written: set[int] = set()
@@ -92,8 +96,7 @@ class PredictionsWriter:
         for name, value in labels.items():
             if name not in OPTIONAL:
                 raise UsageError(f"no label {name!r}", fix=nearest(name, OPTIONAL))
-            if not fits(name, value):
-                raise UsageError(f"the label {name!r} does not fit", expected=kind_of(name), got=repr(value))
+            _require_fit(name, value)
             self._labels[name] = value
 
     def __enter__(self) -> Self:
@@ -101,13 +104,13 @@ class PredictionsWriter:
         import netCDF4
 
         with ExitStack() as stack:
-            temporary = stack.enter_context(atomic_path(self.path))
+            temporary = stack.enter_context(atomic_path(self.path, option="--output"))
             try:
                 self._file = netCDF4.Dataset(temporary, "w", format="NETCDF4")
-            except OSError as error:
+                stack.callback(self._abandon)
+                self._define()
+            except (OSError, RuntimeError) as error:
                 raise self._refused(error) from error
-            stack.callback(lambda: self._file.isopen() and self._file.close())
-            self._define()
             self._stack = stack.pop_all()
         return self
 
@@ -166,13 +169,19 @@ class PredictionsWriter:
                     expected=spell_ids(self._rows),
                     got=f"missing: {spell_ids(missing)}",
                 )
-            if (self._diverged != NEVER).any():
-                self._create("diverged_at", "i4", ("scenario",), self._diverged)
-            self._file.setncatts(self._labels)
             try:
+                if (self._diverged != NEVER).any():
+                    self._create("diverged_at", "i4", ("scenario",), self._diverged)
+                self._file.setncatts(self._labels)
                 self._file.close()
             except (OSError, RuntimeError) as failure:
                 raise self._refused(failure) from failure
+
+    def _abandon(self) -> None:
+        """Close a file that goes; that it cannot be written either must not hide the error before."""
+        if self._file.isopen():
+            with suppress(OSError, RuntimeError):
+                self._file.close()
 
     def _checked(self, name: str, scenario: int, values: ArrayLike) -> NDArray[np.float32]:
         where = f"{name} of scenario {scenario}"
@@ -239,7 +248,7 @@ class PredictionsWriter:
             variable[:] = values
 
     def _refused(self, error: Exception) -> WorkFailedError:
-        fix = "free disk space, or name a folder that you may write to"
+        fix = "free disk space, or name a folder that you may write to: --output"
         return WorkFailedError("cannot write the predictions", where=str(self.path), got=error, fix=fix)
 
 
@@ -250,6 +259,12 @@ _ATTRIBUTES: Mapping[str, Mapping[str, str]] = {
     "velocity": {"long_name": "predicted particle velocity in box lengths per second", "units": "s-1"},
     "diverged_at": {"long_name": "first frame of a frozen rollout, -1 where none is", "units": "1"},
 }
+
+
+def _require_fit(name: str, value: object) -> None:
+    """Refuse what `validate` would refuse of the file."""
+    if not fits(name, value):
+        raise UsageError(f"the label {name!r} does not fit", expected=kind_of(name), got=quoted(value))
 
 
 def _known_hash(size: Size, root: Path) -> str:
@@ -299,7 +314,7 @@ def write(
         The path.
 
     Raises:
-        UsageError: unknown names, wrong shapes, missing scenarios, values that are not finite.
+        UsageError: unknown names or scenarios, wrong shapes, missing scenarios, values that are not finite.
         DataError: the hash of the data set is not known.
         WorkFailedError: the disk is full or not writable.
     """
@@ -316,6 +331,15 @@ def write(
     )
     ids = sorted(writer.size.subsets["test"])
     placed, moving = _by_id(positions, ids), None if velocities is None else _by_id(velocities, ids)
+    for name, held in (("velocities", moving), ("diverged_at", diverged_at)):
+        if unknown := [scenario for scenario in held or {} if scenario not in ids]:
+            raise UsageError(
+                "no such test scenario",
+                where=name,
+                expected=spell_ids(ids),
+                got=", ".join(map(quoted, unknown[:5])),
+                fix="name scenarios by id, not by row",
+            )
     with writer:
         for scenario, values in placed.items():
             velocity = None if moving is None else moving.get(scenario)

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+
+
+def watched() -> bool:
+    """Tell whether a person can watch stderr; where it is closed, Python has none."""
+    return sys.stderr is not None and sys.stderr.isatty()
 
 
 @dataclass(frozen=True, kw_only=True)
