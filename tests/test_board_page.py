@@ -221,10 +221,14 @@ def test_beside_and_beyond_an_aim_do_not_cancel(board: Board) -> None:
         if (value := row.values["energy_ratio"])
     ]
     page = with_rows(board, *rows, floors=())
-    found = dict(re.findall(r'<td class="([^"]*)"[^>]*data-value="(1|0\.9|0\.5)"[^>]*>(?:1|0\.9|0\.5)', page))
-    shades = {value: kind for kind, value in found.items()}
-    assert "best" in shades["0.9"]
-    assert "best" not in shades.get("1", "")
+    cells = re.findall(r'<td(?: class="([^"]*)")?[^>]*data-value="([^"]*)" data-loss="([^"]*)"', page)
+    found = {value: (kind, float(loss)) for kind, value, loss in cells if value in {"1", "0.9", "0.5"}}
+    assert found == {
+        "1": (found["1"][0], 1.0),
+        "0.9": (found["0.9"][0], pytest.approx(0.1)),
+        "0.5": (found["0.5"][0], 0.5),
+    }
+    assert ["best" in found[value][0] for value in ("1", "0.9", "0.5")] == [False, True, False]
 
 
 def test_rows_lead_to_code_paper_and_weights(board: Board, page: str) -> None:

@@ -15,6 +15,7 @@ import scipy.stats
 from score_bench import ScoreBench, right, still, straight
 
 from lagbench.data.registry import Measured, Size
+from lagbench.errors import DataError, UsageError
 from lagbench.floors import FLOORS, floors_of, shipped
 from lagbench.floors.shipped import shipped_path, write_shipped, write_solver_seconds
 from lagbench.metrics import METRICS, Score
@@ -22,6 +23,7 @@ from lagbench.scoring import floors as floors_of_scoring
 from lagbench.scoring import score as scoring
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.floors import differences, kept_in, measurable, measure, measured_again, measured_sizes
+from lagbench.scoring.record import record
 from lagbench.scoring.scenario import SUBMISSION
 from lagbench.scoring.score_file import read_statistics
 from lagbench.scoring.skill import best_floor, skill
@@ -160,7 +162,7 @@ def test_one_floor_measured_anew_leaves_the_others(
     write_solver_seconds(size, 0.5, tmp_path)
     before = json.loads(path.read_text())
     other = replace(measured_floors["persistence"], name="analog", seconds_per_frame=9.0)
-    write_shipped(size, {"analog": other}, **known)
+    write_shipped(size, {"analog": other}, partial=True, **known)
     after = json.loads(path.read_text())
     assert list(after["floors"]) == list(before["floors"])
     assert after["floors"]["analog"].pop("values") == before["floors"]["persistence"]["values"]
@@ -168,6 +170,17 @@ def test_one_floor_measured_anew_leaves_the_others(
     for held in (before, after):
         del held["floors"]["analog"]
     assert after == before
+    write_shipped(size, {"analog": other}, **known)
+    assert list(json.loads(path.read_text())["floors"]) == ["analog"]
+    with pytest.raises(DataError):
+        write_shipped(recorded(bench.size, "b" * 64), {"analog": other}, partial=True, **known)
+
+
+def test_a_floor_that_a_data_set_lacks_is_not_measured(bench: ScoreBench, tmp_path: Path) -> None:
+    """A coarse solver at tiny: nothing is written."""
+    with pytest.raises(UsageError):
+        record(recorded(bench.size), bench.root, folder=tmp_path, floors=["coarse-solver"])
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_forged_shipped_score_is_found(

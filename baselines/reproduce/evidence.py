@@ -106,8 +106,9 @@ class Method:
         return fmean(known) if known else None
 
     def of_seeds(self, seeds: Collection[int | None]) -> Method:
-        """Return this model with the trainings of some seeds only."""
-        return replace(self, seeds=tuple(held for held in self.seeds if held.seed in seeds))
+        """Return this model with the trainings of some seeds only, in their order."""
+        held = [one for one in self.seeds if one.seed in seeds]
+        return replace(self, seeds=tuple(sorted(held, key=lambda one: -1 if one.seed is None else one.seed)))
 
     def spread(self, metric: str) -> float:
         """Return the sample deviation over seeds of the mean over scenarios; NaN for one seed."""
@@ -320,11 +321,15 @@ def _told(entry: Mapping[str, Any], made: Mapping[str, Any]) -> dict[str, Any]:
     if not words or not paid.get("steps") or paid.get("cpu_hours") is None:
         return {}
     device, windows = paid.get("device") or entry.get("hardware"), paid.get("windows")
-    batch = round((windows or 0) / paid["steps"])
+    batch, metric, validations = (
+        round((windows or 0) / paid["steps"]),
+        paid.get("metric"),
+        paid.get("validations") or (),
+    )
     told = {
         "step": paid["steps"],
         "cpu_seconds": 3600.0 * paid["cpu_hours"],
-        "validation": [{"step": step, paid["metric"]: value} for step, value in paid.get("validations", ())],
+        "validation": [{"step": step, metric: value} for step, value in (validations if metric else ())],
         "recipe": {"name": words[1], "changed": words[2], "training": {"batch": batch}},
         "hardware": {
             "device": device if paid.get("gpu_hours") else "cpu",

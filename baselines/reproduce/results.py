@@ -55,11 +55,12 @@ How to read it. `skill` is 1 - score / score of the best floor: 1 perfect, 0 not
 than what costs no learning. Cells are means over test scenarios with 95 % bootstrap intervals, and ± the
 deviation over seeds where there are several; intervals here are those over scenarios, those of the board
 resample seeds too and are wider where there are few. Differences are tested by the exact sign-flip test
-over scenarios where both have one seed, else by the two-way bootstrap over scenarios and seeds, two-sided,
-corrected for the number of rivals (Holm); with fewer than six scenarios nothing is claimed. The thesis
-trained on its own data, at what is here size `full`, for hours on GPUs, and prints one scenario per table:
-its absolute numbers are beside ours for orientation, and only orders can be compared at size `mini` (a
-quarter of the particles, half the grid). `docs/scoring.md` defines every metric."""
+over scenarios where both have one seed, else by the two-way bootstrap over scenarios and seeds (of one
+training used in two ways: of the differences seed by seed), two-sided, corrected for the number of rivals
+(Holm); with fewer than six scenarios nothing is claimed. The thesis trained on its own data, at what is
+here size `full`, for hours on GPUs, and prints one scenario per table: its absolute numbers are beside ours
+for orientation, and only orders can be compared at size `mini` (a quarter of the particles, half the grid).
+`docs/scoring.md` defines every metric."""
 
 COMMANDS = """## How to make these again
 
@@ -127,7 +128,8 @@ def _claims(learned: Sequence[Evidence]) -> Iterator[str]:
     yield (
         "Validation: the least value up to a quarter, half and all of the steps, and what the last doubling"
         " gained, of the first seed, in the metric that was validated. Models whose last doubling gained more"
-        " than 2 % have not converged. Hours are without validations, as in entries."
+        " than 2 % have not converged. Hours are without validations, as in entries (the first"
+        " trainings of NeuralMPM did not time them apart)."
     )
     heads = ("model", "steps x windows", "epochs", "CPU hours per seed", "skill", "validated")
     learning = ("validation at 1/4", "1/2", "1", "last doubling")

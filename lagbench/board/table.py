@@ -149,6 +149,7 @@ def _cell(row: Row | Floor, column: Column, shades: _Shades, *, main: bool, rank
         class_=" ".join([*kind, *shades.classes(row)]) or None,
         title="; ".join(title) or None,
         data_value=(plain if isinstance(plain, str) else f"{plain:.9g}") if known else None,
+        data_loss=f"{loss_of(row, column):.6g}" if known and column.direction is Direction.TARGET else None,
         data_low=f"{ends[0]:.6g}" if ranks and bounds else None,
         data_high=f"{ends[1]:.6g}" if ranks and bounds else None,
         hidden=not main,

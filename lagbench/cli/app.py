@@ -28,16 +28,13 @@ class _Commands(TyperGroup):
     """Turns whatever a command raises into a message on stderr and an exit code."""
 
     def make_context(self, *args: Any, **extra: Any) -> Any:  # noqa: ANN401
-        with _refused_output():  # --help and --version print here
+        with _told(), _refused_output():  # --help and --version print here
             return super().make_context(*args, **extra)
 
     def invoke(self, ctx: Any) -> Any:  # noqa: ANN401 (typer and click disagree on its type)
         try:
-            with _plain_warnings(), _refused_output():
+            with _plain_warnings(), _told(), _refused_output():
                 return super().invoke(ctx)
-        except LagbenchError as error:
-            typer.echo(f"lagbench: {error}", err=True)
-            raise typer.Exit(error.exit_code) from error
         except KeyboardInterrupt:
             typer.echo("lagbench: interrupted; the same command goes on where it stopped", err=True)
             raise typer.Exit(INTERRUPTED) from None
@@ -58,6 +55,16 @@ class _Commands(TyperGroup):
 
 
 @contextmanager
+def _told() -> Iterator[None]:
+    """Print our errors, and end with their exit codes."""
+    try:
+        yield
+    except LagbenchError as error:
+        typer.echo(f"lagbench: {error}", err=True)
+        raise typer.Exit(error.exit_code) from error
+
+
+@contextmanager
 def _refused_output() -> Iterator[None]:
     """End in silence where the reader of a pipe has left; say that there is no space to write to."""
     try:
@@ -74,9 +81,7 @@ def _refused_output() -> Iterator[None]:
             raise
         where = error.filename or "standard output, or another file that is written"
         fix = "free disk space"
-        told = WorkFailedError("cannot write there", where=where, got=error.strerror, fix=fix)
-        typer.echo(f"lagbench: {told}", err=True)
-        raise typer.Exit(told.exit_code) from error
+        raise WorkFailedError("cannot write there", where=where, got=error.strerror, fix=fix) from error
 
 
 @contextmanager

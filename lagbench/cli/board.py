@@ -18,6 +18,7 @@ from .options import (
     SplitOption,
     WorkersOption,
     chosen,
+    root_of,
 )
 from .output import complain, print_blocks, print_json, progress_bar, say, spell_bytes
 from .output import show as tell
@@ -161,6 +162,7 @@ def check(
         Path | None,
         typer.Option(
             "--root",
+            parser=root_of,
             metavar="FOLDER",
             help="Where data sets live; without --predictions the shipped floors of those there are measured"
             " again.",

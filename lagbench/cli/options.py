@@ -10,7 +10,7 @@ import typer
 from lagbench.errors import UsageError
 
 
-def _root(text: str) -> Path:
+def root_of(text: str) -> Path:
     """Return a root; an empty one would be the current folder as a path."""
     if not text.strip():
         raise typer.BadParameter("it is empty: name a folder, or leave it out")
@@ -39,7 +39,7 @@ RootOption = Annotated[
     Path | None,
     typer.Option(
         "--root",
-        parser=_root,
+        parser=root_of,
         metavar="FOLDER",
         help="Where data sets live, or s3://bucket/prefix; else LAGBENCH_ROOT, else user data.",
     ),

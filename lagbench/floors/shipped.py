@@ -108,6 +108,14 @@ def _held(size: Size, folder: Path) -> dict[str, Any] | None:
     return held if same else None
 
 
+def _measured(size: Size, folder: Path) -> dict[str, Any]:
+    """Return what was measured on a data set; refuse one on which nothing was."""
+    held = _held(size, folder)
+    if held is None:
+        raise DataError("no floors were measured on this data set", where=str(shipped_path(size, folder)))
+    return held
+
+
 def _scores(
     said: Mapping[str, Any],
     known: Mapping[str, Metric],
@@ -145,21 +153,26 @@ def write_shipped(
     dataset_sha256: str,
     reported: Sequence[int],
     folder: Path = FOLDER,
+    partial: bool = False,
 ) -> Path:
     """Write what the floors of a data set score, equal bytes for equal scores and costs.
 
-    Other floors that were measured on the same data stay as they are, and so do costs where only some are
-    measured anew: they compare only within one run on one machine.
+    With ``partial`` the other floors stay as they are, and so do all costs, which compare only within one
+    run on one machine.
+
+    Raises:
+        DataError: partial, and no floors were measured on this data set.
     """
     first = next(iter(next(iter(floors.values())).scores.values()))
-    earlier = _held(size, folder) or {}
-    said, known = {name: _said(floor, reported) for name, floor in floors.items()}, earlier.get("floors", {})
-    kept = {}
-    if known.keys() - said.keys():
-        kept = {key: earlier[key] for key in earlier.keys() & {"solver_seconds_per_frame"}}
+    said, kept = {name: _said(floor, reported) for name, floor in floors.items()}, {}
+    if partial:
+        earlier = _measured(size, folder)
+        known = earlier["floors"]
         for name in said.keys() & known.keys():
             said[name]["seconds_per_frame"] = known[name]["seconds_per_frame"]
         said = {**known, **said}
+        if "solver_seconds_per_frame" in earlier:
+            kept["solver_seconds_per_frame"] = earlier["solver_seconds_per_frame"]
     held = {
         "lagbench_floors": FORMAT,
         "split": size.split,
@@ -179,9 +192,7 @@ def write_shipped(
 
 def write_solver_seconds(size: Size, seconds: float, folder: Path = FOLDER) -> Path:
     """Add what a frame costs the solver itself to the measured floors of a data set [s]."""
-    held, path = _held(size, folder), shipped_path(size, folder)
-    if held is None:
-        raise DataError("no floors were measured on this data set", where=str(path))
+    held, path = _measured(size, folder), shipped_path(size, folder)
     floors = held.pop("floors")
     held |= {"solver_seconds_per_frame": _number(seconds, 3), "floors": floors}
     write_atomically(path, f"{_spelled(held)}\n".encode(), option="--folder")

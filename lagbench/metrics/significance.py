@@ -135,6 +135,9 @@ def compare(first: Seeds, second: Seeds, *, paired: bool = False) -> Comparison:
         second: those of another.
         paired: whether seed s of both is one training, used in two ways: its scatter then cancels, and
             the differences seed by seed are tested.
+
+    Raises:
+        UsageError: the scores are of different metrics, or paired of different numbers of seeds.
     """
     sides = [_listed(first), _listed(second)]
     names = {score.metric.name for side in sides for score in side}
@@ -144,6 +147,8 @@ def compare(first: Seeds, second: Seeds, *, paired: bool = False) -> Comparison:
     defined = [set().union(*side) for side in losses]
     common = tuple(sorted(defined[0] & defined[1]))
     one, two = (_table(side, common) for side in losses)
+    if paired and len(one) != len(two):
+        raise UsageError("pairs of different numbers of seeds", got=f"{len(one)} and {len(two)}")
     difference = mean(mean_over_seeds(one) - mean_over_seeds(two))
     tested = (one - two, np.zeros((1, len(common)))) if paired else (one, two)
     found = resample(*tested) if common else None

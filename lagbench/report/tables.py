@@ -93,6 +93,14 @@ def _best(metric: Metric, values: Sequence[Sequence[float] | Floats]) -> frozens
     return frozenset(i for i, loss in enumerate(losses) if text(loss) == least)
 
 
+def _judged(subject: Subject, name: str, rows: Sequence[Floats]) -> list[Floats]:
+    """Return values at a frame, none of floors whose mean alone is known where a metric aims at a value."""
+    aims = subject.rows[0].scores[name].metric.direction is Direction.TARGET
+    return [
+        rows[i][:0] if aims and len(rows[i]) < len(subject.scenarios) else rows[i] for i in range(len(rows))
+    ]
+
+
 def _named(metric: Metric, *, ranks: bool) -> Markup:
     unit = tag("span", unit_of(metric), class_="unit")
     aim = f"aims at {metric.perfect:g}" if metric.direction is Direction.TARGET else _WORDS[metric.direction]
@@ -108,7 +116,7 @@ def frame_table(subject: Subject) -> Markup:
     frame = subject.key_frame
     held = {name: [row.scores[name].at(frame) for row in subject.rows] for name in names}
     means = {name: [mean(values) for values in rows] for name, rows in held.items()}
-    best = {n: _best(subject.rows[0].scores[n].metric, rows) for n, rows in held.items()}
+    best = {n: _best(subject.rows[0].scores[n].metric, _judged(subject, n, rows)) for n, rows in held.items()}
     cells = []
     for i, row in enumerate(subject.rows):
         numbers = [tag("span", text(means[n][i]), class_="n best" if i in best[n] else "n") for n in names]

@@ -4,9 +4,9 @@ usage: python -m lagbench.scoring.record [--split cavity] [--size mini] [--root 
            [--workers 2] [--floor analog ...] [--solver]
 
 All splits and sizes whose data are there, or those named. With --floor only these are measured
-anew, the others, and all costs, stay as they are. What is measured is kept under the
-root folder scenario by scenario: an interrupted run goes on where it stopped. Last the solver
-itself is timed (``lagbench bench solver``); with --solver nothing else is done. What is
+anew, from the start; the others, and all costs, stay as they are. Without it what is measured is
+kept under the root folder scenario by scenario: an interrupted run goes on where it stopped. Last
+the solver itself is timed (``lagbench bench solver``); with --solver nothing else is done. What is
 shipped is checked by ``lagbench leaderboard check --root FOLDER``.
 """
 
@@ -22,9 +22,9 @@ from pathlib import Path
 
 from lagbench.data.layout import resolve_root
 from lagbench.data.registry import Size
-from lagbench.errors import DataError, LagbenchError, WorkFailedError
+from lagbench.errors import DataError, LagbenchError, UsageError, WorkFailedError
 from lagbench.floors.shipped import FOLDER, shipped_path, write_shipped, write_solver_seconds
-from lagbench.floors.table import FLOORS
+from lagbench.floors.table import FLOORS, floors_of
 
 from .floors import kept_in, measure, measured_sizes
 from .task import load_scored_task
@@ -38,23 +38,29 @@ def record(
     folder: Path = FOLDER,
     floors: Collection[str] | None = None,
 ) -> Path:
-    """Measure the floors of a data set and write them to the folder of shipped scores.
+    """Measure the floors of a data set, or some of them, and write them to the folder of shipped scores.
 
     Raises:
         DataError: the data set is not recorded in datasets.yaml, or its files are missing.
+        UsageError: the data set has none of these floors.
     """
+    whole = floors is None
+    if not whole and not {floor.name for floor in floors_of(size)}.intersection(floors or ()):
+        raise UsageError("the data set has no such floor", where=f"{size.split} {size.name}", got=floors)
     if size.measured is None:
         raise DataError("the data set has no recorded hash", where=f"{size.split} {size.name}")
     setting = load_scored_task(size, root).setting
     reported = sorted(setting.slow_frames.intersection(setting.predicted_frames))
     path = write_shipped(
         size,
-        measure(size, root, floors=floors, workers=workers, resume=floors is None),
+        measure(size, root, floors=floors, workers=workers, resume=whole),
         dataset_sha256=size.measured.dataset_sha256,
         reported=reported,
         folder=folder,
+        partial=not whole,
     )
-    shutil.rmtree(kept_in(size, root), ignore_errors=floors is not None)
+    if whole:
+        shutil.rmtree(kept_in(size, root))
     return path
 
 
@@ -81,8 +87,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--size")
     parser.add_argument("--root", type=Path)
     parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--floor", nargs="+", choices=sorted(FLOORS))
-    parser.add_argument("--solver", action="store_true")
+    what = parser.add_mutually_exclusive_group()
+    what.add_argument("--floor", nargs="+", choices=sorted(FLOORS))
+    what.add_argument("--solver", action="store_true")
     options = parser.parse_args(arguments)
     root = resolve_root(options.root)
     try:

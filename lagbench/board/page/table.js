@@ -44,14 +44,6 @@ function textOf(tab, row, key) {
   return cellOf(tab, row, key).firstChild.textContent;
 }
 
-/** Return a number that is smaller the better it is; NaN for what is not judged. */
-function lossOf(tab, key, value) {
-  const { direction, perfect } = columnOf(tab, key);
-  if (direction === "lower") return value;
-  if (direction === "higher") return -value;
-  return direction === "target" ? Math.abs(value - Number(perfect)) : NaN;
-}
-
 /** Return the entries that are shown, in order, and all that could be. */
 function shownRows(tab, state) {
   const terms = state.filter.toLowerCase().split(/\s+/).filter(Boolean);
@@ -69,8 +61,8 @@ function ordered(tab, rows, { key: by, down }) {
   const sign = down ? -1 : 1;
   const of = (row) => {
     if (by === "rank" || by === "name") return by === "rank" ? placeOf(tab, row) : cellOf(tab, row, by).dataset.value;
-    const value = valueOf(tab, row, by);
-    return columnOf(tab, by).direction === "target" ? lossOf(tab, by, value) : value;
+    const target = columnOf(tab, by).direction === "target"; // the nearer the better
+    return target ? Number(cellOf(tab, row, by).dataset.loss ?? NaN) : valueOf(tab, row, by);
   };
   return rows
     .map((row) => [row, of(row)])
