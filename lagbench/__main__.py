@@ -1,6 +1,6 @@
 """``python -m lagbench`` is the command line."""
 
-from .cli import main
+from .cli.app import app
 
 if __name__ == "__main__":
-    main()
+    app()

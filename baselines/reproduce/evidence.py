@@ -304,13 +304,13 @@ class Evidence:
 def _score_files(path: Path, entry: Any) -> Iterator[tuple[Mapping[str, Any], Path]]:  # noqa: ANN401
     """Yield every prediction of an entry, submissions/<split>/<size>/<name>.yaml, and its score file."""
     try:
-        seeds = {made.get("seed"): made for made in entry["predictions"]}
+        predictions = [(made.get("seed"), made) for made in entry["predictions"]]
     except (TypeError, KeyError, AttributeError) as error:
         raise UnreadableFileError("no entry of a leaderboard", where=str(path), got=error) from None
     board = path.parents[3]
     scores = board / "scores" / path.parent.relative_to(board / "submissions")
-    for seed, made in seeds.items():
-        yield made, scores / (f"{path.stem}.nc" if len(seeds) == 1 else f"{path.stem}_{seed}.nc")
+    for seed, made in predictions:
+        yield made, scores / (f"{path.stem}.nc" if len(predictions) == 1 else f"{path.stem}_{seed}.nc")
 
 
 def _told(entry: Mapping[str, Any], made: Mapping[str, Any]) -> dict[str, Any]:
@@ -321,16 +321,17 @@ def _told(entry: Mapping[str, Any], made: Mapping[str, Any]) -> dict[str, Any]:
     if not words or not paid.get("steps") or paid.get("cpu_hours") is None:
         return {}
     device, windows = paid.get("device") or entry.get("hardware"), paid.get("windows")
-    batch, metric, validations = (
-        round((windows or 0) / paid["steps"]),
-        paid.get("metric"),
-        paid.get("validations") or (),
-    )
+    metric = paid.get("metric")
+    validations = paid.get("validations") if metric else None
     told = {
         "step": paid["steps"],
         "cpu_seconds": 3600.0 * paid["cpu_hours"],
-        "validation": [{"step": step, metric: value} for step, value in (validations if metric else ())],
-        "recipe": {"name": words[1], "changed": words[2], "training": {"batch": batch}},
+        "validation": [{"step": step, metric: value} for step, value in validations or ()],
+        "recipe": {
+            "name": words[1],
+            "changed": words[2],
+            "training": {"batch": round((windows or 0) / paid["steps"])},
+        },
         "hardware": {
             "device": device if paid.get("gpu_hours") else "cpu",
             "processor": device,

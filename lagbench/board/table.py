@@ -84,7 +84,6 @@ def draw_table(tab: Tab, metrics: Mapping[str, Metric]) -> Markup:
                 hidden=key not in main,
                 data_unit=column.unit or None,
                 data_direction=str(column.direction),
-                data_perfect=column.perfect if column.direction is Direction.TARGET else None,
                 data_form=None if column.form == "number" else column.form,
             )
         )

@@ -6,9 +6,6 @@ and rich only.
 
 from __future__ import annotations
 
-import io
-import sys
-
 __all__ = ["main"]
 
 
@@ -16,7 +13,4 @@ def main() -> None:
     """Run the command line; the entry point ``lagbench``."""
     from .app import app
 
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # a letter that a stream has not shall not end the work
-            stream.reconfigure(errors="backslashreplace")
     app()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
 import sys
 import warnings
@@ -28,6 +29,9 @@ class _Commands(TyperGroup):
     """Turns whatever a command raises into a message on stderr and an exit code."""
 
     def make_context(self, *args: Any, **extra: Any) -> Any:  # noqa: ANN401
+        for stream in (sys.stdout, sys.stderr):
+            if isinstance(stream, io.TextIOWrapper):  # a letter that a stream lacks shall not end the work
+                stream.reconfigure(errors="backslashreplace")
         with _told(), _refused_output():  # --help and --version print here
             return super().make_context(*args, **extra)
 
@@ -80,8 +84,9 @@ def _refused_output() -> Iterator[None]:
         if error.errno not in FULL:
             raise
         where = error.filename or "standard output, or another file that is written"
-        fix = "free disk space"
-        raise WorkFailedError("cannot write there", where=where, got=error.strerror, fix=fix) from error
+        raise WorkFailedError(
+            "cannot write there", where=where, got=error.strerror, fix="free disk space"
+        ) from error
 
 
 @contextmanager

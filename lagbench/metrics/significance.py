@@ -149,13 +149,12 @@ def compare(first: Seeds, second: Seeds, *, paired: bool = False) -> Comparison:
     one, two = (_table(side, common) for side in losses)
     if paired and len(one) != len(two):
         raise UsageError("pairs of different numbers of seeds", got=f"{len(one)} and {len(two)}")
-    difference = mean(mean_over_seeds(one) - mean_over_seeds(two))
     tested = (one - two, np.zeros((1, len(common)))) if paired else (one, two)
     found = resample(*tested) if common else None
     return Comparison(
         metric=names.pop(),
         scenarios=common,
-        difference=difference,
+        difference=mean(mean_over_seeds(tested[0]) - mean_over_seeds(tested[1])),
         interval=(math.nan, math.nan) if found is None else found.interval,
         p=differ(*tested) if common else math.nan,
         seeds=(len(one), len(two)),

@@ -9,7 +9,7 @@ function presetsOf(tab) {
   return (tab.presets ??= Object.fromEntries([...sectionOf(tab).querySelectorAll("[data-preset]")].map((one) => [one.dataset.preset, one.dataset.keys.split(" ")])));
 }
 
-/** Return columns by key: place in a row, label, quantity, direction, perfect value, form. */
+/** Return columns by key: place in a row, label, quantity, direction, form. */
 function columnsOf(tab) {
   const described = (head, place) => {
     const key = head.querySelector("[data-sort]").dataset.sort;
