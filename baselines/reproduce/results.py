@@ -184,7 +184,8 @@ def _chapter(evidence: Evidence) -> Iterator[str]:
     yield (
         "Cost. Recipe, and what training or prediction changed of it (`none`: nothing), seeds in their order"
         " where they differ, from the entry's words where no record of the training lies beside it. Speed-up:"
-        " our solver's time for a frame on one core over the model's, same machine. Hours: without validations."
+        " our solver's time for a frame on one core over the model's, same machine. Hours are without"
+        " validations."
     )
     heads = (
         "recipe",
