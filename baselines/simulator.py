@@ -26,6 +26,7 @@ from torch import Tensor, nn
 
 from lagbench.baselines.operators.operator import Losses, Operator
 from lagbench.data.grid import Grid, Placement
+from lagbench.errors import UsageError
 
 from .augmentation import Symmetry, disturbed
 from .baseline import Baseline, Batch, Facts, Options, check_moving_walls, last_velocities
@@ -178,7 +179,7 @@ class GraphNetworkOptions(Options):
     in_training = frozenset(
         {"forgetful", "noise_std", "loss", "loss_norm", "link_weight", "rollout_loss_steps", "symmetry"}
     )
-    of_weights = frozenset({"target"})
+    of_weights = frozenset({"target", "sum_messages"})
 
     latent: int = Field(default=128, ge=1)  # width of nodes, edges and hidden layers
     layers: int = Field(default=10, ge=1)  # processor layers
@@ -222,6 +223,14 @@ class GraphNetwork(Baseline):
     def __init__(self, options: GraphNetworkOptions, facts: Facts) -> None:
         super().__init__(options, facts)
         check_moving_walls(options.wall_velocity, facts)
+        if options.link_weight is not None and "link" not in self.operator.weights:
+            raise UsageError(
+                f"{self.method} predicts no links",
+                where="model.link_weight",
+                expected="null",
+                got=options.link_weight,
+                fix="leave the option out, or train supergat",
+            )
         noise, statistics = options.noise_std, facts.statistics
         self.radius = facts.radius if options.radius is None else options.radius
         self.grid = Grid(facts.score_cells, Placement(facts.score_placement))
@@ -272,7 +281,7 @@ class GraphNetwork(Baseline):
     def weights(self) -> Mapping[str, float]:
         """Weight of each term of the loss, the operator's own included."""
         own = dict(self.operator.weights)
-        if self.options.link_weight is not None and "link" in own:
+        if self.options.link_weight is not None:
             own["link"] = self.options.link_weight
         return self.options.loss.model_dump() | own
 

@@ -357,6 +357,14 @@ def fit(job: TrainingJob, model: Baseline) -> tuple[TrainingRecord, int]:
         return ledger, STEPS
     if job.recipe.training.compile:
         model.compile_layers()  # refuses: a closed form has none
+    if job.recipe.training.ema:
+        raise UsageError(
+            f"{model.method} takes no steps to average over",
+            where="training.ema",
+            expected=0.0,
+            got=job.recipe.training.ema,
+            fix="leave the option out",
+        )
 
     def scenarios() -> Iterator[NDArray[np.float32]]:
         paths = [

@@ -107,6 +107,7 @@ def test_options_of_the_training(name: str) -> None:
     [
         *(("mlp", "model.target=change"), ("mlp", "model.activation=tanh")),
         *(("lstm", "model.target=change"), ("gns", "model.target=velocity")),
+        ("gns", "model.sum_messages=false"),
     ],
 )
 def test_weights_keep_their_meaning(name: str, setting: str) -> None:

@@ -187,11 +187,19 @@ def test_a_training_that_stopped_early_is_over(run: Run) -> None:
     assert [file.read_bytes() for file in files] == before
 
 
-def test_what_has_no_layers_is_not_compiled(run: Run) -> None:
-    """A model without layers to compile refuses the option before it trains."""
+@pytest.mark.parametrize(
+    ("baseline", "setting"),
+    [
+        ("drift", "training.compile=true"),
+        ("var", "training.ema=0.9"),
+        ("gns", "model.link_weight=2"),
+    ],
+)
+def test_what_a_model_cannot_use_is_refused(run: Run, baseline: str, setting: str) -> None:
+    """Layers to compile, steps to average over, links to predict: before it trains."""
     with pytest.raises(UsageError) as caught:
-        run("drift", "steps=2", "compile=true")
-    assert caught.value.where == "training.compile"
+        run(baseline, setting)
+    assert caught.value.where == setting.partition("=")[0]
 
 
 def test_folders_are_guarded(run: Run) -> None:
