@@ -31,7 +31,7 @@ from torch.nn.modules.module import register_module_parameter_registration_hook
 from torch.nn.parameter import is_lazy
 
 from lagbench.atomic import atomic_path
-from lagbench.data.hdf5 import check_regular
+from lagbench.data.layout import check_regular
 from lagbench.data.registry import Registry
 from lagbench.data.registry import load as load_registry
 from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError, WorkFailedError

@@ -44,7 +44,7 @@ _FILE_NAMES = {"reynolds": "reynolds_number"}  # drawn parameters that files cal
 
 @dataclass(frozen=True, kw_only=True)
 class Facts:
-    """What one simulated scenario went through; the manifest states it."""
+    """What one simulated scenario went through; its file and the manifest state it."""
 
     start_frame: int  # frames simulated before frame 0
     kinetic_energy_first: float  # sum of m v^2 / 2 at frame 0
@@ -73,7 +73,6 @@ class Simulated:
 
     scenario: int  # its id
     content_sha256: str  # content hash of its file
-    facts: dict[str, int | float]  # see Facts, as a plain mapping
     pace: Pace | None = None  # of a scenario that was simulated alone
 
 
@@ -179,6 +178,8 @@ def simulate(
             for recording in recordings:
                 active = active_frames(recording.energies, job.size.task)
                 recording.writer.state(active_frames=active)
+        for index, recording in enumerate(recordings):
+            recording.writer.state_facts(asdict(_facts(batch, index, recording.energies)))
     timed = size.frame_count(job.scenarios[0]) - COMPILING
     pace = Pace(
         seconds=clock() - begun,
@@ -189,10 +190,9 @@ def simulate(
         Simulated(
             scenario=scenario,
             content_sha256=recording.writer.content_sha256,
-            facts=asdict(_facts(batch, index, recording.energies)),
             pace=pace if timed > 0 and len(job.scenarios) == 1 else None,
         )
-        for index, (scenario, recording) in enumerate(zip(job.scenarios, recordings, strict=True))
+        for scenario, recording in zip(job.scenarios, recordings, strict=True)
     ]
 
 

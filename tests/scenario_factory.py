@@ -51,6 +51,7 @@ def write_scenario(
     walls: bool = True,
     parameters: Mapping[str, object] = PARAMETERS,
     seed: str = "PCG64(SeedSequence([1, 1, 3]))",
+    facts: Mapping[str, float] | None = None,
 ) -> tuple[Path, str]:
     """Write one scenario; return its path and content hash."""
     path = scenario_path(root, key)
@@ -72,4 +73,6 @@ def write_scenario(
     ) as writer:
         for position in positions:
             writer.append(position, -position)
+        if facts is not None:
+            writer.state_facts(facts)
     return path, writer.content_sha256

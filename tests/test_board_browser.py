@@ -119,6 +119,16 @@ def test_badges_say_what_is_wrong(page: Page, board: Board) -> None:
     assert "leaves the box" in page.value("document.querySelector('#panel .flags').textContent")
 
 
+def test_every_line_of_the_charts_is_drawn(page: Page, board: Board) -> None:
+    """A path that only moves shows nothing: each line over frames goes from a point to another."""
+    for tab in board.tabs:
+        go(page, tab)
+        shown = "document.querySelectorAll('section:not([hidden]) [data-figure=lines] path.line')"
+        paths = page.value(f"[...{shown}].map(line => line.getAttribute('d'))")
+        assert paths
+        assert all({"L", "H"} & {*path} for path in paths)
+
+
 def test_film_above_the_fold(running: Browser, file: Path, board: Board) -> None:
     """Truth beside the leader of the tab, in view at once on both widths; a key pauses it."""
     play = "document.querySelector('#stage .play')"

@@ -183,6 +183,15 @@ def test_curves_keep_the_ends() -> None:
     assert found.mean[1:] == pytest.approx(2.0 * (np.array(found.frames[1:]) - 10.0))
 
 
+def test_curves_of_sampled_metrics_are_lines() -> None:
+    """A metric that is measured at every tenth frame has these frames, and no gaps between them."""
+    frames = np.full((2, 298), np.nan)
+    frames[:, 9::10] = np.arange(29.0)
+    found = curve(made_up([0.0, 0.0], frames))
+    assert found.frames == tuple(range(19, 308, 10))
+    assert list(found.mean) == list(range(29))
+
+
 def test_undefined_seeds_are_left_out(bench: BoardBench) -> None:
     """A scenario that one seed has no value for takes the other's; none stays undefined."""
     held = [

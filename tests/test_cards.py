@@ -42,7 +42,8 @@ def make(
     entries = []
     for scenario in scenarios:
         write_swirl(root, split, scenario, frames=4)
-        entries.append(describe_file(root, size.key(scenario), {"kinetic_energy_first": 0.125 + scenario}))
+        entry = describe_file(root, size.key(scenario))
+        entries.append(entry.model_copy(update={"facts": {"kinetic_energy_first": 0.125 + scenario}}))
     manifest = merge(
         None,
         entries,

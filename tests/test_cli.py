@@ -257,6 +257,29 @@ def test_clean_removes_ours_only(
     assert run("clean", *options).exit_code == 0
 
 
+def test_clean_leaves_links(run: Run, copied: Callable[[], Path], tmp_path: Path) -> None:
+    """A subset that lies on another disk loses its files, not its folder."""
+    root = copied()
+    folder = root / SPLIT / SIZE / "v2"
+    (folder / "train").rename(tmp_path / "elsewhere")
+    (folder / "train").symlink_to(tmp_path / "elsewhere")
+    assert run("clean", SPLIT, "--size", SIZE, "--root", root).exit_code == 0
+    assert list((tmp_path / "elsewhere").iterdir()) == []
+    assert [path.name for path in folder.iterdir()] == ["train"]
+
+
+def test_a_broken_local_split_hides_no_other(run: Run, tmp_path: Path) -> None:
+    """One description that cannot be read is told; all other splits are listed."""
+    for name, text in (("mine", "splits: ["), ("pipe", None)):
+        (tmp_path / name).mkdir()
+        description = tmp_path / name / "split.yaml"
+        os.mkfifo(description) if text is None else description.write_text(text)
+    result = run("list", "--root", tmp_path)
+    assert result.exit_code == 0
+    assert {"mine", "pipe"} <= {line.split()[1] for line in result.stderr.splitlines() if "left out" in line}
+    assert "cavity" in result.stdout
+
+
 def test_plot_and_animate_name_their_files(
     run: Run, generated: GenerationResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -70,10 +70,16 @@ def test_two_processes_and_a_last_call(tmp_path: Path, unmeasured_path: Path) ->
 def test_what_no_part_holds_is_simulated(
     parts: tuple[Path, Path], tmp_path: Path, unmeasured: Registry, generated: GenerationResult
 ) -> None:
-    """A job that failed costs its scenarios only."""
-    whole = tmp_path / "whole"
-    result = generate(SPLIT, SIZE, root=whole, gather=[parts[1]], registry=unmeasured, scenarios="1,3,4")
-    assert (result.simulated, result.kept) == ((1,), (3, 4))
+    """A job that failed costs its scenarios only, as a dry run says; files behind links are taken whole."""
+    whole, linked = tmp_path / "whole", parts[1] / FOLDER / "test" / "0004.nc"
+    linked.rename(parts[1] / "blob")
+    linked.symlink_to(os.path.relpath(parts[1] / "blob", linked.parent))
+    for dry in (True, False):
+        result = generate(
+            SPLIT, SIZE, root=whole, gather=parts[1:], registry=unmeasured, scenarios="1,3,4", dry_run=dry
+        )
+        assert (result.simulated, result.kept) == ((1,), (3, 4))
+    assert not (whole / FOLDER / "test" / "0004.nc").is_symlink()
     again = generate(SPLIT, SIZE, root=whole, gather=parts, registry=unmeasured)
     assert again.simulated == ()
     assert again.dataset_sha256 == generated.dataset_sha256

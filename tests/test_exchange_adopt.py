@@ -303,6 +303,7 @@ def test_what_is_no_trajectory_leaves_nothing(tmp_path: Path, kind: str) -> None
         ({"test": 3, "valid": 3}, "each subset needs a trajectory"),
         ({"rescale": True}, "fit the unit box"),
         ({"bounds": ((1.0, 0.0), (0.0, 1.0))}, "low to high"),
+        ({"bounds": ((0.0, 0.3), (0.0, 1.0))}, "outside the stated bounds"),
         ({"output": "My Data"}, "--output my-data"),
         ({"output": "cavity"}, "one of the splits of lagbench"),
         ({"output": "in"}, "there already"),

@@ -142,6 +142,17 @@ def test_lagrangebench_bounds(
         np.testing.assert_array_equal(position.astype(np.float64) + origin, run.astype(np.float64))
 
 
+def test_walls_at_0_are_the_bounds_too(mixed: LocalSplit, tmp_path: Path) -> None:
+    """Measured from walls that lie at 0 nothing is taken off, and the bounds are still the walls."""
+    paths = sorted(mixed.folder.parent.glob("[0-9].npz"))
+    bounds = ((0.0, 0.95), (0.0, 0.95))
+    own = adopt(paths, output=tmp_path / "corner", radius=0.1, frame_interval=0.1, bounds=bounds)
+    for from_walls, high in ((True, 0.95), (False, 1.0)):
+        folder = tmp_path / f"{from_walls}"
+        export(str(own.folder), format="lagrangebench-h5", output=folder, from_walls=from_walls)
+        assert read_metadata(folder)["bounds"] == [[0.0, high]] * 2
+
+
 def test_lagrangebench_layout(flows: dict[str, Path]) -> None:
     """Groups count from 00000; chunks are one frame, with gzip and shuffle; no program is written."""
     with h5py.File(flows["lagrangebench-h5"] / "test.h5") as file:

@@ -249,6 +249,10 @@ def test_a_killed_parent_is_resumed(
     assert result.kept != ()
     assert result.dataset_sha256 == generated.dataset_sha256
     assert partial_files(tmp_path) == []
+    found, whole = (read_manifest(root, SPLIT, SIZE, 2) for root in (tmp_path, generated.root))
+    assert found is not None
+    assert whole is not None
+    assert found.files == whole.files  # with what each simulation went through
 
 
 # --- blow-ups and other bits -----------------------------------------------------------------

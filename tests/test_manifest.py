@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -150,6 +151,27 @@ def test_paths_follow_from_subset_and_id(tmp_path: Path, change: dict[str, str],
         read_manifest(tmp_path, "cavity", "tiny", 1)
 
 
+@pytest.mark.parametrize(
+    "change", [{"split": "../../../etc"}, {"size": "mini"}, {"version": "2.0.0"}, {"version": "x.0.0"}]
+)
+def test_a_manifest_is_of_its_data_set(tmp_path: Path, change: dict[str, str]) -> None:
+    """Names that lead elsewhere, where files would be read and written, are refused."""
+    path = write_manifest(tmp_path, merged(None, range(5)))
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    with pytest.raises(DataError) as caught:
+        read_manifest(tmp_path, "cavity", "tiny", 1)
+    assert str(path) in str(caught.value.where)
+
+
+def test_a_manifest_that_is_no_file(tmp_path: Path) -> None:
+    """A FIFO would be waited for, a device read for ever."""
+    path = write_manifest(tmp_path, merged(None, range(5)))
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(DataError):
+        read_manifest(tmp_path, "cavity", "tiny", 1)
+
+
 def test_round_trip_and_atomic_write(tmp_path: Path) -> None:
     """What is written is read back, as plain JSON, with no temporary file left."""
     manifest = merged(None, range(5), statistics=STATISTICS)
@@ -184,8 +206,9 @@ def test_a_damaged_manifest_names_the_key(tmp_path: Path, change: dict[str, Any]
 def test_entry_of_a_file_on_disk(tmp_path: Path) -> None:
     """The entry holds what the file says and the hash of its bytes."""
     key = make_key(3)
-    path, content = write_scenario(tmp_path, key)
-    found = describe_file(tmp_path, key, {"energy": 0.5})
+    path, content = write_scenario(tmp_path, key, facts={"energy": 0.5})
+    assert content == write_scenario(tmp_path / "plain", key)[1]
+    found = describe_file(tmp_path, key)
     assert (found.content_sha256, found.frames, found.particles) == (content, 4, 8)
     assert (found.path, found.bytes) == ("test/0003.nc", path.stat().st_size)
     assert found.file_sha256 == hashlib.sha256(path.read_bytes()).hexdigest()

@@ -149,7 +149,7 @@ def test_a_registry_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     edited(tmp_path, lambda splits: splits.pop("cavity"))
     assert set(load().splits) == {"fluid", "curl-noise", "multimaterial"}
     monkeypatch.setenv("LAGBENCH_REGISTRY", str(tmp_path / "none.yaml"))
-    with pytest.raises(UnreadableFileError, match="cannot read"):
+    with pytest.raises(UnreadableFileError, match=r"none\.yaml"):
         load()
 
 
@@ -203,6 +203,12 @@ def refused(path: Path, parts: tuple[str, ...], call: Callable[[], object]) -> N
         (cavity("subsets", extra="0"), ("cavity", "stands in two subsets")),
         (cavity(frames={600: "0-58"}), ("cavity", "name every scenario once")),
         (lambda splits: splits["cavity"].update(version="1.0"), ("cavity.version", "match pattern")),
+        (
+            lambda splits: splits["cavity"]["sizes"].update(
+                {"../x": dict(splits["cavity"]["sizes"].pop("tiny"))}
+            ),
+            ("cavity.sizes", "../x", "match pattern"),
+        ),
         (tiny(substeps_per_frame="many"), ("tiny.parameters.substeps_per_frame", ">= 1", "'many'")),
         (tiny(substeps_per_frame=2.5), ("tiny.parameters.substeps_per_frame", "an integer", "2.5")),
         (tiny(substeps_per_frame=0), ("tiny.parameters.substeps_per_frame", ">= 1", "0")),
@@ -319,7 +325,7 @@ def test_other_packages_add_splits_and_change_none(plugged: Plug, theirs: str) -
     [
         ("careless", "", "REGISTRY"),
         ("broken", "import no_such_module_at_all", "ModuleNotFoundError.*no_such_module_at_all"),
-        ("lost", "REGISTRY = '/nowhere/datasets.yaml'", "cannot read"),
+        ("lost", "REGISTRY = '/nowhere/datasets.yaml'", "cannot open"),
         ("silent", "REGISTRY = {theirs!r}", "no split 'silent'"),
         ("cavity", "REGISTRY = {theirs!r}", "its name is taken"),
     ],

@@ -120,6 +120,7 @@ def test_models_stand_beside_the_best_floor() -> None:
     ahead = floors_ahead([evidence])
     assert evidence.ranking in {row[1] for row in ahead.rows}
     assert {row[2] for row in ahead.rows} <= set(evidence.floors)
+    assert floors_ahead([known({"gns": [0.5] * 8, "constant-velocity": [0.5] * 8})]).rows == ()
 
 
 @pytest.mark.parametrize("claim", CLAIMS, ids=lambda claim: claim.question[:30])

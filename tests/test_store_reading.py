@@ -25,7 +25,7 @@ from lagbench.make.generate import GenerationResult
 from lagbench.make.inventory import overview
 from lagbench.make.verify import verify
 from lagbench.store import copy
-from lagbench.store.objects import WrongContentError, WrongLengthError
+from lagbench.store.objects import NotDataError, WrongContentError, WrongLengthError
 from lagbench.submission import template
 
 FOLDER = f"{SPLIT}/{SIZE}/v2"
@@ -179,15 +179,33 @@ def test_other_content_is_refused(folder: Store, tiny: Registry, change: str) ->
     assert {*here(folder.url)} <= {"test/0004.nc"}
 
 
-def test_another_data_set_is_refused(folder: Store) -> None:
-    """A manifest whose hashes are not those of datasets.yaml brings nothing."""
-    text = json.loads(folder.read(MANIFEST))
+@pytest.mark.parametrize(
+    ("change", "of_files", "error"),
+    [
+        ({}, {"content_sha256": "0" * 64}, WrongContentError),
+        ({}, {"bytes": 300_000_000}, WrongLengthError),
+        ({"split": "../../../elsewhere"}, {}, NotDataError),
+        ({"size": "mini"}, {}, NotDataError),
+        ({"version": "7.0.0"}, {}, NotDataError),
+    ],
+)
+def test_what_a_manifest_cannot_say_is_refused(
+    folder: Store,
+    tmp_path: Path,
+    change: dict[str, object],
+    of_files: dict[str, object],
+    error: type[DataError],
+) -> None:
+    """Other hashes than those of datasets.yaml, endless files, names that lead elsewhere: nothing comes."""
+    text = json.loads(folder.read(MANIFEST)) | change
     for entry in text["files"]:
-        entry["content_sha256"] = "0" * 64
+        entry |= of_files
     folder.put(MANIFEST, json.dumps(text).encode())
-    with pytest.raises(WrongContentError):
+    before = set(tmp_path.rglob("manifest.json"))
+    with pytest.raises(error):
         lagbench.open_split(SPLIT, size=SIZE, root=folder.url)
     assert here(folder.url) == []
+    assert set(tmp_path.rglob("manifest.json")) == before
 
 
 def test_who_watches_is_told_how_far_it_is(

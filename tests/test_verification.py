@@ -22,7 +22,7 @@ from lagbench.data.registry import Registry, load
 from lagbench.data.scenario import check_scenario
 from lagbench.errors import DataError, UsageError
 from lagbench.generators.record import measured_values, replace_measured
-from lagbench.make.generate import GenerationResult
+from lagbench.make.generate import GenerationResult, generate
 from lagbench.make.verify import evenly_spaced, verify
 
 Copy = Callable[[], Path]
@@ -185,6 +185,18 @@ def test_a_forger_who_mends_the_manifest_too_is_caught(copied: Copy, measured: R
     with pytest.raises(DataError, match="another content hash") as caught:
         verify(SPLIT, SIZE, root=root, registry=measured).check()
     assert caught.value.exit_code == 4
+
+
+def test_a_forger_who_keeps_the_stored_hashes_is_caught(copied: Copy, measured: Registry) -> None:
+    """Only the packed bytes and the manifest's word for them changed: generate hashes the values."""
+    root = copied()
+    path = file_of(root, "train/0000")
+    with h5py.File(path, "r+") as file:
+        file["position"][:] = 0.5
+    mend_manifest(path.parents[1] / "manifest.json", 0, path, manifest_of(root).files[0].content_sha256)
+    result = generate(SPLIT, SIZE, root=root, workers=1, registry=measured)
+    assert (result.simulated, result.kept) == ((0,), (1, 2, 3, 4))
+    verify(SPLIT, SIZE, root=root, registry=measured).check()
 
 
 def change_manifest(root: Path, change: Callable[[dict[str, Any]], object]) -> None:

@@ -415,6 +415,8 @@ def test_frames_that_do_not_exist_are_refused(root: Path) -> None:
         ({"split": "cavty"}, "did you mean 'cavity'"),
         ({"history": 40}, "no scenario is as long as a window"),
         ({"history": 0}, "at least one given frame"),
+        ({"subset": []}, "0 scenarios"),
+        ({"cache_bytes": -1}, "cache_bytes -1"),
         ({"subset": "valid"}, "1 of 1 scenarios are not there.*missing: 3.*lagbench generate"),
     ],
 )

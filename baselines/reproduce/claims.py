@@ -264,7 +264,10 @@ def floors_ahead(everything: Sequence[Evidence]) -> Table:
                 continue
             order = [name for name in ordered(scores) if not math.isnan(scores[name].mean)]
             best = next((name for name in order if name in evidence.models), None)
-            if best is not None and order[0] in evidence.floors:
+            if best is None or order[0] not in evidence.floors:
+                continue
+            loss = scores[best].metric.loss
+            if loss(scores[order[0]].mean) < loss(scores[best].mean):
                 means = number(scores[order[0]].mean), number(scores[best].mean)
                 rows.append((evidence.where, metric, order[0], means[0], label(best), means[1]))
     return Table("", ("where", "metric", "floor", "its mean", "best model", "its mean"), tuple(rows))

@@ -257,8 +257,12 @@ def _curves(scores: Mapping[str, Score], ranking: str) -> dict[str, Curve]:
 
 
 def curve(score: Score) -> Curve:
-    """Return the mean of a metric over scenarios per frame, and the lowest and highest of them."""
-    chosen = spaced(len(score.frames), CURVE_FRAMES)
+    """Return the mean of a metric over scenarios per frame, and the lowest and highest of them.
+
+    Frames at which no scenario has a value are left out: some metrics have one at every tenth.
+    """
+    measured = np.flatnonzero(np.isfinite(score.per_frame).any(axis=0))
+    chosen = [int(measured[i]) for i in spaced(len(measured), CURVE_FRAMES)]
     values = score.per_frame[:, chosen]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # a frame where nothing is defined is NaN

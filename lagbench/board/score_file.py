@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.grid import Grid, Placement
-from lagbench.data.hdf5 import Structure, check_regular, check_structure, opened
+from lagbench.data.hdf5 import Structure, check_structure, opened
+from lagbench.data.layout import check_regular
 from lagbench.data.registry import Size
 from lagbench.errors import UnreadableFileError
 from lagbench.metrics.distributions import BINS

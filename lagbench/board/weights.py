@@ -12,7 +12,7 @@ from pathlib import Path
 
 from lagbench.atomic import write_atomically
 from lagbench.data.checksums import file_sha256
-from lagbench.data.hdf5 import check_regular
+from lagbench.data.layout import check_regular
 from lagbench.errors import UnreadableFileError, UsageError, check_installed
 from lagbench.submission.findings import Finding
 from lagbench.submission.format import Header

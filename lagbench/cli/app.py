@@ -81,6 +81,14 @@ def _refused_output() -> Iterator[None]:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise typer.Exit(UNREAD) from None
     except OSError as error:
+        if isinstance(error, PermissionError) and error.filename is not None:
+            raise WorkFailedError(
+                "no permission",
+                where=str(error.filename),
+                expected="a file or folder that you may read or write",
+                got=error.strerror,
+                fix="see who owns it, or name another: --root or LAGBENCH_ROOT for data sets",
+            ) from error
         if error.errno not in FULL:
             raise
         where = error.filename or "standard output, or another file that is written"

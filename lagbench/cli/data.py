@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 import lagbench
+from lagbench.errors import UnreadableFileError
 
 from .options import (
     DeviceOption,
@@ -178,11 +179,12 @@ def list_splits(root: RootOption = None, as_json: JsonFlag = False) -> None:
 
     folder = resolve_root(root)
     registry = rooted(folder, load())
-    found = [
-        overview(registry.size(name, size), folder)
-        for name in (*registry.splits, *registry.local_names())
-        for size in registry.split(name).sizes
-    ]
+    found = []
+    for name in (*registry.splits, *registry.local_names()):
+        try:
+            found += [overview(registry.size(name, size), folder) for size in registry.split(name).sizes]
+        except (UnreadableFileError, PermissionError) as error:  # of one split; the others are told
+            typer.echo(f"warning: {name} is left out: {error}", err=True)
 
     def listed() -> Iterator[str]:
         print_table("", ("split", "size", *_COLUMNS), [_row(entry) for entry in found])

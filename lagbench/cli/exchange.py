@@ -110,6 +110,7 @@ def download(
             workers=workers,
             progress=draw,
             announce=lambda text: typer.echo(f"lagbench: {text}", err=True),
+            on_wait=lambda holder: typer.echo(f"lagbench: waiting for {holder}", err=True),
         )
     counts = (
         f"{len(result.downloaded)} downloaded, {len(result.generated)} simulated, {len(result.kept)} kept"

@@ -9,7 +9,6 @@ that report all their findings together use :func:`describe` and :func:`storage_
 from __future__ import annotations
 
 import math
-import stat
 import zlib
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
@@ -21,6 +20,8 @@ import h5py
 import numpy as np
 
 from lagbench.errors import LagbenchError, UnreadableFileError
+
+from .layout import check_regular
 
 MAX_LINKS = 1000
 """Most entries of a group that are looked at."""
@@ -78,35 +79,6 @@ AGAIN = "write the file again; if it was copied or downloaded, compare its lengt
 
 
 # --- the file itself -----------------------------------------------------------------------
-
-
-def check_regular(path: Path, *, longest: int | None = None, fix: str | None = None) -> int:
-    """Refuse what is no regular file, or a long one; return its length [bytes].
-
-    Devices never end and a FIFO waits for ever, so this comes before anything is opened.
-    """
-    try:
-        status = path.stat()
-    except (OSError, ValueError) as error:
-        raise UnreadableFileError(
-            "cannot open the file",
-            where=str(path),
-            expected="a readable file",
-            got=getattr(error, "strerror", None) or error,
-            fix="check the path and that you may read the file",
-        ) from error
-    if not stat.S_ISREG(status.st_mode):
-        kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a device, socket or pipe"
-        raise UnreadableFileError("not a file", where=str(path), expected="a file", got=kind, fix=fix)
-    if longest is not None and status.st_size > longest:
-        raise UnreadableFileError(
-            "the file is too long",
-            where=str(path),
-            expected=f"at most {longest} bytes",
-            got=f"{status.st_size} bytes",
-            fix=fix,
-        )
-    return status.st_size
 
 
 def check_file(path: Path, *, longest: int | None = None, fix: str = AGAIN) -> None:

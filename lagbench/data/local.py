@@ -253,6 +253,8 @@ def remedy(size: Size, *options: str, root: Path | None = None) -> str:
     'lagbench generate --split cavity --size tiny --subset test'
     """
     if size.simulated:
+        if root is not None and (url_of(root) or "").startswith(("http://", "https://")):
+            return "nothing can be written over HTTP: tell whoever serves the address, or name another --root"
         place = [] if root is None else [f"--root {url_of(root) or root}"]
         return " ".join((f"lagbench generate --split {size.split} --size {size.name}", *options, *place))
     return "remove the folder and make the local split again: lagbench adopt, or lagbench import"

@@ -14,20 +14,36 @@ from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+)
 
 from lagbench.atomic import write_atomically
-from lagbench.errors import DataError, WorkFailedError
+from lagbench.errors import DataError, UnreadableFileError, WorkFailedError
 from lagbench.work.machine import may_differ
 
 from .checksums import HASHED_SUBSETS, dataset_hash, file_sha256, round_digits, subset_hash
-from .layout import MANIFEST_NAME, NOTES_NAME, ScenarioKey, dataset_folder, major_of, scenario_path
+from .layout import (
+    MANIFEST_NAME,
+    NOTES_NAME,
+    ScenarioKey,
+    check_regular,
+    dataset_folder,
+    major_of,
+    scenario_path,
+)
 from .registry import Size
 from .scenario import read_scenario
 
 Hash = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]*$")]
-Row = Annotated[tuple[float, ...], Field(strict=False)]
+Row = Annotated[tuple[FiniteFloat, ...], Field(strict=False)]
 
 
 class _Strict(BaseModel):
@@ -46,8 +62,8 @@ class FileEntry(_Strict):
     bytes: int  # length of the file
     file_sha256: Hash  # SHA-256 of its bytes; differs between library versions
     device: str  # device that simulated it
-    # further numbers by name, such as the energy of the last frame over the largest
-    facts: dict[str, float] = Field(default_factory=dict)
+    # further numbers by name, such as the energy of the last frame over the largest; the file states them
+    facts: dict[str, FiniteFloat] = Field(default_factory=dict)
     twin_floor: Row = ()  # position RMSE of the nudged twin at each predicted frame [length]; test only
 
     @field_validator("path")
@@ -72,7 +88,9 @@ class Manifest(_Strict):
     format: Literal[1] = 1  # number of this layout
     split: str  # name of the split
     size: str  # name of the size
-    version: str  # semantic version of the split
+    version: Annotated[
+        str, Field(pattern=r"^[1-9]\d{0,5}\.\d{1,6}\.\d{1,6}$")
+    ]  # semantic version of the split
     complete: bool = False  # whether every scenario of train, valid and test is there
     # "bitwise" where every file comes from a machine that promises equal bits or has the hash of
     # datasets.yaml, else "tolerance"; see lagbench.work.machine
@@ -84,6 +102,10 @@ class Manifest(_Strict):
     # the distinct machines and library versions that wrote files, oldest first
     environments: Annotated[tuple[dict[str, str], ...], Field(strict=False)] = ()
     files: Annotated[tuple[FileEntry, ...], Field(strict=False)] = ()  # scenario files by ascending id
+
+    def is_of(self, split: str, size: str, major: int) -> bool:
+        """Return whether this is of a data set: files are read and written where these names lead."""
+        return (self.split, self.size, major_of(self.version)) == (split, size, major)
 
     def entry(self, scenario: int) -> FileEntry | None:
         """Return the entry of a scenario; None where it is not generated."""
@@ -104,9 +126,7 @@ class Manifest(_Strict):
         return tuple(round_digits(math.fsum(column) / len(column)) for column in zip(*twins, strict=False))
 
 
-def describe_file(
-    root: Path, key: ScenarioKey, facts: Mapping[str, float] | None = None, *, digest: str | None = None
-) -> FileEntry:
+def describe_file(root: Path, key: ScenarioKey, *, digest: str | None = None) -> FileEntry:
     """Return the manifest entry of a scenario file on disk; its content is not re-hashed."""
     path = scenario_path(root, key)
     with read_scenario(path) as file:
@@ -121,7 +141,7 @@ def describe_file(
         bytes=path.stat().st_size,
         file_sha256=digest or file_sha256(path),
         device=header.device,
-        facts=dict(facts or {}),
+        facts=dict(header.facts),
     )
 
 
@@ -180,25 +200,40 @@ def merged(
     )
 
 
+MANIFEST_LIMIT = 64 << 20  # longest manifest that is read [bytes]
+_ANEW = "remove it; lagbench generate checks the files and writes it anew"
+
+
 def read_manifest(root: Path, split: str, size: str, major: int) -> Manifest | None:
     """Return the manifest of a data set folder; None where there is none."""
     path = dataset_folder(root, split, size, major) / MANIFEST_NAME
     try:
+        if not path.exists():
+            return None
+        check_regular(path, longest=MANIFEST_LIMIT)
         text = path.read_bytes()
-    except FileNotFoundError:
-        return None
-    except OSError as error:
-        raise DataError("cannot read the manifest", where=str(path), got=error.strerror) from error
+    except (OSError, UnreadableFileError) as error:
+        got = error.strerror if isinstance(error, OSError) else error.got
+        raise DataError("cannot read the manifest", where=str(path), got=got, fix=_ANEW) from error
     try:
-        return Manifest.model_validate_json(text)
+        found = Manifest.model_validate_json(text)
     except ValidationError as error:
         first = error.errors()[0]
         raise DataError(
             "the manifest is damaged",
             where=f"{path}, key {'.'.join(map(str, first['loc'])) or '(whole file)'}",
             got=first["msg"],
-            fix="remove it; lagbench generate checks the files and writes it anew",
+            fix=_ANEW,
         ) from None
+    if not found.is_of(split, size, major):
+        raise DataError(
+            "the manifest is of another data set",
+            where=str(path),
+            expected=f"{split} {size}, version {major}",
+            got=f"{found.split} {found.size}, version {found.version}",
+            fix=_ANEW,
+        )
+    return found
 
 
 def read_or_empty(size: Size, root: Path) -> Manifest:
@@ -264,13 +299,15 @@ def note(folder: Path, contents: Mapping[Path, str]) -> None:
     """
     if not contents:
         return
-    found = {}
+    old, found = _notes(folder), {}
     for path, content in contents.items():
-        stamp = _stamp(path)  # before the bytes: a file that changes meanwhile does not fit its note
-        found[path] = _seen[path] = _Note(*stamp, file_sha256(path), content)
-    rows = {_spelled(path, folder): astuple(held) for path, held in found.items()}
-    kept = {name: astuple(held) for name, held in _notes(folder).items()}
-    if not rows.items() <= kept.items():
+        stamp, known = _stamp(path), old.get(_spelled(path, folder))
+        if known is None or (*astuple(known)[:3], known.content_sha256) != (*stamp, content):
+            # The times are from before the bytes: a file that changes meanwhile does not fit its note.
+            found[path] = _seen[path] = _Note(*stamp, file_sha256(path), content)
+    if found:
+        rows = {_spelled(path, folder): astuple(held) for path, held in found.items()}
+        kept = {name: astuple(held) for name, held in old.items()}
         with suppress(WorkFailedError):
             write_atomically(folder / NOTES_NAME, (json.dumps(kept | rows, indent=1) + "\n").encode())
 
@@ -278,7 +315,7 @@ def note(folder: Path, contents: Mapping[Path, str]) -> None:
 def noted_content(folder: Path) -> Callable[[Path], str | None]:
     """Return what tells the content hash of a file that was hashed here and is still the same.
 
-    The bytes are read to tell, once in a process; values are not unpacked.
+    Its bytes are read to tell, once in a process; values are not unpacked.
     """
     notes = _notes(folder)
 

@@ -197,6 +197,7 @@ Ids = Annotated[tuple[int, ...], BeforeValidator(_ids)]
 Interval = Annotated[tuple[FiniteFloat, FiniteFloat], Field(strict=False)]
 Hash = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 ShortHash = Annotated[str, Field(pattern=r"^[0-9a-f]{16}$")]
+SizeName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,63}$")]  # names a folder
 REGISTRY_VARIABLE = "LAGBENCH_REGISTRY"
 """Environment variable that names a datasets.yaml to use instead of ours."""
 
@@ -270,6 +271,16 @@ class _SizeEntry(_Strict):
     bounds: tuple[Interval, Interval] = Field(strict=False)
     parameters: dict[str, Number | bool | str]
     task: Task
+
+
+BYTES_PER_PARTICLE = 2 * 2 * 4
+"""Position and velocity in one frame, two float32 each, before compression [bytes]."""
+
+BYTES_BESIDE_FRAMES = 64 * 1024
+"""Header, constants and chunk index of a file, generously [bytes]."""
+
+SLACK = 1.25
+"""Share by which a compressed file may be longer than its values."""
 
 
 class Size(BaseModel):
@@ -375,6 +386,14 @@ class Size(BaseModel):
             return self.frames
         return next(count for count, ids in self.frames.items() if scenario in ids)
 
+    def file_bytes(self, scenario: int) -> int:
+        """Return the most bytes that a scenario's file takes, in sum over a data set."""
+        return self.frame_count(scenario) * self.particles * BYTES_PER_PARTICLE + BYTES_BESIDE_FRAMES
+
+    def longest_file(self, scenario: int) -> int:
+        """Return the bytes beyond which no file of a scenario goes, whatever a store says of it."""
+        return round(SLACK * self.file_bytes(scenario)) + (1 << 20)
+
     def frames_behind(self, scenario: int) -> int:
         """Return how many of a scenario's frames lie behind the horizon of the task."""
         return max(0, self.frame_count(scenario) - self.task.input_frames - self.task.horizon)
@@ -391,7 +410,7 @@ class Split(_Strict):
     generator: str
     source: str
     parameters: dict[str, Parameter]
-    sizes: dict[str, _SizeEntry]
+    sizes: dict[SizeName, _SizeEntry]
     mirrors: tuple[Address, ...] = Field(default=(), strict=False)
 
     @model_validator(mode="after")

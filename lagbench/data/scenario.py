@@ -12,6 +12,8 @@ exactly the attributes given here.
 
 from __future__ import annotations
 
+import json
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -87,6 +89,9 @@ CHUNK_CACHE = 1 << 20
 DEFLATE_RATIO = 1032
 """No zlib stream unpacks to more than this many times its length."""
 
+MOST_IN_ROW = 20_000_000
+"""Values of a variable in one frame, which is read at once: two for each of ten million particles."""
+
 _REPAIR = "lagbench generate writes it anew; a local split is made again by lagbench adopt or import"
 
 
@@ -103,6 +108,7 @@ class ScenarioHeader:
     device: str  # device that simulated
     generator: str  # dotted path of the split's module
     lagbench_version: str  # version that wrote the file
+    facts: Mapping[str, float]  # what the simulation went through, by name; no hash covers it
 
 
 class ScenarioFile:
@@ -250,6 +256,10 @@ def _check_lengths(path: Path, variables: Mapping[str, h5py.Dataset]) -> None:
 
     largest = DEFLATE_RATIO * path.stat().st_size
     for name, variable in variables.items():
+        if name not in ATTRIBUTES or math.prod(variable.shape[1:]) > MOST_IN_ROW:
+            raise _damaged(
+                path, name, f"a variable that no scenario has, or so large: shape {variable.shape}"
+            )
         text = h5py.check_string_dtype(variable.dtype)
         free = text is not None and text.length is None  # how long its values are, they say themselves
         held = variable.size * (1 if free else variable.dtype.itemsize)
@@ -288,7 +298,16 @@ def _header(file: h5py.File, variables: Mapping[str, h5py.Dataset]) -> ScenarioH
         device=str(said("device")),
         generator=str(said("generator")),
         lagbench_version=str(said("lagbench_version")),
+        facts=_facts(attribute(file, "facts")),
     )
+
+
+def _facts(text: object) -> dict[str, float]:
+    """Return the numbers of a mapping in JSON; none where a file states none."""
+    found = {} if text is None else {str(k): float(v) for k, v in json.loads(str(text)).items()}
+    if not all(map(math.isfinite, found.values())):
+        raise DataError("the attribute 'facts' holds a number that is not finite")
+    return found
 
 
 @contextmanager

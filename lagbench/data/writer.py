@@ -6,6 +6,7 @@ variable and attribute. Writing needs netCDF4 only, so that generation workers s
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -59,7 +60,7 @@ PARTICLES_PER_CHUNK = 1 << 17
 _RESERVED = {
     *("Conventions", "title", "source", "license", "lagbench_format", "lagbench_version"),
     *("split", "size", "version", "scenario", "subset", "seed", "generator", "device"),
-    *("hashed_parameters", "content_sha256"),
+    *("hashed_parameters", "content_sha256", "facts"),
 }
 
 
@@ -173,6 +174,11 @@ class ScenarioWriter:
                 {**self._parameters, "hashed_parameters": " ".join(sorted(self._parameters))}
             )
 
+    def state_facts(self, facts: Mapping[str, float]) -> None:
+        """State what the scenario went through: finite numbers by name, which no hash covers."""
+        with _write_errors(self.path):
+            self._file.facts = json.dumps(dict(facts), allow_nan=False)
+
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
@@ -274,7 +280,7 @@ def _write_errors(path: Path) -> Iterator[None]:
         yield
     except LagbenchError:
         raise
-    except (OSError, RuntimeError) as error:
+    except (OSError, RuntimeError, UnicodeError) as error:  # a name that is no UTF-8
         free = shutil.disk_usage(path.parent).free if path.parent.is_dir() else 0
         raise WorkFailedError(
             "cannot write a scenario file",

@@ -12,10 +12,12 @@ from lagbench.data.layout import MANIFEST_NAME, scenario_path
 from lagbench.data.local import locate_new
 from lagbench.data.lock import dataset_lock
 from lagbench.data.manifest import (
+    MANIFEST_LIMIT,
     FileEntry,
     Manifest,
     describe_file,
     merged,
+    note,
     read_manifest,
     read_or_empty,
     write_manifest,
@@ -25,15 +27,14 @@ from lagbench.errors import DataError, UsageError, WorkFailedError
 from lagbench.make.cards import write_cards
 from lagbench.make.generate import generate
 from lagbench.make.inventory import State, compare, examine
-from lagbench.make.plan import Scenarios, Selection, check_disk, scenario_bytes, select
+from lagbench.make.plan import Scenarios, Selection, check_disk, select
 from lagbench.store.archive import RELEASES, RELEASES_VARIABLE, fetch_archive, releases
-from lagbench.store.copy import MANIFEST_LIMIT, address_of, parse_manifest, refuse_strangers
+from lagbench.store.copy import address_of, parse_manifest, refuse_strangers
 from lagbench.store.fetch import CONNECTIONS, Wanted, fetch_scenarios, fetch_text
 from lagbench.store.objects import NotInStoreError, StoreUnreachableError
 from lagbench.store.publication import publication
 from lagbench.work.progress import Meter, Progress
 
-SLACK = 1.25  # share by which a compressed file may be longer than its values
 REMEDY = "try again; if it stays so, name another store: --from"
 
 Reason = DataError | WorkFailedError | UsageError
@@ -71,6 +72,7 @@ def download(
     workers: int | None = None,
     progress: Callable[[Progress], None] | None = None,
     announce: Callable[[str], None] | None = None,
+    on_wait: Callable[[str], None] | None = None,
     registry: Registry | None = None,
 ) -> DownloadResult:
     """Fetch the scenarios of a split that are not on disk yet; simulate those no store has.
@@ -91,6 +93,7 @@ def download(
         workers: worker processes of the simulation.
         progress: called as the work advances.
         announce: told in a sentence when the simulation takes over, and why.
+        on_wait: called with the holder in words when another process holds the lock.
         registry: where splits are described; ours when None.
 
     Raises:
@@ -107,7 +110,10 @@ def download(
     tier, folder, splits = locate_new(split, size, root=root, registry=registry)
     wanted = select(tier, subset=subset, scenarios=scenarios)
     urls = (mirror,) if mirror else (*splits.split(tier.split).mirrors, *releases(tier))
-    with dataset_lock(folder, tier.split, tier.name, tier.major), publication(tier, folder) as store:
+    with (
+        dataset_lock(folder, tier.split, tier.name, tier.major, on_wait=on_wait),
+        publication(tier, folder) as store,
+    ):
         held = [i for i in wanted if store and i in store.held]
         work = _Download(tier, folder, [i for i in wanted if i not in held], Meter(progress), connections)
         try:
@@ -200,7 +206,7 @@ class _Download:
 
     def _fetch_from(self, url: str) -> NotInStoreError | None:
         """Fetch what one store has; return the error of the last file that it has not."""
-        check_disk(self.root, sum(scenario_bytes(self.size, i) for i in self.missing))
+        check_disk(self.root, sum(map(self.size.file_bytes, self.missing)))
         claims, last = self._claims(url), None
         wanted = {}
         for i in self.missing:
@@ -208,17 +214,17 @@ class _Download:
             wanted[i] = Wanted(
                 url=address_of(self.size, url, f"{key.subset}/{i:04d}.nc"),
                 target=scenario_path(self.root, key),
-                limit=self._limit(i),
+                limit=self.size.longest_file(i),
                 content_sha256=self._recorded[i],
                 length=claim.bytes if claim else None,
                 file_sha256=claim.file_sha256 if claim else None,
                 remedy=REMEDY,
             )
-        total = sum(one.length or scenario_bytes(self.size, i) for i, one in wanted.items())
+        total = sum(one.length or self.size.file_bytes(i) for i, one in wanted.items())
         self._meter.begin("downloading", total=total, scenarios=len(wanted))
         try:
             if claims is None:  # it may have the archive of the data set instead
-                limit = sum(map(self._limit, self.size.scenarios)) + MANIFEST_LIMIT
+                limit = sum(map(self.size.longest_file, self.size.scenarios)) + MANIFEST_LIMIT
                 archive = fetch_archive(self.size, url, wanted, self._count, limit=limit, remedy=REMEDY)
                 with suppress(NotInStoreError), closing(archive) as arrived:
                     for claim in arrived:
@@ -242,22 +248,23 @@ class _Download:
             text = fetch_text(place, limit=MANIFEST_LIMIT, remedy=REMEDY)
         except NotInStoreError:
             return None
-        manifest = parse_manifest(text, where=place, remedy=REMEDY)
+        manifest = parse_manifest(self.size, text, where=place, remedy=REMEDY)
         found = {entry.scenario: entry for entry in manifest.files}
         other = [i for i in self.missing if i in found and not found[i].has_hash(self._recorded[i])]
         refuse_strangers(manifest, other, where=place, remedy=REMEDY)
         return found
 
-    def _limit(self, scenario: int) -> int:
-        """Return the bytes beyond which no file of a scenario goes."""
-        return round(SLACK * scenario_bytes(self.size, scenario)) + (1 << 20)
-
     def _take(self, url: str, scenario: int, claim: FileEntry | None) -> None:
         """Note a new file; what cannot be told from it is the store's word."""
         entry = describe_file(self.root, self.size.key(scenario))
-        if claim is not None:
-            entry = entry.model_copy(update={"facts": claim.facts, "twin_floor": claim.twin_floor})
+        if claim is not None:  # files of earlier versions state no facts
+            facts = entry.facts or claim.facts
+            entry = entry.model_copy(update={"facts": facts, "twin_floor": claim.twin_floor})
         self._entries.append(entry)
+        note(
+            self.size.folder(self.root),
+            {scenario_path(self.root, self.size.key(scenario)): entry.content_sha256},
+        )
         self.downloaded.append(scenario)
         self.url = url
         self._meter.count(scenarios=1)

@@ -107,7 +107,8 @@ def export(
             what = "wall particles lie outside the unit box's bounds"
             raise UsageError(what, where="--wall-particles and --unit-box", fix="leave out --unit-box")
         walls = WallParticles(tier.bounds, spacing)
-    origin = _origin(tier, form, walls, from_walls=closed if from_walls is None else from_walls)
+    measured = closed if from_walls is None else from_walls
+    origin = _origin(tier, form, walls, from_walls=measured)
     with contextlib.suppress(OSError):  # written last, it says that an export is whole
         (folder / NAME).unlink()
     meter = Meter(progress)
@@ -131,6 +132,7 @@ def export(
         dataset_sha256=digest,
         spacing=spacing,
         origin=origin,
+        from_walls=measured,
         free_slip=not (tier.simulated and getattr(solver_constants(tier), "no_slip", False)),
         wall=walls.thickness if walls else None,
     )

@@ -269,6 +269,7 @@ class _Building:
         about = self.about
         box = ((self.low[0], self.high[0]), (self.low[1], self.high[1]))
         bounds = box if about.bounds is None else about.measure.box(about.bounds)
+        self._check_bounds(bounds)
         frames: dict[int, list[int]] = {}
         for entry in self.entries:
             frames.setdefault(entry.frames, []).append(entry.scenario)
@@ -312,6 +313,22 @@ class _Building:
             },
             "sizes": {SIZE: size},
         }
+
+    def _check_bounds(self, bounds: Sequence[Sequence[float]]) -> None:
+        """Refuse bounds that do not hold the particles: features, clamps and scores rest on them."""
+        beyond = [
+            max(a - low, high - b) for (a, b), low, high in zip(bounds, self.low, self.high, strict=True)
+        ]
+        if max(beyond) > self.spacing:
+            scale, corner = self.about.measure.scale, np.asarray(self.about.measure.corner)
+            extent = zip(self.low * scale + corner, self.high * scale + corner, strict=True)
+            raise UsageError(
+                "particles lie outside the stated bounds, by more than their spacing",
+                where="--bounds, or bounds of the metadata",
+                expected=f"bounds that hold {' x '.join(f'[{a:.6g}, {b:.6g}]' for a, b in extent)}",
+                got=self.about.bounds,
+                fix="state the box of the data, in their own length",
+            )
 
     def _task(self, *, shortest: int) -> dict[str, object]:
         """Return the task, as far as the shortest test scenario allows one."""

@@ -181,14 +181,16 @@ def describe(
     dataset_sha256: str,
     spacing: float,
     origin: tuple[float, float],
+    from_walls: bool,
     free_slip: bool,
     wall: float | None = None,
 ) -> dict[str, object]:
     """Return the metadata of an export.
 
     Statistics are mean and std over train per frame, see ``lagbench.data.statistics``. ``spacing`` is the
-    distance of neighbouring particles at first, ``origin`` what was taken off every position, ``wall``
-    the thickness of wall particles where there are some [length].
+    distance of neighbouring particles at first, ``origin`` what was taken off every position,
+    ``from_walls`` whether the bounds are those of the box, ``wall`` the thickness of wall particles where
+    there are some [length].
     """
     task, grid = size.task, size.task.score_grid
     short = {"vel": "velocity", "acc": "acceleration"}
@@ -252,7 +254,7 @@ def describe(
             special["bounds"] = [
                 [0.0, high + wall - o] for (_, high), o in zip(size.bounds, origin, strict=True)
             ]
-        elif not any(origin):
+        elif not from_walls:
             special["bounds"] = [[0.0, 1.0], [0.0, 1.0]]
     return {**common, **special, OWN_KEY: own}
 

@@ -58,9 +58,10 @@ def clean(
         found = {path for path in folder.rglob(f".*{SUFFIX}") if path.is_file()}
         if not leftovers:
             ours = {folder / subset / f"{i:04d}.nc" for subset, ids in tier.subsets.items() for i in ids}
-            ours |= {folder / name for name in CARDS}
-            if not tier.simulated:  # the description of a local split says nothing without its data
-                ours.add(folder.parents[1] / DESCRIPTION)
+            if tier.simulated:
+                ours |= {folder / name for name in CARDS}
+            else:  # has no cards; its description says nothing without its data
+                ours |= {folder / MANIFEST_NAME, folder.parents[1] / DESCRIPTION}
             found |= {path for path in ours if path.is_file()}
         length = 0
         for path in found:
@@ -71,11 +72,13 @@ def clean(
                 path.unlink(missing_ok=True)
             except OSError as error:
                 raise WorkFailedError("cannot remove a file", where=str(path), got=error.strerror) from error
+        if not dry_run and not leftovers:
+            for name in (NOTES_NAME, LOCK_NAME):  # who waits for a lock that is gone takes a new one
+                (folder / name).unlink(missing_ok=True)
     if not dry_run and not leftovers:
-        for name in (LOCK_NAME, NOTES_NAME):
-            (folder / name).unlink(missing_ok=True)
-        # Folders that hold nothing any more go too, up to the root folder.
+        # Folders that hold nothing any more go too, up to the root folder; links stay.
         for place in (*(child for child in folder.iterdir() if child.is_dir()), folder, *folder.parents):
-            if home in place.parents and not any(place.iterdir()):
-                place.rmdir()
+            if home in place.parents and not place.is_symlink() and not any(place.iterdir()):
+                with suppress(OSError):  # somebody has just put something there
+                    place.rmdir()
     return CleanResult(removed=tuple(sorted(found)), bytes=length, dry_run=dry_run)

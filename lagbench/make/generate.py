@@ -11,7 +11,7 @@ simulates, so that Ctrl-C reaches it at once and a crash of the solver cannot ta
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -28,7 +28,7 @@ from lagbench.errors import UsageError, check_installed, nearest
 from lagbench.generators.batch import SimulationJob
 from lagbench.generators.simulate import Pace, Simulated, simulate, twin_floors, twin_substeps
 from lagbench.generators.solver import Device
-from lagbench.store.copy import gather
+from lagbench.store.copy import gather, gatherable
 from lagbench.store.publication import Publication, check_address, look_at, publication
 from lagbench.work.cluster import Cluster, await_file
 from lagbench.work.machine import environment_of, promises_bits
@@ -68,6 +68,7 @@ class Generation:
         # the store that the root folder is a working copy of; None for a plain folder
         self.store: Publication | None = None
         self.manifest = merged(self.size, None)  # what the folder holds, as far as is known
+        self._hashed: dict[Path, str] = {}  # content hashes of files that were there and right
         self.kept: list[int] = []  # ids whose files were there and right
         self.to_do: Estimate = estimate(size, ())  # ids to simulate and what that takes
         self.verdict = ""  # how the hashes compare with datasets.yaml, in words
@@ -76,8 +77,11 @@ class Generation:
         self._promised: list[int] = []
         self._paces: list[Pace] = []  # how fast scenarios were simulated here
 
-    def survey(self, wanted: Sequence[int], *, force: bool = False) -> None:
-        """Find out what is there and what is to do; writes nothing."""
+    def survey(self, wanted: Sequence[int], *, force: bool = False, gathered: Collection[int] = ()) -> None:
+        """Find out what is there and what is to do; writes nothing.
+
+        What would be ``gathered`` from other root folders counts as there.
+        """
         old = read_or_empty(self.size, self.root)
         held = self.store.held if self.store else {}
         local = [i for i in self.size.scenarios if i not in held]
@@ -92,11 +96,12 @@ class Generation:
         }
         findings = self._read(look, looks, map(self._path, suspects))
         good = [finding.entry for finding in findings if finding.entry]
+        self._hashed = {self._path(entry.scenario): entry.content_sha256 for entry in good}
         bad = set(suspects) - {entry.scenario for entry in good}
         good += held.values()
         kept = tuple(e for e in old.files if e.scenario not in bad)
         self.manifest = merged(self.size, old.model_copy(update={"files": kept}), good)
-        self.kept = [i for i in wanted if i not in bad and not force]
+        self.kept = [i for i in wanted if (i not in bad or i in gathered) and not force]
         on_cores = self.device is Device.CPU and self.scheduler is None
         self.to_do = estimate(self.size, [i for i in wanted if i not in self.kept], on_cores=on_cores)
 
@@ -106,6 +111,7 @@ class Generation:
         for source in self.sources:
             self._keep(gather(self.size, self.root, source, read_or_empty(self.size, self.root)))
         self.survey(wanted, force=force)
+        note(self.folder, self._hashed)
         check_disk(self.root, self.to_do.bytes)
         self._keep(self.manifest)
         try:
@@ -216,11 +222,9 @@ class Generation:
             self._paces += [outcome.pace for outcome in outcomes if outcome.pace]
         for outcome in outcomes:
             await_file(self._path(outcome.scenario))
-        entries = [
-            describe_file(self.root, self.size.key(outcome.scenario), outcome.facts) for outcome in outcomes
-        ]
+        entries = [describe_file(self.root, self.size.key(outcome.scenario)) for outcome in outcomes]
         tested = [outcome for outcome in outcomes if self._is_test(outcome.scenario)]
-        note(self.folder, {self._path(outcome.scenario): outcome.content_sha256 for outcome in tested})
+        note(self.folder, {self._path(outcome.scenario): outcome.content_sha256 for outcome in outcomes})
         self._keep(merged(self.size, self.manifest, entries, environment))
         self._meter.count(scenarios=len(entries))
         for outcome in tested:
@@ -331,7 +335,8 @@ def generate(
     )
     if dry_run:
         generation.store = look_at(tier, folder)
-        generation.survey(wanted, force=force)
+        there = {i for source in generation.sources for i in gatherable(tier, folder, source)}
+        generation.survey(wanted, force=force, gathered=there)
     else:
         if scheduler is None:
             check_installed("taichi", extra="generate")

@@ -58,12 +58,6 @@ SECONDS_PER_FRAME = 2.3e-3
 SECONDS_TO_START = 5.0
 """Starting a worker there, which imports Taichi and compiles the solver [s]; about half the next time."""
 
-BYTES_PER_PARTICLE = 2 * 2 * 4
-"""Position and velocity in one frame, two float32 each, before compression [bytes]."""
-
-BYTES_BESIDE_FRAMES = 64 * 1024
-"""Header, constants and chunk index of a file, generously [bytes]."""
-
 Selection = str | Sequence[str] | None
 Scenarios = str | Iterable[int] | None
 
@@ -118,11 +112,6 @@ class Estimate:
         return SECONDS_TO_START + max(self.core_seconds / workers, longest)
 
 
-def scenario_bytes(size: Size, scenario: int) -> int:
-    """Return the most bytes that a scenario's file takes, in sum over a data set."""
-    return size.frame_count(scenario) * size.particles * BYTES_PER_PARTICLE + BYTES_BESIDE_FRAMES
-
-
 def estimate(
     size: Size, scenarios: Sequence[int], *, drawn: int | None = None, on_cores: bool = True
 ) -> Estimate:
@@ -158,7 +147,7 @@ def estimate(
         scenarios=tuple(scenarios),
         substeps=substeps,
         frames=frames,
-        bytes=sum(scenario_bytes(size, i) for i in scenarios),
+        bytes=sum(map(size.file_bytes, scenarios)),
         core_seconds=(ratio or 1.0) * reference_seconds((sum(substeps) + twins) * size.particles, both),
         measured=ratio is not None,
     )

@@ -144,10 +144,9 @@ def verify(
     for scenario in ids:
         findings[scenario] = examine(folder, tier, scenario, manifest=manifest)
         meter.count(1, scenarios=1)
-    # Which test files are right is noted, so that the scorer need not hash their values again.
-    there = tier.folder(folder)
-    hashed = {i: findings[i].content_sha256 for i in tier.subsets["test"] if i in findings}
-    note(there, {there / "test" / f"{i:04d}.nc": content for i, content in hashed.items() if content})
+    # Which files are right is noted, so that scorer and generator need not hash their values again.
+    hashed = {tier.path(folder, i): f.content_sha256 for i, f in findings.items()}
+    note(tier.folder(folder), {path: content for path, content in hashed.items() if content})
     anew = _regenerate(tier, evenly_spaced(ids, regenerate), cores, meter)
     regenerated = {i: _likeness(tier, findings[i], content) for i, content in anew.items()}
     problems = [f.problem for f in findings.values() if f.problem]
@@ -170,7 +169,7 @@ def verify(
     return VerificationResult(
         split=tier.split,
         size=tier.name,
-        folder=there,
+        folder=tier.folder(folder),
         subsets=reports,
         identity=manifest.identity if manifest else "unknown",
         dataset_sha256=whole,

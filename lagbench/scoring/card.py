@@ -20,7 +20,7 @@ import numpy as np
 
 from lagbench.atomic import write_atomically
 from lagbench.data.checksums import round_digits
-from lagbench.data.hdf5 import check_regular
+from lagbench.data.layout import check_regular
 from lagbench.errors import UnreadableFileError
 from lagbench.metrics.aggregate import Score, Tally, bootstrap_interval
 from lagbench.metrics.frame import Setting

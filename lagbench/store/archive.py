@@ -21,12 +21,12 @@ from pathlib import Path
 from lagbench.atomic import atomic_path
 from lagbench.data.layout import MANIFEST_NAME
 from lagbench.data.local import locate, remedy
-from lagbench.data.manifest import FileEntry, Manifest, read_manifest
+from lagbench.data.manifest import MANIFEST_LIMIT, FileEntry, Manifest, read_manifest
 from lagbench.data.registry import Registry, Size
 from lagbench.data.scenario import check_scenario
 from lagbench.errors import DataError, LagbenchError
 
-from .copy import MANIFEST_LIMIT, bring, parse_manifest, refuse_strangers
+from .copy import bring, parse_manifest, refuse_strangers
 from .fetch import BLOCK, Pace, Wanted, accept, insist, partial_name, received, saving
 from .objects import (
     Answer,
@@ -123,7 +123,7 @@ def fetch_archive(
         length = stream.member(MANIFEST_NAME)
         if length > MANIFEST_LIMIT:
             raise stream.refused(WrongLengthError, "the manifest is too long", f"{MANIFEST_LIMIT} bytes")
-        manifest = parse_manifest(stream.read(length), where=address, remedy=remedy)
+        manifest = parse_manifest(size, stream.read(length), where=address, remedy=remedy)
         stream.skip(-length % tarfile.BLOCKSIZE)
         ids = [entry.scenario for entry in manifest.files]
         other = ids if sorted(ids) != list(size.scenarios) else []

@@ -23,7 +23,15 @@ from lagbench.data.checksums import file_sha256
 from lagbench.data.layout import MANIFEST_NAME, url_of
 from lagbench.data.local import remedy as remedy_of
 from lagbench.data.lock import dataset_lock
-from lagbench.data.manifest import FileEntry, Manifest, merged, read_manifest, read_or_empty, write_manifest
+from lagbench.data.manifest import (
+    MANIFEST_LIMIT,
+    FileEntry,
+    Manifest,
+    merged,
+    read_manifest,
+    read_or_empty,
+    write_manifest,
+)
 from lagbench.data.registry import Size, spell_ids
 from lagbench.data.scenario import check_scenario
 from lagbench.errors import DataError, UsageError, nearest
@@ -31,10 +39,17 @@ from lagbench.work.machine import may_differ
 from lagbench.work.progress import watched
 
 from .fetch import Wanted, fetch_scenarios, fetch_text
-from .objects import HTTP, NotDataError, NotInStoreError, Objects, WrongContentError, check_bucket
+from .objects import (
+    HTTP,
+    NotDataError,
+    NotInStoreError,
+    Objects,
+    WrongContentError,
+    WrongLengthError,
+    check_bucket,
+)
 
 FRESH = 30.0  # how long a store's manifest is not asked for again by this process [s]
-MANIFEST_LIMIT = 64 << 20  # longest manifest that is read [bytes]
 
 _asked: dict[str, tuple[float, Manifest | None]] = {}
 _written: set[Path] = set()
@@ -52,13 +67,15 @@ def folder_of(size: Size) -> str:
 
 
 def _remedy(size: Size, url: str) -> str:
+    if url.startswith(HTTP):
+        return "tell whoever serves the address, or name another --root"
     return f"lagbench generate --split {size.split} --size {size.name} --root {url} writes it anew"
 
 
-def parse_manifest(text: bytes, *, where: str, remedy: str) -> Manifest:
-    """Return a store's manifest; what is none is a NotDataError."""
+def parse_manifest(size: Size, text: bytes, *, where: str, remedy: str) -> Manifest:
+    """Return a store's manifest; what is none, or another data set's, is a NotDataError."""
     try:
-        return Manifest.model_validate_json(text)
+        found = Manifest.model_validate_json(text)
     except ValidationError as error:
         raise NotDataError(
             "the store's manifest is none",
@@ -67,6 +84,15 @@ def parse_manifest(text: bytes, *, where: str, remedy: str) -> Manifest:
             got=ascii(text[:80].decode("utf-8", "replace")),
             fix=remedy,
         ) from error
+    if not found.is_of(size.split, size.name, size.major):
+        raise NotDataError(
+            "the store's manifest is of another data set",
+            where=where,
+            expected=f"{size.split} {size.name}, version {size.major}",
+            got=ascii(f"{found.split} {found.size}, version {found.version}"[:200]),
+            fix=remedy,
+        )
+    return found
 
 
 def refuse_strangers(found: Manifest, strangers: Collection[int], *, where: str, remedy: str) -> None:
@@ -154,7 +180,7 @@ def remote_manifest(size: Size, url: str, *, fresh: float | None = None) -> Mani
         check_bucket(url)
         found = None
     else:
-        found = parse_manifest(text, where=place, remedy=remedy)
+        found = parse_manifest(size, text, where=place, remedy=remedy)
     _asked[place] = (time.monotonic(), found)
     return found
 
@@ -214,6 +240,15 @@ def fetch_entries(size: Size, root: Path, url: str, entries: Collection[FileEntr
     if not entries:
         return
     folder = size.folder(root)
+    too_long = [e.scenario for e in entries if e.bytes > size.longest_file(e.scenario)]
+    if too_long:
+        raise WrongLengthError(
+            "the store's manifest names longer files than there can be",
+            where=f"{address_of(size, url, MANIFEST_NAME)}, scenarios {spell_ids(too_long)}",
+            expected=f"at most {size.longest_file(too_long[0])} bytes",
+            got=next(entry.bytes for entry in entries if entry.scenario == too_long[0]),
+            fix=_remedy(size, url),
+        )
     wanted = {
         entry.scenario: Wanted(
             url=address_of(size, url, entry.path),
@@ -242,17 +277,8 @@ def gather(size: Size, root: Path, source: Path, manifest: Manifest) -> Manifest
     Each job of an array generates some scenarios into a root folder of its own. The whole is then
     what one call would have left.
     """
-    there = size.folder(source)
-    here = size.folder(root)
-    found = read_manifest(source, size.split, size.name, size.major)
-    if found is None or there.resolve() == here.resolve():
-        raise UsageError(
-            "nothing can be gathered from a folder",
-            where=str(source),
-            expected=f"a root folder with {size.split} {size.name} of another call of lagbench generate",
-            got="the folder to write to" if found else "no manifest of that data set",
-        )
-    taken = []
+    there, here = size.folder(source), size.folder(root)
+    found, taken = _gathered(size, root, source), []
     for entry in found.files:
         old = manifest.entry(entry.scenario)
         if old is None or (not old.twin_floor and old.content_sha256 == entry.content_sha256):
@@ -262,12 +288,29 @@ def gather(size: Size, root: Path, source: Path, manifest: Manifest) -> Manifest
             check_scenario(there / entry.path, entry.content_sha256)
             with atomic_path(here / entry.path) as temporary:
                 try:  # files are only ever replaced, so a shared one cannot change
-                    os.link(there / entry.path, temporary)
+                    os.link((there / entry.path).resolve(), temporary)
                 except OSError:
                     shutil.copyfile(there / entry.path, temporary)
     for environment in found.environments:
         manifest = merged(size, manifest, environment=environment)
     return merged(size, manifest, taken)
+
+
+def gatherable(size: Size, root: Path, source: Path) -> tuple[int, ...]:
+    """Return the scenarios that another root folder has finished."""
+    return tuple(entry.scenario for entry in _gathered(size, root, source).files)
+
+
+def _gathered(size: Size, root: Path, source: Path) -> Manifest:
+    found = read_manifest(source, size.split, size.name, size.major)
+    if found is None or size.folder(source).resolve() == size.folder(root).resolve():
+        raise UsageError(
+            "nothing can be gathered from a folder",
+            where=str(source),
+            expected=f"a root folder with {size.split} {size.name} of another call of lagbench generate",
+            got="the folder to write to" if found else "no manifest of that data set",
+        )
+    return found
 
 
 @contextlib.contextmanager

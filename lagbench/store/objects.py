@@ -310,7 +310,7 @@ def _file_system(url: str) -> tuple[Any, str]:
         raise UsageError(
             "no such kind of address",
             where=url,
-            expected="s3://bucket/prefix, or another that fsspec knows; or a folder",
+            expected="s3://bucket/prefix, or another that fsspec knows; file:///path for a folder",
             got=scheme,
         )
     # Another endpoint or other credentials are another system, also within one process.

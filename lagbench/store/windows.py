@@ -241,6 +241,13 @@ class WindowReader:
                 got=f"history {self.history}, future {future}",
                 fix=f"leave history out for the task's {entry.task.input_frames}",
             )
+        if not frames or cache_bytes < 0:
+            raise UsageError(
+                "no windows can be read like that",
+                where=where,
+                expected="a subset at least, and cache_bytes >= 0",
+                got=f"{len(frames)} scenarios, cache_bytes {cache_bytes}",
+            )
         if not len(self):
             raise UsageError(
                 "no scenario is as long as a window",

@@ -41,7 +41,7 @@ def check_split(anatomy: Anatomy, registry: Registry, out: Findings) -> Size | N
         where="attributes 'split' and 'size'",
         expected="a split and size that `lagbench list` shows",
         got=f"{quoted(split)}, {quoted(size)}",
-        fix=f"{known.splitlines()[0]}; or say where a split of your own lies: --split PATH, --root FOLDER",
+        fix=f"{known.splitlines()[0]}; or say where a split of your own lies: --root FOLDER",
     )
     return None
 
