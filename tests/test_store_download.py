@@ -60,7 +60,8 @@ def test_all_files_come_and_are_right(store: Store, here: Path, original: LocalS
     assert result.complete
     assert result.dataset_sha256 == original.dataset_sha256
     assert result.bytes == sum(path.stat().st_size for path in here.rglob("*.nc"))
-    assert left(here) == {"0000.nc", "0001.nc", "0002.nc", "0003.nc", "manifest.json"}
+    notes = ".verified.json"
+    assert left(here) == {"0000.nc", "0001.nc", "0002.nc", "0003.nc", "manifest.json", notes}
     assert lagbench.verify("own", root=here, complete=True).warnings == ()
     with lagbench.open_split("own", root=here) as one, lagbench.open_split(str(original.folder)) as two:
         np.testing.assert_array_equal(one["position"].values, two["position"].values)

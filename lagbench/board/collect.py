@@ -259,10 +259,12 @@ def _curves(scores: Mapping[str, Score], ranking: str) -> dict[str, Curve]:
 def curve(score: Score) -> Curve:
     """Return the mean of a metric over scenarios per frame, and the lowest and highest of them.
 
-    Frames at which no scenario has a value are left out: some metrics have one at every tenth.
+    Some metrics have a value at every tenth frame: the others are left out, they are no gaps.
     """
     measured = np.flatnonzero(np.isfinite(score.per_frame).any(axis=0))
-    chosen = [int(measured[i]) for i in spaced(len(measured), CURVE_FRAMES)]
+    step = int(np.diff(measured).min(initial=len(score.frames)))
+    sampled = range(int(measured[0]) % step if len(measured) else 0, len(score.frames), step)
+    chosen = [sampled[i] for i in spaced(len(sampled), CURVE_FRAMES)]
     values = score.per_frame[:, chosen]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # a frame where nothing is defined is NaN

@@ -87,7 +87,7 @@ def _refused_output() -> Iterator[None]:
                 where=str(error.filename),
                 expected="a file or folder that you may read or write",
                 got=error.strerror,
-                fix="see who owns it, or name another: --root or LAGBENCH_ROOT for data sets",
+                fix="see who owns it, or name another",
             ) from error
         if error.errno not in FULL:
             raise

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 import lagbench
-from lagbench.errors import UnreadableFileError
+from lagbench.errors import LagbenchError
 
 from .options import (
     DeviceOption,
@@ -179,11 +179,13 @@ def list_splits(root: RootOption = None, as_json: JsonFlag = False) -> None:
 
     folder = resolve_root(root)
     registry = rooted(folder, load())
-    found = []
-    for name in (*registry.splits, *registry.local_names()):
+    found = [
+        overview(registry.size(name, s), folder) for name, one in registry.splits.items() for s in one.sizes
+    ]
+    for name in registry.local_names():
         try:
             found += [overview(registry.size(name, size), folder) for size in registry.split(name).sizes]
-        except (UnreadableFileError, PermissionError) as error:  # of one split; the others are told
+        except (LagbenchError, OSError) as error:  # of one split; the others are told
             typer.echo(f"warning: {name} is left out: {error}", err=True)
 
     def listed() -> Iterator[str]:

@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 from lagbench.errors import UnreadableFileError, UsageError, nearest
 
-from .layout import dataset_folder, expanded, resolve_root, url_of
+from .layout import check_regular, dataset_folder, expanded, resolve_root, url_of
 from .registry import NO_GENERATOR, Measured, Registry, Size, Split, load
 
 DESCRIPTION = "split.yaml"
@@ -223,6 +223,7 @@ def _at(folder: Path, root: str | Path | None, registry: Registry | None) -> Hom
 
 def _described(path: Path, name: str) -> tuple[Split, Mapping[str, Measured]]:
     """Return what a local split's description says of it."""
+    check_regular(path)  # a device never ends
     file = load(path)
     if list(file.splits) != [name]:
         raise UnreadableFileError(

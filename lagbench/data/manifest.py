@@ -201,7 +201,10 @@ def merged(
 
 
 MANIFEST_LIMIT = 64 << 20  # longest manifest that is read [bytes]
-_ANEW = "remove it; lagbench generate checks the files and writes it anew"
+_ANEW = (
+    "remove it; lagbench generate checks the files and writes it anew; a local split is made again by"
+    " lagbench adopt or import"
+)
 
 
 def read_manifest(root: Path, split: str, size: str, major: int) -> Manifest | None:
@@ -214,7 +217,7 @@ def read_manifest(root: Path, split: str, size: str, major: int) -> Manifest | N
         text = path.read_bytes()
     except (OSError, UnreadableFileError) as error:
         got = error.strerror if isinstance(error, OSError) else error.got
-        raise DataError("cannot read the manifest", where=str(path), got=got, fix=_ANEW) from error
+        raise DataError("cannot read the manifest", where=str(path), got=got) from error
     try:
         found = Manifest.model_validate_json(text)
     except ValidationError as error:
@@ -292,10 +295,11 @@ _seen: dict[Path, _Note] = {}
 """Files that this process has read whole: their bytes are not read again while their times stay."""
 
 
-def note(folder: Path, contents: Mapping[Path, str]) -> None:
+def note(folder: Path, contents: Mapping[Path, str], digests: Mapping[Path, str] | None = None) -> None:
     """Note the content hashes of files of a data set folder, just hashed or written by this machine.
 
-    Where the folder cannot be written to, nothing is noted.
+    ``digests`` holds the SHA-256 of their bytes, from before their values were read, where it is known;
+    else the bytes are read. Where the folder cannot be written to, nothing is noted.
     """
     if not contents:
         return
@@ -304,7 +308,10 @@ def note(folder: Path, contents: Mapping[Path, str]) -> None:
         stamp, known = _stamp(path), old.get(_spelled(path, folder))
         if known is None or (*astuple(known)[:3], known.content_sha256) != (*stamp, content):
             # The times are from before the bytes: a file that changes meanwhile does not fit its note.
-            found[path] = _seen[path] = _Note(*stamp, file_sha256(path), content)
+            digest = (digests or {}).get(path)
+            found[path] = _Note(*stamp, digest or file_sha256(path), content)
+            if digest is None:
+                _seen[path] = found[path]
     if found:
         rows = {_spelled(path, folder): astuple(held) for path, held in found.items()}
         kept = {name: astuple(held) for name, held in old.items()}
@@ -312,29 +319,41 @@ def note(folder: Path, contents: Mapping[Path, str]) -> None:
             write_atomically(folder / NOTES_NAME, (json.dumps(kept | rows, indent=1) + "\n").encode())
 
 
-def noted_content(folder: Path) -> Callable[[Path], str | None]:
-    """Return what tells the content hash of a file that was hashed here and is still the same.
+def note_entries(folder: Path, entries: Iterable[FileEntry]) -> None:
+    """Note files by their entries, which this machine has just made from them."""
+    files = {folder / entry.path: entry for entry in entries}
+    note(
+        folder,
+        {path: entry.content_sha256 for path, entry in files.items()},
+        {path: entry.file_sha256 for path, entry in files.items()},
+    )
+
+
+def noted_hashes(folder: Path) -> Callable[[Path], tuple[str, str] | None]:
+    """Return what tells content hash and SHA-256 of a file that was hashed here and is still the same.
 
     Its bytes are read to tell, once in a process; values are not unpacked.
     """
     notes = _notes(folder)
 
-    def content(path: Path) -> str | None:
+    def hashes(path: Path) -> tuple[str, str] | None:
         held = notes.get(_spelled(path, folder))
         if held is None or astuple(held)[:3] != _stamp(path):
             return None
         if _seen.get(path) != held and file_sha256(path) != held.file_sha256:
             return None
         _seen[path] = held
-        return held.content_sha256
+        return held.content_sha256, held.file_sha256
 
-    return content
+    return hashes
 
 
 def _notes(folder: Path) -> dict[str, _Note]:
+    path = folder / NOTES_NAME
     try:
-        return {name: _Note(*row) for name, row in json.loads((folder / NOTES_NAME).read_bytes()).items()}
-    except (OSError, ValueError, TypeError, AttributeError, RecursionError):
+        check_regular(path, longest=MANIFEST_LIMIT)
+        return {name: _Note(*row) for name, row in json.loads(path.read_bytes()).items()}
+    except (UnreadableFileError, OSError, ValueError, TypeError, AttributeError, RecursionError):
         return {}
 
 

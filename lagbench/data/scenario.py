@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -88,6 +89,11 @@ CHUNK_CACHE = 1 << 20
 
 DEFLATE_RATIO = 1032
 """No zlib stream unpacks to more than this many times its length."""
+
+MOST_OF_FACTS = 4096
+"""Characters of ``facts``, which no hash covers and the manifest repeats."""
+
+_FACT = re.compile(r"[a-z][a-z0-9_]{0,63}")
 
 MOST_IN_ROW = 20_000_000
 """Values of a variable in one frame, which is read at once: two for each of ten million particles."""
@@ -256,10 +262,10 @@ def _check_lengths(path: Path, variables: Mapping[str, h5py.Dataset]) -> None:
 
     largest = DEFLATE_RATIO * path.stat().st_size
     for name, variable in variables.items():
-        if name not in ATTRIBUTES or math.prod(variable.shape[1:]) > MOST_IN_ROW:
-            raise _damaged(
-                path, name, f"a variable that no scenario has, or so large: shape {variable.shape}"
-            )
+        if name not in ATTRIBUTES:
+            raise _damaged(path, name, "no scenario has that variable")
+        if math.prod(variable.shape[1:]) > MOST_IN_ROW:
+            raise _damaged(path, name, f"more than {MOST_IN_ROW} values in a frame: shape {variable.shape}")
         text = h5py.check_string_dtype(variable.dtype)
         free = text is not None and text.length is None  # how long its values are, they say themselves
         held = variable.size * (1 if free else variable.dtype.itemsize)
@@ -304,9 +310,13 @@ def _header(file: h5py.File, variables: Mapping[str, h5py.Dataset]) -> ScenarioH
 
 def _facts(text: object) -> dict[str, float]:
     """Return the numbers of a mapping in JSON; none where a file states none."""
-    found = {} if text is None else {str(k): float(v) for k, v in json.loads(str(text)).items()}
-    if not all(map(math.isfinite, found.values())):
-        raise DataError("the attribute 'facts' holds a number that is not finite")
+    if text is None:
+        return {}
+    if len(str(text)) > MOST_OF_FACTS:
+        raise DataError("the attribute 'facts' is too long")
+    found = {str(name): float(value) for name, value in json.loads(str(text)).items()}
+    if not all(_FACT.fullmatch(name) and math.isfinite(value) for name, value in found.items()):
+        raise DataError("the attribute 'facts' holds something else than finite numbers by name")
     return found
 
 

@@ -25,6 +25,7 @@ from .layout import ScenarioKey, scenario_path
 from .scenario import (
     AXES,
     MATERIALS,
+    MOST_IN_ROW,
     WALLS,
     ScenarioFile,
     ScenarioHeader,
@@ -108,6 +109,9 @@ class ScenarioWriter:
         reynolds: float | None = None,
         licence: str = "CC-BY-4.0",
     ) -> None:
+        if particles * len(AXES) > MOST_IN_ROW:
+            expected = f"at most {MOST_IN_ROW // len(AXES)}"
+            raise DataError("too many particles", where=str(path), expected=expected, got=particles)
         self.path = path
         self.key = key
         self.content_sha256 = ""  # content hash, set by the clean exit

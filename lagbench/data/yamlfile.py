@@ -16,8 +16,6 @@ import yaml
 
 from lagbench.errors import UnreadableFileError
 
-from .layout import check_regular
-
 MAX_BYTES = 4 * 2**20
 """Largest YAML file that is read [bytes]."""
 
@@ -88,7 +86,14 @@ def _check_structure(text: str) -> None:
 def read_yaml(path: Path) -> Any:  # noqa: ANN401
     """Return the plain Python value of a YAML file."""
     try:
-        check_regular(path, longest=MAX_BYTES)
+        size = path.stat().st_size
+        if size > MAX_BYTES:
+            raise UnreadableFileError(
+                "the YAML file is too large",
+                where=str(path),
+                expected=f"at most {MAX_BYTES} bytes",
+                got=f"{size} bytes",
+            )
         text = path.read_text(encoding="utf-8")
         _check_structure(text)
         return yaml.load(text, Loader=_StrictLoader)

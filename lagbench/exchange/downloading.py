@@ -17,7 +17,7 @@ from lagbench.data.manifest import (
     Manifest,
     describe_file,
     merged,
-    note,
+    note_entries,
     read_manifest,
     read_or_empty,
     write_manifest,
@@ -261,10 +261,6 @@ class _Download:
             facts = entry.facts or claim.facts
             entry = entry.model_copy(update={"facts": facts, "twin_floor": claim.twin_floor})
         self._entries.append(entry)
-        note(
-            self.size.folder(self.root),
-            {scenario_path(self.root, self.size.key(scenario)): entry.content_sha256},
-        )
         self.downloaded.append(scenario)
         self.url = url
         self._meter.count(scenarios=1)
@@ -275,6 +271,7 @@ class _Download:
 
     def record(self) -> Manifest:
         """Write the manifest of what is there now; return it."""
+        note_entries(self.size.folder(self.root), self._entries)
         there = {entry.scenario for entry in self._entries}
         kept = [e for e in self._old.files if e.scenario not in self.missing or e.scenario in there]
         manifest = merged(self.size, self._old.model_copy(update={"files": tuple(kept)}), self._entries)

@@ -229,6 +229,20 @@ class _Building:
                 got=" x ".join(f"[{a:.6g}, {b:.6g}]" for a, b in zip(low, high, strict=True)),
                 fix="fit the box of the data into the unit box: --rescale, and --bounds if none are stated",
             )
+        about = self.about
+        if about.bounds is not None and self.spacing:
+            box = about.measure.box(about.bounds)
+            beyond = max(max(a - p, q - b) for (a, b), p, q in zip(box, low, high, strict=True))
+            if beyond > self.spacing:  # features, clamps and scores rest on the bounds
+                scale, corner = about.measure.scale, np.asarray(about.measure.corner)
+                extent = zip(low * scale + corner, high * scale + corner, strict=True)
+                raise UsageError(
+                    "particles lie outside the stated bounds, by more than their spacing",
+                    where=f"{where}; --bounds, or bounds of the metadata",
+                    expected=f"bounds that hold {' x '.join(f'[{a:.6g}, {b:.6g}]' for a, b in extent)}",
+                    got=about.bounds,
+                    fix="state the box of the data, in their own length",
+                )
         self.low, self.high = np.minimum(self.low, low), np.maximum(self.high, high)
 
     def finish(self, command: str) -> Manifest:
@@ -269,7 +283,6 @@ class _Building:
         about = self.about
         box = ((self.low[0], self.high[0]), (self.low[1], self.high[1]))
         bounds = box if about.bounds is None else about.measure.box(about.bounds)
-        self._check_bounds(bounds)
         frames: dict[int, list[int]] = {}
         for entry in self.entries:
             frames.setdefault(entry.frames, []).append(entry.scenario)
@@ -313,22 +326,6 @@ class _Building:
             },
             "sizes": {SIZE: size},
         }
-
-    def _check_bounds(self, bounds: Sequence[Sequence[float]]) -> None:
-        """Refuse bounds that do not hold the particles: features, clamps and scores rest on them."""
-        beyond = [
-            max(a - low, high - b) for (a, b), low, high in zip(bounds, self.low, self.high, strict=True)
-        ]
-        if max(beyond) > self.spacing:
-            scale, corner = self.about.measure.scale, np.asarray(self.about.measure.corner)
-            extent = zip(self.low * scale + corner, self.high * scale + corner, strict=True)
-            raise UsageError(
-                "particles lie outside the stated bounds, by more than their spacing",
-                where="--bounds, or bounds of the metadata",
-                expected=f"bounds that hold {' x '.join(f'[{a:.6g}, {b:.6g}]' for a, b in extent)}",
-                got=self.about.bounds,
-                fix="state the box of the data, in their own length",
-            )
 
     def _task(self, *, shortest: int) -> dict[str, object]:
         """Return the task, as far as the shortest test scenario allows one."""

@@ -77,8 +77,9 @@ def clean(
                 (folder / name).unlink(missing_ok=True)
     if not dry_run and not leftovers:
         # Folders that hold nothing any more go too, up to the root folder; links stay.
-        for place in (*(child for child in folder.iterdir() if child.is_dir()), folder, *folder.parents):
-            if home in place.parents and not place.is_symlink() and not any(place.iterdir()):
-                with suppress(OSError):  # somebody has just put something there
-                    place.rmdir()
+        with suppress(OSError):  # somebody else was faster
+            for place in (*(child for child in folder.iterdir() if child.is_dir()), folder, *folder.parents):
+                if home in place.parents and not place.is_symlink():
+                    with suppress(OSError):  # it holds something
+                        place.rmdir()
     return CleanResult(removed=tuple(sorted(found)), bytes=length, dry_run=dry_run)

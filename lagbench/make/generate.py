@@ -21,7 +21,15 @@ from lagbench.data.checksums import round_digits
 from lagbench.data.layout import MANIFEST_NAME, expanded
 from lagbench.data.local import locate_new
 from lagbench.data.lock import dataset_lock
-from lagbench.data.manifest import Manifest, describe_file, merged, note, read_or_empty, write_manifest
+from lagbench.data.manifest import (
+    FileEntry,
+    Manifest,
+    describe_file,
+    merged,
+    note_entries,
+    read_or_empty,
+    write_manifest,
+)
 from lagbench.data.registry import Registry, Size, Split, spell_ids
 from lagbench.data.statistics import file_moments, statistics
 from lagbench.errors import UsageError, check_installed, nearest
@@ -68,7 +76,7 @@ class Generation:
         # the store that the root folder is a working copy of; None for a plain folder
         self.store: Publication | None = None
         self.manifest = merged(self.size, None)  # what the folder holds, as far as is known
-        self._hashed: dict[Path, str] = {}  # content hashes of files that were there and right
+        self._hashed: list[FileEntry] = []  # files that were there and right, just hashed
         self.kept: list[int] = []  # ids whose files were there and right
         self.to_do: Estimate = estimate(size, ())  # ids to simulate and what that takes
         self.verdict = ""  # how the hashes compare with datasets.yaml, in words
@@ -77,10 +85,13 @@ class Generation:
         self._promised: list[int] = []
         self._paces: list[Pace] = []  # how fast scenarios were simulated here
 
-    def survey(self, wanted: Sequence[int], *, force: bool = False, gathered: Collection[int] = ()) -> None:
+    def survey(
+        self, wanted: Sequence[int], *, force: bool = False, gathered: Collection[int] | None = None
+    ) -> None:
         """Find out what is there and what is to do; writes nothing.
 
-        What would be ``gathered`` from other root folders counts as there.
+        With ``gathered``, what a real call would take from other root folders, it only tells: that counts
+        as there, and the manifest's word is taken for files.
         """
         old = read_or_empty(self.size, self.root)
         held = self.store.held if self.store else {}
@@ -91,17 +102,23 @@ class Generation:
         suspects = [i for i in local if i in wanted or lengths.get(i) != stated.get(i)]
         self._meter.begin("checking", total=len(suspects), scenarios=len(suspects))
         looks = {
-            f"scenario {i}": Look(root=self.root, size=self.size, scenario=i, manifest=old.only(i))
+            f"scenario {i}": Look(
+                root=self.root,
+                size=self.size,
+                scenario=i,
+                manifest=old.only(i),
+                trusting=gathered is not None,
+            )
             for i in suspects
         }
         findings = self._read(look, looks, map(self._path, suspects))
         good = [finding.entry for finding in findings if finding.entry]
-        self._hashed = {self._path(entry.scenario): entry.content_sha256 for entry in good}
+        self._hashed = [*good]
         bad = set(suspects) - {entry.scenario for entry in good}
         good += held.values()
         kept = tuple(e for e in old.files if e.scenario not in bad)
         self.manifest = merged(self.size, old.model_copy(update={"files": kept}), good)
-        self.kept = [i for i in wanted if (i not in bad or i in gathered) and not force]
+        self.kept = [i for i in wanted if (i not in bad or i in (gathered or ())) and not force]
         on_cores = self.device is Device.CPU and self.scheduler is None
         self.to_do = estimate(self.size, [i for i in wanted if i not in self.kept], on_cores=on_cores)
 
@@ -111,7 +128,7 @@ class Generation:
         for source in self.sources:
             self._keep(gather(self.size, self.root, source, read_or_empty(self.size, self.root)))
         self.survey(wanted, force=force)
-        note(self.folder, self._hashed)
+        note_entries(self.folder, self._hashed)
         check_disk(self.root, self.to_do.bytes)
         self._keep(self.manifest)
         try:
@@ -224,7 +241,7 @@ class Generation:
             await_file(self._path(outcome.scenario))
         entries = [describe_file(self.root, self.size.key(outcome.scenario)) for outcome in outcomes]
         tested = [outcome for outcome in outcomes if self._is_test(outcome.scenario)]
-        note(self.folder, {self._path(outcome.scenario): outcome.content_sha256 for outcome in outcomes})
+        note_entries(self.folder, entries)
         self._keep(merged(self.size, self.manifest, entries, environment))
         self._meter.count(scenarios=len(entries))
         for outcome in tested:
@@ -255,7 +272,7 @@ class GenerationResult:
     device: str  # where the solver ran
     workers: int  # worker processes
     simulated: tuple[int, ...]  # ids that were (dry run: would be) simulated
-    kept: tuple[int, ...]  # ids whose files were there and right
+    kept: tuple[int, ...]  # ids whose files were there and right (dry run: or would be gathered)
     missing: tuple[int, ...]  # ids of the size that are still not there
     bytes_needed: int  # disk space of 'simulated' before compression [bytes]
     bytes_free: int  # free disk space before the start [bytes]
@@ -355,7 +372,7 @@ def generate(
         workers=cores,
         simulated=generation.to_do.scenarios,
         kept=tuple(generation.kept),
-        missing=generation.missing(),
+        missing=tuple(i for i in generation.missing() if i not in generation.kept),
         bytes_needed=generation.to_do.bytes,
         bytes_free=free,
         seconds_expected=generation.to_do.seconds(cores),

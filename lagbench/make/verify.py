@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from lagbench.data.checksums import HASHED_SUBSETS, dataset_hash, subset_hash
+from lagbench.data.checksums import HASHED_SUBSETS, dataset_hash, file_sha256, subset_hash
 from lagbench.data.local import locate, remedy
 from lagbench.data.manifest import Manifest, note, read_manifest
 from lagbench.data.registry import Registry, Size, spell_ids
@@ -140,13 +141,16 @@ def verify(
     except DataError as error:
         warnings.append(str(error))
     meter.begin("hashing", total=len(ids), scenarios=len(ids))
-    findings = {}
+    findings, digests_of = {}, {}
     for scenario in ids:
+        path = tier.path(folder, scenario)
+        with suppress(OSError):  # before the values, so that a file that changes meanwhile fits no note
+            digests_of[path] = file_sha256(path)
         findings[scenario] = examine(folder, tier, scenario, manifest=manifest)
         meter.count(1, scenarios=1)
     # Which files are right is noted, so that scorer and generator need not hash their values again.
     hashed = {tier.path(folder, i): f.content_sha256 for i, f in findings.items()}
-    note(tier.folder(folder), {path: content for path, content in hashed.items() if content})
+    note(tier.folder(folder), {path: content for path, content in hashed.items() if content}, digests_of)
     anew = _regenerate(tier, evenly_spaced(ids, regenerate), cores, meter)
     regenerated = {i: _likeness(tier, findings[i], content) for i, content in anew.items()}
     problems = [f.problem for f in findings.values() if f.problem]

@@ -28,6 +28,7 @@ from lagbench.data.manifest import (
     FileEntry,
     Manifest,
     merged,
+    note_entries,
     read_manifest,
     read_or_empty,
     write_manifest,
@@ -278,7 +279,7 @@ def gather(size: Size, root: Path, source: Path, manifest: Manifest) -> Manifest
     what one call would have left.
     """
     there, here = size.folder(source), size.folder(root)
-    found, taken = _gathered(size, root, source), []
+    found, taken, new = _gathered(size, root, source), [], []
     for entry in found.files:
         old = manifest.entry(entry.scenario)
         if old is None or (not old.twin_floor and old.content_sha256 == entry.content_sha256):
@@ -286,19 +287,29 @@ def gather(size: Size, root: Path, source: Path, manifest: Manifest) -> Manifest
             if (here / entry.path).exists():
                 continue
             check_scenario(there / entry.path, entry.content_sha256)
+            new.append(entry)
             with atomic_path(here / entry.path) as temporary:
                 try:  # files are only ever replaced, so a shared one cannot change
                     os.link((there / entry.path).resolve(), temporary)
                 except OSError:
                     shutil.copyfile(there / entry.path, temporary)
+    note_entries(here, new)
     for environment in found.environments:
         manifest = merged(size, manifest, environment=environment)
     return merged(size, manifest, taken)
 
 
 def gatherable(size: Size, root: Path, source: Path) -> tuple[int, ...]:
-    """Return the scenarios that another root folder has finished."""
-    return tuple(entry.scenario for entry in _gathered(size, root, source).files)
+    """Return the scenarios that :func:`gather` would bring: finished there, and not here at all."""
+    found, known = _gathered(size, root, source), read_or_empty(size, root)
+    there, here = size.folder(source), size.folder(root)
+    return tuple(
+        entry.scenario
+        for entry in found.files
+        if known.entry(entry.scenario) is None
+        and (there / entry.path).is_file()
+        and not (here / entry.path).exists()
+    )
 
 
 def _gathered(size: Size, root: Path, source: Path) -> Manifest:

@@ -36,7 +36,8 @@ class Publication:
         lengths = self._objects.sizes()
         self._named = self._latest = self._read_manifest()
         # Entries of the scenarios that the store holds and that are right, by id.
-        self.held = {e.scenario: e for e in self._right(self._named) if lengths.get(e.path) == e.bytes}
+        right = [e for e in self._right(self._named) if e.bytes <= size.longest_file(e.scenario)]
+        self.held = {e.scenario: e for e in right if lengths.get(e.path) == e.bytes}
         self._there = {e.path: e.file_sha256 for e in self.held.values()}
         self._when = time.monotonic()
 

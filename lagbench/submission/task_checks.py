@@ -73,7 +73,7 @@ def check_dataset(anatomy: Anatomy, size: Size, root: Path, out: Findings) -> No
             where="attribute 'dataset_sha256'",
             expected=f"a recorded hash of {size.split} {size.name}",
             got="neither datasets.yaml nor a complete manifest has one",
-            fix=remedy(size),
+            fix=remedy(size, root=root),
         )
     elif got != expected:
         out.error(

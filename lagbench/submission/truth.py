@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lagbench.data.layout import dataset_folder
 from lagbench.data.local import remedy
-from lagbench.data.manifest import note, noted_content, read_manifest
+from lagbench.data.manifest import note, noted_hashes, read_manifest
 from lagbench.data.registry import Size, spell_ids
 from lagbench.data.scenario import ScenarioFile, check_scenario, read_scenario
 from lagbench.errors import DataError
@@ -46,13 +46,14 @@ class Truth:
 
     def check(self) -> None:
         """Hash the values of every scenario, or find that this machine has done so."""
-        known, new = noted_content(self.folder), {}
+        known, new = noted_hashes(self.folder), {}
         for scenario in sorted(self.size.subsets[self.subset]):
             path, expected = self.path(scenario), self._expected(scenario)
             try:
-                content = known(path)
-                if content is None:
-                    content = new[path] = check_scenario(path)
+                found = known(path)
+                if found is None:
+                    new[path] = check_scenario(path)
+                content = found[0] if found else new[path]
             except (DataError, OSError) as error:
                 raise self._damaged(path, error) from error
             if not content.startswith(expected):

@@ -275,7 +275,7 @@ def _known_hash(size: Size, root: Path) -> str:
             "the hash of the data set is not known",
             where=f"{size.split} {size.name}",
             expected="a hash in datasets.yaml, or a complete data set here",
-            fix=f"{remedy(size)}, or give dataset_sha256",
+            fix=f"{remedy(size, root=root)}, or give dataset_sha256",
         )
     return known
 
