@@ -195,10 +195,27 @@ def test_a_second_call_hashes_each_file_once_and_draws_nothing(
     for module in ("make.inventory", "data.manifest"):
         monkeypatch.setattr(f"lagbench.{module}.file_sha256", counted)
     monkeypatch.setattr(cards, "_draw", refuse)
+    generate(SPLIT, SIZE, root=root, registry=unmeasured, dry_run=True)
+    read.clear()
     generate(SPLIT, SIZE, root=root, registry=unmeasured, progress=news.append)
     assert read == {f"{i:04d}.nc": 1 for i in range(5)}
     checking = [state for state in news if state.stage == "checking"]
     assert (checking[0].done, checking[-1].done, checking[-1].total) == (0, 5, 5)
+
+
+def test_values_are_hashed_once(copied: Copy, unmeasured: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the first call of a copied folder; a dry run takes the manifest's word, later calls the note."""
+
+    def refuse(*_: object) -> str:
+        pytest.fail("values are hashed again")
+
+    root = copied()
+    for dry_run, allowed in ((True, False), (False, True), (False, False)):
+        with monkeypatch.context() as patch:
+            if not allowed:
+                patch.setattr("lagbench.make.inventory.check_scenario", refuse)
+            result = generate(SPLIT, SIZE, root=root, registry=unmeasured, dry_run=dry_run)
+        assert result.kept == (0, 1, 2, 3, 4)
 
 
 @pytest.mark.parametrize("name", ["README.md", "croissant.json", "pictures/frame.png"])

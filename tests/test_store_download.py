@@ -67,6 +67,13 @@ def test_all_files_come_and_are_right(store: Store, here: Path, original: LocalS
         np.testing.assert_array_equal(one["position"].values, two["position"].values)
 
 
+def test_what_came_is_not_hashed_again(store: Store, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A second download reads bytes, not values."""
+    download("own", root=here, mirror=store.url)
+    monkeypatch.setattr("lagbench.make.inventory.check_scenario", None)
+    assert download("own", root=here, mirror=store.url).kept == (0, 1, 2, 3)
+
+
 def test_what_is_there_is_kept(store: Store, here: Path) -> None:
     """A second download asks for what is missing or damaged, and for nothing else."""
     download("own", root=here, mirror=store.url, subset="train")

@@ -225,6 +225,8 @@ _MODELS = (
         recipe="long",
         weights="neuralmpm-long",
     ),
+    Model("neuralmpm-longer", "NeuralMPM from its own rollouts, for longer"),
+    Model("neuralmpm-longer-averaged", "NeuralMPM from its own rollouts, for longer, mean over images"),
     Model("neuralmpm-of-mini", "NeuralMPM trained at mini"),
     Model("neuralmpm-of-mini-averaged", "NeuralMPM trained at mini, mean over images"),
     Model("mlp", "MLP", "#0072b2"),
