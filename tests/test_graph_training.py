@@ -276,7 +276,7 @@ def test_the_operators_own_loss_has_its_weight() -> None:
     assert model.weights["link"] == 1.0
     heavy = linked.build(SMALL | {"link_weight": 0.5, "loss": {"vorticity": 0.0}}, facts())
     assert (heavy.weights["link"], heavy.weights["vorticity"]) == (0.5, 0.0)
-    assert "link" not in network(link_weight=0.5).weights
+    assert "link" not in network().weights
 
 
 @pytest.mark.parametrize("name", ["gns", "supergat"])
