@@ -325,7 +325,7 @@ def test_other_packages_add_splits_and_change_none(plugged: Plug, theirs: str) -
     [
         ("careless", "", "REGISTRY"),
         ("broken", "import no_such_module_at_all", "ModuleNotFoundError.*no_such_module_at_all"),
-        ("lost", "REGISTRY = '/nowhere/datasets.yaml'", "cannot open"),
+        ("lost", "REGISTRY = '/nowhere/datasets.yaml'", "/nowhere/datasets.yaml"),
         ("silent", "REGISTRY = {theirs!r}", "no split 'silent'"),
         ("cavity", "REGISTRY = {theirs!r}", "its name is taken"),
     ],
