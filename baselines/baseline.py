@@ -8,9 +8,10 @@ and never a test scenario.
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
@@ -27,7 +28,16 @@ from lagbench.errors import DataError, UsageError
 from lagbench.store.copy import bring
 from lagbench.torch import Batch
 
-__all__ = ["Baseline", "Batch", "Facts", "Options", "check_moving_walls", "facts_of", "last_velocities"]
+__all__ = [
+    "Baseline",
+    "Batch",
+    "Facts",
+    "Options",
+    "check_moving_walls",
+    "facts_of",
+    "last_velocities",
+    "rescaled",
+]
 
 
 class Options(BaseModel):
@@ -187,6 +197,17 @@ class Facts:
     def from_json(cls, values: object) -> Self:
         """Return the facts that :meth:`as_json` gave."""
         return TypeAdapter(cls).validate_python(values)
+
+
+def rescaled(trained: Facts, here: Facts) -> Facts:
+    """Return the facts of a size for weights of another: what they multiply stays as it was trained.
+
+    Bodies fill the same area with more or fewer particles: their distance goes with the root of that.
+    """
+    if trained.size == here.size:
+        return trained
+    radius = trained.radius * math.sqrt(trained.particles / here.particles)
+    return replace(here, radius=radius, statistics=trained.statistics)
 
 
 def facts_of(

@@ -137,9 +137,15 @@ class _Options(_Read):
     windows: tuple[str, ...] = ("train",)
 
 
+class _Start(_Read):
+    sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
+    recipe: str = Field(max_length=200)
+
+
 class _Recipe(_Read):
     name: str = Field(default="", max_length=200)
     training: _Options = _Options()
+    start: _Start | None = None
 
 
 class _Training(_Read):

@@ -290,6 +290,7 @@ class TrainingJob:
     def budget(self, ledger: TrainingRecord) -> Budget:
         """Return what the training took so far, as predictions and entries say it.
 
+        Hours are with those of the weights that it started from; steps, windows and validations are its own.
         Of many validations every n-th is told, the last one among them.
         """
         machine = hardware(self.device)
@@ -299,13 +300,19 @@ class TrainingJob:
         stride = -(-len(told) // MOST_VALIDATIONS) or 1
         # Processes that read windows ahead live on, so that nobody has their time.
         seconds = None if self.workers else ledger.cpu_seconds - ledger.validation_cpu_seconds
+        before = self.recipe.start or {}
+
+        def hours(own: float | None, name: str) -> float | None:
+            spent = before.get(name, 0.0)
+            return None if own is None or spent is None else round_digits(own / 3600.0 + spent, 6)
+
         return Budget(
             windows=ledger.windows_seen or None,
             epochs=round_digits(ledger.epochs, 6),
             steps=ledger.step,
-            cpu_hours=None if seconds is None else round_digits(seconds / 3600.0, 6),
-            validation_hours=round_digits(ledger.validation_cpu_seconds / 3600.0, 6),
-            gpu_hours=round_digits(ledger.gpu_seconds / 3600.0, 6),
+            cpu_hours=hours(seconds, "cpu_hours"),
+            validation_hours=hours(ledger.validation_cpu_seconds, "validation_hours"),
+            gpu_hours=hours(ledger.gpu_seconds, "gpu_hours"),
             device=device.encode("ascii", "replace").decode()[:100],
             threads=machine["threads"],
             metric=ledger.metric,

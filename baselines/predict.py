@@ -7,7 +7,6 @@ step to warm up; that of the neighbour search is measured on frames of the same 
 from __future__ import annotations
 
 import json
-import math
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -27,7 +26,7 @@ from lagbench.submission.writer import PredictionsWriter
 from lagbench.work.progress import Meter, Progress
 
 from .augmentation import check_symmetry
-from .baseline import Baseline, Facts
+from .baseline import Baseline, Facts, rescaled
 from .catalogue import find
 from .checkpoint import Checkpoint, check_data, load, restore
 from .graph import radius_graph
@@ -236,7 +235,7 @@ def _model(
     found: Checkpoint, facts: Facts, settings: Sequence[str], known: Registry, *, where: str
 ) -> Baseline:
     """Return the model of a checkpoint for the size that facts tell of, with settings."""
-    scaled = replace(found, facts=_rescaled(found.facts, facts))
+    scaled = replace(found, facts=rescaled(found.facts, facts))
     model = restore(scaled, where=where)  # refuses a damaged file, whatever is set
     if not settings:
         return model
@@ -253,17 +252,6 @@ def _model(
         ) from error
 
 
-def _rescaled(trained: Facts, here: Facts) -> Facts:
-    """Return the facts of a size for weights of another: what they multiply stays as it was trained.
-
-    Bodies fill the same area with more or fewer particles: their distance goes with the root of that.
-    """
-    if trained.size == here.size:
-        return trained
-    radius = trained.radius * math.sqrt(trained.particles / here.particles)
-    return replace(here, radius=radius, statistics=trained.statistics)
-
-
 RECIPE, PREDICTED_WITH = ", recipe ", ", predicted with "
 """What comes before a recipe's name and before the settings of a prediction, in the words for a training."""
 
@@ -274,7 +262,9 @@ def training_words(checkpoint: Checkpoint) -> str:
     recipe = done.get("recipe", {})
     subsets = "+".join(recipe.get("training", {}).get("windows", ("train",)))
     words = f"{facts.split} {facts.size} {subsets}{RECIPE}{recipe.get('name')}, step {done.get('step', 0)}"
-    return words + "".join(f", {setting}" for setting in settings_of(recipe))
+    words += "".join(f", {setting}" for setting in settings_of(recipe))
+    start = recipe.get("start")
+    return words + (f", started from {start['recipe']}, weights {start['sha256'][:12]}" if start else "")
 
 
 def fits(training: str, checkpoint: Checkpoint) -> bool:

@@ -173,6 +173,8 @@ class Recipe:
     name: str  # name of the recipe, as in cavity/mini
     model: Mapping[str, Any]  # options of the model, plain values
     training: TrainingOptions  # options of the training
+    # what is known of the weights that the training starts from, their SHA-256 among it; None for random ones
+    start: Mapping[str, Any] | None = None
 
     def as_json(self) -> dict[str, Any]:
         """Return plain values."""
@@ -181,7 +183,8 @@ class Recipe:
             group: {key: value for key, value in part.items() if (key, value) not in LATER[group].items()}
             for group, part in parts.items()
         }
-        return {"baseline": self.baseline, "name": self.name, **told}
+        start = {"start": dict(self.start)} if self.start else {}
+        return {"baseline": self.baseline, "name": self.name, **told, **start}
 
 
 class _Part(BaseModel):

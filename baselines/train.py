@@ -13,7 +13,7 @@ import shutil
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain, count, islice
 from pathlib import Path
 
@@ -47,6 +47,7 @@ from .machine import (
 from .module import TrainingCallback, TrainingModule, generators_kept, reseed, seed_of
 from .recipe import recipe_for
 from .rollout import scenario_batch, scenario_paths, validation_of
+from .start import start_from
 
 SMALLER = "lower --set training.batch=1, then the model: model.latent, .layers, .widths or .lags"
 
@@ -90,6 +91,7 @@ def train(
     recipe: str | None = None,
     settings: tuple[str, ...] = (),
     seed: int | None = None,
+    start: str | Path | None = None,
     root: str | Path | None = None,
     output: str | Path | None = None,
     resume: bool = True,
@@ -110,6 +112,7 @@ def train(
         recipe: variant of the recipe, or a YAML file of recipes.
         settings: changes to the recipe, as in ``training.steps=100``.
         seed: seed in place of the recipe's.
+        start: weights.pt to start from, perhaps of another size; random weights when None.
         root: folder of all data sets; else ``LAGBENCH_ROOT``, else the user data folder.
         output: folder of the run; ``runs/<split>/<size>/<baseline>-<seed>`` by default.
         resume: go on with what an earlier run left there.
@@ -123,7 +126,8 @@ def train(
 
     Raises:
         UsageError: unknown baseline, split, size, recipe or key; images that gravity forbids; or
-            the folder holds another training, or weights without their checkpoint.
+            the folder holds another training, or weights without their checkpoint; weights to start
+            from that do not fit.
         DataError: the data set is missing or damaged.
         UnreadableFileError: the checkpoint in the folder is damaged.
         WorkFailedError: the loss is not finite, memory or disk is full.
@@ -133,7 +137,10 @@ def train(
     tier, home, known = locate(split, size, root=root, registry=registry)
     plan = recipe_for(entry, tier.split, tier.name, variant=recipe, settings=settings, seed=seed)
     check_symmetry(plan.model.get("symmetry"), tier)
-    facts = facts_of(tier.split, tier.name, root=home, registry=known)
+    facts, begun = facts_of(tier.split, tier.name, root=home, registry=known), None
+    if start is not None:
+        begun = start_from(start, plan, tier, root=home, registry=known)
+        plan, facts = replace(plan, start=begun.record), begun.facts
     own = Path("runs") / plan.name / f"{plan.baseline}-{plan.training.seed}"
     folder = RunFolder(Path(output) if output else own)
     check_writable(folder.path, option="--output")
@@ -160,6 +167,8 @@ def train(
     with generators_kept(), threads_used(threads, processes=here), memory_errors_told(SMALLER):
         reseed(seed_of(plan.training.seed))
         model = entry.model.build(plan.model, facts)
+        if begun is not None and earlier is None:
+            begun.fill(model)
         ledger, steps = (fit if getattr(model, "closed_form", False) else descend)(job, model)
         budget = job.budget(ledger)
         return TrainingResult(
@@ -357,6 +366,8 @@ def fit(job: TrainingJob, model: Baseline) -> tuple[TrainingRecord, int]:
         return ledger, STEPS
     if job.recipe.training.compile:
         model.compile_layers()  # refuses: a closed form has none
+    if job.recipe.start:
+        raise UsageError(f"{model.method} is fitted as a whole", where="--start", fix="leave the option out")
     if job.recipe.training.ema:
         raise UsageError(
             f"{model.method} takes no steps to average over",

@@ -62,6 +62,10 @@ def train(
     seed: Annotated[
         int | None, typer.Option("--seed", metavar="N", help="Seed of all chance.", min=0)
     ] = None,
+    start: Annotated[
+        Path | None,
+        typer.Option("--start", metavar="FILE", help="weights.pt to start from; of another size perhaps."),
+    ] = None,
     root: RootOption = None,
     output: Annotated[
         Path | None,
@@ -103,6 +107,7 @@ def train(
             recipe=recipe,
             settings=tuple(settings or ()),
             seed=seed,
+            start=start,
             root=root,
             output=output,
             resume=resume,
