@@ -366,16 +366,10 @@ def fit(job: TrainingJob, model: Baseline) -> tuple[TrainingRecord, int]:
         return ledger, STEPS
     if job.recipe.training.compile:
         model.compile_layers()  # refuses: a closed form has none
-    if job.recipe.start:
-        raise UsageError(f"{model.method} is fitted as a whole", where="--start", fix="leave the option out")
-    if job.recipe.training.ema:
-        raise UsageError(
-            f"{model.method} takes no steps to average over",
-            where="training.ema",
-            expected=0.0,
-            got=job.recipe.training.ema,
-            fix="leave the option out",
-        )
+    for where, asked in (("--start", bool(job.recipe.start)), ("training.ema", job.recipe.training.ema)):
+        if asked:
+            message = f"{model.method} is fitted as a whole, without steps"
+            raise UsageError(message, where=where, got=asked, fix="leave the option out")
 
     def scenarios() -> Iterator[NDArray[np.float32]]:
         paths = [
