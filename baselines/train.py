@@ -148,7 +148,7 @@ def train(
     earlier = folder.earlier(plan, resume=resume, fresh=fresh)
     if earlier is not None:
         _check_same_conditions(earlier, facts, processes=shared, where=str(folder.path))
-    if earlier is None and not is_helper():
+    elif not is_helper():
         folder.clear()
     job = TrainingJob(
         recipe=plan,

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import atexit
 import functools
 import gc
 import os
 import pickle
 import shutil
 import sys
+import tempfile
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
@@ -45,6 +47,10 @@ from lagbench.work.pool import Pool
 # Seeded examples are the same ones every time, and the later ones are variations of the first.
 settings.register_profile("seeded", derandomize=True, deadline=None, max_examples=40)
 settings.load_profile("seeded")
+
+if os.environ.pop("PYTHONDONTWRITEBYTECODE", None):  # each child process would compile torch anew, in 7 s
+    os.environ["PYTHONPYCACHEPREFIX"] = bytecode = tempfile.mkdtemp(prefix="lagbench-bytecode-")
+    atexit.register(shutil.rmtree, bytecode, ignore_errors=True)
 
 OUTCOMES, DRAW = scored._outcomes, cards._draw
 
