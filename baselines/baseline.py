@@ -164,7 +164,7 @@ def check_moving_walls(asked: bool, facts: Facts) -> None:
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Count = Annotated[int, Field(gt=0)]
+Count = Annotated[int, Field(gt=0, lt=10**12)]
 Pair = tuple[Finite, Finite]
 
 
@@ -204,8 +204,6 @@ def rescaled(trained: Facts, here: Facts) -> Facts:
 
     Bodies fill the same area with more or fewer particles: their distance goes with the root of that.
     """
-    if trained.size == here.size:
-        return trained
     radius = trained.radius * math.sqrt(trained.particles / here.particles)
     return replace(here, radius=radius, statistics=trained.statistics)
 

@@ -35,6 +35,7 @@ from lagbench.data.layout import check_regular
 from lagbench.data.registry import Registry
 from lagbench.data.registry import load as load_registry
 from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError, WorkFailedError
+from lagbench.submission.budget import Budget, budget_in
 
 from .baseline import Baseline, Facts, facts_of
 from .catalogue import find
@@ -109,6 +110,9 @@ def _too_large(where: str, expected: str, got: str) -> UnreadableFileError:
 FORMAT = 1
 KEY = "lagbench_checkpoint"
 SAFE = "a checkpoint that lagbench train wrote"
+RECIPE_NAME = (
+    r"^[A-Za-z0-9._/*-]{1,100}$"  # what records say of a recipe by which others' weights were trained
+)
 
 _FOREIGN = re.compile(r"GLOBAL ([\w.]+)")  # how torch's refusal names what a pickle would call
 
@@ -125,6 +129,11 @@ class Checkpoint:
     # state of the optimiser; None in a file that is for predictions only
     optimizer: Mapping[str, Any] | None = None
 
+    @property
+    def budget(self) -> Budget | None:
+        """What the training took; None where that is not known."""
+        return budget_in(json.dumps(self.training.get("budget")))
+
 
 class _Read(BaseModel):
     """What a file says of a training, as far as it is read again; the rest passes as it is."""
@@ -139,7 +148,7 @@ class _Options(_Read):
 
 class _Start(_Read):
     sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
-    recipe: str = Field(max_length=200)
+    recipe: str = Field(pattern=RECIPE_NAME)
 
 
 class _Recipe(_Read):
@@ -230,7 +239,7 @@ def restore(checkpoint: Checkpoint, *, where: str = "the checkpoint") -> Baselin
             got=first["msg"],
             fix=f"it is from another version of {checkpoint.baseline}; train anew",
         ) from None
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, ArithmeticError) as error:
         raise UnreadableFileError(
             "no model can be built from it", where=where, got=f"{type(error).__name__}: {error}"
         ) from None
@@ -240,7 +249,7 @@ def restore(checkpoint: Checkpoint, *, where: str = "the checkpoint") -> Baselin
 
 def load_weights(model: nn.Module, weights: Mapping[str, Tensor], *, where: str) -> None:
     """Copy weights into a model; those in bfloat16 become float32."""
-    broken = [name for name, value in weights.items() if not torch.isfinite(value).all()]
+    broken = [name for name, value in weights.items() if not value.to(torch.float32).isfinite().all()]
     if broken:
         raise UnreadableFileError("weights are not finite", where=where, got=", ".join(broken[:3]))
     try:

@@ -184,6 +184,10 @@ class RunFolder:
             return {}
         return said if isinstance(said, dict) else {}
 
+    def holds(self, file: Path) -> bool:
+        """Tell whether a file is one of those that a training here writes, behind a link perhaps."""
+        return any(one.exists() and one.samefile(file) for one in (self.weights, self.checkpoint))
+
     def clear(self) -> None:
         """Remove what an earlier training left, and nothing else."""
         logs = (*self.logs.glob("events.out.tfevents.*"), self.logs / "hparams.yaml")
@@ -234,6 +238,13 @@ def settings_of(recipe: object) -> tuple[str, ...]:
         return ()
     parts = {"model": shipped.model, "training": shipped.training.model_dump(mode="json")}
     return tuple(sorted(f"{key}={_spelled(value)}" for key, value in _changes(parts, held, LATER)))
+
+
+def changes_of(recipe: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return what a training changed of its recipe, and the weights that it started from, in words."""
+    start = recipe.get("start")
+    words = (f"started from {start['recipe']}, weights {start['sha256'][:12]}",) if start else ()
+    return (*settings_of(recipe), *words)
 
 
 def _changes(
@@ -290,7 +301,7 @@ class TrainingJob:
     def budget(self, ledger: TrainingRecord) -> Budget:
         """Return what the training took so far, as predictions and entries say it.
 
-        Hours are with those of the weights that it started from; steps, windows and validations are its own.
+        Hours are with those of the weights that it started from; epochs, steps and validations are its own.
         Of many validations every n-th is told, the last one among them.
         """
         machine = hardware(self.device)
@@ -300,16 +311,17 @@ class TrainingJob:
         stride = -(-len(told) // MOST_VALIDATIONS) or 1
         # Processes that read windows ahead live on, so that nobody has their time.
         seconds = None if self.workers else ledger.cpu_seconds - ledger.validation_cpu_seconds
-        before = self.recipe.start or {}
+        earlier = (self.recipe.start or {}).get("took", {})
 
         def hours(own: float | None, name: str) -> float | None:
-            spent = before.get(name, 0.0)
+            spent = earlier.get(name, 0.0)
             return None if own is None or spent is None else round_digits(own / 3600.0 + spent, 6)
 
         return Budget(
             windows=ledger.windows_seen or None,
             epochs=round_digits(ledger.epochs, 6),
             steps=ledger.step,
+            start_steps=earlier.get("steps"),
             cpu_hours=hours(seconds, "cpu_hours"),
             validation_hours=hours(ledger.validation_cpu_seconds, "validation_hours"),
             gpu_hours=hours(ledger.gpu_seconds, "gpu_hours"),

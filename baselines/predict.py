@@ -21,7 +21,6 @@ from lagbench.data.layout import resolve_root
 from lagbench.data.local import rooted
 from lagbench.data.registry import Registry
 from lagbench.errors import UnreadableFileError, UsageError
-from lagbench.submission.budget import budget_in
 from lagbench.submission.writer import PredictionsWriter
 from lagbench.work.progress import Meter, Progress
 
@@ -30,7 +29,7 @@ from .baseline import Baseline, Facts, rescaled
 from .catalogue import find
 from .checkpoint import Checkpoint, check_data, load, restore
 from .graph import radius_graph
-from .job import RunFolder, parameter_count, settings_of
+from .job import RunFolder, changes_of, parameter_count
 from .machine import bound_memory, chosen_device, hardware, memory_errors_told, threads_used
 from .recipe import changed_options
 from .rollout import Rollout, roll_out, scenario_batch, scenario_paths
@@ -262,9 +261,7 @@ def training_words(checkpoint: Checkpoint) -> str:
     recipe = done.get("recipe", {})
     subsets = "+".join(recipe.get("training", {}).get("windows", ("train",)))
     words = f"{facts.split} {facts.size} {subsets}{RECIPE}{recipe.get('name')}, step {done.get('step', 0)}"
-    words += "".join(f", {setting}" for setting in settings_of(recipe))
-    start = recipe.get("start")
-    return words + (f", started from {start['recipe']}, weights {start['sha256'][:12]}" if start else "")
+    return words + "".join(f", {change}" for change in changes_of(recipe))
 
 
 def fits(training: str, checkpoint: Checkpoint) -> bool:
@@ -282,7 +279,7 @@ def _provenance(checkpoint: Checkpoint, here: Facts, settings: Sequence[str]) ->
     words = training_words(checkpoint) + (f"{PREDICTED_WITH}{', '.join(settings)}" if settings else "")
     seed = done.get("recipe", {}).get("training", {}).get("seed", 0)
     found: dict[str, Any] = {"training": words, "seed": int(seed)}
-    budget = budget_in(json.dumps(done.get("budget")))
+    budget = checkpoint.budget
     if budget is None:
         return found
     if here.size != facts.size:

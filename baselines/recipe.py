@@ -222,8 +222,12 @@ def recipe_for(
     variant: str | None = None,
     settings: Iterable[str] = (),
     seed: int | None = None,
+    known: Mapping[str, Any] | None = None,
 ) -> Recipe:
-    """Return the recipe of a baseline for a split and size."""
+    """Return the recipe of a baseline for a split and size.
+
+    ``known`` are options of a trained model to go on with: above the recipe's, below ``settings``.
+    """
     own_file = variant is not None and variant.endswith((".yaml", ".yml"))
     path = Path(str(variant)) if own_file else entry.recipes
     file = _read(path) if path else _File(format=1)
@@ -250,7 +254,7 @@ def recipe_for(
             where = f"{path}, {name}, baselines"
             raise UnreadableFileError(f"unknown baseline {other!r}", where=where, fix=nearest(other, names()))
     own = part.baselines.get(entry.name, _Part())
-    model, training = _merge(model, own.model), _merge(training, own.training)
+    model, training = _merge(_merge(model, own.model), dict(known or {})), _merge(training, own.training)
     for setting in settings:
         group, changes = _setting(setting)
         if group == "model":

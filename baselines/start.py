@@ -1,14 +1,14 @@
 """Weights that a training starts from: those of an earlier one, of the same size or of another.
 
-A model that knows the velocities and distances of one size goes on in their units at another, so that its
-first step there predicts what ``lagbench predict --size`` does.
+A model that knows the velocities and distances of one size goes on in their units at another, and with the
+options that it has, so that its first step there predicts what ``lagbench predict --size`` does.
 """
 
 from __future__ import annotations
 
-import json
+import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +16,15 @@ from torch import Tensor
 
 from lagbench.data.checksums import file_sha256
 from lagbench.data.registry import Registry, Size
-from lagbench.errors import UsageError
-from lagbench.submission.budget import Budget, budget_in
+from lagbench.errors import UnreadableFileError, UsageError
+from lagbench.submission.budget import Budget
 
 from .baseline import Baseline, Facts, rescaled
-from .checkpoint import Checkpoint, check_data, load, load_weights
-from .recipe import Recipe
+from .catalogue import Entry
+from .checkpoint import RECIPE_NAME, Checkpoint, check_data, load, load_weights, restore
 
 WHERE = "--start"
+MOST_HOURS, MOST_STEPS = 1e9, 10**12  # more are not believed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,74 +34,96 @@ class Start:
     path: Path  # their file
     facts: Facts  # public figures of the data at hand, in the units that the weights know
     weights: Mapping[str, Tensor]
-    options: Mapping[str, Any]  # options of the model that they are of
-    record: Mapping[str, Any]  # what records say of them: sha256, recipe, and the hours that they took
+    options: Mapping[str, Any]  # options of the model that they are of, without those of its training
+    record: Mapping[str, Any]  # what records say of them: recipe, sha256, and what they took
 
     def fill(self, model: Baseline) -> None:
         """Copy the weights into a model.
 
         Raises:
-            UsageError: the weights are those of another network, or mean something else.
-            UnreadableFileError: they are not finite.
+            UsageError: they are of another network, or mean something else there.
         """
-        ours, kind = model.options.model_dump(mode="json"), type(model.options)
-        other = {name for name in set(ours) & set(self.options) if self.options[name] != ours[name]}
+        ours = model.options.model_dump(mode="json")
+        other = sorted(name for name, value in self.options.items() if ours[name] != value)
         held, needed = (
             {name: value.shape for name, value in weights.items()}
             for weights in (self.weights, model.state_dict())
         )
-        if held != needed or other & kind.of_weights:
-            told = [f"model.{name}={self.options[name]}" for name in sorted(other - kind.in_training)]
+        if held != needed or model.options.of_weights.intersection(other):
             raise UsageError(
                 "the weights do not fit the model",
                 where=WHERE,
                 expected="weights of the network that is trained",
-                got=f"weights of one with {', '.join(told)}"[:500] if told else "weights of another",
-                fix="train the network that they are of, with --set, or start from other weights",
+                got="weights of one with "
+                + ", ".join(f"model.{name}={self.options[name]}" for name in other)[:500],
+                fix="leave out what was --set of these, or start from other weights",
             )
         load_weights(model, self.weights, where=str(self.path))
 
 
-def start_from(path: str | Path, recipe: Recipe, size: Size, *, root: Path, registry: Registry) -> Start:
+def start_from(path: str | Path, entry: Entry, size: Size, *, root: Path, registry: Registry) -> Start:
     """Return the weights of a file for a training on the data at hand.
 
     Args:
         path: weights.pt or checkpoint.pt of a training, perhaps at another size of the split.
-        recipe: what is to be trained.
+        entry: baseline that is to be trained.
         size: on which data.
         root: folder of all data sets.
         registry: where splits are described.
 
     Raises:
-        UnreadableFileError: the file is damaged or unsafe.
-        UsageError: weights of another baseline, split, box or interval of frames.
+        UnreadableFileError: the file is damaged, unsafe, or changed while it was read.
+        UsageError: a baseline that is fitted as a whole; or weights of another baseline, split or size.
         DataError: the data are missing, or of another version than those that the weights were trained on.
     """
+    if getattr(entry.model, "closed_form", False):
+        message = f"{entry.model.method} is fitted as a whole, without steps"
+        raise UsageError(message, where=WHERE, got=str(path), fix="leave the option out")
     file = Path(path)
-    found = load(file)
+    found, before = load(file), file.stat()
+    sha256, after = file_sha256(file), file.stat()
+    if (before.st_ino, before.st_size, before.st_mtime_ns) != (
+        after.st_ino,
+        after.st_size,
+        after.st_mtime_ns,
+    ):
+        raise UnreadableFileError(
+            "the file changed while it was read", where=str(file), fix="start from a copy"
+        )
     for what, asked, got in (
-        ("baseline", recipe.baseline, found.baseline),
+        ("baseline", entry.name, found.baseline),
         ("split", size.split, found.facts.split),
     ):
         if asked != got:
             fix = f"start from weights of {asked}"
             raise UsageError(f"weights of another {what}", where=WHERE, expected=asked, got=got, fix=fix)
-    here = check_data(found, root=root, registry=registry, size=size.name, where=f"{WHERE} {file}")
+    try:
+        here = check_data(found, root=root, registry=registry, size=size.name, where=f"{WHERE} {file}")
+    except UsageError as error:
+        fix = f"start from weights of {size.name}"
+        raise UsageError(error.what, where=WHERE, expected=error.expected, got=error.got, fix=fix) from error
+    facts = rescaled(found.facts, here)
+    options = restore(replace(found, facts=facts), where=str(file)).options
     return Start(
         path=file,
-        facts=rescaled(found.facts, here),
+        facts=facts,
         weights=found.weights,
-        options=found.options,
-        record=_record(file, found),
+        options=options.model_dump(mode="json", exclude=set(options.in_training)),
+        record={"recipe": _recipe_of(found), "sha256": sha256, "took": _took(found)},
     )
 
 
-def _record(file: Path, found: Checkpoint) -> dict[str, Any]:
-    """Return what records say of the weights; hours that nobody knows are None."""
-    budget = budget_in(json.dumps(found.training.get("budget"))) or Budget()
-    hours = ("cpu_hours", "validation_hours", "gpu_hours")
-    return {
-        "sha256": file_sha256(file),
-        "recipe": str(found.training.get("recipe", {}).get("name", "")),
-        **{name: getattr(budget, name) for name in hours},
-    }
+def _recipe_of(found: Checkpoint) -> str:
+    """Return the name of the recipe that weights were trained by, if it is one."""
+    name = str(found.training.get("recipe", {}).get("name", ""))
+    return name if re.fullmatch(RECIPE_NAME, name) else "unnamed"
+
+
+def _took(found: Checkpoint) -> dict[str, float | None]:
+    """Return steps and hours behind weights; None for all hours where one is not known."""
+    budget = found.budget or Budget()
+    hours = {name: getattr(budget, name) for name in ("cpu_hours", "validation_hours", "gpu_hours")}
+    if any(value is None or value > MOST_HOURS for value in hours.values()):
+        hours = dict.fromkeys(hours)
+    steps = int(found.training.get("step", 0)) + (budget.start_steps or 0)
+    return {**hours, "steps": min(steps, MOST_STEPS)}

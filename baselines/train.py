@@ -7,12 +7,9 @@ a training that was interrupted and resumed ends, on one thread, with the same b
 
 from __future__ import annotations
 
-import logging
 import os
 import shutil
-import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import chain, count, islice
 from pathlib import Path
@@ -44,7 +41,7 @@ from .machine import (
     multiplies_bfloat16,
     threads_used,
 )
-from .module import TrainingCallback, TrainingModule, generators_kept, reseed, seed_of
+from .module import TrainingCallback, TrainingModule, generators_kept, quiet, reseed, seed_of
 from .recipe import recipe_for
 from .rollout import scenario_batch, scenario_paths, validation_of
 from .start import start_from
@@ -135,21 +132,26 @@ def train(
     """
     entry = find(baseline)
     tier, home, known = locate(split, size, root=root, registry=registry)
-    plan = recipe_for(entry, tier.split, tier.name, variant=recipe, settings=settings, seed=seed)
+    begun = None if start is None else start_from(start, entry, tier, root=home, registry=known)
+    kept = begun.options if begun else None
+    plan = recipe_for(entry, tier.split, tier.name, variant=recipe, settings=settings, seed=seed, known=kept)
     check_symmetry(plan.model.get("symmetry"), tier)
-    facts, begun = facts_of(tier.split, tier.name, root=home, registry=known), None
-    if start is not None:
-        begun = start_from(start, plan, tier, root=home, registry=known)
-        plan, facts = replace(plan, start=begun.record), begun.facts
+    facts = begun.facts if begun else facts_of(tier.split, tier.name, root=home, registry=known)
+    plan = replace(plan, start=begun.record) if begun else plan
     own = Path("runs") / plan.name / f"{plan.baseline}-{plan.training.seed}"
     folder = RunFolder(Path(output) if output else own)
     check_writable(folder.path, option="--output")
+    if begun is not None and folder.holds(begun.path):
+        raise UsageError(
+            "the weights to start from lie in the folder of the training",
+            where="--start",
+            got=str(start),
+            fix="name another folder with --output",
+        )
     shared = int(os.environ.get("WORLD_SIZE", processes))
     earlier = folder.earlier(plan, resume=resume, fresh=fresh)
     if earlier is not None:
         _check_same_conditions(earlier, facts, processes=shared, where=str(folder.path))
-    elif not is_helper():
-        folder.clear()
     job = TrainingJob(
         recipe=plan,
         facts=facts,
@@ -169,6 +171,8 @@ def train(
         model = entry.model.build(plan.model, facts)
         if begun is not None and earlier is None:
             begun.fill(model)
+        if earlier is None and not is_helper():
+            folder.clear()
         ledger, steps = (fit if getattr(model, "closed_form", False) else descend)(job, model)
         budget = job.budget(ledger)
         return TrainingResult(
@@ -218,9 +222,6 @@ def _check_same_conditions(earlier: Checkpoint, facts: Facts, *, processes: int,
             got=processes,
             fix="the learning rate and the order of windows follow from it; or train anew with --fresh",
         )
-
-
-LOGGERS = ("lightning.pytorch", "lightning.fabric", "pytorch_lightning", "lightning_fabric")
 
 
 class StepBatches(Sampler[list[int]]):
@@ -334,22 +335,6 @@ def descend(job: TrainingJob, model: Baseline) -> tuple[TrainingRecord, int]:
     return ledger, steps
 
 
-@contextmanager
-def quiet() -> Iterator[None]:
-    """Keep Lightning's advice from our users: none of it is about what they asked for."""
-    loggers = [logging.getLogger(name) for name in LOGGERS]
-    levels = [logger.level for logger in loggers]
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", module=r"(pytorch_lightning|lightning_fabric|tensorboard)(\..*)?")
-        for logger in loggers:
-            logger.setLevel(logging.ERROR)
-        try:
-            yield
-        finally:
-            for logger, level in zip(loggers, levels, strict=True):
-                logger.setLevel(level)
-
-
 STEPS = 1  # a closed form counts as one step
 
 
@@ -366,10 +351,14 @@ def fit(job: TrainingJob, model: Baseline) -> tuple[TrainingRecord, int]:
         return ledger, STEPS
     if job.recipe.training.compile:
         model.compile_layers()  # refuses: a closed form has none
-    for where, asked in (("--start", bool(job.recipe.start)), ("training.ema", job.recipe.training.ema)):
-        if asked:
-            message = f"{model.method} is fitted as a whole, without steps"
-            raise UsageError(message, where=where, got=asked, fix="leave the option out")
+    if job.recipe.training.ema:
+        raise UsageError(
+            f"{model.method} takes no steps to average over",
+            where="training.ema",
+            expected=0.0,
+            got=job.recipe.training.ema,
+            fix="leave the option out",
+        )
 
     def scenarios() -> Iterator[NDArray[np.float32]]:
         paths = [

@@ -14,7 +14,7 @@ import pytest
 import torch
 from simple_models import Drift, trainer
 
-from lagbench.baselines.baseline import facts_of
+from lagbench.baselines.baseline import Facts, facts_of
 from lagbench.baselines.checkpoint import Checkpoint, load, save
 from lagbench.baselines.predict import fits, predict, training_words
 from lagbench.baselines.train import TrainingResult
@@ -22,6 +22,7 @@ from lagbench.data.checksums import file_sha256
 from lagbench.data.registry import Registry
 from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError
 from lagbench.make.generate import GenerationResult
+from lagbench.submission.budget import Budget, track_of
 from lagbench.work.progress import Progress
 
 Run = Callable[..., TrainingResult]
@@ -30,7 +31,10 @@ STILL = ("steps=1", "learning_rate=1e-30")
 
 
 class AnySize(Drift):
-    """A Drift in the units of its statistics, of any size; ``unit`` says what its weight means."""
+    """A Drift in the units of its statistics, of any size; ``unit`` says what its weight means.
+
+    ``share`` has no weights: that of weights to start from is kept.
+    """
 
     any_size = True
 
@@ -39,11 +43,16 @@ class AnySize(Drift):
 
         of_weights = frozenset({"unit"})
         unit: float = 1.0
+        share: float = 1.0
+
+    def __init__(self, options: Any, facts: Facts) -> None:
+        super().__init__(options, facts)
+        self.speed = facts.statistics["velocity_std"][0]
 
     def advance(self, state: Any) -> Any:
         """Drift by a share of what is usual."""
         state, position = super().advance(state)
-        return state, position + self.facts.statistics["velocity_std"][0] * self.a
+        return state, position + self.options.share * self.speed * self.a
 
 
 @pytest.fixture
@@ -100,8 +109,8 @@ def test_it_goes_on_where_the_weights_are(
     """A step that changes nothing predicts what the weights do, also in units of another size."""
     units = dict.fromkeys(("velocity_std", "acceleration_std", "position_std"), (1e-3, 1e-3))
     other = {"size": "mini", "dataset_sha256": "0" * 64, "statistics": units, "radius": 0.5}
-    start = stored(facts=other if size == "mini" else None)
-    result = run("any", *STILL, start=start)
+    start = stored(facts=other if size == "mini" else None, model={"share": 0.5})
+    result = run("any", *STILL, start=start)  # the recipe's share is another
     options: dict[str, Any] = {"root": generated.root, "registry": unmeasured, "threads": 1, "size": "tiny"}
     predict(result.weights, tmp_path / "went-on.nc", **options)
     predict(start, tmp_path / "weights.nc", **options)
@@ -126,20 +135,63 @@ def test_what_came_before_is_told(run: Run, stored: Callable[..., Path], tmp_pat
     assert 2.0 < budget["cpu_hours"] < 2.1
     assert budget["gpu_hours"] == 0.5
     assert 0.25 < budget["validation_hours"] < 0.35
-    assert (budget["steps"], budget["windows"]) == (1, 2)
+    assert (budget["steps"], budget["start_steps"], budget["windows"]) == (1, 9, 2)
     assert record["recipe"]["start"]["sha256"] == file_sha256(start)
     held = load(result.weights)
     words = training_words(held)
     assert words.endswith(f"curl-noise/mini-made-up, weights {file_sha256(start)[:12]}")
     assert fits(words, held)
-    again = run("any", *STILL, start=result.weights, to="again")
-    assert 2.0 < load(again.weights).training["budget"]["cpu_hours"] < 2.1
+    again = load(run("any", *STILL, start=result.weights, to="again").weights).training["budget"]
+    assert 2.0 < again["cpu_hours"] < 2.1
+    assert again["start_steps"] == 10
 
 
-def test_hours_that_nobody_knows(run: Run, stored: Callable[..., Path]) -> None:
-    """Weights without a budget leave the sum unknown."""
-    budget = load(run("any", *STILL, start=stored()).weights).training["budget"]
+@pytest.mark.parametrize(
+    "spent", [None, {"cpu_hours": 0.1, "validation_hours": 0.0}, {"cpu_hours": 9.9e11, "gpu_hours": 0.0}]
+)
+def test_hours_that_nobody_knows(
+    run: Run, stored: Callable[..., Path], spent: dict[str, float] | None
+) -> None:
+    """Weights without a budget that can be believed leave the sum unknown: it is of no equal compute."""
+    budget = load(run("any", *STILL, start=stored(budget=spent)).weights).training["budget"]
     assert budget["cpu_hours"] is None
+    assert track_of("mini", Budget.model_validate(budget)) is None
+
+
+def test_what_came_before_counts_for_convergence() -> None:
+    """Steps that bring nothing converge only where they are half of all."""
+    flat = Budget(steps=4, cpu_hours=9.0, best=0.5, validations=((2, 0.5), (4, 0.5)))
+    for start, track in ((None, "converged"), (2, None), (0, "converged"), (100, None)):
+        assert track_of("mini", flat.model_copy(update={"start_steps": start})) == track
+    long = flat.model_copy(update={"start_steps": 10, "steps": 30, "validations": ((9, 0.5), (30, 0.5))})
+    assert track_of("mini", long) == "converged"
+
+
+def test_nothing_is_lost(run: Run, stored: Callable[..., Path]) -> None:
+    """A start that is refused leaves what the folder holds; none may lie in the folder that is emptied."""
+    first = run("any", "steps=2")
+    held = first.weights.read_bytes(), first.checkpoint.read_bytes()
+    odd = {"a": torch.zeros(2), "calls": torch.zeros(())}
+    link = first.folder.with_name("link.pt")
+    link.symlink_to(first.checkpoint)
+    for baseline, start in (
+        ("any", first.weights),
+        ("any", link),
+        ("any", stored(weights=odd)),
+        ("drift", stored()),
+        ("any", stored(model={"unit": 2.0})),
+    ):
+        with pytest.raises(LagbenchError):
+            run(baseline, "steps=2", "model.unit=1", start=start, fresh=True)
+        assert (first.weights.read_bytes(), first.checkpoint.read_bytes()) == held
+
+
+def test_facts_are_those_of_the_data(run: Run, stored: Callable[..., Path]) -> None:
+    """What a file says of frames, box and cells does not bound what is validated on."""
+    plain = run("any", "steps=2", start=stored(), to="plain")
+    told = {"horizon": 1, "score_cells": 10**6, "score_placement": "odd", "bounds": ((0.4, 0.6), (0.4, 0.6))}
+    odd = run("any", "steps=2", start=stored(facts=told), to="odd")
+    assert odd.best_value == plain.best_value
 
 
 def test_it_can_be_interrupted(run: Run, stored: Callable[..., Path]) -> None:
@@ -171,8 +223,8 @@ def test_it_can_be_interrupted(run: Run, stored: Callable[..., Path]) -> None:
         ("any", {"facts": {"size": "mini", "version": "0.9.0"}}, DataError),
         ("any", {"facts": {"size": "mini", "frame_interval": 9.0}}, UsageError),
         ("drift", {"baseline": "drift", "facts": {"size": "mini"}}, UsageError),  # for one size only
-        ("any", {"model": {"unit": 2.0}}, UsageError),
-        ("any", {"weights": {"a": torch.zeros(2), "calls": torch.zeros(())}}, UsageError),
+        ("any", {"facts": {"statistics": {}}}, UnreadableFileError),
+        ("any", {"weights": {"a": torch.zeros(2), "calls": torch.zeros(())}}, UnreadableFileError),
         (
             "any",
             {"weights": {"a": torch.full((1,), float("nan")), "calls": torch.zeros(())}},

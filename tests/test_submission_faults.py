@@ -128,7 +128,7 @@ test_changed_bytes_never_escape_the_checks = settings(
     max_examples=15, deadline=None, database=None, suppress_health_check=RELAXED
 )(BYTES(check_mutation))
 test_many_changed_bytes_never_escape_the_checks = pytest.mark.slow(
-    settings(max_examples=100, deadline=None, database=None, suppress_health_check=RELAXED)(
+    settings(max_examples=200, deadline=None, database=None, suppress_health_check=RELAXED)(
         BYTES(check_mutation)
     )
 )

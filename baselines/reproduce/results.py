@@ -164,7 +164,7 @@ def _training_rows(evidence: Evidence) -> Iterator[list[str]]:
 
 def _chapter(evidence: Evidence) -> Iterator[str]:
     """Yield what was scored on one split and size: over the horizon, beside the thesis, costs."""
-    from lagbench.baselines.job import settings_of  # loads torch, which the imports of this page do not
+    from lagbench.baselines.job import changes_of  # loads torch, which the imports of this page do not
 
     size, task = evidence.size, evidence.size.task
     yield f"## {evidence.where}"
@@ -202,7 +202,7 @@ def _chapter(evidence: Evidence) -> Iterator[str]:
         record, cost = method.seeds[0].record, method.cost
         recipes = [held.record.get("recipe", {}) for held in method.seeds]
         changed = [
-            recipe.get("changed") or "; ".join(settings_of(recipe)) or ("none" if recipe else "-")
+            recipe.get("changed") or "; ".join(changes_of(recipe)) or ("none" if recipe else "-")
             for recipe in recipes
         ]
         paid = (cost.seconds_per_frame, cost.solver_seconds_per_frame, cost.speed_up) if cost else (None,) * 3

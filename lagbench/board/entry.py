@@ -223,11 +223,12 @@ class EntryBudget(Budget):
         if len(known) < len(seeds):
             return None
         held: dict[str, Any] = {}
-        for name in ("windows", "epochs", "steps", "cpu_hours", "validation_hours", "gpu_hours"):
+        counts = ("windows", "steps", "start_steps")
+        for name in (*counts, "epochs", "cpu_hours", "validation_hours", "gpu_hours"):
             values = [value for seed in known if (value := getattr(seed, name)) is not None]
             if len(values) == len(known):
                 mean = sum(values) / len(values)
-                held[name] = round(mean) if name in ("windows", "steps") else round_digits(mean, 6)
+                held[name] = round(mean) if name in counts else round_digits(mean, 6)
         for name in ("device", "threads", "metric"):
             if len({getattr(seed, name) for seed in known}) == 1:
                 held[name] = getattr(known[0], name)

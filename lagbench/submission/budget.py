@@ -35,6 +35,9 @@ class Budget(BaseModel):
     windows: Count | None = Field(default=None, description="training windows seen")
     epochs: Amount | None = Field(default=None, description="windows seen over those of the training subset")
     steps: Count | None = Field(default=None, description="optimiser steps")
+    start_steps: Count | None = Field(
+        default=None, description="steps behind the weights that it started from; hours are with theirs"
+    )
     cpu_hours: Amount | None = Field(default=None, description="processor time without validations")
     validation_hours: Amount | None = Field(default=None, description="processor time of validations")
     gpu_hours: Amount | None = Field(default=None, description="0 where no GPU was used")
@@ -75,9 +78,10 @@ def track_of(size: str, budget: Budget) -> Track | None:
 
 def _has_converged(budget: Budget) -> bool:
     """Tell whether the last doubling brought less than 2 %; a validation near half the steps must tell."""
-    steps = budget.steps or 0
-    before = [(step, value) for step, value in budget.validations if step <= (steps + 1) // 2]
-    if not before or budget.best is None or before[-1][0] < 0.4 * steps:
+    first = budget.start_steps or 0
+    steps = first + (budget.steps or 0)
+    before = [(step, value) for step, value in budget.validations if first + step <= (steps + 1) // 2]
+    if not before or budget.best is None or first + before[-1][0] < 0.4 * steps:
         return False
     half = min(value for _, value in before)
     return half > 0.0 and (half - budget.best) / half < CONVERGED
