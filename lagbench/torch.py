@@ -11,6 +11,7 @@ the cache. Needs PyTorch: ``pip install 'lagbench[baselines]'``.
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -124,8 +125,20 @@ class Batch:
         return self.position.shape[1]
 
     def part(self, frames: slice) -> Self:
-        """Return some frames of every window; `frame` follows, and the forcing of later frames stays."""
-        first = range(self.frames)[frames][0]
+        """Return consecutive frames of every window; `frame` follows, and the forcing of later frames stays.
+
+        Raises:
+            UsageError: no frame is left, or not every frame is taken: forcing is given per frame.
+        """
+        kept = range(self.frames)[frames]
+        if not kept or kept.step != 1:
+            raise UsageError(
+                "a part of a batch is of consecutive frames",
+                where="Batch.part",
+                expected=f"some of {self.frames} frames, in steps of 1",
+                got=frames,
+            )
+        first = kept[0]
         walls = None if self.wall_velocity is None else self.wall_velocity[:, first:]
         return replace(self, position=self.position[:, frames], wall_velocity=walls, frame=self.frame + first)
 
@@ -211,7 +224,7 @@ class WindowSampler(Sampler[int]):
                 got=f"rank {self.rank} of {self.ranks}",
             )
         self.data = data  # what is drawn from
-        self.seed = seed  # seed of all epochs
+        self.seed = _natural(seed, "seed")  # seed of all epochs
         self.epoch = 0  # epoch that is drawn from
         self.position = 0  # windows of its order that the ranks together have drawn
 
@@ -243,8 +256,11 @@ class WindowSampler(Sampler[int]):
 
         Loaders with worker processes draw ahead of the training: give the position that follows
         from the steps taken.
+
+        Raises:
+            UsageError: there is no such place.
         """
-        self.epoch, self.position = epoch, position
+        self.epoch, self.position = _natural(epoch, "epoch"), _natural(position, "position")
 
     def state_dict(self) -> dict[str, int]:
         """Return what `load_state_dict` takes to continue here, in mid-epoch too."""
@@ -252,8 +268,21 @@ class WindowSampler(Sampler[int]):
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue where another sampler of the same data stood."""
-        self.seed = int(state["seed"])
-        self.seek(int(state["epoch"]), int(state["position"]))
+        self.seed = _natural(state["seed"], "seed")
+        self.seek(state["epoch"], state["position"])
+
+
+def _natural(value: object, name: str) -> int:
+    """Return a whole number that is not negative."""
+    try:
+        number = operator.index(value)  # type: ignore[arg-type]
+    except TypeError:
+        number = -1
+    if number < 0:
+        raise UsageError(
+            f"{name} does not fit", where="WindowSampler", expected="a whole number from 0", got=repr(value)
+        )
+    return number
 
 
 def _cut(start: int, stop: int) -> list[NDArray[np.int64]]:
@@ -277,7 +306,7 @@ def roll_out(step: Step, given: Batch, frames: int) -> Tensor:
     """Feed a model with its own predictions; gradients pass through all frames.
 
     Args:
-        step: the model.
+        step: the model; it may not write to its batch.
         given: the frames that it starts from, with the forcing of those to predict: windows of a
             loader cut by ``batch.part(slice(history))``.
         frames: frames to predict.
@@ -286,28 +315,31 @@ def roll_out(step: Step, given: Batch, frames: int) -> Tensor:
         Positions of the frames after the given ones [length], shape [particle, frame, 2].
 
     Raises:
-        UsageError: no frame is asked for, or the model returns another shape than [particle, 2].
+        UsageError: no frame is asked for, or the model returns something else than a tensor of shape
+            [particle, 2].
     """
     if frames < 1:
         raise UsageError("no frame to predict", where="roll_out", expected="frames from 1", got=frames)
     predicted, expected = [], given.position[:, -1].shape
     for _ in range(frames):
         position = step(given)
-        if position.shape != expected:
+        if not isinstance(position, Tensor) or position.shape != expected:
             raise UsageError(
                 "a model returned no positions of the next frame",
                 where="roll_out, step",
-                expected=f"shape {list(expected)}: [particle, 2]",
-                got=f"shape {list(position.shape)}",
+                expected=f"a tensor of shape {list(expected)}: [particle, 2]",
+                got=f"shape {list(position.shape)}"
+                if isinstance(position, Tensor)
+                else type(position).__name__,
             )
         given = given.followed_by(position)
-        predicted.append(position)
+        predicted.append(given.position[:, -1])  # a copy: the model may use the memory of its answer again
     return torch.stack(predicted, dim=1)
 
 
 def predict(
     step: Step,
-    split: str,
+    split: str | Path,
     *,
     subset: str = "test",
     size: str | None = None,

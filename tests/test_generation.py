@@ -280,6 +280,10 @@ def test_selection_by_subset_and_id(unmeasured: Registry) -> None:
     assert select(size, subset="valid,test") == tuple(range(48, 72))
     assert select(size, subset=["extra"], scenarios="73,72") == (72, 73)
     assert select(size, scenarios=[5, 3, 5]) == (3, 5)
+    assert [type(i) for i in select(size, scenarios=np.arange(3, 5))] == [int, int]
+    for odd in (3, [3.0], [None]):
+        with pytest.raises(UsageError):
+            select(size, scenarios=odd)  # type: ignore[arg-type]
     assert len(select(size)) == 87
 
 

@@ -79,7 +79,7 @@ def test_all_ways_to_name_it(own: Path, monkeypatch: pytest.MonkeyPatch, tmp_pat
     A path names its root; the same one beside it is fine, another is refused.
     """
     monkeypatch.chdir(own.parent)
-    by_path = [(str(own), None), (f"{own}/", None), ("./own", None), ("own/", None)]
+    by_path = [(name, None) for name in (own, Path("own"), str(own), f"{own}/", "./own", "own/")]
     for split, root in [*by_path, ("own", own.parent), ("own", "."), ("own", None)]:
         found = home(split, root=root)
         assert (found.name, found.root.resolve()) == ("own", own.parent.resolve())

@@ -70,11 +70,21 @@ def test_ties_by_rounding_count() -> None:
         assert sign_flip_p(np.linspace(1.0, 2.0, n)) == pytest.approx(2.0 ** (1 - n), rel=1e-12)
 
 
-@pytest.mark.parametrize("differences", [[], [1.0] * 41])
-def test_too_few_or_too_many_scenarios(differences: list[float]) -> None:
-    """Nothing to compare, or more than can be enumerated, is refused."""
+@pytest.mark.parametrize("differences", [[], [1.0] * 41, [1.0, math.nan], [1.0, math.inf]])
+def test_differences_that_no_p_value_fits(differences: list[float]) -> None:
+    """Nothing to compare, more than can be enumerated, or no numbers are refused."""
     with pytest.raises(UsageError):
         sign_flip_p(differences)
+
+
+def test_infinite_losses_are_refused() -> None:
+    """They are no evidence: a p-value of 0 would be below the least there is."""
+    plain, infinite = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0], [1.0, 2.0, math.inf, 4.0, 5.0, 6.0]
+    for first, second in ((plain, infinite), (infinite, plain), ([plain, infinite], [plain, plain])):
+        with pytest.raises(UsageError):
+            differ(first, second)
+    with pytest.raises(UsageError):
+        bootstrap_interval(plain, minus=plain[:5])
 
 
 def test_interval_is_scipys_percentile_bootstrap() -> None:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import hashlib
 import json
 import tracemalloc
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 import pytest
+import torch
 import xarray as xr
 from bad_submissions import FAULTS
 from faulty import positions, rows, store
@@ -114,6 +116,7 @@ def _nan(values: np.ndarray) -> np.ndarray:
         ({}, {"seed": 2**70}, "an integer"),
         ({}, {"seconds_per_frame": 10**400}, "positive"),
         ({}, {"device": "\udcff"}, "text"),
+        ({}, {"device": "a\0b"}, "text"),
         ({}, {"training": "x" * 70_000}, "text"),
         *(({}, {"method": name}, "printable text") for name in ("", " ", "a\x07", "\udcff", "x" * 201, None)),
         *(({}, {"dataset_sha256": held}, "64 hex digits") for held in ("zz", "", 5)),
@@ -174,6 +177,56 @@ def test_labels_may_come_while_writing(bench: Bench) -> None:
         writer.label(seconds_per_frame=0.5, device="one core")
     with open_predictions(path) as predictions:
         assert (predictions.header.seconds_per_frame, predictions.header.device) == (0.5, "one core")
+
+
+def test_a_writer_that_failed_begins_anew(bench: Bench) -> None:
+    """What an earlier try wrote is not taken for written; nothing is taken while no file is open."""
+    path = bench.folder / "again.nc"
+    writer = PredictionsWriter(path, **options(bench))
+    with pytest.raises(UsageError):
+        writer.add(TESTS[0], truth(TESTS[0]))
+
+    def attempt(scenarios: Sequence[int], then: object = None) -> None:
+        with writer:
+            for scenario in scenarios:
+                writer.add(scenario, truth(scenario))
+            if then is not None:
+                raise KeyError(then)
+
+    with pytest.raises(KeyError):
+        attempt(TESTS[:1], then="a crash")
+    with pytest.raises(UsageError):
+        attempt(TESTS[1:])
+    assert not path.exists()
+    attempt(TESTS)
+    with pytest.raises(UsageError):
+        attempt(())
+    assert bench.validate(path).valid
+
+
+@pytest.mark.parametrize(
+    "odd",
+    [
+        np.ma.masked_less(truth(3), 0.5),
+        truth(3).astype(complex),
+        truth(3).astype(str),
+        [truth(3)[0], truth(3)[0, :2]],
+        torch.ones(SHAPE, requires_grad=True),
+    ],
+)
+def test_what_is_no_array_of_numbers_is_refused(bench: Bench, odd: Any) -> None:
+    """Masked, complex, text, ragged, with gradients: nothing is dropped in silence."""
+    with pytest.raises(UsageError):
+        write(bench.folder / "odd.nc", RIGHT | {3: odd}, **options(bench))
+
+
+def test_scalars_of_numpy_are_labels(bench: Bench) -> None:
+    """As loops over arrays give them."""
+    path = write(
+        bench.folder / "np.nc", RIGHT, **options(bench, seed=np.int64(2), seconds_per_frame=np.float32(0.5))
+    )
+    with open_predictions(path) as predictions:
+        assert (predictions.header.seed, predictions.header.seconds_per_frame) == (2, 0.5)
 
 
 ALL = list(range(GIVEN, FRAMES))

@@ -272,6 +272,27 @@ def test_every_epoch_draws_every_window_once(train: Open) -> None:
     assert sampler.state_dict() == {"seed": 5, "epoch": 3, "position": 0}
 
 
+@pytest.mark.parametrize("odd", [-1, 1.5, None, "1"])
+def test_places_that_there_are_not(train: Open, odd: Any) -> None:
+    """Seeds, epochs and positions are whole numbers from 0: others would draw windows twice."""
+    with pytest.raises(UsageError):
+        WindowSampler(train(), seed=odd)
+    sampler = WindowSampler(train(), seed=0)
+    for state in ({"epoch": odd, "position": 0}, {"epoch": 0, "position": odd}):
+        with pytest.raises(UsageError):
+            sampler.load_state_dict({"seed": 0, **state})
+
+
+def test_an_index_may_be_of_numpy_or_torch(train: Open) -> None:
+    """The window is the same, and the caller's index stays."""
+    data = train()
+    for index in (np.array(-1), torch.tensor(-1)):
+        window = data[index]  # type: ignore[index]
+        assert (window.scenario, window.frame) == (data[-1].scenario, data[-1].frame)
+        assert type(window.frame) is int
+        assert int(index) == -1
+
+
 def test_an_order_is_pinned(train: Open) -> None:
     """The first windows of seed 0: a change would break the resumption of older runs."""
     assert WindowSampler(train(), seed=0).order(0)[:8].tolist() == [61, 70, 63, 8, 2, 53, 11, 18]
@@ -501,6 +522,23 @@ def test_what_a_model_returns_has_the_shape_of_positions(
         roll_out(lambda seen: wrong(seen.position[:, -1]), given, 2)
     with pytest.raises(UsageError):
         roll_out(drifting, given, 0)
+    with pytest.raises(UsageError):
+        roll_out(lambda seen: seen.position[:, -1].numpy(), given, 2)  # type: ignore[arg-type, return-value]
+
+
+def test_a_model_may_use_the_memory_of_its_answer_again(train: Open) -> None:
+    """Every frame is kept as it was when the model returned it."""
+    given = collate([train(history=2, future=4)[0]]).part(slice(2))
+    memory = torch.empty_like(given.position[:, -1])
+    found = roll_out(lambda seen: memory.copy_(drifting(seen)), given, 4)
+    assert torch.equal(found, roll_out(drifting, given, 4))
+
+
+@pytest.mark.parametrize("odd", [slice(0, 4, 2), slice(None, None, -1), slice(2, 2), slice(9, 12)])
+def test_parts_of_batches_are_consecutive_frames(train: Open, odd: slice) -> None:
+    """Forcing is given per frame: with steps it would be another frame's."""
+    with pytest.raises(UsageError):
+        collate([train(history=2, future=4)[0]]).part(odd)
 
 
 @pytest.mark.parametrize("history", [None, 2])

@@ -99,11 +99,11 @@ def rooted(root: Path, registry: Registry | None = None) -> RootedRegistry:
     return RootedRegistry(base.base if isinstance(base, RootedRegistry) else base, root)
 
 
-def home(split: str, *, root: str | Path | None = None, registry: Registry | None = None) -> Home:
+def home(split: str | Path, *, root: str | Path | None = None, registry: Registry | None = None) -> Home:
     """Return what a user means by ``--split``: a name, or the path of a local split's folder.
 
     What has a separator (``path/to/own``, ``./own``, ``own/``) is a path; so is a name that no
-    split has while the current folder holds a local split of that name.
+    split has while the current folder holds a local split of that name, and any ``Path``.
 
     Args:
         split: name or path.
@@ -114,8 +114,10 @@ def home(split: str, *, root: str | Path | None = None, registry: Registry | Non
         UsageError: unknown split, no local split at the path, or a path and another root.
         UnreadableFileError: the description of the local split is not right.
     """
+    named = isinstance(split, str)
+    split = os.fspath(split)
     path = Path(os.path.abspath(expanded(split, "--split")))
-    if "/" in split or os.sep in split or split in {".", "..", "~"}:
+    if not named or "/" in split or os.sep in split or split in {".", "..", "~"}:
         return _at(path, root, registry)
     folder = resolve_root(root)
     known = rooted(folder, registry)
@@ -129,7 +131,7 @@ def home(split: str, *, root: str | Path | None = None, registry: Registry | Non
 
 
 def locate(
-    split: str,
+    split: str | Path,
     size: str | None = None,
     *,
     root: str | Path | None = None,
@@ -157,7 +159,7 @@ SIZE_TO_MAKE = "mini"
 
 
 def locate_new(
-    split: str,
+    split: str | Path,
     size: str | None = None,
     *,
     root: str | Path | None = None,

@@ -60,7 +60,7 @@ class DownloadResult:
 
 
 def download(
-    split: str,
+    split: str | Path,
     size: str | None = None,
     *,
     mirror: str | None = None,

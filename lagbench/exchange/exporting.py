@@ -48,7 +48,7 @@ class ExportResult:
 
 
 def export(
-    split: str,
+    split: str | Path,
     size: str | None = None,
     *,
     format: str,

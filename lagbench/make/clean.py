@@ -28,7 +28,7 @@ class CleanResult:
 
 
 def clean(
-    split: str,
+    split: str | Path,
     size: str | None = None,
     *,
     root: str | Path | None = None,

@@ -286,7 +286,7 @@ class GenerationResult:
 
 
 def generate(
-    split: str,
+    split: str | Path,
     size: str | None = None,
     *,
     subset: Selection = None,

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import math
+import operator
 import os
 import platform
 import shutil
@@ -81,7 +82,11 @@ def select(size: Size, *, subset: Selection = None, scenarios: Scenarios = None)
     held = {i for name in names for i in size.subsets[name]}
     if scenarios is None:
         return tuple(sorted(held))
-    wanted = parse_ids(scenarios) if isinstance(scenarios, str) else tuple(scenarios)
+    try:
+        wanted = parse_ids(scenarios) if isinstance(scenarios, str) else tuple(map(operator.index, scenarios))
+    except TypeError:
+        expected = "ids, as in (0, 3) or '0,3-5'"
+        raise UsageError("no ids", where="--scenarios", expected=expected, got=repr(scenarios)[:80]) from None
     strangers = [i for i in wanted if i not in held]
     if strangers or not wanted:
         raise UsageError(

@@ -239,9 +239,14 @@ def resample(values: ArrayLike, minus: ArrayLike | None = None) -> Resampling | 
 
     Values are NaN where undefined, shape [scenario] or [seed, scenario]; with those of another method in
     the same scenarios as ``minus`` the mean is that of the difference. None where fewer than two
-    scenarios are defined.
+    scenarios are defined. Infinite values, and methods in different scenarios, are refused.
     """
     sides = [np.atleast_2d(np.asarray(side, np.float64)) for side in (values, minus) if side is not None]
+    if len({side.shape[1] for side in sides}) > 1:
+        expected, got = (side.shape[1] for side in sides)
+        raise UsageError("methods over different scenarios", expected=expected, got=got)
+    if any(np.isinf(side).any() for side in sides):
+        raise UsageError("losses are infinite", expected="numbers, NaN where undefined", got="infinity")
     defined = np.all([~np.isnan(side).all(axis=0) for side in sides], axis=0)
     if np.count_nonzero(defined) < 2:
         return None

@@ -39,9 +39,12 @@ def sign_flip_p(differences: ArrayLike) -> float:
 
     If neither is better, each difference is as likely as its negative: the share of all 2^n sign
     patterns whose mean is at least as far from 0 as the one seen. Zero differences count: they
-    are the same under either sign. All zero gives 1. None, or more than 40, are refused.
+    are the same under either sign. All zero gives 1. None, or more than 40, are refused, as are
+    differences that are not finite.
     """
-    d = np.abs(np.asarray(differences, np.float64))
+    d = np.abs(np.asarray(differences, np.float64).ravel())
+    if not np.isfinite(d).all():
+        raise UsageError("differences are not finite", expected="numbers", got="NaN or infinity")
     if not 1 <= d.size <= MOST_SCENARIOS:
         raise UsageError(
             "the exact sign-flip test does not fit", expected=f"1 to {MOST_SCENARIOS} scenarios", got=d.size

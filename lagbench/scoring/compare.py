@@ -175,6 +175,7 @@ def compare(
     judged = _judged(one, two)
     methods = one.identity["method"], two.identity["method"]
     names = told_apart(methods) if floor is None else [*told_apart(methods[:1], taken=(floor,)), floor]
+    metrics = (metrics,) if isinstance(metrics, str) else metrics
     wanted = [_known(name, judged) for name in metrics] or judged
     order = sorted({one.ranking, *wanted}, key=lambda name: (name != one.ranking, judged.index(name)))
     found = {name: _compared(one.scores[name], two.scores[name]) for name in order}

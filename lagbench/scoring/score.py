@@ -179,6 +179,7 @@ def _written(card: ScoreCard, folder: Path) -> ScoreCard:
 def _chosen(extras: Collection[str]) -> tuple[Metric, ...]:
     """Return the metrics to measure; refuse an extra that brings none."""
     known = {metric.extra for metric in available().values() if metric.extra}
+    extras = (extras,) if isinstance(extras, str) else extras
     for extra in extras:
         if extra not in known:
             raise UsageError(f"no extra {extra!r} with metrics", where="--extras", fix=nearest(extra, known))

@@ -65,7 +65,7 @@ def _members(manifest: Manifest) -> list[FileEntry]:
 
 
 def write_archive(
-    split: str,
+    split: str | Path,
     size: str | None = None,
     *,
     output: str | Path,

@@ -25,7 +25,7 @@ def list_splits() -> tuple[str, ...]:
     return tuple(sorted(registry.load().splits))
 
 
-def load_manifest(split: str, *, size: str | None = None, root: str | Path | None = None) -> Manifest:
+def load_manifest(split: str | Path, *, size: str | None = None, root: str | Path | None = None) -> Manifest:
     """Return the manifest of a generated data set.
 
     Args:
@@ -52,7 +52,7 @@ def load_manifest(split: str, *, size: str | None = None, root: str | Path | Non
 
 
 def open_split(
-    split: str, *, subset: str = "test", size: str | None = None, root: str | Path | None = None
+    split: str | Path, *, subset: str = "test", size: str | None = None, root: str | Path | None = None
 ) -> xr.Dataset:
     """Open one subset of a generated data set; arrays are read when computed.
 

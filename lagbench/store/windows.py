@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import operator
 import os
 from bisect import bisect_right
 from collections import OrderedDict
@@ -207,7 +208,7 @@ class WindowReader:
 
     def __init__(
         self,
-        split: str,
+        split: str | Path,
         *,
         subset: str | Sequence[str] = "train",
         size: str | None = None,
@@ -276,6 +277,7 @@ class WindowReader:
 
     def place(self, index: int) -> tuple[int, int]:
         """Return scenario id and first frame of a window."""
+        index = operator.index(index)
         if not -len(self) <= index < len(self):
             message = f"no window {index} among {len(self)}"
             raise IndexError(message)
@@ -304,7 +306,7 @@ class Windows(WindowReader):
 
 
 def windows(
-    split: str,
+    split: str | Path,
     *,
     subset: str | Sequence[str] = "train",
     size: str | None = None,

@@ -143,8 +143,8 @@ def fits(name: str, value: object) -> bool:
         return bool(text.strip()) and len(text) <= MAX_NAME and text.isprintable()
     if isinstance(value, bool) or (isinstance(value, int) and not -(2**63) <= value < 2**64):
         return False
-    if isinstance(value, str) and (len(value) > MAX_ATTRIBUTE or _SURROGATES.search(value)):
-        return False  # HDF5 stores UTF-8
+    if isinstance(value, str) and (len(value) > MAX_ATTRIBUTE or _SURROGATES.search(value) or "\0" in value):
+        return False  # HDF5 stores UTF-8, up to the first NUL
     if OPTIONAL[name] is float:
         return isinstance(value, (int, float)) and 0 < value < math.inf
     if name == "budget":

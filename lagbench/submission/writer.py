@@ -56,7 +56,7 @@ class PredictionsWriter:
         self,
         path: str | Path,
         *,
-        split: str,
+        split: str | Path,
         size: str | None = None,
         method: str,
         velocity: bool = False,
@@ -73,6 +73,7 @@ class PredictionsWriter:
         _require_fit("method", method)
         self._names = ("position", "velocity") if velocity else ("position",)
         self._rows = {scenario: row for row, scenario in enumerate(sorted(self.size.subsets["test"]))}
+        self._open = False  # whether a file is being written
         self._written: set[int] = set()
         self._diverged = np.full(len(self._rows), NEVER, np.int32)
         self._labels: dict[str, Label] = {"method": method}
@@ -94,6 +95,7 @@ class PredictionsWriter:
             UsageError: there is no such label, or it cannot have that value.
         """
         for name, value in labels.items():
+            value = value.item() if isinstance(value, np.generic) else value
             if name not in OPTIONAL:
                 raise UsageError(f"no label {name!r}", fix=nearest(name, OPTIONAL))
             _require_fit(name, value)
@@ -103,6 +105,10 @@ class PredictionsWriter:
         """Create the temporary file with everything but the predictions."""
         import netCDF4
 
+        if self._open:
+            raise UsageError("the file is being written", where=str(self.path), fix="enter a writer once")
+        self._written.clear()
+        self._diverged.fill(NEVER)
         with ExitStack() as stack:
             temporary = stack.enter_context(atomic_path(self.path, option="--output"))
             try:
@@ -112,6 +118,7 @@ class PredictionsWriter:
             except (OSError, RuntimeError) as error:
                 raise self._refused(error) from error
             self._stack = stack.pop_all()
+        self._open = True
         return self
 
     def add(
@@ -135,6 +142,10 @@ class PredictionsWriter:
                 a rollout that is not frozen where ``diverged_at`` says.
             WorkFailedError: the disk is full.
         """
+        if not self._open:
+            raise UsageError(
+                "no file is open", where=str(self.path), fix="with PredictionsWriter(...) as writer:"
+            )
         if scenario not in self._rows or scenario in self._written:
             what = "is written twice" if scenario in self._written else "is no test scenario"
             raise UsageError(f"scenario {scenario} {what}", expected=spell_ids(self._rows))
@@ -157,6 +168,7 @@ class PredictionsWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Finish and rename the file, or remove it when the body raised."""
+        self._open = False
         if error is not None:
             self._stack.__exit__(kind, error, trace)
             return
@@ -185,8 +197,17 @@ class PredictionsWriter:
 
     def _checked(self, name: str, scenario: int, values: ArrayLike) -> NDArray[np.float32]:
         where = f"{name} of scenario {scenario}"
+        try:
+            given = np.asanyarray(values)
+            kind = "masked values" if np.ma.is_masked(given) else f"values of type {given.dtype}"
+        except (ValueError, TypeError, RuntimeError) as error:  # ragged lists, tensors with gradients
+            given, kind = np.empty(0, object), f"{type(values).__name__}: {str(error)[:200]}"
+        if given.dtype.kind not in "fiu" or np.ma.is_masked(given):
+            raise UsageError(
+                "these are no positions", where=where, expected="an array of numbers without a mask", got=kind
+            )
         with np.errstate(over="ignore"):
-            array = np.asarray(values).astype(np.float32)
+            array = np.asarray(given).astype(np.float32)
         if array.shape != self.shape:
             turned = sorted(array.shape) == sorted(self.shape)
             fix = "transpose it: frame, particle, space" if turned else None
@@ -284,7 +305,7 @@ def write(
     path: str | Path,
     positions: Mapping[int, ArrayLike] | ArrayLike,
     *,
-    split: str,
+    split: str | Path,
     size: str | None = None,
     method: str,
     velocities: Mapping[int, ArrayLike] | ArrayLike | None = None,
@@ -375,7 +396,7 @@ class TemplateResult:
 
 
 def template(
-    split: str,
+    split: str | Path,
     size: str | None = None,
     *,
     output: str | Path = "predictions.nc",
