@@ -338,6 +338,39 @@ def test_command(tmp_path: Path) -> None:
     assert "cannot be simulated" in refused.output
 
 
+def test_walls_in_some_trajectories_only_are_refused(tmp_path: Path) -> None:
+    """Whichever of them come first, the error names the first that is otherwise."""
+    for walled in ({0}, {1, 2}):
+        paths = []
+        for number, run in enumerate(straight_runs(3)):
+            paths.append(tmp_path / f"run{number}.npz")
+            walls = {"wall_velocity": np.zeros((4, 2))} if number in walled else {}
+            np.savez(paths[-1], position=run, **walls)
+        with pytest.raises(DataError) as caught:
+            adopt(paths, output=tmp_path / "mine", **BASIC)
+        assert caught.value.where == str(paths[1])
+        assert not (tmp_path / "mine").exists()
+
+
+@pytest.mark.parametrize("way", ["twice", "folder", "link", "subsets"])
+def test_a_trajectory_named_twice_is_refused(tmp_path: Path, way: str) -> None:
+    """It would be trained on and tested: by its name, in its folder, by a link, and in two subsets."""
+    paths = save_runs(tmp_path / "in", straight_runs(4))
+    link = tmp_path / ("in/test/run9.npy" if way == "subsets" else "run9.npy")
+    given = {"twice": [*paths, paths[0]], "folder": [tmp_path / "in", paths[2]], "link": [*paths, link]}
+    if way == "subsets":
+        for subset, path in zip(("train", "valid", "test"), paths, strict=False):
+            (tmp_path / "in" / subset).mkdir()
+            path.rename(tmp_path / "in" / subset / path.name)
+        link.symlink_to(tmp_path / "in/train/run0.npy")
+    elif way == "link":
+        link.symlink_to(paths[1])
+    with pytest.raises(UsageError) as caught:
+        adopt(given.get(way, [tmp_path / "in"]), output=tmp_path / "mine", **BASIC)
+    assert "run" in str(caught.value.where)
+    assert not (tmp_path / "mine").exists()
+
+
 @pytest.mark.parametrize("text", ["x", "8-", "9-8", "8,8"])
 def test_bad_frames_of_interest_name_their_option(tmp_path: Path, text: str) -> None:
     """The list is read as one of scenarios is, and the message speaks of frames."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Unpack
@@ -52,8 +52,8 @@ def adopt(
             see :class:`lagbench.exchange.trajectory.Description`.
 
     Raises:
-        UsageError: no radius or frame interval, too few trajectories, a folder that is there, a
-            task that does not fit the data.
+        UsageError: no radius or frame interval, too few trajectories or one named twice, a folder that
+            is there, a task that does not fit the data.
         UnreadableFileError: a file is damaged, pickled, or holds no positions.
         DataError: positions are not plane, not finite, or outside the unit box; another reading explains
             the axes or the velocities far better.
@@ -64,6 +64,7 @@ def adopt(
             raise UsageError(f"the {name.replace('_', ' ')} is not known", fix=f"--{name.replace('_', '-')}")
     given = [Path(sources)] if isinstance(sources, str | Path) else [Path(source) for source in sources]
     files = _by_subset(given, valid=valid, test=test)
+    _check_once(row for rows in files.values() for row in rows)
     counts = {subset: len(rows) for subset, rows in files.items()}
     source = f"{sum(counts.values())} trajectories of the user's own"
     about = Description(name=output_name(output), source=source, **wishes)
@@ -187,6 +188,18 @@ def _by_subset(given: Sequence[Path], *, valid: int | None, test: int | None) ->
         "valid": rows[for_train : for_train + for_valid],
         "test": rows[for_train + for_valid :],
     }
+
+
+def _check_once(rows: Iterable[Row]) -> None:
+    """Refuse a trajectory that is named twice, by links too: it could be trained on and tested."""
+    known: dict[Row, Path] = {}
+    for path, row in rows:
+        place = path.resolve(), row
+        if place in known:
+            raise UsageError(
+                "a file is named twice", where=str(path), expected="each once", got=f"{known[place]} before"
+            )
+        known[place] = path
 
 
 def _unbroken(trajectory: Trajectory, stated: Source) -> Trajectory:
