@@ -19,7 +19,7 @@ from .array_files import Row, natural, open_row, rows_of
 from .exporting import ENDINGS
 from .local_split import LocalSplit, make_local_split, output_name
 from .metadata import DROP, Format, Source, parse_format, read_source
-from .trajectory import Description, Frame, Trajectory, Wishes
+from .trajectory import Description, Frame, Trajectory, Wishes, check_wishes
 
 
 def adopt(
@@ -59,8 +59,9 @@ def adopt(
             the axes or the velocities far better.
         WorkFailedError: the disk is full or not writable.
     """
+    wishes = check_wishes(wishes)
     for name in ("radius", "frame_interval"):
-        if wishes.get(name) is None:
+        if name not in wishes:
             raise UsageError(f"the {name.replace('_', ' ')} is not known", fix=f"--{name.replace('_', '-')}")
     given = [Path(sources)] if isinstance(sources, str | Path) else [Path(source) for source in sources]
     files = _by_subset(given, valid=valid, test=test)
@@ -108,6 +109,7 @@ def import_split(
             periodic one.
         WorkFailedError: the disk is full or not writable.
     """
+    said = {**wishes, **check_wishes(wishes)}
     form, folder = parse_format(format), Path(source)
     files = {subset: folder / f"{subset}{ENDINGS[form]}" for subset in HASHED_SUBSETS}
     missing = [path.name for path in files.values() if not path.is_file()]
@@ -142,7 +144,7 @@ def import_split(
         "frames_of_interest": hints.frames_of_interest,
         "cells": hints.cells,
         "full_box": hints.placement == "cell_centres",
-        **wishes,
+        **said,
     }
     if facts["frame_interval"] is None:
         raise UsageError("the metadata state no time between frames", fix="say it: --frame-interval SECONDS")
