@@ -171,7 +171,7 @@ def test_no_progress_without_a_terminal(
     [
         *({"kind": kind} for kind in ("streamlines", "sped")),
         *({"frames_per_second": rate} for rate in (0, float("nan"), float("inf"), 1e-9)),
-        {"every": 0},
+        *({"every": step} for step in (0, 1.5, 2.0)),
     ],
 )
 def test_bad_options_are_refused(swirl: Path, tmp_path: Path, options: dict[str, object]) -> None:

@@ -20,7 +20,7 @@ from lagbench.data.checksums import dataset_hash, subset_hash
 from lagbench.data.local import locate
 from lagbench.data.scenario import check_scenario, read_scenario
 from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError, WorkFailedError
-from lagbench.exchange import adopt, local_split
+from lagbench.exchange import adopt, import_split, local_split
 from lagbench.exchange.adoption import _by_subset
 from lagbench.exchange.local_split import LocalSplit
 from lagbench.exchange.trajectory import Measure, estimate_spacing
@@ -338,6 +338,96 @@ def test_command(tmp_path: Path) -> None:
     assert "cannot be simulated" in refused.output
 
 
+PLAIN: dict[str, Any] = {
+    "radius": 0.15,
+    "frame_interval": 0.25,
+    "density": 1.5,
+    "spacing": 0.05,
+    "cells": 8,
+    "input_frames": 3,
+    "horizon": 8,
+    "frames_of_interest": (10,),
+    "bounds": ((0.0, 1.0), (0.0, 1.0)),
+    "full_box": True,
+}
+
+
+@pytest.mark.parametrize("spelled", ["numpy", "texts and floats"])
+def test_numbers_may_be_spelled_otherwise(tmp_path: Path, spelled: str) -> None:
+    """NumPy's scalars and arrays, and what --describe takes for numbers, give the same description."""
+    paths = save_runs(tmp_path / "in", straight_runs(3))
+    other = {**PLAIN, "radius": "0.15", "cells": 8.0, "horizon": 8.0, "density": "1.5", "title": None}
+    if spelled == "numpy":
+        other = {name: np.asarray(value)[()] for name, value in PLAIN.items()}
+        other["density"] = np.float32(1.5)
+    texts = [
+        (adopt(paths, output=tmp_path / kind / "mine", **wishes).folder / "split.yaml").read_bytes()
+        for kind, wishes in (("plain", PLAIN), ("other", other))
+    ]
+    assert texts[0] == texts[1]
+
+
+@pytest.mark.parametrize(
+    ("wish", "key"),
+    [
+        ({"radius": "far"}, "radius"),
+        ({"density": [1.0]}, "density"),
+        ({"cells": 16.5}, "cells"),
+        ({"horizon": "all"}, "horizon"),
+        ({"horizon": np.array([5])}, "horizon"),
+        ({"horizon": 10**5000}, "horizon"),
+        ({"frames_of_interest": 8}, "frames_of_interest"),
+        ({"frames_of_interest": [10**5000]}, "frames_of_interest.0"),
+        ({"title": 3}, "title"),
+        ({"title": 10**5000}, "title"),
+        ({"bounds": ((0.0, 1.0),) * 3}, "bounds"),
+        ({"bounds": 1.0}, "bounds"),
+        ({"raduis": 0.1}, "raduis"),
+    ],
+)
+def test_a_value_that_does_not_fit_names_its_key(tmp_path: Path, wish: dict[str, Any], key: str) -> None:
+    """By adopt and by import, before a file is looked at."""
+    with pytest.raises(UsageError) as adopted:
+        adopt(tmp_path / "none", output=tmp_path / "mine", **{**BASIC, **wish})
+    with pytest.raises(UsageError) as imported:
+        import_split(tmp_path / "none", format="gns-npz", output=tmp_path / "mine", **wish)
+    assert adopted.value.where == imported.value.where == key
+    assert not list(tmp_path.iterdir())
+
+
+def test_walls_in_some_trajectories_only_are_refused(tmp_path: Path) -> None:
+    """Whichever of them come first, the error names the first that is otherwise."""
+    for walled in ({0}, {1, 2}):
+        paths = []
+        for number, run in enumerate(straight_runs(3)):
+            paths.append(tmp_path / f"run{number}.npz")
+            walls = {"wall_velocity": np.zeros((4, 2))} if number in walled else {}
+            np.savez(paths[-1], position=run, **walls)
+        with pytest.raises(DataError) as caught:
+            adopt(paths, output=tmp_path / "mine", **BASIC)
+        assert caught.value.where == str(paths[1])
+        assert not (tmp_path / "mine").exists()
+
+
+@pytest.mark.parametrize("way", ["twice", "folder", "link", "subsets"])
+def test_a_trajectory_named_twice_is_refused(tmp_path: Path, way: str) -> None:
+    """It would be trained on and tested: by its name, in its folder, by a link, and in two subsets."""
+    paths = save_runs(tmp_path / "in", straight_runs(4))
+    link = tmp_path / ("in/test/run9.npy" if way == "subsets" else "run9.npy")
+    given = {"twice": [*paths, paths[0]], "folder": [tmp_path / "in", paths[2]], "link": [*paths, link]}
+    if way == "subsets":
+        for subset, path in zip(("train", "valid", "test"), paths, strict=False):
+            (tmp_path / "in" / subset).mkdir()
+            path.rename(tmp_path / "in" / subset / path.name)
+        link.symlink_to(tmp_path / "in/train/run0.npy")
+    elif way == "link":
+        link.symlink_to(paths[1])
+    with pytest.raises(UsageError) as caught:
+        adopt(given.get(way, [tmp_path / "in"]), output=tmp_path / "mine", **BASIC)
+    assert "run" in str(caught.value.where)
+    assert not (tmp_path / "mine").exists()
+
+
 @pytest.mark.parametrize("text", ["x", "8-", "9-8", "8,8"])
 def test_bad_frames_of_interest_name_their_option(tmp_path: Path, text: str) -> None:
     """The list is read as one of scenarios is, and the message speaks of frames."""
@@ -355,7 +445,9 @@ def test_a_file_describes_the_data_and_options_win(tmp_path: Path) -> None:
     told = tmp_path / "data.yaml"
     options = ["-o", str(tmp_path / "mine"), "--describe", str(told), "--free-surface", "--horizon", "3"]
     words = ["adopt", *map(str, paths), *options]
-    for line in ("colour: red", "radius: far", "- radius"):
+    endless = f"0x{'f' * 5000}"  # an integer whose digits Python does not spell
+    wrong = ["colour: red", "radius: far", "- radius", f"title: {endless}", f"horizon: {endless}"]
+    for line in (*wrong, f"density: [{endless}]", f"? {endless}\n: 1"):
         told.write_text(line)
         assert CliRunner().invoke(app, words).exit_code == 2
     assert not (tmp_path / "mine").exists()

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 import struct
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import xarray as xr
+from exchange_readers import straight_runs
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from numpy.typing import NDArray
@@ -22,6 +25,7 @@ from lagbench.draw.plot import KINDS, contact_sheet, describe, plot_frame
 from lagbench.draw.recording import open_recording
 from lagbench.draw.style import figure, pixels_of
 from lagbench.errors import DataError, UsageError, WorkFailedError
+from lagbench.exchange import adopt
 from lagbench.store.dataset import open_split
 
 PNG_HEAD = b"\x89PNG\r\n\x1a\n"
@@ -87,6 +91,34 @@ def test_a_data_set_of_several_scenarios_is_refused(swirl: Path, tmp_path: Path)
     assert "sel(scenario" in str(caught.value)
 
 
+CUTS = {"late": slice(1, None), "strided": slice(None, None, 2), "short": slice(0, 3), "one": 2}
+
+
+@pytest.mark.parametrize("cut", CUTS)
+def test_a_data_set_cut_in_frames_is_refused(tmp_path: Path, cut: str) -> None:
+    """Whether frames are missing before, between or behind those that are left: they are called by place."""
+    write_swirl(tmp_path, "fluid", walls=None, parameters={"family": "disc"})
+    write_swirl(tmp_path, "fluid", 1, walls=None, parameters={"family": "disc"})
+    with open_split("fluid", subset="train", size="tiny", root=tmp_path) as data:
+        less = data.isel(scenario=0, frame=CUTS[cut])
+        with pytest.raises(UsageError) as caught:
+            plot_frame(less, 0, tmp_path / "x.png")
+    assert caught.value.where == "coordinate frame"
+
+
+def test_a_scenario_of_a_local_split_is_drawn_with_its_own_grid(tmp_path: Path) -> None:
+    """An opened split, and a data set of one of its files, know the split that stands beside them."""
+    runs = [tmp_path / f"run{number}.npy" for number in range(3)]
+    for number, path in enumerate(runs):
+        np.save(path, straight_runs(3)[number])
+    made = adopt(runs, output=tmp_path / "mine", radius=0.1, frame_interval=0.25)
+    from_file = plot_frame(made.folder / "full/v1/test/0002.nc", 3, tmp_path / "file.png").read_bytes()
+    with open_split(str(made.folder)) as data:
+        assert plot_frame(data.isel(scenario=0), 3, tmp_path / "split.png").read_bytes() == from_file
+    with xr.open_dataset(made.folder / "full/v1/test/0002.nc") as data:
+        assert plot_frame(data, 3, tmp_path / "data.png").read_bytes() == from_file
+
+
 def test_fields_of_solid_body_rotation(swirl: Path) -> None:
     """Vorticity on the grid is twice the angular velocity, per frame, at frame 0 and later."""
     with open_recording(swirl) as recording:
@@ -142,6 +174,19 @@ def test_dpi_scales_a_picture(swirl: Path, tmp_path: Path) -> None:
         assert large.size == pytest.approx((2 * small.width, 2 * small.height), abs=1)
 
 
+@pytest.mark.parametrize("dpi", [0, -1, math.nan, 1e6, "128"])
+def test_pixels_per_inch_out_of_range_are_refused(swirl: Path, tmp_path: Path, dpi: Any) -> None:
+    """The error names the option, and nothing is written, of a frame or of a sheet."""
+    for draw in (
+        lambda: plot_frame(swirl, 0, tmp_path / "x.png", dpi=dpi),
+        lambda: contact_sheet("cavity", "tiny", tmp_path / "x.png", root=swirl.parents[4], dpi=dpi),
+    ):
+        with pytest.raises(UsageError) as caught:
+            draw()
+        assert caught.value.where == "--dpi"
+    assert not list(tmp_path.iterdir())
+
+
 def test_captions_say_what_sets_a_scenario_apart(swirl: Path, tmp_path: Path) -> None:
     """Reynolds number, family or frequency stand beside split, size and id."""
     with open_recording(swirl) as recording:
@@ -159,6 +204,15 @@ def test_a_frame_counts_from_the_end_or_is_refused(swirl: Path, tmp_path: Path) 
         with pytest.raises(UsageError, match=f"no frame {frame}") as caught:
             plot_frame(swirl, frame, tmp_path / "x.png")
         assert "0 to 5" in str(caught.value)
+
+
+def test_a_frame_is_a_whole_number(swirl: Path, tmp_path: Path) -> None:
+    """One of NumPy's is; a float is a mistake of the caller's, not of the file."""
+    plot_frame(swirl, np.int64(1), tmp_path / "one.png")  # type: ignore[arg-type]
+    with pytest.raises(UsageError) as caught:
+        plot_frame(swirl, 1.0, tmp_path / "x.png")  # type: ignore[arg-type]
+    assert caught.value.where == "scenario 0"
+    assert not (tmp_path / "x.png").exists()
 
 
 def test_moving_walls_are_marked_and_point_where_they_slide(tmp_path: Path) -> None:

@@ -16,7 +16,9 @@ from conftest import SIZE, SPLIT
 from forging import forge, mend_manifest
 from hypothesis import given
 from hypothesis import strategies as st
+from typer.testing import CliRunner
 
+from lagbench.cli.app import app
 from lagbench.data.manifest import Manifest, read_manifest
 from lagbench.data.registry import Registry, load
 from lagbench.data.scenario import check_scenario
@@ -329,6 +331,15 @@ def test_evenly_spaced_ids(ids: list[int], count: int) -> None:
         places = [ids.index(i) for i in chosen]
         gaps = [b - a for a, b in itertools.pairwise(places)]
         assert max(gaps) - min(gaps) <= 1
+
+
+def test_fewer_than_no_scenario_anew_is_refused(tmp_path: Path) -> None:
+    """In Python and by the command, before anything is hashed."""
+    with pytest.raises(UsageError) as caught:
+        verify("fluid", "tiny", root=tmp_path, regenerate=-1)
+    assert caught.value.where == "--regenerate"
+    words = ["verify", "fluid", "--size", "tiny", "--root", str(tmp_path), "--regenerate", "-1"]
+    assert CliRunner().invoke(app, words).exit_code == 2
 
 
 def test_regeneration_needs_taichi(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

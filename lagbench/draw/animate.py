@@ -270,11 +270,12 @@ def animate(
     if kind is not None and kind not in KINDS:
         fix = nearest(str(kind), map(str, KINDS))
         raise UsageError(f"an animation cannot show {kind!r}", where="--kind", fix=fix)
-    if not SLOWEST <= frames_per_second <= FASTEST or every < 1:  # nan lies in no interval
+    whole = isinstance(every, int | np.integer)
+    if not SLOWEST <= frames_per_second <= FASTEST or not whole or every < 1:  # nan lies in no interval
         raise UsageError(
             "an animation needs a positive rate and step",
             where="--fps, --every",
-            expected=f"{SLOWEST:g} to {FASTEST:g} frames/s, every 1 or more",
+            expected=f"{SLOWEST:g} to {FASTEST:g} frames/s, every whole number from 1 on",
             got=f"{frames_per_second} frames/s, every {every}",
         )
     with ExitStack() as stack:

@@ -6,6 +6,7 @@ A recording is a scenario file, or an ``xarray.Dataset`` of one scenario as
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -119,6 +120,15 @@ class Recording:
 
     def frame_number(self, frame: int) -> int:
         """Return an absolute frame number; negative ones count from the end."""
+        try:
+            frame = operator.index(frame)
+        except TypeError:
+            raise UsageError(
+                "a frame is named by a whole number",
+                where=f"scenario {self.scenario}",
+                expected=f"0 to {self.frames - 1}",
+                got=repr(frame),
+            ) from None
         if not -self.frames <= frame < self.frames:
             raise UsageError(
                 f"no frame {frame}",
@@ -150,19 +160,24 @@ def open_recording(
 ) -> Iterator[Recording]:
     """Open a scenario file, or a data set of one scenario, for drawing."""
     if not isinstance(source, str | Path):
-        yield _of_dataset(source, registry or load())
+        yield _of_dataset(source, registry)
         return
     with read_scenario(Path(source)) as file:
         head = file.header
         key = head.key
         identity = {"split": key.split, "size": key.size, "scenario": key.scenario, "subset": key.subset}
         variables = set(file.variables)
-        parents = Path(source).absolute().parents  # the root is where `scenario_path` has it
-        splits = rooted(parents[min(4, len(parents) - 1)], registry)
+        splits = _beside(source, registry)
         yield Recording(identity, head.parameters, head.frames, variables, file.read, splits)
 
 
-def _of_dataset(data: xr.Dataset, registry: Registry) -> Recording:
+def _beside(file: str | Path, registry: Registry | None) -> Registry:
+    """Return a registry that also knows the local splits of the root of a scenario file."""
+    parents = Path(file).absolute().parents  # the root is where `scenario_path` has it
+    return rooted(parents[min(4, len(parents) - 1)], registry)
+
+
+def _of_dataset(data: xr.Dataset, registry: Registry | None) -> Recording:
     """Return the recording that a data set of one scenario holds."""
     if "scenario" in data.dims:
         raise UsageError(
@@ -174,13 +189,24 @@ def _of_dataset(data: xr.Dataset, registry: Registry) -> Recording:
     identity = {
         name: data.coords[name].item() if name in data.coords else attributes[name] for name in _IDENTITY
     }
-    frames = int(data["frame_count"]) if "frame_count" in data else data.sizes["frame"]
+    held = data["frame"].values.tolist() if "frame" in data.dims else []
+    frames = int(data["frame_count"]) if "frame_count" in data else len(held)
+    if not held or held != list(range(max(frames, len(held)))):
+        raise UsageError(
+            "a picture needs all frames of a scenario: a frame is called by its number",
+            where="coordinate frame",
+            expected=f"0, 1, 2, ... to {max(frames, len(held), 1) - 1}",
+            got=f"{len(held)}: {', '.join(map(str, held[:3]))}, ..." if held else "no dimension frame",
+            fix="choose a scenario only, data.sel(scenario=3), and say which frame to draw",
+        )
 
     def read(name: str, frames: slice | int) -> NDArray[Any]:
         variable = data[name]
         return np.asarray(variable.isel(frame=frames) if "frame" in variable.dims else variable)
 
-    return Recording(identity, attributes, frames, {str(name) for name in data.variables}, read, registry)
+    file = data.encoding.get("source")  # as xarray and open_split note where the data are from
+    splits = _beside(file, registry) if isinstance(file, str | Path) else registry or load()
+    return Recording(identity, attributes, frames, {str(name) for name in data.variables}, read, splits)
 
 
 _IDENTITY = ("split", "size", "scenario", "subset")

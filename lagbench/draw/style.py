@@ -96,6 +96,7 @@ def _cut(name: str, low: float, high: float, levels: int) -> ListedColormap:
 ENDINGS = (".png", ".pdf", ".svg")  # endings of files that pictures can be
 
 DPI = 128  # a power of two: every whole number of pixels is exact in inches
+COARSEST, FINEST = 32, 1200  # pixels per inch that a picture may have
 
 _STYLE = {
     "font.family": "DejaVu Sans",  # ships with matplotlib, so that text has the same pixels everywhere
@@ -122,6 +123,10 @@ def figure(width: float, height: float, *, dpi: int = DPI) -> Iterator[Figure]:
 
     Draw and save it inside the context.
     """
+    if not (isinstance(dpi, int | float | np.number) and COARSEST <= dpi <= FINEST):
+        raise UsageError(
+            "no such number of pixels per inch", where="--dpi", expected=f"{COARSEST} to {FINEST}", got=dpi
+        )
     matplotlib = require("matplotlib", extra="plots")
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

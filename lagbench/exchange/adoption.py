@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Unpack
@@ -19,7 +19,7 @@ from .array_files import Row, natural, open_row, rows_of
 from .exporting import ENDINGS
 from .local_split import LocalSplit, make_local_split, output_name
 from .metadata import DROP, Format, Source, parse_format, read_source
-from .trajectory import Description, Frame, Trajectory, Wishes
+from .trajectory import Description, Frame, Trajectory, Wishes, check_wishes
 
 
 def adopt(
@@ -52,18 +52,20 @@ def adopt(
             see :class:`lagbench.exchange.trajectory.Description`.
 
     Raises:
-        UsageError: no radius or frame interval, too few trajectories, a folder that is there, a
-            task that does not fit the data.
+        UsageError: no radius or frame interval, too few trajectories or one named twice, a folder that
+            is there, a task that does not fit the data.
         UnreadableFileError: a file is damaged, pickled, or holds no positions.
         DataError: positions are not plane, not finite, or outside the unit box; another reading explains
             the axes or the velocities far better.
         WorkFailedError: the disk is full or not writable.
     """
+    wishes = check_wishes(wishes)
     for name in ("radius", "frame_interval"):
-        if wishes.get(name) is None:
+        if name not in wishes:
             raise UsageError(f"the {name.replace('_', ' ')} is not known", fix=f"--{name.replace('_', '-')}")
     given = [Path(sources)] if isinstance(sources, str | Path) else [Path(source) for source in sources]
     files = _by_subset(given, valid=valid, test=test)
+    _check_once(row for rows in files.values() for row in rows)
     counts = {subset: len(rows) for subset, rows in files.items()}
     source = f"{sum(counts.values())} trajectories of the user's own"
     about = Description(name=output_name(output), source=source, **wishes)
@@ -107,6 +109,7 @@ def import_split(
             periodic one.
         WorkFailedError: the disk is full or not writable.
     """
+    said = {**wishes, **check_wishes(wishes)}
     form, folder = parse_format(format), Path(source)
     files = {subset: folder / f"{subset}{ENDINGS[form]}" for subset in HASHED_SUBSETS}
     missing = [path.name for path in files.values() if not path.is_file()]
@@ -141,7 +144,7 @@ def import_split(
         "frames_of_interest": hints.frames_of_interest,
         "cells": hints.cells,
         "full_box": hints.placement == "cell_centres",
-        **wishes,
+        **said,
     }
     if facts["frame_interval"] is None:
         raise UsageError("the metadata state no time between frames", fix="say it: --frame-interval SECONDS")
@@ -187,6 +190,18 @@ def _by_subset(given: Sequence[Path], *, valid: int | None, test: int | None) ->
         "valid": rows[for_train : for_train + for_valid],
         "test": rows[for_train + for_valid :],
     }
+
+
+def _check_once(rows: Iterable[Row]) -> None:
+    """Refuse a trajectory that is named twice, by links too: it could be trained on and tested."""
+    known: dict[Row, Path] = {}
+    for path, row in rows:
+        place = path.resolve(), row
+        if place in known:
+            raise UsageError(
+                "a file is named twice", where=str(path), expected="each once", got=f"{known[place]} before"
+            )
+        known[place] = path
 
 
 def _unbroken(trajectory: Trajectory, stated: Source) -> Trajectory:

@@ -156,12 +156,22 @@ class _Building:
     entries: list[FileEntry] = field(default_factory=list)  # of the scenarios written so far, by id
     low: NDArray[np.float64] = field(default_factory=lambda: np.full(2, np.inf))  # of any particle [length]
     high: NDArray[np.float64] = field(default_factory=lambda: np.full(2, -np.inf))
+    walled: bool | None = None  # whether trajectories have velocities of walls; None before the first
 
     def add(self, subset: str, trajectory: Trajectory) -> None:
         """Write the next scenario."""
         scenario = len(self.entries)
         if scenario > MAX_ID:
             raise DataError("too many trajectories", where=trajectory.name, expected=f"at most {MAX_ID + 1}")
+        walled = trajectory.wall_velocity is not None
+        if self.walled not in (None, walled):
+            raise DataError(
+                "velocities of walls in some trajectories only",
+                where=trajectory.name,
+                expected="wall_velocity, as before" if self.walled else "no wall_velocity, as before",
+                fix="give zeros where walls rest",
+            )
+        self.walled = walled
         about, scale = self.about, self.about.measure.scale
         if not self.spacing:
             first = np.asarray(next(trajectory.read())[0])

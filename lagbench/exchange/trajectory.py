@@ -7,17 +7,19 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ConfigDict, TypeAdapter, ValidationError, with_config
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError, with_config
 from typing_extensions import TypedDict  # pydantic reads that of Python 3.12 and later only
 
 from lagbench.data.checksums import round_digits
 from lagbench.data.limits import FRAMES, NEEDED
 from lagbench.data.local import is_name
 from lagbench.data.yamlfile import read_yaml
-from lagbench.errors import DataError, UnreadableFileError, UsageError
+from lagbench.errors import DataError, UnreadableFileError, UsageError, nearest
+from lagbench.submission.findings import quoted
 
 from .mistakes import misplaced_axes
 
@@ -101,6 +103,10 @@ def _power(length: float) -> float:
     return 2.0 ** max(0, math.ceil(math.log2(length))) if length > 1.0 else 1.0
 
 
+Count = Annotated[int, Field(gt=-(1 << 31), lt=1 << 31)]
+"""A number of frames or cells, or of a frame: one that a message can spell out."""
+
+
 @with_config(ConfigDict(extra="forbid"))
 class Wishes(TypedDict, total=False):
     """What a user may say of data from elsewhere; see :class:`Description`."""
@@ -115,10 +121,10 @@ class Wishes(TypedDict, total=False):
     rescale: bool
     density: float
     spacing: float
-    input_frames: int
-    horizon: int
-    frames_of_interest: Sequence[int]
-    cells: int
+    input_frames: Count
+    horizon: Count
+    frames_of_interest: Sequence[Count]
+    cells: Count
     full_box: bool
 
 
@@ -129,16 +135,33 @@ def read_wishes(path: Path) -> Wishes:
         UnreadableFileError: no plain YAML.
         UsageError: an unknown key, or a value that does not fit.
     """
+    return _checked(read_yaml(path), where=f"{path}, key ")
+
+
+def check_wishes(wishes: Wishes) -> Wishes:
+    """Return what a caller says of the data as plain values, NumPy's converted; None says nothing.
+
+    An unknown name, or a value that does not fit, is a UsageError.
+    """
+    said = {name: value for name, value in wishes.items() if value is not None}
+    plain = {n: v.tolist() if isinstance(v, np.ndarray | np.generic) else v for n, v in said.items()}
+    return _checked(plain, where="")
+
+
+def _checked(given: object, *, where: str) -> Wishes:
     try:
-        return TypeAdapter(Wishes).validate_python(read_yaml(path))
+        return TypeAdapter(Wishes).validate_python(given)
     except ValidationError as error:
         first = error.errors()[0]
+        value = first["input"]
+        key = quoted(".".join(map(str, first["loc"])))[1:-1]
+        strange = first["type"] == "extra_forbidden"
         raise UsageError(
-            "the file does not describe data",
-            where=f"{path}, key {'.'.join(map(str, first['loc'])) or '(whole file)'}",
+            "this does not describe data",
+            where=f"{where}{key or '(whole file)'}",
             expected=first["msg"],
-            got=first["input"],
-            fix="docs/exchange.md has the keys",
+            got=quoted(value) if isinstance(value, str | int | float) else f"a {type(value).__name__}",
+            fix=nearest(key, Wishes.__annotations__) if strange else "docs/exchange.md has the keys",
         ) from None
 
 

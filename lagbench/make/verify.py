@@ -17,7 +17,7 @@ from lagbench.data.checksums import HASHED_SUBSETS, dataset_hash, file_sha256, s
 from lagbench.data.local import locate, remedy
 from lagbench.data.manifest import Manifest, note, read_manifest
 from lagbench.data.registry import Registry, Size, spell_ids
-from lagbench.errors import DataError, check_installed
+from lagbench.errors import DataError, UsageError, check_installed
 from lagbench.generators.batch import SimulationJob
 from lagbench.generators.simulate import simulate
 from lagbench.generators.solver import Device
@@ -119,12 +119,14 @@ def verify(
         registry: where splits are described; ours when None.
 
     Raises:
-        UsageError: unknown split, size, subset or scenario, or fewer than one worker.
+        UsageError: unknown split, size, subset or scenario, fewer than one worker, or than no scenario anew.
         WorkFailedError: simulating anew failed.
     """
     tier, folder, _ = locate(split, size, root=root, registry=registry)
     ids = select(tier, subset=subset, scenarios=scenarios)
     meter, cores = Meter(progress), worker_count(workers)
+    if regenerate < 0:
+        raise UsageError("fewer than none", where="--regenerate", expected=">= 0", got=regenerate)
     if regenerate:
         check_installed("taichi", extra="generate")
     bring(tier, folder, ids, thoroughly=True)

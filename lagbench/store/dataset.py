@@ -94,6 +94,7 @@ def open_split(
         padded, dim=ids, data_vars="all", coords="minimal", join="exact", combine_attrs="drop_conflicts"
     )
     joined = joined.assign_coords(scenario=ids, time=longest["time"].compute())
+    joined.encoding["source"] = str(next(iter(paths.values())).absolute())  # local splits are found by it
     joined["frame_count"] = ("scenario", frames, {"long_name": "recorded frames", "units": "1"})
     joined["particle_count"] = ("scenario", particles, {"long_name": "particles", "units": "1"})
     for variable in joined.variables.values():
