@@ -189,6 +189,12 @@ def refused(path: Path, parts: tuple[str, ...], call: Callable[[], object]) -> N
     assert all(part in text for part in (str(path), *parts)), text
 
 
+def test_a_number_that_python_cannot_print(tmp_path: Path) -> None:
+    """YAML reads hexadecimals of any length."""
+    (tmp_path / "odd.yaml").write_text(f"format: 0x{'f' * 5000}")
+    refused(tmp_path / "odd.yaml", ("format",), lambda: load(tmp_path / "odd.yaml"))
+
+
 @pytest.mark.parametrize(
     ("change", "parts"),
     [

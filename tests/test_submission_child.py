@@ -117,6 +117,7 @@ def test_text_of_strangers_is_shown_escaped_and_short() -> None:
     """Control characters never reach the terminal."""
     assert quoted("\x1b[2J\u202e") == r"'\x1b[2J\u202e'"
     assert len(quoted("x" * 10**6)) == 80
+    assert len(quoted([16**5000])) < 80
 
 
 def test_the_document_names_every_check() -> None:

@@ -529,6 +529,8 @@ def _read(path: Path) -> _File:
 
 def _mistake(place: tuple[int | str, ...], message: str, given: object) -> str:
     """Return one line: key, what is expected there, and what was got if that is short."""
+    if isinstance(given, int) and given.bit_length() > 256:  # Python prints no integer of thousands of digits
+        given = f"an integer of {given.bit_length()} bits"
     got = f"; got {given!r}" if isinstance(given, str | int | float) and "; got " not in message else ""
     return f"{'.'.join(map(str, place))}: {message.removeprefix('Value error, ')}{got}"
 

@@ -40,7 +40,10 @@ def quoted(value: object) -> str:
     """
     if isinstance(value, int) and value.bit_length() > 4 * MAX_TEXT:
         return f"an integer of {value.bit_length()} bits"
-    text = ascii(value[: MAX_TEXT + 1] if isinstance(value, (str, bytes)) else value)
+    try:
+        text = ascii(value[: MAX_TEXT + 1] if isinstance(value, (str, bytes)) else value)
+    except ValueError:  # an integer inside, of more digits than Python prints
+        return f"a {type(value).__name__}"
     return text if len(text) <= MAX_TEXT else f"{text[: MAX_TEXT - 3]}..."
 
 
