@@ -125,5 +125,6 @@ def _took(found: Checkpoint) -> dict[str, float | None]:
     hours = {name: getattr(budget, name) for name in ("cpu_hours", "validation_hours", "gpu_hours")}
     if any(value is None or value > MOST_HOURS for value in hours.values()):
         hours = dict.fromkeys(hours)
-    steps = int(found.training.get("step", 0)) + (budget.start_steps or 0)
+    made = found.training.get("step", 0) if budget.steps is None else budget.steps
+    steps = int(made) + (budget.start_steps or 0)
     return {**hours, "steps": min(steps, MOST_STEPS)}
