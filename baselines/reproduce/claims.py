@@ -107,6 +107,11 @@ CLAIMS = (
         rivals=("neuralmpm",),
     ),
     Claim(
+        question="Does NeuralMPM gain by starting from the weights of another size?",
+        first="neuralmpm-started",
+        rivals=("neuralmpm",),
+    ),
+    Claim(
         question="Does LSTM + MLP come first among the frame models (Table 4.8: it does)?",
         first="lstm-mlp",
         rivals=tuple(name for name in FRAME_MODELS if name != "lstm-mlp"),

@@ -227,6 +227,8 @@ _MODELS = (
     ),
     Model("neuralmpm-longer", "NeuralMPM from its own rollouts, for longer"),
     Model("neuralmpm-longer-averaged", "NeuralMPM from its own rollouts, for longer, mean over images"),
+    Model("neuralmpm-started", "NeuralMPM, started from another size"),
+    Model("neuralmpm-started-averaged", "NeuralMPM, started from another size, mean over images"),
     Model("neuralmpm-of-mini", "NeuralMPM trained at mini"),
     Model("neuralmpm-of-mini-averaged", "NeuralMPM trained at mini, mean over images"),
     Model("mlp", "MLP", "#0072b2"),
