@@ -24,6 +24,7 @@ from lagbench.baselines.catalogue import names
 from lagbench.baselines.checkpoint import load
 from lagbench.cli.app import app
 from lagbench.errors import DataError, WorkFailedError
+from lagbench.exchange.local_split import LocalSplit
 from lagbench.make.generate import GenerationResult
 from lagbench.submission.validation import validate
 
@@ -161,8 +162,8 @@ def command(*words: str, threads: int = 1) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_bench_of_the_solver(lagbench: Command) -> None:
-    """The solver is timed in a process of its own; nothing else can be timed."""
+def test_bench_of_the_solver(lagbench: Command, original: LocalSplit) -> None:
+    """The solver is timed in a process of its own; nothing else can be timed, and no local split."""
     done = command("bench", "solver", "--split", "curl-noise", "--size", "tiny", "--frames", "3", "--json")
     found = json.loads(done.stdout)
     assert (found["particles"], found["substeps"]) == (506, 12)
@@ -171,6 +172,9 @@ def test_bench_of_the_solver(lagbench: Command) -> None:
     # 506 particles x 12 substeps at 30 to 40 ns each: a fifth of a millisecond; never a tenth of a second.
     assert 1e-5 < found["seconds_per_frame"] < 0.1
     assert lagbench("bench", "model", "--split", "curl-noise").exit_code == 2
+    refused = lagbench("bench", "solver", "--split", str(original.folder))
+    assert refused.exit_code == 2
+    assert "simulated" in refused.stderr
 
 
 def test_the_second_process_says_nothing(lagbench: Command, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -81,7 +81,13 @@ class Seeded:
         seconds = self.record.get("cpu_seconds")
         if seconds is None:
             return None
-        return (float(seconds) - float(self.record.get("validation_cpu_seconds") or 0.0)) / 3600.0
+        # with those behind the weights that it started from
+        before = self.record.get("recipe", {}).get("start", {}).get("took", {}).get("cpu_hours", 0.0)
+        if before is None:
+            return None
+        return (float(seconds) - float(self.record.get("validation_cpu_seconds") or 0.0)) / 3600.0 + float(
+            before
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

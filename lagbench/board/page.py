@@ -105,7 +105,7 @@ def build(
         raise ChecksFailedError(
             "the page is not what the submissions give",
             where=", ".join(str(path) for path in stale),
-            expected=f"{len(wanted[page])} bytes, tabs {len(held.tabs)}",
+            expected=", ".join(f"{path.name} of {len(wanted[path])} bytes" for path in stale),
             got="another content, or no file",
             fix=f"lagbench leaderboard build --board {board}",
         )

@@ -333,6 +333,9 @@ def bench(
             f"nothing to time is called {what!r}", expected="solver", fix="lagbench bench solver"
         )
     tier = locate_new(chosen(None, split), size).size
+    if not tier.simulated:
+        fix = "lagbench list names splits of ours"
+        raise UsageError("a local split cannot be simulated", where="--split", got=tier.split, fix=fix)
     result = bench_solver(tier.split, tier.name, frames=frames)
     if as_json:
         print_json(result)
