@@ -348,7 +348,7 @@ def _content(file: Path) -> dict[str, Any]:
     has the checksum that it states: nothing unpacks to more, and no damaged byte is read.
     """
     try:
-        inside = f"name the file: {file / 'weights.pt'}" if file.is_dir() else None
+        inside = f"name the file: {file / 'weights.pt'}" if (file / "weights.pt").is_file() else None
         length = check_regular(file, fix=inside)
         if not zipfile.is_zipfile(file):
             with file.open("rb") as stream:

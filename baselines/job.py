@@ -152,6 +152,15 @@ class RunFolder:
                 fix=f"{instead}, or train anew with --fresh",
             )
         found = load(self.checkpoint)
+        started = found.training.get("recipe", {}).get("start")
+        if started != asked.get("start"):
+            raise UsageError(
+                "the folder holds a training that started from other weights",
+                where=f"--start, {where}",
+                expected=start_words(started) or "random weights: no --start",
+                got=start_words(asked.get("start")) or "no --start",
+                fix="give the same --start, name another folder with --output, or train anew with --fresh",
+            )
         if found.training.get("recipe") != asked:
             raise UsageError(
                 "the folder holds a training with another recipe",
@@ -242,9 +251,13 @@ def settings_of(recipe: object) -> tuple[str, ...]:
 
 def changes_of(recipe: Mapping[str, Any]) -> tuple[str, ...]:
     """Return what a training changed of its recipe, and the weights that it started from, in words."""
-    start = recipe.get("start")
-    words = (f"started from {start['recipe']}, weights {start['sha256'][:12]}",) if start else ()
-    return (*settings_of(recipe), *words)
+    words = start_words(recipe.get("start"))
+    return (*settings_of(recipe), *((f"started from {words}",) if words else ()))
+
+
+def start_words(start: Mapping[str, Any] | None) -> str:
+    """Return which weights a training starts from, in words; nothing for random ones."""
+    return f"{start['recipe']}, weights {start['sha256'][:12]}" if start else ""
 
 
 def _changes(

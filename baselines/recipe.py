@@ -361,4 +361,5 @@ def _complaint(
         fix = nearest(str(first["loc"][-1]), list(options.model_fields))
         return kind(f"unknown key {key!r}", where=where, fix=fix)
     expected = first["msg"].removeprefix("Value error, ")
-    return kind(f"{key} does not fit", where=where, expected=expected, got=repr(first["input"])[:80])
+    got = None if isinstance(first["input"], Mapping) else repr(first["input"])[:80]
+    return kind(f"{key} does not fit", where=where, expected=expected, got=got)

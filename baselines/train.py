@@ -32,7 +32,7 @@ from .augmentation import check_symmetry
 from .baseline import Baseline, Facts, facts_of
 from .catalogue import find
 from .checkpoint import Checkpoint, load_weights, rounded_weights, save
-from .job import STOPPED_EARLY, RunFolder, TrainingJob, TrainingRecord, parameter_count
+from .job import STOPPED_EARLY, RunFolder, TrainingJob, TrainingRecord, parameter_count, start_words
 from .machine import (
     bound_memory,
     chosen_device,
@@ -61,6 +61,7 @@ class TrainingResult:
     weights: Path  # weights to predict from
     checkpoint: Path  # last state, to go on from
     state: str  # finished, stopped early or interrupted
+    start: str  # weights that it started from, in words; empty for random ones
     first_step: int  # optimiser steps that were there when this call began
     step: int  # optimiser steps made
     steps: int  # steps of the whole training
@@ -189,6 +190,7 @@ def train(
             threads=budget.threads or 0,
             track=track_of(facts.size, budget),
             state=ledger.state,
+            start=start_words(plan.start),
             first_step=int(earlier.training.get("step", 0)) if earlier else 0,
             step=ledger.step,
             loss=ledger.loss,

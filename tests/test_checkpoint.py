@@ -114,6 +114,10 @@ def test_text_is_no_pickle(tmp_path: Path) -> None:
     with pytest.raises(UnreadableFileError, match="lagbench train") as caught:
         load(tmp_path / "notes.md")
     assert "more than tensors" not in str(caught.value)
+    with pytest.raises(UnreadableFileError) as caught:
+        load(tmp_path)
+    assert "weights.pt" not in str(caught.value)
+    (tmp_path / "weights.pt").touch()
     with pytest.raises(UnreadableFileError, match=r"weights\.pt"):
         load(tmp_path)
 

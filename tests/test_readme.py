@@ -77,7 +77,7 @@ def test_the_quickstart_programs_run(tmp_path: Path, tiny_split: Callable[..., G
     assert done.returncode == 0, done.stderr
     stated = re.findall(r"# (0\.\d+)$", look, re.MULTILINE)
     assert done.stdout.splitlines()[0] == stated[0]
-    assert lagbench.validate(tmp_path / "predictions.nc", root=root).valid
+    assert lagbench.validate(tmp_path / "fading.nc", root=root).valid
 
 
 def test_every_command_of_the_pages_exists() -> None:

@@ -137,6 +137,7 @@ def test_what_came_before_is_told(run: Run, stored: Callable[..., Path], tmp_pat
     assert 0.25 < budget["validation_hours"] < 0.35
     assert (budget["steps"], budget["start_steps"], budget["windows"]) == (1, 9, 2)
     assert record["recipe"]["start"]["sha256"] == file_sha256(start)
+    assert file_sha256(start)[:12] in result.start
     held = load(result.weights)
     words = training_words(held)
     assert words.endswith(f"curl-noise/mini-made-up, weights {file_sha256(start)[:12]}")
@@ -206,8 +207,9 @@ def test_it_can_be_interrupted(run: Run, stored: Callable[..., Path]) -> None:
     with pytest.raises(KeyboardInterrupt):
         run("any", "steps=4", start=start, progress=stop)
     for other in (None, stored(model={"start": 0.25})):
-        with pytest.raises(UsageError):
+        with pytest.raises(UsageError) as told:
             run("any", "steps=4", start=other)
+        assert "--start" in str(told.value.where)
     parts = run("any", "steps=4", start=stored())
     assert 0 < parts.first_step < 4
     one, two = (load(result.checkpoint).weights for result in (whole, parts))

@@ -132,6 +132,8 @@ def submit(
         result.check()
         results.append(result)
         with open_predictions(path) as opened:
+            if (got := opened.header.split) not in (known := described.splits):
+                raise UsageError("no split of a leaderboard", where=str(path), expected=[*known], got=got)
             headers.append(opened.header)
             hashes.append(opened.content_sha256())
             size = described.size(opened.header.split, opened.header.size)

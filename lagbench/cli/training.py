@@ -190,6 +190,11 @@ def _trained(result: TrainingResult, where: str) -> list[str]:
         time += f"; this call went on from step {result.first_step}"
     lines = [
         f"{result.baseline} on {result.recipe}: {result.state}, step {result.step} of {result.steps}, {time}",
+        *(
+            [f"  started    from {result.start}; hours and track count what they took"]
+            if result.start
+            else []
+        ),
         f"  parameters {result.parameters}",
         "  loss       " + ", ".join(f"{name} {value:.4g}" for name, value in result.loss.items()),
     ]
