@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 
 import dask.array
@@ -96,6 +97,26 @@ def test_damaged_and_foreign_files_are_named(ragged: Path) -> None:
         file.scenario = 17
     with pytest.raises(DataError, match=rf"(?s)another scenario.*{path.name}"):
         open_split("cavity", size="tiny", root=ragged)
+
+
+def test_nothing_stays_open_after_an_error(ragged: Path) -> None:
+    """Neither the file that is wrong nor those before it, though the error is still held.
+
+    A thread that collects them would close them while another reads, and HDF5 crashes.
+    """
+
+    def held() -> list[str]:
+        links = [link.readlink() for link in Path("/proc/self/fd").iterdir() if link.is_symlink()]
+        return [str(link) for link in links if link.is_relative_to(ragged)]
+
+    path = ragged / "cavity/tiny/v2/test" / f"{TEST_IDS[1]:04d}.nc"
+    for number in (17, TEST_IDS[1]):
+        with netCDF4.Dataset(path, "r+") as file:
+            file.scenario = number
+        kept = pytest.raises(DataError) if number == 17 else nullcontext()
+        with kept as caught, open_split("cavity", size="tiny", root=ragged):
+            assert len(held()) == len(TEST_IDS)
+        assert held() == [], caught
 
 
 @pytest.mark.parametrize(

@@ -78,8 +78,8 @@ def test_a_scenario_of_an_opened_split_draws_what_its_file_draws(tmp_path: Path)
     """Padding of the shorter of two scenarios is not drawn: its last frame is its own."""
     for scenario, frames in ((0, 4), (1, 6)):
         write_swirl(tmp_path, "fluid", scenario, frames=frames, walls=None, parameters={"family": "disc"})
-    split = open_split("fluid", subset="train", size="tiny", root=tmp_path)
-    from_split = plot_frame(split.sel(scenario=0), -1, tmp_path / "split.png")
+    with open_split("fluid", subset="train", size="tiny", root=tmp_path) as split:
+        from_split = plot_frame(split.sel(scenario=0), -1, tmp_path / "split.png")
     from_file = plot_frame(tmp_path / "fluid/tiny/v2/train/0000.nc", 3, tmp_path / "file.png")
     assert from_split.read_bytes() == from_file.read_bytes()
 

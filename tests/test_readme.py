@@ -168,9 +168,9 @@ def test_dam_break_is_a_split(dam_break: None, tmp_path: Path) -> None:
     assert "dam-break" in registry.load().splits
     result = generate("dam-break", "tiny", subset="test", root=tmp_path)
     assert result.simulated == (3, 4)
-    test = lagbench.open_split("dam-break", subset="test", size="tiny", root=tmp_path)
-    height = test.position.sel(space="y").mean("particle")
-    assert (height.isel(frame=-1) < 0.8 * height.isel(frame=0)).all()
+    with lagbench.open_split("dam-break", subset="test", size="tiny", root=tmp_path) as test:
+        height = test.position.sel(space="y").mean("particle")
+        assert (height.isel(frame=-1) < 0.8 * height.isel(frame=0)).all()
 
 
 def test_sage_is_a_baseline_and_enstrophy_a_metric(

@@ -154,6 +154,7 @@ def test_arrays_tensors_and_open_split_agree(generated: GenerationResult, unmeas
         assert tensor.wall_velocity is not None
         np.testing.assert_array_equal(array.wall_velocity, frames.wall_velocity)
         np.testing.assert_array_equal(tensor.wall_velocity.numpy(), frames.wall_velocity)
+    truth.close()
 
 
 def test_what_is_published_comes_along(

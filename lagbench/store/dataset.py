@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -73,15 +75,27 @@ def open_split(
         UsageError: unknown split, size or subset.
         DataError: scenarios are missing, damaged, or of another version.
     """
-    import xarray as xr
-
     from .copy import scenario_files
 
     entry, folder, _ = locate(split, size, root=root)
     paths, fix = scenario_files(entry, folder, (subset,)), remedy(entry, root=folder)
-    scenarios = [_open_scenario(path, entry.key(i), fix) for i, path in paths.items()]
-    ids = xr.Variable("scenario", list(paths), {"long_name": "scenario id", "units": "1"})
-    # Scenarios of unequal lengths are stacked along a new first dimension.
+    with (
+        ExitStack() as opened
+    ):  # what stays open after an error is closed by whichever thread collects garbage
+        scenarios = [
+            opened.enter_context(_open_scenario(path, entry.key(i), fix)) for i, path in paths.items()
+        ]
+        joined = _joined(scenarios, list(paths))
+        joined.encoding["source"] = str(next(iter(paths.values())).absolute())  # local splits are found by it
+        joined.set_close(opened.pop_all().close)
+    return joined
+
+
+def _joined(scenarios: Sequence[xr.Dataset], numbers: Sequence[int]) -> xr.Dataset:
+    """Return scenarios along a new first dimension; those of unequal lengths are padded."""
+    import xarray as xr
+
+    ids = xr.Variable("scenario", list(numbers), {"long_name": "scenario id", "units": "1"})
     frames = [scenario.sizes["frame"] for scenario in scenarios]
     particles = [scenario.sizes["particle"] for scenario in scenarios]
     longest = scenarios[frames.index(max(frames))]
@@ -94,17 +108,10 @@ def open_split(
         padded, dim=ids, data_vars="all", coords="minimal", join="exact", combine_attrs="drop_conflicts"
     )
     joined = joined.assign_coords(scenario=ids, time=longest["time"].compute())
-    joined.encoding["source"] = str(next(iter(paths.values())).absolute())  # local splits are found by it
     joined["frame_count"] = ("scenario", frames, {"long_name": "recorded frames", "units": "1"})
     joined["particle_count"] = ("scenario", particles, {"long_name": "particles", "units": "1"})
     for variable in joined.variables.values():
         variable.attrs.pop("content_sha256", None)
-
-    def close() -> None:
-        for scenario in scenarios:
-            scenario.close()
-
-    joined.set_close(close)
     return joined
 
 
@@ -112,21 +119,22 @@ def _open_scenario(path: Path, key: ScenarioKey, fix: str) -> xr.Dataset:
     """Open one file lazily and check that it is the scenario that its path says."""
     import xarray as xr
 
-    try:
-        stored = xr.open_dataset(path, engine="netcdf4", cache=False)
-        frame_bytes = stored["position"].dtype.itemsize * stored.sizes["particle"] * stored.sizes["space"]
-        scenario = stored.chunk(frame=max(1, CHUNK_BYTES // frame_bytes), particle=-1, space=-1)
-        scenario.set_close(stored.close)
-        found = {name: scenario.attrs[name] for name in ("split", "size", "scenario", "version")}
-    except Exception as error:  # HDF5 on damaged bytes raises nearly any type
-        raise DataError(
-            "a scenario file is damaged or not one of lagbench",
-            where=str(path),
-            got=f"{type(error).__name__}: {error}",
-            fix=fix,
-        ) from error
-    same_major = str(found["version"]).split(".")[0] == str(key.major)
-    named = (found["split"], found["size"], int(found["scenario"]))
-    if not same_major or named != (key.split, key.size, key.scenario):
-        raise DataError("a scenario file is another scenario", where=str(path), expected=key, got=found)
+    with ExitStack() as opened:
+        try:
+            stored = opened.enter_context(xr.open_dataset(path, engine="netcdf4", cache=False))
+            frame_bytes = stored["position"].dtype.itemsize * stored.sizes["particle"] * stored.sizes["space"]
+            scenario = stored.chunk(frame=max(1, CHUNK_BYTES // frame_bytes), particle=-1, space=-1)
+            found = {name: scenario.attrs[name] for name in ("split", "size", "scenario", "version")}
+        except Exception as error:  # HDF5 on damaged bytes raises nearly any type
+            raise DataError(
+                "a scenario file is damaged or not one of lagbench",
+                where=str(path),
+                got=f"{type(error).__name__}: {error}",
+                fix=fix,
+            ) from error
+        same_major = str(found["version"]).split(".")[0] == str(key.major)
+        named = (found["split"], found["size"], int(found["scenario"]))
+        if not same_major or named != (key.split, key.size, key.scenario):
+            raise DataError("a scenario file is another scenario", where=str(path), expected=key, got=found)
+        scenario.set_close(opened.pop_all().close)
     return scenario
