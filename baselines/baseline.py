@@ -202,7 +202,8 @@ class Facts:
 def rescaled(trained: Facts, here: Facts) -> Facts:
     """Return the facts of a size for weights of another: what they multiply stays as it was trained.
 
-    Bodies fill the same area with more or fewer particles: their distance goes with the root of that.
+    Statistics [length, length/frame, length/frame^2] are those of the training. Bodies fill the same area
+    with more or fewer particles, so the radius [length] goes with the root of that.
     """
     radius = trained.radius * math.sqrt(trained.particles / here.particles)
     return replace(here, radius=radius, statistics=trained.statistics)

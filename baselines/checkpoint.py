@@ -110,9 +110,8 @@ def _too_large(where: str, expected: str, got: str) -> UnreadableFileError:
 FORMAT = 1
 KEY = "lagbench_checkpoint"
 SAFE = "a checkpoint that lagbench train wrote"
-RECIPE_NAME = (
-    r"^[A-Za-z0-9._/*-]{1,100}$"  # what records say of a recipe by which others' weights were trained
-)
+RECIPE_NAME = r"^[A-Za-z0-9._/*-]{1,100}$"
+"""What a recipe's name may be, in a file of weights to start from."""
 
 _FOREIGN = re.compile(r"GLOBAL ([\w.]+)")  # how torch's refusal names what a pickle would call
 

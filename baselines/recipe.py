@@ -222,11 +222,11 @@ def recipe_for(
     variant: str | None = None,
     settings: Iterable[str] = (),
     seed: int | None = None,
-    known: Mapping[str, Any] | None = None,
+    learned: Mapping[str, Any] | None = None,
 ) -> Recipe:
     """Return the recipe of a baseline for a split and size.
 
-    ``known`` are options of a trained model to go on with: above the recipe's, below ``settings``.
+    ``learned`` are options of a trained model to go on with: above the recipe's, below ``settings``.
     """
     own_file = variant is not None and variant.endswith((".yaml", ".yml"))
     path = Path(str(variant)) if own_file else entry.recipes
@@ -254,7 +254,7 @@ def recipe_for(
             where = f"{path}, {name}, baselines"
             raise UnreadableFileError(f"unknown baseline {other!r}", where=where, fix=nearest(other, names()))
     own = part.baselines.get(entry.name, _Part())
-    model, training = _merge(_merge(model, own.model), dict(known or {})), _merge(training, own.training)
+    model, training = _merge(_merge(model, own.model), dict(learned or {})), _merge(training, own.training)
     for setting in settings:
         group, changes = _setting(setting)
         if group == "model":

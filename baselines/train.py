@@ -133,16 +133,18 @@ def train(
     """
     entry = find(baseline)
     tier, home, known = locate(split, size, root=root, registry=registry)
-    begun = None if start is None else start_from(start, entry, tier, root=home, registry=known)
-    kept = begun.options if begun else None
-    plan = recipe_for(entry, tier.split, tier.name, variant=recipe, settings=settings, seed=seed, known=kept)
+    initial = None if start is None else start_from(start, entry, tier, root=home, registry=known)
+    learned = initial.options if initial else None
+    plan = recipe_for(
+        entry, tier.split, tier.name, variant=recipe, settings=settings, seed=seed, learned=learned
+    )
     check_symmetry(plan.model.get("symmetry"), tier)
-    facts = begun.facts if begun else facts_of(tier.split, tier.name, root=home, registry=known)
-    plan = replace(plan, start=begun.record) if begun else plan
+    facts = initial.facts if initial else facts_of(tier.split, tier.name, root=home, registry=known)
+    plan = replace(plan, start=initial.record) if initial else plan
     own = Path("runs") / plan.name / f"{plan.baseline}-{plan.training.seed}"
     folder = RunFolder(Path(output) if output else own)
     check_writable(folder.path, option="--output")
-    if begun is not None and folder.holds(begun.path):
+    if initial is not None and folder.holds(initial.path):
         raise UsageError(
             "the weights to start from lie in the folder of the training",
             where="--start",
@@ -170,8 +172,8 @@ def train(
     with generators_kept(), threads_used(threads, processes=here), memory_errors_told(SMALLER):
         reseed(seed_of(plan.training.seed))
         model = entry.model.build(plan.model, facts)
-        if begun is not None and earlier is None:
-            begun.fill(model)
+        if initial is not None and earlier is None:
+            initial.fill(model)
         if earlier is None and not is_helper():
             folder.clear()
         ledger, steps = (fit if getattr(model, "closed_form", False) else descend)(job, model)

@@ -328,9 +328,7 @@ def roll_out(step: Step, given: Batch, frames: int) -> Tensor:
                 "a model returned no positions of the next frame",
                 where="roll_out, step",
                 expected=f"a tensor of shape {list(expected)}: [particle, 2]",
-                got=f"shape {list(position.shape)}"
-                if isinstance(position, Tensor)
-                else type(position).__name__,
+                got=getattr(position, "shape", None) or type(position).__name__,
             )
         given = given.followed_by(position)
         predicted.append(given.position[:, -1])  # a copy: the model may use the memory of its answer again

@@ -78,16 +78,13 @@ class Seeded:
     @property
     def cpu_hours(self) -> float | None:
         """Processor time of the training without its validations, as entries tell it [h]."""
+        if "budget" in self.record:
+            hours = self.record["budget"]["cpu_hours"]
+            return None if hours is None else float(hours)
         seconds = self.record.get("cpu_seconds")
         if seconds is None:
             return None
-        # with those behind the weights that it started from
-        before = self.record.get("recipe", {}).get("start", {}).get("took", {}).get("cpu_hours", 0.0)
-        if before is None:
-            return None
-        return (float(seconds) - float(self.record.get("validation_cpu_seconds") or 0.0)) / 3600.0 + float(
-            before
-        )
+        return (float(seconds) - float(self.record.get("validation_cpu_seconds") or 0.0)) / 3600.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
