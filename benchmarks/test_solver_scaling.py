@@ -18,8 +18,7 @@ from lagbench.generators.solver import Device
 DEVICE = Device(os.environ.get("LAGBENCH_BENCH_DEVICE", "cpu"))
 LAST = 9 if DEVICE is Device.CUDA else 4
 ROWS = table_3_1.THESIS[:LAST]
-CPU_EXPONENT = 1.05
-GPU_SPEED_UP = 10.0
+LARGEST_EXPONENT = 1.05
 
 
 @pytest.fixture(scope="module")
@@ -42,19 +41,16 @@ def test_row(benchmark: BenchmarkFixture, row: table_3_1.Row, found: list[table_
         nanoseconds_per_particle_substep=1e6 * measured.substep_ms / row.particles,
         thesis_over_ours=row.frame_ms / measured.frame_ms,
     )
-    if DEVICE is Device.CUDA:
-        assert row.frame_ms / measured.frame_ms >= GPU_SPEED_UP
 
 
 def test_exponents(found: list[table_3_1.Measurement], tmp_path: Path) -> None:
-    """A busy core scales linearly: t/substep against particles at most to the power 1.05."""
+    """A substep's time grows with the particles at most to the power 1.05."""
     if len(found) < 2:
         pytest.skip("needs the rows of this module in the same run")
     print("\n" + table_3_1.markdown(found, DEVICE.value))
     table_3_1.draw(found, DEVICE.value, tmp_path / "figure_3_1.png")
     print(f"Fig. 3.1: {tmp_path / 'figure_3_1.png'}")
-    if DEVICE is Device.CPU:
-        assert table_3_1.of_measured(found).substep_particles <= CPU_EXPONENT
+    assert table_3_1.of_measured(found).substep_particles <= LARGEST_EXPONENT
 
 
 def test_the_thesis_exponents_follow_from_its_table() -> None:

@@ -97,6 +97,20 @@ def test_weights_lie_beside_their_entry(own: BoardBench) -> None:
     assert found(own) == set()
 
 
+def test_weights_go_to_their_seeds(own: BoardBench) -> None:
+    """In any order, and of some seeds only."""
+    runs = [trained(own, 0), trained(own, 3)]
+    first, second = (run / "weights.pt" for run in runs)
+    submitted(own, *runs, weights=(second, first))
+    held = [made.weights for made in read_entry(own.entry("drift")).predictions]
+    assert [one and one.sha256 for one in held] == [file_sha256(first), file_sha256(second)]
+    submitted(own, *runs, weights=(second,), replace=True)
+    held = [made.weights for made in read_entry(own.entry("drift")).predictions]
+    assert [one and one.sha256 for one in held] == [None, file_sha256(second)]
+    assert [path.name for path in (own.folder / "weights").rglob("*.pt")] == ["drift_3.pt"]
+    assert found(own) == set()
+
+
 def test_a_later_entry_takes_its_files_along(own: BoardBench) -> None:
     """Replaced without weights, an entry leaves none behind."""
     run = trained(own, 0)
@@ -129,16 +143,16 @@ def test_weights_are_those_of_the_predictions(own: BoardBench, training: str, fi
 
 
 def test_other_weights_are_refused(own: BoardBench) -> None:
-    """Weights of another seed, too few of them and files that are none are told; nothing is written."""
+    """Weights of another seed, one twice and files that are none are told; nothing is written."""
     runs = [trained(own, 0), trained(own, 3)]
     before = own.state()
     first, second = (run / "weights.pt" for run in runs)
     with pytest.raises(UsageError) as caught:
-        submitted(own, *runs, weights=(second, first))
+        submitted(own, runs[0], weights=(second,))
     assert caught.value.where == str(second)
     with pytest.raises(UsageError) as caught:
-        submitted(own, *runs, weights=(first,))
-    assert caught.value.where == "--weights"
+        submitted(own, *runs, weights=(first, first))
+    assert caught.value.where == str(first)
     with pytest.raises(UnreadableFileError):
         submitted(own, *runs, weights=(first, runs[0] / "training.json"))
     assert own.state() == before

@@ -13,16 +13,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from reproduce_bench import NOISE, SIZE, SPLIT, markdown_rows, pretend
 from score_bench import ScoreBench, bench_of
 
+from lagbench.baselines.checkpoint import load as load_checkpoint
 from lagbench.baselines.reproduce import results
 from lagbench.baselines.reproduce.__main__ import main
 from lagbench.baselines.reproduce.catalogue import FIGURES
 from lagbench.baselines.reproduce.drawing import opened
 from lagbench.baselines.reproduce.evidence import Evidence, Method, Seeded, Sources
-from lagbench.baselines.reproduce.runs import Plan, budget
+from lagbench.baselines.reproduce.runs import Plan, budget, make_runs
 from lagbench.baselines.reproduce.thesis import EXPECTED, ROSTER
 from lagbench.data.grid import fields
 from lagbench.data.registry import Registry, Size, load
@@ -337,6 +339,21 @@ def test_what_fails_is_said_and_the_rest_is_made(
     assert code == 4
     assert "table_5_1" in capsys.readouterr().err
     assert (plan.output / "table_5_3.md").is_file()
+
+
+def test_side_by_side_as_one_after_the_other(plan: Plan, tmp_path: Path) -> None:
+    """Two workers leave the weights that one leaves; what fails is told, and the others are made."""
+    short = {"settings": ("training.steps=2", "training.validate_every=0"), "threads": 1}
+    runs = [("fluid", ROSTER["mlp"], 0), *((SPLIT, ROSTER["mlp"], seed) for seed in (0, 1))]
+    weights = {}
+    for workers in (1, 2):
+        asked = replace(plan, runs=tmp_path / str(workers), **short)
+        assert make_runs(asked, runs, workers=workers) == 4  # there are no data of fluid
+        folders = [asked.folder(split, model.name, seed) for split, model, seed in runs[1:]]
+        weights[workers] = [load_checkpoint(folder / "weights.pt").weights for folder in folders]
+        assert all((folder / "scores.nc").is_file() for folder in folders)
+    for alone, beside in zip(weights[1], weights[2], strict=True):
+        assert all(torch.equal(value, beside[name]) for name, value in alone.items())
 
 
 @pytest.mark.slow

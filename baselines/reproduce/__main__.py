@@ -20,11 +20,12 @@ from pathlib import Path
 from lagbench.data.layout import resolve_root
 from lagbench.data.registry import Registry, load
 from lagbench.errors import LagbenchError, UsageError, nearest
+from lagbench.work.pool import worker_count
 
 from .catalogue import FIGURES
 from .drawing import Figure, write_sheet
 from .evidence import STUDIES, WEIGHTS
-from .runs import Plan, budget, make_run, outlook, score_committed
+from .runs import Plan, Run, budget, complain, make_runs, note, outlook, score_committed
 from .tables import TABLES, make_studies
 from .thesis import EXPECTED, ROSTER, Model, label, number
 
@@ -57,36 +58,36 @@ def main(arguments: Sequence[str] | None = None, *, registry: Registry | None = 
         )
         if given.dry_run:
             return rehearse(plan, figures, split=given.split)
-        return reproduce(plan, figures, training=not given.no_training, split=given.split)
+        training = 0 if given.no_training else worker_count(given.workers, default=1)
+        return reproduce(plan, figures, split=given.split, workers=training)
     except LagbenchError as error:
-        _complain(error)
+        complain(error)
         return error.exit_code
 
 
-def reproduce(
-    plan: Plan, figures: Sequence[Figure], *, training: bool = True, split: str | None = None
-) -> int:
-    """Make figures; what fails is said, and the others are made. Return 0, or the last error's code."""
+def reproduce(plan: Plan, figures: Sequence[Figure], *, split: str | None = None, workers: int = 1) -> int:
+    """Make figures; what fails is said, and the others are made. Return 0, or the last error's code.
+
+    So many trainings run side by side; without workers there are none.
+    """
 
     def draw(figure: Figure) -> None:
         _say(write_sheet(figure.draw(plan, figure), plan.output, figure.name, _head(plan, figure)))
 
     def jobs() -> Iterator[tuple[str, Callable[[], None]]]:
-        if training:
-            for where, model, seed in _runs(plan, figures, split):
-                _note(f"{where} {plan.size} {model.name}-{seed}")
-                yield "", partial(make_run, plan, where, model, seed, say=_note)
+        if workers:
             for study in _studies(plan, figures):
-                _note(f"studies of {study}")
+                note(f"studies of {study}")
                 yield "", partial(make_studies, plan, study)
         else:
             for where, name in _wanted(figures, split):
-                yield "", partial(score_committed, plan, where, ROSTER[name], say=_note)
+                yield "", partial(score_committed, plan, where, ROSTER[name], say=note)
         yield from ((figure.name, partial(draw, figure)) for figure in figures)
 
-    code = _each(jobs())
+    made = make_runs(plan, _runs(plan, figures, split), workers=workers) if workers else 0
+    code = _each(jobs()) or made
     for path in plan.stale:
-        _note(f"{path}: scores of another version of the data; left out")
+        note(f"{path}: scores of another version of the data; left out")
     return code
 
 
@@ -109,7 +110,7 @@ def _each(jobs: Iterable[tuple[str, Callable[[], None]]]) -> int:
         try:
             job()
         except LagbenchError as error:
-            _complain(error, name)
+            complain(error, name)
             code = error.exit_code
     return code
 
@@ -123,7 +124,7 @@ def _wanted(figures: Sequence[Figure], split: str | None) -> list[tuple[str, str
     return list(wanted)
 
 
-def _runs(plan: Plan, figures: Sequence[Figure], split: str | None) -> list[tuple[str, Model, int]]:
+def _runs(plan: Plan, figures: Sequence[Figure], split: str | None) -> list[Run]:
     """Return split, model and seed of every run that figures need, one seed after the other.
 
     Models without the variant of the recipes are left out, with a note: their plain recipe may take days
@@ -150,7 +151,7 @@ def _studies(plan: Plan, figures: Sequence[Figure]) -> Iterator[str]:
 
 
 def _leave_out(plan: Plan, what: str, baseline: str) -> None:
-    _note(f"{what}: left out, {baseline} has no recipe {plan.recipe!r} for it; without --recipe it is made")
+    note(f"{what}: left out, {baseline} has no recipe {plan.recipe!r} for it; without --recipe it is made")
 
 
 def _head(plan: Plan, figure: Figure) -> str:
@@ -201,14 +202,6 @@ def _say(text: str) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _note(text: str) -> None:
-    sys.stderr.write(f"-- {text}\n")
-
-
-def _complain(error: LagbenchError, where: str = "") -> None:
-    sys.stderr.write(f"error: {where + ': ' if where else ''}{error}\n")
-
-
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m lagbench.baselines.reproduce",
@@ -229,6 +222,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--set", action="append", default=[], metavar="KEY=VALUE", help="change every recipe; repeatable")
     add("--device", default="auto", help="cpu, cuda or auto")
     add("--threads", type=int, help="CPU threads; one per core by default")
+    add("--workers", type=int, help="trainings side by side, on one GPU or many cores; 1 by default")
     add("--no-training", action="store_true", help="train nothing: runs that are there, what is committed")
     add("--dry-run", action="store_true", help="make nothing, say what would be trained")
     add("--list", action="store_true", help="list tables and figures, and what they need")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import sys
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -13,11 +14,13 @@ from lagbench.baselines.job import OVER
 from lagbench.data.local import rooted
 from lagbench.data.manifest import read_manifest
 from lagbench.data.registry import Registry, Size
-from lagbench.errors import DataError, UsageError
+from lagbench.errors import DataError, LagbenchError, UsageError
 from lagbench.scoring.card import JSON_NAME
 from lagbench.scoring.score_file import NETCDF_NAME, read_statistics
 from lagbench.scoring.task import ScoredTask, load_scored_task
 from lagbench.submission.predictions import open_predictions
+from lagbench.work.pool import Report
+from lagbench.work.run import run_all
 
 from .evidence import RECORD_NAME, STUDIES, WEIGHTS, Evidence, Sources, read_json
 from .thesis import Model
@@ -128,6 +131,43 @@ class Plan:
         if split not in self._subsets:
             self._subsets[split] = load_scored_task(self.tier(split), self.root)
         return self._subsets[split]
+
+
+Run = tuple[str, Model, int]
+"""Split, model and seed."""
+
+
+def make_runs(plan: Plan, runs: Sequence[Run], *, workers: int = 1) -> int:
+    """Make runs, so many side by side; what fails is said, the others are made.
+
+    On one GPU that pays as it does on many cores: small models keep a GPU waiting for their processor.
+    Return 0, or the exit code of the last one that failed.
+    """
+    jobs = {f"{split} {plan.size} {model.name}-{seed}": (split, model, seed) for split, model, seed in runs}
+    asked = {name: (plan, name, run) for name, run in jobs.items()}
+    return next((code for code in reversed(run_all(_make_named, asked, workers=workers)) if code), 0)
+
+
+def _make_named(job: tuple[Plan, str, Run], report: Report) -> int:
+    plan, name, run = job
+    note(name)
+    try:
+        make_run(plan, *run, say=note)
+    except LagbenchError as error:
+        complain(error, name)
+        return error.exit_code
+    report(1)
+    return 0
+
+
+def note(text: str) -> None:
+    """Say how the work goes on."""
+    sys.stderr.write(f"-- {text}\n")
+
+
+def complain(error: LagbenchError, where: str = "") -> None:
+    """Say what failed."""
+    sys.stderr.write(f"error: {where + ': ' if where else ''}{error}\n")
 
 
 def make_run(

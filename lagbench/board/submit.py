@@ -96,7 +96,7 @@ def submit(
     Args:
         predictions: one predictions.nc per seed.
         meta: what is said of the method.
-        weights: weights that made the predictions, to keep beside the entry: one per seed, or none.
+        weights: weights that made the predictions, to keep beside the entry: at most one per seed.
         board: the leaderboard's folder.
         root: folder of all data sets.
         replace: whether an entry of that name may be replaced.
@@ -340,7 +340,7 @@ def _publish(
     made: Sequence[Prediction],
     folder: Folder,
     outside: Sequence[float | None],
-    sources: Sequence[Path],
+    sources: Sequence[Path | None],
 ) -> SubmitResult:
     """Write score files, then the entry that names them; remove those that only the old entry had."""
     names, yaml_path = score_paths(place, [one.seed for one in made]), entry_path(place)

@@ -29,18 +29,11 @@ MOST_RECORD = 256 << 10  # longest record of a training beside its weights [byte
 RECORD = "training.json"
 
 
-def require_weights(weights: Sequence[str | Path], headers: Sequence[Header]) -> tuple[Path, ...]:
-    """Refuse weights that cannot have made the predictions, one file for each; return their paths."""
+def require_weights(weights: Sequence[str | Path], headers: Sequence[Header]) -> tuple[Path | None, ...]:
+    """Refuse weights that cannot have made the predictions; return those of each, which their seed tells."""
+    found: list[Path | None] = [None] * len(headers)
     if not weights:
-        return ()
-    if len(weights) != len(headers):
-        raise UsageError(
-            "weights and predictions differ in number",
-            where="--weights",
-            expected=len(headers),
-            got=len(weights),
-            fix="give one file per predictions.nc, in their order, or none",
-        )
+        return tuple(found)
     length = sum(Path(path).stat().st_size for path in weights if Path(path).is_file())
     if length > MOST_BYTES:
         raise UsageError(
@@ -54,22 +47,23 @@ def require_weights(weights: Sequence[str | Path], headers: Sequence[Header]) ->
     from lagbench.baselines.checkpoint import load
     from lagbench.baselines.predict import fits, training_words
 
-    paths = tuple(map(Path, weights))
-    for path, header in zip(paths, headers, strict=True):
+    seeds = [header.seed or 0 for header in headers]
+    for path in map(Path, weights):
         held = load(path)
         seed = held.training.get("recipe", {}).get("training", {}).get("seed", 0)
-        facts = held.facts
-        got = (facts.split, facts.size, facts.dataset_sha256, seed)
-        expected = (header.split, header.size, header.dataset_sha256, header.seed or 0)
-        if got != expected:
+        facts, first = held.facts, headers[0]
+        got = (facts.split, facts.size, facts.dataset_sha256)
+        expected = (first.split, first.size, first.dataset_sha256)
+        number = seeds.index(seed) if seed in seeds else None
+        if got != expected or number is None or found[number] is not None:
             raise UsageError(
                 "the weights do not belong to these predictions",
                 where=str(path),
-                expected=f"{expected[0]} {expected[1]}, data set {expected[2][:16]}, seed {expected[3]}",
-                got=f"{got[0]} {got[1]}, data set {got[2][:16]}, seed {got[3]}",
-                fix="give --weights in the order of the predictions; leave those of another size out"
-                " and name their file in --command",
+                expected=f"{expected[0]} {expected[1]}, data set {expected[2][:16]}, one of seeds {seeds}",
+                got=f"{got[0]} {got[1]}, data set {got[2][:16]}, seed {seed}",
+                fix="leave those of another size out and name their file in --command",
             )
+        header, found[number] = headers[number], path
         if not fits(header.training or "", held):
             raise UsageError(
                 "the weights did not make these predictions",
@@ -78,24 +72,22 @@ def require_weights(weights: Sequence[str | Path], headers: Sequence[Header]) ->
                 got=ascii(training_words(held)),
                 fix="give the weights that `lagbench predict` was given, or predict with these",
             )
-    return paths
+    return tuple(found)
 
 
 def named_weights(
-    place: Place, seeds: Sequence[int | None], paths: Sequence[Path]
+    place: Place, seeds: Sequence[int | None], paths: Sequence[Path | None]
 ) -> tuple[Weights | None, ...]:
-    """Return what an entry says of its weights, seed by seed; None of each where there are none."""
-    if not paths:
-        return (None,) * len(seeds)
+    """Return what an entry says of its weights, seed by seed; None where there are none."""
     return tuple(
-        Weights(path=weights_path(place, seed).as_posix(), sha256=file_sha256(path))
+        None if path is None else Weights(path=weights_path(place, seed).as_posix(), sha256=file_sha256(path))
         for seed, path in zip(seeds, paths, strict=True)
     )
 
 
-def copy_weights(folder: Folder, named: Sequence[Weights | None], paths: Sequence[Path]) -> None:
+def copy_weights(folder: Folder, named: Sequence[Weights | None], paths: Sequence[Path | None]) -> None:
     """Copy weights, and what their trainings recorded, to their places."""
-    for said, path in zip(filter(None, named), paths, strict=True):
+    for said, path in zip(filter(None, named), filter(None, paths), strict=True):
         target, record = folder.path / said.path, path.with_name(RECORD)
         target.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(target, path.read_bytes(), option="--board")

@@ -56,7 +56,9 @@ def submit(
     ] = None,
     weights: Annotated[
         list[Path] | None,
-        typer.Option("--weights", metavar="FILE", help="weights.pt to keep beside the entry; one per FILE."),
+        typer.Option(
+            "--weights", metavar="FILE", help="weights.pt to keep beside the entry; at most one a seed."
+        ),
     ] = None,
     replace: Annotated[bool, typer.Option("--replace", help="Replace the entry of that name.")] = False,
     new_board: Annotated[
