@@ -196,12 +196,14 @@ class TrainingCallback(Callback):
         self._handlers: dict[int, Any] = {}
 
     def on_train_start(self, trainer: Trainer, module: LightningModule) -> None:
-        """Listen to interrupts; begin to count."""
+        """Listen to interrupts; begin to count; validate weights that the training starts from."""
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
                 self._handlers[number] = signal.signal(number, self._interrupt)
         steps = self.steps
         self.job.meter.begin("training", total=steps, scenarios=steps, done=_of(module).step)
+        if self.validation is not None and self.job.recipe.start and not self.ledger.validation:
+            self._validate(trainer, _of(module), self.validation)
 
     def on_train_batch_end(
         self, trainer: Trainer, module: LightningModule, outputs: object, batch: object, batch_idx: int

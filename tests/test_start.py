@@ -125,6 +125,16 @@ def test_it_learns_from_there(run: Run) -> None:
     assert further.loss["total"] < 0.95 * anew.loss["total"]
 
 
+def test_nothing_worse_takes_their_place(run: Run, stored: Callable[..., Path]) -> None:
+    """Where every step leads away, the best weights are those that it started from."""
+    start = stored()
+    result = run("any", "steps=4", "learning_rate=100.0", "validate_every=2", start=start)
+    assert result.best_step == 0
+    assert float(load(result.weights).weights["a"]) == 0.5
+    again = json.loads((result.folder / "training.json").read_text())
+    assert [entry["step"] for entry in again["validation"]] == [0, 2, 4]
+
+
 def test_what_came_before_is_told(run: Run, stored: Callable[..., Path], tmp_path: Path) -> None:
     """Hours are with those of the start, other figures are not; words and record name the weights."""
     spent = {"cpu_hours": 2.0, "gpu_hours": 0.5, "validation_hours": 0.25, "steps": 9, "windows": 18}
