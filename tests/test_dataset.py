@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from pathlib import Path
+from typing import Any
 
 import dask.array
 import netCDF4
@@ -125,10 +126,11 @@ def test_nothing_stays_open_after_an_error(ragged: Path) -> None:
         ("cavty", "tiny", "test", "did you mean 'cavity'"),
         ("cavity", "tiney", "test", "did you mean 'tiny'"),
         ("cavity", "tiny", "tset", "did you mean 'test'"),
+        ("cavity", "tiny", ["test"], "test"),
     ],
 )
 def test_unknown_names_offer_the_nearest(
-    tmp_path: Path, split: str, size: str, subset: str, hint: str
+    tmp_path: Path, split: str, size: str, subset: Any, hint: str
 ) -> None:
     """A typing error is exit code 2 and names the nearest known word."""
     with pytest.raises(UsageError, match=hint):

@@ -69,9 +69,7 @@ def train(
     root: RootOption = None,
     output: Annotated[
         Path | None,
-        typer.Option(
-            "--output", "-o", metavar="FOLDER", help="runs/SPLIT/SIZE/BASELINE[-started]-SEED."
-        ),
+        typer.Option("--output", "-o", metavar="FOLDER", help="runs/SPLIT/SIZE/BASELINE[-started]-SEED."),
     ] = None,
     resume: Annotated[bool, typer.Option("--resume/--no-resume", help="Go on with what is there.")] = True,
     fresh: Annotated[bool, typer.Option("--fresh", help="Train anew whatever is there.")] = False,

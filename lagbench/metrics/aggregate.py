@@ -298,6 +298,8 @@ class Score:
 
 def score(metric: Metric, tallies: Mapping[int, Tally]) -> Score | None:
     """Return the score of one metric, None where it was measured nowhere or the task is too short."""
+    if not tallies:
+        return None
     scenarios = tuple(sorted(tallies))
     frames = tallies[scenarios[0]].frames
     asked = np.stack([_measured(metric, tallies[i]) for i in scenarios])

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from lagbench.data.layout import check_regular
 from lagbench.data.registry import Registry
 from lagbench.errors import DataError, UnreadableFileError, UsageError, nearest
 from lagbench.metrics.aggregate import FEWEST_FOR_INTERVAL, Score, mean_over_seeds
@@ -163,9 +164,11 @@ def compare(
         DataError: they belong to data sets of different hashes.
         UnreadableFileError: a file is neither scores nor predictions.
     """
+    bare = Path(second).name == str(second) and not Path(second).suffix
+    for path in (*_seeds_of(Path(first)), *(() if bare else _seeds_of(Path(second)))):
+        check_regular(path)  # before what is there is scored
     one = _contestant(first, root, workers, registry)
     floor = str(second) if str(second) in one.floors else None
-    bare = Path(second).name == str(second) and not Path(second).suffix
     if floor is None and bare and not os.path.lexists(second):
         floors = f"{nearest(str(second), one.floors)}; or " if one.floors else ""
         fix = f"{floors}name scores, predictions or a folder of them"

@@ -111,9 +111,9 @@ def refuse_strangers(found: Manifest, strangers: Collection[int], *, where: str,
 def scenario_files(size: Size, root: Path, subsets: Sequence[str]) -> dict[int, Path]:
     """Return the files of subsets by id, brought from the store that a root is a copy of; all are there."""
     for subset in subsets:
-        if subset not in size.subsets:
+        if not isinstance(subset, str) or subset not in size.subsets:
             where = f"{size.split} {size.name}"
-            raise UsageError(f"no subset {subset!r}", where=where, fix=nearest(subset, size.subsets))
+            raise UsageError(f"no subset {subset!r}", where=where, fix=nearest(str(subset), size.subsets))
     paths = {i: size.path(root, i) for subset in subsets for i in size.subsets[subset]}
     bring(size, root, paths)
     missing = [i for i, path in paths.items() if not path.is_file()]
