@@ -230,6 +230,7 @@ _MODELS = (
     Model("neuralmpm-started", "NeuralMPM, started from another size"),
     Model("neuralmpm-started-averaged", "NeuralMPM, started from another size, mean over images"),
     Model("neuralmpm-wide", "NeuralMPM, 48 channels"),
+    Model("neuralmpm-wide-averaged", "NeuralMPM, 48 channels, mean over images"),
     Model("neuralmpm-of-mini", "NeuralMPM trained at mini"),
     Model("neuralmpm-of-mini-averaged", "NeuralMPM trained at mini, mean over images"),
     Model("mlp", "MLP", "#0072b2"),
