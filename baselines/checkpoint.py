@@ -268,6 +268,11 @@ def rounded_weights(model: nn.Module) -> dict[str, Tensor]:
     }
 
 
+def rounded_parameters(checkpoint: Checkpoint) -> int:
+    """Return how many parameters a file holds by :func:`rounded_weights`; 0 where they are not rounded."""
+    return sum(value.numel() for value in checkpoint.weights.values() if value.dtype == torch.bfloat16)
+
+
 def check_data(
     checkpoint: Checkpoint,
     *,

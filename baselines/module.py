@@ -204,6 +204,7 @@ class TrainingCallback(Callback):
         self.job.meter.begin("training", total=steps, scenarios=steps, done=_of(module).step)
         if self.validation is not None and self.job.recipe.start and not self.ledger.validation:
             self._validate(trainer, _of(module), self.validation)
+            self._store(trainer, _of(module))  # weights without a checkpoint could not be gone on with
 
     def on_train_batch_end(
         self, trainer: Trainer, module: LightningModule, outputs: object, batch: object, batch_idx: int

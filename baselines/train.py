@@ -112,7 +112,7 @@ def train(
         seed: seed in place of the recipe's.
         start: weights.pt to start from, perhaps of another size; random weights when None.
         root: folder of all data sets; else ``LAGBENCH_ROOT``, else the user data folder.
-        output: folder of the run; ``runs/<split>/<size>/<baseline>[-started]-<seed>`` by default.
+        output: folder of the run; ``runs/<split>/<size>/<baseline>[-further]-<seed>`` by default.
         resume: go on with what an earlier run left there.
         fresh: train anew whatever is there.
         device: ``cpu``, ``cuda`` or ``auto``.
@@ -141,7 +141,7 @@ def train(
     check_symmetry(plan.model.get("symmetry"), tier)
     facts = initial.facts if initial else facts_of(tier.split, tier.name, root=home, registry=known)
     plan = replace(plan, start=initial.record) if initial else plan
-    name = f"{plan.baseline}-started" if initial else plan.baseline
+    name = f"{plan.baseline}-further" if initial else plan.baseline
     own = Path("runs") / plan.name / f"{name}-{plan.training.seed}"
     folder = RunFolder(Path(output) if output else own)
     check_writable(folder.path, option="--output")

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import netCDF4
 import pytest
 from made_up import BoardBench, copied, noisy
 from simple_models import FACTS, Drift
 
-from lagbench.baselines.checkpoint import Checkpoint, save
+from lagbench.baselines.checkpoint import Checkpoint, rounded_weights, save
 from lagbench.board import weights as kept
 from lagbench.board.check import check_board
 from lagbench.board.entry import Meta
@@ -55,7 +57,7 @@ def trained(own: BoardBench, seed: int, training: str = "") -> Path:
         baseline="drift",
         options={},
         facts=facts,
-        weights=Drift.build({}, facts).state_dict(),
+        weights=rounded_weights(Drift.build({}, facts)),
         training={"step": 6, "recipe": recipe},
     )
     save(folder / "weights.pt", weights)
@@ -137,6 +139,25 @@ def test_weights_are_those_of_the_predictions(own: BoardBench, training: str, fi
     if fits:
         submitted(own, run)
         return
+    with pytest.raises(UsageError) as caught:
+        submitted(own, run)
+    assert caught.value.where == str(run / "weights.pt")
+
+
+@pytest.mark.parametrize(("change", "fits"), [("", True), (", model.noise_std=0.001", False)])
+def test_seeds_differ_in_nothing_else(own: BoardBench, change: str, fits: bool) -> None:
+    """The step of the best weights is each seed's own; a changed recipe is another method."""
+    words = "cavity tiny train, recipe cavity/tiny, step"
+    runs = [trained(own, 0, f"{words} 6"), trained(own, 3, f"{words} 9{change}")]
+    with nullcontext() if fits else pytest.raises(UsageError, match=r"noise_std"):
+        submitted(own, *runs, weights=())
+
+
+def test_weights_of_another_model_are_refused(own: BoardBench) -> None:
+    """Words that fit are not enough: the number of parameters tells GNS from SuperGAT."""
+    run = trained(own, 0)
+    with netCDF4.Dataset(run / "predictions.nc", "a") as data:
+        data.parameters = 12345
     with pytest.raises(UsageError) as caught:
         submitted(own, run)
     assert caught.value.where == str(run / "weights.pt")

@@ -126,7 +126,7 @@ def test_nothing_stays_open_after_an_error(ragged: Path) -> None:
         ("cavty", "tiny", "test", "did you mean 'cavity'"),
         ("cavity", "tiney", "test", "did you mean 'tiny'"),
         ("cavity", "tiny", "tset", "did you mean 'test'"),
-        ("cavity", "tiny", ["test"], "test"),
+        ("cavity", "tiny", ["train"], "did you mean 'train'"),
     ],
 )
 def test_unknown_names_offer_the_nearest(

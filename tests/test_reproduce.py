@@ -356,6 +356,25 @@ def test_side_by_side_as_one_after_the_other(plan: Plan, tmp_path: Path) -> None
         assert all(torch.equal(value, beside[name]) for name, value in alone.items())
 
 
+def test_an_interrupt_says_how_to_go_on(
+    plan: Plan, cavity: ScoreBench, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Exit code 130, as of every command, and no traceback."""
+
+    def stop(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("lagbench.baselines.reproduce.__main__.make_runs", stop)
+    assert main(options(plan, "--only", "table_5_4"), registry=cavity.registry) == 130
+    assert "goes on" in capsys.readouterr().err
+
+
+def test_workers_are_counted_from_one(plan: Plan, cavity: ScoreBench) -> None:
+    """None is a mistake, whatever else was asked for."""
+    for more in ((), ("--dry-run",), ("--no-training",)):
+        assert main(options(plan, "--workers", "0", *more), registry=cavity.registry) == 2
+
+
 @pytest.mark.slow
 def test_everything_is_made_at_tiny(
     tmp_path: Path, unmeasured: Registry, tiny_split: Callable[..., GenerationResult]

@@ -20,7 +20,7 @@ from lagbench.baselines.predict import predict, training_words
 from lagbench.baselines.train import TrainingResult
 from lagbench.data.checksums import file_sha256
 from lagbench.data.registry import Registry
-from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError
+from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError, WorkFailedError
 from lagbench.make.generate import GenerationResult
 from lagbench.submission.budget import Budget, track_of
 from lagbench.work.progress import Progress
@@ -131,8 +131,16 @@ def test_nothing_worse_takes_their_place(run: Run, stored: Callable[..., Path]) 
     result = run("any", "steps=4", "learning_rate=100.0", "validate_every=2", start=start)
     assert result.best_step == 0
     assert float(load(result.weights).weights["a"]) == 0.5
-    again = json.loads((result.folder / "training.json").read_text())
-    assert [entry["step"] for entry in again["validation"]] == [0, 2, 4]
+    record = json.loads((result.folder / "training.json").read_text())
+    assert [entry["step"] for entry in record["validation"]] == [0, 2, 4]
+
+
+def test_what_fails_early_can_be_tried_again(run: Run, stored: Callable[..., Path]) -> None:
+    """The folder then holds a checkpoint beside the weights that were validated first."""
+    bad = ("steps=100", "learning_rate=1e38", "validate_every=50")
+    for _ in range(2):
+        with pytest.raises(WorkFailedError):
+            run("any", *bad, start=stored())
 
 
 def test_what_came_before_is_told(run: Run, stored: Callable[..., Path], tmp_path: Path) -> None:

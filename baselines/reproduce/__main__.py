@@ -56,10 +56,13 @@ def main(arguments: Sequence[str] | None = None, *, registry: Registry | None = 
             threads=given.threads,
             registry=registry,
         )
+        workers = worker_count(given.workers, default=1)
         if given.dry_run:
             return rehearse(plan, figures, split=given.split)
-        training = 0 if given.no_training else worker_count(given.workers, default=1)
-        return reproduce(plan, figures, split=given.split, workers=training)
+        return reproduce(plan, figures, split=given.split, workers=0 if given.no_training else workers)
+    except KeyboardInterrupt:
+        sys.stderr.write("interrupted; the same command goes on where it stopped\n")
+        return 130  # as every command of ours
     except LagbenchError as error:
         complain(error)
         return error.exit_code
@@ -68,7 +71,7 @@ def main(arguments: Sequence[str] | None = None, *, registry: Registry | None = 
 def reproduce(plan: Plan, figures: Sequence[Figure], *, split: str | None = None, workers: int = 1) -> int:
     """Make figures; what fails is said, and the others are made. Return 0, or the last error's code.
 
-    So many trainings run side by side; without workers there are none.
+    ``workers`` trainings run side by side; with 0 there are none.
     """
 
     def draw(figure: Figure) -> None:
@@ -221,7 +224,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--recipe", metavar="NAME", help="variant of the recipes, as in short")
     add("--set", action="append", default=[], metavar="KEY=VALUE", help="change every recipe; repeatable")
     add("--device", default="auto", help="cpu, cuda or auto")
-    add("--threads", type=int, help="CPU threads; one per core by default")
+    add("--threads", type=int, help="CPU threads of a training; one per core by default, one with --workers")
     add("--workers", type=int, help="trainings side by side, on one GPU or many cores; 1 by default")
     add("--no-training", action="store_true", help="train nothing: runs that are there, what is committed")
     add("--dry-run", action="store_true", help="make nothing, say what would be trained")

@@ -19,7 +19,7 @@ from lagbench.scoring.card import JSON_NAME
 from lagbench.scoring.score_file import NETCDF_NAME, read_statistics
 from lagbench.scoring.task import ScoredTask, load_scored_task
 from lagbench.submission.predictions import open_predictions
-from lagbench.work.pool import Report
+from lagbench.work.pool import Report, crashed
 from lagbench.work.run import run_all
 
 from .evidence import RECORD_NAME, STUDIES, WEIGHTS, Evidence, Sources, read_json
@@ -47,7 +47,7 @@ class Plan:
     recipe: str | None = None  # variant of the recipes, as in short; None for the size's own
     settings: tuple[str, ...] = ()  # changes to every recipe, as in training.steps=100
     device: str = "auto"
-    threads: int | None = None  # on the CPU; one per core by default
+    threads: int | None = None  # of a training on the CPU; one per core by default, one with workers
     registry: Registry | None = None  # where splits are described; ours when None
     _evidence: dict[str, Evidence] = field(default_factory=dict, compare=False, repr=False)
     _subsets: dict[str, ScoredTask] = field(default_factory=dict, compare=False, repr=False)
@@ -138,25 +138,30 @@ Run = tuple[str, Model, int]
 
 
 def make_runs(plan: Plan, runs: Sequence[Run], *, workers: int = 1) -> int:
-    """Make runs, so many side by side; what fails is said, the others are made.
+    """Make runs, ``workers`` of them side by side; what fails is said, the others are made.
 
     On one GPU that pays as it does on many cores: small models keep a GPU waiting for their processor.
-    Return 0, or the exit code of the last one that failed.
+    Return 0, or the exit code of the last one that failed; a worker that dies three times ends all.
     """
-    jobs = {f"{split} {plan.size} {model.name}-{seed}": (split, model, seed) for split, model, seed in runs}
-    asked = {name: (plan, name, run) for name, run in jobs.items()}
-    return next((code for code in reversed(run_all(_make_named, asked, workers=workers)) if code), 0)
+    names = [f"{split} {plan.size} {model.name}-{seed}" for split, model, seed in runs]
+    jobs = {name: (plan, name, run) for name, run in zip(names, runs, strict=True)}
+    try:
+        codes = run_all(_make_named, jobs, workers=workers)
+    except LagbenchError as error:
+        complain(error)
+        return error.exit_code
+    return next((code for code in reversed(codes) if code), 0)
 
 
-def _make_named(job: tuple[Plan, str, Run], report: Report) -> int:
+def _make_named(job: tuple[Plan, str, Run], _: Report) -> int:
     plan, name, run = job
     note(name)
     try:
         make_run(plan, *run, say=note)
-    except LagbenchError as error:
-        complain(error, name)
-        return error.exit_code
-    report(1)
+    except Exception as error:  # the others go on
+        told = error if isinstance(error, LagbenchError) else crashed(error)
+        complain(told, name)
+        return told.exit_code
     return 0
 
 
@@ -318,9 +323,7 @@ def _complete(folder: Path) -> bool:
     record = folder / RECORD_NAME
     if not (folder / "weights.pt").is_file():
         return False
-    if not (folder / "checkpoint.pt").is_file() or not record.is_file():
-        return True
-    return read_json(record).get("state") in OVER
+    return not record.is_file() or read_json(record).get("state") in OVER
 
 
 def budget(record: Mapping[str, Any]) -> str:

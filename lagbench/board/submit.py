@@ -215,6 +215,11 @@ def _seeds(headers: Sequence[Header]) -> tuple[int | None, ...]:
             if name == "method":
                 fix += "; or write seeds of one method under one name: lagbench predict --method NAME"
             raise UsageError(f"the files differ in {name}", got=", ".join(map(ascii, found)), fix=fix)
+    # each seed has its own step of the best weights, and its own weights to start from
+    said = dict.fromkeys(re.sub(r"(, step |, weights )\w+", "", header.training or "") for header in headers)
+    if len(said) > 1 and all(", recipe " in words for words in said):
+        fix = "submit each on its own: seeds of a method differ in nothing but their seed"
+        raise UsageError("the files differ in training", got="; ".join(map(ascii, said)), fix=fix)
     seeds = tuple(header.seed for header in headers)
     if any(seed is not None and not 0 <= seed < 2**63 for seed in seeds):
         raise UsageError("a seed does not fit", expected="0 to 2^63 - 1", got=seeds)

@@ -30,7 +30,7 @@ RECORD = "training.json"
 
 
 def require_weights(weights: Sequence[str | Path], headers: Sequence[Header]) -> tuple[Path | None, ...]:
-    """Refuse weights that cannot have made the predictions; return those of each, which their seed tells."""
+    """Refuse weights that cannot have made the predictions; return the file of each, found by its seed."""
     found: list[Path | None] = [None] * len(headers)
     if not weights:
         return tuple(found)
@@ -44,7 +44,7 @@ def require_weights(weights: Sequence[str | Path], headers: Sequence[Header]) ->
             fix="leave --weights out, and name a file of a release by `weights: https://...` in --from",
         )
     check_installed("torch", extra="baselines")
-    from lagbench.baselines.checkpoint import load
+    from lagbench.baselines.checkpoint import load, rounded_parameters
     from lagbench.baselines.predict import fits, training_words
 
     seeds = [header.seed or 0 for header in headers]
@@ -54,24 +54,37 @@ def require_weights(weights: Sequence[str | Path], headers: Sequence[Header]) ->
         facts, first = held.facts, headers[0]
         got = (facts.split, facts.size, facts.dataset_sha256)
         expected = (first.split, first.size, first.dataset_sha256)
-        number = seeds.index(seed) if seed in seeds else None
-        if got != expected or number is None or found[number] is not None:
+        if got != expected or seed not in seeds:
             raise UsageError(
                 "the weights do not belong to these predictions",
                 where=str(path),
-                expected=f"{expected[0]} {expected[1]}, data set {expected[2][:16]}, one of seeds {seeds}",
+                expected=f"{expected[0]} {expected[1]}, data set {expected[2][:16]}, seeds {seeds}",
                 got=f"{got[0]} {got[1]}, data set {got[2][:16]}, seed {seed}",
-                fix="leave those of another size out and name their file in --command",
+                fix="leave them out; those of another size are named in --command",
             )
-        header, found[number] = headers[number], path
-        if not fits(header.training or "", held):
+        number = seeds.index(seed)
+        if found[number] is not None:
+            raise UsageError(
+                f"two files of weights of seed {seed}", where=str(path), fix="give one of each seed at most"
+            )
+        if not fits(headers[number].training or "", held):
             raise UsageError(
                 "the weights did not make these predictions",
                 where=str(path),
-                expected=ascii(header.training),
+                expected=ascii(headers[number].training),
                 got=ascii(training_words(held)),
                 fix="give the weights that `lagbench predict` was given, or predict with these",
             )
+        count = rounded_parameters(held)
+        if count and headers[number].parameters not in (None, count):
+            raise UsageError(
+                "the weights did not make these predictions",
+                where=str(path),
+                expected=f"{headers[number].parameters} parameters",
+                got=f"{count}, of {held.baseline}",
+                fix="give the weights that `lagbench predict` was given, or predict with these",
+            )
+        found[number] = path
     return tuple(found)
 
 

@@ -69,7 +69,12 @@ def train(
     root: RootOption = None,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", metavar="FOLDER", help="runs/SPLIT/SIZE/BASELINE[-started]-SEED."),
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="FOLDER",
+            help="By default in runs/, named after recipe, baseline and seed.",
+        ),
     ] = None,
     resume: Annotated[bool, typer.Option("--resume/--no-resume", help="Go on with what is there.")] = True,
     fresh: Annotated[bool, typer.Option("--fresh", help="Train anew whatever is there.")] = False,
@@ -201,6 +206,7 @@ def _trained(result: TrainingResult, where: str) -> list[str]:
     if result.best_value is not None:
         lines.append(
             f"  best       {result.metric} {result.best_value:.4g} on valid, step {result.best_step}"
+            + (": nothing better than the weights that it started from" if result.best_step == 0 else "")
         )
     share = result.validation_cpu_seconds / (result.cpu_seconds or 1.0)
     seen = f"{result.windows_seen:,} windows, " if result.windows_seen else ""

@@ -164,12 +164,13 @@ def compare(
         DataError: they belong to data sets of different hashes.
         UnreadableFileError: a file is neither scores nor predictions.
     """
-    bare = Path(second).name == str(second) and not Path(second).suffix
+    plain = Path(second).name == str(second) and not Path(second).suffix
+    bare = plain and not os.path.lexists(second)  # the name of a floor
     for path in (*_seeds_of(Path(first)), *(() if bare else _seeds_of(Path(second)))):
         check_regular(path)  # before what is there is scored
     one = _contestant(first, root, workers, registry)
     floor = str(second) if str(second) in one.floors else None
-    if floor is None and bare and not os.path.lexists(second):
+    if floor is None and bare:
         floors = f"{nearest(str(second), one.floors)}; or " if one.floors else ""
         fix = f"{floors}name scores, predictions or a folder of them"
         raise UsageError("neither a floor nor a file", got=ascii(str(second)), fix=fix)

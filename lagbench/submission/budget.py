@@ -67,7 +67,7 @@ def track_of(size: str, budget: Budget) -> Track | None:
 
     Equal compute: at most 15 minutes of processor time at mini and 60 at full, 5 % more allowed, without
     a GPU; validations do not count. Converged: over the last doubling of the steps the best validation
-    fell by less than 2 %.
+    fell by less than 2 %, and every window was seen.
     """
     most = EQUAL_MINUTES.get(size)
     on_cpu = budget.cpu_hours is not None and not budget.gpu_hours
@@ -82,6 +82,8 @@ def _has_converged(budget: Budget) -> bool:
     steps = first + (budget.steps or 0)
     before = [(step, value) for step, value in budget.validations if first + step <= (steps + 1) // 2]
     if not before or budget.best is None or first + before[-1][0] < 0.4 * steps:
+        return False
+    if budget.epochs is not None and budget.epochs < 1.0 and not first:
         return False
     half = min(value for _, value in before)
     return half > 0.0 and (half - budget.best) / half < CONVERGED
