@@ -69,7 +69,10 @@ def start(device: Device, *, scenarios: int = 1, threads: int | None = None) -> 
                 )
         except RuntimeError as error:
             raise UsageError(
-                "Taichi cannot use this device", where="cuda" if on_gpu else "cpu", got=error
+                "Taichi cannot use this device",
+                where="cuda" if on_gpu else "cpu",
+                got=error,
+                fix="use --device cpu: there is no NVIDIA GPU, or no driver of one" if on_gpu else None,
             ) from error
         _started.append((on_gpu, size))
     running_on_gpu, pool = _started[0]
