@@ -341,7 +341,9 @@ def test_what_fails_is_said_and_the_rest_is_made(
     assert (plan.output / "table_5_3.md").is_file()
 
 
-def test_side_by_side_as_one_after_the_other(plan: Plan, tmp_path: Path) -> None:
+def test_side_by_side_as_one_after_the_other(
+    plan: Plan, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Two workers leave the weights that one leaves; what fails is told, and the others are made."""
     short = {"settings": ("training.steps=2", "training.validate_every=0"), "threads": 1}
     runs = [("fluid", ROSTER["mlp"], 0), *((SPLIT, ROSTER["mlp"], seed) for seed in (0, 1))]
@@ -349,6 +351,8 @@ def test_side_by_side_as_one_after_the_other(plan: Plan, tmp_path: Path) -> None
     for workers in (1, 2):
         asked = replace(plan, runs=tmp_path / str(workers), **short)
         assert make_runs(asked, runs, workers=workers) == 4  # there are no data of fluid
+        here = capsys.readouterr().err  # what other processes say does not pass through this one
+        assert ("cavity tiny mlp-1" in here) == (workers == 1)
         folders = [asked.folder(split, model.name, seed) for split, model, seed in runs[1:]]
         weights[workers] = [load_checkpoint(folder / "weights.pt").weights for folder in folders]
         assert all((folder / "scores.nc").is_file() for folder in folders)

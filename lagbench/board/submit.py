@@ -208,18 +208,17 @@ def _require_files(paths: Sequence[Path]) -> None:
 
 def _seeds(headers: Sequence[Header]) -> tuple[int | None, ...]:
     """Return the seeds of files that belong together; refuse those that do not."""
-    for name in ("split", "size", "dataset_sha256", "method", "parameters"):
-        found = dict.fromkeys(str(getattr(header, name)) for header in headers)
-        if len(found) > 1:
-            fix = "submit each on its own"
-            if name == "method":
-                fix += "; or write seeds of one method under one name: lagbench predict --method NAME"
-            raise UsageError(f"the files differ in {name}", got=", ".join(map(ascii, found)), fix=fix)
+    alike = ("split", "size", "dataset_sha256", "method", "parameters")
+    told = {name: [str(getattr(header, name)) for header in headers] for name in alike}
     # each seed has its own step of the best weights, and its own weights to start from
-    said = dict.fromkeys(re.sub(r"(, step |, weights )\w+", "", header.training or "") for header in headers)
-    if len(said) > 1 and all(", recipe " in words for words in said):
-        fix = "submit each on its own: seeds of a method differ in nothing but their seed"
-        raise UsageError("the files differ in training", got="; ".join(map(ascii, said)), fix=fix)
+    words = [re.sub(r"(, step |, weights )\w+", "", header.training or "") for header in headers]
+    if all(", recipe " in one for one in words):
+        told["training"] = words
+    for name, values in told.items():
+        if len(found := dict.fromkeys(values)) > 1:
+            rename = "; or write seeds of one method under one name: lagbench predict --method NAME"
+            fix = "submit each on its own" + rename * (name == "method")
+            raise UsageError(f"the files differ in {name}", got=", ".join(map(ascii, found)), fix=fix)
     seeds = tuple(header.seed for header in headers)
     if any(seed is not None and not 0 <= seed < 2**63 for seed in seeds):
         raise UsageError("a seed does not fit", expected="0 to 2^63 - 1", got=seeds)

@@ -67,21 +67,14 @@ def require_weights(weights: Sequence[str | Path], headers: Sequence[Header]) ->
             raise UsageError(
                 f"two files of weights of seed {seed}", where=str(path), fix="give one of each seed at most"
             )
-        if not fits(headers[number].training or "", held):
+        words, said = headers[number].training or "", headers[number].parameters
+        count = rounded_parameters(held) or said
+        if not fits(words, held) or said not in (None, count):
             raise UsageError(
                 "the weights did not make these predictions",
                 where=str(path),
-                expected=ascii(headers[number].training),
-                got=ascii(training_words(held)),
-                fix="give the weights that `lagbench predict` was given, or predict with these",
-            )
-        count = rounded_parameters(held)
-        if count and headers[number].parameters not in (None, count):
-            raise UsageError(
-                "the weights did not make these predictions",
-                where=str(path),
-                expected=f"{headers[number].parameters} parameters",
-                got=f"{count}, of {held.baseline}",
+                expected=f"{words!a}, {said} parameters",
+                got=f"{training_words(held)!a}, {count} parameters of {held.baseline}",
                 fix="give the weights that `lagbench predict` was given, or predict with these",
             )
         found[number] = path
