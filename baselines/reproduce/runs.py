@@ -319,7 +319,7 @@ def _stale(data: str | None, folder: Path) -> list[Path]:
 
 
 def _complete(folder: Path) -> bool:
-    """Tell whether weights are there, and their training is over or cannot be gone on with."""
+    """Tell whether weights are there whose training is over, as far as a record says."""
     record = folder / RECORD_NAME
     if not (folder / "weights.pt").is_file():
         return False
