@@ -27,7 +27,7 @@ from lagbench.work.progress import Meter, Progress
 from .augmentation import check_symmetry
 from .baseline import Baseline, Facts, rescaled
 from .catalogue import find
-from .checkpoint import Checkpoint, check_data, load, restore
+from .checkpoint import Checkpoint, check_data, load, restore, warn_of_last_state
 from .graph import radius_graph
 from .job import RunFolder, changes_of, parameter_count
 from .machine import bound_memory, chosen_device, hardware, memory_errors_told, threads_used
@@ -86,7 +86,8 @@ def predict(
     those of the training.
 
     Where a training.json beside the checkpoint says that its training is not over, there is an
-    :class:`UnfinishedWarning`.
+    :class:`UnfinishedWarning`; where it holds the last state beside the best weights, a
+    :class:`~lagbench.baselines.checkpoint.LastStateWarning`.
 
     Args:
         checkpoint: weights.pt or checkpoint.pt of a training.
@@ -110,6 +111,7 @@ def predict(
         WorkFailedError: out of memory, or the disk is full.
     """
     found = load(checkpoint)
+    warn_of_last_state(found, Path(checkpoint))
     # Weights of the best validation say 'running' for good: what became of the training stands beside them.
     path = Path(checkpoint)
     if (reached := RunFolder(path.parent).unfinished(found.training)) is not None:

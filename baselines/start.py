@@ -21,7 +21,15 @@ from lagbench.submission.budget import Budget
 
 from .baseline import Baseline, Facts, rescaled
 from .catalogue import Entry
-from .checkpoint import RECIPE_NAME, Checkpoint, check_data, load, load_weights, restore
+from .checkpoint import (
+    RECIPE_NAME,
+    Checkpoint,
+    check_data,
+    load,
+    load_weights,
+    restore,
+    warn_of_last_state,
+)
 
 WHERE = "--start"
 MOST_HOURS, MOST_STEPS = 1e9, 10**12  # more are not believed
@@ -81,6 +89,7 @@ def start_from(path: str | Path, entry: Entry, size: Size, *, root: Path, regist
         raise UsageError(message, where=WHERE, got=str(path), fix="leave the option out")
     file = Path(path)
     found, before = load(file), file.stat()
+    warn_of_last_state(found, file)
     sha256, after = file_sha256(file), file.stat()
     if (before.st_ino, before.st_size, before.st_mtime_ns) != (
         after.st_ino,

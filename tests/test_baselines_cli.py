@@ -154,6 +154,21 @@ def test_predicting_before_the_end_is_warned_of(lagbench: Command, tmp_path: Pat
     assert "step 1 of 2" in done.stderr
 
 
+@pytest.mark.filterwarnings("default")
+def test_the_last_state_is_not_the_best(lagbench: Command, tmp_path: Path) -> None:
+    """Where weights.pt lies beside checkpoint.pt, predicting from and starting at the latter is warned of."""
+    lagbench("train", "--baseline", "mlp", *TINY, "--set", "training.steps=2", "-o", "run")
+    predict = ("predict", "run/checkpoint.pt", "--threads", "1", "--no-bench", "--quiet")
+    more = ("train", "--baseline", "mlp", *TINY, "--set", "training.steps=1", "--quiet")
+    for words in (predict, (*more, "--start", "run/checkpoint.pt", "-o", "more")):
+        done = lagbench(*words)
+        assert done.exit_code == 0
+        assert "run/weights.pt" in done.stderr
+    assert lagbench(*more, "--start", "run/weights.pt", "-o", "best").stderr == ""
+    (tmp_path / "run/weights.pt").unlink()
+    assert lagbench(*predict).stderr == ""
+
+
 def command(*words: str, threads: int = 1) -> subprocess.CompletedProcess[str]:
     """Run lagbench in a process of its own."""
     environment = {**os.environ, "OMP_NUM_THREADS": str(threads)}

@@ -99,7 +99,7 @@ def test_machines_are_answered_in_json(run: Run, monkeypatch: pytest.MonkeyPatch
     ("words", "code", "message"),
     [
         (["submit"], 2, "FILE"),
-        (["submit", "none.nc", "--author", "A", "--command", "x"], 2, "--new-board"),
+        (["submit", "none.nc"], 3, "none.nc"),
         (["submit", "none.nc", "--author", "A", "--command", "x", "--new-board"], 3, "none.nc"),
         (["submit", "x.nc", "--url", "javascript:alert(1)"], 2, "is not an http:// or https:// address"),
         (["submit", "x.nc", "--from", "none.yaml"], 3, "none.yaml"),

@@ -302,6 +302,29 @@ def test_no_board_is_begun_by_mistake(own: BoardBench, predictions: Path, tmp_pa
     assert submitting.submit([predictions], meta, new_board=True, **where).board == tmp_path / "elsewhere"
 
 
+def test_no_board_is_begun_among_other_files(own: BoardBench, predictions: Path, tmp_path: Path) -> None:
+    """A page of one's own would be replaced; what git and a README put there is no obstacle."""
+    meta = Meta(authors=("A. Author",), command="make", date=DAY)
+    board = tmp_path / "site"
+    (board / ".git").mkdir(parents=True)
+    (board / "README.md").write_text("mine")
+    where = own.where | {"board": board, "new_board": True}
+    (board / "index.html").write_text("mine")
+    with pytest.raises(UsageError) as error:
+        submitting.submit([predictions], meta, **where)
+    assert (error.value.where, error.value.got) == (str(board), "'index.html'")
+    assert sorted(path.name for path in board.iterdir()) == [".git", "README.md", "index.html"]
+    (board / "index.html").unlink()
+    assert submitting.submit([predictions], meta, **where).board == board
+
+
+def test_a_missing_file_is_told_before_what_nobody_said(own: BoardBench, tmp_path: Path) -> None:
+    """Authors are not asked for on behalf of a file that is not there."""
+    with pytest.raises(UnreadableFileError) as error:
+        submitting.submit([tmp_path / "none.nc"], Meta(), **own.where)
+    assert error.value.where == str(tmp_path / "none.nc")
+
+
 def test_what_is_not_given(own: BoardBench) -> None:
     """The date is today's in UTC; seeds timed on different machines have no cost."""
     first = own.predict(nearer, "mixed", seed=0, device="one", seconds_per_frame=0.25)

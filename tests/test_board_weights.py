@@ -14,7 +14,7 @@ import pytest
 from made_up import BoardBench, copied, noisy
 from simple_models import FACTS, Drift
 
-from lagbench.baselines.checkpoint import Checkpoint, rounded_weights, save
+from lagbench.baselines.checkpoint import Checkpoint, load, rounded_weights, save
 from lagbench.board import weights as kept
 from lagbench.board.check import check_board
 from lagbench.board.entry import Meta
@@ -111,6 +111,17 @@ def test_weights_go_to_their_seeds(own: BoardBench) -> None:
     assert [one and one.sha256 for one in held] == [None, file_sha256(second)]
     assert [path.name for path in (own.folder / "weights").rglob("*.pt")] == ["drift_3.pt"]
     assert found(own) == set()
+
+
+def test_a_state_to_go_on_from_is_not_published(own: BoardBench) -> None:
+    """A checkpoint.pt, with what the optimiser holds, is refused; nothing is written."""
+    run = trained(own, 0)
+    held = load(run / "weights.pt")
+    save(run / "checkpoint.pt", replace(held, optimizer={"state": {}}))
+    with pytest.raises(UsageError) as error:
+        submitted(own, run, weights=(run / "checkpoint.pt",))
+    assert error.value.where == str(run / "checkpoint.pt")
+    assert not own.entry("drift").exists()
 
 
 def test_a_later_entry_takes_its_files_along(own: BoardBench) -> None:

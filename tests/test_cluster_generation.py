@@ -118,10 +118,11 @@ def test_a_folder_that_workers_do_not_share(
 
 
 def test_a_missing_folder_and_a_late_mark(tmp_path: Path) -> None:
-    """No folder at all is told as such; a mark that another machine sees late is waited for."""
+    """No folder at all is told as such; a mark that is seen late, its name before its word, is waited for."""
     with pytest.raises(WorkFailedError, match="no such folder"):
         Mark(tmp_path / "none" / "mark", "word", 0.0).check("w")
     late = Mark(tmp_path / "mark", "word", 20.0)
+    late.path.touch()
     Timer(0.2, lambda: late.path.write_text("word")).start()
     late.check("w")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["mark"]

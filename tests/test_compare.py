@@ -124,6 +124,14 @@ def test_seeds_of_two_methods_are_not_one(tmp_path: Path) -> None:
         compare(tmp_path, tmp_path)
 
 
+def test_a_folder_without_scores(tmp_path: Path) -> None:
+    """What is named is the folder that was given."""
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(UnreadableFileError) as error:
+        compare(published(tmp_path, [1.0] * 6, method="a"), tmp_path / "empty")
+    assert error.value.where == str(tmp_path / "empty")
+
+
 @pytest.mark.parametrize(
     ("changes", "kind", "word"),
     [

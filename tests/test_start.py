@@ -120,7 +120,7 @@ def test_it_goes_on_where_the_weights_are(
 def test_it_learns_from_there(run: Run) -> None:
     """A training from its own end begins at the loss that it ended with; random weights do not."""
     first = run("gns", "steps=30", "validate_every=0", to="first")
-    further = run("gns", "steps=1", "validate_every=0", start=first.checkpoint, to="further")
+    further = run("gns", "steps=1", "validate_every=0", start=first.weights, to="further")
     anew = run("gns", "steps=1", "validate_every=0", to="anew")
     assert further.loss["total"] < 0.95 * anew.loss["total"]
 

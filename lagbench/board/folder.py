@@ -84,6 +84,20 @@ class Folder:
                 fix=fix,
             )
 
+    def require_room(self) -> None:
+        """Refuse to begin a leaderboard among other files, which its page could replace."""
+        if (self.path / SUBMISSIONS).is_dir() or not self.path.exists():
+            return
+        others = sorted(name for name in os.listdir(self.path) if name[0] != "." and name != README)
+        if others:
+            raise UsageError(
+                "no room for a leaderboard",
+                where=str(self.path),
+                expected="a folder that is not there yet, or is empty",
+                got=", ".join(map(ascii, others[:3])) + (" and more" if len(others) > 3 else ""),
+                fix="name another: --board FOLDER",
+            )
+
     def entries(self) -> tuple[Path, ...]:
         """Return the YAML files of entries, relative to the folder, in the order of their names."""
         return self._sound(SUBMISSIONS)

@@ -19,6 +19,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from lagbench.atomic import write_atomically
+from lagbench.data.hdf5 import check_file
 from lagbench.data.registry import Registry, load
 from lagbench.errors import ChecksFailedError, Mistakes, UnreadableFileError, UsageError, WorkFailedError
 from lagbench.floors.table import FLOORS
@@ -28,7 +29,7 @@ from lagbench.scoring.score import score
 from lagbench.scoring.score_file import write_statistics
 from lagbench.submission.checks import outside_share
 from lagbench.submission.findings import ValidationResult
-from lagbench.submission.format import Header
+from lagbench.submission.format import WRITE, Header
 from lagbench.submission.predictions import open_predictions
 from lagbench.submission.validation import validate
 from lagbench.work.progress import Progress
@@ -119,7 +120,9 @@ def submit(
     with mistakes:
         _require_said(meta)
     with mistakes:
-        if not new_board:
+        if new_board:
+            folder.require_room()
+        else:
             folder.require("run it from the root of a clone, name it with --board, or begin one: --new-board")
     with mistakes:
         _require_files(paths)
@@ -200,7 +203,9 @@ def _require_said(meta: Meta) -> None:
 
 
 def _require_files(paths: Sequence[Path]) -> None:
-    """Refuse no files, and more than an entry may have."""
+    """Refuse no files, more than an entry may have, and what is no file of predictions."""
+    for path in paths:
+        check_file(path, fix=WRITE)
     if not 1 <= len(paths) <= MOST_SEEDS:
         what = "too many files" if paths else "no predictions"
         raise UsageError(what, expected=f"1 to {MOST_SEEDS}, one per seed", got=len(paths))

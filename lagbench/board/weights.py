@@ -50,6 +50,12 @@ def require_weights(weights: Sequence[str | Path], headers: Sequence[Header]) ->
     seeds = [header.seed or 0 for header in headers]
     for path in map(Path, weights):
         held = load(path)
+        if held.optimizer is not None:
+            raise UsageError(
+                "a state to go on from, not the weights of a model",
+                where=str(path),
+                fix="give weights.pt beside it, and predictions that were made with that",
+            )
         seed = held.training.get("recipe", {}).get("training", {}).get("seed", 0)
         facts, first = held.facts, headers[0]
         got = (facts.split, facts.size, facts.dataset_sha256)

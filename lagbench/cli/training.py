@@ -97,7 +97,11 @@ def train(
     split = chosen(name, split)
     for module in ("torch", "torch_geometric", "pytorch_lightning"):
         check_installed(module, extra=EXTRA)
-    with progress_bar(quiet=quiet):  # PyTorch takes seconds to load
+    from lagbench.data.local import locate
+
+    if "LOCAL_RANK" not in os.environ:  # of several processes one tells an error
+        locate(split, size, root=root)  # PyTorch takes seconds to load: what can be refused before, is
+    with progress_bar(quiet=quiet):
         from lagbench.baselines.machine import is_helper
         from lagbench.baselines.train import train as run
 
@@ -193,6 +197,7 @@ def _trained(result: TrainingResult, where: str) -> list[str]:
         time += "; it was over before, --fresh trains anew"
     elif result.first_step:
         time += f"; this call went on from step {result.first_step}"
+    terms = sorted(result.loss, key=lambda name: (name == "total", name))
     lines = [
         f"{result.baseline} on {result.recipe}: {result.state}, step {result.step} of {result.steps}, {time}",
         *(
@@ -201,7 +206,7 @@ def _trained(result: TrainingResult, where: str) -> list[str]:
             else []
         ),
         f"  parameters {result.parameters}",
-        "  loss       " + ", ".join(f"{name} {value:.4g}" for name, value in result.loss.items()),
+        "  loss       " + ", ".join(f"{name} {result.loss[name]:.4g}" for name in terms),
     ]
     if result.best_value is not None:
         lines.append(

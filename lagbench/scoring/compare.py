@@ -241,12 +241,19 @@ def _contestant(
 
 
 def _seeds_of(path: Path) -> list[Path]:
-    """Return the score files of a folder: its own, or those of its folders; else the path itself."""
+    """Return the score files of a folder: its own, or those of its folders; of a file the path itself."""
     if not os.path.isdir(path):  # unlike Path.is_dir, it takes any name
         return [path]
     if (path / JSON_NAME).is_file():
         return [path / JSON_NAME]
-    return sorted(path.glob(f"*/{JSON_NAME}")) or [path / JSON_NAME]
+    if not (found := sorted(path.glob(f"*/{JSON_NAME}"))):
+        raise UnreadableFileError(
+            "no scores in the folder",
+            where=str(path),
+            expected=f"{JSON_NAME}, or folders that hold one each, of a method's seeds",
+            fix="`lagbench score` writes them; or name a predictions.nc",
+        )
+    return found
 
 
 def _scored(

@@ -62,7 +62,7 @@ class Mark:
     def check(self, worker: str) -> None:
         """See that the folder is here and can be written to."""
         folder = self.path.parent
-        if not _appears(self.path, self.patience) or self.path.read_text(encoding="utf-8") != self.word:
+        if not _appears(self.path, self.patience, holding=self.word):
             raise WorkFailedError(
                 "a worker does not see the folder of the data set",
                 where=f"{folder}, worker {worker}",
@@ -98,11 +98,12 @@ def await_file(path: Path) -> None:
         )
 
 
-def _appears(path: Path, patience: float) -> bool:
+def _appears(path: Path, patience: float, *, holding: str | None = None) -> bool:
     end = time.monotonic() + patience
     while True:
         _look_again(path.parent)
-        if path.is_file():
+        # Another machine may see the name before the content.
+        if path.is_file() and (holding is None or path.read_text(encoding="utf-8") == holding):
             return True
         if time.monotonic() > end:
             return False
