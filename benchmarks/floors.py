@@ -20,7 +20,7 @@ import numpy as np
 
 from lagbench.data.registry import Size, load
 from lagbench.floors import FloorScores, shipped
-from lagbench.scoring.skill import best_floor
+from lagbench.scoring.card import best_floor
 from lagbench.scoring.task import ranking_metric
 
 FALLEN, SHARE, ERROR = 0.8, 0.75, 0.8

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from lagbench.metrics.aggregate import Score, bootstrap_interval
 from lagbench.metrics.table import METRICS
-from lagbench.scoring.skill import skill
+from lagbench.scoring.card import skill
 
 CASES = ((1.9, 0.6, 0.6, 0.3), (0.4, 0.4, 0.3, 0.5), (0.4, 0.8, 0.6, 0.0), (1.0, 0.3, 0.3, 0.8))
 """Ratio of the means, deviations of the logarithms of method and floor over scenarios, their correlation."""

@@ -28,9 +28,9 @@ from lagbench.floors.shipped import FOLDER, shipped_path
 from lagbench.generators.batch import solver_constants
 from lagbench.generators.solver import build
 from lagbench.generators.split import InitialState
+from lagbench.scoring.card import best_floor
 from lagbench.scoring.floors import measurable
 from lagbench.scoring.scenario import SUBMISSION
-from lagbench.scoring.skill import best_floor
 from lagbench.scoring.task import ranking_metric
 
 Floats = NDArray[np.float64]

@@ -21,12 +21,11 @@ from lagbench.floors.shipped import shipped_path, write_shipped, write_solver_se
 from lagbench.metrics import METRICS, Score
 from lagbench.scoring import floors as floors_of_scoring
 from lagbench.scoring import score as scoring
-from lagbench.scoring.card import ScoreCard
+from lagbench.scoring.card import ScoreCard, best_floor, skill
 from lagbench.scoring.floors import differences, kept_in, measurable, measure, measured_again, measured_sizes
 from lagbench.scoring.record import record
 from lagbench.scoring.scenario import SUBMISSION
 from lagbench.scoring.score_file import read_statistics
-from lagbench.scoring.skill import best_floor, skill
 from lagbench.scoring.tables import card_tables
 
 

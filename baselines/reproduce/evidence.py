@@ -28,8 +28,8 @@ from lagbench.floors.shipped import shipped, shipped_path
 from lagbench.floors.table import FLOORS
 from lagbench.metrics.aggregate import Score
 from lagbench.metrics.metric import mean
+from lagbench.scoring.card import best_floor
 from lagbench.scoring.score_file import NETCDF_NAME, read_statistics
-from lagbench.scoring.skill import best_floor
 from lagbench.scoring.task import ranking_metric
 
 from .thesis import ROSTER

@@ -21,8 +21,8 @@ from lagbench.metrics.aggregate import Score
 from lagbench.metrics.metric import mean
 from lagbench.metrics.significance import FEWEST_SCENARIOS, Standing, mean_loss, standings
 from lagbench.metrics.table import METRICS
+from lagbench.scoring.card import skill
 from lagbench.scoring.scenario import Preview
-from lagbench.scoring.skill import skill
 from lagbench.submission.task_checks import frames_to_predict
 
 from .entry import Cost, Entry, Status

@@ -23,9 +23,8 @@ from lagbench.floors.table import FLOORS
 from lagbench.metrics.aggregate import Score, Tally, aggregate
 from lagbench.metrics.table import available
 
-from .card import FORMAT, IDENTITY, ScoreCard, unreadable_scores
+from .card import FORMAT, IDENTITY, ScoreCard, Skill, skill, unreadable_scores
 from .scenario import SUBMISSION, Preview
-from .skill import Skill, skill
 
 NETCDF_NAME = "scores.nc"
 
