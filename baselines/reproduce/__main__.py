@@ -18,6 +18,8 @@ from functools import partial
 from pathlib import Path
 
 from lagbench.data.layout import resolve_root
+from lagbench.data.local import remedy
+from lagbench.data.manifest import read_manifest
 from lagbench.data.registry import Registry, load
 from lagbench.errors import LagbenchError, UsageError, nearest
 from lagbench.work.pool import worker_count
@@ -95,12 +97,19 @@ def reproduce(plan: Plan, figures: Sequence[Figure], *, split: str | None = None
 
 
 def rehearse(plan: Plan, figures: Sequence[Figure], *, split: str | None = None) -> int:
-    """Say what :func:`reproduce` would train, predict and score; return 0, or the last error's code."""
+    """Say what :func:`reproduce` would train, predict and score; return 0, or the last error's code.
+
+    Data that are not there are named with the command that makes them.
+    """
 
     def say(where: str, model: Model, seed: int) -> None:
         _say(f"{where} {plan.size} {model.name}-{seed}: {outlook(plan, where, model, seed)}")
 
-    code = _each(("", partial(say, *run)) for run in _runs(plan, figures, split))
+    runs = _runs(plan, figures, split)
+    for tier in map(plan.tier, dict.fromkeys(where for where, _, _ in runs)):
+        if read_manifest(plan.root, tier.split, tier.name, tier.major) is None:
+            note(f"{tier.split} {tier.name} is not there yet: {remedy(tier, root=plan.root)}")
+    code = _each(("", partial(say, *run)) for run in runs)
     for study in _studies(plan, figures):
         _say(f"studies of {study}")
     return code

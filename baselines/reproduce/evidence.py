@@ -169,6 +169,7 @@ class Sources:
     studies: Path = STUDIES  # folder of committed results that are no entries
     recipe: str | None = None  # variant of the recipes whose runs to read; None for the size's own
     registry: Registry | None = None  # where splits are described; ours when None
+    left_out: frozenset[Path] = frozenset()  # folders of runs that are not to be read
 
     def size(self, split: str, size: str) -> Size:
         """Return what the registry says of a split and size."""
@@ -196,7 +197,7 @@ class Sources:
             homes |= {path.name[len(size) :]: path for path in sorted(home.glob(f"{size}-*"))}
         for variant, folder in homes.items():
             for run in sorted(folder.glob("*-*")):
-                if found := RUN.fullmatch(run.name):
+                if run not in self.left_out and (found := RUN.fullmatch(run.name)):
                     yield found[1] + variant, int(found[2]), run
 
 

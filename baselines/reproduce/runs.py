@@ -49,6 +49,8 @@ class Plan:
     device: str = "auto"
     threads: int | None = None  # of a training on the CPU; one per core by default, one with workers
     registry: Registry | None = None  # where splits are described; ours when None
+    # folders of runs that could not be made, or are not those that were asked for: nothing of them is shown
+    failed: set[Path] = field(default_factory=set, compare=False, repr=False)
     _evidence: dict[str, Evidence] = field(default_factory=dict, compare=False, repr=False)
     _subsets: dict[str, ScoredTask] = field(default_factory=dict, compare=False, repr=False)
 
@@ -113,6 +115,7 @@ class Plan:
             recipe=self.recipe,
             registry=self.described,
             studies=self.studies,
+            left_out=frozenset(self.failed),
         )
 
     def evidence(self, split: str) -> Evidence:
@@ -138,7 +141,7 @@ Run = tuple[str, Model, int]
 
 
 def make_runs(plan: Plan, runs: Sequence[Run], *, workers: int = 1) -> int:
-    """Make runs, ``workers`` of them side by side; what fails is said, the others are made.
+    """Make runs, ``workers`` of them side by side; what fails is said and entered, the others are made.
 
     On one GPU that pays as it does on many cores: small models keep a GPU waiting for their processor.
     Return 0, or the exit code of the last one that failed; a worker that dies three times ends all.
@@ -150,6 +153,9 @@ def make_runs(plan: Plan, runs: Sequence[Run], *, workers: int = 1) -> int:
     except LagbenchError as error:
         complain(error)
         return error.exit_code
+    for (split, model, seed), code in zip(runs, codes, strict=True):
+        if code:
+            plan.failed.add(plan.folder(split, model.name, seed))
     return next((code for code in reversed(codes) if code), 0)
 
 
