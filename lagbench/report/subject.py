@@ -208,8 +208,8 @@ class Walls:
 
     @property
     def classes(self) -> str:
-        """Classes of a panel whose walls move."""
-        return " ".join(f"{wall}-moves" for wall in self.moving)
+        """Classes of a panel, which tell the walls that move."""
+        return " ".join(["panel", *(f"{wall}-moves" for wall in self.moving)])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
