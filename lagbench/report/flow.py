@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from lagbench.data.grid import Fields
 
 from .html import SIDE, Figure, Markup, grid, join, path_data, ramp, tag, vector
-from .maps import limit_of
-from .subject import Gallery, Subject
+from .subject import Gallery, Subject, limit_of
 
 Floats = NDArray[np.float64]
 

@@ -19,7 +19,7 @@ from lagbench.metrics.frame import FramePair, Snapshot
 from lagbench.scoring.task import ScoredTask
 
 from .html import Figure, Markup, grid, image, join, key, ramp, tag
-from .subject import Gallery, Moment, Subject, Walls
+from .subject import Gallery, Moment, Subject, Walls, limit_of
 
 Floats = NDArray[np.float64]
 
@@ -79,9 +79,6 @@ def _ramp(below: str, above: str) -> Bytes:
 _DIVERGING, _SEQUENTIAL = _ramp(CLOCKWISE, COUNTER), _ramp(FAST, FAST)
 
 
-TOP = 99.5  # full colour is the percentile of the truth's magnitudes
-
-
 def inside(task: ScoredTask, field: Floats) -> Floats:
     """Return the nodes of a field that lie within the walls, shape [x node, y node]."""
     grid_ = task.setting.grid
@@ -90,13 +87,6 @@ def inside(task: ScoredTask, field: Floats) -> Floats:
         room = 0.26 * grid_.spacing  # nodes on a wall are seen, those in it are not
         kept.append((grid_.axis >= low - room) & (grid_.axis <= high + room))
     return field[np.ix_(*kept)]
-
-
-def limit_of(fields: Sequence[Floats]) -> float:
-    """Return the magnitude of full colour: what almost all nodes stay below."""
-    values = np.concatenate([np.abs(field[np.isfinite(field)]) for field in fields])
-    top = float(np.percentile(values, TOP)) if values.size else 0.0
-    return top if np.isfinite(top) and top > 0.0 else 1.0
 
 
 def field_figure(subject: Subject, gallery: Gallery) -> Figure:
