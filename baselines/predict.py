@@ -17,6 +17,7 @@ from typing import Any
 import torch
 
 from lagbench.atomic import write_atomically
+from lagbench.data.hdf5 import SIGNATURE
 from lagbench.data.layout import resolve_root
 from lagbench.data.local import rooted
 from lagbench.data.registry import Registry
@@ -29,7 +30,7 @@ from .baseline import Baseline, Facts, rescaled
 from .catalogue import find
 from .checkpoint import Checkpoint, check_data, load, restore, warn_of_last_state
 from .graph import radius_graph
-from .job import RunFolder, changes_of, parameter_count
+from .job import MOST_RECORD, RunFolder, changes_of, parameter_count
 from .machine import bound_memory, chosen_device, hardware, memory_errors_told, threads_used
 from .recipe import changed_options
 from .rollout import Rollout, roll_out, scenario_batch, scenario_paths
@@ -107,9 +108,11 @@ def predict(
     Raises:
         UnreadableFileError: the checkpoint is damaged or unsafe.
         DataError: the data set is missing, damaged, or of another version than that of the training.
-        UsageError: the baseline is not installed, no such device, or weights of no use at the size or as set.
+        UsageError: the baseline is not installed, no such device, weights of no use at the size or as set, or
+            the output would replace something else, as the weights themselves.
         WorkFailedError: out of memory, or the disk is full.
     """
+    check_replaceable(Path(output))
     found = load(checkpoint)
     warn_of_last_state(found, Path(checkpoint))
     # Weights of the best validation say 'running' for good: what became of the training stands beside them.
@@ -176,6 +179,18 @@ def predict(
     plain = json.dumps({**asdict(result), "path": result.path.name}, indent=2, sort_keys=True)
     write_atomically(result.path.with_suffix(".json"), plain.encode() + b"\n", option="--output")
     return result
+
+
+def check_replaceable(output: Path) -> None:
+    """Refuse to write predictions, and what they cost beside them, over files that are something else."""
+    for path, ours in ((output, SIGNATURE), (output.with_suffix(".json"), b"seconds_per_frame")):
+        if path.is_file() and path.stat().st_size and ours not in path.read_bytes()[:MOST_RECORD]:
+            raise UsageError(
+                "the output would replace a file that is something else",
+                where="--output",
+                got=str(path),
+                fix="name another file: -o predictions.nc",
+            )
 
 
 class _Rollouts:

@@ -19,8 +19,8 @@ from lagbench.board.entry import (
     Prediction,
     ScoreBlock,
     ScoredFile,
+    Verification,
 )
-from lagbench.board.entry_file import Verification
 from lagbench.board.model import Board, Curve, Floor, Histogram, Pictures, Row, Tab, Value
 from lagbench.board.score_file import reported_frames
 from lagbench.data.registry import load

@@ -133,7 +133,7 @@ def test_a_script_beside_the_clone_imports_the_package(tmp_path: Path) -> None:
         ("list; info cavity; generate fluid --size tiny --dry-run", HEAVY - {"numpy"}),
         ("import lagbench.data.writer", {"xarray", "pandas", "h5py", "pydantic", "scipy", "dask"}),
         ("import lagbench.metrics", {"torch", "taichi", "xarray", "scipy", "netCDF4", "ot"}),
-        ("import lagbench.report", {"matplotlib", "PIL", "taichi", "torch"}),
+        ("import lagbench.report.report", {"matplotlib", "PIL", "taichi", "torch"}),
         ("import lagbench.draw.plot, lagbench.draw.animate, lagbench.make.cards", DRAWN),
     ],
 )

@@ -21,7 +21,7 @@ from torch import Tensor
 from lagbench.baselines import predict as prediction
 from lagbench.baselines.baseline import Batch, Facts, facts_of
 from lagbench.baselines.catalogue import every_entry, find
-from lagbench.baselines.checkpoint import Checkpoint, save
+from lagbench.baselines.checkpoint import Checkpoint, load, save
 from lagbench.baselines.job import MOST_RECORD, OVER
 from lagbench.baselines.machine import threads_used
 from lagbench.baselines.neuralmpm import NeuralMPM
@@ -381,6 +381,19 @@ def test_models_of_any_size_have_the_same_weights_at_each() -> None:
             for facts in (small, large)
         ]
         assert shapes[0] == shapes[1], model.method
+
+
+@pytest.mark.parametrize("name", ["weights.pt", "training.nc"])
+def test_nothing_else_is_replaced(run: Predict, tmp_path: Path, name: str) -> None:
+    """Not the weights themselves, nor the record of their training, whose name that of the cost would be."""
+    (tmp_path / "training.json").write_text(json.dumps(UNFINISHED))
+    with pytest.raises(UsageError) as caught:
+        run(name=name)
+    assert caught.value.where == "--output"
+    assert json.loads((tmp_path / "training.json").read_text()) == UNFINISHED
+    assert load(tmp_path / "weights.pt").baseline == "drift"
+    run(name="predictions.nc")
+    run(name="predictions.nc")
 
 
 def test_out_of_memory(run: Predict, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -36,10 +36,10 @@ from lagbench.data.grid import Grid, fields
 from lagbench.data.registry import load
 from lagbench.errors import UsageError
 from lagbench.metrics import METRICS, Setting, Tally, aggregate
-from lagbench.report import write_report
 from lagbench.report.html import Markup, tag, text
-from lagbench.report.maps import inside, limit_of
-from lagbench.report.subject import Subject
+from lagbench.report.maps import inside
+from lagbench.report.report import write_report
+from lagbench.report.subject import Subject, limit_of
 from lagbench.report.tables import stable_of
 from lagbench.scoring.task import ScoredTask
 from lagbench.submission.truth import Truth

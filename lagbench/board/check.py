@@ -68,7 +68,6 @@ def check_board(
     recording: bool = False,
     floors: Collection[Size] = (),
     root: str | Path | None = None,
-    today: datetime.date | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> CheckResult:
     """Check entries, score files and aggregates of a leaderboard's folder.
@@ -84,7 +83,6 @@ def check_board(
         recording: whether to note entries thus confirmed in verified.yaml.
         floors: sizes whose shipped floors are measured again.
         root: folder of all data sets, for both.
-        today: the last day that entries may be of; by default tomorrow, as somewhere it is.
         progress: told how far that scoring is.
 
     Raises:
@@ -95,7 +93,8 @@ def check_board(
     folder.require()
     files = [folder.path / path for path in (*folder.score_files(), *folder.floor_files())]
     broken = unreadable_in_child(files) if isolated else {}
-    last = today or datetime.datetime.now(datetime.UTC).date() + datetime.timedelta(days=1)
+    today = datetime.datetime.now(datetime.UTC).date()
+    last = today + datetime.timedelta(days=1)  # somewhere it is tomorrow
     look = _Look(folder=folder, registry=described, broken=broken, last=last)
     for path in folder.entries():
         look.guarded(path, look.entry)
@@ -106,7 +105,7 @@ def check_board(
         look.found += check_base(folder, base, own)
     again = Rescoring(
         folder=folder,
-        entries=[entry for entry, _ in look.known],
+        entries=look.known,
         sound=look.sound,
         registry=described,
         root=root,
@@ -116,7 +115,7 @@ def check_board(
         look.found += again.of_file(one)
     measured = {f"{size.split} {size.name}": look.measured(size, root, progress) for size in floors}
     recorded = again.entries_confirmed() if recording and not look.found else []
-    record(folder, recorded, datetime.datetime.now(datetime.UTC).date())
+    record(folder, recorded, today)
     looked = page and not look.found
     if looked:
         try:
@@ -143,7 +142,7 @@ class _Look:
     broken: Mapping[Path, str]  # files that cannot be read, and why, as a child process found
     last: datetime.date
     found: list[Finding] = field(default_factory=list)
-    known: list[tuple[Entry, Size]] = field(default_factory=list)
+    known: list[Entry] = field(default_factory=list)
     sound: set[Path] = field(default_factory=set)  # score files that were read
     prints: dict[str, list[tuple[Entry, Path]]] = field(default_factory=dict)  # by what was predicted
 
@@ -174,7 +173,7 @@ class _Look:
         except UsageError as error:
             self.add("split", path, f"{entry.split} {entry.size}", fix=error.fix)
             return
-        self.known.append((entry, size))
+        self.known.append(entry)
         if entry.yaml_path != path:
             self.add("place", path, path, expected=entry.yaml_path)
         if entry.status is Status.ACTIVE and not is_current(entry.dataset, size):
@@ -299,7 +298,7 @@ class _Look:
 
     def together(self) -> None:
         """Check what entries are to each other, and what else lies in the folder."""
-        entries = [entry for entry, _ in self.known]
+        entries = self.known
         named = [Path(made.path) for entry in entries for made in entry.predictions if made.path]
         for path, reason in self.folder.odd(named):
             self.add("folder", ascii(path.as_posix())[1:-1], reason)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,8 +25,8 @@ from lagbench.scoring.card import skill
 from lagbench.scoring.scenario import Preview
 from lagbench.submission.task_checks import frames_to_predict
 
-from .entry import Cost, Entry, Status
-from .entry_file import Verification, read_entry, read_verified, verification_of
+from .entry import Cost, Entry, Status, Verification
+from .entry_file import read_entry, read_verified, verification_of
 from .folder import Folder
 from .model import Board, Curve, Floor, Histogram, Pictures, Row, Tab, Value
 from .payload import spaced
@@ -70,7 +70,6 @@ def collect(
     *,
     only: Collection[tuple[str, str]] | None = None,
     registry: Registry | None = None,
-    report: Callable[[int], None] = lambda _: None,
 ) -> Board:
     """Return the board of a leaderboard's folder.
 
@@ -78,7 +77,6 @@ def collect(
         folder: the leaderboard's folder.
         only: the (split, size) to read; all when None.
         registry: where splits are described; ours when None.
-        report: told the entries done.
 
     Raises:
         UsageError: no leaderboard there.
@@ -106,7 +104,6 @@ def collect(
         except UnreadableFileError:
             if current:
                 raise
-            report(1)
             continue  # old scores that do not fit the task of today
         scores = combine([held.scores for held in stored])
         lacking = [name for name in (stored[0].scores.ranking, *ENERGIES) if name not in scores]
@@ -119,7 +116,6 @@ def collect(
             )
         held = _Held(entry=entry, current=current, stored=stored, scores=scores)
         found.setdefault((entry.split, entry.size), []).append(held)
-        report(1)
     verified, tabs, empty = read_verified(place), [], []
     for split, about in described.splits.items():
         for name in about.sizes:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -88,38 +89,20 @@ def _of(part: str, key: str) -> Callable[[Row | Floor], object]:
     return of
 
 
-def _reported(part: str, held: Mapping[str, tuple[str, str, str, Direction, str]]) -> Iterator[Column]:
-    """Yield columns of what submitters say: key to label, unit, form, direction and meaning."""
-    for key, (label, unit, form, direction, meaning) in held.items():
-        said = Column(key=key, label=label, unit=unit, form=form, meaning=meaning)
-        yield replace(said, direction=direction, reported=True, of=_of(part, key))
+def _reported(part: str, key: str, label: str, meaning: str, **how: Any) -> Column:  # noqa: ANN401
+    """Return a column of what submitters say."""
+    return Column(key=key, label=label, meaning=meaning, reported=True, of=_of(part, key), **how)
 
 
-LOWER, HIGHER, NONE = Direction.LOWER, Direction.HIGHER, Direction.NONE
-COST = {
-    "speed_up": (
-        "speed\u2011up",
-        "",
-        "factor",
-        HIGHER,
-        "Time of the solver over that of the model per frame.",
-    ),
-    "seconds_per_frame": ("time per frame", "s", "number", LOWER, "Wall time of a frame of one scenario."),
-    "solver_seconds_per_frame": ("solver time per frame", "s", "number", NONE, "On the same machine."),
-    "device": ("device", "", "text", NONE, "Machine of both times."),
-}
-TRAINING = {
-    "track": ("track", "", "text", NONE, "Equal compute for all, or trained until it no longer helped."),
-    "windows": ("windows", "", "count", NONE, "Training windows seen."),
-    "epochs": ("epochs", "", "number", NONE, "Passes over the training subset."),
-    "cpu_hours": ("CPU time", "h", "number", NONE, "Of one training."),
-    "gpu_hours": ("GPU time", "h", "number", NONE, "Of one training."),
-}
-PARAMETERS = {"parameters": ("parameters", "", "count", NONE, "Trainable parameters of the model.")}
-
+SPEED_UP = "Time of the solver over that of the model per frame."
+TIME = "Wall time of a frame of one scenario."
+TRACK = "Equal compute for all, or trained until it no longer helped."
 OF_ENTRY = (
-    *_reported("cost", COST),
-    *_reported("", PARAMETERS),
+    _reported("cost", "speed_up", "speed\u2011up", SPEED_UP, form="factor", direction=Direction.HIGHER),
+    _reported("cost", "seconds_per_frame", "time per frame", TIME, unit="s", direction=Direction.LOWER),
+    _reported("cost", "solver_seconds_per_frame", "solver time per frame", "On the same machine.", unit="s"),
+    _reported("cost", "device", "device", "Machine of both times.", form="text"),
+    _reported("", "parameters", "parameters", "Trainable parameters of the model.", form="count"),
     Column(
         key="budget",
         label="budget",
@@ -128,7 +111,11 @@ OF_ENTRY = (
         meaning="Computing time of one training.",
         of=lambda row: _budget(row.entry.budget) if isinstance(row, Row) else "",
     ),
-    *_reported("budget", TRAINING),
+    _reported("budget", "track", "track", TRACK, form="text"),
+    _reported("budget", "windows", "windows", "Training windows seen.", form="count"),
+    _reported("budget", "epochs", "epochs", "Passes over the training subset."),
+    _reported("budget", "cpu_hours", "CPU time", "Of one training.", unit="h"),
+    _reported("budget", "gpu_hours", "GPU time", "Of one training.", unit="h"),
     Column(
         key="seeds",
         label="seeds",
@@ -173,12 +160,11 @@ def columns_of(tab: Tab, metrics: Mapping[str, Metric]) -> dict[str, Column]:
 def presets_of(tab: Tab, columns: Mapping[str, Column]) -> dict[str, tuple[str, ...]]:
     """Return the keys of each preset that has something to show, main first, all last."""
     main = ("skill", *tab.columns[:MAIN_METRICS], "speed_up", "budget", "checked")
-    chosen = {"main": main, **PRESETS, "all": tuple(columns)}
-    presets = {}
-    for name, keys in chosen.items():
-        if any(key in columns for key in keys):
-            presets[name] = tuple(key for key in columns if key in ("skill", tab.ranking, *keys))
-    return presets
+    return {
+        name: tuple(key for key in columns if key in ("skill", tab.ranking, *keys))
+        for name, keys in {"main": main, **PRESETS, "all": tuple(columns)}.items()
+        if any(key in columns for key in keys)
+    }
 
 
 def value_of(row: Row | Floor, column: Column) -> float | str:

@@ -294,6 +294,14 @@ class ScoreBlock(Strict):
     metrics: Annotated[dict[str, Summary], Field(max_length=500)]
 
 
+class Verification(Strict):
+    """What the maintainers found of an entry when they scored its predictions again."""
+
+    scores: Annotated[tuple[Hash, ...], Field(min_length=1, max_length=MOST_SEEDS, strict=False)]
+    lagbench: Short
+    date: Date
+
+
 class About(Strict):
     """What a submitter says of a method."""
 

@@ -15,9 +15,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, get_args
+from typing import Any, TypeVar, get_args
 
-from pydantic import BaseModel, Field, RootModel, ValidationError
+from pydantic import BaseModel, RootModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from lagbench.atomic import write_atomically
@@ -25,7 +25,7 @@ from lagbench.data.yamlfile import read_yaml, spell_yaml
 from lagbench.errors import ChecksFailedError, UnreadableFileError, UsageError, nearest
 from lagbench.submission.findings import quoted
 
-from .entry import MOST_SEEDS, PATTERNS, Date, Entry, Hash, Meta, Short, Strict
+from .entry import PATTERNS, Entry, Meta, Verification
 from .folder import VERIFIED, Folder
 
 MAX_ENTRY_BYTES = 64_000
@@ -176,14 +176,6 @@ def _model_in(annotation: object) -> type[BaseModel] | None:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     return next((found for inner in get_args(annotation) if (found := _model_in(inner))), None)
-
-
-class Verification(Strict):
-    """What the maintainers found."""
-
-    scores: Annotated[tuple[Hash, ...], Field(min_length=1, max_length=MOST_SEEDS, strict=False)]
-    lagbench: Short
-    date: Date
 
 
 class _List(RootModel[dict[str, Verification]]):

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from lagbench.data.registry import Size
 from lagbench.metrics.metric import Metric
 
-from .entry import Cost, Entry, Flag, Status
-from .entry_file import Verification
+from .entry import Cost, Entry, Flag, Status, Verification
 
 Floats = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ import bisect
 import functools
 import hashlib
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -70,7 +70,6 @@ def build(
     *,
     check: bool = False,
     registry: Registry | None = None,
-    report: Callable[[int], None] = lambda _: None,
 ) -> BuildResult:
     """Write the page and schema.json of a leaderboard's folder; files that are right stay untouched.
 
@@ -78,7 +77,6 @@ def build(
         board: the leaderboard's folder.
         check: write nothing, fail where a file would change.
         registry: where splits are described; ours when None.
-        report: told the entries read.
 
     Raises:
         UsageError: no leaderboard there.
@@ -86,7 +84,7 @@ def build(
         ChecksFailedError: an entry does not fit, or with ``check`` a file is stale.
         WorkFailedError: the disk is full or not writable.
     """
-    folder, held = Folder(board), collect(board, registry=registry, report=report)
+    folder, held = Folder(board), collect(board, registry=registry)
     links = {label: path for label, path in LINKS.items() if (folder.path / path).exists()}
     page = folder.path / PAGE
     if check and page.is_file():  # a copy of the folder elsewhere still has the links of where it was drawn

@@ -147,7 +147,11 @@ def submit(
     with mistakes:
         about = _about(headers, meta)
     with mistakes:
-        urls = _urls(meta, len(headers))
+        if meta.urls and len(meta.urls) != len(headers):
+            what, count = "addresses and files differ in number", len(headers)
+            fix = "give one address per file, in their order, or none"
+            raise UsageError(what, where="--url", expected=count, got=len(meta.urls), fix=fix)
+        urls = meta.urls or (None,) * len(headers)
     with mistakes:
         sources = require_weights(weights, headers)
     with mistakes:
@@ -181,7 +185,11 @@ def submit(
                 budget=header.budget,
             )
         )
-    _require_new([print_of(card.tallies[SUBMISSION]) for card in cards], paths, _prints(folder, others))
+    errors: dict[str, str] = {}  # what only the same predictions share, whatever they are called, and where
+    for scored in (scored for entry in others.values() for scored in entry.score_paths):
+        with suppress(UnreadableFileError):  # `leaderboard check` tells of those
+            errors[print_of(read_stored(folder.path / scored).scores.tallies)] = str(scored)
+    _require_new([print_of(card.tallies[SUBMISSION]) for card in cards], paths, errors)
     try:
         return _publish(place, about, cards, made, folder, outside, sources)
     except OSError as error:
@@ -234,16 +242,6 @@ def _seeds(headers: Sequence[Header]) -> tuple[int | None, ...]:
             fix="write them with submission.write(..., seed=0), seed=1 and so on",
         )
     return seeds
-
-
-def _urls(meta: Meta, count: int) -> Sequence[str | None]:
-    """Return the address of each file, None where none are given."""
-    if meta.urls and len(meta.urls) != count:
-        fix = "give one address per file, in their order, or none"
-        raise UsageError(
-            "addresses and files differ in number", where="--url", expected=count, got=len(meta.urls), fix=fix
-        )
-    return meta.urls or (None,) * count
 
 
 def _method(header: Header, meta: Meta) -> str:
@@ -302,15 +300,6 @@ def _require_new(prints: Sequence[str], paths: Sequence[Path], known: Mapping[st
             got = f"those of {found[print_]}"
             raise UsageError("the same predictions are there", where=str(path), got=got, fix=fix)
         found[print_] = str(path)
-
-
-def _prints(folder: Folder, others: Mapping[Path, Entry]) -> dict[str, str]:
-    """Return what only the same predictions share, whatever they are called, and where."""
-    found = {}
-    for path in (path for entry in others.values() for path in entry.score_paths):
-        with suppress(UnreadableFileError):  # `leaderboard check` tells of those
-            found[print_of(read_stored(folder.path / path).scores.tallies)] = str(path)
-    return found
 
 
 def _about(headers: Sequence[Header], meta: Meta) -> About:

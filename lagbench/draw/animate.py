@@ -10,9 +10,8 @@ from __future__ import annotations
 
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, cast
 
@@ -115,8 +114,7 @@ class Painter:
 
     def _dots(self, scene: Scene) -> Packed:
         """Draw a dot for every particle, cut off at the walls; later particles lie on earlier ones."""
-        margin = self._margin
-        walls = self._walls(scene)
+        margin, walls = self._margin, self._walls(scene)
         image = np.pad(walls, margin)
         shown = ((scene.position >= 0.0) & (scene.position <= 1.0)).all(axis=-1)
         x, y = scene.position[shown].T
@@ -283,9 +281,14 @@ def animate(
         recordings = [stack.enter_context(open_recording(item, registry=registry)) for item in sources]
         mixed = any(np.unique(recording.material).size > 1 for recording in recordings)
         film = _Film(recordings, Panel(kind or (Panel.MATERIAL if mixed else Panel.SPEED)))
-        numbers = range(0, min(recording.frames for recording in recordings), every)
+        numbers: Iterable[int] = range(0, min(recording.frames for recording in recordings), every)
         write = stack.enter_context(open_video(path, film.size, frames_per_second))
-        for frame in _counted(numbers, path, quiet=quiet):
+        if not quiet and watched():
+            from rich.console import Console
+            from rich.progress import track
+
+            numbers = track(numbers, description=path.name, console=Console(stderr=True), transient=True)
+        for frame in numbers:
             write(film.frame(frame))
     return path
 
@@ -301,29 +304,37 @@ def check_ending(path: Path) -> None:
         )
 
 
-def _counted(numbers: range, path: Path, *, quiet: bool) -> Iterator[int]:
-    """Yield frame numbers; show how far the work is where somebody can see it."""
-    if quiet or not watched():
-        yield from numbers
-        return
-    from rich.console import Console
-    from rich.progress import track
-
-    yield from track(numbers, description=path.name, console=Console(stderr=True), transient=True)
-
-
 class _Film:
     """Composes the frames: a still background, one painted panel per recording, a counter."""
 
     def __init__(self, recordings: Sequence[Recording], panel: Panel) -> None:
-        limit = max(_limit(recording, panel) for recording in recordings)
+        """Draw all that does not move: titles, names of the scenarios, colour bar or key."""
+        limit = 1.0
+        if panel is not Panel.MATERIAL:  # one scale that suits whole recordings
+            tops = []
+            for recording in recordings:
+                numbers = np.unique(np.linspace(0, recording.frames - 1, SAMPLES).astype(int)).tolist()
+                limits = [limit_of(panel, recording.scene(number)) for number in numbers]
+                # No vorticity is white: on the scale of the strongest frame most of a film would be pale.
+                tops.append(float(np.median(limits)) if panel is Panel.VORTICITY else max(limits))
+            limit = max(tops)
         self._recordings = recordings
         self._painters = [Painter(recording, panel, side=SIDE, limit=limit) for recording in recordings]
         self._lefts = [MARGIN + column * (SIDE + GAP) for column in range(len(recordings))]
-        width = self._lefts[-1] + SIDE + MARGIN
-        self.size = (width, TOP + SIDE + BOTTOM)
-        self._still = _background(recordings, panel, limit, self.size)
-        self._counter = _Counter.of(recordings[0], right=width - MARGIN)
+        width, height = self.size = (self._lefts[-1] + SIDE + MARGIN, TOP + SIDE + BOTTOM)
+        self._counter = _Counter(recordings[0], right=width - MARGIN)
+        with figure(width / DPI, height / DPI) as drawn:
+            title = " | ".join(dict.fromkeys(recording.title for recording in recordings))
+            drawn.text(MARGIN / width, 1 - 14 / height, title, fontsize=12, fontweight="bold", va="top")
+            for recording, left in zip(recordings, self._lefts, strict=True):
+                name = describe(recording)
+                drawn.text(left / width, 1 - (TOP - 12) / height, name, fontsize=9, color=MUTED)
+            below = drawn.add_axes((MARGIN / width, (BOTTOM - 24) / height, BAR / width, 10 / height))
+            if panel is Panel.MATERIAL:
+                material_key(below, np.concatenate([recording.material for recording in recordings]))
+            else:
+                colour_bar(below, panel, limit)
+            self._still = pixels_of(drawn)
 
     def frame(self, number: int) -> NDArray[np.uint8]:
         """Return one frame as RGB bytes, shape [row, column, 3]."""
@@ -334,63 +345,26 @@ class _Film:
         return image
 
 
-def _limit(recording: Recording, panel: Panel) -> float:
-    """Return a top of the colour scale that suits the whole recording."""
-    if panel is Panel.MATERIAL:
-        return 1.0
-    numbers = np.unique(np.linspace(0, recording.frames - 1, SAMPLES).astype(int))
-    limits = [limit_of(panel, recording.scene(int(number))) for number in numbers]
-    # No vorticity is white: on the scale of the strongest frame most of a film would be pale.
-    return float(np.median(limits)) if panel is Panel.VORTICITY else max(limits)
-
-
-def _background(
-    recordings: Sequence[Recording], panel: Panel, limit: float, size: tuple[int, int]
-) -> NDArray[np.uint8]:
-    """Return all that does not move: titles, names of the scenarios, colour bar or key."""
-    width, height = size
-    with figure(width / DPI, height / DPI) as drawn:
-        titles = dict.fromkeys(recording.title for recording in recordings)
-        drawn.text(
-            MARGIN / width, 1 - 14 / height, " | ".join(titles), fontsize=12, fontweight="bold", va="top"
-        )
-        for column, recording in enumerate(recordings):
-            left = (MARGIN + column * (SIDE + GAP)) / width
-            drawn.text(left, 1 - (TOP - 12) / height, describe(recording), fontsize=9, color=MUTED)
-        below = drawn.add_axes((MARGIN / width, (BOTTOM - 24) / height, BAR / width, 10 / height))
-        if panel is Panel.MATERIAL:
-            material_key(below, np.concatenate([recording.material for recording in recordings]))
-        else:
-            colour_bar(below, panel, limit)
-        return pixels_of(drawn)
-
-
-@dataclass(frozen=True)
 class _Counter:
     """Frame number and time at the bottom right, put together from digits drawn once."""
 
-    digits: dict[str, NDArray[np.uint8]]  # picture of each character, all of one size
-    right: int  # right end [pixel]
-    interval: float  # time between frames [s]
-    places: tuple[int, int]  # characters of the longest frame number and of the longest time
-
-    @staticmethod
-    def of(recording: Recording, *, right: int) -> _Counter:
-        """Return the counter of a recording."""
+    def __init__(self, recording: Recording, *, right: int) -> None:
+        """Draw the digits; the counter ends at a pixel."""
+        self._right = right
+        self._interval = recording.size.frame_interval
         last = recording.frames - 1
-        interval = recording.size.frame_interval
-        letters = {}
+        self._places = (len(str(last)), len(f"{last * self._interval:.2f}"))
+        self._digits = {}
         for letter in "0123456789.frames t=":
             with figure(DIGIT / DPI, LINE / DPI) as drawn:
                 drawn.text(0.5, 0.25, letter, fontsize=8.5, family="DejaVu Sans Mono", ha="center", color=INK)
-                letters[letter] = pixels_of(drawn)
-        return _Counter(letters, right, interval, (len(str(last)), len(f"{last * interval:.2f}")))
+                self._digits[letter] = pixels_of(drawn)
 
     def draw(self, image: NDArray[np.uint8], number: int) -> None:
         """Write the frame number and its time into an image."""
-        text = f"frame {number:>{self.places[0]}}  {number * self.interval:>{self.places[1]}.2f} s"
-        left = self.right - DIGIT * len(text)
+        text = f"frame {number:>{self._places[0]}}  {number * self._interval:>{self._places[1]}.2f} s"
+        left = self._right - DIGIT * len(text)
         top = TOP + SIDE + 12
         for letter in text:
-            image[top : top + LINE, left : left + DIGIT] = self.digits[letter]
+            image[top : top + LINE, left : left + DIGIT] = self._digits[letter]
             left += DIGIT

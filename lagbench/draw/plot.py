@@ -25,7 +25,6 @@ from .style import DPI, MUTED, figure, header, save
 
 if TYPE_CHECKING:
     import xarray as xr
-    from matplotlib.figure import Figure
 
 __all__ = ["KINDS", "Panel", "check_kind", "contact_sheet", "describe", "plot_frame", "scenario_files"]
 
@@ -103,14 +102,32 @@ def contact_sheet(
             fix=remedy(tier, root=folder),
         )
     panel = None if kind is None else Panel(kind)
-    kinds = _first_of_each_kind(files, splits)
+    found: dict[str, Path] = {}  # the first scenario of every family or pair
+    for path in files:
+        with open_recording(path, registry=splits) as recording:
+            named = [str(recording.parameters[n]) for n in KIND_PARAMETERS if n in recording.parameters]
+            if named and named[0]:
+                found.setdefault(named[0], path)
+    kinds = dict(sorted(found.items(), key=lambda item: item[1].name))
     sheet = _over_time(kinds, panel, splits) if kinds else _table(files, panel, frame, splits)
     columns = max(len(row) for row in sheet.rows)
-    width = 2 * RIM + columns * (CELL + CELL_GAP) - CELL_GAP
+    width = max(2 * RIM + columns * (CELL + CELL_GAP) - CELL_GAP, 5.0)
     height = HEAD + len(sheet.rows) * (CELL + LABEL + CELL_GAP) + FOOT
-    with figure(max(width, 5.0), height, dpi=dpi) as drawn:
+    with figure(width, height, dpi=dpi) as drawn:
         header(drawn, f"{splits.split(tier.split).title} · {tier.split} {size}", sheet.subtitle, left=RIM)
-        _draw_sheet(drawn, sheet)
+        for row, cells in enumerate(sheet.rows):
+            for column, cell in enumerate(cells):
+                left = RIM + column * (CELL + CELL_GAP)
+                bottom = height - HEAD - (row + 1) * (CELL + LABEL + CELL_GAP) + CELL_GAP
+                axes = drawn.add_axes((left / width, bottom / height, CELL / width, CELL / height))
+                axes.set_title(cell.label, fontsize=7.5, color=MUTED, pad=2.5)
+                draw(axes, sheet.panel, cell.scene, limit=cell.limit, detail=0.0)
+        below = drawn.add_axes((RIM / width, 0.42 / height, 2.6 / width, 0.09 / height))
+        if sheet.panel is Panel.MATERIAL:
+            shown = [cell.scene.recording.material for row in sheet.rows for cell in row]
+            material_key(below, np.concatenate(shown))
+        else:
+            colour_bar(below, sheet.panel, sheet.limit, label=sheet.unit)
         return save(drawn, output)
 
 
@@ -118,19 +135,6 @@ def scenario_files(size: Size, root: Path) -> list[Path]:
     """Return the scenario files that are there: train, valid, test, extra, each by id."""
     paths = (size.path(root, i) for ids in size.subsets.values() for i in sorted(ids))
     return [path for path in paths if path.is_file()]
-
-
-def _first_of_each_kind(files: Sequence[Path], splits: Registry) -> dict[str, Path]:
-    """Return the first scenario of every family or pair, in order of appearance."""
-    found: dict[str, Path] = {}
-    for path in files:
-        with open_recording(path, registry=splits) as recording:
-            kinds = [
-                str(recording.parameters[name]) for name in KIND_PARAMETERS if name in recording.parameters
-            ]
-            if kinds and kinds[0]:
-                found.setdefault(kinds[0], path)
-    return dict(sorted(found.items(), key=lambda item: item[1].name))
 
 
 def _over_time(kinds: dict[str, Path], panel: Panel | None, splits: Registry) -> _Sheet:
@@ -192,22 +196,6 @@ def _name(scene: Scene) -> str:
     return str(recording.scenario)
 
 
-def _draw_sheet(drawn: Figure, sheet: _Sheet) -> None:
-    width, height = drawn.get_size_inches()
-    for row, cells in enumerate(sheet.rows):
-        for column, cell in enumerate(cells):
-            left = RIM + column * (CELL + CELL_GAP)
-            bottom = height - HEAD - (row + 1) * (CELL + LABEL + CELL_GAP) + CELL_GAP
-            axes = drawn.add_axes((left / width, bottom / height, CELL / width, CELL / height))
-            axes.set_title(cell.label, fontsize=7.5, color=MUTED, pad=2.5)
-            draw(axes, sheet.panel, cell.scene, limit=cell.limit, detail=0.0)
-    below = drawn.add_axes((RIM / width, 0.42 / height, 2.6 / width, 0.09 / height))
-    if sheet.panel is Panel.MATERIAL:
-        material_key(below, np.concatenate([c.scene.recording.material for row in sheet.rows for c in row]))
-    else:
-        colour_bar(below, sheet.panel, sheet.limit, label=sheet.unit)
-
-
 ALL = "all"
 KINDS = (ALL, *(str(panel) for panel in Panel))
 """What :func:`plot_frame` can draw."""
@@ -252,15 +240,13 @@ def plot_frame(
     with open_recording(source, registry=registry) as recording:
         scene = recording.scene(frame)
     mixed = np.unique(recording.material).size > 1
-    three = [Panel.SPEED, Panel.VORTICITY, Panel.STREAMLINES]
-    if mixed:
-        three = [Panel.MATERIAL, Panel.SPEED, Panel.VORTICITY]
+    three = [Panel.SPEED, Panel.VORTICITY]
+    three = [Panel.MATERIAL, *three] if mixed else [*three, Panel.STREAMLINES]
     panels = three if kind == ALL else [Panel(kind)]
-    width = 2 * MARGIN + len(panels) * SIDE + (len(panels) - 1) * GAP
-    with figure(width, TOP + SIDE + BAR, dpi=dpi) as drawn:
-        single = len(panels) == 1
+    width, height = 2 * MARGIN + len(panels) * SIDE + (len(panels) - 1) * GAP, TOP + SIDE + BAR
+    with figure(width, height, dpi=dpi) as drawn:
         subtitle = describe(recording)
-        if not single:
+        if len(panels) > 1:
             # frame and time, and which walls move, which way, how fast
             said = [subtitle, f"frame {scene.frame}", f"t = {scene.time:.2f} s"]
             for wall, v in moving_walls(recording, scene.frame):
@@ -268,7 +254,18 @@ def plot_frame(
                 said.append(f"{WALLS[wall]} wall moves {way} at {np.abs(v).max():.3g} length/s")
             subtitle = SEPARATOR.join(said)
         header(drawn, recording.title, subtitle, left=MARGIN)
-        _draw_panels(drawn, panels, scene)
+        for column, panel in enumerate(panels):
+            left = (MARGIN + column * (SIDE + GAP)) / width
+            axes = drawn.add_axes((left, BAR / height, SIDE / width, SIDE / height))
+            moment = f" at frame {scene.frame}, t = {scene.time:.2f} s" if len(panels) == 1 else ""
+            axes.set_title(TITLES[panel] + moment)
+            limit = limit_of(panel, scene)
+            draw(axes, panel, scene, limit=limit)
+            below = drawn.add_axes((left, (BAR - 0.2) / height, SIDE / width, 0.09 / height))
+            if panel is Panel.MATERIAL:
+                material_key(below, recording.material)
+            else:
+                colour_bar(below, panel, limit)
         return save(drawn, output)
 
 
@@ -279,19 +276,3 @@ def describe(recording: Recording) -> str:
         parts.append(f"Re {recording.reynolds:.0f}")
     parts += [f"{name} {recording.parameters[name]}" for name in MARKS if name in recording.parameters]
     return SEPARATOR.join(parts)
-
-
-def _draw_panels(drawn: Figure, panels: Sequence[Panel], scene: Scene) -> None:
-    width, height = drawn.get_size_inches()
-    for column, panel in enumerate(panels):
-        left = (MARGIN + column * (SIDE + GAP)) / width
-        axes = drawn.add_axes((left, BAR / height, SIDE / width, SIDE / height))
-        moment = f" at frame {scene.frame}, t = {scene.time:.2f} s" if len(panels) == 1 else ""
-        axes.set_title(TITLES[panel] + moment)
-        limit = limit_of(panel, scene)
-        draw(axes, panel, scene, limit=limit)
-        below = drawn.add_axes((left, (BAR - 0.2) / height, SIDE / width, 0.09 / height))
-        if panel is Panel.MATERIAL:
-            material_key(below, scene.recording.material)
-        else:
-            colour_bar(below, panel, limit)

@@ -90,10 +90,9 @@ class Recording:
         self._present = np.isfinite(read("position", 0)).all(axis=-1)
         # material of each particle, shape [particle]
         self.material = read("material", slice(None))[self._present].astype(np.int8)
-        moving = "wall_velocity" in variables
         # [length/s], shape [frame, wall, 2]; zeros where the file has none
         self.wall_velocity = np.zeros((frames, 4, 2))
-        if moving:
+        if "wall_velocity" in variables:
             self.wall_velocity[:] = read("wall_velocity", slice(frames))
         self._mass = float(read("particle_mass", slice(None)))
 

@@ -12,8 +12,7 @@ from lagbench.metrics.metric import Direction, mean
 from lagbench.metrics.vorticity import STABLE_PEARSON
 
 from .chart import Bar, Plot, Scale, bar_chart, linear, spanning
-from .html import Markup, clipped, html, join, quantity, sentence, tag, text, words
-from .page import Figure, key, table
+from .html import Figure, Markup, clipped, html, join, key, quantity, sentence, table, tag, text, words
 from .subject import Gallery, Moment, Row, Subject, kind_of
 
 Floats = NDArray[np.float64]

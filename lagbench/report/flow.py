@@ -16,10 +16,8 @@ from numpy.typing import NDArray
 
 from lagbench.data.grid import Fields
 
-from .html import Markup, join, path_data, tag
-from .maps import limit_of
-from .page import SIDE, Figure, grid, ramp, vector
-from .subject import Gallery, Subject
+from .html import SIDE, Figure, Markup, grid, join, path_data, ramp, tag, vector
+from .subject import Gallery, Subject, limit_of
 
 Floats = NDArray[np.float64]
 
@@ -166,7 +164,7 @@ def _figures(
             for (what, velocity), (_, panels) in zip(fields.items(), rows, strict=False):
                 drawn = draw(subject, moment.truth.fields, velocity, limit)
                 alt = f"{what}, frame {moment.frame}"
-                panels.append(vector(drawn, gallery.walls[scenario], alt))
+                panels.append(vector(drawn, gallery.walls[scenario].classes, alt))
         yield Figure(
             name=f"{name}-{entry.number}",
             title=f"{title} over time: {entry.name}",

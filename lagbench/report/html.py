@@ -3,13 +3,16 @@
 >>> tag("p", "a < b", tag("b", "!"), class_="note")
 '<p class="note">a &lt; b<b>!</b></p>'
 
-Numbers and names of metrics as readers like them: few digits, real minus signs, words.
+Numbers and names of metrics as readers like them: few digits, real minus signs, words. Figures and what
+stands in them: keys, tables, and panels side by side, in rows of truth, predictions and differences.
 """
 
 from __future__ import annotations
 
+import base64
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from unicodedata import east_asian_width
 
 from lagbench.metrics.metric import Metric
@@ -190,3 +193,77 @@ def quantity(metric: Metric) -> str:
 def sentence(metric: Metric) -> str:
     """Return what a metric says, its unit and where it is defined, as one sentence."""
     return f"{metric.summary[0].upper()}{metric.summary[1:]}{unit(metric)} ({metric.source})."
+
+
+@dataclass(frozen=True, kw_only=True)
+class Figure:
+    """One figure."""
+
+    name: str  # identifier, unique on the page
+    title: str  # what it shows, a few words
+    thesis: str  # the figure of the thesis that it corresponds to, as in "Fig. 5.10"
+    body: Markup  # the drawing, with its key
+    caption: Markup  # what it shows, units, how to read it
+    wide: bool = False  # whether it takes the whole width
+    data: Markup | None = None  # its numbers as a table, where that is cheap
+
+
+def key(items: Sequence[tuple[str, str]], *, kind: str = "line") -> Markup:
+    """Return what the marks of a figure mean."""
+    drawn = []
+    for mark, name in items:
+        swatch = tag("path", d="M1 5H21", class_=f"line {mark}")
+        if kind == "square":
+            swatch = tag("rect", x=5, y=0, width=12, height=10, rx=2, class_=f"bar {mark}")
+        shown = tag("svg", swatch, viewBox="0 0 22 10", class_="swatch", aria_hidden="true")
+        drawn.append(tag("li", shown, tag("span", name)))
+    return tag("ul", *drawn, class_="key")
+
+
+def table(
+    head: Sequence[object], rows: Sequence[Sequence[object]], *, kind: str = "", label: str = ""
+) -> Markup:
+    """Return a table in a box of its own that scrolls when it is wider than the page."""
+    headings = tag("tr", *(tag("th", cell, scope="col") for cell in head))
+    body = [tag("tr", tag("th", row[0], scope="row"), *(tag("td", cell) for cell in row[1:])) for row in rows]
+    drawn = tag("table", tag("thead", headings), tag("tbody", *body), class_=kind or None)
+    return tag("div", drawn, class_="scroll", role="region", aria_label=label or None, tabindex=0)
+
+
+def paragraph(*parts: object) -> Markup:
+    """Return a paragraph."""
+    return tag("p", join(parts))
+
+
+SIDE = 200  # side of the coordinates of a vector panel
+
+
+def grid(
+    columns: Sequence[object], rows: Sequence[tuple[str, Sequence[Markup]]], *, width: float = 6.6
+) -> Markup:
+    """Return panels in a grid that scrolls sideways on narrow screens."""
+    cells = [tag("span"), *(tag("span", column, class_="time") for column in columns)]
+    for name, panels in rows:
+        cells += [tag("span", name, class_="side"), *panels]
+    tracks = f"grid-template-columns:minmax(5.2rem,6.5rem) repeat({len(columns)},minmax({width}rem,1fr))"
+    return tag("div", tag("div", *cells, class_="panels", style=tracks), class_="scroll", tabindex=0)
+
+
+def image(png: bytes, kind: str, alt: str, *, smooth: bool = False) -> Markup:
+    """Return a panel, of classes that tell moving walls, that shows a picture of the inside of the box."""
+    source = "data:image/png;base64," + base64.b64encode(png).decode("ascii")
+    shown = tag("img", src=source, alt=alt, class_="smooth" if smooth else None)
+    return tag("span", shown, class_=kind)
+
+
+def vector(drawn: Markup, kind: str, alt: str) -> Markup:
+    """Return a panel of lines in coordinates from 0 to 200."""
+    svg = tag("svg", tag("title", alt), drawn, viewBox=f"0 0 {SIDE} {SIDE}", class_="flow", role="img")
+    return tag("span", svg, class_=kind)
+
+
+def ramp(kind: str, limit: float, unit: str, *, signed: bool = False) -> Markup:
+    """Return the key of a colour scale."""
+    low = f"−{text(limit)}" if signed else "0"
+    bar = tag("span", class_=f"ramp {kind}")
+    return tag("p", join([low, bar, text(limit)], " "), tag("span", unit, class_="muted"), class_="scale")

@@ -18,9 +18,8 @@ from lagbench.draw.style import MATERIAL_COLOURS, rgb
 from lagbench.metrics.frame import FramePair, Snapshot
 from lagbench.scoring.task import ScoredTask
 
-from .html import Markup, join, tag
-from .page import Figure, grid, image, key, ramp
-from .subject import Gallery, Moment, Subject, Walls
+from .html import Figure, Markup, grid, image, join, key, ramp, tag
+from .subject import Gallery, Moment, Subject, Walls, limit_of
 
 Floats = NDArray[np.float64]
 
@@ -80,9 +79,6 @@ def _ramp(below: str, above: str) -> Bytes:
 _DIVERGING, _SEQUENTIAL = _ramp(CLOCKWISE, COUNTER), _ramp(FAST, FAST)
 
 
-TOP = 99.5  # full colour is the percentile of the truth's magnitudes
-
-
 def inside(task: ScoredTask, field: Floats) -> Floats:
     """Return the nodes of a field that lie within the walls, shape [x node, y node]."""
     grid_ = task.setting.grid
@@ -91,13 +87,6 @@ def inside(task: ScoredTask, field: Floats) -> Floats:
         room = 0.26 * grid_.spacing  # nodes on a wall are seen, those in it are not
         kept.append((grid_.axis >= low - room) & (grid_.axis <= high + room))
     return field[np.ix_(*kept)]
-
-
-def limit_of(fields: Sequence[Floats]) -> float:
-    """Return the magnitude of full colour: what almost all nodes stay below."""
-    values = np.concatenate([np.abs(field[np.isfinite(field)]) for field in fields])
-    top = float(np.percentile(values, TOP)) if values.size else 0.0
-    return top if np.isfinite(top) and top > 0.0 else 1.0
 
 
 def field_figure(subject: Subject, gallery: Gallery) -> Figure:
@@ -115,7 +104,7 @@ def field_figure(subject: Subject, gallery: Gallery) -> Figure:
     def pictures(what: str, fields: Sequence[Floats], limit: float, *, signed: bool) -> list[Markup]:
         draw = diverging if signed else sequential
         return [
-            image(draw(inside(subject.task, f), limit), walls, f"{what} of {n}, frame {frame}")
+            image(draw(inside(subject.task, f), limit), walls.classes, f"{what} of {n}, frame {frame}")
             for n, f in zip(names, fields, strict=True)
         ]
 
@@ -146,7 +135,7 @@ def vorticity_figure(subject: Subject, gallery: Gallery) -> Figure:
     limit = limit_of([moment.true_vorticity for moment in moments])
 
     def picture(field: Floats, what: str, frame: int) -> Markup:
-        return image(diverging(inside(subject.task, field), limit), walls, f"{what}, frame {frame}")
+        return image(diverging(inside(subject.task, field), limit), walls.classes, f"{what}, frame {frame}")
 
     rows = [("truth", [picture(m.true_vorticity, "true vorticity", m.frame) for m in moments])]
     for i, entry in enumerate(subject.entries):
@@ -179,7 +168,7 @@ def scenario_figure(subject: Subject, gallery: Gallery) -> Figure:
         return [
             image(
                 diverging(inside(subject.task, field), limit),
-                gallery.walls[moment.scenario],
+                gallery.walls[moment.scenario].classes,
                 f"{what}, scenario {moment.scenario}",
             )
             for field, limit, moment in zip(fields, limits, moments, strict=True)
@@ -259,7 +248,7 @@ def _panel(subject: Subject, gallery: Gallery, moment: Moment, snapshot: Snapsho
     material, area = moment.setting_of.material, moment.setting_of.area
     spacing = float(np.sqrt(area / len(material)))
     png = paint(snapshot.position, material, subject.task.size.bounds, spacing)
-    return image(png, gallery.walls[moment.scenario], f"{what}, frame {moment.frame}", smooth=True)
+    return image(png, gallery.walls[moment.scenario].classes, f"{what}, frame {moment.frame}", smooth=True)
 
 
 def paint(

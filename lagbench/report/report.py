@@ -1,8 +1,14 @@
-"""Compose the report and write it."""
+"""Compose the report and write it: one HTML file with a table of contents, sections and numbered figures.
+
+Nothing in it is fetched from anywhere: styles, drawings and pictures stand in the file, there
+is no script, and a content security policy forbids the browser to ask for more.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.resources import files
 from pathlib import Path
 
 from lagbench.atomic import write_atomically
@@ -10,11 +16,22 @@ from lagbench.data.registry import Registry
 from lagbench.scoring.card import ScoreCard
 
 from . import curves, flow, maps, tables
-from .html import Markup, join, tag, words
-from .page import Figure, Section, document, paragraph
+from .html import Figure, Markup, join, paragraph, tag, words
 from .subject import Subject, open_gallery, subject_of
 
 FILE_NAME = "index.html"
+
+POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
+
+
+@dataclass(frozen=True)
+class Section:
+    """A stretch of the page."""
+
+    name: str  # identifier, unique on the page
+    title: str  # its heading
+    lead: str  # what stands before the figures: markup, or the text of a paragraph
+    figures: Sequence[Figure] = ()
 
 
 def write_report(
@@ -66,38 +83,29 @@ def render(subject: Subject) -> str:
     ]
     now, over_time = curves.histogram_figures(subject, gallery)
     bars = list(curves.bar_figures(subject))
-    vorticity = _section(
-        "vorticity",
-        "Vorticity",
-        "Where the flow rotates, how strongly, and how the prediction differs.",
-        maps.field_figure(subject, gallery),
-        *(now, *bars[:1], over_time, *bars[1:]),
-        *curves.residual_figures(subject, gallery),
-    )
+    fields = [maps.field_figure(subject, gallery), now, *bars[:1], over_time, *bars[1:]]
+    fields += curves.residual_figures(subject, gallery)
+    said = "Where the flow rotates, how strongly, and how the prediction differs."
+    vorticity = Section("vorticity", "Vorticity", said, fields)
     if subject.full_box:
-        motion = _section(
-            "flow",
-            "The flow over time",
-            "Truth and prediction as fields on the score grid.",
-            maps.vorticity_figure(subject, gallery),
-            *flow.arrow_figures(subject, gallery),
-            *flow.stream_figures(subject, gallery),
-            maps.scenario_figure(subject, gallery),
-        )
+        arrows, streams = flow.arrow_figures(subject, gallery), flow.stream_figures(subject, gallery)
+        over_time, every = maps.vorticity_figure(subject, gallery), maps.scenario_figure(subject, gallery)
+        said = "Truth and prediction as fields on the score grid."
+        motion = Section("flow", "The flow over time", said, [over_time, *arrows, *streams, every])
     else:
         figures = [*maps.particle_figures(subject, gallery), *curves.body_curves(subject)]
         said = "What the particles do: truth above, predictions below."
-        motion = _section("particles", "Particles", said, *figures)
+        motion = Section("particles", "Particles", said, figures)
     means = "Means over the horizon and the test scenarios, with 95 % intervals; bold is best."
     errors = [*curves.method_curves(subject), *curves.error_curves(subject)]
-    energy = curves.energy_curves(subject)
+    energy = [*curves.energy_curves(subject)]
     sections = [
-        _section("scores", "Scores", join(scores)),
-        _section("rollout", "Error over the rollout", "How the error grows from frame to frame.", *errors),
+        Section("scores", "Scores", join(scores)),
+        Section("rollout", "Error over the rollout", "How the error grows from frame to frame.", errors),
         *([vorticity, motion] if subject.full_box else [motion, vorticity]),
-        _section("energy", "Energy", "Whether the motion is damped, kept or fed.", *energy),
-        _section("metrics", "Every metric", join([paragraph(means), tables.every_metric(subject)])),
-        _section("identity", "What was scored", tables.identity(subject)),
+        Section("energy", "Energy", "Whether the motion is damped, kept or fed.", energy),
+        Section("metrics", "Every metric", join([paragraph(means), tables.every_metric(subject)])),
+        Section("identity", "What was scored", tables.identity(subject)),
     ]
     foot = paragraph(
         "Intervals are 95 % bootstrap intervals over test scenarios. Velocity and vorticity are per frame;"
@@ -106,5 +114,45 @@ def render(subject: Subject) -> str:
     return document(tables.title(subject), tables.head(subject), sections, foot)
 
 
-def _section(name: str, title: str, lead: str, *figures: Figure) -> Section:
-    return Section(name, title, lead if isinstance(lead, Markup) else paragraph(lead), figures)
+def document(title: str, head: Markup, sections: Sequence[Section], foot: Markup) -> str:
+    """Return the page."""
+    links = [tag("li", tag("a", section.title, href=f"#part-{section.name}")) for section in sections]
+    contents = tag("nav", tag("ol", *links), class_="contents", aria_label="Contents")
+    first = 1
+    written = []
+    for section in sections:
+        written.append(_section(section, first))
+        first += len(section.figures)
+    body = [
+        tag("header", head),
+        tag("div", contents, tag("main", *written), class_="columns"),
+        tag("footer", foot),
+    ]
+    meta = [
+        tag("meta", charset="utf-8"),
+        tag("meta", http_equiv="Content-Security-Policy", content=POLICY),
+        tag("meta", name="viewport", content="width=device-width, initial-scale=1"),
+        tag("meta", name="color-scheme", content="light dark"),
+        tag("meta", name="referrer", content="no-referrer"),
+        tag("title", title),
+        tag("link", rel="icon", href="data:,"),
+        tag("style", Markup(files(__package__).joinpath("style.css").read_text("utf-8"))),
+    ]
+    whole = tag("html", tag("head", *meta), tag("body", *body), lang="en")
+    return f"<!DOCTYPE html>\n{whole}\n"
+
+
+def _section(section: Section, first: int) -> Markup:
+    figures = []
+    for number, figure in enumerate(section.figures, first):
+        heading = tag("h3", tag("span", f"Figure {number}", class_="number"), " ", figure.title)
+        source = tag("span", f"thesis {figure.thesis}", class_="thesis")
+        numbers = tag("details", tag("summary", "Numbers"), figure.data, class_="numbers")
+        parts = [heading, figure.body, tag("figcaption", tag("p", figure.caption, " ", source))]
+        kind = "figure wide" if figure.wide else "figure"
+        drawn = tag("figure", *parts, numbers if figure.data else "", id=figure.name, class_=kind)
+        figures.append(join([drawn, "\n"]))
+    grid = tag("div", *figures, class_="figures") if figures else ""
+    heading = tag("h2", section.title)
+    lead = section.lead if isinstance(section.lead, Markup) else paragraph(section.lead)
+    return join([tag("section", heading, lead, grid, id=f"part-{section.name}", class_="part"), "\n"])

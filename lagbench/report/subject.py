@@ -33,6 +33,8 @@ OTHER_FRAME = 60
 
 TIMES = 6  # columns of the pictures over time
 
+TOP = 99.5  # full colour of pictures is the percentile of the truth's magnitudes
+
 SAME = ("split", "size", "dataset_version", "dataset_sha256")
 
 
@@ -208,8 +210,8 @@ class Walls:
 
     @property
     def classes(self) -> str:
-        """Classes of a panel whose walls move."""
-        return " ".join(f"{wall}-moves" for wall in self.moving)
+        """Classes of a panel, which tell the walls that move."""
+        return " ".join(["panel", *(f"{wall}-moves" for wall in self.moving)])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -272,6 +274,13 @@ def open_gallery(subject: Subject) -> Gallery:
                         pairs.append(FramePair(scenario, frame, true, scenario.snapshot(now, before)))
                     moments[number, frame] = Moment(scenario=number, frame=frame, pairs=tuple(pairs))
     return Gallery(moments, walls)
+
+
+def limit_of(fields: Sequence[NDArray[np.float64]]) -> float:
+    """Return the magnitude of full colour: what almost all nodes stay below."""
+    values = np.concatenate([np.abs(field[np.isfinite(field)]) for field in fields])
+    top = float(np.percentile(values, TOP)) if values.size else 0.0
+    return top if np.isfinite(top) and top > 0.0 else 1.0
 
 
 def _walls(truth: OpenScenario) -> Walls:

@@ -18,9 +18,8 @@ from lagbench.metrics.significance import FEWEST_SCENARIOS, compare, standings
 from lagbench.metrics.table import CHOSEN, FAMILIES
 from lagbench.metrics.vorticity import STABLE_PEARSON
 
-from .html import Markup, html, interval, join, tag, text, unit, words
+from .html import Markup, html, interval, join, paragraph, table, tag, text, unit, words
 from .html import unit as unit_of
-from .page import paragraph, table
 from .subject import Row, Subject
 
 AT_FRAMES = ("vorticity_mae", "vorticity_mse", "vorticity_rmse", "vorticity_pearson", "vorticity_kl")
