@@ -28,7 +28,6 @@ from lagbench.errors import UnreadableFileError, UsageError
 from .metadata import Format, materials_of
 from .trajectory import Trajectory, check_array, check_inflation
 
-ENDING = ".npz"
 JOINT = "gns_data"  # key under which some files hold all trajectories together
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 """Time of every member: the earliest that zip knows, so that equal data give equal bytes."""
