@@ -36,15 +36,12 @@ from .metadata import (
     parse_format,
     write_metadata,
 )
-from .trajectory import Box
+from .trajectory import Box, Run
 
 FORCE = "force.py"  # name of the program beside the data that LagrangeBench would run
 
 LAYERS = 3  # layers of particles of a wall, as LagrangeBench's own lid-driven cavity has them
 ALONG = (1, 1, 0, 0)  # axis along each wall: left, right, bottom, top
-
-Run = tuple[int, Callable[[int], NDArray[np.float32]], NDArray[np.int64]]
-"""Frames of a trajectory, what returns the positions of one of them, and the kind of each particle."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,11 +129,9 @@ def export(
     for subset, files in frames_of.items():
         target, runs = folder / f"{subset}{ending}", _runs(files, form, tier.frame_interval, walls)
         if form is Format.GNS_NPZ:
-            shapes[subset] = []
-            gns_npz.write(target, _whole(runs, shapes[subset]))
+            shapes[subset] = gns_npz.write(target, runs)
         else:
-            length = min(files.values())
-            shapes[subset] = _write_h5(target, runs, length=length, origin=origin)
+            shapes[subset] = _write_h5(target, runs, length=min(files.values()), origin=origin)
         meter.count(1, scenarios=len(files))
     metadata = describe(
         tier,
@@ -241,18 +236,6 @@ def _with_walls(
     file: ScenarioFile, walls: WallParticles, travel: NDArray[np.float64], frame: int
 ) -> NDArray[np.float32]:
     return np.concatenate([file.read("position", frame), walls.place(travel[frame])])
-
-
-def _whole(
-    runs: Iterator[Run], shapes: list[tuple[int, int]]
-) -> Iterator[tuple[NDArray[np.float32], NDArray[np.int64]]]:
-    """Yield positions [frame, particle, 2] and kinds of each run; note its shape."""
-    for frames, position, kinds in runs:
-        shapes.append((frames, len(kinds)))
-        whole = np.empty((frames, len(kinds), 2), np.float32)
-        for number in range(frames):
-            whole[number] = position(number)
-        yield whole, kinds
 
 
 def _write_h5(

@@ -26,7 +26,7 @@ from lagbench.atomic import atomic_path
 from lagbench.errors import UnreadableFileError, UsageError
 
 from .metadata import Format, materials_of
-from .trajectory import Trajectory, check_array, check_inflation
+from .trajectory import Run, Trajectory, check_array, check_inflation
 
 JOINT = "gns_data"  # key under which some files hold all trajectories together
 _EPOCH = (1980, 1, 1, 0, 0, 0)
@@ -40,23 +40,28 @@ _PARTS = 3  # parts of a trajectory at the most: positions, kinds, a material pr
 _DEPTH = 3  # how deep arrays may lie in each other: trajectories in a joint array, parts, and a spare
 
 
-def write(path: Path, runs: Iterable[tuple[NDArray[np.float32], NDArray[np.int64]]]) -> None:
-    """Write positions and kinds of one subset's trajectories; the file appears whole or not at all.
+def write(path: Path, runs: Iterable[Run]) -> list[tuple[int, int]]:
+    """Write one subset, whole or not at all; return frames and particles of each trajectory.
 
     Members are stored uncompressed, as ``numpy.savez`` stores them: compressed bytes would
     change with the version of zlib. One trajectory is in memory at a time.
     """
+    shapes: list[tuple[int, int]] = []
     with atomic_path(path, option="--output") as temporary, zipfile.ZipFile(temporary, "w") as archive:
-        for number, parts in enumerate(runs):
+        for frames, position, kinds in runs:
             pair = np.empty(2, dtype=object)
-            pair[0], pair[1] = parts
-            member = zipfile.ZipInfo(f"simulation_{number}.npy", date_time=_EPOCH)
+            pair[0], pair[1] = np.empty((frames, len(kinds), 2), np.float32), kinds
+            for number in range(frames):
+                pair[0][number] = position(number)
+            member = zipfile.ZipInfo(f"simulation_{len(shapes)}.npy", date_time=_EPOCH)
             member.external_attr = 0o644 << 16
             with archive.open(member, "w", force_zip64=True) as stream:
                 np.lib.format.write_array_header_1_0(
                     stream, {"descr": "|O", "fortran_order": False, "shape": (2,)}
                 )
                 pickle.dump(pair, stream, protocol=4)
+            shapes.append((frames, len(kinds)))
+    return shapes
 
 
 def trajectories(path: Path, *, allow_pickle: bool, kinds: Mapping[int, str]) -> Iterator[Trajectory]:

@@ -27,6 +27,9 @@ Array = NDArray[np.floating]
 Frame = tuple[Array, Array | None]
 """Positions [length of the source] and, where the source has them, velocities [its length/s]."""
 
+Run = tuple[int, Callable[[int], NDArray[np.float32]], NDArray[np.int64]]
+"""Frames of a trajectory, what returns the positions of one of them, and the kind of each particle."""
+
 Box = tuple[tuple[float, float], tuple[float, float]]
 """Low and high walls along x and y."""
 
