@@ -228,6 +228,11 @@ class Sheet:
     tables: tuple[Table, ...] = ()
     pictures: Mapping[str, bytes] = field(default_factory=dict)  # PNG files by what is added to their name
 
+    @property
+    def text(self) -> str:
+        """Notes and tables as Markdown."""
+        return "\n\n".join([*self.notes, *(table(held.columns, held.rows) for held in self.tables)])
+
 
 def write_sheet(sheet: Sheet, folder: Path, name: str, head: str) -> str:
     """Write ``<name>.md``, ``<name>[-n].csv`` and pictures; return the Markdown, which the head opens."""
