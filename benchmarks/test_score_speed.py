@@ -12,9 +12,6 @@ against our sixty.
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -25,6 +22,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import griddata
 from scipy.stats import entropy, pearsonr
 from score_data import ScoreData, make_score_data
+from timing import measured_apart
 
 from lagbench.scoring.task import load_scored_task
 
@@ -61,9 +59,7 @@ print(json.dumps({
 
 def run_ours(folder: Path, workers: int) -> dict[str, float]:
     """Score in a fresh process; return its time, processor time and memory."""
-    command = [sys.executable, "-c", CHILD, str(folder), str(workers)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    return dict(json.loads(done.stdout))
+    return dict(measured_apart("-c", CHILD, str(folder), str(workers)))
 
 
 def naive_scores(truth: Path, predictions: Path, row: int, first: int, frames: int) -> dict[str, float]:

@@ -11,9 +11,6 @@ Memory is that of a fresh process that has read from twice as many scenarios.
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -25,6 +22,7 @@ import yaml
 from numpy.typing import NDArray
 from pytest_benchmark.fixture import BenchmarkFixture
 from score_data import write_scenario
+from timing import measured_apart
 from torch.utils.data import DataLoader
 
 import lagbench
@@ -194,14 +192,12 @@ def test_memory_is_flat(root: Path, tmp_path: Path) -> None:
     few = tmp_path / "few"
     few.mkdir()
     write_ours(few, FEW)
-    peaks = [_peak(folder, windows) for folder, windows in ((few, 4100), (root, 7000))]
+    peaks = [
+        float(measured_apart("-c", CHILD, str(folder), str(count)))
+        for folder, count in ((few, 4100), (root, 7000))
+    ]
     print(f"\npeak memory, {FEW} scenarios: {peaks[0] / 1e6:.0f} MB; {SCENARIOS}: {peaks[1] / 1e6:.0f} MB")
     assert peaks[1] <= 1.05 * peaks[0]
-
-
-def _peak(root: Path, windows: int) -> float:
-    command = [sys.executable, "-c", CHILD, str(root), str(windows)]
-    return float(json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout))
 
 
 def test_npz_in_memory(tmp_path: Path) -> None:
