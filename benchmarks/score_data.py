@@ -30,17 +30,11 @@ BOX = (0.0625, 0.875)
 
 @dataclass(frozen=True)
 class ScoreData:
-    """Where the data set and the submission are.
+    """Where the data set and the submission are."""
 
-    Attributes:
-        root: folder of all data sets.
-        registry: registry that describes this one.
-        predictions: a predictions.nc.
-    """
-
-    root: Path
-    registry: Registry
-    predictions: Path
+    root: Path  # folder of all data sets
+    registry: Registry  # registry that describes this one
+    predictions: Path  # a predictions.nc
 
 
 def make_score_data(folder: Path, *, horizon: int = 90) -> ScoreData:
