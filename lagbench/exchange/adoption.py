@@ -129,7 +129,12 @@ def import_split(
             fix=next(there, None),
         )
     if form is Format.GNS_NPZ and not allow_pickle:
-        next(gns_npz.trajectories(files["train"], allow_pickle=False, kinds={}))
+        raise UsageError(
+            "the trajectories in this format are pickled objects",
+            where=str(files["train"]),
+            expected="leave to rebuild them",
+            fix="add --allow-pickle: arrays are rebuilt, any other call in the file is refused",
+        )
     stated = read_source(folder, form)
     hints = stated.hints
     if wishes.keys() & {"input_frames", "horizon"}:  # the frames belong to the exported task
@@ -160,7 +165,7 @@ def import_split(
 
     def read(path: Path) -> Iterator[Trajectory]:
         if form is Format.GNS_NPZ:
-            return gns_npz.trajectories(path, allow_pickle=allow_pickle, kinds=given)
+            return gns_npz.trajectories(path, given)
         return _h5_trajectories(path, given, stated)
 
     subsets = {subset: read(path) for subset, path in files.items()}

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.atomic import atomic_path
-from lagbench.errors import UnreadableFileError, UsageError
+from lagbench.errors import UnreadableFileError
 
 from .metadata import Format, materials_of
 from .trajectory import Run, Trajectory, check_array, check_inflation
@@ -64,20 +64,12 @@ def write(path: Path, runs: Iterable[Run]) -> list[tuple[int, int]]:
     return shapes
 
 
-def trajectories(path: Path, *, allow_pickle: bool, kinds: Mapping[int, str]) -> Iterator[Trajectory]:
-    """Yield the trajectories of a file, one in memory at a time.
+def trajectories(path: Path, kinds: Mapping[int, str]) -> Iterator[Trajectory]:
+    """Yield the trajectories of a file, one in memory at a time; its pickles are rebuilt.
 
-    Kinds say what numbers of particles stand for, see :func:`.metadata.materials_of`. Without
-    ``allow_pickle`` the file is refused by a UsageError, damage by an UnreadableFileError, positions
-    that are not of two components by a DataError.
+    Kinds say what numbers of particles stand for, see :func:`.metadata.materials_of`. Damage is refused
+    by an UnreadableFileError, positions that are not of two components by a DataError.
     """
-    if not allow_pickle:
-        raise UsageError(
-            "the trajectories in this format are pickled objects",
-            where=str(path),
-            expected="leave to rebuild them",
-            fix="add --allow-pickle: arrays are rebuilt, any other call in the file is refused",
-        )
     try:
         archive = zipfile.ZipFile(path)
     except (OSError, zipfile.BadZipFile) as error:
