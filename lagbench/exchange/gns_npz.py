@@ -17,7 +17,7 @@ import re
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,7 @@ from lagbench.atomic import atomic_path
 from lagbench.errors import UnreadableFileError
 
 from .metadata import Format, materials_of
-from .trajectory import Run, Trajectory, check_array, check_inflation
+from .trajectory import Run, Trajectory, check_array, check_inflation, read_header
 
 JOINT = "gns_data"  # key under which some files hold all trajectories together
 _EPOCH = (1980, 1, 1, 0, 0, 0)
@@ -159,13 +159,6 @@ def _load(archive: zipfile.ZipFile, member: str, name: str) -> NDArray[Any]:
             expected="an object array of arrays",
             got=f"{type(error).__name__}: {error}",
         ) from error
-
-
-def read_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Return shape, whether the order is Fortran's, and type of a .npy stream."""
-    first = np.lib.format.read_magic(stream) == (1, 0)
-    read = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
-    return read(stream)
 
 
 class _Type:
