@@ -50,15 +50,11 @@ def main() -> int:
     return 0 if good else 1
 
 
-def _open(size: Size, root: Path, scenario: int) -> ScenarioFile:
-    return read_scenario(size.path(root, scenario))
-
-
 def _frozen(size: Size, root: Path, each: bool) -> bool:
     """Print share below 0.8 and median relative error of the test subset."""
     found = []
     for scenario in size.subsets["test"]:
-        with _open(size, root, scenario) as file:
+        with read_scenario(size.path(root, scenario)) as file:
             found.append(_scores(size, file))
             if each:
                 told = file.header.parameters
@@ -148,7 +144,7 @@ def _active(size: Size, root: Path, each: bool) -> bool:
     """Print the median of active frames of each pair or family, over all scenarios."""
     found = defaultdict(list)
     for scenario in size.scenarios:
-        with _open(size, root, scenario) as file:
+        with read_scenario(size.path(root, scenario)) as file:
             told = file.header.parameters
             found[told[KINDS[size.split]]].append(told["active_frames"])
             if each:

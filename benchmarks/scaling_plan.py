@@ -46,40 +46,24 @@ _AREA, _COURANT, _MODULUS = 0.25, 0.4, 30.0
 
 @dataclass(frozen=True, kw_only=True)
 class Parts:
-    """Processor time of each part, for one particle.
+    """Processor time of each part, for one particle."""
 
-    Attributes:
-        draw: drawing the initial state [s].
-        substep: one substep [s].
-        write: hashing, compressing and writing one frame [s].
-        check: reading and hashing one frame again [s].
-        statistics: moments of one frame [s].
-        bytes: one frame in the file [bytes].
-    """
-
-    draw: float
-    substep: float
-    write: float
-    check: float
-    statistics: float
-    bytes: float
+    draw: float  # drawing the initial state [s]
+    substep: float  # one substep [s]
+    write: float  # hashing, compressing and writing one frame [s]
+    check: float  # reading and hashing one frame again [s]
+    statistics: float  # moments of one frame [s]
+    bytes: float  # one frame in the file [bytes]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Whole:
-    """One generation of a scenario and one of a test scenario with its twin.
+    """One generation of a scenario and one of a test scenario with its twin."""
 
-    Attributes:
-        frames: frames of each.
-        seconds: processor time of all processes [s].
-        parent: peak memory of the parent [bytes].
-        worker: peak memory of the largest worker [bytes].
-    """
-
-    frames: int
-    seconds: float
-    parent: int
-    worker: int
+    frames: int  # frames of each
+    seconds: float  # processor time of all processes [s]
+    parent: int  # peak memory of the parent [bytes]
+    worker: int  # peak memory of the largest worker [bytes]
 
 
 def registry_of(row: Row, frames: int) -> Registry:

@@ -6,7 +6,7 @@ of realistic shape; nothing is learned from the values.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from lagbench.data.writer import ScenarioKey, ScenarioWriter, scenario_path
 from lagbench.data.yamlfile import read_yaml
 from lagbench.submission import PredictionsWriter
 
-__all__ = ["ScoreData", "make_score_data"]
+__all__ = ["ScoreData", "make_score_data", "write_scenario"]
 
 SPEED = 0.0022
 """Per-frame speed of the swirls, as in the cavity [length/frame]."""
@@ -30,17 +30,11 @@ BOX = (0.0625, 0.875)
 
 @dataclass(frozen=True)
 class ScoreData:
-    """Where the data set and the submission are.
+    """Where the data set and the submission are."""
 
-    Attributes:
-        root: folder of all data sets.
-        registry: registry that describes this one.
-        predictions: a predictions.nc.
-    """
-
-    root: Path
-    registry: Registry
-    predictions: Path
+    root: Path  # folder of all data sets
+    registry: Registry  # registry that describes this one
+    predictions: Path  # a predictions.nc
 
 
 def make_score_data(folder: Path, *, horizon: int = 90) -> ScoreData:
@@ -58,7 +52,11 @@ def make_score_data(folder: Path, *, horizon: int = 90) -> ScoreData:
     root, hashes = folder / "root", {}
     for scenario in size.subsets["test"]:
         key = ScenarioKey(split="cavity", size="full", version=size.version, scenario=scenario, subset="test")
-        hashes[scenario] = _write_truth(scenario_path(root, key), key, frames, size.particles)
+        flow = ((position, position) for position in _flow(scenario, frames, size.particles))
+        mass = 1e-4 * BOX[1] ** 2 / size.particles
+        hashes[scenario] = write_scenario(
+            root, key, flow, particles=size.particles, frames=frames, particle_mass=mass
+        )
     registry = load(_write_registry(folder / "datasets.yaml", horizon, frames, hashes))
     path = folder / "predictions.nc"
     writer = PredictionsWriter(path, split="cavity", size="full", method="swirls", registry=registry)
@@ -82,23 +80,34 @@ def _flow(scenario: int, frames: int, particles: int, *, error: float = 0.0) -> 
         x = np.clip(x + SPEED * (1.0 + (error if frame >= 5 else 0.0)) * u, low, low + side)
 
 
-def _write_truth(path: Path, key: ScenarioKey, frames: int, particles: int) -> str:
+def write_scenario(
+    root: Path,
+    key: ScenarioKey,
+    flow: Iterable[tuple[NDArray[np.float32], NDArray[np.float32]]],
+    *,
+    particles: int,
+    frames: int,
+    particle_mass: float = 1e-8,
+    wall_velocity: NDArray[np.float64] | None = None,
+) -> str:
+    """Write a made-up scenario of positions and velocities, frame by frame; return its content hash."""
     writer = ScenarioWriter(
-        path,
+        scenario_path(root, key),
         key,
         particles=particles,
         frames=frames,
         frame_interval=0.1,
         material=np.zeros(particles),
-        particle_mass=1e-4 * BOX[1] ** 2 / particles,
+        particle_mass=particle_mass,
+        wall_velocity=wall_velocity,
         parameters={"start_frame": 0},
         seed="made up",
         device="cpu",
         generator="benchmarks",
     )
     with writer:
-        for position in _flow(key.scenario, frames, particles):
-            writer.append(position, position)
+        for position, velocity in flow:
+            writer.append(position, velocity)
     return writer.content_sha256
 
 

@@ -13,17 +13,14 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import subprocess
-import sys
 import tempfile
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
 
-from lagbench.baselines.machine import hardware
+from solver_against import HERE, checked_out, on_one_core
 
-HERE = Path(__file__).resolve().parent.parent
+from lagbench.baselines.machine import hardware
 
 MAKE = """
 import sys
@@ -56,19 +53,10 @@ print(json.dumps({"cpu": (own + children) / count, "children": children / count,
 """
 
 
-def run(tree: Path, code: str, folder: Path) -> str:
-    """Run a program in a tree on one core; return what it prints."""
-    core = min(os.sched_getaffinity(0))
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(folder)],
-        cwd=tree,
-        env={**os.environ, "PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1"},
-        preexec_fn=lambda: os.sched_setaffinity(0, {core}),
-        stdout=subprocess.PIPE,
-        text=True,
-        check=True,
-    )
-    return done.stdout
+def score(tree: Path, data: Path) -> dict[str, float]:
+    """Return what a tree's scorer takes for the data that it made."""
+    found: dict[str, float] = json.loads(on_one_core(tree, "-c", SCORE, str(data), OMP_NUM_THREADS="1"))
+    return found
 
 
 def declare(tree: Path) -> None:
@@ -91,25 +79,19 @@ def main() -> int:
     parser.add_argument("--against", required=True, metavar="REV")
     parser.add_argument("--rounds", type=int, default=3)
     given = parser.parse_args()
-    with tempfile.TemporaryDirectory() as held:
-        folder, other = Path(held), Path(held) / "other"
-        git = ["git", "-C", str(HERE), "worktree"]
-        subprocess.run([*git, "add", "--quiet", "--detach", str(other), given.against], check=True)
-        try:
-            declare(other)
-            best: dict[Path, dict[str, float]] = {}
-            made = {other: folder / "theirs", HERE: folder / "ours"}
+    with tempfile.TemporaryDirectory() as folder, checked_out(given.against) as other:
+        declare(other)
+        best: dict[Path, dict[str, float]] = {}
+        made = {other: Path(folder) / "theirs", HERE: Path(folder) / "ours"}
+        for tree, data in made.items():
+            data.mkdir()
+            on_one_core(tree, "-c", MAKE, str(data), OMP_NUM_THREADS="1")
+        for tree, data in made.items():
+            score(tree, data)
+        for _ in range(given.rounds):
             for tree, data in made.items():
-                data.mkdir()
-                run(tree, MAKE, data)
-            for tree, data in made.items():
-                run(tree, SCORE, data)
-            for _ in range(given.rounds):
-                for tree, data in made.items():
-                    found: dict[str, float] = json.loads(run(tree, SCORE, data))
-                    best[tree] = min(best.get(tree, found), found, key=lambda one: one["cpu"])
-        finally:
-            subprocess.run([*git, "remove", "--force", str(other)], check=True)
+                found = score(tree, data)
+                best[tree] = min(best.get(tree, found), found, key=lambda one: one["cpu"])
     print(f"{hardware()['processor']}, one core, cavity full, all metrics but Sinkhorn")
     print(f"| per scenario of 90 frames | {given.against} | this tree | ratio |\n|---|---|---|---|")
     shown: tuple[tuple[str, str, Callable[[float], str]], ...] = (

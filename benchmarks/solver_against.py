@@ -16,6 +16,8 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -25,22 +27,41 @@ HERE = Path(__file__).resolve().parent.parent
 SPLITS = ("cavity", "curl-noise", "fluid", "multimaterial")
 
 
+def on_one_core(tree: Path, *arguments: str, **variables: str) -> str:
+    """Run Python in a tree, on one core; return what it prints."""
+    core = min(os.sched_getaffinity(0))
+    done = subprocess.run(
+        [sys.executable, *arguments],
+        cwd=tree,
+        env={**os.environ, "PYTHONPATH": str(tree), **variables},
+        preexec_fn=lambda: os.sched_setaffinity(0, {core}),
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+    )
+    return done.stdout
+
+
+@contextmanager
+def checked_out(revision: str) -> Iterator[Path]:
+    """Yield a folder with another commit, which is gone afterwards."""
+    git = ["git", "-C", str(HERE), "worktree"]
+    with tempfile.TemporaryDirectory() as folder:
+        other = Path(folder) / "other"
+        subprocess.run([*git, "add", "--quiet", "--detach", str(other), revision], check=True)
+        try:
+            yield other
+        finally:
+            subprocess.run([*git, "remove", "--force", str(other)], check=True)
+
+
 def rate(tree: Path, case: str, size: str) -> float:
     """Return the particle-substeps per second of processor time that a tree reaches."""
     command = ["benchmarks/whole_frame.py"]
     if case != "kernels":
         command = ["-m", "lagbench", "bench", "solver", "--split", case, "--size", size, "--json"]
-    core = min(os.sched_getaffinity(0))
-    done = subprocess.run(
-        [sys.executable, *command],
-        cwd=tree,
-        env={**os.environ, "PYTHONPATH": str(tree)},
-        preexec_fn=lambda: os.sched_setaffinity(0, {core}),
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    found: dict[str, Any] = json.loads(done.stdout[done.stdout.index("{") :])
+    printed = on_one_core(tree, *command)
+    found: dict[str, Any] = json.loads(printed[printed.index("{") :])
     if case == "kernels":
         return float(found["per_processor_second"])
     return float(found["particles"] * found["substeps"] / found["seconds_per_frame"])
@@ -57,20 +78,14 @@ def main() -> int:
     given = parser.parse_args()
     print(f"{hardware()['processor']}, size {given.size}; M particle-substeps/s of processor time")
     print(f"| case | {given.against} | this tree | ratio |\n|---|---|---|---|")
-    with tempfile.TemporaryDirectory() as folder:
-        other = Path(folder) / "other"
-        git = ["git", "-C", str(HERE), "worktree"]
-        subprocess.run([*git, "add", "--quiet", "--detach", str(other), given.against], check=True)
-        try:
-            for case in ("kernels", *SPLITS):
-                best = dict.fromkeys((other, HERE), 0.0)
-                for _ in range(given.rounds):
-                    for tree, so_far in best.items():
-                        best[tree] = max(so_far, rate(tree, case, given.size))
-                theirs, ours = best[other] / 1e6, best[HERE] / 1e6
-                print(f"| {case} | {theirs:.1f} | {ours:.1f} | {ours / theirs:.2f} |", flush=True)
-        finally:
-            subprocess.run([*git, "remove", "--force", str(other)], check=True)
+    with checked_out(given.against) as other:
+        for case in ("kernels", *SPLITS):
+            best = dict.fromkeys((other, HERE), 0.0)
+            for _ in range(given.rounds):
+                for tree, so_far in best.items():
+                    best[tree] = max(so_far, rate(tree, case, given.size))
+            theirs, ours = best[other] / 1e6, best[HERE] / 1e6
+            print(f"| {case} | {theirs:.1f} | {ours:.1f} | {ours / theirs:.2f} |", flush=True)
     return 0
 
 

@@ -69,17 +69,11 @@ class Measurement:
 
 @dataclass(frozen=True, kw_only=True)
 class Exponents:
-    """Slopes of log time over log size.
+    """Slopes of log time over log size."""
 
-    Attributes:
-        frame_q2: of t/frame against q^2 (Eq. 3.2).
-        frame_particles: of t/frame against particles.
-        substep_particles: of t/substep against particles.
-    """
-
-    frame_q2: float
-    frame_particles: float
-    substep_particles: float
+    frame_q2: float  # of t/frame against q^2 (Eq. 3.2)
+    frame_particles: float  # of t/frame against particles
+    substep_particles: float  # of t/substep against particles
 
 
 def block(row: Row) -> tuple[FreeSurfaceParameters, InitialState]:

@@ -5,16 +5,13 @@ Every side runs in a process of its own, one thread; rounds alternate, the best 
 
 from __future__ import annotations
 
-import json
 import math
-import subprocess
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from pytest_benchmark.fixture import BenchmarkFixture
-from timing import best_seconds
+from timing import best_seconds, measured_apart
 
 ROUNDS = 2
 SECONDS = {"float32": 4.2, "bfloat16": 1.5}
@@ -39,13 +36,7 @@ Found = dict[str, Any]
 
 def measure(*options: str) -> Found:
     """Run the script in a process of its own and return what it prints."""
-    done = subprocess.run(
-        [sys.executable, "-W", "ignore", str(Path(__file__).with_name("gns_step.py")), *options],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    found: Found = json.loads(done.stdout.splitlines()[-1])
+    found: Found = measured_apart("-W", "ignore", str(Path(__file__).with_name("gns_step.py")), *options)
     return found
 
 

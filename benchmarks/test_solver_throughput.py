@@ -9,16 +9,13 @@ printed; asserted is only a ratio, of processor time on one core, which other wo
 
 from __future__ import annotations
 
-import json
 import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
-from timing import best_seconds
+from timing import best_seconds, measured_apart
 
 from lagbench.baselines.machine import hardware
 
@@ -34,15 +31,8 @@ def measure(script: str, cores: int) -> dict[str, Any]:
     options = ["--substeps", str(SUBSTEPS[script]), "--repeats", "2"]
     if script == "conventional.py":
         options += ["--threads", str(cores)]
-    done = subprocess.run(
-        [sys.executable, str(Path(__file__).with_name(script)), *options],
-        preexec_fn=lambda: os.sched_setaffinity(0, CORES[:cores]),
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
-    return found
+    path = str(Path(__file__).with_name(script))
+    return dict(measured_apart(path, *options, cores=CORES[:cores]))
 
 
 def test_throughput_per_core(benchmark: BenchmarkFixture) -> None:
@@ -75,11 +65,5 @@ def test_both_formulations_simulate_the_same_flow() -> None:
     options = ["--substeps", "1000", "--repeats", "1"]
     energy = []
     for script in SUBSTEPS:
-        done = subprocess.run(
-            [sys.executable, str(Path(__file__).with_name(script)), *options],
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-        energy.append(json.loads(done.stdout.splitlines()[-1])["energy"])
+        energy.append(measured_apart(str(Path(__file__).with_name(script)), *options)["energy"])
     assert energy[0] == pytest.approx(energy[1], rel=1e-3)

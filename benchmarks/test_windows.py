@@ -4,15 +4,13 @@
 
 The readers do what geoelements/gns (NPZ, everything in memory) and LagrangeBench (HDF5, one group
 per trajectory, windows read when asked for) do for a window of 6 + 1 frames; all draw windows at
-random. Ours is timed over whole pools of its sampler, decompression included, in one process.
+random. Files are made without simulating, in seconds: each scenario is a rotation at its own speed.
+Ours is timed over whole pools of its sampler, decompression included, in one process.
 Memory is that of a fresh process that has read from twice as many scenarios.
 """
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -20,13 +18,17 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+import yaml
 from numpy.typing import NDArray
 from pytest_benchmark.fixture import BenchmarkFixture
+from score_data import write_scenario
+from timing import measured_apart
 from torch.utils.data import DataLoader
-from window_data import FRAMES, write_gns_npz, write_lagrangebench_h5, write_ours
 
 import lagbench
-from lagbench.data.registry import REGISTRY_VARIABLE, load
+from lagbench.data.layout import ScenarioKey
+from lagbench.data.registry import REGISTRY_VARIABLE, default_path, load
+from lagbench.data.yamlfile import read_yaml
 from lagbench.torch import RUN, WindowDataset, WindowSampler, collate
 
 TARGET = 1000.0
@@ -44,6 +46,14 @@ OTHERS = 3
 HISTORY = 6
 SEED = 0
 
+FRAMES, PARTICLES = 600, 8192
+"""Size of one scenario of cavity full."""
+
+RADIUS = 0.43
+"""Particles fill a disc of this radius about the centre of the box [length]."""
+
+Frames = NDArray[np.float32]
+
 CHILD = """
 import json, sys
 from pathlib import Path
@@ -58,6 +68,52 @@ for drawn, index in enumerate(WindowSampler(data, seed=0)):
 peak = int(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0])
 print(json.dumps(1024 * peak))
 """
+
+
+def trajectory(scenario: int) -> Frames:
+    """Return positions [length], shape [frame, particle, 2]."""
+    return np.stack(list(_rotation(scenario)))
+
+
+def _rotation(scenario: int) -> Iterator[Frames]:
+    """Yield frames of a solid-body rotation of random particles: files compress as real ones do."""
+    rng = np.random.Generator(np.random.PCG64(scenario))
+    distance = RADIUS * np.sqrt(rng.random(PARTICLES))
+    angle = 2.0 * np.pi * rng.random(PARTICLES)
+    for frame in range(FRAMES):
+        turned = angle + 0.005 * (1 + scenario % 5) * frame
+        x = 0.5 + distance * np.cos(turned)
+        yield np.stack([x, 0.5 + distance * np.sin(turned)], axis=1).astype(np.float32)
+
+
+def write_ours(root: Path, scenarios: int) -> None:
+    """Write the train subset as lagbench does, and the registry that describes it."""
+    held = read_yaml(default_path())
+    size = held["splits"]["cavity"]["sizes"]["full"]
+    size["subsets"] = {"train": f"0-{scenarios - 1}", "valid": f"{scenarios}", "test": f"{scenarios + 1}"}
+    held["measured"] = {}
+    path = root / "datasets.yaml"
+    path.write_text(yaml.safe_dump(held))
+    registry = load(path)
+    version, still = registry.split("cavity").version, np.zeros((PARTICLES, 2), np.float32)
+    for i in range(scenarios):
+        key = ScenarioKey(split="cavity", size="full", version=version, scenario=i, subset="train")
+        flow = ((position, still) for position in _rotation(i))
+        write_scenario(root, key, flow, particles=PARTICLES, frames=FRAMES, wall_velocity=np.zeros((4, 2)))
+
+
+def write_gns_npz(path: Path, scenarios: int) -> None:
+    """Write what geoelements/gns loads into memory: one array per trajectory."""
+    arrays = {f"simulation_trajectory_{i}": trajectory(i) for i in range(scenarios)}
+    np.savez_compressed(path, **arrays)  # type: ignore[arg-type]
+
+
+def write_lagrangebench_h5(path: Path, scenarios: int) -> None:
+    """Write what LagrangeBench reads: a group per trajectory, gzip in the chunks that h5py guesses."""
+    with h5py.File(path, "w") as file:
+        for i in range(scenarios):
+            file.create_dataset(f"{i:05d}/particle_type", data=np.zeros(PARTICLES, np.int64))
+            file.create_dataset(f"{i:05d}/position", data=trajectory(i), compression="gzip")
 
 
 @pytest.fixture(scope="module")
@@ -136,14 +192,12 @@ def test_memory_is_flat(root: Path, tmp_path: Path) -> None:
     few = tmp_path / "few"
     few.mkdir()
     write_ours(few, FEW)
-    peaks = [_peak(folder, windows) for folder, windows in ((few, 4100), (root, 7000))]
+    peaks = [
+        float(measured_apart("-c", CHILD, str(folder), str(count)))
+        for folder, count in ((few, 4100), (root, 7000))
+    ]
     print(f"\npeak memory, {FEW} scenarios: {peaks[0] / 1e6:.0f} MB; {SCENARIOS}: {peaks[1] / 1e6:.0f} MB")
     assert peaks[1] <= 1.05 * peaks[0]
-
-
-def _peak(root: Path, windows: int) -> float:
-    command = [sys.executable, "-c", CHILD, str(root), str(windows)]
-    return float(json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout))
 
 
 def test_npz_in_memory(tmp_path: Path) -> None:

@@ -1,18 +1,36 @@
-"""One way to time: pytest-benchmark's pedantic mode, whose calls are not annotated."""
+"""One way to time, and one to measure in a process of its own."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Collection
+from typing import Any
 
 from pytest_benchmark.fixture import BenchmarkFixture
 
-__all__ = ["best_seconds"]
+__all__ = ["best_seconds", "measured_apart"]
 
 
 def best_seconds(
     benchmark: BenchmarkFixture, call: Callable[[], object], *, rounds: int, warmup_rounds: int = 0
 ) -> float:
     """Run a call some rounds under pytest-benchmark and return the shortest [s]."""
+    # Calls of the pedantic mode are not annotated.
     benchmark.pedantic(call, rounds=rounds, warmup_rounds=warmup_rounds)  # type: ignore[no-untyped-call]
     # None only with --benchmark-disable, when there is nothing to report.
     return float(benchmark.stats.stats.min) if benchmark.stats is not None else float("nan")
+
+
+def measured_apart(*arguments: str, cores: Collection[int] = ()) -> Any:  # noqa: ANN401 (plain values)
+    """Run Python in a process of its own, on some cores where they are named; return the JSON at its end."""
+    done = subprocess.run(
+        [sys.executable, *arguments],
+        preexec_fn=(lambda: os.sched_setaffinity(0, cores)) if cores else None,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return json.loads(done.stdout.splitlines()[-1])

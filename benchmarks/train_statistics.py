@@ -11,24 +11,8 @@ from __future__ import annotations
 
 import argparse
 
+from lagbench.baselines.reproduce.thesis import STATISTICS
 from lagbench.data.registry import load
-
-THESIS = {
-    "cavity": {
-        "velocity_mean": (-3.5108e-05, -2.6359e-06),
-        "velocity_std": (0.002191, 0.002195),
-        "acceleration_mean": (8.5449e-10, 1.3844e-07),
-        "acceleration_std": (9.9393e-05, 9.9605e-05),
-    },
-    "curl-noise": {
-        "position_mean": (0.499, 0.4999),
-        "position_std": (0.272, 0.272),
-        "velocity_mean": (-1.8180e-05, 4.789e-07),
-        "velocity_std": (1.600e-03, 1.600e-03),
-        "acceleration_mean": (-3.116e-09, 7.532e-08),
-        "acceleration_std": (7.334e-05, 7.315e-05),
-    },
-}
 
 
 def main() -> int:
@@ -42,7 +26,7 @@ def main() -> int:
     for split in registry.splits:
         measured = registry.size(split, name).measured
         for statistic, values in measured.statistics.items() if measured else ():
-            thesis = THESIS.get(split, {}).get(statistic) if name == "full" else None
+            thesis = STATISTICS.get(split, {}).get(statistic) if name == "full" else None
             cells = [*values, *(thesis or ("", ""))]
             words = (f"{cell:.4g}" if isinstance(cell, float) else cell for cell in cells)
             print(f"| {split} | {statistic.replace('_', ' ')} | {' | '.join(words)} |")

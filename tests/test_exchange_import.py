@@ -66,7 +66,15 @@ def test_another_horizon_drops_the_frames_of_the_exported_task(tmp_path: Path) -
     hints = {"lagbench": {"horizon": 6, "frames_of_interest": [10]}}
     source = write_gns(tmp_path / "in", straight_runs(3), **hints)
     kept = import_split(source, format="gns-npz", output=tmp_path / "a", allow_pickle=True)
-    own = import_split(source, format="gns-npz", output=tmp_path / "b", allow_pickle=True, horizon=3)
+    own = import_split(
+        source,
+        format="gns-npz",
+        output=tmp_path / "b",
+        allow_pickle=True,
+        horizon=3,
+        radius=None,
+        bounds=None,
+    )  # None says nothing: the metadata do
     interest = [locate(str(made.folder)).size.task.frames_of_interest for made in (kept, own)]
     assert interest == [(10,), (8,)]
 

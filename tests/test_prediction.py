@@ -386,11 +386,12 @@ def test_models_of_any_size_have_the_same_weights_at_each() -> None:
 @pytest.mark.parametrize("name", ["weights.pt", "training.nc"])
 def test_nothing_else_is_replaced(run: Predict, tmp_path: Path, name: str) -> None:
     """Not the weights themselves, nor the record of their training, whose name that of the cost would be."""
-    (tmp_path / "training.json").write_text(json.dumps(UNFINISHED))
+    record = {**UNFINISHED, "state": "finished"}
+    (tmp_path / "training.json").write_text(json.dumps(record))
     with pytest.raises(UsageError) as caught:
         run(name=name)
     assert caught.value.where == "--output"
-    assert json.loads((tmp_path / "training.json").read_text()) == UNFINISHED
+    assert json.loads((tmp_path / "training.json").read_text()) == record
     assert load(tmp_path / "weights.pt").baseline == "drift"
     run(name="predictions.nc")
     run(name="predictions.nc")

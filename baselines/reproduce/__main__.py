@@ -86,7 +86,7 @@ def reproduce(plan: Plan, figures: Sequence[Figure], *, split: str | None = None
                 yield "", partial(make_studies, plan, study)
         else:
             for where, name in _wanted(figures, split):
-                yield "", partial(score_committed, plan, where, ROSTER[name], say=note)
+                yield "", partial(score_committed, plan, where, ROSTER[name])
         yield from ((figure.name, partial(draw, figure)) for figure in figures)
 
     made = make_runs(plan, _runs(plan, figures, split), workers=workers) if workers else 0

@@ -20,7 +20,7 @@ from lagbench.metrics.table import CHOSEN
 from lagbench.scoring.tables import Table
 
 from .evidence import Evidence, ordered
-from .thesis import FRAME_MODELS, OPERATORS, ROSTER, key_frame, label, number
+from .thesis import FRAME_MODELS, OPERATORS, ROSTER, interval, key_frame, label, number
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -232,7 +232,7 @@ def answer(rows: Sequence[Compared]) -> str:
     return f"ahead of {ahead} of {len(judged)}; better than {better}, worse than {worse}"
 
 
-def comparison_table(rows: Sequence[Compared], title: str = "") -> Table:
+def comparison_table(rows: Sequence[Compared]) -> Table:
     """Return comparisons as a table; the lead is second minus first in loss: positive favours the first."""
     heads = (
         *("where", "metric", "first", "second", "means", "seeds"),
@@ -240,8 +240,7 @@ def comparison_table(rows: Sequence[Compared], title: str = "") -> Table:
     )
     cells = []
     for row in rows:
-        low, high = (-bound for bound in reversed(row.test.interval))
-        bounds = "" if math.isnan(low) else f" ({number(low)} to {number(high)})"
+        low, high = row.test.interval
         cells.append(
             (
                 row.where,
@@ -250,13 +249,13 @@ def comparison_table(rows: Sequence[Compared], title: str = "") -> Table:
                 label(row.second),
                 f"{number(row.means[0])} / {number(row.means[1])}",
                 f"{row.seeds[0]} / {row.seeds[1]}",
-                f"{number(-row.test.difference)}{bounds}",
+                interval(-row.test.difference, (-high, -low)),
                 f"{row.won} of {len(row.test.scenarios)}",
                 number(row.p, 2),
                 row.verdict.value,
             )
         )
-    return Table(title, heads, tuple(cells))
+    return Table("", heads, tuple(cells))
 
 
 def floors_ahead(everything: Sequence[Evidence]) -> Table:

@@ -196,17 +196,15 @@ class Figure:
     name: str  # as in fig_5_10 or table_5_4
     title: str  # what it shows
     draw: Callable[[Plan, Figure], Sheet]
-    needs: Mapping[str, tuple[str, ...]] = field(
-        default_factory=dict
-    )  # models whose scored runs it shows, by split
+    # models whose scored runs it shows, by split
+    needs: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     studies: str = ""  # table of MLPs whose trainings it shows
     cases: tuple[int, ...] = (0,)  # scenarios of the thesis: T0, T1, ...; ids on the free surface
     frames: tuple[int, ...] = ()  # absolute; empty for the frame at which the thesis compares models
     whole: bool = False  # show the whole rollout: pictures spread over it, errors over the horizon
     panels: tuple[str, ...] = ()  # kinds of picture, one each
-    metrics: tuple[
-        str, ...
-    ] = ()  # of its table; of curves: the models', the truth's own, then means over the horizon
+    # of its table; of curves: the models', the truth's own, then means over the horizon
+    metrics: tuple[str, ...] = ()
     said: str = ""  # what the thesis says of it
 
     @property
@@ -227,6 +225,11 @@ class Sheet:
     notes: tuple[str, ...] = ()  # sentences; one paragraph each
     tables: tuple[Table, ...] = ()
     pictures: Mapping[str, bytes] = field(default_factory=dict)  # PNG files by what is added to their name
+
+    @property
+    def text(self) -> str:
+        """Notes and tables as Markdown."""
+        return "\n\n".join([*self.notes, *(table(held.columns, held.rows) for held in self.tables)])
 
 
 def write_sheet(sheet: Sheet, folder: Path, name: str, head: str) -> str:

@@ -55,9 +55,8 @@ class Cost:
 
     seconds_per_frame: float  # of the model [s]
     device: str  # where it ran
-    solver_seconds_per_frame: float | None = (
-        None  # of the solver on the same machine [s]; None if not measured
-    )
+    # of the solver on the same machine [s]; None if not measured
+    solver_seconds_per_frame: float | None = None
 
     @property
     def speed_up(self) -> float | None:
@@ -125,12 +124,10 @@ class Method:
         """
         if metric not in self.scores:
             return math.nan
-        values = self.scores[metric].at(frame)
-        if scenario is not None and len(values) < len(self.scores[metric].scenarios):
-            return math.nan
-        return (
-            mean(values) if scenario is None else float(values[self.scores[metric].scenarios.index(scenario)])
-        )
+        values, scenarios = self.scores[metric].at(frame), self.scores[metric].scenarios
+        if scenario is None:
+            return mean(values)
+        return float(values[scenarios.index(scenario)]) if len(values) == len(scenarios) else math.nan
 
     def over_horizon(self, metric: str, scenario: int) -> float:
         """Return a metric of one scenario over the horizon; NaN if not measured."""

@@ -29,7 +29,7 @@ from .drawing import (
     tidy,
 )
 from .runs import Plan
-from .thesis import LOSS_SNAPSHOTS, TABLE_4_8, colour, key_frame, label, number, predicted, scenario_of
+from .thesis import LOSS_SNAPSHOTS, TABLE_4_8, colour, key_frame, label, number, scenario_of
 
 TIMES = 6  # columns of a picture that shows a whole rollout
 
@@ -72,11 +72,12 @@ def panels(plan: Plan, figure: Figure) -> Sheet:
 
 
 def _frames(size: Size, figure: Figure) -> tuple[int, ...]:
-    """Return the frames of a figure that are predicted: its own, or that at which models are compared."""
+    """Return the frames of a figure that are predicted, the last if none is: its own, or the key frame."""
     first, last = size.task.input_frames, size.task.input_frames + size.task.horizon - 1
     if figure.whole:
         return tuple(first + round(i * (last - first) / (TIMES - 1)) for i in range(TIMES))
-    return predicted(size, figure.frames or (key_frame(size),))
+    frames = figure.frames or (key_frame(size),)
+    return tuple(frame for frame in frames if first <= frame <= last) or (last,)
 
 
 def _errors(plan: Plan, figure: Figure, frames: Sequence[int], cases: Mapping[int, int]) -> Table:

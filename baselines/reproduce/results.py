@@ -235,9 +235,10 @@ def _horizon(evidence: Evidence) -> str:
     def cell(method: Method, metric: str) -> str:
         if metric not in method.scores:
             return "-"
+        score = method.scores[metric]
         spread = f" ± {number(method.spread(metric), 2)}" if len(method.seeds) > 1 else ""
-        undefined = sum(method.scores[metric].undefined)
-        return interval(method.scores[metric]) + spread + (f", {undefined} undefined" if undefined else "")
+        undefined = f", {count} undefined" if (count := sum(score.undefined)) else ""
+        return interval(score.mean, score.interval) + spread + undefined
 
     rows = []
     for name in evidence.order():
@@ -290,8 +291,7 @@ def _protocol(sources: Sources, size: str) -> Iterator[str]:
     for home in (sources.studies, sources.runs):
         path = home / "fluid" / size / FILE if home else None
         if path and path.is_file():
-            sheet = beside_thesis(read_json(path))
-            yield "\n\n".join([*sheet.notes, *map(_markdown, sheet.tables)])
+            yield beside_thesis(read_json(path)).text
             return
 
 
@@ -302,8 +302,7 @@ def _studies(sources: Sources, size: str) -> Iterator[str]:
         measured = sources.size(split, size).measured
         known = known_studies(homes, measured.dataset_sha256 if measured else None)
         if any(study_name(study) in known for study in study_rows(name)):
-            sheet = studies_beside_thesis(name, size, known)
-            yield "\n\n".join([*sheet.notes, *map(_markdown, sheet.tables)])
+            yield studies_beside_thesis(name, size, known).text
 
 
 def _missing(found: Sequence[Evidence]) -> Iterator[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -91,13 +91,6 @@ class Plan:
         """Return the folder of one training."""
         return self.home(split) / f"{name}-{seed}"
 
-    def committed(self, split: str, name: str) -> tuple[int, Path] | None:
-        """Return the least seed of a model's committed weights, and their file; None where there are none."""
-        known = f"{name}-{self.recipe}" if self.recipe else name
-        files = (self.weights / split / self.size).glob(f"{known}_*.pt")
-        seeds = {int(end): path for path in files if (end := path.stem[len(known) + 1 :]).isdecimal()}
-        return min(seeds.items(), default=None)
-
     def predictions(self, split: str, name: str) -> Path | None:
         """Return a model's predictions, those of the first seed asked for; None where none were scored."""
         method = self.evidence(split).methods.get(name)
@@ -163,7 +156,7 @@ def _make_named(job: tuple[Plan, str, Run], _: Report) -> int:
     plan, name, run = job
     note(name)
     try:
-        make_run(plan, *run, say=note)
+        make_run(plan, *run)
     except Exception as error:  # the others go on
         told = error if isinstance(error, LagbenchError) else crashed(error)
         complain(told, name)
@@ -181,18 +174,16 @@ def complain(error: LagbenchError, where: str = "") -> None:
     sys.stderr.write(f"error: {where + ': ' if where else ''}{error}\n")
 
 
-def make_run(
-    plan: Plan, split: str, model: Model, seed: int, *, say: Callable[[str], None] = lambda _: None
-) -> None:
+def make_run(plan: Plan, split: str, model: Model, seed: int) -> None:
     """Train, predict and score what of a run is missing.
 
-    An interrupted training goes on where it stopped; predictions and scores of other data are made again, and
-    the caller is told.
+    An interrupted training goes on where it stopped; predictions and scores of other data are made again,
+    with a note.
     """
     folder = plan.folder(split, model.name, seed)
     check_training(plan, split, model, seed, folder=folder)
     for path in _stale(plan.hash(split), folder):
-        say(f"{path}: of another version of the data; made again")
+        note(f"{path}: of another version of the data; made again")
         path.unlink()
     if (folder / NETCDF_NAME).is_file() and (folder / JSON_NAME).is_file():
         return
@@ -202,19 +193,19 @@ def make_run(
     _score(plan, folder)
 
 
-def score_committed(
-    plan: Plan, split: str, model: Model, *, say: Callable[[str], None] = lambda _: None
-) -> None:
-    """Make a run of a model's committed weights, if there are any and no run of it was scored."""
+def score_committed(plan: Plan, split: str, model: Model) -> None:
+    """Make a run of a model's committed weights of the least seed, if there are any and no run was scored."""
     for name, _, folder in plan.sources.run_folders(split, plan.size):
         if name == model.name and (folder / NETCDF_NAME).is_file():
             return
-    found = plan.committed(split, model.name)
-    if found is None:
+    known = f"{model.name}-{plan.recipe}" if plan.recipe else model.name
+    files = (plan.weights / split / plan.size).glob(f"{known}_*.pt")
+    seeds = {int(end): path for path in files if (end := path.stem[len(known) + 1 :]).isdecimal()}
+    if not seeds:
         return
-    seed, weights = found
+    seed, weights = min(seeds.items())
     folder = plan.folder(split, model.name, seed)
-    say(f"{folder}: from {weights}")
+    note(f"{folder}: from {weights}")
     # predicting comes first: it refuses weights of other data, and then nothing is written
     if not (folder / PREDICTIONS).is_file():
         _predict(plan, weights, folder, model.name)

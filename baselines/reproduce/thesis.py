@@ -8,13 +8,12 @@ holds here is said beside the number.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
 from lagbench.data.registry import Size
 from lagbench.draw.style import MUTED
-from lagbench.metrics.aggregate import Score
 
 
 @dataclass(frozen=True)
@@ -300,12 +299,6 @@ def key_frame(size: Size) -> int:
     return min(frames, key=lambda frame: (abs(frame - wanted), frame))
 
 
-def predicted(size: Size, frames: Iterable[int]) -> tuple[int, ...]:
-    """Return those absolute frames that are predicted; the last predicted one if none is."""
-    first, last = size.task.input_frames, size.task.input_frames + size.task.horizon - 1
-    return tuple(frame for frame in frames if first <= frame <= last) or (last,)
-
-
 def number(value: float | None, digits: int = 3) -> str:
     """Return a number with so many digits, a dash where there is none.
 
@@ -315,8 +308,7 @@ def number(value: float | None, digits: int = 3) -> str:
     return "-" if value is None or math.isnan(value) else f"{value:.{digits}g}"
 
 
-def interval(score: Score) -> str:
-    """Return mean and 95 % interval over scenarios, as in "0.12 (0.1 to 0.15)"."""
-    low, high = score.interval
-    bounds = "" if math.isnan(low) else f" ({number(low)} to {number(high)})"
-    return f"{number(score.mean)}{bounds}"
+def interval(mean: float, bounds: tuple[float, float]) -> str:
+    """Return a mean and its 95 % interval over scenarios, as in "0.12 (0.1 to 0.15)"."""
+    low, high = bounds
+    return number(mean) + ("" if math.isnan(low) else f" ({number(low)} to {number(high)})")

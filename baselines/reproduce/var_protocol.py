@@ -29,7 +29,6 @@ from numpy.typing import NDArray
 from lagbench.atomic import write_atomically
 from lagbench.data.registry import load
 from lagbench.data.scenario import read_scenario
-from lagbench.draw.markdown import table as markdown_table
 from lagbench.scoring.tables import Table
 
 from .drawing import Figure, Sheet
@@ -194,9 +193,7 @@ def beside_thesis(held: Mapping[str, Any]) -> Sheet:
 
 def table(result: ProtocolResult) -> str:
     """Return the thesis's figures beside ours, as Markdown."""
-    sheet = beside_thesis(asdict(result))
-    tables = (markdown_table(held.columns, held.rows) for held in sheet.tables)
-    return "\n\n".join([*sheet.notes, *tables]) + "\n"
+    return beside_thesis(asdict(result)).text + "\n"
 
 
 def main() -> int:

@@ -245,9 +245,7 @@ def picture(
 
     wanted = locate_new(chosen(name, split), size).size
     if output.suffix.lower() != ".svg":
-        raise UsageError(
-            "the picture is an SVG file", where="--output", expected="a name in .svg", got=output
-        )
+        raise UsageError("the picture is an SVG file", where="--output", expected="a .svg name", got=output)
     drawn = draw(collect(board, only=[(wanted.split, wanted.name)]), wanted)
     write_atomically(output, drawn.encode(), option="--output")
     say(str(output), quiet=quiet)

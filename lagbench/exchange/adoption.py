@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Unpack
 
+import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.checksums import HASHED_SUBSETS, file_sha256
+from lagbench.data.hdf5 import Structure, check_structure, opened, reading
 from lagbench.errors import DataError, UnreadableFileError, UsageError
 from lagbench.work.progress import Progress
 
-from . import gns_npz, lagrangebench_h5
+from . import gns_npz
 from .array_files import Row, natural, open_row, rows_of
-from .exporting import ENDINGS
 from .local_split import LocalSplit, make_local_split, output_name
-from .metadata import DROP, Format, Source, parse_format, read_source
-from .trajectory import Description, Frame, Trajectory, Wishes, check_wishes
+from .metadata import DROP, ENDINGS, Format, Source, materials_of, parse_format, read_source
+from .trajectory import Description, Frame, Trajectory, Wishes, check_array, check_wishes
+
+MOST_TRAJECTORIES = 100_000  # most trajectories of an HDF5 file that are looked at
 
 
 def adopt(
@@ -109,7 +111,7 @@ def import_split(
             periodic one.
         WorkFailedError: the disk is full or not writable.
     """
-    said = {**wishes, **check_wishes(wishes)}
+    said = check_wishes(wishes)
     form, folder = parse_format(format), Path(source)
     files = {subset: folder / f"{subset}{ENDINGS[form]}" for subset in HASHED_SUBSETS}
     missing = [path.name for path in files.values() if not path.is_file()]
@@ -127,7 +129,12 @@ def import_split(
             fix=next(there, None),
         )
     if form is Format.GNS_NPZ and not allow_pickle:
-        next(gns_npz.trajectories(files["train"], allow_pickle=False, kinds={}))
+        raise UsageError(
+            "the trajectories in this format are pickled objects",
+            where=str(files["train"]),
+            expected="leave to rebuild them",
+            fix="add --allow-pickle: arrays are rebuilt, any other call in the file is refused",
+        )
     stated = read_source(folder, form)
     hints = stated.hints
     if wishes.keys() & {"input_frames", "horizon"}:  # the frames belong to the exported task
@@ -158,9 +165,8 @@ def import_split(
 
     def read(path: Path) -> Iterator[Trajectory]:
         if form is Format.GNS_NPZ:
-            return gns_npz.trajectories(path, allow_pickle=allow_pickle, kinds=given)
-        found = lagrangebench_h5.trajectories(path, kinds=given, origin=stated.hints.origin)
-        return (_unbroken(trajectory, stated) for trajectory in found)
+            return gns_npz.trajectories(path, given)
+        return _h5_trajectories(path, given, stated)
 
     subsets = {subset: read(path) for subset, path in files.items()}
     return make_local_split(about, subsets, output, command="import", progress=progress)
@@ -204,25 +210,60 @@ def _check_once(rows: Iterable[Row]) -> None:
         known[place] = path
 
 
-def _unbroken(trajectory: Trajectory, stated: Source) -> Trajectory:
-    """Return a trajectory that raises where particles cross a periodic boundary."""
-    if not any(stated.periodic):
-        return trajectory
+def _h5_trajectories(path: Path, kinds: Mapping[int, str], stated: Source) -> Iterator[Trajectory]:
+    """Yield the trajectories of a file of LagrangeBench; frames are read when asked for.
+
+    Groups ``00000``, ``00001``, ... hold ``position`` float32 [frame, particle, space] and ``particle_type``
+    [particle]; a ``force.py`` beside the data, which that program executes, is left alone. A group that is
+    no trajectory is an UnreadableFileError, positions that are not of two components are a DataError.
+    """
+    with opened(path) as file:
+        # A stranger's file shall read none of ours, and hold no more than it shows.
+        check_structure(file, path, Structure(members=MOST_TRAJECTORIES, groups=None))
+        for key in sorted(file):
+            with reading(path):
+                found = _h5_trajectory(path, file[key], f"{path}, group {key!r}", kinds, stated)
+            yield found
+
+
+def _h5_trajectory(
+    path: Path, group: h5py.Group, name: str, given: Mapping[int, str], stated: Source
+) -> Trajectory:
+    parts = set() if isinstance(group, h5py.Dataset) else set(group)
+    if not {"position", "particle_type"} <= parts:
+        raise UnreadableFileError("this is no trajectory", where=name, expected="position and particle_type")
+    position, kinds = group["position"], group["particle_type"]
+    shape = position.shape
+    check_array(name, shape, position.dtype)
+    numbers = np.asarray(kinds)
+    if numbers.shape != shape[1:2] or numbers.dtype.kind not in "iu":
+        raise UnreadableFileError(
+            "these are no kinds of particles",
+            where=name,
+            expected=f"{shape[1]} integers",
+            got=f"{numbers.dtype} of shape {numbers.shape}",
+        )
+    material, kept = materials_of(Format.LAGRANGEBENCH_H5, numbers, given=given, where=name)
+
+    origin = np.asarray(stated.hints.origin, np.float32)
     sides = np.array([high - low for low, high in stated.bounds])
     half = np.where(stated.periodic, sides / 2.0, np.inf)
 
     def read() -> Iterator[Frame]:
         before: NDArray[np.floating] | None = None
-        for number, (position, velocity) in enumerate(trajectory.read()):
-            if before is not None and (np.abs(position - before) > half).any():
+        for number in range(shape[0]):
+            with reading(path, f"{position.name}, frame {number}"):
+                frame = position[number]
+            place = frame[kept] + origin if origin.any() else frame[kept]
+            if any(stated.periodic) and before is not None and (np.abs(place - before) > half).any():
                 raise DataError(
                     "particles cross a periodic boundary",
-                    where=f"{trajectory.name}, frame {number}",
+                    where=f"{name}, frame {number}",
                     expected="positions that move on: velocities are their differences",
                     got="a jump of more than half the box",
                     fix="lagbench has no periodic boxes: leave such data out",
                 )
-            before = position
-            yield position, velocity
+            before = place
+            yield place, None
 
-    return replace(trajectory, read=read)
+    return Trajectory(name=name, frames=shape[0], material=material, read=read)

@@ -22,9 +22,8 @@ from lagbench.data.registry import MAX_ID
 from lagbench.data.scenario import MATERIALS
 from lagbench.errors import DataError, LagbenchError, UnreadableFileError
 
-from . import gns_npz
 from .mistakes import check_meaning
-from .trajectory import Frame, Trajectory, check_array, check_inflation
+from .trajectory import Frame, Trajectory, check_array, check_inflation, read_header
 
 READABLE = (".npy", ".npz", ".nc")  # files that are adopted: an array, named arrays, netCDF
 ARRAYS = POSITION, VELOCITY, MATERIAL, WALLS = "position", "velocity", "material", "wall_velocity"
@@ -180,7 +179,7 @@ def _check_header(name: str, stream: IO[bytes], length: int) -> None:
 
     NumPy reserves memory for what the header claims before it reads.
     """
-    shape, _, dtype = gns_npz.read_header(stream)
+    shape, _, dtype = read_header(stream)
     if dtype.hasobject:
         raise UnreadableFileError(
             "the file holds pickled objects",

@@ -17,18 +17,17 @@ import re
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.atomic import atomic_path
-from lagbench.errors import UnreadableFileError, UsageError
+from lagbench.errors import UnreadableFileError
 
 from .metadata import Format, materials_of
-from .trajectory import Trajectory, check_array, check_inflation
+from .trajectory import Run, Trajectory, check_array, check_inflation, read_header
 
-ENDING = ".npz"
 JOINT = "gns_data"  # key under which some files hold all trajectories together
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 """Time of every member: the earliest that zip knows, so that equal data give equal bytes."""
@@ -41,39 +40,36 @@ _PARTS = 3  # parts of a trajectory at the most: positions, kinds, a material pr
 _DEPTH = 3  # how deep arrays may lie in each other: trajectories in a joint array, parts, and a spare
 
 
-def write(path: Path, runs: Iterable[tuple[NDArray[np.float32], NDArray[np.int64]]]) -> None:
-    """Write positions and kinds of one subset's trajectories; the file appears whole or not at all.
+def write(path: Path, runs: Iterable[Run]) -> list[tuple[int, int]]:
+    """Write one subset, whole or not at all; return frames and particles of each trajectory.
 
     Members are stored uncompressed, as ``numpy.savez`` stores them: compressed bytes would
     change with the version of zlib. One trajectory is in memory at a time.
     """
+    shapes: list[tuple[int, int]] = []
     with atomic_path(path, option="--output") as temporary, zipfile.ZipFile(temporary, "w") as archive:
-        for number, parts in enumerate(runs):
+        for frames, position, kinds in runs:
             pair = np.empty(2, dtype=object)
-            pair[0], pair[1] = parts
-            member = zipfile.ZipInfo(f"simulation_{number}.npy", date_time=_EPOCH)
+            pair[0], pair[1] = np.empty((frames, len(kinds), 2), np.float32), kinds
+            for number in range(frames):
+                pair[0][number] = position(number)
+            member = zipfile.ZipInfo(f"simulation_{len(shapes)}.npy", date_time=_EPOCH)
             member.external_attr = 0o644 << 16
             with archive.open(member, "w", force_zip64=True) as stream:
                 np.lib.format.write_array_header_1_0(
                     stream, {"descr": "|O", "fortran_order": False, "shape": (2,)}
                 )
                 pickle.dump(pair, stream, protocol=4)
+            shapes.append((frames, len(kinds)))
+    return shapes
 
 
-def trajectories(path: Path, *, allow_pickle: bool, kinds: Mapping[int, str]) -> Iterator[Trajectory]:
-    """Yield the trajectories of a file, one in memory at a time.
+def trajectories(path: Path, kinds: Mapping[int, str]) -> Iterator[Trajectory]:
+    """Yield the trajectories of a file, one in memory at a time; its pickles are rebuilt.
 
-    Kinds say what numbers of particles stand for, see :func:`.metadata.materials_of`. Without
-    ``allow_pickle`` the file is refused by a UsageError, damage by an UnreadableFileError, positions
-    that are not of two components by a DataError.
+    Kinds say what numbers of particles stand for, see :func:`.metadata.materials_of`. Damage is refused
+    by an UnreadableFileError, positions that are not of two components by a DataError.
     """
-    if not allow_pickle:
-        raise UsageError(
-            "the trajectories in this format are pickled objects",
-            where=str(path),
-            expected="leave to rebuild them",
-            fix="add --allow-pickle: arrays are rebuilt, any other call in the file is refused",
-        )
     try:
         archive = zipfile.ZipFile(path)
     except (OSError, zipfile.BadZipFile) as error:
@@ -163,13 +159,6 @@ def _load(archive: zipfile.ZipFile, member: str, name: str) -> NDArray[Any]:
             expected="an object array of arrays",
             got=f"{type(error).__name__}: {error}",
         ) from error
-
-
-def read_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Return shape, whether the order is Fortran's, and type of a .npy stream."""
-    first = np.lib.format.read_magic(stream) == (1, 0)
-    read = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
-    return read(stream)
 
 
 class _Type:

@@ -47,6 +47,8 @@ class Format(enum.StrEnum):
     LAGRANGEBENCH_H5 = "lagrangebench-h5"
 
 
+ENDINGS = {Format.GNS_NPZ: ".npz", Format.LAGRANGEBENCH_H5: ".h5"}  # of the files of subsets
+
 NUMBERS: Mapping[Format, Mapping[str, int]] = {
     Format.GNS_NPZ: {"liquid": 5, "snow": 6, "jelly": 7, "rope": 8},
     Format.LAGRANGEBENCH_H5: {"liquid": 0, "jelly": 4, "snow": 5, "rope": 6},

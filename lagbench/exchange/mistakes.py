@@ -79,17 +79,14 @@ def check_meaning(name: str, position: Any, velocity: Any, interval: float) -> N
 
 def _block(array: Any) -> Block:  # noqa: ANN401
     """Return evenly spaced stretches of an array, of which a frame at a time is in memory."""
-    frames, particles = (_stretches(n, most) for n, most in zip(array.shape[:2], STRETCHES, strict=True))
+    places = []  # indices of shape [stretch, neighbour] along each axis
+    for count, most in zip(array.shape[:2], STRETCHES, strict=True):
+        length = min(STRETCH, count)
+        first = np.unique(np.linspace(0, count - length, most).astype(int))
+        places.append(first[:, None] + np.arange(length))
+    frames, particles = places
     rows = [np.asarray(array[int(frame)], np.float64)[particles] for frame in frames.flat]
     return np.stack(rows).reshape(*frames.shape, *particles.shape, 2)
-
-
-def _stretches(count: int, most: int) -> NDArray[np.int_]:
-    """Return indices of shape [stretch, neighbour]."""
-    length = min(STRETCH, count)
-    first = np.unique(np.linspace(0, count - length, most).astype(int))
-    found: NDArray[np.int_] = first[:, None] + np.arange(length)
-    return found
 
 
 def _is_transposed(moved: Block) -> bool:

@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import IO, Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,9 @@ from .mistakes import misplaced_axes
 Array = NDArray[np.floating]
 Frame = tuple[Array, Array | None]
 """Positions [length of the source] and, where the source has them, velocities [its length/s]."""
+
+Run = tuple[int, Callable[[int], NDArray[np.float32]], NDArray[np.int64]]
+"""Frames of a trajectory, what returns the positions of one of them, and the kind of each particle."""
 
 Box = tuple[tuple[float, float], tuple[float, float]]
 """Low and high walls along x and y."""
@@ -297,3 +300,10 @@ def check_inflation(where: str, *, packed: int, unpacked: int) -> None:
             expected=f"at most {MOST_INFLATION} times {packed} bytes",
             got=f"{unpacked} bytes",
         )
+
+
+def read_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Return shape, whether the order is Fortran's, and type of a .npy stream."""
+    first = np.lib.format.read_magic(stream) == (1, 0)
+    read = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
+    return read(stream)

@@ -22,7 +22,7 @@ from lagbench.atomic import atomic_path
 from lagbench.data.layout import MANIFEST_NAME
 from lagbench.data.local import locate, remedy
 from lagbench.data.manifest import MANIFEST_LIMIT, FileEntry, Manifest, read_manifest
-from lagbench.data.registry import Registry, Size
+from lagbench.data.registry import Size
 from lagbench.data.scenario import check_scenario
 from lagbench.errors import DataError, LagbenchError
 
@@ -65,15 +65,10 @@ def _members(manifest: Manifest) -> list[FileEntry]:
 
 
 def write_archive(
-    split: str | Path,
-    size: str | None = None,
-    *,
-    output: str | Path,
-    root: str | Path | None = None,
-    registry: Registry | None = None,
+    split: str | Path, size: str | None = None, *, output: str | Path, root: str | Path | None = None
 ) -> Path:
     """Write the archive of a complete data set into a folder, every file checked; return its path."""
-    tier, home, _ = locate(split, size, root=root, registry=registry)
+    tier, home, _ = locate(split, size, root=root)
     target = Path(output) / archive_name(tier)
     bring(tier, home, tier.scenarios)
     folder = tier.folder(home)
