@@ -185,11 +185,7 @@ def submit(
                 budget=header.budget,
             )
         )
-    errors: dict[str, str] = {}  # what only the same predictions share, whatever they are called, and where
-    for scored in (scored for entry in others.values() for scored in entry.score_paths):
-        with suppress(UnreadableFileError):  # `leaderboard check` tells of those
-            errors[print_of(read_stored(folder.path / scored).scores.tallies)] = str(scored)
-    _require_new([print_of(card.tallies[SUBMISSION]) for card in cards], paths, errors)
+    _require_new([print_of(card.tallies[SUBMISSION]) for card in cards], paths, _prints(folder, others))
     try:
         return _publish(place, about, cards, made, folder, outside, sources)
     except OSError as error:
@@ -300,6 +296,15 @@ def _require_new(prints: Sequence[str], paths: Sequence[Path], known: Mapping[st
             got = f"those of {found[print_]}"
             raise UsageError("the same predictions are there", where=str(path), got=got, fix=fix)
         found[print_] = str(path)
+
+
+def _prints(folder: Folder, others: Mapping[Path, Entry]) -> dict[str, str]:
+    """Return what only the same predictions share, whatever they are called, and where."""
+    found = {}
+    for path in (path for entry in others.values() for path in entry.score_paths):
+        with suppress(UnreadableFileError):  # `leaderboard check` tells of those
+            found[print_of(read_stored(folder.path / path).scores.tallies)] = str(path)
+    return found
 
 
 def _about(headers: Sequence[Header], meta: Meta) -> About:
