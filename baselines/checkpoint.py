@@ -75,10 +75,6 @@ def check_footprint(
         raise _too_large(where, f"weights of {held} numbers", f"options for {asked}")
 
 
-class LastStateWarning(UserWarning):
-    """What is taken are not the best weights of a training."""
-
-
 class _TooManyPartsError(Exception):
     """More parameters than the file has tensors."""
 
@@ -217,14 +213,6 @@ def load(path: str | Path) -> Checkpoint:
         )
     except (KeyError, TypeError, ValueError, RecursionError) as error:
         raise _unfit(file, SAFE, f"{type(error).__name__}: {' '.join(str(error).split())[:200]}") from None
-
-
-def warn_of_last_state(checkpoint: Checkpoint, path: Path) -> None:
-    """Warn where a file holds the last state of a training whose best weights lie beside it."""
-    best = path.with_name("weights.pt")
-    if checkpoint.optimizer is not None and best.is_file():
-        message = f"{path} holds the last state of a training; the best weights on valid are {best}"
-        warnings.warn(message, LastStateWarning, stacklevel=3)
 
 
 def _is_plain(value: Tensor) -> bool:

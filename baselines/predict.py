@@ -28,12 +28,13 @@ from lagbench.work.progress import Meter, Progress
 from .augmentation import check_symmetry
 from .baseline import Baseline, Facts, rescaled
 from .catalogue import find
-from .checkpoint import Checkpoint, check_data, load, restore, warn_of_last_state
+from .checkpoint import Checkpoint, check_data, load, restore
 from .graph import radius_graph
 from .job import MOST_RECORD, RunFolder, changes_of, parameter_count
 from .machine import bound_memory, chosen_device, hardware, memory_errors_told, threads_used
 from .recipe import changed_options
 from .rollout import Rollout, roll_out, scenario_batch, scenario_paths
+from .start import warn_of_last_state
 
 SEARCHES = 5  # frames of a rollout on which the neighbour search is timed alone
 
@@ -88,7 +89,7 @@ def predict(
 
     Where a training.json beside the checkpoint says that its training is not over, there is an
     :class:`UnfinishedWarning`; where it holds the last state beside the best weights, a
-    :class:`~lagbench.baselines.checkpoint.LastStateWarning`.
+    :class:`~lagbench.baselines.start.LastStateWarning`.
 
     Args:
         checkpoint: weights.pt or checkpoint.pt of a training.
@@ -184,7 +185,11 @@ def predict(
 def check_replaceable(output: Path) -> None:
     """Refuse to write predictions, and what they cost beside them, over files that are something else."""
     for path, ours in ((output, SIGNATURE), (output.with_suffix(".json"), b"seconds_per_frame")):
-        if path.is_file() and path.stat().st_size and ours not in path.read_bytes()[:MOST_RECORD]:
+        if not path.is_file():
+            continue
+        with path.open("rb") as stream:
+            held = stream.read(MOST_RECORD)
+        if held and ours not in held:
             raise UsageError(
                 "the output would replace a file that is something else",
                 where="--output",

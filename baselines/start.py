@@ -7,6 +7,7 @@ options that it has, so that its first step there predicts what ``lagbench predi
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,15 +22,7 @@ from lagbench.submission.budget import Budget
 
 from .baseline import Baseline, Facts, rescaled
 from .catalogue import Entry
-from .checkpoint import (
-    RECIPE_NAME,
-    Checkpoint,
-    check_data,
-    load,
-    load_weights,
-    restore,
-    warn_of_last_state,
-)
+from .checkpoint import RECIPE_NAME, Checkpoint, check_data, load, load_weights, restore
 
 WHERE = "--start"
 MOST_HOURS, MOST_STEPS = 1e9, 10**12  # more are not believed
@@ -67,6 +60,18 @@ class Start:
                 fix="leave out what was --set of these, or start from other weights",
             )
         load_weights(model, self.weights, where=str(self.path))
+
+
+class LastStateWarning(UserWarning):
+    """What is taken are not the best weights of a training."""
+
+
+def warn_of_last_state(checkpoint: Checkpoint, path: Path) -> None:
+    """Warn where a file holds the last state of a training whose best weights lie beside it."""
+    best = path.with_name("weights.pt")
+    if checkpoint.optimizer is not None and best.is_file():
+        message = f"{path} holds the last state of a training; the best weights on valid are {best}"
+        warnings.warn(message, LastStateWarning, stacklevel=3)
 
 
 def start_from(path: str | Path, entry: Entry, size: Size, *, root: Path, registry: Registry) -> Start:

@@ -138,7 +138,7 @@ def submit(
             if (got := opened.header.split) not in (known := described.splits):
                 raise UsageError("no split of a leaderboard", where=str(path), expected=[*known], got=got)
             headers.append(opened.header)
-            hashes.append(opened.content_sha256())
+            hashes.append(result.sha256 or opened.content_sha256())
             size = described.size(opened.header.split, opened.header.size)
             warned = any(found.check == OUTSIDE for found in result.warnings)
             outside.append(outside_share(opened, size) if warned else None)
@@ -148,9 +148,8 @@ def submit(
         about = _about(headers, meta)
     with mistakes:
         if meta.urls and len(meta.urls) != len(headers):
-            what, count = "addresses and files differ in number", len(headers)
-            fix = "give one address per file, in their order, or none"
-            raise UsageError(what, where="--url", expected=count, got=len(meta.urls), fix=fix)
+            fix = f"give {len(headers)}, one per file in their order, or none"
+            raise UsageError("addresses do not match the files", where="--url", got=len(meta.urls), fix=fix)
         urls = meta.urls or (None,) * len(headers)
     with mistakes:
         sources = require_weights(weights, headers)
