@@ -224,8 +224,12 @@ def _is_plain(value: Tensor) -> bool:
 
 def restore(checkpoint: Checkpoint, *, where: str = "the checkpoint") -> Baseline:
     """Return the model of a checkpoint, in float32, ready to predict."""
-    entry = find(checkpoint.baseline)
     options, facts = checkpoint.options, checkpoint.facts
+    try:
+        entry = find(checkpoint.baseline)
+    except UsageError as error:
+        fix = f"install the package that adds it; {error.fix}"
+        raise UsageError(error.what, where=where, got=error.got, fix=fix) from error
     try:
         check_footprint(entry.model, options, facts, checkpoint.weights, where=where)
         model = entry.model.build(options, facts)
@@ -295,6 +299,15 @@ def check_data(
         UsageError: no such size, the model knows one only, or box or frames there are others.
     """
     trained, known = checkpoint.facts, registry or load_registry()
+    try:
+        known.split(trained.split)
+    except UsageError as error:
+        raise DataError(
+            f"the data that the model was trained on, {trained.split}, are not there",
+            where=where,
+            got=f"splits known in {root}: {', '.join(known.splits)}",
+            fix=f"name the folder that holds {trained.split}: --root FOLDER",
+        ) from error
     if size in (None, trained.size):
         here = facts_of(trained.split, trained.size, root=root, registry=known)
         expected, got = trained.dataset_sha256, here.dataset_sha256

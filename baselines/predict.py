@@ -184,6 +184,9 @@ def predict(
 
 def check_replaceable(output: Path) -> None:
     """Refuse to write predictions, and what they cost beside them, over files that are something else."""
+    if output.is_dir():
+        fix = f"name a file: -o {output / 'predictions.nc'}"
+        raise UsageError("the output is a folder", where="--output", got=str(output), fix=fix)
     for path, ours in ((output, SIGNATURE), (output.with_suffix(".json"), b"seconds_per_frame")):
         if not path.is_file():
             continue
@@ -286,10 +289,15 @@ def training_words(checkpoint: Checkpoint) -> str:
     return words + "".join(f", {change}" for change in changes_of(recipe))
 
 
+def told_by_us(training: str) -> bool:
+    """Tell whether what predictions say of their training was written by `training_words`."""
+    return RECIPE in training
+
+
 def fits(training: str, checkpoint: Checkpoint) -> bool:
     """Tell whether what predictions say of their training is what weights say; words of others always fit."""
     said, _, _ = training.partition(PREDICTED_WITH)
-    return RECIPE not in said or said == training_words(checkpoint)
+    return not told_by_us(said) or said == training_words(checkpoint)
 
 
 def _provenance(checkpoint: Checkpoint, here: Facts, settings: Sequence[str]) -> dict[str, Any]:

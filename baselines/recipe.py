@@ -234,9 +234,11 @@ def recipe_for(
     wanted = size if own_file or not variant else f"{size}-{variant}"
     name = f"{split}/{wanted}"
     part = file.recipes.get(name) or file.recipes.get(f"{ANY}/{wanted}")
-    if part is None and file.recipes:
+    if part is None and (file.recipes or (variant and not own_file)):
         same_split = [other for other in file.recipes if other.split("/")[0] == split]
-        fix = f"{nearest(name, same_split or file.recipes)}; or "
+        fix = (
+            f"{nearest(name, same_split or file.recipes)}; or " if file.recipes else "leave --recipe out; or "
+        )
         if variant and not own_file:
             parts = [other.split("/")[1] for other in file.recipes if other.split("/")[0] in (split, ANY)]
             variants = [other.removeprefix(f"{size}-") for other in parts if other.startswith(f"{size}-")]

@@ -36,7 +36,6 @@ from lagbench.board.entry_file import spell
 from lagbench.board.folder import Folder, score_paths
 from lagbench.board.page import build
 from lagbench.board.ranking import combine, summarise, write_floors
-from lagbench.board.score_file import read_stored, reported_frames
 from lagbench.cli.output import spell_bytes
 from lagbench.data.checksums import file_sha256
 from lagbench.data.grid import Grid, Placement
@@ -47,6 +46,7 @@ from lagbench.metrics.distributions import BINS
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.scenario import FRAMES, PARTICLES, SUBMISSION, Preview, as_stored
 from lagbench.scoring.score_file import write_statistics
+from lagbench.scoring.stored import read_stored, reported_frames
 from lagbench.scoring.task import ranking_metric
 from lagbench.submission import Header
 from lagbench.submission.task_checks import frames_to_predict

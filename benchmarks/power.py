@@ -176,9 +176,10 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--write", action="store_true", help="write docs/power.md")
+    write = parser.parse_args().write
     page = tables()
     print(page)
-    if parser.parse_args().write:
+    if write:
         (ROOT / "docs" / "power.md").write_text(page, encoding="utf-8")
     return 0
 

@@ -90,8 +90,11 @@ def _mark() -> str:
 
 
 def _refused(target: Path, option: str, error: OSError) -> WorkFailedError:
-    in_the_way = isinstance(error, (FileExistsError, NotADirectoryError))
-    remedy = "a file is where a folder has to be: remove it" if in_the_way else "free disk space"
+    remedy = "free disk space"
+    if isinstance(error, (FileExistsError, NotADirectoryError)):
+        remedy = "a file is where a folder has to be: remove it"
+    if isinstance(error, IsADirectoryError):
+        remedy = "a folder has that name: name a file in it"
     return WorkFailedError(
         "cannot write there",
         where=str(target),

@@ -141,7 +141,7 @@ def nearest(name: str, known: Iterable[str]) -> str:
     """
     words = sorted(known)
     close = difflib.get_close_matches(name, words, n=1, cutoff=0.5)
-    listing = f"known: {', '.join(words)}"
+    listing = f"known: {', '.join(words) or 'none'}"
     return f"did you mean {close[0]!r}? {listing}" if close else listing
 
 

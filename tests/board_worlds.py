@@ -22,9 +22,9 @@ from lagbench.board.entry import (
     Verification,
 )
 from lagbench.board.model import Board, Curve, Floor, Histogram, Pictures, Row, Tab, Value
-from lagbench.board.score_file import reported_frames
 from lagbench.data.registry import load
 from lagbench.metrics import METRICS
+from lagbench.scoring.stored import reported_frames
 from lagbench.submission.task_checks import frames_to_predict
 
 Floats = NDArray[np.float64]

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from lagbench.board.entry import Meta
 from lagbench.board.entry_file import read_entry
 from lagbench.board.ranking import combine, summarise
-from lagbench.board.score_file import read_stored
 from lagbench.board.submit import SubmitResult, submit
 from lagbench.data.checksums import dataset_hash, file_sha256, subset_hash
 from lagbench.data.registry import Registry, Size, default_path, load
@@ -28,6 +27,7 @@ from lagbench.data.yamlfile import read_yaml, spell_yaml
 from lagbench.report.report import write_report
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.score import score
+from lagbench.scoring.stored import read_stored
 from lagbench.scoring.task import ScoredTask, load_scored_task
 from lagbench.submission import write
 

@@ -113,6 +113,7 @@ def test_the_speed_up_needs_the_solver(lagbench: Command, monkeypatch: pytest.Mo
         (("--baseline", "gns", *TINY, "--set", "model.latant=3"), 2, "did you mean 'latent'"),
         (("--baseline", "gns", *TINY, "--recipe", "shrt"), 2, "no recipe"),
         (("--baseline", "gns", *TINY, "--device", "tpu"), 2, "no device 'tpu'"),
+        (("--baseline", "gns", *TINY, "--fresh", "--no-resume"), 2, "--no-resume"),
         (("--baseline", "gns", "--split", "cavity", "--size", "mini"), 4, "lagbench generate"),
         (("--baseline", "gns", *TINY, "--output", "/proc/none"), 5, "--output"),
     ],

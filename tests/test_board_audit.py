@@ -73,6 +73,7 @@ def test_a_method_is_verified_with_all_its_seeds(own: BoardBench) -> None:
     path = own.predict(damped, "damped", seed=0, device="cpu", seconds_per_frame=0.25)
     result = rescored(own, path, recording=True)
     assert ([one.score_file.name for one in result.confirmed], result.recorded) == (["damped_0.nc"], ())
+    assert result.partly == (f"{PLACE}/damped.yaml",)
 
 
 def test_scoring_again_finds_what_a_forger_hid(own: BoardBench, predictions: Path) -> None:

@@ -16,7 +16,6 @@ from lagbench.board.folder import Folder
 from lagbench.board.model import Board, Row
 from lagbench.board.page import build
 from lagbench.board.ranking import Combined, combine
-from lagbench.board.score_file import read_stored
 from lagbench.board.show import as_plain, chosen_data_sets, tables
 from lagbench.errors import ChecksFailedError, LagbenchError, UsageError
 from lagbench.floors.table import FLOORS
@@ -24,6 +23,7 @@ from lagbench.metrics import METRICS, Score, bootstrap_interval
 from lagbench.scoring.card import ScoreCard, digits
 from lagbench.scoring.scenario import SUBMISSION
 from lagbench.scoring.score_file import read_statistics
+from lagbench.scoring.stored import read_stored
 
 
 @pytest.fixture(scope="module")

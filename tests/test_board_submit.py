@@ -15,10 +15,10 @@ from lagbench.board import submit as submitting
 from lagbench.board.check import check_board
 from lagbench.board.entry import Meta
 from lagbench.board.entry_file import read_entry
-from lagbench.board.score_file import read_stored
 from lagbench.data.checksums import file_sha256
 from lagbench.errors import ChecksFailedError, LagbenchError, UnreadableFileError, UsageError, WorkFailedError
 from lagbench.floors import floors_of
+from lagbench.scoring.stored import read_stored
 from lagbench.submission import open_predictions
 
 
@@ -84,6 +84,17 @@ def test_predictions_in_the_folder_are_referred_to(own: BoardBench) -> None:
     assert read_entry(own.entry("inside")).predictions[0].path == "predictions/mine.nc"
     assert read_entry(own.entry("noisy")).predictions[0].path is None
     assert not check_board(own.folder, registry=own.registry, page=False, isolated=False).findings
+
+
+def test_a_name_that_no_entry_can_hold(own: BoardBench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A path inside the folder that the schema refuses is told before anything is scored."""
+    inside = own.folder / ("p" * 150) / f"{'q' * 100}.nc"
+    inside.parent.mkdir()
+    own.data.submit(inside, nearer, "inside")
+    monkeypatch.setattr(submitting, "score", pytest.fail)
+    with pytest.raises(ChecksFailedError):
+        own.submit(inside)
+    assert not own.entry("inside").exists()
 
 
 def tree(folder: Path) -> set[str]:

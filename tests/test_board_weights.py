@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import netCDF4
 import pytest
 from made_up import BoardBench, copied, noisy
 from simple_models import FACTS, Drift
@@ -34,16 +33,31 @@ def own(home: Path, tmp_path: Path) -> BoardBench:
     return copied(home, tmp_path)
 
 
-def trained(own: BoardBench, seed: int, training: str = "") -> Path:
+OURS = "cavity tiny train, recipe cavity/tiny, step 6"
+"""What `lagbench predict` says of the training of `trained`."""
+
+
+COUNT = 1
+"""Parameters of that model."""
+
+
+def trained(
+    own: BoardBench,
+    seed: int,
+    training: str | None = OURS,
+    parameters: int | None = None,
+    share: float = 0.6,
+) -> Path:
     """Write the weights of a run, with its record beside them and its predictions."""
     folder = own.folder.parent / f"drift-{seed}"
     folder.mkdir()
+    said = {"training": training, "parameters": parameters}
     labels = {
         "seed": seed,
         "budget": BUDGET.model_dump_json(),
-        **({"training": training} if training else {}),
+        **{key: held for key, held in said.items() if held is not None},
     }
-    share = 0.6 + 0.1 * seed
+    share += 0.1 * seed
 
     def between(truth: Any, n: int, h: int) -> Any:
         return truth[n : n + h] + share * (noisy(truth, n, h) - truth[n : n + h])
@@ -66,12 +80,16 @@ def trained(own: BoardBench, seed: int, training: str = "") -> Path:
 
 
 def submitted(
-    own: BoardBench, *folders: Path, weights: tuple[Path, ...] | None = None, **options: Any
+    own: BoardBench,
+    *folders: Path,
+    weights: tuple[Path, ...] | None = None,
+    method: str | None = None,
+    **options: Any,
 ) -> None:
     """Submit the predictions of runs, with their weights unless others are given."""
     files = [folder / "predictions.nc" for folder in folders]
     given = tuple(folder / "weights.pt" for folder in folders) if weights is None else weights
-    meta = Meta(authors=("A. Author",), command="make")
+    meta = Meta(authors=("A. Author",), command="make", method=method, name=method)
     submit(files, meta, weights=given, **own.where, **options)
 
 
@@ -134,19 +152,28 @@ def test_a_later_entry_takes_its_files_along(own: BoardBench) -> None:
 
 
 @pytest.mark.parametrize(
-    ("training", "fits"),
+    ("training", "parameters", "fits"),
     [
-        ("cavity tiny train, recipe cavity/tiny, step 6", True),
-        ("cavity tiny train, recipe cavity/tiny, step 6, predicted with model.average=true", True),
-        ("three nights on my own cluster", True),
-        ("cavity tiny train, recipe cavity/tiny, step 60", False),
-        ("cavity tiny train, recipe cavity/tiny-change, step 6", False),
-        ("cavity tiny train, recipe cavity/tiny, step 6, model.target=change", False),
+        (OURS, None, True),
+        (f"{OURS}, predicted with model.average=true", None, True),
+        ("three nights on my own cluster", COUNT, True),
+        (None, COUNT, True),
+        (OURS, COUNT + 1, False),
+        ("three nights on my own cluster", None, False),
+        (None, None, False),
+        (f"{OURS}0", None, False),
+        ("cavity tiny train, recipe cavity/tiny-change, step 6", None, False),
+        (f"{OURS}, model.target=change", None, False),
     ],
 )
-def test_weights_are_those_of_the_predictions(own: BoardBench, training: str, fits: bool) -> None:
-    """What predictions say of their training is what the weights say; others' own words are no matter."""
-    run = trained(own, 0, training)
+def test_weights_are_those_of_the_predictions(
+    own: BoardBench, training: str | None, parameters: int | None, fits: bool
+) -> None:
+    """What predictions say of training and parameters is what the weights say, and they say one of them.
+
+    The number of parameters tells GNS from SuperGAT, whose words are alike.
+    """
+    run = trained(own, 0, training, parameters)
     if fits:
         submitted(own, run)
         return
@@ -164,14 +191,21 @@ def test_seeds_differ_in_nothing_else(own: BoardBench, change: str, fits: bool) 
         submitted(own, *runs, weights=())
 
 
-def test_weights_of_another_model_are_refused(own: BoardBench) -> None:
-    """Words that fit are not enough: the number of parameters tells GNS from SuperGAT."""
-    run = trained(own, 0)
-    with netCDF4.Dataset(run / "predictions.nc", "a") as data:
-        data.parameters = 12345
+def test_weights_of_another_entry_are_refused(own: BoardBench) -> None:
+    """They lie on the board already; where they came by hand, the check finds them."""
+    first = trained(own, 0)
+    submitted(own, first)
+    (own.folder.parent / "drift-0").rename(own.folder.parent / "first")
+    second = trained(own, 0, share=0.3)
     with pytest.raises(UsageError) as caught:
-        submitted(own, run)
-    assert caught.value.where == str(run / "weights.pt")
+        submitted(own, second, method="glide")
+    assert caught.value.where == str(second / "weights.pt")
+    submitted(own, second, weights=(), method="glide")
+    source, target = (own.folder / f"weights/cavity/tiny/{name}_0.pt" for name in ("drift", "glide"))
+    target.write_bytes(source.read_bytes())
+    said = {"path": "weights/cavity/tiny/glide_0.pt", "sha256": file_sha256(source)}
+    own.edit("glide", lambda held: held["predictions"][0].update(weights=said))
+    assert found(own) == {"weights"}
 
 
 def test_other_weights_are_refused(own: BoardBench) -> None:

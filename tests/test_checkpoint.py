@@ -247,9 +247,10 @@ def test_unfit_weights(changes: dict[str, Any], message: str, monkeypatch: pytes
 
 
 def test_unknown_baseline() -> None:
-    """A checkpoint of a baseline that is not installed says so."""
-    with pytest.raises(UsageError, match="no baseline 'drift'"):
-        restore(example())
+    """A checkpoint of a baseline that is not installed says so, and which file it is."""
+    with pytest.raises(UsageError, match="no baseline 'drift'") as caught:
+        restore(example(), where="a.pt")
+    assert caught.value.where == "a.pt"
 
 
 def test_data_of_another_version(generated: GenerationResult, unmeasured: Registry) -> None:
@@ -258,6 +259,10 @@ def test_data_of_another_version(generated: GenerationResult, unmeasured: Regist
         check_data(example(), root=generated.root, registry=unmeasured, where="a.pt")
     with pytest.raises(DataError, match="lagbench generate"):
         check_data(example(), root=generated.root / "nowhere", registry=unmeasured, where="a.pt")
+    elsewhere = example(facts=replace(FACTS, split="my-river"))
+    with pytest.raises(DataError) as caught:  # a local split of another root
+        check_data(elsewhere, root=generated.root, registry=unmeasured, where="a.pt")
+    assert caught.value.where == "a.pt"
 
 
 def repacked(source: Path, target: Path, *, compression: int = zipfile.ZIP_STORED, **more: bytes) -> Path:

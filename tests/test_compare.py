@@ -5,14 +5,16 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
+import netCDF4
 import numpy as np
 import pytest
 from score_bench import ScoreBench, half_right, still, straight
 
-from lagbench.errors import DataError, UnreadableFileError, UsageError
+from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError
 from lagbench.metrics import differ
 from lagbench.scoring.compare import ComparisonResult, compare
 from lagbench.scoring.tables import Table, card_tables, comparison_tables, flag_lines
@@ -151,7 +153,7 @@ def test_other_data_are_not_compared(
 
 
 def test_folders_files_and_predictions_agree(bench: ScoreBench, scored: dict[str, Path]) -> None:
-    """A folder, its scores.json and its predictions.nc, scored on the way, say the same.
+    """A folder, its scores.json, scores.nc and its predictions.nc, scored on the way, say the same.
 
     The short table leads with the ranking metric; all metrics come when asked for.
     """
@@ -160,7 +162,8 @@ def test_folders_files_and_predictions_agree(bench: ScoreBench, scored: dict[str
     by_file = compare(still_ / "scores.json", straight_ / "scores.json")
     nc = "predictions.nc"
     fresh = compare(still_ / nc, straight_ / nc, root=bench.root, registry=bench.registry)
-    assert by_folder.as_json() == by_file.as_json() == fresh.as_json()
+    binary = compare(still_ / "scores.nc", straight_ / "scores.nc")
+    assert by_folder.as_json() == by_file.as_json() == fresh.as_json() == binary.as_json()
     assert by_folder.first == "still"
     assert compare(still_, still_).verdict == "both hold the same predictions"
     assert next(iter(by_folder.metrics)) == by_folder.ranking
@@ -169,6 +172,24 @@ def test_folders_files_and_predictions_agree(bench: ScoreBench, scored: dict[str
     assert short.rows[0][0].split()[0] == "vorticity_nrmse"
     assert len(means.rows) == len(short.rows)
     assert len(short.rows) < len(whole.rows) == len(result.metrics)
+
+
+def test_files_of_a_leaderboard(scored: dict[str, Path], tmp_path: Path) -> None:
+    """Score files of several seeds go by their common name; the best floor stands in each."""
+    for i, name in enumerate(("still", "straight")):
+        path = tmp_path / f"moving_{i}.nc"
+        shutil.copy(scored[name] / "scores.nc", path)
+        with netCDF4.Dataset(path, "a") as file:
+            file.method = "moving"
+    result = compare(tmp_path / "moving.nc", scored["still"])
+    assert (result.first, result.seeds) == ("moving", (2, 1))
+    single = compare(scored["still"] / "scores.nc", "constant-velocity").as_json()["metrics"]
+    whole = compare(scored["still"], "constant-velocity").as_json()["metrics"]
+    assert single == {name: whole[name] for name in ("vorticity_nrmse",)}
+    with netCDF4.Dataset(path, "a") as file:
+        file.method = "moving\x1b[2J"  # a terminal would obey
+    with pytest.raises(LagbenchError):
+        compare(tmp_path / "moving.nc", scored["still"])
 
 
 def test_floors_stand_in_the_scores(scored: dict[str, Path]) -> None:

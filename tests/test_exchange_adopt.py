@@ -127,7 +127,7 @@ def test_ten_comes_after_two(tmp_path: Path) -> None:
     """Files count by the numbers in their names, as a shell lists them or in a folder; others stay."""
     names = [f"run{n}.npz" for n in (0, 1, 10, 11, 2)]
     for name in names:
-        (tmp_path / name).touch()
+        (tmp_path / name).write_bytes(b"1")
     given = [tmp_path / name for name in names]
     wanted = {"train": ["run0", "run1", "run2"], "valid": ["run10"], "test": ["run11"]}
     for paths in (given, [tmp_path]):
@@ -135,6 +135,17 @@ def test_ten_comes_after_two(tmp_path: Path) -> None:
         assert {subset: [path.stem for path, _ in rows] for subset, rows in found.items()} == wanted
     found = _by_subset(given[::-1], valid=1, test=1)
     assert [path.stem for path, _ in found["test"]] == ["run0"]
+
+
+@pytest.mark.parametrize("ending", ["npy", "npz", "nc"])
+def test_an_empty_file_is_no_trajectory(tmp_path: Path, ending: str) -> None:
+    """It is told as such, and not counted among too few."""
+    save_runs(tmp_path, straight_runs(2))
+    (tmp_path / f"run2.{ending}").touch(exist_ok=True)
+    (tmp_path / f"run2.{ending}").write_bytes(b"")
+    with pytest.raises(UnreadableFileError) as caught:
+        adopt(tmp_path, output=tmp_path / "mine", **BASIC)
+    assert caught.value.where == str(tmp_path / f"run2.{ending}")
 
 
 def test_named_arrays(tmp_path: Path, runs: list[NDArray[np.float32]]) -> None:

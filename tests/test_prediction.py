@@ -383,9 +383,9 @@ def test_models_of_any_size_have_the_same_weights_at_each() -> None:
         assert shapes[0] == shapes[1], model.method
 
 
-@pytest.mark.parametrize("name", ["weights.pt", "training.nc"])
+@pytest.mark.parametrize("name", ["weights.pt", "training.nc", "."])
 def test_nothing_else_is_replaced(run: Predict, tmp_path: Path, name: str) -> None:
-    """Not the weights themselves, nor the record of their training, whose name that of the cost would be."""
+    """Not the weights, nor the record of their training, whose name that of the cost would be; no folder."""
     record = {**UNFINISHED, "state": "finished"}
     (tmp_path / "training.json").write_text(json.dumps(record))
     with pytest.raises(UsageError) as caught:

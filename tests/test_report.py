@@ -290,6 +290,20 @@ def test_cards_must_belong_together(bench_of: Callable[[str], ReportBench], tmp_
     assert not (tmp_path / "index.html").exists()
 
 
+def test_pages_of_others_stay(bench_of: Callable[[str], ReportBench], tmp_path: Path) -> None:
+    """A report replaces a report, and no other page."""
+    bench = bench_of("cavity")
+    path = bench.submit(tmp_path / "1.nc", still, "a")
+    held = {"root": bench.root, "registry": bench.registry}
+    for _ in range(2):
+        page = write_report(tmp_path / "report", [bench.card(path)], [path], **held)
+    page.write_text("<!doctype html><title>My thesis</title>")
+    with pytest.raises(UsageError) as caught:
+        write_report(tmp_path / "report", [bench.card(path)], [path], **held)
+    assert (caught.value.where, caught.value.got) == ("--report", str(page))
+    assert "My thesis" in page.read_text()
+
+
 def subject_on(split: str, size_name: str) -> Subject:
     """Return a subject without entries: enough to ask which frames are shown."""
     size = load().size(split, size_name)

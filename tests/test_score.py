@@ -11,9 +11,10 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+from full_disk import largest_file
 from score_bench import ScoreBench, half_right, right, still, straight
 
-from lagbench.errors import ChecksFailedError, DataError, UsageError
+from lagbench.errors import ChecksFailedError, DataError, UsageError, WorkFailedError
 from lagbench.scoring import score as scoring
 from lagbench.scoring.card import ScoreCard, digits
 from lagbench.scoring.scenario import SUBMISSION
@@ -122,6 +123,19 @@ def test_scores_follow_from_scores_nc(standing: ScoreCard) -> None:
         assert entry["interval"] == [digits(bound) for bound in found.interval], name
         assert entry["undefined"] == list(found.undefined), name
     assert stored.predictions_sha256 == said["predictions_sha256"]
+
+
+@pytest.mark.parametrize("one_fits", [False, True])
+def test_a_full_disk_leaves_both_files_or_none(bench: ScoreBench, tmp_path: Path, one_fits: bool) -> None:
+    """Scores of before stay as they were: scores.json belongs to the scores.nc beside it."""
+    bench.score(bench.submit(tmp_path / "predictions.nc", half_right))
+    before = {path.name: path.read_bytes() for path in tmp_path.glob("scores.*")}
+    one, other = sorted(map(len, before.values()))
+    room = (one + other) // 2 if one_fits else 2_000
+    bench.submit(tmp_path / "predictions.nc", still)
+    with largest_file(room), pytest.raises(WorkFailedError):
+        bench.score(tmp_path / "predictions.nc")
+    assert {path.name: path.read_bytes() for path in tmp_path.glob("scores.*")} == before
 
 
 def test_same_bytes_from_worker_processes(bench: ScoreBench, standing: ScoreCard, tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.scenario import LONG_BITS, LONG_ROLLOUT, SUBMISSION
 from lagbench.scoring.score import score
 from lagbench.scoring.score_file import FILM_RANGE, LEVELS, StoredScores, write_statistics
+from lagbench.scoring.stored import read_stored
 from lagbench.submission.findings import Finding
 from lagbench.work.progress import Progress
 
@@ -31,7 +32,6 @@ from .entry import Entry, ScoredFile
 from .entry_file import MAX_ENTRY_BYTES
 from .findings import FLOORS_ANEW, finding
 from .folder import FLOORS, SCORES, SUBMISSIONS, VERIFIED, WEIGHTS, Folder
-from .score_file import read_stored
 
 TOLERANCE = 1e-6
 """Relative difference up to which two numbers are equal; NumPy versions may differ in the last bits."""

@@ -23,6 +23,7 @@ from lagbench.errors import LagbenchError, UnreadableFileError, UsageError
 from lagbench.floors.shipped import shipped_path
 from lagbench.floors.table import FLOORS
 from lagbench.scoring.floors import measured_again
+from lagbench.scoring.stored import MAX_SCORE_BYTES, Stored, read_stored, unreadable_in_child
 from lagbench.submission.findings import Finding
 from lagbench.work.progress import Progress
 
@@ -33,7 +34,6 @@ from .findings import finding, finding_of, impossible, print_of, skeleton
 from .folder import VERIFIED, Folder, Place, entry_path
 from .page import build
 from .ranking import combine, dataset_of, is_current, summarise
-from .score_file import MAX_SCORE_BYTES, Stored, read_stored, unreadable_in_child
 from .weights import check_weights
 
 
@@ -47,6 +47,8 @@ class CheckResult:
     page_checked: bool  # whether the page was compared; it is not while anything else is wrong
     confirmed: tuple[Confirmation, ...] = ()  # predictions that gave the same when scored again
     recorded: tuple[str, ...] = ()  # entries that were added to verified.yaml
+    # entries of which some seeds were confirmed and others not looked at: they are not added
+    partly: tuple[str, ...] = ()
     # floors that were measured again, by data set, as in "cavity mini"
     floors: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
@@ -114,7 +116,9 @@ def check_board(
     for one in predictions:
         look.found += again.of_file(one)
     measured = {f"{size.split} {size.name}": look.measured(size, root, progress) for size in floors}
-    recorded = again.entries_confirmed() if recording and not look.found else []
+    confirmed = again.entries_confirmed()
+    whole = {entry.yaml_path.as_posix() for entry in confirmed}
+    recorded = confirmed if recording and not look.found else []
     record(folder, recorded, today)
     looked = page and not look.found
     if looked:
@@ -129,6 +133,7 @@ def check_board(
         page_checked=looked,
         confirmed=tuple(again.confirmed),
         recorded=tuple(entry.yaml_path.as_posix() for entry in recorded),
+        partly=tuple(sorted({one.entry.as_posix() for one in again.confirmed} - whole)),
         floors=measured,
     )
 

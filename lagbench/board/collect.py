@@ -23,6 +23,7 @@ from lagbench.metrics.significance import FEWEST_SCENARIOS, Standing, mean_loss,
 from lagbench.metrics.table import METRICS
 from lagbench.scoring.card import skill
 from lagbench.scoring.scenario import Preview
+from lagbench.scoring.stored import Stored, read_stored, reported_frames
 from lagbench.submission.task_checks import frames_to_predict
 
 from .entry import Cost, Entry, Status, Verification
@@ -31,7 +32,6 @@ from .folder import Folder
 from .model import Board, Curve, Floor, Histogram, Pictures, Row, Tab, Value
 from .payload import spaced
 from .ranking import Combined, combine, is_current, read_floors
-from .score_file import Stored, read_stored, reported_frames
 
 COLUMNS = (
     *("vorticity_nrmse", "cloud_distance", "vorticity_rmse", "mse_avg", "vorticity_pearson"),

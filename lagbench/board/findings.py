@@ -14,9 +14,8 @@ from lagbench.errors import LagbenchError
 from lagbench.metrics.aggregate import Tally
 from lagbench.metrics.metric import Direction
 from lagbench.metrics.table import METRICS
+from lagbench.scoring.stored import MAX_SCORE_BYTES, Stored
 from lagbench.submission.findings import Finding, Severity
-
-from .score_file import MAX_SCORE_BYTES, Stored
 
 ROUNDING = 1e-6  # share of the greatest value by which rounding may take one below zero, or above one
 

@@ -24,10 +24,10 @@ from lagbench.metrics.table import METRICS
 from lagbench.scoring.card import ScoreCard, digits
 from lagbench.scoring.scenario import SUBMISSION
 from lagbench.scoring.score_file import StoredScores, write_statistics
+from lagbench.scoring.stored import read_stored
 
 from .entry import DataSet, Summary
 from .folder import FLOORS, Folder
-from .score_file import read_stored
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

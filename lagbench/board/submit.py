@@ -27,6 +27,7 @@ from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.scenario import SUBMISSION
 from lagbench.scoring.score import score
 from lagbench.scoring.score_file import write_statistics
+from lagbench.scoring.stored import MAX_SCORE_BYTES, read_stored
 from lagbench.submission.checks import outside_share
 from lagbench.submission.findings import ValidationResult
 from lagbench.submission.format import WRITE, Header
@@ -55,7 +56,6 @@ from .entry_file import Model, examine, listed, read_entry, spell
 from .findings import print_of, skeleton
 from .folder import SUBMISSIONS, Folder, Place, entry_path, score_paths
 from .ranking import combine, summarise, write_floors
-from .score_file import MAX_SCORE_BYTES, read_stored
 from .weights import copy_weights, named_weights, require_weights
 
 BOARD = Path("leaderboard")  # the leaderboard's folder, from the root of the repository
@@ -151,18 +151,24 @@ def submit(
             fix = f"give {len(headers)}, one per file in their order, or none"
             raise UsageError("addresses do not match the files", where="--url", got=len(meta.urls), fix=fix)
         urls = meta.urls or (None,) * len(headers)
-    with mistakes:
-        sources = require_weights(weights, headers)
+    others: dict[Path, Entry] = {}
     with mistakes:
         place = (headers[0].split, headers[0].size, _method(headers[0], meta))
         others = _others(folder, place)
         _require_free(folder, place, _name(headers[0], meta), others, replace=replace)
+    with mistakes:
+        sources = require_weights(weights, headers, others)
     mistakes.tell()
     taken = {made.sha256: str(where) for where, entry in others.items() for made in entry.predictions}
     _require_new(hashes, paths, taken)
-    cards, made = [], []
-    for path, result, header, seed, url in zip(paths, results, headers, seeds, urls, strict=True):
-        card = score(
+    made = []
+    for path, sha256, header, seed, url in zip(paths, hashes, headers, seeds, urls, strict=True):
+        inside, whole = path.resolve(), folder.path.resolve()
+        kept = inside.relative_to(whole).as_posix() if inside.is_relative_to(whole) else None
+        said = {"seed": seed, "sha256": sha256, "url": url, "path": kept}
+        made.append(_fitting(Prediction, {**said, "bytes": path.stat().st_size, "budget": header.budget}))
+    cards = [
+        score(
             path,
             root=root,
             workers=workers,
@@ -171,19 +177,8 @@ def submit(
             write=False,
             validated=result,
         )
-        inside, whole = path.resolve(), folder.path.resolve()
-        kept = inside.relative_to(whole).as_posix() if inside.is_relative_to(whole) else None
-        cards.append(card)
-        made.append(
-            Prediction(
-                seed=seed,
-                sha256=card.predictions_sha256,
-                url=url,
-                path=kept,
-                bytes=path.stat().st_size,
-                budget=header.budget,
-            )
-        )
+        for path, result in zip(paths, results, strict=True)
+    ]
     _require_new([print_of(card.tallies[SUBMISSION]) for card in cards], paths, _prints(folder, others))
     try:
         return _publish(place, about, cards, made, folder, outside, sources)

@@ -7,7 +7,7 @@ weights/<split>/<size>/<method>_<seed>.json   what the training recorded, where 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from lagbench.atomic import write_atomically
@@ -29,8 +29,14 @@ MOST_RECORD = 256 << 10  # longest record of a training beside its weights [byte
 RECORD = "training.json"
 
 
-def require_weights(weights: Sequence[str | Path], headers: Sequence[Header]) -> tuple[Path | None, ...]:
-    """Refuse weights that cannot have made the predictions; return the file of each, found by its seed."""
+def require_weights(
+    weights: Sequence[str | Path], headers: Sequence[Header], others: Mapping[Path, Entry]
+) -> tuple[Path | None, ...]:
+    """Return the file of weights of each of the predictions, found by its seed, None where there is none.
+
+    Refused are weights that cannot have made the predictions, that nothing says have, and those of
+    another entry: they lie on the board already.
+    """
     found: list[Path | None] = [None] * len(headers)
     if not weights:
         return tuple(found)
@@ -45,9 +51,15 @@ def require_weights(weights: Sequence[str | Path], headers: Sequence[Header]) ->
         )
     check_installed("torch", extra="baselines")
     from lagbench.baselines.checkpoint import load, rounded_parameters
-    from lagbench.baselines.predict import fits, training_words
+    from lagbench.baselines.predict import fits, told_by_us, training_words
 
     seeds = [header.seed or 0 for header in headers]
+    lying = {
+        made.weights.sha256: str(where)
+        for where, entry in others.items()
+        for made in entry.predictions
+        if made.weights is not None
+    }
     for path in map(Path, weights):
         held = load(path)
         if held.optimizer is not None:
@@ -73,7 +85,21 @@ def require_weights(weights: Sequence[str | Path], headers: Sequence[Header]) ->
             raise UsageError(
                 f"two files of weights of seed {seed}", where=str(path), fix="give one of each seed at most"
             )
+        if (holder := lying.get(file_sha256(path))) is not None:
+            raise UsageError(
+                "these weights lie beside another entry",
+                where=str(path),
+                got=f"those of {holder}",
+                fix="leave them out, and name them in --command; or give those of this method",
+            )
         words, said = headers[number].training or "", headers[number].parameters
+        if said is None and not told_by_us(words):
+            raise UsageError(
+                "nothing says that these weights made the predictions",
+                where=str(path),
+                expected="predictions that state their training, or how many parameters the model has",
+                fix="predict with these weights: lagbench predict; or leave them out",
+            )
         count = rounded_parameters(held) or said
         if not fits(words, held) or said not in (None, count):
             raise UsageError(
@@ -124,6 +150,7 @@ def unfit_record(path: Path) -> str | None:
 def check_weights(folder: Folder, entries: Sequence[Entry]) -> Iterator[Finding]:
     """Yield weights that are missing, edited, out of place, without an entry, or too many; unfit records."""
     known: set[Path] = set()
+    holders: dict[str, str] = {}
     for entry in entries:
         for number, made in enumerate(entry.predictions):
             if made.weights is None:
@@ -139,6 +166,8 @@ def check_weights(folder: Folder, entries: Sequence[Entry]) -> Iterator[Finding]
             elif (found := file_sha256(file)) != made.weights.sha256:
                 said = made.weights.sha256[:16]
                 yield finding("weights", path, f"SHA-256 {found[:16]}", expected=f"{said} as the entry says")
+            elif (holder := holders.setdefault(found, where)) != where:
+                yield finding("weights", where, f"those of {holder}", expected="weights of this method")
             record = path.with_suffix(".json")  # its absence is no finding
             kept = folder.path / record
             if (

@@ -207,11 +207,11 @@ def check(
     if as_json:
         print_json(result)
     else:
-        _checked(result, quiet=quiet)
+        _checked(result, recording=recording, quiet=quiet)
     raise typer.Exit(result.exit_code)
 
 
-def _checked(result: CheckResult, *, quiet: bool) -> None:
+def _checked(result: CheckResult, *, recording: bool, quiet: bool) -> None:
     for finding in result.findings:
         typer.echo(str(finding), err=True)
     for one in result.confirmed:
@@ -221,6 +221,8 @@ def _checked(result: CheckResult, *, quiet: bool) -> None:
         say(f"{name}: measured again {', '.join(floors)}", quiet=quiet)
     for entry in result.recorded:
         say(f"recorded as verified: {entry}", quiet=quiet)
+    for entry in result.partly if recording else ():
+        say(f"not recorded: {entry}: give the predictions of all its seeds in one call", quiet=quiet)
     state = f"{len(result.findings)} findings" if result.findings else "nothing wrong"
     looked = ", page compared" if result.page_checked else ""
     say(f"{result.folder}: {_entries(result.entries)}, {state}{looked}", quiet=quiet)

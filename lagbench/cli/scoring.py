@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lagbench.atomic import check_writable
 from lagbench.errors import UsageError
 
 from .options import (
@@ -125,7 +124,9 @@ def score(
     root = wanted.root
     together = _checked_together(predictions, root) if len(predictions) > 1 else [None]
     if report is not None:
-        check_writable(report, option="--report")
+        from lagbench.report.report import check_folder
+
+        check_folder(report)
     cards: list[ScoreCard] = []
     for path, target, validated in zip(predictions, targets, together, strict=True):
         with progress_bar(quiet=quiet) as draw:
@@ -239,7 +240,7 @@ def _wanted(split: str | None, root: Path | None) -> _Wanted:
 def compare(
     first: Annotated[
         str,
-        typer.Argument(metavar="A", help="scores.json, its folder, a folder of seeds, predictions.nc."),
+        typer.Argument(metavar="A", help="scores.json or .nc, a folder of one or of seeds, predictions.nc."),
     ],
     second: Annotated[str, typer.Argument(metavar="B", help="Another, or the name of a floor.")],
     metric: Annotated[

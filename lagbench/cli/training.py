@@ -94,6 +94,9 @@ def train(
 
     if baseline is None:
         raise UsageError("no model is named", where="--baseline", fix="name one, as in --baseline gns")
+    if fresh and not resume:
+        fix = "--fresh trains anew whatever is there; --no-resume leaves alone what is there"
+        raise UsageError("two options that exclude each other", where="--fresh and --no-resume", fix=fix)
     split = chosen(name, split)
     for module in ("torch", "torch_geometric", "pytorch_lightning"):
         check_installed(module, extra=EXTRA)

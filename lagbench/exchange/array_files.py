@@ -60,6 +60,8 @@ def rows_of(path: Path) -> list[Row]:
             expected=f"a file {', '.join(READABLE)}, or a folder of them",
             got="a folder without such files" if path.is_dir() else None,
         )
+    if path.stat().st_size == 0:
+        raise UnreadableFileError("the file is empty", where=str(path), expected="a trajectory")
     if path.suffix != ".npy":
         return [(path, None)]
     shape = _array(path).shape
@@ -112,7 +114,10 @@ def _trajectory(
     """Return the trajectory of named arrays after a look at their shapes and, given an interval, meaning."""
     if POSITION not in arrays:
         raise UnreadableFileError(
-            "there are no positions", where=name, expected=f"an array {POSITION!r}", got=", ".join(arrays)
+            "there are no positions",
+            where=name,
+            expected=f"an array {POSITION!r}",
+            got=", ".join(arrays) or f"none of {', '.join(ARRAYS)}",
         )
     shape = tuple(arrays[POSITION].shape)
     check_array(name, shape, _dtype(arrays[POSITION]))

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 
-from lagbench.atomic import write_atomically
+from lagbench.atomic import check_writable, write_atomically
 from lagbench.data.registry import Registry
+from lagbench.errors import UsageError
 from lagbench.scoring.card import ScoreCard
 
 from . import curves, flow, maps, tables
@@ -22,6 +23,9 @@ from .subject import Subject, open_gallery, subject_of
 FILE_NAME = "index.html"
 
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
+
+BEGINNING = tag("meta", http_equiv="Content-Security-Policy", content=POLICY)
+"""What is in the head of every report, and of no other page."""
 
 
 @dataclass(frozen=True)
@@ -54,15 +58,29 @@ def write_report(
         registry: where splits are described; ours when None.
 
     Raises:
-        UsageError: no card, or cards that do not belong together.
+        UsageError: no card, cards that do not belong together, or a page there that is no report.
         DataError: the test subset is missing or damaged.
         UnreadableFileError: a predictions.nc is.
         WorkFailedError: the page cannot be written.
     """
+    check_folder(folder)
     subject = subject_of(cards, [Path(path) for path in predictions], root=root, registry=registry)
     path = Path(folder) / FILE_NAME
     write_atomically(path, render(subject).encode(), option="--report")
     return path
+
+
+def check_folder(folder: str | Path) -> None:
+    """Refuse a folder where no report can be written, or where one would replace a page of another kind."""
+    check_writable(Path(folder), option="--report")
+    path = Path(folder) / FILE_NAME
+    if path.is_file() and BEGINNING.encode() not in path.read_bytes()[: 4 * len(BEGINNING)]:
+        raise UsageError(
+            "a page that is no report lies there",
+            where="--report",
+            got=str(path),
+            fix="name another folder",
+        )
 
 
 def render(subject: Subject) -> str:
@@ -130,7 +148,7 @@ def document(title: str, head: Markup, sections: Sequence[Section], foot: Markup
     ]
     meta = [
         tag("meta", charset="utf-8"),
-        tag("meta", http_equiv="Content-Security-Policy", content=POLICY),
+        BEGINNING,
         tag("meta", name="viewport", content="width=device-width, initial-scale=1"),
         tag("meta", name="color-scheme", content="light dark"),
         tag("meta", name="referrer", content="no-referrer"),

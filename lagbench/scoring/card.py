@@ -23,7 +23,6 @@ from typing import Any
 
 import numpy as np
 
-from lagbench.atomic import write_atomically
 from lagbench.data.checksums import round_digits
 from lagbench.data.layout import check_regular
 from lagbench.errors import UnreadableFileError
@@ -260,10 +259,10 @@ def _flag(flag: Flag) -> dict[str, Any]:
     return {"raised": flag.raised, "reasons": list(flag.reasons), "evidence": numbers}
 
 
-def write_json(card: ScoreCard, path: Path) -> None:
-    """Write scores.json, whole or not at all."""
+def spell(card: ScoreCard) -> bytes:
+    """Return the bytes of scores.json."""
     text = json.dumps(card.as_json(), indent=1, allow_nan=False, ensure_ascii=False)
-    write_atomically(path, f"{text}\n".encode(), option="--output")
+    return f"{text}\n".encode()
 
 
 LARGEST = float(np.finfo(np.float32).max)  # a value of a score file at most
@@ -314,9 +313,9 @@ def parse_scores(held: Mapping[str, Any]) -> PublishedScores:
         raise ValueError("scenario ids that occur twice")
     known = available()
     return PublishedScores(
-        identity={name: _text(held, name) for name in IDENTITY},
-        predictions_sha256=_text(held, "predictions_sha256"),
-        ranking=_text(held, "ranking_metric"),
+        identity={name: printable(held, name) for name in IDENTITY},
+        predictions_sha256=printable(held, "predictions_sha256"),
+        ranking=printable(held, "ranking_metric"),
         scores={
             row: {n: _read_score(known[n], ids, said) for n, said in scores.items() if n in known}
             for row, scores in held["rows"].items()
@@ -324,7 +323,7 @@ def parse_scores(held: Mapping[str, Any]) -> PublishedScores:
     )
 
 
-def _text(held: Mapping[str, Any], name: str) -> str:
+def printable(held: Mapping[str, Any], name: str) -> str:
     """Return text under the rule for attributes of predictions: it goes to terminals as it is."""
     text = held[name]
     if not isinstance(text, str) or not text.strip() or len(text) > MAX_NAME or not text.isprintable():

@@ -7,6 +7,7 @@ the intervals speak alone. With one seed on each side these weights are compared
 
 from __future__ import annotations
 
+import glob
 import os
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
@@ -14,6 +15,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from lagbench.data.checksums import round_digits
 from lagbench.data.layout import check_regular
 from lagbench.data.registry import Registry
 from lagbench.errors import DataError, UnreadableFileError, UsageError, nearest
@@ -26,6 +30,7 @@ from lagbench.submission.format import MAX_NAME
 from .card import JSON_NAME, PublishedScores, digits, parse_scores, read_scores
 from .scenario import SUBMISSION
 from .score import score
+from .stored import MAX_SCORE_BYTES, read_stored, unreadable_in_child
 
 
 def told_apart(methods: Sequence[str], taken: Collection[str] = ()) -> list[str]:
@@ -152,8 +157,11 @@ def compare(
 
     Args:
         first: a scores.json, a folder that holds one, a folder whose folders hold those of the
-            seeds of a method, or a predictions.nc, which is then scored.
-        second: another; or the name of a floor, which stands in the first's scores.
+            seeds of a method; a scores.nc, or a leaderboard's score file, of several seeds without
+            their numbers, as in ``leaderboard/scores/cavity/full/neuralmpm.nc``; or a predictions.nc,
+            which is then scored.
+        second: another; or the name of a floor, which stands in the first's scores: in a scores.nc
+            the best one, in the ranking metric.
         metrics: metrics to compare; by default all that judge.
         root: folder of all data sets, where predictions are to be scored.
         workers: worker processes for that.
@@ -204,7 +212,7 @@ def _contestant(
     """Return a method with the scores of its seeds, and the floors beside the first of them."""
     held = []
     for path in _seeds_of(Path(source)):
-        found = read_scores(path) if path.suffix == ".json" else _scored(path, root, workers, registry)
+        found = _published(path) or _scored(path, root, workers, registry)
         if SUBMISSION not in found.scores:
             raise _incomplete(
                 str(path), f"a row {SUBMISSION!r}", ", ".join(map(repr, list(found.scores)[:10]))[:MAX_NAME]
@@ -241,9 +249,13 @@ def _contestant(
 
 
 def _seeds_of(path: Path) -> list[Path]:
-    """Return the score files of a folder: its own, or those of its folders; of a file the path itself."""
+    """Return the score files of a folder: its own, or those of its folders; of a file the path itself.
+
+    What is not there may be the name that a leaderboard's files of several seeds share.
+    """
     if not os.path.isdir(path):  # unlike Path.is_dir, it takes any name
-        return [path]
+        shared = path.suffix == ".nc" and not os.path.lexists(path)
+        return (sorted(path.parent.glob(f"{glob.escape(path.stem)}_*.nc")) if shared else []) or [path]
     if (path / JSON_NAME).is_file():
         return [path / JSON_NAME]
     if not (found := sorted(path.glob(f"*/{JSON_NAME}"))):
@@ -254,6 +266,29 @@ def _seeds_of(path: Path) -> list[Path]:
             fix="`lagbench score` writes them; or name a predictions.nc",
         )
     return found
+
+
+def _published(path: Path) -> PublishedScores | None:
+    """Return what a scores.json or scores.nc says; None of what is neither."""
+    if path.suffix == ".json":
+        return read_scores(path)
+    if path.stat().st_size > MAX_SCORE_BYTES or unreadable_in_child([path]):
+        return None
+    stored = read_stored(path).scores
+    ours = {
+        name: replace(score, values=np.array([round_digits(value) for value in score.values.tolist()]))
+        for name, score in stored.scores().items()
+    }
+    rows = {SUBMISSION: ours}
+    if stored.best_floor is not None and stored.ranking in ours:
+        floor = replace(ours[stored.ranking], values=stored.best_floor_values)
+        rows[stored.best_floor] = {stored.ranking: floor}
+    return PublishedScores(
+        identity=stored.identity,
+        predictions_sha256=stored.predictions_sha256,
+        ranking=stored.ranking,
+        scores=rows,
+    )
 
 
 def _scored(

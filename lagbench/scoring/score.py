@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lagbench.atomic import check_writable
+from lagbench.atomic import atomic_path, check_writable
 from lagbench.data.layout import resolve_root
 from lagbench.data.local import rooted
 from lagbench.data.registry import Registry
@@ -25,7 +25,7 @@ from lagbench.work.machine import available_cores
 from lagbench.work.progress import Meter, Progress
 from lagbench.work.run import run_all
 
-from .card import JSON_NAME, ScoreCard, read_scores, write_json
+from .card import JSON_NAME, ScoreCard, read_scores, spell
 from .flags import Flag, below_twin_floor, copy_suspect, physics
 from .floors import measurable
 from .scenario import SUBMISSION, ScenarioJob, ScenarioScores, score_scenario
@@ -171,8 +171,9 @@ def _has_nodes(tally: Tally) -> bool:
 
 def _written(card: ScoreCard, folder: Path) -> ScoreCard:
     json_path, netcdf_path = folder / JSON_NAME, folder / NETCDF_NAME
-    write_statistics(card, netcdf_path)
-    write_json(card, json_path)
+    with atomic_path(json_path, option="--output") as temporary:  # both, or neither where the disk is full
+        temporary.write_bytes(spell(card))
+        write_statistics(card, netcdf_path)
     return card.at(json_path, netcdf_path)
 
 

@@ -23,7 +23,7 @@ from lagbench.floors.table import FLOORS
 from lagbench.metrics.aggregate import Score, Tally, aggregate
 from lagbench.metrics.table import available
 
-from .card import FORMAT, IDENTITY, ScoreCard, Skill, skill, unreadable_scores
+from .card import FORMAT, IDENTITY, ScoreCard, Skill, printable, skill, unreadable_scores
 from .scenario import SUBMISSION, Preview
 
 NETCDF_NAME = "scores.nc"
@@ -191,10 +191,13 @@ def read_statistics(path: Path) -> StoredScores:
             scenarios = file["scenario"][:].tolist()
             floor, of_floor = _best_floor(file, len(scenarios))
             values, measured = file["value"][:].astype(np.float64), file["measured"][:]
+            held = {
+                name: file.getncattr(name) for name in (*IDENTITY, "predictions_sha256", "ranking_metric")
+            }
             return StoredScores(
-                identity={name: str(file.getncattr(name)) for name in IDENTITY},
-                predictions_sha256=str(file.predictions_sha256),
-                ranking=str(file.ranking_metric),
+                identity={name: printable(held, name) for name in IDENTITY},
+                predictions_sha256=printable(held, "predictions_sha256"),
+                ranking=printable(held, "ranking_metric"),
                 tallies={
                     scenario: _tally(names, frames, values[:, i], measured[:, i])
                     for i, scenario in enumerate(scenarios)

@@ -24,12 +24,13 @@ from lagbench.data.layout import check_regular
 from lagbench.data.registry import Size
 from lagbench.errors import UnreadableFileError
 from lagbench.metrics.distributions import BINS
-from lagbench.scoring.card import unreadable_scores
-from lagbench.scoring.scenario import FRAMES, PARTICLES, Preview
-from lagbench.scoring.score_file import FILM_RANGE, StoredScores, read_statistics
-from lagbench.scoring.task import ranking_metric
 from lagbench.submission.task_checks import frames_to_predict
 from lagbench.work.machine import in_child
+
+from .card import unreadable_scores
+from .scenario import FRAMES, PARTICLES, Preview
+from .score_file import FILM_RANGE, StoredScores, read_statistics
+from .task import ranking_metric
 
 MAX_SCORE_BYTES = 1_000_000  # longest score file [bytes]
 MAX_UNPACKED = 32 << 20  # most that a score file may unpack to [bytes]; the largest of ours takes 3 MB

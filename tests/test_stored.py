@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from made_up import SCORES, BoardBench, copied
 
-from lagbench.board import score_file as isolation
 from lagbench.board.check import check_board
-from lagbench.board.score_file import read_stored, unreadable_in_child
 from lagbench.errors import UnreadableFileError
+from lagbench.scoring import stored as isolation
+from lagbench.scoring.stored import read_stored, unreadable_in_child
 
 PACKAGE = Path(isolation.__file__).parents[2]
 
