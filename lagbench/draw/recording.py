@@ -83,7 +83,6 @@ class Recording:
         self.size: Size = registry.size(str(identity["split"]), str(identity["size"]))
         self.title = registry.split(self.size.split).title  # title of the split
         self.scenario = int(identity["scenario"])  # id
-        self.subset = str(identity["subset"])  # subset that holds the scenario
         self.parameters = parameters  # physical parameters by name
         self.frames = frames  # recorded frames
         self._read = read
@@ -164,7 +163,7 @@ def open_recording(
     with read_scenario(Path(source)) as file:
         head = file.header
         key = head.key
-        identity = {"split": key.split, "size": key.size, "scenario": key.scenario, "subset": key.subset}
+        identity = {"split": key.split, "size": key.size, "scenario": key.scenario}
         variables = set(file.variables)
         splits = _beside(source, registry)
         yield Recording(identity, head.parameters, head.frames, variables, file.read, splits)

@@ -338,8 +338,8 @@ def shares_of(values: Floats, truth: Floats) -> tuple[Floats, Floats]:
 def residual_figures(subject: Subject, gallery: Gallery) -> Iterator[Figure]:
     """Yield residuals against the truth (5.14) and against the node's number (5.15)."""
     scenario = subject.scenarios[0]
-    pairs = [pair for pair in gallery.moments[scenario, subject.key_frame].pairs if pair.node_count]
-    if not pairs:
+    pairs = gallery.moments[scenario, subject.key_frame].pairs
+    if not pairs[0].node_count:  # nodes are the truth's
         return
     # axes leave out the farthest nodes
     farthest = [np.percentile(np.abs(pair.vorticity_residual), 100.0 - FAR_QUANTILE) for pair in pairs]
@@ -362,7 +362,7 @@ def residual_figures(subject: Subject, gallery: Gallery) -> Iterator[Figure]:
         ("node", "node number", "Fig. 5.15", by_number, "node", places),
     ):
         title, charts = f"Residual against {against}", []
-        for entry, pair in zip(subject.entries, pairs, strict=False):
+        for entry, pair in zip(subject.entries, pairs, strict=True):
             x = pair.true_vorticity if name == "truth" else np.flatnonzero(pair.nodes).astype(np.float64)
             every = -(-len(x) // MOST_DOTS)
             plot = Plot(axis, y, x_label=label, y_label="residual [1/frame]", height=230)

@@ -87,17 +87,9 @@ class Subject:
         return card.submission[card.ranking].metric
 
     @property
-    def leader(self) -> Row:
-        """The row with the least loss in the ranking metric, the first of equals."""
-        return self._least(self.rows)
-
-    @property
     def best_entry(self) -> Row:
-        """The same among the entries, floors aside."""
-        return self._least([row for row in self.rows if row.entry is not None])
-
-    def _least(self, rows: Sequence[Row]) -> Row:
-        metric = self.ranking
+        """The entry with the least loss in the ranking metric, the first of equals."""
+        metric, rows = self.ranking, [row for row in self.rows if row.entry is not None]
         losses = [metric.loss(row.scores[metric.name].mean) for row in rows]
         return rows[int(np.argmin(np.nan_to_num(losses, nan=np.inf)))]
 
