@@ -315,11 +315,20 @@ def roll_out(step: Step, given: Batch, frames: int) -> Tensor:
         Positions of the frames after the given ones [length], shape [particle, frame, 2].
 
     Raises:
-        UsageError: no frame is asked for, or the model returns something else than a tensor of shape
-            [particle, 2].
+        UsageError: no frame is asked for, or more than the forcing is known for, or the model returns
+            something else than a tensor of shape [particle, 2].
     """
     if frames < 1:
         raise UsageError("no frame to predict", where="roll_out", expected="frames from 1", got=frames)
+    walls = given.wall_velocity
+    if walls is not None and walls.shape[1] < given.frames + frames:
+        raise UsageError(
+            "the velocity of the walls is not known for all frames to predict",
+            where="roll_out",
+            expected=f"at most {walls.shape[1] - given.frames} frames",
+            got=frames,
+            fix="read windows of history and these frames, and cut them: batch.part(slice(history))",
+        )
     predicted, expected = [], given.position[:, -1].shape
     for _ in range(frames):
         position = step(given)

@@ -255,7 +255,8 @@ def launched(*words: str) -> list[subprocess.CompletedProcess[str]]:
     return [one.result() for one in pair]
 
 
-@pytest.mark.parametrize("nodes", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("nodes", [1, 2])
 def test_two_processes_make_the_weights_of_one(lagbench: Command, tmp_path: Path, nodes: int) -> None:
     """Three windows on each of two gloo processes give the weights of six on one, at twice the rate.
 

@@ -189,9 +189,18 @@ def test_seeds_of_one_method_seldom_differ() -> None:
     assert told / 400 <= 0.05
 
 
-@given(st.lists(st.floats(0.0, 1.0), min_size=1, max_size=9))
+@pytest.mark.parametrize(
+    "p",
+    [
+        [0.03],
+        [0.0, 1.0],
+        [0.04, 0.01, 0.03, 0.005],  # the third is held up by the second: 0.06, 0.03, 0.06, 0.02
+        [0.2, 0.01, 0.01, 0.2, 1.0, 0.6],
+        np.random.default_rng(0).beta(0.5, 3.0, 9).tolist(),
+    ],
+)
 def test_holm_is_that_of_statsmodels(p: list[float]) -> None:
-    """The corrected p-values are those of statsmodels' step-down method."""
+    """The corrected p-values are those of statsmodels' step-down method, with ties, 0 and 1."""
     assert holm(p) == pytest.approx(multipletests(p, method="holm")[1].tolist())
     *others, claimed_none = holm([*p, math.nan])  # NaN is not counted as a comparison and stays
     assert others == holm(p)

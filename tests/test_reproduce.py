@@ -341,6 +341,7 @@ def test_what_fails_is_said_and_the_rest_is_made(
     assert (plan.output / "table_5_3.md").is_file()
 
 
+@pytest.mark.slow
 def test_side_by_side_as_one_after_the_other(
     plan: Plan, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -527,6 +527,15 @@ def test_what_a_model_returns_has_the_shape_of_positions(
         roll_out(lambda seen: seen.position[:, -1].numpy(), given, 2)  # type: ignore[arg-type, return-value]
 
 
+def test_a_rollout_ends_where_the_forcing_does(train: Open) -> None:
+    """Beyond it no wall moves as it did: a model that takes the last velocity known would be wrong unseen."""
+    given = collate([train(history=2, future=3)[0]]).part(slice(2))
+    assert roll_out(drifting, given, 3).shape[1] == 3
+    with pytest.raises(UsageError) as caught:
+        roll_out(lambda seen: seen.position[:, -1], given, 4)
+    assert caught.value.where == "roll_out"
+
+
 def test_a_model_may_use_the_memory_of_its_answer_again(train: Open) -> None:
     """Every frame is kept as it was when the model returned it."""
     given = collate([train(history=2, future=4)[0]]).part(slice(2))

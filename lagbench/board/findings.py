@@ -131,8 +131,8 @@ CHECKS: Mapping[str, Check] = MappingProxyType(
             RESCORE,
         ),
         "weights": Check(
-            "weights that are missing, edited, out of place or without an entry; more than 40 MB of them; "
-            "a long or broken record of a training",
+            "weights that are missing, edited, out of place, without an entry or of two; more than 40 MB of"
+            " them; a long or broken record of a training",
             "the weights are not those of the entry",
             "the file that `lagbench submit --weights` wrote",
             "submit with the weights again: lagbench submit --weights; or remove what no entry names",
