@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from lagbench.atomic import write_atomically
 from lagbench.data.checksums import file_sha256
@@ -20,6 +21,9 @@ from lagbench.submission.format import Header
 from .entry import Entry, Weights
 from .findings import finding
 from .folder import Folder, Place, weights_path
+
+if TYPE_CHECKING:
+    from lagbench.baselines.checkpoint import Checkpoint
 
 MOST_BYTES = 40_000_000
 """All weights of a leaderboard together [bytes]: git keeps every version of them for good."""
@@ -50,8 +54,7 @@ def require_weights(
             fix="leave --weights out, and name a file of a release by `weights: https://...` in --from",
         )
     check_installed("torch", extra="baselines")
-    from lagbench.baselines.checkpoint import load, rounded_parameters
-    from lagbench.baselines.predict import fits, told_by_us, training_words
+    from lagbench.baselines.checkpoint import load
 
     seeds = [header.seed or 0 for header in headers]
     lying = {
@@ -92,25 +95,33 @@ def require_weights(
                 got=f"those of {holder}",
                 fix="leave them out, and name them in --command; or give those of this method",
             )
-        words, said = headers[number].training or "", headers[number].parameters
-        if said is None and not told_by_us(words):
-            raise UsageError(
-                "nothing says that these weights made the predictions",
-                where=str(path),
-                expected="predictions that state their training, or how many parameters the model has",
-                fix="predict with these weights: lagbench predict; or leave them out",
-            )
-        count = rounded_parameters(held) or said
-        if not fits(words, held) or said not in (None, count):
-            raise UsageError(
-                "the weights did not make these predictions",
-                where=str(path),
-                expected=f"{words!a}, {said} parameters",
-                got=f"{training_words(held)!a}, {count} parameters of {held.baseline}",
-                fix="give the weights that `lagbench predict` was given, or predict with these",
-            )
+        _require_made_by(path, held, headers[number])
         found[number] = path
     return tuple(found)
+
+
+def _require_made_by(path: Path, held: Checkpoint, header: Header) -> None:
+    """Refuse weights of which the predictions say nothing, or that others than these made."""
+    from lagbench.baselines.checkpoint import rounded_parameters
+    from lagbench.baselines.predict import fits, told_by_us, training_words
+
+    words, said = header.training or "", header.parameters
+    if said is None and not told_by_us(words):
+        raise UsageError(
+            "nothing says that these weights made the predictions",
+            where=str(path),
+            expected="predictions that state their training, or how many parameters the model has",
+            fix="predict with these weights: lagbench predict; or leave them out",
+        )
+    count = rounded_parameters(held) or said
+    if not fits(words, held) or said not in (None, count):
+        raise UsageError(
+            "the weights did not make these predictions",
+            where=str(path),
+            expected=f"{words!a}, {said} parameters",
+            got=f"{training_words(held)!a}, {count} parameters of {held.baseline}",
+            fix="give the weights that `lagbench predict` was given, or predict with these",
+        )
 
 
 def named_weights(
