@@ -12,7 +12,7 @@ import netCDF4
 import numpy as np
 import pytest
 import yaml
-from made_up import PLACE, SCORES, BoardBench, copied, damped, noisy, reform, scale, set_mean
+from made_up import PLACE, SCORES, BoardBench, copied, damped, nearer, noisy, reform, scale, set_mean
 
 from lagbench.board import submit as submitting
 from lagbench.board.check import CheckResult, check_board
@@ -231,6 +231,21 @@ def test_ones_own_may_be_altered(branch: BoardBench) -> None:
     branch.edit("noisy", lambda held: held.update(notes="other"))
     branch.entry("damped").unlink()
     assert set(touched(branch, own=["noisy"])) == {f"{PLACE}/damped.yaml"}
+
+
+def test_a_verified_entry_may_be_replaced(branch: BoardBench) -> None:
+    """Its line goes with it: that is one's own to remove, and nothing else of the list."""
+    rescored(branch, branch.predict(noisy, "noisy", parameters=5), recording=True)
+    commit(branch)
+    result = branch.submit(branch.predict(nearer, "noisy"), replace=True)
+    assert result.removed == (branch.folder / "verified.yaml",)
+    where = {"registry": branch.registry, "isolated": False, "base": "HEAD"}
+    assert not check_board(branch.folder, own=["noisy"], **where).findings
+    assert any(one.where == "verified.yaml" for one in check_board(branch.folder, **where).findings)
+    (branch.folder / "verified.yaml").write_text(f"{DAMPED}: x\n")
+    assert any(
+        one.where == "verified.yaml" for one in check_board(branch.folder, own=["noisy"], **where).findings
+    )
 
 
 def test_the_base_may_have_gone_on(branch: BoardBench) -> None:

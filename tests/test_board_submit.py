@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import os
 from pathlib import Path
 from typing import Any
 
@@ -84,6 +85,13 @@ def test_predictions_in_the_folder_are_referred_to(own: BoardBench) -> None:
     assert read_entry(own.entry("inside")).predictions[0].path == "predictions/mine.nc"
     assert read_entry(own.entry("noisy")).predictions[0].path is None
     assert not check_board(own.folder, registry=own.registry, page=False, isolated=False).findings
+
+
+def test_no_entry_is_of_a_day_to_come(own: BoardBench, predictions: Path) -> None:
+    """What `check` would refuse is refused at once."""
+    with pytest.raises(UsageError) as caught:
+        own.submit(predictions, replace=True, date=datetime.date(2999, 1, 1))
+    assert caught.value.where == "date"
 
 
 def test_a_name_that_no_entry_can_hold(own: BoardBench, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -229,15 +237,19 @@ def test_invalid_predictions_leave_nothing(own: BoardBench, predictions: Path, t
 def test_an_interruption_is_found(
     own: BoardBench, predictions: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Score files come first, the entry last: what a full disk leaves is a score file without an entry."""
+    """Score files come first, the entry last: what a kill leaves is a score file without an entry."""
     before = own.state()
 
-    def full(*_: object, **__: object) -> None:
-        raise WorkFailedError("no space left")
+    move = os.replace
+
+    def killed(source: Path, target: Path) -> None:
+        if target.suffix == ".yaml":
+            raise KeyboardInterrupt
+        move(source, target)
 
     with monkeypatch.context() as patch:
-        patch.setattr(submitting, "write_atomically", full)
-        with pytest.raises(WorkFailedError):
+        patch.setattr(os, "replace", killed)
+        with pytest.raises(KeyboardInterrupt):
             own.submit(predictions)
     assert own.state() == before | {
         "scores/cavity/tiny/my-model.nc": own.state()["scores/cavity/tiny/my-model.nc"]

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from full_disk import largest_file
 from made_up import BoardBench, copied, noisy
 from simple_models import FACTS, Drift
 
@@ -18,9 +19,9 @@ from lagbench.board import weights as kept
 from lagbench.board.check import check_board
 from lagbench.board.entry import Meta
 from lagbench.board.entry_file import read_entry
-from lagbench.board.submit import submit
+from lagbench.board.submit import SubmitResult, submit
 from lagbench.data.checksums import file_sha256
-from lagbench.errors import UnreadableFileError, UsageError
+from lagbench.errors import UnreadableFileError, UsageError, WorkFailedError
 from lagbench.submission import open_predictions
 from lagbench.submission.budget import Budget
 
@@ -85,12 +86,12 @@ def submitted(
     weights: tuple[Path, ...] | None = None,
     method: str | None = None,
     **options: Any,
-) -> None:
+) -> SubmitResult:
     """Submit the predictions of runs, with their weights unless others are given."""
     files = [folder / "predictions.nc" for folder in folders]
     given = tuple(folder / "weights.pt" for folder in folders) if weights is None else weights
     meta = Meta(authors=("A. Author",), command="make", method=method, name=method)
-    submit(files, meta, weights=given, **own.where, **options)
+    return submit(files, meta, weights=given, **own.where, **options)
 
 
 def found(own: BoardBench) -> set[str]:
@@ -118,7 +119,7 @@ def test_weights_lie_beside_their_entry(own: BoardBench) -> None:
 
 
 def test_weights_go_to_their_seeds(own: BoardBench) -> None:
-    """In any order, and of some seeds only."""
+    """In any order, and of some seeds only; those of others stay while the predictions do."""
     runs = [trained(own, 0), trained(own, 3)]
     first, second = (run / "weights.pt" for run in runs)
     submitted(own, *runs, weights=(second, first))
@@ -126,8 +127,13 @@ def test_weights_go_to_their_seeds(own: BoardBench) -> None:
     assert [one and one.sha256 for one in held] == [file_sha256(first), file_sha256(second)]
     submitted(own, *runs, weights=(second,), replace=True)
     held = [made.weights for made in read_entry(own.entry("drift")).predictions]
+    assert [one and one.sha256 for one in held] == [file_sha256(first), file_sha256(second)]
+    own.entry("drift").unlink()
+    submitted(own, *runs, weights=(second,))
+    held = [made.weights for made in read_entry(own.entry("drift")).predictions]
     assert [one and one.sha256 for one in held] == [None, file_sha256(second)]
-    assert [path.name for path in (own.folder / "weights").rglob("*.pt")] == ["drift_3.pt"]
+    (own.folder / "weights/cavity/tiny/drift_0.pt").unlink()
+    (own.folder / "weights/cavity/tiny/drift_0.json").unlink()
     assert found(own) == set()
 
 
@@ -143,12 +149,33 @@ def test_a_state_to_go_on_from_is_not_published(own: BoardBench) -> None:
 
 
 def test_a_later_entry_takes_its_files_along(own: BoardBench) -> None:
-    """Replaced without weights, an entry leaves none behind."""
+    """Weights stay with their predictions, and go with them: an entry leaves none behind."""
     run = trained(own, 0)
     submitted(own, run)
-    submitted(own, run, weights=(), replace=True)
+    lying = {path.name: path.read_bytes() for path in (own.folder / "weights").rglob("*.*")}
+    assert len(lying) == 2
+    again = submitted(own, run, weights=(), replace=True)
+    assert {path.name: path.read_bytes() for path in (own.folder / "weights").rglob("*.*")} == lying
+    assert (again.removed, found(own)) == ((), set())
+    run.rename(own.folder.parent / "first")
+    later = submitted(own, trained(own, 0, share=0.3), weights=(), replace=True)
+    assert {path.name for path in later.removed} == set(lying)
     assert not list((own.folder / "weights").rglob("*.*"))
     assert found(own) == set()
+
+
+def test_a_full_disk_leaves_the_entry_before(own: BoardBench) -> None:
+    """Score files fit, weights do not: nothing of the old entry is lost, nothing of the new one is there."""
+    run = trained(own, 0)
+    submitted(own, run)
+    run.rename(own.folder.parent / "first")
+    second, before = trained(own, 0, share=0.3), own.state()
+    (second / "training.json").write_text(json.dumps({"note": "x" * (kept.MOST_RECORD - 100)}))
+    room = 1000 + max(path.stat().st_size for path in (own.folder / "scores").rglob("drift*"))
+    assert room < (second / "training.json").stat().st_size
+    with largest_file(room), pytest.raises(WorkFailedError):
+        submitted(own, second, replace=True)
+    assert own.state() == before
 
 
 @pytest.mark.parametrize(

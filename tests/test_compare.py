@@ -181,7 +181,7 @@ def test_files_of_a_leaderboard(scored: dict[str, Path], tmp_path: Path) -> None
         shutil.copy(scored[name] / "scores.nc", path)
         with netCDF4.Dataset(path, "a") as file:
             file.method = "moving"
-    result = compare(tmp_path / "moving.nc", scored["still"])
+    result = compare(tmp_path / "moving.nc", "constant-velocity")
     assert (result.first, result.seeds) == ("moving", (2, 1))
     single = compare(scored["still"] / "scores.nc", "constant-velocity").as_json()["metrics"]
     whole = compare(scored["still"], "constant-velocity").as_json()["metrics"]
@@ -190,6 +190,33 @@ def test_files_of_a_leaderboard(scored: dict[str, Path], tmp_path: Path) -> None
         file.method = "moving\x1b[2J"  # a terminal would obey
     with pytest.raises(LagbenchError):
         compare(tmp_path / "moving.nc", scored["still"])
+
+
+def test_seeds_by_either_file(scored: dict[str, Path], tmp_path: Path) -> None:
+    """A seed counts whose scores.json is lost; what holds no scores is passed over."""
+    for i, (name, file) in enumerate((("still", "scores.json"), ("straight", "scores.nc"))):
+        (tmp_path / str(i)).mkdir()
+        shutil.copy(scored[name] / file, tmp_path / str(i))
+    (tmp_path / "notes").mkdir()
+    said = json.loads((tmp_path / "0/scores.json").read_text())
+    (tmp_path / "0/scores.json").write_text(json.dumps(said | {"method": "straight"}))
+    assert compare(tmp_path, "persistence").seeds == (2, 1)
+    with pytest.raises(UsageError) as caught:  # one seed of both would be compared with itself
+        compare(tmp_path, scored["straight"])
+    assert str(tmp_path) in str(caught.value.where)
+
+
+def test_floors_that_are_not_at_hand(scored: dict[str, Path], tmp_path: Path) -> None:
+    """A floor goes second; a scores.nc holds the best one; a file that is empty is no submission."""
+    with pytest.raises(UsageError, match="give the floor last"):
+        compare("persistence", scored["still"])
+    with pytest.raises(UsageError) as caught:
+        compare(scored["still"] / "scores.nc", "analog")
+    assert caught.value.expected == "analog"
+    (tmp_path / "scores.nc").touch()
+    with pytest.raises(UnreadableFileError) as damaged:
+        compare(tmp_path / "scores.nc", scored["still"])
+    assert damaged.value.where == str(tmp_path / "scores.nc")
 
 
 def test_floors_stand_in_the_scores(scored: dict[str, Path]) -> None:

@@ -28,7 +28,7 @@ from lagbench.submission.findings import Finding
 from lagbench.work.progress import Progress
 
 from .audit import TOLERANCE, Confirmation, Rescoring, check_base
-from .entry import Entry, EntryBudget, Status, Summary
+from .entry import Entry, EntryBudget, Status, Summary, last_day
 from .entry_file import examine, load_plain, read_verified, record, verification_of
 from .findings import finding, finding_of, impossible, print_of, skeleton
 from .folder import VERIFIED, Folder, Place, entry_path
@@ -95,9 +95,7 @@ def check_board(
     folder.require()
     files = [folder.path / path for path in (*folder.score_files(), *folder.floor_files())]
     broken = unreadable_in_child(files) if isolated else {}
-    today = datetime.datetime.now(datetime.UTC).date()
-    last = today + datetime.timedelta(days=1)  # somewhere it is tomorrow
-    look = _Look(folder=folder, registry=described, broken=broken, last=last)
+    look = _Look(folder=folder, registry=described, broken=broken, last=last_day())
     for path in folder.entries():
         look.guarded(path, look.entry)
     for path in folder.floor_files():
@@ -119,7 +117,7 @@ def check_board(
     confirmed = again.entries_confirmed()
     whole = {entry.yaml_path.as_posix() for entry in confirmed}
     recorded = confirmed if recording and not look.found else []
-    record(folder, recorded, today)
+    record(folder, recorded, datetime.datetime.now(datetime.UTC).date())
     looked = page and not look.found
     if looked:
         try:

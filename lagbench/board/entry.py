@@ -66,6 +66,11 @@ BLANKS = frozenset("\u115f\u1160\u2800\u3164\uffa0")
 """Letters and symbols that show nothing, though Unicode counts them as printable."""
 
 
+def last_day() -> datetime.date:
+    """Return the last day that an entry may be of: somewhere it is tomorrow."""
+    return datetime.datetime.now(datetime.UTC).date() + datetime.timedelta(days=1)
+
+
 def _line(text: str) -> str:
     marks = 0
     for letter in unicodedata.normalize("NFC", text):

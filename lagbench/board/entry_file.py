@@ -12,6 +12,7 @@ import datetime
 import enum
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -25,8 +26,8 @@ from lagbench.data.yamlfile import read_yaml, spell_yaml
 from lagbench.errors import ChecksFailedError, UnreadableFileError, UsageError, nearest
 from lagbench.submission.findings import quoted
 
-from .entry import PATTERNS, Entry, Meta, Verification
-from .folder import VERIFIED, Folder
+from .entry import PATTERNS, Entry, Meta, Status, Verification
+from .folder import VERIFIED, Folder, Place, entry_path
 
 MAX_ENTRY_BYTES = 64_000
 """Longest YAML file of an entry [bytes]; twenty seeds and all metrics take half of it."""
@@ -158,6 +159,8 @@ def _mistake(kind: type[BaseModel], item: ErrorDetails) -> Mistake:
     if item["type"] == "missing":
         return Mistake(where=where, what="this key is missing", got="no such key")
     wanted = PATTERNS.get(item.get("ctx", {}).get("pattern", ""))
+    if item["type"] == "tuple_type":
+        wanted = "a list"
     what = item["msg"].removeprefix("Value error, ") if wanted is None else f"is not {wanted}"
     return Mistake(where=where, what=what, got=given)
 
@@ -176,6 +179,20 @@ def _model_in(annotation: object) -> type[BaseModel] | None:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     return next((found for inner in get_args(annotation) if (found := _model_in(inner))), None)
+
+
+def readable(path: Path) -> Entry | None:
+    """Return an entry; None of none and of one that cannot be read: `leaderboard check` tells of those."""
+    with suppress(ChecksFailedError, UnreadableFileError):
+        return read_entry(path) if path.exists() else None
+    return None
+
+
+def active_beside(folder: Folder, place: Place) -> dict[Path, Entry]:
+    """Return the other active entries of a split and size, by their paths in the folder."""
+    beside = [path for path in folder.entries() if path.parts[1:3] == place[:2] and path != entry_path(place)]
+    found = {path: readable(folder.path / path) for path in beside}
+    return {path: one for path, one in found.items() if one is not None and one.status is Status.ACTIVE}
 
 
 class _List(RootModel[dict[str, Verification]]):
@@ -204,6 +221,17 @@ def verification_of(entry: Entry, known: Mapping[str, Verification]) -> Verifica
     """Return the line of an entry; None without one, or if it is of other score files."""
     line = known.get(entry.yaml_path.as_posix())
     return line if line and line.scores == tuple(held.sha256 for held in entry.score.files) else None
+
+
+def forget(folder: Folder, entry: Entry) -> bool:
+    """Remove the line of an entry whose score files are others now; return whether there was one."""
+    known = read_verified(folder)
+    name = entry.yaml_path.as_posix()
+    if name not in known or verification_of(entry, known) is not None:
+        return False
+    left = {path: line.model_dump() for path, line in known.items() if path != name}
+    write_atomically(folder.path / VERIFIED, spell(left), option="--board")
+    return True
 
 
 def record(folder: Folder, entries: Sequence[Entry], date: datetime.date) -> Path | None:

@@ -1,9 +1,9 @@
 """Score predictions and write the entry: ``lagbench submit``.
 
 What can be refused is refused before the work: together what needs no file, then together what the
-files must be for. Then score files are written, and last the YAML file, which names them by SHA-256,
-each atomically: what an interruption leaves behind is a score file without an entry, which
-``lagbench leaderboard check`` finds. ``lagbench leaderboard build`` draws the board's page anew.
+files must be for. Then all files are written beside their places and moved there, last the YAML file,
+which names them by SHA-256: what a kill between two moves leaves behind, ``lagbench leaderboard check``
+finds. ``lagbench leaderboard build`` draws the board's page anew.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
-from lagbench.atomic import write_atomically
 from lagbench.data.hdf5 import check_file
 from lagbench.data.registry import Registry, load
 from lagbench.errors import ChecksFailedError, Mistakes, UnreadableFileError, UsageError, WorkFailedError
@@ -50,13 +49,13 @@ from .entry import (
     Prediction,
     ScoreBlock,
     ScoredFile,
-    Status,
+    last_day,
 )
-from .entry_file import Model, examine, listed, read_entry, spell
+from .entry_file import Model, active_beside, examine, forget, listed, readable, spell
 from .findings import print_of, skeleton
-from .folder import SUBMISSIONS, Folder, Place, entry_path, score_paths
+from .folder import SUBMISSIONS, VERIFIED, Folder, Place, entry_path, score_paths
 from .ranking import combine, summarise, write_floors
-from .weights import copy_weights, named_weights, require_weights
+from .weights import named_weights, require_weights, stage_weights
 
 BOARD = Path("leaderboard")  # the leaderboard's folder, from the root of the repository
 
@@ -76,6 +75,8 @@ class SubmitResult:
     flags: tuple[str, ...]  # names of flags that were raised
     board: Path
     files: tuple[Path, ...]  # what was written, the YAML file first
+    # what only the entry that was replaced had: files, and its line of verified.yaml
+    removed: tuple[Path, ...]
 
 
 def submit(
@@ -154,7 +155,7 @@ def submit(
     others: dict[Path, Entry] = {}
     with mistakes:
         place = (headers[0].split, headers[0].size, _method(headers[0], meta))
-        others = _others(folder, place)
+        others = active_beside(folder, place)
         _require_free(folder, place, _name(headers[0], meta), others, replace=replace)
     with mistakes:
         sources = require_weights(weights, headers, others)
@@ -255,16 +256,6 @@ def _name(header: Header, meta: Meta) -> str:
     return meta.name or header.method[:100]
 
 
-def _others(folder: Folder, place: Place) -> dict[Path, Entry]:
-    """Return the other active entries of a split and size."""
-    found = {}
-    for path in folder.entries():
-        if path.parts[1:3] == place[:2] and path != entry_path(place):
-            with suppress(ChecksFailedError, UnreadableFileError):  # `leaderboard check` tells of those
-                found[path] = read_entry(folder.path / path)
-    return {path: entry for path, entry in found.items() if entry.status is Status.ACTIVE}
-
-
 def _require_free(
     folder: Folder, place: Place, label: str, others: Mapping[Path, Entry], *, replace: bool
 ) -> None:
@@ -307,6 +298,8 @@ def _about(headers: Sequence[Header], meta: Meta) -> About:
     held = {name: getattr(meta, name) for name in About.model_fields}
     held["name"] = _name(first, meta)
     held["date"] = meta.date or datetime.datetime.now(datetime.UTC).date()
+    if held["date"] > (last := last_day()):
+        raise UsageError("a day to come", where="date", expected=f"at most {last}", got=meta.date)
     held["training"] = meta.training or (first.training or "")[:LONGEST_TEXT]
     if meta.parameters is None:
         held["parameters"] = first.parameters
@@ -339,9 +332,12 @@ def _publish(
     outside: Sequence[float | None],
     sources: Sequence[Path | None],
 ) -> SubmitResult:
-    """Write score files, then the entry that names them; remove those that only the old entry had."""
+    """Write all files beside their places, then move them there, the entry last; remove the old one's others.
+
+    A full disk is met before anything of the old entry is touched.
+    """
     names, yaml_path = score_paths(place, [one.seed for one in made]), entry_path(place)
-    before = read_entry(folder.path / yaml_path).files if (folder.path / yaml_path).exists() else ()
+    before = readable(folder.path / yaml_path)
     (folder.path / SUBMISSIONS).mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=STAGE, dir=folder.path) as stage:
         staged = [Path(stage) / name.name for name in names]
@@ -357,7 +353,7 @@ def _publish(
                     fix="uninstall packages that add metrics, and submit again",
                 )
         files = tuple(map(ScoredFile.of, cards, staged, outside))
-        kept = named_weights(place, [one.seed for one in made], sources)
+        kept = named_weights(place, made, sources, before)
         made = [one.model_copy(update={"weights": held}) for one, held in zip(made, kept, strict=True)]
         header = cards[0].header
         block = ScoreBlock(
@@ -371,15 +367,20 @@ def _publish(
         held |= dict(zip(("format", "split", "size", "method"), (2, *place), strict=True))
         held["dataset"] = DataSet(version=header.dataset_version, sha256=header.dataset_sha256)
         entry = _fitting(Entry, {**held, "predictions": tuple(made), "score": block})
-        for source, name in zip(staged, names, strict=True):
+        moves = [*zip(staged, names, strict=True), *stage_weights(Path(stage), kept, sources)]
+        (Path(stage) / yaml_path.name).write_bytes(spell(entry))
+        floors = write_floors(cards[0], folder)
+        for source, name in (*moves, (Path(stage) / yaml_path.name, yaml_path)):
             (folder.path / name).parent.mkdir(parents=True, exist_ok=True)
             os.replace(source, folder.path / name)
-    copy_weights(folder, kept, sources)
-    floors = write_floors(cards[0], folder)
-    (folder.path / yaml_path).parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(folder.path / yaml_path, spell(entry), option="--board")
-    for name in set(before) - set(entry.files):
-        (folder.path / name).unlink(missing_ok=True)
+    fresh = {name for _, name in moves}
+    records = {path for path in entry.files if path.suffix == ".json" and path.with_suffix(".pt") in fresh}
+    idle = sorted((set(before.files if before else ()) - set(entry.files)) | (records - fresh))
+    removed = [folder.path / name for name in idle if (folder.path / name).is_file()]
+    for path in removed:
+        path.unlink()
+    if forget(folder, entry):
+        removed.append(folder.path / VERIFIED)
     summary = entry.score.metrics[entry.score.ranking_metric]
     split, size, method = place
     return SubmitResult(
@@ -392,4 +393,5 @@ def _publish(
         flags=tuple(dict.fromkeys(flag.name for file in entry.score.files for flag in file.flags)),
         board=folder.path,
         files=(*filter(Path.is_file, (folder.path / name for name in (yaml_path, *entry.files))), *floors),
+        removed=tuple(removed),
     )

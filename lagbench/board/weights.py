@@ -7,18 +7,18 @@ weights/<split>/<size>/<method>_<seed>.json   what the training recorded, where 
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lagbench.atomic import write_atomically
 from lagbench.data.checksums import file_sha256
 from lagbench.data.layout import check_regular
 from lagbench.errors import UnreadableFileError, UsageError, check_installed
 from lagbench.submission.findings import Finding
 from lagbench.submission.format import Header
 
-from .entry import Entry, Weights
+from .entry import Entry, Prediction, Weights
 from .findings import finding
 from .folder import Folder, Place, weights_path
 
@@ -125,25 +125,34 @@ def _require_made_by(path: Path, held: Checkpoint, header: Header) -> None:
 
 
 def named_weights(
-    place: Place, seeds: Sequence[int | None], paths: Sequence[Path | None]
+    place: Place, made: Sequence[Prediction], paths: Sequence[Path | None], before: Entry | None
 ) -> tuple[Weights | None, ...]:
-    """Return what an entry says of its weights, seed by seed; None where there are none."""
+    """Return what an entry says of its weights, seed by seed; None where there are none.
+
+    Those of the entry that it replaces stay where the predictions stay.
+    """
+    kept = {(one.seed, one.sha256): one.weights for one in (before.predictions if before else ())}
     return tuple(
-        None if path is None else Weights(path=weights_path(place, seed).as_posix(), sha256=file_sha256(path))
-        for seed, path in zip(seeds, paths, strict=True)
+        kept.get((one.seed, one.sha256))
+        if path is None
+        else Weights(path=weights_path(place, one.seed).as_posix(), sha256=file_sha256(path))
+        for one, path in zip(made, paths, strict=True)
     )
 
 
-def copy_weights(folder: Folder, named: Sequence[Weights | None], paths: Sequence[Path | None]) -> None:
-    """Copy weights, and what their trainings recorded, to their places."""
-    for said, path in zip(filter(None, named), filter(None, paths), strict=True):
-        target, record = folder.path / said.path, path.with_name(RECORD)
-        target.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(target, path.read_bytes(), option="--board")
+def stage_weights(
+    stage: Path, named: Sequence[Weights | None], paths: Sequence[Path | None]
+) -> Iterator[tuple[Path, Path]]:
+    """Copy weights, and what their trainings recorded, to a folder; yield each copy and its place."""
+    for number, (said, path) in enumerate(zip(named, paths, strict=True)):
+        if said is None or path is None:
+            continue
+        record, target = path.with_name(RECORD), Path(said.path)
+        sources = {target: path}
         if record.is_file() and unfit_record(record) is None:
-            write_atomically(target.with_suffix(".json"), record.read_bytes(), option="--board")
-        else:  # that of weights which stood here before
-            target.with_suffix(".json").unlink(missing_ok=True)
+            sources[target.with_suffix(".json")] = record
+        for place, source in sources.items():
+            yield Path(shutil.copyfile(source, stage / f"{number}{place.suffix}")), place
 
 
 def unfit_record(path: Path) -> str | None:

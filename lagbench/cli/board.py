@@ -20,7 +20,7 @@ from .options import (
     chosen,
     root_of,
 )
-from .output import complain, print_blocks, print_json, progress_bar, say, spell_bytes
+from .output import complain, counted, print_blocks, print_json, progress_bar, say, spell_bytes
 from .output import show as tell
 
 if TYPE_CHECKING:
@@ -105,6 +105,9 @@ def _submitted(result: SubmitResult, *, quiet: bool) -> None:
         advice = "it is for trying out: --board trial --new-board"
         typer.echo(f"warning: tiny has too few scenarios to rank anything; {advice}", err=True)
     say("written: " + ", ".join(str(path) for path in result.files), quiet=quiet)
+    if result.removed:
+        what = "; its entry is to be scored again" if result.removed[-1].name == "verified.yaml" else ""
+        say("removed, of the entry before: " + ", ".join(map(str, result.removed)) + what, quiet=quiet)
     where = "" if result.board == BOARD else f" --board {result.board}"
     say(
         f"next: lagbench leaderboard check{where}; to look at it: lagbench leaderboard build{where}",
@@ -129,13 +132,8 @@ def build(
 
     result = run(board, check=check)
     state = "written" if result.page in result.written else "up to date"
-    tabs = f"{result.tabs} {'tab' if result.tabs == 1 else 'tabs'}"
-    what = f"{_entries(result.rows)}, {tabs}, {spell_bytes(result.bytes)}"
+    what = f"{counted(result.rows, 'entry')}, {counted(result.tabs, 'tab')}, {spell_bytes(result.bytes)}"
     tell(result, [f"{result.page}: {what}, {state}"], as_json=as_json, quiet=quiet)
-
-
-def _entries(count: int) -> str:
-    return f"{count} {'entry' if count == 1 else 'entries'}"
 
 
 @leaderboard.command("check", epilog="Example: lagbench leaderboard check --base origin/main")
@@ -223,9 +221,9 @@ def _checked(result: CheckResult, *, recording: bool, quiet: bool) -> None:
         say(f"recorded as verified: {entry}", quiet=quiet)
     for entry in result.partly if recording else ():
         say(f"not recorded: {entry}: give the predictions of all its seeds in one call", quiet=quiet)
-    state = f"{len(result.findings)} findings" if result.findings else "nothing wrong"
+    state = counted(len(result.findings), "finding") if result.findings else "nothing wrong"
     looked = ", page compared" if result.page_checked else ""
-    say(f"{result.folder}: {_entries(result.entries)}, {state}{looked}", quiet=quiet)
+    say(f"{result.folder}: {counted(result.entries, 'entry')}, {state}{looked}", quiet=quiet)
 
 
 @leaderboard.command("picture", epilog="Example: lagbench leaderboard picture cavity --size mini -o cost.svg")

@@ -33,6 +33,16 @@ SECONDS_PER_LINE = 60.0
 """Time between two lines of progress that go to a file [s]."""
 
 
+def counted(number: int, noun: str) -> str:
+    """Return a number with its noun.
+
+    >>> counted(1, "finding"), counted(2, "entry")
+    ('1 finding', '2 entries')
+    """
+    many = f"{noun[:-1]}ies" if noun.endswith("y") else f"{noun}s"
+    return f"{number} {noun if number == 1 else many}"
+
+
 def say(text: str, *, quiet: bool = False) -> None:
     """Print a line on stdout unless the user asked for silence."""
     if not quiet:

@@ -22,7 +22,7 @@ from .options import (
     WorkersOption,
     chosen,
 )
-from .output import complain, print_blocks, print_json, progress_bar, say, show, spell_bytes
+from .output import complain, counted, print_blocks, print_json, progress_bar, say, show, spell_bytes
 
 if TYPE_CHECKING:
     from lagbench.scoring.card import ScoreCard
@@ -80,7 +80,8 @@ def validate(
         checks = ", ".join(check for check, why in result.skipped.items() if why == reason)
         words.append(f"not made, since {reason}: {checks}")
     counts = (
-        f"{len(result.errors)} errors, {len(result.warnings)} warnings, {len(result.passed)} checks passed"
+        f"{counted(len(result.errors), 'error')}, {counted(len(result.warnings), 'warning')}, "
+        f"{counted(len(result.passed), 'check')} passed"
     )
     words.append(f"{result.path}: {'valid' if result.valid else 'not valid'}, {counts}")
     show(result, words, as_json=as_json, quiet=quiet)

@@ -346,8 +346,8 @@ class _Building:
             raise UsageError(
                 "a test scenario is too short for the task",
                 where="--input-frames and --horizon",
-                expected=f"together at most {shortest}",
-                got=f"{about.input_frames} and {horizon}",
+                expected=f"together at most {shortest} frames, one of them to predict",
+                got=f"{about.input_frames} given" + (f", {horizon} to predict" if about.horizon else ""),
             )
         interest = sorted(set(about.frames_of_interest or (last,)))
         if not about.input_frames <= interest[0] <= interest[-1] <= last:

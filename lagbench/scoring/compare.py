@@ -21,6 +21,7 @@ from lagbench.data.checksums import round_digits
 from lagbench.data.layout import check_regular
 from lagbench.data.registry import Registry
 from lagbench.errors import DataError, UnreadableFileError, UsageError, nearest
+from lagbench.floors.table import FLOORS
 from lagbench.metrics.aggregate import FEWEST_FOR_INTERVAL, Score, mean_over_seeds
 from lagbench.metrics.metric import Direction, Metric, mean
 from lagbench.metrics.significance import FEWEST_SCENARIOS, Comparison
@@ -30,6 +31,7 @@ from lagbench.submission.format import MAX_NAME
 from .card import JSON_NAME, PublishedScores, digits, parse_scores, read_scores
 from .scenario import SUBMISSION
 from .score import score
+from .score_file import NETCDF_NAME
 from .stored import MAX_SCORE_BYTES, read_stored, unreadable_in_child
 
 
@@ -174,16 +176,37 @@ def compare(
     """
     plain = Path(second).name == str(second) and not Path(second).suffix
     bare = plain and not os.path.lexists(second)  # the name of a floor
+    if str(first) in FLOORS and not os.path.lexists(first):
+        fix = f"give the floor last: lagbench compare {'PREDICTIONS' if bare else second} {first}"
+        raise UsageError("a floor stands in the scores of a submission", got=str(first), fix=fix)
     for path in (*_seeds_of(Path(first)), *(() if bare else _seeds_of(Path(second)))):
         check_regular(path)  # before what is there is scored
     one = _contestant(first, root, workers, registry)
     floor = str(second) if str(second) in one.floors else None
     if floor is None and bare:
+        if str(second) in FLOORS:
+            raise UsageError(
+                "these scores do not hold the floor",
+                where=str(first),
+                expected=str(second),
+                got=f"scores of {', '.join(one.floors) or 'no floor'}",
+                fix="a scores.nc holds the best floor only: compare predictions.nc or scores.json",
+            )
         floors = f"{nearest(str(second), one.floors)}; or " if one.floors else ""
         fix = f"{floors}name scores, predictions or a folder of them"
         raise UsageError("neither a floor nor a file", got=ascii(str(second)), fix=fix)
     two = _contestant(second, root, workers, registry) if floor is None else _floor(one, floor)
     _check_same(one, two)
+    if floor is None and 0 < len(shared := set(one.predictions) & set(two.predictions)) < max(
+        len(one.predictions), len(two.predictions)
+    ):
+        raise UsageError(
+            "both sides have predictions of their own and the same ones",
+            where=f"{one.name} and {two.name}",
+            expected="other trainings on either side",
+            got=f"{len(shared)} in common",
+            fix="compare seeds of one method with those of another",
+        )
     judged = _judged(one, two)
     methods = one.identity["method"], two.identity["method"]
     names = told_apart(methods) if floor is None else [*told_apart(methods[:1], taken=(floor,)), floor]
@@ -256,23 +279,27 @@ def _seeds_of(path: Path) -> list[Path]:
     if not os.path.isdir(path):  # unlike Path.is_dir, it takes any name
         shared = path.suffix == ".nc" and not os.path.lexists(path)
         return (sorted(path.parent.glob(f"{glob.escape(path.stem)}_*.nc")) if shared else []) or [path]
-    if (path / JSON_NAME).is_file():
-        return [path / JSON_NAME]
-    if not (found := sorted(path.glob(f"*/{JSON_NAME}"))):
-        raise UnreadableFileError(
-            "no scores in the folder",
-            where=str(path),
-            expected=f"{JSON_NAME}, or folders that hold one each, of a method's seeds",
-            fix="`lagbench score` writes them; or name a predictions.nc",
-        )
-    return found
+    for folders in ([path], sorted(inner for inner in path.iterdir() if inner.is_dir())):
+        files = [[folder / name for name in (JSON_NAME, NETCDF_NAME)] for folder in folders]
+        if found := [file for one in files if (file := next(filter(Path.is_file, one), None))]:
+            return found
+    raise UnreadableFileError(
+        "no scores in the folder",
+        where=str(path),
+        expected=f"{JSON_NAME} or {NETCDF_NAME}, or folders that hold one each, of a method's seeds",
+        fix="`lagbench score` writes them; or name a predictions.nc",
+    )
 
 
 def _published(path: Path) -> PublishedScores | None:
     """Return what a scores.json or scores.nc says; None of what is neither."""
     if path.suffix == ".json":
         return read_scores(path)
-    if path.stat().st_size > MAX_SCORE_BYTES or unreadable_in_child([path]):
+    if path.stat().st_size > MAX_SCORE_BYTES:
+        return None
+    if reason := unreadable_in_child([path]).get(path):
+        if path.name == NETCDF_NAME or not path.stat().st_size:
+            raise UnreadableFileError("not the scores of a submission", where=str(path), got=reason)
         return None
     stored = read_stored(path).scores
     ours = {

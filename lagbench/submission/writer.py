@@ -148,7 +148,9 @@ class PredictionsWriter:
             )
         if scenario not in self._rows or scenario in self._written:
             what = "is written twice" if scenario in self._written else "is no test scenario"
-            raise UsageError(f"scenario {scenario} {what}", expected=spell_ids(self._rows))
+            raise UsageError(
+                f"scenario {scenario!r} {what}", expected=f"whole numbers: {spell_ids(self._rows)}"
+            )
         arrays = [position] if velocity is None else [position, velocity]
         if len(arrays) != len(self._names):
             raise UsageError("velocities come for every scenario or for none", where=f"scenario {scenario}")
