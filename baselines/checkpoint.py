@@ -228,8 +228,7 @@ def restore(checkpoint: Checkpoint, *, where: str = "the checkpoint") -> Baselin
     try:
         entry = find(checkpoint.baseline)
     except UsageError as error:
-        fix = f"install the package that adds it; {error.fix}"
-        raise UsageError(error.what, where=where, got=error.got, fix=fix) from error
+        raise UsageError(error.what, where=where, fix="install the package that adds it") from error
     try:
         check_footprint(entry.model, options, facts, checkpoint.weights, where=where)
         model = entry.model.build(options, facts)
@@ -302,12 +301,8 @@ def check_data(
     try:
         known.split(trained.split)
     except UsageError as error:
-        raise DataError(
-            f"the data that the model was trained on, {trained.split}, are not there",
-            where=where,
-            got=f"splits known in {root}: {', '.join(known.splits)}",
-            fix=f"name the folder that holds {trained.split}: --root FOLDER",
-        ) from error
+        what = f"{trained.split}, which the model was trained on, is not there"
+        raise DataError(what, where=where, got=f"in {root}", fix="name its folder: --root") from error
     if size in (None, trained.size):
         here = facts_of(trained.split, trained.size, root=root, registry=known)
         expected, got = trained.dataset_sha256, here.dataset_sha256

@@ -17,7 +17,6 @@ from typing import Any
 import torch
 
 from lagbench.atomic import write_atomically
-from lagbench.data.hdf5 import SIGNATURE
 from lagbench.data.layout import resolve_root
 from lagbench.data.local import rooted
 from lagbench.data.registry import Registry
@@ -187,12 +186,14 @@ def check_replaceable(output: Path) -> None:
     if output.is_dir():
         fix = f"name a file: -o {output / 'predictions.nc'}"
         raise UsageError("the output is a folder", where="--output", got=str(output), fix=fix)
-    for path, ours in ((output, SIGNATURE), (output.with_suffix(".json"), b"seconds_per_frame")):
+    # scores have no format of data, scenarios no hash of the whole data set
+    of_predictions, of_cost = (b"lagbench_format", b"dataset_sha256"), (b"seconds_per_frame",)
+    for path, ours in ((output, of_predictions), (output.with_suffix(".json"), of_cost)):
         if not path.is_file():
             continue
         with path.open("rb") as stream:
             held = stream.read(MOST_RECORD)
-        if held and ours not in held:
+        if held and not all(sign in held for sign in ours):
             raise UsageError(
                 "the output would replace a file that is something else",
                 where="--output",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import os
 import secrets
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -45,6 +45,20 @@ def write_atomically(target: Path, data: bytes, *, option: str = ROOT_OPTION) ->
     """Write bytes to a file that appears whole or not at all."""
     with atomic_path(target, option=option) as temporary:
         temporary.write_bytes(data)
+
+
+def move_together(moves: Sequence[tuple[Path, Path]]) -> None:
+    """Rename files to places on the same disk, in their order.
+
+    What may fail comes first: files are flushed and folders made before the first one is moved.
+    """
+    for source, target in moves:
+        _flush(source)
+        target.parent.mkdir(parents=True, exist_ok=True)
+    for source, target in moves:
+        source.replace(target)
+    for folder in {target.parent for _, target in moves}:
+        _flush_folder(folder)
 
 
 def check_writable(folder: Path, *, option: str = ROOT_OPTION) -> None:
@@ -94,7 +108,7 @@ def _refused(target: Path, option: str, error: OSError) -> WorkFailedError:
     if isinstance(error, (FileExistsError, NotADirectoryError)):
         remedy = "a file is where a folder has to be: remove it"
     if isinstance(error, IsADirectoryError):
-        remedy = "a folder has that name: name a file in it"
+        remedy = "a folder is where the file has to be: remove it"
     return WorkFailedError(
         "cannot write there",
         where=str(target),

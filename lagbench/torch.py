@@ -315,20 +315,13 @@ def roll_out(step: Step, given: Batch, frames: int) -> Tensor:
         Positions of the frames after the given ones [length], shape [particle, frame, 2].
 
     Raises:
-        UsageError: no frame is asked for, or more than the forcing is known for, or the model returns
-            something else than a tensor of shape [particle, 2].
+        UsageError: frames below 1 or beyond the known forcing, or the model returns no [particle, 2].
     """
-    if frames < 1:
-        raise UsageError("no frame to predict", where="roll_out", expected="frames from 1", got=frames)
     walls = given.wall_velocity
-    if walls is not None and walls.shape[1] < given.frames + frames:
-        raise UsageError(
-            "the velocity of the walls is not known for all frames to predict",
-            where="roll_out",
-            expected=f"at most {walls.shape[1] - given.frames} frames",
-            got=frames,
-            fix="read windows of history and these frames, and cut them: batch.part(slice(history))",
-        )
+    known = max(1, frames) if walls is None else walls.shape[1] - given.frames
+    if not 1 <= frames <= known:  # beyond the forcing a model would take the last one known
+        fix = "give longer windows, cut by batch.part(slice(history))"
+        raise UsageError("no such frames", where="roll_out", expected=f"1 to {known}", got=frames, fix=fix)
     predicted, expected = [], given.position[:, -1].shape
     for _ in range(frames):
         position = step(given)

@@ -12,7 +12,7 @@ import netCDF4
 import numpy as np
 import pytest
 import yaml
-from made_up import PLACE, SCORES, BoardBench, copied, damped, nearer, noisy, reform, scale, set_mean
+from made_up import PLACE, SCORES, BoardBench, copied, damped, nearer, noisy, reform, scale, set_mean, still
 
 from lagbench.board import submit as submitting
 from lagbench.board.check import CheckResult, check_board
@@ -235,17 +235,27 @@ def test_ones_own_may_be_altered(branch: BoardBench) -> None:
 
 def test_a_verified_entry_may_be_replaced(branch: BoardBench) -> None:
     """Its line goes with it: that is one's own to remove, and nothing else of the list."""
-    rescored(branch, branch.predict(noisy, "noisy", parameters=5), recording=True)
+    other, listed = branch.predict(nearer, "other"), branch.folder / "verified.yaml"
+    branch.submit(other)
+    own = branch.predict(noisy, "noisy", parameters=5)
+    assert len(rescored(branch, own, other, recording=True).recorded) == 2
     commit(branch)
-    result = branch.submit(branch.predict(nearer, "noisy"), replace=True)
-    assert result.removed == (branch.folder / "verified.yaml",)
+    both = listed.read_bytes()
+    branch.submit(own, replace=True)
+    assert listed.read_bytes() == both  # its scores are those of before
+    assert listed in branch.submit(branch.predict(still, "noisy"), replace=True).files
     where = {"registry": branch.registry, "isolated": False, "base": "HEAD"}
-    assert not check_board(branch.folder, own=["noisy"], **where).findings
-    assert any(one.where == "verified.yaml" for one in check_board(branch.folder, **where).findings)
-    (branch.folder / "verified.yaml").write_text(f"{DAMPED}: x\n")
-    assert any(
-        one.where == "verified.yaml" for one in check_board(branch.folder, own=["noisy"], **where).findings
-    )
+
+    def told(*own: str) -> set[tuple[str, str]]:
+        return {(one.check, str(one.where)) for one in check_board(branch.folder, own=own, **where).findings}
+
+    assert told("noisy") == set()
+    assert ("base", "verified.yaml") in told()
+    left = listed.read_text()
+    listed.write_text(left.replace("lagbench: ", "lagbench: 9"))
+    assert ("base", "verified.yaml") in told("noisy")
+    listed.write_bytes(both + b"# all others too\n")
+    assert ("base", "verified.yaml") in told("noisy")
 
 
 def test_the_base_may_have_gone_on(branch: BoardBench) -> None:

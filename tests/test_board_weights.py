@@ -164,6 +164,58 @@ def test_a_later_entry_takes_its_files_along(own: BoardBench) -> None:
     assert found(own) == set()
 
 
+def test_records_go_with_their_weights(own: BoardBench) -> None:
+    """New weights without a record leave none of the old; those of the board keep theirs."""
+    run = trained(own, 0)
+    submitted(own, run)
+    file = own.folder / "weights/cavity/tiny/drift_0.pt"
+    submitted(own, run, weights=(file,), replace=True)
+    assert json.loads(file.with_suffix(".json").read_text()) == {"step": 6}
+    (run / "training.json").unlink()
+    assert submitted(own, run, replace=True).removed == (file.with_suffix(".json"),)
+    assert found(own) == set()
+
+
+@pytest.mark.parametrize("damage", ["lost", "edited", "linked"])
+def test_only_sound_weights_are_kept(own: BoardBench, damage: str) -> None:
+    """What is wrong with those of before is mended by submitting anew."""
+    run = trained(own, 0)
+    submitted(own, run)
+    file = own.folder / "weights/cavity/tiny/drift_0.pt"
+    if damage == "edited":
+        file.write_bytes(b"1")
+    else:
+        file.unlink()
+    if damage == "linked":
+        file.symlink_to(run / "weights.pt")
+    submitted(own, run, weights=(), replace=True)
+    assert read_entry(own.entry("drift")).predictions[0].weights is None
+    assert found(own) == set()
+
+
+def test_a_new_name_takes_the_weights_along(own: BoardBench) -> None:
+    """A superseded entry and its successor have one file of weights each, with the same bytes."""
+    run = trained(own, 0)
+    submitted(own, run)
+    own.edit("drift", lambda held: held.update(status="superseded", superseded_by="glide"))
+    submitted(own, run, method="glide")
+    assert found(own) == set()
+
+
+def test_no_link_leads_out_of_the_board(own: BoardBench, tmp_path: Path) -> None:
+    """Nothing is written behind one; the entry before stays."""
+    run = trained(own, 0)
+    submitted(own, run, weights=())
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (own.folder / "weights").symlink_to(elsewhere)
+    before = own.state()
+    with pytest.raises(UsageError) as caught:
+        submitted(own, run, replace=True)
+    assert caught.value.where == str(own.folder / "weights")
+    assert (own.state(), list(elsewhere.iterdir())) == (before, [])
+
+
 def test_a_full_disk_leaves_the_entry_before(own: BoardBench) -> None:
     """Score files fit, weights do not: nothing of the old entry is lost, nothing of the new one is there."""
     run = trained(own, 0)

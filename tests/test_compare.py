@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from score_bench import ScoreBench, half_right, still, straight
 
-from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError
+from lagbench.errors import DataError, UnreadableFileError, UsageError
 from lagbench.metrics import differ
 from lagbench.scoring.compare import ComparisonResult, compare
 from lagbench.scoring.tables import Table, card_tables, comparison_tables, flag_lines
@@ -176,20 +176,31 @@ def test_folders_files_and_predictions_agree(bench: ScoreBench, scored: dict[str
 
 def test_files_of_a_leaderboard(scored: dict[str, Path], tmp_path: Path) -> None:
     """Score files of several seeds go by their common name; the best floor stands in each."""
+    folder = tmp_path / "scores" / "cavity" / "tiny"
+    folder.mkdir(parents=True)
     for i, name in enumerate(("still", "straight")):
-        path = tmp_path / f"moving_{i}.nc"
+        path = folder / f"moving_{i}.nc"
         shutil.copy(scored[name] / "scores.nc", path)
         with netCDF4.Dataset(path, "a") as file:
             file.method = "moving"
-    result = compare(tmp_path / "moving.nc", "constant-velocity")
+    (folder / "moving_old.nc").write_bytes(b"not a seed")
+    result = compare(folder / "moving.nc", "constant-velocity")
     assert (result.first, result.seeds) == ("moving", (2, 1))
     single = compare(scored["still"] / "scores.nc", "constant-velocity").as_json()["metrics"]
     whole = compare(scored["still"], "constant-velocity").as_json()["metrics"]
     assert single == {name: whole[name] for name in ("vorticity_nrmse",)}
     with netCDF4.Dataset(path, "a") as file:
         file.method = "moving\x1b[2J"  # a terminal would obey
-    with pytest.raises(LagbenchError):
-        compare(tmp_path / "moving.nc", scored["still"])
+    with pytest.raises(UnreadableFileError) as caught:
+        compare(path, "constant-velocity")
+    assert caught.value.where == str(path)
+    path.write_bytes(path.read_bytes()[:9000])
+    with pytest.raises(UnreadableFileError):
+        compare(path, "constant-velocity")
+    with pytest.raises(UnreadableFileError):  # elsewhere a name stands for itself
+        compare(tmp_path / "predictions.nc", "constant-velocity")
+    (tmp_path / "linked.nc").symlink_to(scored["still"] / "scores.nc")
+    assert compare(tmp_path / "linked.nc", scored["straight"]).first == "still"
 
 
 def test_seeds_by_either_file(scored: dict[str, Path], tmp_path: Path) -> None:

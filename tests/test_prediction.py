@@ -397,6 +397,15 @@ def test_nothing_else_is_replaced(run: Predict, tmp_path: Path, name: str) -> No
     run(name="predictions.nc")
 
 
+def test_no_scenario_is_replaced(run: Predict, tmp_path: Path, generated: GenerationResult) -> None:
+    """It is a file of the same format, and the truth."""
+    scenario = next(generated.folder.glob("test/*.nc")).read_bytes()
+    (tmp_path / "scenario.nc").write_bytes(scenario)
+    with pytest.raises(UsageError):
+        run(name="scenario.nc")
+    assert (tmp_path / "scenario.nc").read_bytes() == scenario
+
+
 def test_out_of_memory(run: Predict, monkeypatch: pytest.MonkeyPatch) -> None:
     """When memory is full, the message says what to lower, and no file appears."""
 

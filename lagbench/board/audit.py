@@ -237,7 +237,7 @@ def _only_own_lines_left(folder: Folder, start: str, own: Collection[str]) -> bo
         return False
     gone = before.keys() - now.keys()
     kept = {name: line for name, line in before.items() if name not in gone}
-    return now == kept and all(Path(str(name)).stem in own for name in gone)
+    return now == kept and bool(gone) and all(Path(str(name)).stem in own for name in gone)
 
 
 def _verb(how: str) -> str:

@@ -223,15 +223,12 @@ def verification_of(entry: Entry, known: Mapping[str, Verification]) -> Verifica
     return line if line and line.scores == tuple(held.sha256 for held in entry.score.files) else None
 
 
-def forget(folder: Folder, entry: Entry) -> bool:
-    """Remove the line of an entry whose score files are others now; return whether there was one."""
-    known = read_verified(folder)
-    name = entry.yaml_path.as_posix()
+def unverified(folder: Folder, entry: Entry) -> bytes | None:
+    """Return the list without an entry's line of other score files; None where it has no such line."""
+    known, name = read_verified(folder), entry.yaml_path.as_posix()
     if name not in known or verification_of(entry, known) is not None:
-        return False
-    left = {path: line.model_dump() for path, line in known.items() if path != name}
-    write_atomically(folder.path / VERIFIED, spell(left), option="--board")
-    return True
+        return None
+    return spell({path: line.model_dump() for path, line in known.items() if path != name})
 
 
 def record(folder: Folder, entries: Sequence[Entry], date: datetime.date) -> Path | None:

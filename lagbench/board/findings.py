@@ -5,17 +5,22 @@ from __future__ import annotations
 import hashlib
 import unicodedata
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 
-from lagbench.errors import LagbenchError
+from lagbench.errors import LagbenchError, UnreadableFileError
 from lagbench.metrics.aggregate import Tally
 from lagbench.metrics.metric import Direction
 from lagbench.metrics.table import METRICS
-from lagbench.scoring.stored import MAX_SCORE_BYTES, Stored
+from lagbench.scoring.stored import MAX_SCORE_BYTES, Stored, read_stored
 from lagbench.submission.findings import Finding, Severity
+
+from .entry import Entry
+from .folder import Folder
 
 ROUNDING = 1e-6  # share of the greatest value by which rounding may take one below zero, or above one
 
@@ -224,6 +229,15 @@ def print_of(tallies: Mapping[int, Tally]) -> str:
         digest.update(f"{scenario} {tally.names} {tally.frames}".encode())
         digest.update(np.ascontiguousarray(tally.total.astype(np.float32)).tobytes())
     return digest.hexdigest()
+
+
+def prints_of(folder: Folder, others: Mapping[Path, Entry]) -> dict[str, str]:
+    """Return what only the same predictions share, whatever they are called, and where."""
+    found = {}
+    for path in (path for entry in others.values() for path in entry.score_paths):
+        with suppress(UnreadableFileError):  # `leaderboard check` tells of those
+            found[print_of(read_stored(folder.path / path).scores.tallies)] = str(path)
+    return found
 
 
 def impossible(held: Stored) -> Iterator[str]:

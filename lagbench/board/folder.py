@@ -14,7 +14,7 @@ from __future__ import annotations
 import os
 import re
 import stat
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 
 from lagbench.errors import UsageError
@@ -153,6 +153,13 @@ class Folder:
         """Return the first part of a relative path that is a symbolic link, None without any."""
         whole = [*reversed(path.parents), path][1:]
         return next((part for part in whole if (self.path / part).is_symlink()), None)
+
+    def require_unlinked(self, paths: Iterable[Path]) -> None:
+        """Refuse to write to places behind symbolic links, which may lie anywhere."""
+        for path in paths:
+            if (link := self.link_in(path)) is not None:
+                fix = "put the folder or file itself in its place"
+                raise UsageError("a leaderboard holds no links", where=str(self.path / link), fix=fix)
 
     def _sound(self, top: str) -> tuple[Path, ...]:
         return tuple(path for path in self._files(top) if self.oddity(path) is None)

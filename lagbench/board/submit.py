@@ -9,18 +9,17 @@ finds. ``lagbench leaderboard build`` draws the board's page anew.
 from __future__ import annotations
 
 import datetime
-import os
 import re
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
+from lagbench.atomic import move_together
 from lagbench.data.hdf5 import check_file
 from lagbench.data.registry import Registry, load
-from lagbench.errors import ChecksFailedError, Mistakes, UnreadableFileError, UsageError, WorkFailedError
+from lagbench.errors import ChecksFailedError, Mistakes, UsageError, WorkFailedError
 from lagbench.floors.table import FLOORS
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.scenario import SUBMISSION
@@ -51,8 +50,8 @@ from .entry import (
     ScoredFile,
     last_day,
 )
-from .entry_file import Model, active_beside, examine, forget, listed, readable, spell
-from .findings import print_of, skeleton
+from .entry_file import Model, active_beside, examine, listed, read_verified, readable, spell, unverified
+from .findings import print_of, prints_of, skeleton
 from .folder import SUBMISSIONS, VERIFIED, Folder, Place, entry_path, score_paths
 from .ranking import combine, summarise, write_floors
 from .weights import named_weights, require_weights, stage_weights
@@ -74,9 +73,9 @@ class SubmitResult:
     std: float | None  # over seeds; None for one seed
     flags: tuple[str, ...]  # names of flags that were raised
     board: Path
-    files: tuple[Path, ...]  # what was written, the YAML file first
-    # what only the entry that was replaced had: files, and its line of verified.yaml
-    removed: tuple[Path, ...]
+    files: tuple[Path, ...]  # what was written; verified.yaml, where the entry before had a line there
+    kept: tuple[Path, ...]  # weights of the entry before that are those of this one
+    removed: tuple[Path, ...]  # what only the entry before had
 
 
 def submit(
@@ -157,6 +156,7 @@ def submit(
         place = (headers[0].split, headers[0].size, _method(headers[0], meta))
         others = active_beside(folder, place)
         _require_free(folder, place, _name(headers[0], meta), others, replace=replace)
+        read_verified(folder)  # a line of it may have to go
     with mistakes:
         sources = require_weights(weights, headers, others)
     mistakes.tell()
@@ -166,8 +166,9 @@ def submit(
     for path, sha256, header, seed, url in zip(paths, hashes, headers, seeds, urls, strict=True):
         inside, whole = path.resolve(), folder.path.resolve()
         kept = inside.relative_to(whole).as_posix() if inside.is_relative_to(whole) else None
-        said = {"seed": seed, "sha256": sha256, "url": url, "path": kept}
-        made.append(_fitting(Prediction, {**said, "bytes": path.stat().st_size, "budget": header.budget}))
+        said: dict[str, object] = {"seed": seed, "sha256": sha256, "url": url, "path": kept}
+        said |= {"bytes": path.stat().st_size, "budget": header.budget}
+        made.append(_fitting(Prediction, said, where=path, fix="name the file otherwise, or move it"))
     cards = [
         score(
             path,
@@ -180,13 +181,13 @@ def submit(
         )
         for path, result in zip(paths, results, strict=True)
     ]
-    _require_new([print_of(card.tallies[SUBMISSION]) for card in cards], paths, _prints(folder, others))
+    _require_new([print_of(card.tallies[SUBMISSION]) for card in cards], paths, prints_of(folder, others))
     try:
-        return _publish(place, about, cards, made, folder, outside, sources)
+        return _publish(place, about, cards, made, folder, outside, sources, others)
     except OSError as error:
         raise WorkFailedError(
             "cannot write there",
-            where=str(folder.path),
+            where=str(error.filename or folder.path),
             got=error.strerror or error,
             fix="free disk space, or name a folder that you may write to: --board",
         ) from error
@@ -283,15 +284,6 @@ def _require_new(prints: Sequence[str], paths: Sequence[Path], known: Mapping[st
         found[print_] = str(path)
 
 
-def _prints(folder: Folder, others: Mapping[Path, Entry]) -> dict[str, str]:
-    """Return what only the same predictions share, whatever they are called, and where."""
-    found = {}
-    for path in (path for entry in others.values() for path in entry.score_paths):
-        with suppress(UnreadableFileError):  # `leaderboard check` tells of those
-            found[print_of(read_stored(folder.path / path).scores.tallies)] = str(path)
-    return found
-
-
 def _about(headers: Sequence[Header], meta: Meta) -> About:
     """Return what is said of the method, with what the predictions say where nothing is."""
     first = headers[0]
@@ -314,12 +306,18 @@ def _about(headers: Sequence[Header], meta: Meta) -> About:
     return _fitting(About, held)
 
 
-def _fitting(kind: type[Model], held: Mapping[str, object]) -> Model:
+def _fitting(
+    kind: type[Model],
+    held: Mapping[str, object],
+    *,
+    where: object = None,
+    fix: str = "say it otherwise in --from meta.yaml; docs/submitting.md describes the keys",
+) -> Model:
     """Return what an entry says, or what of it its schema refuses."""
     found, mistakes = examine(kind, held)
     if found is None:
-        fix = "say it otherwise in --from meta.yaml; docs/submitting.md describes the keys"
-        raise ChecksFailedError("the entry does not fit the schema", got=listed(mistakes), fix=fix)
+        what, place = "the entry does not fit the schema", None if where is None else str(where)
+        raise ChecksFailedError(what, where=place, got=listed(mistakes), fix=fix)
     return found
 
 
@@ -331,6 +329,7 @@ def _publish(
     folder: Folder,
     outside: Sequence[float | None],
     sources: Sequence[Path | None],
+    others: Mapping[Path, Entry],
 ) -> SubmitResult:
     """Write all files beside their places, then move them there, the entry last; remove the old one's others.
 
@@ -353,7 +352,7 @@ def _publish(
                     fix="uninstall packages that add metrics, and submit again",
                 )
         files = tuple(map(ScoredFile.of, cards, staged, outside))
-        kept = named_weights(place, made, sources, before)
+        kept = named_weights(folder, place, made, sources, before, others)
         made = [one.model_copy(update={"weights": held}) for one, held in zip(made, kept, strict=True)]
         header = cards[0].header
         block = ScoreBlock(
@@ -367,20 +366,21 @@ def _publish(
         held |= dict(zip(("format", "split", "size", "method"), (2, *place), strict=True))
         held["dataset"] = DataSet(version=header.dataset_version, sha256=header.dataset_sha256)
         entry = _fitting(Entry, {**held, "predictions": tuple(made), "score": block})
-        moves = [*zip(staged, names, strict=True), *stage_weights(Path(stage), kept, sources)]
-        (Path(stage) / yaml_path.name).write_bytes(spell(entry))
+        moves = dict(zip(names, staged, strict=True))
+        moves |= stage_weights(Path(stage), kept, sources)
+        texts = {Path(VERIFIED): unverified(folder, entry), yaml_path: spell(entry)}  # the entry last
+        for name, text in texts.items():
+            if text is not None:
+                moves[name] = Path(stage) / name.name
+                moves[name].write_bytes(text)
+        folder.require_unlinked(moves)
         floors = write_floors(cards[0], folder)
-        for source, name in (*moves, (Path(stage) / yaml_path.name, yaml_path)):
-            (folder.path / name).parent.mkdir(parents=True, exist_ok=True)
-            os.replace(source, folder.path / name)
-    fresh = {name for _, name in moves}
-    records = {path for path in entry.files if path.suffix == ".json" and path.with_suffix(".pt") in fresh}
-    idle = sorted((set(before.files if before else ()) - set(entry.files)) | (records - fresh))
+        move_together([(source, folder.path / name) for name, source in moves.items()])
+    records = {name.with_suffix(".json") for name in moves if name.suffix == ".pt"}
+    idle = sorted((set(before.files if before else ()) - set(entry.files)) | (records - set(moves)))
     removed = [folder.path / name for name in idle if (folder.path / name).is_file()]
     for path in removed:
         path.unlink()
-    if forget(folder, entry):
-        removed.append(folder.path / VERIFIED)
     summary = entry.score.metrics[entry.score.ranking_metric]
     split, size, method = place
     return SubmitResult(
@@ -392,6 +392,7 @@ def _publish(
         std=summary.std,
         flags=tuple(dict.fromkeys(flag.name for file in entry.score.files for flag in file.flags)),
         board=folder.path,
-        files=(*filter(Path.is_file, (folder.path / name for name in (yaml_path, *entry.files))), *floors),
+        files=(*(folder.path / name for name in reversed(moves)), *floors),
+        kept=tuple(folder.path / said.path for said in kept if said and Path(said.path) not in moves),
         removed=tuple(removed),
     )

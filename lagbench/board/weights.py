@@ -18,7 +18,7 @@ from lagbench.errors import UnreadableFileError, UsageError, check_installed
 from lagbench.submission.findings import Finding
 from lagbench.submission.format import Header
 
-from .entry import Entry, Prediction, Weights
+from .entry import Entry, Prediction, Status, Weights
 from .findings import finding
 from .folder import Folder, Place, weights_path
 
@@ -57,12 +57,7 @@ def require_weights(
     from lagbench.baselines.checkpoint import load
 
     seeds = [header.seed or 0 for header in headers]
-    lying = {
-        made.weights.sha256: str(where)
-        for where, entry in others.items()
-        for made in entry.predictions
-        if made.weights is not None
-    }
+    lying = _holders(others)
     for path in map(Path, weights):
         held = load(path)
         if held.optimizer is not None:
@@ -125,13 +120,26 @@ def _require_made_by(path: Path, held: Checkpoint, header: Header) -> None:
 
 
 def named_weights(
-    place: Place, made: Sequence[Prediction], paths: Sequence[Path | None], before: Entry | None
+    folder: Folder,
+    place: Place,
+    made: Sequence[Prediction],
+    paths: Sequence[Path | None],
+    before: Entry | None,
+    others: Mapping[Path, Entry],
 ) -> tuple[Weights | None, ...]:
     """Return what an entry says of its weights, seed by seed; None where there are none.
 
-    Those of the entry that it replaces stay where the predictions stay.
+    Those of the entry that it replaces stay where the predictions stay and nothing is wrong with them.
     """
-    kept = {(one.seed, one.sha256): one.weights for one in (before.predictions if before else ())}
+    lying = _holders(others)
+    kept = {
+        (one.seed, one.sha256): one.weights
+        for one in (before.predictions if before else ())
+        if one.weights is not None
+        and one.weights.sha256 not in lying
+        and one.weights.path == weights_path(place, one.seed).as_posix()
+        and _is_there(folder, one.weights)
+    }
     return tuple(
         kept.get((one.seed, one.sha256))
         if path is None
@@ -140,19 +148,35 @@ def named_weights(
     )
 
 
+def _holders(entries: Mapping[Path, Entry]) -> dict[str, str]:
+    """Return the entries that have weights, by the SHA-256 of these."""
+    held = [(made.weights, where) for where, entry in entries.items() for made in entry.predictions]
+    return {weights.sha256: str(where) for weights, where in held if weights is not None}
+
+
+def _is_there(folder: Folder, weights: Weights) -> bool:
+    """Tell whether weights lie where their entry says, as it says, and not behind a link."""
+    file = folder.path / weights.path
+    return (
+        file.is_file() and folder.link_in(Path(weights.path)) is None and file_sha256(file) == weights.sha256
+    )
+
+
 def stage_weights(
     stage: Path, named: Sequence[Weights | None], paths: Sequence[Path | None]
 ) -> Iterator[tuple[Path, Path]]:
-    """Copy weights, and what their trainings recorded, to a folder; yield each copy and its place."""
+    """Copy weights, and what their trainings recorded, to a folder; yield each place and its copy."""
     for number, (said, path) in enumerate(zip(named, paths, strict=True)):
         if said is None or path is None:
             continue
-        record, target = path.with_name(RECORD), Path(said.path)
+        target = Path(said.path)
         sources = {target: path}
-        if record.is_file() and unfit_record(record) is None:
+        records = (path.with_name(RECORD), path.with_suffix(".json"))  # of a run; of weights on a board
+        fit = (one for one in records if one.is_file() and unfit_record(one) is None)
+        if (record := next(fit, None)) is not None:
             sources[target.with_suffix(".json")] = record
         for place, source in sources.items():
-            yield Path(shutil.copyfile(source, stage / f"{number}{place.suffix}")), place
+            yield place, Path(shutil.copyfile(source, stage / f"{number}{place.suffix}"))
 
 
 def unfit_record(path: Path) -> str | None:
@@ -170,7 +194,7 @@ def unfit_record(path: Path) -> str | None:
 def check_weights(folder: Folder, entries: Sequence[Entry]) -> Iterator[Finding]:
     """Yield weights that are missing, edited, out of place, without an entry, or too many; unfit records."""
     known: set[Path] = set()
-    holders: dict[str, str] = {}
+    holders: dict[str, Path] = {}
     for entry in entries:
         for number, made in enumerate(entry.predictions):
             if made.weights is None:
@@ -186,8 +210,11 @@ def check_weights(folder: Folder, entries: Sequence[Entry]) -> Iterator[Finding]
             elif (found := file_sha256(file)) != made.weights.sha256:
                 said = made.weights.sha256[:16]
                 yield finding("weights", path, f"SHA-256 {found[:16]}", expected=f"{said} as the entry says")
-            elif (holder := holders.setdefault(found, where)) != where:
-                yield finding("weights", where, f"those of {holder}", expected="weights of this method")
+            elif entry.status is Status.ACTIVE:
+                holder = holders.setdefault(found, path)
+                if holder != path:
+                    got = f"the same file as {holder}"
+                    yield finding("weights", path, got, what="weights of two entries", expected="of one")
             record = path.with_suffix(".json")  # its absence is no finding
             kept = folder.path / record
             if (

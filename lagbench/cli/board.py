@@ -105,9 +105,11 @@ def _submitted(result: SubmitResult, *, quiet: bool) -> None:
         advice = "it is for trying out: --board trial --new-board"
         typer.echo(f"warning: tiny has too few scenarios to rank anything; {advice}", err=True)
     say("written: " + ", ".join(str(path) for path in result.files), quiet=quiet)
-    if result.removed:
-        what = "; its entry is to be scored again" if result.removed[-1].name == "verified.yaml" else ""
-        say("removed, of the entry before: " + ", ".join(map(str, result.removed)) + what, quiet=quiet)
+    for what, paths in {"kept": result.kept, "removed": result.removed}.items():
+        if paths:
+            say(f"{what}, of the entry before: " + ", ".join(map(str, paths)), quiet=quiet)
+    if any(path.name == "verified.yaml" for path in result.files):
+        say("its line of verified.yaml is gone: maintainers score the entry again", quiet=quiet)
     where = "" if result.board == BOARD else f" --board {result.board}"
     say(
         f"next: lagbench leaderboard check{where}; to look at it: lagbench leaderboard build{where}",
@@ -219,7 +221,7 @@ def _checked(result: CheckResult, *, recording: bool, quiet: bool) -> None:
         say(f"{name}: measured again {', '.join(floors)}", quiet=quiet)
     for entry in result.recorded:
         say(f"recorded as verified: {entry}", quiet=quiet)
-    for entry in result.partly if recording else ():
+    for entry in result.partly if recording and not result.findings else ():
         say(f"not recorded: {entry}: give the predictions of all its seeds in one call", quiet=quiet)
     state = counted(len(result.findings), "finding") if result.findings else "nothing wrong"
     looked = ", page compared" if result.page_checked else ""

@@ -24,7 +24,7 @@ FILE_NAME = "index.html"
 
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
 
-BEGINNING = tag("meta", http_equiv="Content-Security-Policy", content=POLICY)
+SIGN = tag("meta", http_equiv="Content-Security-Policy", content=POLICY)
 """What is in the head of every report, and of no other page."""
 
 
@@ -63,8 +63,8 @@ def write_report(
         UnreadableFileError: a predictions.nc is.
         WorkFailedError: the page cannot be written.
     """
-    check_folder(folder)
     subject = subject_of(cards, [Path(path) for path in predictions], root=root, registry=registry)
+    check_folder(folder)
     path = Path(folder) / FILE_NAME
     write_atomically(path, render(subject).encode(), option="--report")
     return path
@@ -74,13 +74,12 @@ def check_folder(folder: str | Path) -> None:
     """Refuse a folder where no report can be written, or where one would replace a page of another kind."""
     check_writable(Path(folder), option="--report")
     path = Path(folder) / FILE_NAME
-    if path.is_file() and BEGINNING.encode() not in path.read_bytes()[: 4 * len(BEGINNING)]:
-        raise UsageError(
-            "a page that is no report lies there",
-            where="--report",
-            got=str(path),
-            fix="name another folder",
-        )
+    if path.is_file():
+        with path.open("rb") as stream:
+            head = stream.read(4 * len(SIGN))
+        if SIGN.encode() not in head:
+            fix = "name another folder, or remove the page"
+            raise UsageError("a page that is no report lies there", where="--report", got=str(path), fix=fix)
 
 
 def render(subject: Subject) -> str:
@@ -148,7 +147,7 @@ def document(title: str, head: Markup, sections: Sequence[Section], foot: Markup
     ]
     meta = [
         tag("meta", charset="utf-8"),
-        BEGINNING,
+        SIGN,
         tag("meta", name="viewport", content="width=device-width, initial-scale=1"),
         tag("meta", name="color-scheme", content="light dark"),
         tag("meta", name="referrer", content="no-referrer"),

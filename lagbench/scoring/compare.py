@@ -7,20 +7,17 @@ the intervals speak alone. With one seed on each side these weights are compared
 
 from __future__ import annotations
 
-import glob
 import os
+import re
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from lagbench.data.checksums import round_digits
 from lagbench.data.layout import check_regular
 from lagbench.data.registry import Registry
-from lagbench.errors import DataError, UnreadableFileError, UsageError, nearest
+from lagbench.errors import ChecksFailedError, DataError, UnreadableFileError, UsageError, nearest
 from lagbench.floors.table import FLOORS
 from lagbench.metrics.aggregate import FEWEST_FOR_INTERVAL, Score, mean_over_seeds
 from lagbench.metrics.metric import Direction, Metric, mean
@@ -32,7 +29,7 @@ from .card import JSON_NAME, PublishedScores, digits, parse_scores, read_scores
 from .scenario import SUBMISSION
 from .score import score
 from .score_file import NETCDF_NAME
-from .stored import MAX_SCORE_BYTES, read_stored, unreadable_in_child
+from .stored import MAX_SCORE_BYTES, published, unreadable_in_child
 
 
 def told_apart(methods: Sequence[str], taken: Collection[str] = ()) -> list[str]:
@@ -235,7 +232,7 @@ def _contestant(
     """Return a method with the scores of its seeds, and the floors beside the first of them."""
     held = []
     for path in _seeds_of(Path(source)):
-        found = _published(path) or _scored(path, root, workers, registry)
+        found = read_scores(path) if path.suffix == ".json" else _read(path, root, workers, registry)
         if SUBMISSION not in found.scores:
             raise _incomplete(
                 str(path), f"a row {SUBMISSION!r}", ", ".join(map(repr, list(found.scores)[:10]))[:MAX_NAME]
@@ -277,11 +274,13 @@ def _seeds_of(path: Path) -> list[Path]:
     What is not there may be the name that a leaderboard's files of several seeds share.
     """
     if not os.path.isdir(path):  # unlike Path.is_dir, it takes any name
-        shared = path.suffix == ".nc" and not os.path.lexists(path)
-        return (sorted(path.parent.glob(f"{glob.escape(path.stem)}_*.nc")) if shared else []) or [path]
+        on_a_board = path.suffix == ".nc" and len(path.parts) > 3 and path.parts[-4] == "scores"
+        shared = sorted(path.parent.glob("*.nc")) if on_a_board and not os.path.lexists(path) else []
+        name = re.compile(rf"{re.escape(path.stem)}_[0-9]+")
+        return [file for file in shared if name.fullmatch(file.stem)] or [path]
     for folders in ([path], sorted(inner for inner in path.iterdir() if inner.is_dir())):
         files = [[folder / name for name in (JSON_NAME, NETCDF_NAME)] for folder in folders]
-        if found := [file for one in files if (file := next(filter(Path.is_file, one), None))]:
+        if found := [file for one in files if (file := next(filter(os.path.isfile, one), None))]:
             return found
     raise UnreadableFileError(
         "no scores in the folder",
@@ -291,39 +290,33 @@ def _seeds_of(path: Path) -> list[Path]:
     )
 
 
-def _published(path: Path) -> PublishedScores | None:
-    """Return what a scores.json or scores.nc says; None of what is neither."""
-    if path.suffix == ".json":
-        return read_scores(path)
-    if path.stat().st_size > MAX_SCORE_BYTES:
-        return None
-    if reason := unreadable_in_child([path]).get(path):
-        if path.name == NETCDF_NAME or not path.stat().st_size:
-            raise UnreadableFileError("not the scores of a submission", where=str(path), got=reason)
-        return None
-    stored = read_stored(path).scores
-    ours = {
-        name: replace(score, values=np.array([round_digits(value) for value in score.values.tolist()]))
-        for name, score in stored.scores().items()
-    }
-    rows = {SUBMISSION: ours}
-    if stored.best_floor is not None and stored.ranking in ours:
-        floor = replace(ours[stored.ranking], values=stored.best_floor_values)
-        rows[stored.best_floor] = {stored.ranking: floor}
-    return PublishedScores(
-        identity=stored.identity,
-        predictions_sha256=stored.predictions_sha256,
-        ranking=stored.ranking,
-        scores=rows,
-    )
-
-
-def _scored(
+def _read(
     path: Path, root: str | Path | None, workers: int | None, registry: Registry | None
 ) -> PublishedScores:
-    # through JSON, so that its digits are those of a scores.json
-    card = score(path, root=root, workers=workers, registry=registry, write=False)
-    return parse_scores(card.as_json())
+    """Return what a scores.nc says, or what predictions score."""
+    real = path.resolve()
+    length = real.stat().st_size
+    if length > MAX_SCORE_BYTES:
+        reason: str | None = f"{length} bytes, more than scores take"
+    else:
+        reason = unreadable_in_child([real]).get(real)
+    if reason is None:
+        return published(real)
+    try:
+        # through JSON, so that its digits are those of a scores.json
+        return parse_scores(score(path, root=root, workers=workers, registry=registry, write=False).as_json())
+    except (UnreadableFileError, ChecksFailedError) as error:
+        with real.open("rb") as stream:
+            head = stream.read(MAX_SCORE_BYTES)
+        if isinstance(error, ChecksFailedError) and b"lagbench_scores" not in head:
+            raise  # predictions that are not valid
+        raise UnreadableFileError(
+            "neither scores nor predictions",
+            where=str(path),
+            expected="what `lagbench score` or `lagbench submit` wrote, or a predictions.nc",
+            got=f"as scores: {reason}",
+            fix="score the predictions again: lagbench score predictions.nc",
+        ) from error
 
 
 def _floor(beside: Contestant, name: str) -> Contestant:

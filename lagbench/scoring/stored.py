@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.data.checksums import round_digits
 from lagbench.data.grid import Grid, Placement
 from lagbench.data.hdf5 import Structure, check_structure, opened
 from lagbench.data.layout import check_regular
@@ -27,8 +28,8 @@ from lagbench.metrics.distributions import BINS
 from lagbench.submission.task_checks import frames_to_predict
 from lagbench.work.machine import in_child
 
-from .card import unreadable_scores
-from .scenario import FRAMES, PARTICLES, Preview
+from .card import PublishedScores, unreadable_scores
+from .scenario import FRAMES, PARTICLES, SUBMISSION, Preview
 from .score_file import FILM_RANGE, StoredScores, read_statistics
 from .task import ranking_metric
 
@@ -106,6 +107,25 @@ def read_stored(path: Path, size: Size | None = None) -> Stored:
     except Exception as error:  # HDF5 on damaged bytes raises nearly any type
         raise unreadable_scores(path, error) from error
     return Stored(scores=scores, preview=preview, precision=precision)
+
+
+def published(path: Path) -> PublishedScores:
+    """Return what a score file says as a scores.json would; of the floors it has the best, in one metric."""
+    stored = read_stored(path).scores
+    ours = {
+        name: replace(score, values=np.array([round_digits(value) for value in score.values.tolist()]))
+        for name, score in stored.scores().items()
+    }
+    rows = {SUBMISSION: ours}
+    if stored.best_floor is not None and stored.ranking in ours:
+        floor = replace(ours[stored.ranking], values=stored.best_floor_values)
+        rows[stored.best_floor] = {stored.ranking: floor}
+    return PublishedScores(
+        identity=stored.identity,
+        predictions_sha256=stored.predictions_sha256,
+        ranking=stored.ranking,
+        scores=rows,
+    )
 
 
 def _unpacked(variable: h5py.Dataset) -> tuple[NDArray[np.float32], float]:
