@@ -9,6 +9,7 @@ gathers by it.
 from __future__ import annotations
 
 import inspect
+import re
 import warnings
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint
@@ -23,6 +24,8 @@ GROUP = "lagbench.baselines"
 
 OWN = "lagbench.baselines."
 RECIPES = Path(__file__).parent / "recipes"
+NAME = re.compile("[a-z0-9]+(-[a-z0-9]+)*")  # of a baseline: it names folders
+REQUIRED = ("history", "forward", "start", "advance")  # what a subclass of Baseline defines
 OPERATOR_RECIPES = "gns"  # recipe file that all operators share, so that they differ in the operator only
 
 
@@ -72,9 +75,11 @@ def _points() -> dict[str, EntryPoint]:
     """Return the entry points by name; ours are not to be replaced."""
     found: dict[str, EntryPoint] = {}
     for point in sorted(installed(GROUP), key=lambda point: not point.value.startswith(OWN)):
-        held = found.setdefault(point.name, point)
-        if held.value != point.value:
-            message = f"package {_package(point)} adds no baseline {point.name!r}: its name is taken"
+        reason = "a name has small letters, digits and single hyphens"
+        if NAME.fullmatch(point.name):
+            reason = "its name is taken" if found.setdefault(point.name, point).value != point.value else ""
+        if reason:
+            message = f"package {_package(point)} adds no baseline {point.name!r}: {reason}"
             warnings.warn(message, PluginWarning, stacklevel=3)
     return found
 
@@ -84,6 +89,9 @@ def _entry(point: EntryPoint) -> Entry:
     if not inspect.isclass(loaded):
         raise UsageError(f"{point.value} is no class", expected="a subclass of Baseline or Operator")
     if issubclass(loaded, Baseline):
+        bare = [name for name in REQUIRED if getattr(loaded, name) is getattr(Baseline, name)]
+        if bare:
+            raise UsageError(f"{point.value} lacks {', '.join(bare)}", expected=", ".join(REQUIRED))
         return Entry(name=point.name, model=loaded, recipes=_recipes(loaded, point.name))
     from lagbench.baselines.operators.operator import Operator
 
@@ -96,9 +104,9 @@ def _entry(point: EntryPoint) -> Entry:
 
 
 def _recipes(loaded: type, name: str) -> Path | None:
-    """Return the file that a class names as ``recipes``, else ours of that name."""
+    """Return the file that a class names as ``recipes``, from its module's folder, else ours of that name."""
     given = getattr(loaded, "recipes", None)
-    path = Path(given) if given else RECIPES / f"{name}.yaml"
+    path = Path(inspect.getfile(loaded)).parent / given if given else RECIPES / f"{name}.yaml"
     return path if given or path.is_file() else None
 
 

@@ -26,7 +26,7 @@ from torch import Tensor
 from torch.optim import AdamW, Optimizer
 from torch.utils.data import DataLoader
 
-from lagbench.errors import WorkFailedError
+from lagbench.errors import UsageError, WorkFailedError
 from lagbench.torch import Window
 
 from .baseline import Baseline, Batch
@@ -46,6 +46,20 @@ def weighted_sum(terms: Mapping[str, Tensor], weights: Mapping[str, float]) -> T
     if not parts:
         raise WorkFailedError("every term of the loss has weight 0", got=", ".join(terms))
     return torch.stack(parts).sum()
+
+
+def _check_terms(model: Baseline, terms: object) -> None:
+    """Refuse a loss of a user's own class that nothing can be learned from."""
+    held: list[Any] = list(terms.values()) if isinstance(terms, Mapping) else [terms]
+    fit = isinstance(terms, Mapping) and all(isinstance(one, Tensor) and one.numel() == 1 for one in held)
+    if not fit or not any(one.requires_grad for one in held):
+        raise UsageError(
+            "a model returned no loss",
+            where=f"{type(model).__qualname__}.forward",
+            expected="a dict of terms, tensors of one number each, that depend on the model's parameters",
+            got="none that depends on a parameter" if fit else ", ".join(type(one).__name__ for one in held),
+            fix="mend that class; docs/baselines.md has an example",
+        )
 
 
 class TrainingModule(LightningModule):
@@ -86,6 +100,11 @@ class TrainingModule(LightningModule):
 
     def configure_optimizers(self) -> Optimizer:
         """Return AdamW, which is Adam where weights do not decay, as an earlier run left it."""
+        if next(self.model.parameters(), None) is None:
+            what, where = "a model without parameters", type(self.model).__qualname__
+            raise UsageError(
+                what, where=where, fix="what needs no training needs no baseline: submission.write"
+            )
         self._optimizer = AdamW(
             self.model.parameters(), lr=self._rate, weight_decay=self.recipe.weight_decay, fused=True
         )
@@ -106,6 +125,7 @@ class TrainingModule(LightningModule):
         if self._noise is None:
             self._noise = torch.Generator(device=self.device)
         terms = self.model(batch, self._noise.manual_seed(seed))
+        _check_terms(self.model, terms)
         total = weighted_sum(terms, self.model.weights)
         self.terms = {name: value.detach() for name, value in (*terms.items(), (TOTAL, total))}
         return total

@@ -102,12 +102,29 @@ def _advance(model: Baseline, given: Batch, frames: int) -> tuple[Tensor, int]:
     predicted = torch.empty((frames, len(given.position), 2), dtype=torch.float32)
     state = model.start(given)
     for frame in range(frames):
-        state, position = model.advance(state)
+        state, position = _answer(model, state, predicted[frame].shape)
         predicted[frame] = position
         # The scorer refuses what lies farther out; of NaN nothing is true.
         if not ((predicted[frame] - 0.5).abs() <= MAX_DISTANCE).all():
             return predicted, frame
     return predicted, frames
+
+
+def _answer(model: Baseline, state: object, shape: torch.Size) -> tuple[object, Tensor]:
+    """Return the next state and positions of a model; refuse what a frame could only be broadcast from."""
+    found: object = model.advance(state)
+    if isinstance(found, tuple) and len(found) == 2:
+        state, position = found
+        if isinstance(position, Tensor) and position.shape == shape:
+            return state, position
+    parts = found if isinstance(found, tuple) else (found,)
+    raise UsageError(
+        "a model returned no positions of the next frame",
+        where=f"{type(model).__qualname__}.advance",
+        expected=f"the next state and a tensor of shape {list(shape)}: [particle, 2]",
+        got=", ".join(str(getattr(part, "shape", type(part).__name__)) for part in parts),
+        fix="mend that class",
+    )
 
 
 @contextmanager

@@ -151,8 +151,9 @@ class Driver(ABC, Generic[Parameters]):
             raise WorkFailedError(
                 "the initial state is outside the solver's bounds",
                 where=f"scenario {index}",
-                expected=f"finite, abs(v) <= dx/dt = {fastest:.6g}, abs(C) dt <= 2",
-                got=f"abs(v) = {speed:.6g}, abs(C) dt = {stretch:.6g}",
+                expected=f"finite positions, abs(v) <= dx/dt = {fastest:.6g}, abs(C) dt <= 2",
+                got=f"abs(v) = {speed:.6g}, abs(C) dt = {stretch:.6g}, "
+                f"{np.count_nonzero(~np.isfinite(state.position))} coordinates that are not finite",
             )
 
     def _check_health(self, index: int, health: Health, substeps: int) -> None:

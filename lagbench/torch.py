@@ -261,6 +261,9 @@ class WindowSampler(Sampler[int]):
             UsageError: there is no such place.
         """
         self.epoch, self.position = _natural(epoch, "epoch"), _natural(position, "position")
+        if position > len(self.data):
+            most = f"at most {len(self.data)} windows"
+            raise UsageError("no such place in an epoch", where="WindowSampler", expected=most, got=position)
 
     def state_dict(self) -> dict[str, int]:
         """Return what `load_state_dict` takes to continue here, in mid-epoch too."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import subprocess
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from lagbench.board import submit as submitting
 from lagbench.board.check import CheckResult, check_board
 from lagbench.board.collect import collect
 from lagbench.errors import UnreadableFileError, UsageError
+from lagbench.metrics.table import available
 from lagbench.scoring import score
 
 FLOOR = "floors/cavity/tiny/persistence.nc"
@@ -66,6 +68,21 @@ def test_scoring_again_confirms_and_is_recorded(own: BoardBench, predictions: Pa
     rows = {row.id: row.verified for row in collect(own.folder, registry=own.registry).tabs[0].rows}
     assert rows["noisy"] is None
     assert found(own) == ["verified"]
+
+
+def test_metrics_of_packages_decide_nothing(
+    own: BoardBench, predictions: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever scores again may have a package that measures more, or lack the submitter's."""
+    more = dict(available())
+    more["of_a_package"] = replace(
+        more["position_mse"], name="of_a_package", of=(), statistic=lambda pair: 1.0
+    )
+    with monkeypatch.context() as patch:
+        patch.setattr("lagbench.metrics.table.available", lambda: more)
+        assert len(rescored(own, predictions).confirmed) == 1
+        own.submit(predictions, replace=True)
+    assert len(rescored(own, predictions).confirmed) == 1
 
 
 def test_a_method_is_verified_with_all_its_seeds(own: BoardBench) -> None:

@@ -112,6 +112,13 @@ def made_up(values: list[float], per_frame: Any = None) -> Score:
     )
 
 
+def test_a_split_that_is_not_known_here(bench: BoardBench) -> None:
+    """The entry is named: a package that describes its split is missing."""
+    with pytest.raises(DataError) as caught:
+        collect(bench.folder, registry=Registry({}, {}))
+    assert caught.value.where in {str(path) for path in (bench.folder / "submissions").rglob("*.yaml")}
+
+
 def test_few_scenarios_decide_nothing(board: Board) -> None:
     """With two scenarios there is no p-value, so no sign, and the tab says so; ranks are the order."""
     (tab,) = board.tabs

@@ -6,6 +6,7 @@ import json
 import os
 import re
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import netCDF4
 import numpy as np
 import pytest
 from score_bench import ScoreBench, half_right, still, straight
+from typer.testing import Result
 
 from lagbench.errors import DataError, UnreadableFileError, UsageError
 from lagbench.metrics import differ
@@ -349,6 +351,22 @@ def test_wide_tables_come_in_blocks() -> None:
         assert [row[0] for row in block.rows] == ["row 0", "row 1", "row 2"]
     assert sum((block.columns[1:] for block in blocks), ()) == columns[1:]
     assert sum((block.rows[1][1:] for block in blocks), ()) == rows[1][1:]
+
+
+def test_metrics_that_cannot_be_loaded(
+    run: Callable[..., Result], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Metrics that cannot be imported: the entry point is named, not the file of scores."""
+    (tmp_path / "broken_metric.py").write_text("raise KeyError('mine')\n")
+    about = tmp_path / "broken-1.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1\n")
+    (about / "entry_points.txt").write_text("[lagbench.metrics]\nbroken = broken_metric:METRICS\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    scores = published(tmp_path, [1.0] * 6, method="a")
+    result = run("compare", scores, scores)
+    assert result.exit_code == 2
+    assert "broken_metric:METRICS" in result.stderr
 
 
 def test_pipes_and_devices_are_refused_at_once(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from metric_flows import SETTING, Floats, pairs_of, rollout, scenario_of
 from numpy.testing import assert_allclose
 
 from lagbench.data.grid import Grid, Placement
-from lagbench.errors import UsageError
+from lagbench.errors import UsageError, WorkFailedError
 from lagbench.metrics import (
     FAMILIES,
     METRICS,
@@ -313,6 +313,22 @@ def test_selection_brings_what_a_metric_follows_from() -> None:
     assert found == {"vorticity_mse", "vorticity_rmse", "energy_predicted", "energy_true", "energy_ratio"}
     with pytest.raises(UsageError, match="did you mean 'vorticity_rmse'"):
         select(["vorticity_rmsee"])
-    for changes in ({"statistic": None, "of": ()}, {"direction": Direction.TARGET, "perfect": None}):
+    for changes in (
+        {"statistic": None, "of": ()},
+        {"direction": Direction.TARGET, "perfect": None},
+        {"direction": "sideways"},
+        *({"name": name, "of": ()} for name in ("My metric", "", "skill", "Ω")),
+    ):
         with pytest.raises(UsageError):
             replace(OTHERS, **changes)
+    assert replace(OTHERS, direction="higher").direction is Direction.HIGHER  # as a package may write it
+
+
+@pytest.mark.parametrize("value", [None, "much", np.zeros(3), 1j])
+def test_what_is_no_number_is_told_with_its_metric(value: object) -> None:
+    """A statistic of another package that gives something else is named, and where it comes from."""
+    truth = rollout()
+    bad = replace(OTHERS, statistic=lambda pair: value)
+    with pytest.raises(WorkFailedError) as caught:
+        bad.measure(pairs_of(scenario_of(truth), truth, truth)[0])
+    assert caught.value.where == f"{__name__}, enstrophy_error"

@@ -237,6 +237,35 @@ def test_a_rollout_is_frozen_before_it_is_too_far(monkeypatch: pytest.MonkeyPatc
     assert torch.isfinite(found.position).all()
 
 
+class Wrong(Drift):
+    """A Drift with another answer."""
+
+    answer: Any = None
+
+    def advance(self, state: State) -> Any:
+        """Give the answer."""
+        state, position = super().advance(state)
+        return self.answer(state, position)
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        lambda state, position: (state, position[:1]),
+        lambda state, position: (state, position.mean()),
+        lambda state, position: (position, state),
+        lambda state, position: (state, position.numpy()),
+        lambda state, position: position,
+    ],
+)
+def test_what_is_no_frame_is_not_broadcast(answer: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One particle, a mean, parts exchanged, an array or positions alone: told with the class."""
+    monkeypatch.setattr(Wrong, "answer", staticmethod(answer))
+    with torch.no_grad(), pytest.raises(UsageError) as caught:
+        roll_out(Wrong.build({"start": 0.0}, FACTS), windows([0.2, 0.9]), 3)
+    assert caught.value.where == "Wrong.advance"
+
+
 def test_rollouts_keep_the_mode() -> None:
     """A model in training is rolled out without dropout, and is in training afterwards."""
     model = Drift.build({}, FACTS).train()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import math
 from dataclasses import replace
@@ -11,6 +12,7 @@ import pytest
 import torch
 from simple_models import Drift, batch, facts, install, rolled, swirl
 
+from lagbench.baselines.baseline import Baseline
 from lagbench.baselines.catalogue import Entry, every_entry, find, names
 from lagbench.baselines.job import settings_of
 from lagbench.baselines.recipe import (
@@ -321,6 +323,28 @@ def test_other_packages_add_baselines(monkeypatch: pytest.MonkeyPatch) -> None:
 
 class NoBaseline:
     """Neither a baseline nor an operator."""
+
+
+class Half(Baseline):
+    """A baseline that defines too little."""
+
+
+def test_a_baseline_is_whole_and_has_a_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without its methods none is built; a name that no folder should have is passed over."""
+    install(monkeypatch, half=Half)
+    with pytest.raises(UsageError, match="history, forward, start, advance"):
+        find("half")
+    install(monkeypatch, **{"Bad Name/x": Drift})
+    with pytest.warns(UserWarning, match="Bad Name/x"):
+        assert "Bad Name/x" not in names()
+
+
+def test_recipes_lie_beside_their_module(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """From whatever folder the command is given."""
+    install(monkeypatch, drift=Drift)
+    monkeypatch.setattr(Drift, "recipes", "drift.yaml", raising=False)
+    monkeypatch.chdir(tmp_path)
+    assert find("drift").recipes == Path(inspect.getfile(Drift)).with_name("drift.yaml")
 
 
 def test_broken_packages_only_warn(monkeypatch: pytest.MonkeyPatch) -> None:

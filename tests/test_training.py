@@ -42,7 +42,7 @@ def run(
     generated: GenerationResult, unmeasured: Registry, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Run:
     """Train on tiny curl-noise data."""
-    return trainer(generated.root, unmeasured, tmp_path, monkeypatch, drift=Drift, greedy=Greedy)
+    return trainer(generated.root, unmeasured, tmp_path, monkeypatch, drift=Drift, greedy=Greedy, wrong=Wrong)
 
 
 class Greedy(Drift):
@@ -51,6 +51,34 @@ class Greedy(Drift):
     def forward(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """Return more than there is."""
         return {"motion": torch.zeros(2**50)}
+
+
+class Wrong(Drift):
+    """A Drift with another loss."""
+
+    loss: Any = None
+
+    def forward(self, batch: Batch, generator: torch.Generator | None = None) -> Any:
+        """Return it."""
+        return self.loss(super().forward(batch, generator)["motion"])
+
+
+@pytest.mark.parametrize(
+    "loss",
+    [
+        lambda motion: motion,
+        lambda motion: {"motion": motion.detach()},
+        lambda motion: {"motion": motion * torch.ones(3)},
+        lambda motion: {"motion": motion.item()},
+        lambda motion: {},
+    ],
+)
+def test_a_loss_that_nothing_is_learned_from(run: Run, monkeypatch: pytest.MonkeyPatch, loss: Any) -> None:
+    """No dict, nothing that depends on a parameter, several numbers, no tensor, no term."""
+    monkeypatch.setattr(Wrong, "loss", staticmethod(loss))
+    with pytest.raises(UsageError) as caught:
+        run("wrong", "steps=2")
+    assert caught.value.where == "Wrong.forward"
 
 
 def interrupt_at(step: int) -> Callable[[Progress], None]:

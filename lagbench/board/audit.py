@@ -36,6 +36,9 @@ from .folder import FLOORS, SCORES, SUBMISSIONS, VERIFIED, WEIGHTS, Folder
 TOLERANCE = 1e-6
 """Relative difference up to which two numbers are equal; NumPy versions may differ in the last bits."""
 
+OURS = frozenset(statistic for metric in METRICS.values() for statistic in metric.of)
+"""Statistics that lagbench itself measures."""
+
 FILM_STEP = (FILM_RANGE[1] - FILM_RANGE[0]) / LEVELS  # step of packed film positions [length]
 
 
@@ -158,11 +161,14 @@ def _unlike(ours: dict[int, Tally], theirs: StoredScores) -> tuple[list[str], fl
     first = next(iter(theirs.tallies.values()))
     # of a long rollout the last bits may have pushed a value over to the next step of its rounding
     room = 2.0 ** (1 - LONG_BITS) if len(first.frames) > LONG_ROLLOUT else TOLERANCE
-    names = dict.fromkeys((*next(iter(ours.values())).names, *first.names))
+    # what packages measure that one side lacks is on no board
+    names = OURS.intersection((*next(iter(ours.values())).names, *first.names))
     apart = {
         name: max(farthest(tally, theirs.tallies[i], name) for i, tally in ours.items()) for name in names
     }
-    return [n for n in names if apart[n] > room], max((v for v in apart.values() if v <= room), default=0.0)
+    return [n for n in sorted(names) if apart[n] > room], max(
+        (v for v in apart.values() if v <= room), default=0.0
+    )
 
 
 def farthest(one: Tally, other: Tally, name: str) -> float:

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from lagbench.data.registry import Registry, Size, load
-from lagbench.errors import ChecksFailedError, UnreadableFileError
+from lagbench.errors import ChecksFailedError, DataError, UnreadableFileError, UsageError
 from lagbench.floors.shipped import FloorScores, solver_seconds
 from lagbench.floors.table import FLOORS
 from lagbench.metrics.aggregate import Score
@@ -82,6 +82,7 @@ def collect(
         UsageError: no leaderboard there.
         UnreadableFileError: an entry or a score file cannot be read.
         ChecksFailedError: an entry does not fit the schema or lies in another place.
+        DataError: an entry is of a split that is not known here.
     """
     place, described = Folder(folder), registry or load()
     place.require()
@@ -97,7 +98,11 @@ def collect(
                 expected=str(entry.yaml_path),
                 fix="let split, size and method be those of the path",
             )
-        size = described.size(entry.split, entry.size)
+        try:
+            size = described.size(entry.split, entry.size)
+        except UsageError as error:
+            fix = "install the package that adds the split; lagbench list names those that are known"
+            raise DataError(error.what, where=str(place.path / path), fix=fix) from error
         current = is_current(entry.dataset, size)
         try:
             stored = [read_stored(place.path / path, size) for path in entry.score_paths]

@@ -158,7 +158,8 @@ def picture(board: Board, size: Size) -> str:
         known = shipped(size) or {}
         marks = [_floor(n, held.seconds_per_frame, held.scores[ranking].mean) for n, held in known.items()]
     if not marks:
-        raise DataError("nothing to draw: neither entries nor floors", where=f"{size.split} {size.name}")
+        what, where = "nothing to draw: neither entries nor floors with a cost", f"{size.split} {size.name}"
+        raise DataError(what, where=where, fix="`lagbench predict` labels what a frame takes")
     drawn = draw(marks, solver, ranking, f"{size.split} {size.name}: accuracy against cost")
     whole = tag(
         "svg",

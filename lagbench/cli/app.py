@@ -6,6 +6,7 @@ import errno
 import io
 import os
 import sys
+import traceback
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -49,13 +50,29 @@ class _Commands(TyperGroup):
             usage = any(kind.__name__ == "ClickException" for kind in type(error).__mro__)
             if usage or os.environ.get("LAGBENCH_DEBUG") == "1":
                 raise
+            again = f"LAGBENCH_DEBUG=1 lagbench {' '.join(sys.argv[1:])}"
+            fix = f"this is a fault of lagbench; please report it with the output of\n       {again}"
+            if (place := _in_a_package(error)) is not None:
+                fix = f"mend or uninstall the package behind {place}; {again}\n       has the whole trace"
             typer.echo(
-                f"lagbench: unexpected {type(error).__name__}: {printable(str(error))}\n"
-                "  fix: this is a fault of lagbench; please report it with the output of\n"
-                f"       LAGBENCH_DEBUG=1 lagbench {' '.join(sys.argv[1:])}",
+                f"lagbench: unexpected {type(error).__name__}: {printable(str(error))}\n  fix: {fix}",
                 err=True,
             )
             raise typer.Exit(FAILED) from error
+
+
+def _in_a_package(error: Exception) -> str | None:
+    """Return the innermost place of a trace in what another package adds; None where there is none."""
+    from lagbench.data.registry import installed
+
+    groups = (f"lagbench.{group}" for group in ("baselines", "generators", "metrics"))
+    added = {point.module.split(".")[0] for group in groups for point in installed(group)} - {"lagbench"}
+    trace = reversed(traceback.extract_tb(error.__traceback__))
+    frames = reversed([frame for frame, _ in traceback.walk_tb(error.__traceback__)])
+    for frame, line in zip(frames, trace, strict=True):
+        if str(frame.f_globals.get("__name__")).split(".")[0] in added:
+            return f"{line.filename}, line {line.lineno}"
+    return None
 
 
 @contextmanager

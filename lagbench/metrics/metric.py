@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import enum
 import math
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from lagbench.errors import UsageError
+from lagbench.errors import UsageError, WorkFailedError
 
 from .frame import Floats, FramePair
 
@@ -110,6 +111,10 @@ class FirstFrames:
         return math.nan if len(values) < self.count else self.reduction(values[: self.count])
 
 
+NAME, RESERVED = re.compile("[a-z][a-z0-9_]{0,63}"), ("skill",)
+"""What a metric may be called: stored names are split at blanks, and tables have a row `skill`."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Metric:
     """One entry of the table of metrics.
@@ -119,7 +124,8 @@ class Metric:
     the frame is undefined: left out of the mean and counted.
 
     Raises:
-        UsageError: neither a statistic nor others' series, or a target without its value.
+        UsageError: neither a statistic nor others' series, a target without its value, a name that
+            is not of small letters, digits and underscores, or no direction.
     """
 
     name: str  # unique
@@ -140,7 +146,16 @@ class Metric:
     extra: str | None = None  # extra of lagbench that it needs; measured only when asked for
 
     def __post_init__(self) -> None:
-        """Fill in ``of``; refuse a metric that nothing could be computed for or judged by."""
+        """Fill in ``of``; refuse a metric that nothing could be computed for, judged by, or stored under."""
+        try:
+            object.__setattr__(self, "direction", Direction(self.direction))  # a package may give a text
+        except ValueError:
+            what, known = f"metric {self.name!r} has no such direction", ", ".join(Direction)
+            raise UsageError(what, expected=known, got=repr(self.direction)) from None
+        for name in (self.name, *self.of):
+            if not NAME.fullmatch(name) or name in RESERVED:
+                what = f"no name for a metric: {name!r}"
+                raise UsageError(what, expected="small letters, digits and underscores, as in my_error")
         if self.statistic is None and not self.of:
             raise UsageError(f"metric {self.name!r} has neither a statistic nor others to follow from")
         if self.perfect is None and self.direction is Direction.TARGET:
@@ -152,7 +167,14 @@ class Metric:
         """Return the statistic of a frame pair, NaN where it is undefined."""
         if self.statistic is None or not self.defined(pair):
             return math.nan
-        return float(self.statistic(pair))
+        try:
+            return float(self.statistic(pair))
+        except (TypeError, ValueError) as error:
+            got = f"{type(error).__name__}: {error}"
+            where = f"{getattr(self.statistic, '__module__', '?')}, {self.name}"
+            raise WorkFailedError(
+                "a metric gave no number", where=where, expected="a float", got=got
+            ) from error
 
     def loss(self, value: float) -> float:
         """Return the value turned so that smaller is better.

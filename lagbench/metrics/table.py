@@ -12,7 +12,7 @@ from importlib.metadata import EntryPoint
 from types import MappingProxyType
 
 from lagbench.data.registry import installed
-from lagbench.errors import UsageError, nearest
+from lagbench.errors import LagbenchError, UsageError, nearest
 
 from . import bodies, conservation, distributions, pointwise, transport, vorticity
 from .metric import Metric
@@ -65,8 +65,16 @@ def available() -> dict[str, Metric]:
 
 
 def _load(point: EntryPoint) -> Sequence[Metric]:
-    loaded = point.load()
-    found = (loaded,) if isinstance(loaded, Metric) else tuple(loaded)
+    try:
+        loaded = point.load()
+        found = (loaded,) if isinstance(loaded, Metric) else tuple(loaded)
+    except Exception as error:  # a stranger's module: importing it may raise anything
+        raise UsageError(
+            "a package's metrics cannot be loaded",
+            where=f"entry point {point.name} = {point.value}",
+            got=str(error) if isinstance(error, LagbenchError) else f"{type(error).__name__}: {error}",
+            fix="mend or uninstall that package",
+        ) from error
     for metric in found:
         if not isinstance(metric, Metric):
             raise UsageError(
