@@ -17,7 +17,8 @@ from lagbench.board.model import Board, Row
 from lagbench.board.page import build
 from lagbench.board.ranking import Combined, combine
 from lagbench.board.show import as_plain, chosen_data_sets, tables
-from lagbench.errors import ChecksFailedError, LagbenchError, UsageError
+from lagbench.data.registry import Registry
+from lagbench.errors import ChecksFailedError, DataError, LagbenchError, UsageError
 from lagbench.floors.table import FLOORS
 from lagbench.metrics import METRICS, Score, bootstrap_interval
 from lagbench.scoring.card import ScoreCard, digits
