@@ -106,7 +106,10 @@ def _entry(point: EntryPoint) -> Entry:
 def _recipes(loaded: type, name: str) -> Path | None:
     """Return the file that a class names as ``recipes``, from its module's folder, else ours of that name."""
     given = getattr(loaded, "recipes", None)
-    path = Path(inspect.getfile(loaded)).parent / given if given else RECIPES / f"{name}.yaml"
+    path = Path(given) if given else RECIPES / f"{name}.yaml"
+    if not path.is_absolute():
+        owner = next(base for base in loaded.__mro__ if "recipes" in vars(base))
+        path = Path(inspect.getfile(owner)).parent / path
     return path if given or path.is_file() else None
 
 

@@ -42,7 +42,8 @@ TOTAL = "total"  # name of the weighted sum among the loss terms
 
 def weighted_sum(terms: Mapping[str, Tensor], weights: Mapping[str, float]) -> Tensor:
     """Return sum_i w_i L_i; terms that no weight is given for have 1, those of weight 0 are left out."""
-    parts = [value * weights.get(name, 1.0) for name, value in terms.items() if weights.get(name, 1.0) != 0]
+    used = {name: value for name, value in terms.items() if weights.get(name, 1.0) != 0}
+    parts = [value.reshape(()) * weights.get(name, 1.0) for name, value in used.items()]
     if not parts:
         raise WorkFailedError("every term of the loss has weight 0", got=", ".join(terms))
     return torch.stack(parts).sum()
@@ -50,14 +51,17 @@ def weighted_sum(terms: Mapping[str, Tensor], weights: Mapping[str, float]) -> T
 
 def _check_terms(model: Baseline, terms: object) -> None:
     """Refuse a loss of a user's own class that nothing can be learned from."""
-    held: list[Any] = list(terms.values()) if isinstance(terms, Mapping) else [terms]
-    fit = isinstance(terms, Mapping) and all(isinstance(one, Tensor) and one.numel() == 1 for one in held)
-    if not fit or not any(one.requires_grad for one in held):
+    named = dict(terms) if isinstance(terms, Mapping) else {"no dict": terms}
+    fit = isinstance(terms, Mapping) and all(
+        isinstance(one, Tensor) and one.numel() == 1 for one in named.values()
+    )
+    held = ", ".join(f"{name}: {getattr(one, 'shape', type(one).__name__)}" for name, one in named.items())
+    if not fit or not named:
         raise UsageError(
             "a model returned no loss",
             where=f"{type(model).__qualname__}.forward",
-            expected="a dict of terms, tensors of one number each, that depend on the model's parameters",
-            got="none that depends on a parameter" if fit else ", ".join(type(one).__name__ for one in held),
+            expected="a dict of terms, tensors of one number each",
+            got=held or "an empty dict",
             fix="mend that class; docs/baselines.md has an example",
         )
 
@@ -127,6 +131,14 @@ class TrainingModule(LightningModule):
         terms = self.model(batch, self._noise.manual_seed(seed))
         _check_terms(self.model, terms)
         total = weighted_sum(terms, self.model.weights)
+        if not total.requires_grad:
+            raise UsageError(
+                "nothing can be learned from the loss",
+                where=f"{type(self.model).__qualname__}.forward",
+                expected="a term, of a weight above 0, that depends on the model's parameters",
+                got=", ".join(terms),
+                fix="mend that class, or the weights",
+            )
         self.terms = {name: value.detach() for name, value in (*terms.items(), (TOTAL, total))}
         return total
 

@@ -187,7 +187,7 @@ def check_replaceable(output: Path) -> None:
         fix = f"name a file: -o {output / 'predictions.nc'}"
         raise UsageError("the output is a folder", where="--output", got=str(output), fix=fix)
     # scores have no format of data, scenarios no hash of the whole data set
-    of_predictions, of_cost = (b"lagbench_format", b"dataset_sha256"), (b"seconds_per_frame",)
+    of_predictions, of_cost = (b"lagbench_format", b"dataset_sha256"), (b"seconds_without_search",)
     for path, ours in ((output, of_predictions), (output.with_suffix(".json"), of_cost)):
         if not path.is_file():
             continue

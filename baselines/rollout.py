@@ -113,11 +113,11 @@ def _advance(model: Baseline, given: Batch, frames: int) -> tuple[Tensor, int]:
 def _answer(model: Baseline, state: object, shape: torch.Size) -> tuple[object, Tensor]:
     """Return the next state and positions of a model; refuse what a frame could only be broadcast from."""
     found: object = model.advance(state)
-    if isinstance(found, tuple) and len(found) == 2:
+    if isinstance(found, tuple | list) and len(found) == 2:
         state, position = found
         if isinstance(position, Tensor) and position.shape == shape:
             return state, position
-    parts = found if isinstance(found, tuple) else (found,)
+    parts = found if isinstance(found, tuple | list) else (found,)
     raise UsageError(
         "a model returned no positions of the next frame",
         where=f"{type(model).__qualname__}.advance",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import functools
 import os
 import secrets
@@ -55,6 +56,8 @@ def move_together(moves: Sequence[tuple[Path, Path]]) -> None:
     for source, target in moves:
         _flush(source)
         target.parent.mkdir(parents=True, exist_ok=True)
+        if target.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(target))
     for source, target in moves:
         source.replace(target)
     for folder in {target.parent for _, target in moves}:

@@ -260,10 +260,9 @@ class WindowSampler(Sampler[int]):
         Raises:
             UsageError: there is no such place.
         """
-        self.epoch, self.position = _natural(epoch, "epoch"), _natural(position, "position")
-        if position > len(self.data):
-            most = f"at most {len(self.data)} windows"
-            raise UsageError("no such place in an epoch", where="WindowSampler", expected=most, got=position)
+        if _natural(position, "position") > (most := len(self.data)):
+            raise UsageError("no such place", where="WindowSampler", expected=f"at most {most}", got=position)
+        self.epoch, self.position = _natural(epoch, "epoch"), position
 
     def state_dict(self) -> dict[str, int]:
         """Return what `load_state_dict` takes to continue here, in mid-epoch too."""

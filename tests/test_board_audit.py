@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 from collections.abc import Callable
@@ -269,10 +270,42 @@ def test_a_verified_entry_may_be_replaced(branch: BoardBench) -> None:
     assert told("noisy") == set()
     assert ("base", "verified.yaml") in told()
     left = listed.read_text()
+    assert "other" in left
     listed.write_text(left.replace("lagbench: ", "lagbench: 9"))
     assert ("base", "verified.yaml") in told("noisy")
     listed.write_bytes(both + b"# all others too\n")
     assert ("base", "verified.yaml") in told("noisy")
+
+
+def test_the_entry_comes_last(own: BoardBench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After its scores and the list of the verified, whatever the method is called."""
+    first, about = own.predict(nearer, "new"), {"method": "verified", "name": "Verified"}
+    own.submit(first, **about)
+    rescored(own, first, recording=True)
+    moved, move = [], os.replace
+
+    def note(source: Path, target: Path) -> None:
+        moved.append(os.path.relpath(target, own.folder))
+        move(source, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", note)
+        own.submit(own.predict(still, "new"), replace=True, **about)
+    ours = [name for name in moved if "verified" in name and ".submit-" not in name]
+    assert ours == ["scores/cavity/tiny/verified.nc", "verified.yaml", f"{PLACE}/verified.yaml"]
+    assert (own.folder / "verified.yaml").read_text() == "{}\n"
+    assert found(own) == []
+
+
+def test_statistics_of_ours_are_all_there(own: BoardBench, predictions: Path) -> None:
+    """One that a score file lacks is told; one that somebody made up hides no copy."""
+    path = own.folder / SCORES / "noisy.nc"
+    with netCDF4.Dataset(path, "a") as file:
+        names = file.statistics.split()
+        file.statistics = " ".join("made_up" if name == "velocity_mse" else name for name in names)
+    own.rehash("noisy")
+    result = rescored(own, predictions)
+    assert "velocity_mse" in next(str(one.got) for one in result.findings if one.check == "rescored")
 
 
 def test_the_base_may_have_gone_on(branch: BoardBench) -> None:

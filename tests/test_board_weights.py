@@ -184,13 +184,34 @@ def test_only_sound_weights_are_kept(own: BoardBench, damage: str) -> None:
     file = own.folder / "weights/cavity/tiny/drift_0.pt"
     if damage == "edited":
         file.write_bytes(b"1")
-    else:
+    if damage in ("lost", "linked"):
         file.unlink()
     if damage == "linked":
         file.symlink_to(run / "weights.pt")
     submitted(own, run, weights=(), replace=True)
     assert read_entry(own.entry("drift")).predictions[0].weights is None
     assert found(own) == set()
+
+
+def test_weights_of_another_are_not_kept(own: BoardBench) -> None:
+    """Nor those that lie elsewhere: what the old entry says of them is not believed."""
+    run = trained(own, 0)
+    submitted(own, run)
+    run.rename(own.folder.parent / "first")
+    second = trained(own, 0, share=0.3)
+    submitted(own, second, weights=(), method="glide")
+    source, target = (own.folder / f"weights/cavity/tiny/{name}_0.pt" for name in ("drift", "glide"))
+    target.write_bytes(source.read_bytes())
+    for path in ("weights/cavity/tiny/glide_0.pt", "weights/cavity/tiny/drift_0.pt"):
+        said = {"path": path, "sha256": file_sha256(source)}
+        own.edit("glide", lambda held, said=said: held["predictions"][0].update(weights=said))
+        submitted(own, second, weights=(), method="glide", replace=True)
+        assert read_entry(own.entry("glide")).predictions[0].weights is None
+    target.unlink(missing_ok=True)
+    own.entry("drift").unlink()  # nobody else's now, and still not in its place
+    own.edit("glide", lambda held: held["predictions"][0].update(weights=said))
+    submitted(own, second, weights=(), method="glide", replace=True)
+    assert read_entry(own.entry("glide")).predictions[0].weights is None
 
 
 def test_a_new_name_takes_the_weights_along(own: BoardBench) -> None:
@@ -214,6 +235,15 @@ def test_no_link_leads_out_of_the_board(own: BoardBench, tmp_path: Path) -> None
         submitted(own, run, replace=True)
     assert caught.value.where == str(own.folder / "weights")
     assert (own.state(), list(elsewhere.iterdir())) == (before, [])
+    (own.folder / "weights").unlink()
+    submitted(own, run, replace=True)
+    (own.folder / "weights").rename(elsewhere / "weights")
+    (own.folder / "weights").symlink_to(elsewhere / "weights")
+    lying = sorted(elsewhere.rglob("*.*"))
+    run.rename(tmp_path / "first")
+    with pytest.raises(UsageError):
+        submitted(own, trained(own, 0, share=0.3), weights=(), replace=True)
+    assert sorted(elsewhere.rglob("*.*")) == lying
 
 
 def test_a_full_disk_leaves_the_entry_before(own: BoardBench) -> None:
@@ -222,7 +252,7 @@ def test_a_full_disk_leaves_the_entry_before(own: BoardBench) -> None:
     submitted(own, run)
     run.rename(own.folder.parent / "first")
     second, before = trained(own, 0, share=0.3), own.state()
-    (second / "training.json").write_text(json.dumps({"note": "x" * (kept.MOST_RECORD - 100)}))
+    (second / "training.json").write_text(json.dumps({"step": 6, "note": "x" * (kept.MOST_RECORD - 100)}))
     room = 1000 + max(path.stat().st_size for path in (own.folder / "scores").rglob("drift*"))
     assert room < (second / "training.json").stat().st_size
     with largest_file(room), pytest.raises(WorkFailedError):

@@ -176,7 +176,9 @@ def test_folders_files_and_predictions_agree(bench: ScoreBench, scored: dict[str
     assert len(short.rows) < len(whole.rows) == len(result.metrics)
 
 
-def test_files_of_a_leaderboard(scored: dict[str, Path], tmp_path: Path) -> None:
+def test_files_of_a_leaderboard(
+    scored: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Score files of several seeds go by their common name; the best floor stands in each."""
     folder = tmp_path / "scores" / "cavity" / "tiny"
     folder.mkdir(parents=True)
@@ -185,6 +187,8 @@ def test_files_of_a_leaderboard(scored: dict[str, Path], tmp_path: Path) -> None
         shutil.copy(scored[name] / "scores.nc", path)
         with netCDF4.Dataset(path, "a") as file:
             file.method = "moving"
+    monkeypatch.chdir(folder)
+    assert compare("moving.nc", "constant-velocity").seeds == (2, 1)
     (folder / "moving_old.nc").write_bytes(b"not a seed")
     result = compare(folder / "moving.nc", "constant-velocity")
     assert (result.first, result.seeds) == ("moving", (2, 1))

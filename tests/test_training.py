@@ -71,6 +71,7 @@ class Wrong(Drift):
         lambda motion: {"motion": motion * torch.ones(3)},
         lambda motion: {"motion": motion.item()},
         lambda motion: {},
+        lambda motion: {"motion": motion * torch.ones(3), "idle": motion},
     ],
 )
 def test_a_loss_that_nothing_is_learned_from(run: Run, monkeypatch: pytest.MonkeyPatch, loss: Any) -> None:

@@ -527,6 +527,16 @@ def test_what_a_model_returns_has_the_shape_of_positions(
         roll_out(lambda seen: seen.position[:, -1].numpy(), given, 2)  # type: ignore[arg-type, return-value]
 
 
+def test_no_place_beyond_an_epoch(train: Open) -> None:
+    """The last one is the end itself; what is refused moves nothing."""
+    data = train(history=2, future=1)
+    sampler = WindowSampler(data, seed=0)
+    sampler.seek(3, len(data))
+    with pytest.raises(UsageError):
+        sampler.seek(4, len(data) + 1)
+    assert sampler.state_dict() == {"seed": 0, "epoch": 3, "position": len(data)}
+
+
 def test_a_rollout_ends_where_the_forcing_does(train: Open) -> None:
     """Beyond it no wall moves as it did: a model that takes the last velocity known would be wrong unseen."""
     given = collate([train(history=2, future=3)[0]]).part(slice(2))

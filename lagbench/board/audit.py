@@ -19,7 +19,7 @@ import yaml
 from lagbench.data.registry import Registry
 from lagbench.errors import ChecksFailedError, UnreadableFileError, UsageError
 from lagbench.metrics.aggregate import Tally
-from lagbench.metrics.table import METRICS
+from lagbench.metrics.table import METRICS, STATISTICS
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.scenario import LONG_BITS, LONG_ROLLOUT, SUBMISSION
 from lagbench.scoring.score import score
@@ -35,9 +35,6 @@ from .folder import FLOORS, SCORES, SUBMISSIONS, VERIFIED, WEIGHTS, Folder
 
 TOLERANCE = 1e-6
 """Relative difference up to which two numbers are equal; NumPy versions may differ in the last bits."""
-
-OURS = frozenset(statistic for metric in METRICS.values() for statistic in metric.of)
-"""Statistics that lagbench itself measures."""
 
 FILM_STEP = (FILM_RANGE[1] - FILM_RANGE[0]) / LEVELS  # step of packed film positions [length]
 
@@ -162,7 +159,7 @@ def _unlike(ours: dict[int, Tally], theirs: StoredScores) -> tuple[list[str], fl
     # of a long rollout the last bits may have pushed a value over to the next step of its rounding
     room = 2.0 ** (1 - LONG_BITS) if len(first.frames) > LONG_ROLLOUT else TOLERANCE
     # what packages measure that one side lacks is on no board
-    names = OURS.intersection((*next(iter(ours.values())).names, *first.names))
+    names = set(STATISTICS).intersection((*next(iter(ours.values())).names, *first.names))
     apart = {
         name: max(farthest(tally, theirs.tallies[i], name) for i, tally in ours.items()) for name in names
     }

@@ -15,7 +15,7 @@ import numpy as np
 from lagbench.errors import LagbenchError, UnreadableFileError
 from lagbench.metrics.aggregate import Tally
 from lagbench.metrics.metric import Direction
-from lagbench.metrics.table import METRICS
+from lagbench.metrics.table import METRICS, STATISTICS
 from lagbench.scoring.stored import MAX_SCORE_BYTES, Stored, read_stored
 from lagbench.submission.findings import Finding, Severity
 
@@ -223,11 +223,16 @@ def finding_of(check: str, error: LagbenchError, where: object) -> Finding:
 
 
 def print_of(tallies: Mapping[int, Tally]) -> str:
-    """Return what only the same predictions share: their errors in every scenario and frame."""
+    """Return what only the same predictions share: their errors in every scenario and frame.
+
+    Those that lagbench measures: what a package adds, or somebody makes up, tells nothing apart.
+    """
     digest = hashlib.sha256()
     for scenario, tally in sorted(tallies.items()):
-        digest.update(f"{scenario} {tally.names} {tally.frames}".encode())
-        digest.update(np.ascontiguousarray(tally.total.astype(np.float32)).tobytes())
+        names = [name for name in STATISTICS if name in tally.names]
+        digest.update(f"{scenario} {names} {tally.frames}".encode())
+        total = tally.total[[tally.names.index(name) for name in names]]
+        digest.update(np.ascontiguousarray(total.astype(np.float32)).tobytes())
     return digest.hexdigest()
 
 

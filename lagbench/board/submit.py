@@ -9,6 +9,7 @@ finds. ``lagbench leaderboard build`` draws the board's page anew.
 from __future__ import annotations
 
 import datetime
+import os
 import re
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
@@ -20,7 +21,7 @@ from lagbench.atomic import move_together
 from lagbench.data.hdf5 import check_file
 from lagbench.data.registry import Registry, load
 from lagbench.errors import ChecksFailedError, Mistakes, UsageError, WorkFailedError
-from lagbench.floors.table import FLOORS
+from lagbench.floors.table import FLOORS as KNOWN_FLOORS
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.scenario import SUBMISSION
 from lagbench.scoring.score import score
@@ -52,7 +53,7 @@ from .entry import (
 )
 from .entry_file import Model, active_beside, examine, listed, read_verified, readable, spell, unverified
 from .findings import print_of, prints_of, skeleton
-from .folder import SUBMISSIONS, VERIFIED, Folder, Place, entry_path, score_paths
+from .folder import FLOORS, SUBMISSIONS, VERIFIED, Folder, Place, entry_path, score_paths
 from .ranking import combine, summarise, write_floors
 from .weights import named_weights, require_weights, stage_weights
 
@@ -246,7 +247,7 @@ def _method(header: Header, meta: Meta) -> str:
             got=ascii(name),
             fix=f"name it: --method {re.sub('[^a-z0-9]+', '-', name.lower()).strip('-') or 'my-model'}",
         )
-    if name in FLOORS:
+    if name in KNOWN_FLOORS:
         fix = "name your method otherwise; the floors are added by themselves"
         raise UsageError(f"{name!r} is the name of a floor", where="--method", fix=fix)
     return name
@@ -265,7 +266,7 @@ def _require_free(
     if (folder.path / own).exists() and not replace:
         fix = "replace it with --replace, or give this one another --method, and another name: in meta.yaml"
         raise UsageError("there is such an entry already", where=str(folder.path / own), fix=fix)
-    names = {floor: f"the floor {floor}" for floor in FLOORS}
+    names = {floor: f"the floor {floor}" for floor in KNOWN_FLOORS}
     names |= {entry.name: str(path) for path, entry in others.items()}
     for name, holder in names.items():
         if skeleton(name) == skeleton(label):
@@ -369,16 +370,16 @@ def _publish(
         moves = dict(zip(names, staged, strict=True))
         moves |= stage_weights(Path(stage), kept, sources)
         texts = {Path(VERIFIED): unverified(folder, entry), yaml_path: spell(entry)}  # the entry last
-        for name, text in texts.items():
+        for number, (name, text) in enumerate(texts.items()):
             if text is not None:
-                moves[name] = Path(stage) / name.name
+                moves[name] = Path(stage) / f"{number}.yaml"  # a method may be called verified
                 moves[name].write_bytes(text)
-        folder.require_unlinked(moves)
+        records = {name.with_suffix(".json") for name in moves if name.suffix == ".pt"}
+        idle = sorted((set(before.files if before else ()) - set(entry.files)) | (records - set(moves)))
+        folder.require_unlinked([*moves, *(name.parent for name in idle), Path(FLOORS, *place[:2])])
         floors = write_floors(cards[0], folder)
         move_together([(source, folder.path / name) for name, source in moves.items()])
-    records = {name.with_suffix(".json") for name in moves if name.suffix == ".pt"}
-    idle = sorted((set(before.files if before else ()) - set(entry.files)) | (records - set(moves)))
-    removed = [folder.path / name for name in idle if (folder.path / name).is_file()]
+    removed = [path for name in idle if os.path.lexists(path := folder.path / name)]
     for path in removed:
         path.unlink()
     summary = entry.score.metrics[entry.score.ranking_metric]

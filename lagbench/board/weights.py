@@ -162,6 +162,11 @@ def _is_there(folder: Folder, weights: Weights) -> bool:
     )
 
 
+def _is_record(path: Path) -> bool:
+    """Tell whether a file is the record of a training, and not what predictions cost."""
+    return path.is_file() and unfit_record(path) is None and "step" in json.loads(path.read_bytes())
+
+
 def stage_weights(
     stage: Path, named: Sequence[Weights | None], paths: Sequence[Path | None]
 ) -> Iterator[tuple[Path, Path]]:
@@ -172,7 +177,7 @@ def stage_weights(
         target = Path(said.path)
         sources = {target: path}
         records = (path.with_name(RECORD), path.with_suffix(".json"))  # of a run; of weights on a board
-        fit = (one for one in records if one.is_file() and unfit_record(one) is None)
+        fit = (one for one in records if _is_record(one))
         if (record := next(fit, None)) is not None:
             sources[target.with_suffix(".json")] = record
         for place, source in sources.items():
@@ -214,7 +219,7 @@ def check_weights(folder: Folder, entries: Sequence[Entry]) -> Iterator[Finding]
                 holder = holders.setdefault(found, path)
                 if holder != path:
                     got = f"the same file as {holder}"
-                    yield finding("weights", path, got, what="weights of two entries", expected="of one")
+                    yield finding("weights", path, got, what="the same weights twice", expected="one place")
             record = path.with_suffix(".json")  # its absence is no finding
             kept = folder.path / record
             if (

@@ -53,7 +53,7 @@ class _Commands(TyperGroup):
             again = f"LAGBENCH_DEBUG=1 lagbench {' '.join(sys.argv[1:])}"
             fix = f"this is a fault of lagbench; please report it with the output of\n       {again}"
             if (place := _in_a_package(error)) is not None:
-                fix = f"mend or uninstall the package behind {place}; {again}\n       has the whole trace"
+                fix = f"mend or uninstall the package of {place};\n       {again} has the whole trace"
             typer.echo(
                 f"lagbench: unexpected {type(error).__name__}: {printable(str(error))}\n  fix: {fix}",
                 err=True,
@@ -66,13 +66,12 @@ def _in_a_package(error: Exception) -> str | None:
     from lagbench.data.registry import installed
 
     groups = (f"lagbench.{group}" for group in ("baselines", "generators", "metrics"))
-    added = {point.module.split(".")[0] for group in groups for point in installed(group)} - {"lagbench"}
-    trace = reversed(traceback.extract_tb(error.__traceback__))
-    frames = reversed([frame for frame, _ in traceback.walk_tb(error.__traceback__)])
-    for frame, line in zip(frames, trace, strict=True):
-        if str(frame.f_globals.get("__name__")).split(".")[0] in added:
-            return f"{line.filename}, line {line.lineno}"
-    return None
+    added = {point.value.partition(":")[0].split(".")[0] for group in groups for point in installed(group)}
+    place = None
+    for frame, line in traceback.walk_tb(error.__traceback__):
+        if str(frame.f_globals.get("__name__")).split(".")[0] in added - {"lagbench"}:
+            place = f"{frame.f_code.co_filename}, line {line}"
+    return place
 
 
 @contextmanager

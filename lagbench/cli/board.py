@@ -96,6 +96,8 @@ def submit(
 
 
 def _submitted(result: SubmitResult, *, quiet: bool) -> None:
+    from lagbench.board.folder import VERIFIED
+
     mean = "undefined" if result.mean is None else f"{result.mean:.4g}"
     spread = "" if result.std is None else f" ± {result.std:.2g} over seeds"
     say(f"{result.method} on {result.split} {result.size}: {result.ranking} {mean}{spread}", quiet=quiet)
@@ -108,7 +110,7 @@ def _submitted(result: SubmitResult, *, quiet: bool) -> None:
     for what, paths in {"kept": result.kept, "removed": result.removed}.items():
         if paths:
             say(f"{what}, of the entry before: " + ", ".join(map(str, paths)), quiet=quiet)
-    if any(path.name == "verified.yaml" for path in result.files):
+    if result.board / VERIFIED in result.files:
         say("its line of verified.yaml is gone: maintainers score the entry again", quiet=quiet)
     where = "" if result.board == BOARD else f" --board {result.board}"
     say(

@@ -151,11 +151,13 @@ class Metric:
             object.__setattr__(self, "direction", Direction(self.direction))  # a package may give a text
         except ValueError:
             what, known = f"metric {self.name!r} has no such direction", ", ".join(Direction)
-            raise UsageError(what, expected=known, got=repr(self.direction)) from None
+            raise UsageError(
+                what, expected=known, got=repr(self.direction), fix="name one of these"
+            ) from None
         for name in (self.name, *self.of):
-            if not NAME.fullmatch(name) or name in RESERVED:
-                what = f"no name for a metric: {name!r}"
-                raise UsageError(what, expected="small letters, digits and underscores, as in my_error")
+            if not isinstance(name, str) or not NAME.fullmatch(name) or name in RESERVED:
+                expected = "up to 64 small letters, digits and underscores, as in my_error; not skill"
+                raise UsageError(f"no name for a metric: {name!r}", expected=expected, fix="rename it")
         if self.statistic is None and not self.of:
             raise UsageError(f"metric {self.name!r} has neither a statistic nor others to follow from")
         if self.perfect is None and self.direction is Direction.TARGET:
@@ -167,13 +169,16 @@ class Metric:
         """Return the statistic of a frame pair, NaN where it is undefined."""
         if self.statistic is None or not self.defined(pair):
             return math.nan
+        value = self.statistic(pair)
         try:
-            return float(self.statistic(pair))
+            return float(value)
         except (TypeError, ValueError) as error:
-            got = f"{type(error).__name__}: {error}"
-            where = f"{getattr(self.statistic, '__module__', '?')}, {self.name}"
             raise WorkFailedError(
-                "a metric gave no number", where=where, expected="a float", got=got
+                "a metric gave no number",
+                where=f"{getattr(self.statistic, '__module__', '?')}, {self.name}",
+                expected="a float",
+                got=type(value).__name__,
+                fix="mend or uninstall the package that adds it",
             ) from error
 
     def loss(self, value: float) -> float:

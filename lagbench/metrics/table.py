@@ -37,6 +37,8 @@ METRICS: Mapping[str, Metric] = MappingProxyType(
 )
 """Our metrics by name."""
 
+STATISTICS = tuple(sorted({statistic for metric in METRICS.values() for statistic in metric.of}))
+"""Names of the statistics that they are formed from; other packages may measure more."""
 
 CHOSEN = (
     *("vorticity_nrmse", "vorticity_rmse", "vorticity_pearson", "stable_frames", "spectrum_error"),

@@ -274,7 +274,7 @@ def _seeds_of(path: Path) -> list[Path]:
     What is not there may be the name that a leaderboard's files of several seeds share.
     """
     if not os.path.isdir(path):  # unlike Path.is_dir, it takes any name
-        on_a_board = path.suffix == ".nc" and len(path.parts) > 3 and path.parts[-4] == "scores"
+        on_a_board = path.suffix == ".nc" and Path(os.path.abspath(path)).parts[-4:-3] == ("scores",)
         shared = sorted(path.parent.glob("*.nc")) if on_a_board and not os.path.lexists(path) else []
         name = re.compile(rf"{re.escape(path.stem)}_[0-9]+")
         return [file for file in shared if name.fullmatch(file.stem)] or [path]
