@@ -57,7 +57,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "compare second": ("compare", "{}.json", "{}.json"),
     "plot": ("plot", "{}.nc"),
     "animate": ("animate", "{}.nc", "-o", "film.gif"),
-    "predict": ("predict", "{}.pt"),
+    "predict": ("predict", "{}.pt", "-o", "new.nc"),
     "train recipe": ("train", "curl-noise", "--size", "tiny", "--baseline", "mlp", "--recipe", "./{}.yaml"),
     "submit": ("submit", "{}.nc", "--method", "x", "--author", "y", "--command", "z", "--new-board"),
     "submit meta": ("submit", "predictions.nc", "--from", "{}.yaml"),
