@@ -36,7 +36,7 @@ from lagbench.submission.findings import Finding
 from lagbench.submission.format import MAX_NAME, Header
 
 from .flags import Flag
-from .scenario import SUBMISSION, Preview
+from .scenario import LARGEST, SUBMISSION, Preview
 
 FORMAT = 1
 """Number of the layout of scores.json and scores.nc; stored as ``lagbench_scores``."""
@@ -265,7 +265,6 @@ def spell(card: ScoreCard) -> bytes:
     return f"{text}\n".encode()
 
 
-LARGEST = float(np.finfo(np.float32).max)  # a value of a score file at most
 MAX_BYTES = 64 << 20
 """Longest scores.json that is read [bytes]; those of ours take less than 2 MB."""
 
