@@ -105,9 +105,11 @@ class TrainingModule(LightningModule):
     def configure_optimizers(self) -> Optimizer:
         """Return AdamW, which is Adam where weights do not decay, as an earlier run left it."""
         if next(self.model.parameters(), None) is None:
-            what, where = "a model without parameters", type(self.model).__qualname__
             raise UsageError(
-                what, where=where, fix="what needs no training needs no baseline: submission.write"
+                "a model without parameters",
+                where=type(self.model).__qualname__,
+                expected="one that learns",
+                fix="write its predictions without a training: lagbench.submission.write",
             )
         self._optimizer = AdamW(
             self.model.parameters(), lr=self._rate, weight_decay=self.recipe.weight_decay, fused=True

@@ -260,9 +260,10 @@ class WindowSampler(Sampler[int]):
         Raises:
             UsageError: there is no such place.
         """
-        if _natural(position, "position") > (most := len(self.data)):
+        place, most = (_natural(epoch, "epoch"), _natural(position, "position")), len(self.data)
+        if place[1] > most:
             raise UsageError("no such place", where="WindowSampler", expected=f"at most {most}", got=position)
-        self.epoch, self.position = _natural(epoch, "epoch"), position
+        self.epoch, self.position = place
 
     def state_dict(self) -> dict[str, int]:
         """Return what `load_state_dict` takes to continue here, in mid-epoch too."""

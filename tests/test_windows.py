@@ -531,7 +531,8 @@ def test_no_place_beyond_an_epoch(train: Open) -> None:
     """The last one is the end itself; what is refused moves nothing."""
     data = train(history=2, future=1)
     sampler = WindowSampler(data, seed=0)
-    sampler.seek(3, len(data))
+    sampler.seek(np.int64(3), np.int64(len(data)))  # type: ignore[arg-type]
+    assert json.loads(json.dumps(sampler.state_dict())) == sampler.state_dict()
     with pytest.raises(UsageError):
         sampler.seek(4, len(data) + 1)
     assert sampler.state_dict() == {"seed": 0, "epoch": 3, "position": len(data)}

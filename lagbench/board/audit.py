@@ -163,9 +163,8 @@ def _unlike(ours: dict[int, Tally], theirs: StoredScores) -> tuple[list[str], fl
     apart = {
         name: max(farthest(tally, theirs.tallies[i], name) for i, tally in ours.items()) for name in names
     }
-    return [n for n in sorted(names) if apart[n] > room], max(
-        (v for v in apart.values() if v <= room), default=0.0
-    )
+    within = max((value for value in apart.values() if value <= room), default=0.0)
+    return sorted(name for name in names if apart[name] > room), within
 
 
 def farthest(one: Tally, other: Tally, name: str) -> float:
