@@ -314,7 +314,7 @@ def _read(
             "neither scores nor predictions",
             where=str(path),
             expected="what `lagbench score` or `lagbench submit` wrote, or a predictions.nc",
-            got=f"as scores: {reason}",
+            got=f"as scores: {reason}; as predictions: {error.what}, {error.got}",
             fix="score the predictions again: lagbench score predictions.nc",
         ) from error
 
