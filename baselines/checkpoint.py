@@ -373,11 +373,8 @@ def _content(file: Path) -> dict[str, Any]:
             packed = [one.filename for one in members if one.compress_type != zipfile.ZIP_STORED]
             total = sum(max(one.file_size, one.compress_size) for one in members)
             if packed or total > length or len({one.filename for one in members}) < len(members):
-                got = (
-                    f"{packed[0][:100]!a} is compressed"
-                    if packed
-                    else f"members of {total} bytes in {length}"
-                )
+                sizes = f"members of {total} bytes in {length}"
+                got = f"{packed[0][:100]!a} is compressed" if packed else sizes
                 raise _unfit(file, "an archive whose members are stored as they are, each once", got)
             broken = archive.testzip()
         if broken is not None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -90,6 +91,19 @@ def multiplies_bfloat16(device: str) -> bool:
         return bool(torch.cuda.is_bf16_supported(including_emulation=False))
     flags = {flag for name in ("flags", "Features") for flag in _processor(name).split()}
     return not flags.isdisjoint({"avx512_bf16", "amx_bf16", "bf16"})
+
+
+def check_compiler(device: str) -> None:
+    """Refuse to compile layers for a CPU without a C++ compiler."""
+    compiler = os.environ.get("CXX") or "g++"  # the one that torch takes
+    if device == "cpu" and shutil.which(compiler) is None:
+        raise UsageError(
+            "no C++ compiler",
+            where="training.compile",
+            expected="g++ on the PATH, or another in CXX",
+            got=f"no {compiler}",
+            fix="install it, or leave the option out",
+        )
 
 
 def _processor(field: str = "model name") -> str:

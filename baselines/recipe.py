@@ -102,6 +102,10 @@ class TrainingOptions(_Strict):
     # fuse what a processor layer of a graph network does, by torch.compile; needs a C++ compiler on CPUs
     compile: bool = False
     windows: tuple[str, ...] = ("train",)  # subsets to train on
+    # share of the windows that are drawn from those that begin in a scenario's first frames, so many of them:
+    # bodies meet once, and rest for hundreds of frames
+    opening_share: float = Field(default=0.0, ge=0.0, le=1.0)
+    opening_frames: int = Field(default=40, gt=0)
     # steps between validations, 0 never; by default up to eight, as many as take 15 % of the processor time
     validate_every: int | None = Field(default=None, ge=0)
     # for tests: frames and scenarios of 'valid' that are rolled out; all by default

@@ -8,10 +8,9 @@ a training that was interrupted and resumed ends, on one thread, with the same b
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from itertools import chain, count, islice
+from itertools import chain, count, islice, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +34,7 @@ from .checkpoint import Checkpoint, load_weights, rounded_weights, save
 from .job import STOPPED_EARLY, RunFolder, TrainingJob, TrainingRecord, parameter_count, start_words
 from .machine import (
     bound_memory,
+    check_compiler,
     chosen_device,
     is_helper,
     memory_errors_told,
@@ -42,7 +42,7 @@ from .machine import (
     threads_used,
 )
 from .module import TrainingCallback, TrainingModule, generators_kept, quiet, reseed, seed_of
-from .recipe import recipe_for
+from .recipe import TrainingOptions, recipe_for
 from .rollout import scenario_batch, scenario_paths, validation_of
 from .start import start_from
 
@@ -230,12 +230,21 @@ def _check_same_conditions(earlier: Checkpoint, facts: Facts, *, processes: int,
 
 
 class StepBatches(Sampler[list[int]]):
-    """Windows of each step of a training, from any step on."""
+    """Windows of each step of a training, from any step on.
 
-    def __init__(self, sampler: WindowSampler, batch: int, *, first: int, last: int) -> None:
+    Some of them, at random, are others: windows that begin in the first frames of a scenario, evenly drawn.
+    """
+
+    def __init__(self, sampler: WindowSampler, options: TrainingOptions, *, first: int, last: int) -> None:
         self.sampler = sampler  # draws the windows of one process, epoch after epoch
-        self.batch = batch  # windows of a step
+        self.batch = options.batch  # windows of a step
         self.steps = range(first, last)
+        self.share = options.opening_share  # share of the windows that are others
+        ends = (
+            (start, min(start + options.opening_frames, stop))
+            for start, stop in pairwise(sampler.data.starts)
+        )
+        self.openings = np.concatenate([np.arange(*each) for each in ends])  # those others
 
     def __len__(self) -> int:
         """Return the number of steps."""
@@ -246,21 +255,13 @@ class StepBatches(Sampler[list[int]]):
         epoch, used = divmod(self.steps.start * self.batch, len(self.sampler))
         self.sampler.seek(epoch, used * self.sampler.ranks)
         drawn = chain.from_iterable(self.sampler for _ in count())
-        for _ in self.steps:
-            yield list(islice(drawn, self.batch))
-
-
-def _check_compiler(device: str) -> None:
-    """Refuse to compile layers for a CPU without a C++ compiler."""
-    compiler = os.environ.get("CXX") or "g++"  # the one that torch takes
-    if device == "cpu" and shutil.which(compiler) is None:
-        raise UsageError(
-            "no C++ compiler",
-            where="training.compile",
-            expected="g++ on the PATH, or another in CXX",
-            got=f"no {compiler}",
-            fix="install it, or leave the option out",
-        )
+        for step in self.steps:
+            windows = np.array([*islice(drawn, self.batch)])
+            own = np.random.SeedSequence([self.sampler.seed, step, self.sampler.rank, self.sampler.ranks])
+            # NumPy promises the same bits for `random` alone
+            chance, place = np.random.Generator(np.random.PCG64(own)).random((2, self.batch))
+            others = self.openings[(place * len(self.openings)).astype(np.intp)]
+            yield np.where(chance < self.share, others, windows).tolist()
 
 
 def descend(job: TrainingJob, model: Baseline) -> tuple[TrainingRecord, int]:
@@ -285,12 +286,12 @@ def descend(job: TrainingJob, model: Baseline) -> tuple[TrainingRecord, int]:
     if ledger.state != "running":
         return ledger, steps
     if options.compile:
-        _check_compiler(job.device)
+        check_compiler(job.device)
         model.compile_layers()
 
     def loader(rank: int, ranks: int) -> DataLoader[Window]:
         sampler = WindowSampler(data, seed=options.seed, rank=rank, ranks=ranks)
-        batches = StepBatches(sampler, options.batch, first=ledger.step, last=steps)
+        batches = StepBatches(sampler, options, first=ledger.step, last=steps)
         return DataLoader(
             data,
             batch_sampler=batches,

@@ -236,7 +236,9 @@ class WindowSampler(Sampler[int]):
         """Return the windows of an epoch in the order of all ranks together, shape [window]."""
         rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence([self.seed, epoch])))
         runs = [
-            run for ends in zip(self.data.starts, self.data.starts[1:], strict=False) for run in _cut(*ends)
+            np.arange(first, min(first + RUN, stop))
+            for start, stop in zip(self.data.starts, self.data.starts[1:], strict=False)
+            for first in range(start, stop, RUN)
         ]
         shuffled = [runs[i] for i in _permutation(rng, len(runs))]
         pool = max(1, POOL_BYTES // (self.data.frame_bytes * (RUN + self.data.length - 1)))
@@ -286,11 +288,6 @@ def _natural(value: object, name: str) -> int:
             f"{name} does not fit", where="WindowSampler", expected="a whole number from 0", got=repr(value)
         )
     return number
-
-
-def _cut(start: int, stop: int) -> list[NDArray[np.int64]]:
-    """Return the windows from start to stop in runs."""
-    return [np.arange(first, min(first + RUN, stop)) for first in range(start, stop, RUN)]
 
 
 def _permutation(rng: np.random.Generator, length: int) -> NDArray[np.intp]:

@@ -8,7 +8,7 @@ import random
 import signal
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
@@ -314,15 +314,21 @@ def test_batches_from_any_step(generated: GenerationResult, unmeasured: Registry
     data = WindowDataset("curl-noise", size="tiny", root=generated.root, history=2, registry=unmeasured)
     for rank in range(ranks):
 
-        def drawn(first: int, rank: int = rank) -> list[list[int]]:
+        def drawn(first: int, share: float = 0.0, rank: int = rank) -> list[list[int]]:
             sampler = WindowSampler(data, seed=1, rank=rank, ranks=ranks)
-            return list(StepBatches(sampler, 5, first=first, last=23))
+            options = TrainingOptions(batch=5, opening_share=share, opening_frames=3)
+            return list(StepBatches(sampler, options, first=first, last=23))
 
-        whole = drawn(0)
+        whole, others = drawn(0), drawn(0, share=0.6)
         assert all(drawn(first) == whole[first:] for first in range(23))
-        assert {len(batch) for batch in whole} == {5}
+        assert all(drawn(first, share=0.6) == others[first:] for first in range(23))
+        assert {len(batch) for batch in whole + others} == {5}
         epoch = list(islice((window for batch in whole for window in batch), len(data) // ranks))
         assert len(set(epoch)) == len(epoch)
+        changed = [b for a, b in zip(chain(*whole), chain(*others), strict=True) if a != b]
+        assert 0.4 * 115 < len(changed) < 0.75 * 115
+        assert {data[window].frame for window in changed} == {0, 1, 2}
+        assert {data[window].scenario for window in changed} == set(data.scenarios)
 
 
 def test_closed_forms_go_through_the_same_door(run: Run) -> None:
