@@ -6,6 +6,7 @@ large edge updates keep no hidden layer: the backward pass computes them again.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from itertools import pairwise
 from typing import Any
 
@@ -13,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from lagbench.baselines.operators.operator import Losses, Operator, summed
+from lagbench.errors import UsageError
 
 
 class ProcessorLayer(nn.Module):
@@ -46,9 +48,28 @@ class ProcessorLayer(nn.Module):
         given = node
         if self.sum_messages and self.operator.reads_nodes:
             given = torch.cat([node, summed(edge_index, message, len(node))], dim=-1)
-        gathered, losses = self.operator(given, edge_index, message, generator=generator)
+        answer = self.operator(given, edge_index, message, generator=generator)
+        if not torch.compiler.is_compiling():
+            _check_gathered(self.operator, answer, len(node))
+        gathered, losses = answer
         update = self.update(torch.cat([node, gathered], dim=-1))
         return node + update, edge + message, losses
+
+
+def _check_gathered(operator: Operator, answer: Any, particles: int) -> None:  # noqa: ANN401 (it may be anything)
+    """Refuse what an operator of a user's own may return instead of the pair that it should."""
+    pair = isinstance(answer, tuple) and len(answer) == 2 and isinstance(answer[1], Mapping)
+    held = [answer[0], *answer[1].values()] if pair else [answer]
+    shapes = [tuple(one.shape) if isinstance(one, Tensor) else type(one).__name__ for one in held]
+    wanted = (particles, operator.latent)
+    if not pair or shapes[0] != wanted or any(shape != () for shape in shapes[1:]):
+        raise UsageError(
+            "an operator returned no pair of what is gathered and losses",
+            where=f"{type(operator).__qualname__}.forward",
+            expected=f"a tensor of shape {wanted}, and a dict of losses of shape (), which may be empty",
+            got=", ".join(map(str, shapes)),
+            fix="mend that class; docs/baselines.md has an example",
+        )
 
 
 class EncodeProcessDecode(nn.Module):

@@ -183,12 +183,16 @@ def predict(
 
 def check_replaceable(output: Path) -> None:
     """Refuse to write predictions, and what they cost beside them, over files that are something else."""
-    if output.is_dir():
-        fix = f"name a file: -o {output / 'predictions.nc'}"
-        raise UsageError("the output is a folder", where="--output", got=str(output), fix=fix)
+    cost = output.with_suffix(".json")
+    if output == cost:
+        fix = f"name it {output.with_suffix('.nc').name}: what the predictions cost goes to {cost.name}"
+        raise UsageError("predictions are no JSON", where="--output", got=str(output), fix=fix)
+    if (folder := next((path for path in (output, cost) if path.is_dir()), None)) is not None:
+        fix = f"name a file, as in -o {folder / 'predictions.nc'}"
+        raise UsageError("the output is a folder", where="--output", got=str(folder), fix=fix)
     # scores have no format of data, scenarios no hash of the whole data set
     of_predictions, of_cost = (b"lagbench_format", b"dataset_sha256"), (b"seconds_without_search",)
-    for path, ours in ((output, of_predictions), (output.with_suffix(".json"), of_cost)):
+    for path, ours in ((output, of_predictions), (cost, of_cost)):
         if not path.is_file():
             continue
         with path.open("rb") as stream:

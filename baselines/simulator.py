@@ -322,6 +322,13 @@ class GraphNetwork(Baseline):
                 norm=options.loss_norm,
                 weights=self.weights,
             )
+            if taken := terms.keys() & own.keys():
+                raise UsageError(
+                    "an operator's loss has the name of one of ours",
+                    where=f"{self.operator.__qualname__}.forward",
+                    got=", ".join(sorted(taken)),
+                    fix="rename it",
+                )
             steps.append(terms | dict(own))
             state = following
         return {name: torch.stack([terms[name] for terms in steps]).mean() for name in steps[0]}

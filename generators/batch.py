@@ -69,9 +69,13 @@ def draw(size: Size, scenario: int) -> InitialState:
     rng, module = generator(size.split, size.name, size.major, scenario), split_module(size)
     try:
         with blamed_on_parameters(size, f"drawing scenario {scenario}"):
-            return module.initial_state(size, scenario, rng)
+            state: object = module.initial_state(size, scenario, rng)
     except WorkFailedError as error:
         raise _placed(error, f"{size.split} {size.name}, scenario {scenario}") from error
+    if not isinstance(state, InitialState):
+        where, got = f"{size.generator}.initial_state", type(state).__name__
+        raise UsageError("a split drew no initial state", where=where, expected="an InitialState", got=got)
+    return state
 
 
 def _placed(error: WorkFailedError, where: str) -> WorkFailedError:

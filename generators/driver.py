@@ -16,7 +16,7 @@ from lagbench.errors import UsageError, WorkFailedError
 
 from . import backend
 from .solver import Device, Health
-from .split import ClosedBoxParameters, FreeSurfaceParameters, InitialState
+from .split import ClosedBoxParameters, FreeSurfaceParameters, InitialState, Material
 from .transfer import Nothing, Template
 
 Parameters = TypeVar("Parameters", ClosedBoxParameters, FreeSurfaceParameters)
@@ -136,13 +136,28 @@ class Driver(ABC, Generic[Parameters]):
         self._kernels.x.from_numpy(np.concatenate((kept, np.zeros_like(kept)), axis=-1))
 
     def _check_state(self, index: int, state: InitialState) -> None:
-        shape = (self.parameters.particles, 2)
-        if state.position.shape != shape:
+        count = self.parameters.particles
+        shapes = {
+            "position": (count, 2),
+            "velocity": (count, 2),
+            "affine": (count, 2, 2),
+            "material": (count,),
+        }
+        for name, shape in shapes.items():
+            held = getattr(state, name, None)
+            got = getattr(held, "shape", type(held).__name__)
+            if got != shape:
+                what = f"wrong shape of {name} in an initial state"
+                raise UsageError(what, where=f"scenario {index}", expected=shape, got=got)
+        known, area = [int(one) for one in Material], np.float64(state.area)
+        outside = np.count_nonzero((state.position < 0.0) | (state.position > 1.0))
+        if outside or not np.isin(state.material, known).all() or not 0.0 < area <= 1.0:
             raise UsageError(
-                "wrong shape of positions",
+                "no such initial state",
                 where=f"scenario {index}",
-                expected=shape,
-                got=state.position.shape,
+                expected=f"positions in the unit box, materials of {known}, an area up to 1",
+                got=f"{outside} coordinates outside, materials {np.unique(state.material)}, area {area:g}",
+                fix="mend the split's initial_state",
             )
         fastest = self._kernels.speed_bound
         speed = np.abs(state.velocity).max()

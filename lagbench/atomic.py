@@ -6,7 +6,7 @@ import errno
 import functools
 import os
 import secrets
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -56,12 +56,18 @@ def move_together(moves: Sequence[tuple[Path, Path]]) -> None:
     for source, target in moves:
         _flush(source)
         target.parent.mkdir(parents=True, exist_ok=True)
-        if target.is_dir():
-            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(target))
+    refuse_folders(target for _, target in moves)
     for source, target in moves:
         source.replace(target)
     for folder in {target.parent for _, target in moves}:
         _flush_folder(folder)
+
+
+def refuse_folders(paths: Iterable[Path]) -> None:
+    """Raise IsADirectoryError for a folder where a file is to be replaced or removed."""
+    for path in paths:
+        if path.is_dir() and not path.is_symlink():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
 
 
 def check_writable(folder: Path, *, option: str = ROOT_OPTION) -> None:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import difflib
 import importlib
 import importlib.util
+import traceback
 from collections.abc import Iterable
 from types import ModuleType
 from typing import ClassVar
@@ -143,6 +144,20 @@ def nearest(name: str, known: Iterable[str]) -> str:
     close = difflib.get_close_matches(name, words, n=1, cutoff=0.5)
     listing = f"known: {', '.join(words) or 'none'}"
     return f"did you mean {close[0]!r}? {listing}" if close else listing
+
+
+def package_at_fault(error: BaseException) -> str | None:
+    """Return the innermost place of a trace in what another package adds; None where there is none."""
+    from importlib.metadata import entry_points  # half of what importing lagbench would take
+
+    groups = (f"lagbench.{group}" for group in ("baselines", "generators", "metrics"))
+    points = [point for group in groups for point in entry_points(group=group)]
+    added = {point.module.split(".")[0] for point in points} - {"lagbench"}
+    place = None
+    for frame, line in traceback.walk_tb(error.__traceback__):
+        if str(frame.f_globals.get("__name__")).split(".")[0] in added:
+            place = f"{frame.f_code.co_filename}, line {line}"
+    return place
 
 
 def require(module: str, *, extra: str) -> ModuleType:

@@ -273,8 +273,9 @@ class WindowSampler(Sampler[int]):
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue where another sampler of the same data stood."""
-        self.seed = _natural(state["seed"], "seed")
+        seed = _natural(state["seed"], "seed")
         self.seek(state["epoch"], state["position"])
+        self.seed = seed
 
 
 def _natural(value: object, name: str) -> int:

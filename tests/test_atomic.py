@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from lagbench.atomic import atomic_path, check_writable, remove_leftovers, write_atomically
+from lagbench.atomic import atomic_path, check_writable, move_together, remove_leftovers, write_atomically
 from lagbench.errors import DataError, WorkFailedError
 
 
@@ -54,6 +54,23 @@ def test_a_folder_is_tried_before_the_work(tmp_path: Path) -> None:
     for folder, remedy in ((file, "remove it"), (file / "below", "remove it"), (Path("/proc/self"), "free")):
         with pytest.raises(WorkFailedError, match=rf"(?s)cannot write.*{remedy}.*--output"):
             check_writable(folder, option="--output")
+
+
+def test_files_move_together_or_not_at_all(tmp_path: Path) -> None:
+    """A folder at one of the places is met before the first file moves; a link to one is replaced."""
+    sources = [tmp_path / "new-a", tmp_path / "new-b"]
+    for path in sources:
+        path.write_text(path.name)
+    places = [tmp_path / "a", tmp_path / "deep" / "b"]
+    places[1].mkdir(parents=True)
+    with pytest.raises(IsADirectoryError):
+        move_together(list(zip(sources, places, strict=True)))
+    assert not places[0].exists()
+    places[1].rename(tmp_path / "elsewhere")
+    places[1].symlink_to(tmp_path / "elsewhere")
+    move_together(list(zip(sources, places, strict=True)))
+    assert [path.read_text() for path in places] == ["new-a", "new-b"]
+    assert (tmp_path / "elsewhere").is_dir()
 
 
 def test_leftovers_of_killed_writers_are_removed(tmp_path: Path) -> None:

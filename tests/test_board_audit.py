@@ -83,6 +83,8 @@ def test_metrics_of_packages_decide_nothing(
         patch.setattr("lagbench.metrics.table.available", lambda: more)
         assert len(rescored(own, predictions).confirmed) == 1
         own.submit(predictions, replace=True)
+        with pytest.raises(UsageError):  # the same predictions by another name, measured otherwise
+            own.submit(own.predict(noisy, "twin"))
     assert len(rescored(own, predictions).confirmed) == 1
 
 
@@ -298,7 +300,7 @@ def test_the_entry_comes_last(own: BoardBench, monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_statistics_of_ours_are_all_there(own: BoardBench, predictions: Path) -> None:
-    """One that a score file lacks is told; one that somebody made up hides no copy."""
+    """One that a score file lacks is told by scoring again."""
     path = own.folder / SCORES / "noisy.nc"
     with netCDF4.Dataset(path, "a") as file:
         names = file.statistics.split()

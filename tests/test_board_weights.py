@@ -246,6 +246,25 @@ def test_no_link_leads_out_of_the_board(own: BoardBench, tmp_path: Path) -> None
     assert sorted(elsewhere.rglob("*.*")) == lying
 
 
+def test_an_idle_place_that_cannot_be_cleared(own: BoardBench) -> None:
+    """A folder where a record was: told before anything moves. A link that leads nowhere just goes."""
+    run = trained(own, 0)
+    submitted(own, run)
+    record = next((own.folder / "weights").rglob("*.json"))
+    record.unlink()
+    record.mkdir()
+    run.rename(own.folder.parent / "first")
+    second, before = trained(own, 0, share=0.3), own.state()
+    (second / "training.json").unlink()
+    with pytest.raises(WorkFailedError):
+        submitted(own, second, replace=True)
+    assert own.state() == before
+    record.rmdir()
+    record.symlink_to(own.folder.parent / "nowhere")
+    assert submitted(own, second, replace=True).removed == (record,)
+    assert not record.is_symlink()
+
+
 def test_a_full_disk_leaves_the_entry_before(own: BoardBench) -> None:
     """Score files fit, weights do not: nothing of the old entry is lost, nothing of the new one is there."""
     run = trained(own, 0)
@@ -379,10 +398,14 @@ def test_what_the_check_finds(own: BoardBench, name: str) -> None:
 
 
 def test_what_is_no_record_is_not_copied(own: BoardBench) -> None:
-    """The entry does without, as it may."""
+    """The entry does without, as it may: too long, or what predictions cost."""
     run = trained(own, 0)
     (run / "training.json").write_text(json.dumps({"note": "x" * kept.MOST_RECORD}))
     submitted(own, run)
+    assert [path.suffix for path in (own.folder / "weights").rglob("*.*")] == [".pt"]
+    (run / "training.json").unlink()
+    (run / "weights.json").write_text(json.dumps({"seconds_per_frame": 1.0}))
+    submitted(own, run, replace=True)
     assert [path.suffix for path in (own.folder / "weights").rglob("*.*")] == [".pt"]
     assert found(own) == set()
 

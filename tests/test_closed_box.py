@@ -217,6 +217,17 @@ def test_states_outside_the_bounds_are_refused() -> None:
         loaded(NO_SLIP, [dataclasses.replace(state, velocity=state.velocity + 100.0)])
     with pytest.raises(UsageError, match="wrong shape"):
         loaded(NO_SLIP, [dataclasses.replace(state, position=state.position[1:])])
+    for odd in (
+        {"velocity": state.velocity[1:]},
+        {"affine": state.velocity},
+        {"material": None},
+        {"material": state.material + 9},
+        {"position": state.position + 5.0},
+        {"area": 0.0},
+        {"area": None},
+    ):
+        with pytest.raises(UsageError):
+            loaded(NO_SLIP, [dataclasses.replace(state, **odd)])
     with pytest.raises(UsageError, match="slide along"):
         loaded(NO_SLIP, [dataclasses.replace(state, wall_velocity=walls)])
     with pytest.raises(UsageError, match="slide along"):

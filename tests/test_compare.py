@@ -18,6 +18,7 @@ from typer.testing import Result
 
 from lagbench.errors import DataError, UnreadableFileError, UsageError
 from lagbench.metrics import differ
+from lagbench.scoring.card import digits
 from lagbench.scoring.compare import ComparisonResult, compare
 from lagbench.scoring.tables import Table, card_tables, comparison_tables, flag_lines
 
@@ -83,6 +84,26 @@ def test_a_folder_of_seeds_is_a_method(tmp_path: Path) -> None:
     assert found.test.p == differ(values["a"], values["b"])
     assert "3 and 2 seeds" in result.verdict
     assert result.as_json()["seeds"] == [3, 2]
+
+
+def test_a_value_that_saturates_is_read_again(tmp_path: Path) -> None:
+    """The greatest of float32, as a file holds it in nine digits, is a little more than it is."""
+    greatest = digits(float(np.finfo(np.float32).max)) or 0.0
+    scores = published(tmp_path, [greatest, 1.0, 1.0], method="a")
+    other = published(tmp_path, [1.0, 1.0, 1.0], method="b")
+    assert compare(scores, other).metrics["mse_avg"].first == pytest.approx(greatest / 3)
+
+
+def test_from_a_folder_that_is_gone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """There is no such file there either, and a file that is named whole is read."""
+    scores = published(tmp_path, [1.0, 2.0, 3.0], method="a")
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    with pytest.raises(UnreadableFileError) as caught:
+        compare("scores.nc", scores)
+    assert caught.value.where == "scores.nc"
+    assert compare(scores, published(tmp_path, [2.0, 3.0, 5.0], method="b")).metrics
 
 
 def test_copies_are_no_seeds(tmp_path: Path) -> None:

@@ -277,6 +277,7 @@ OTHERS = Metric(
 )
 CLASHING = (replace(OTHERS, name="vorticity_mse", of=()),)
 NO_METRIC = ("vorticity",)
+ROOTLESS = (replace(OTHERS, statistic=None, of=("velocity_mse", "nothing_known")),)
 
 
 def with_entry_point(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
@@ -296,11 +297,11 @@ def test_another_package_adds_a_metric(monkeypatch: pytest.MonkeyPatch) -> None:
     assert aggregate(metrics, {0: pieces})["enstrophy_error"].mean == 1.0
 
 
-@pytest.mark.parametrize("name", ["CLASHING", "NO_METRIC"])
+@pytest.mark.parametrize("name", ["CLASHING", "NO_METRIC", "ROOTLESS"])
 def test_a_bad_entry_point_is_named(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    """A taken name or a thing that is no metric is refused with the entry point's name."""
+    """A taken name, no metric, or one of statistics that nothing measures: refused, and said where it is."""
     with_entry_point(monkeypatch, name)
-    with pytest.raises(UsageError, match="others"):
+    with pytest.raises(UsageError, match=r"others|nothing_known"):
         available()
 
 
@@ -317,6 +318,7 @@ def test_selection_brings_what_a_metric_follows_from() -> None:
         {"statistic": None, "of": ()},
         {"direction": Direction.TARGET, "perfect": None},
         {"direction": "sideways"},
+        {"of": "vorticity_mse"},
         *({"name": name, "of": ()} for name in ("My metric", "", "skill", "Ω")),
     ):
         with pytest.raises(UsageError):
@@ -324,7 +326,7 @@ def test_selection_brings_what_a_metric_follows_from() -> None:
     assert replace(OTHERS, direction="higher").direction is Direction.HIGHER  # as a package may write it
 
 
-@pytest.mark.parametrize("value", [None, "much", np.zeros(3), 1j])
+@pytest.mark.parametrize("value", [None, "much", "1.5", np.zeros(3), 1j, np.complex128(3), 10**400])
 def test_what_is_no_number_is_told_with_its_metric(value: object) -> None:
     """A statistic of another package that gives something else is named, and where it comes from."""
     truth = rollout()

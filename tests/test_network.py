@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from lagbench.baselines.network import (
 from lagbench.baselines.operators.gns import GNS
 from lagbench.baselines.operators.operator import Losses, Operator
 from lagbench.baselines.operators.supergat import SuperGAT
+from lagbench.errors import UsageError
 
 EVERY = pytest.mark.parametrize("operator", OPERATORS)
 
@@ -229,6 +231,29 @@ class Total(Operator):
         """Return what each node gathers and a loss of its own."""
         heard = node.index_add(0, edge_index[1], node[edge_index[0]])
         return self.linear(heard), {"size": heard.square().mean()}
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        lambda heard: heard,
+        lambda heard: (heard, None),
+        lambda heard: (heard[:1], {}),
+        lambda heard: (torch.cat([heard, heard], dim=1), {}),
+        lambda heard: (heard, {"size": 1.0}),
+        lambda heard: (heard, {"size": heard}),
+    ],
+)
+def test_an_operator_that_returns_something_else(answer: Callable[[Tensor], Any]) -> None:
+    """No pair, another number of rows or columns, no losses of one number: its class is named."""
+
+    class Odd(Total):
+        def forward(self, *given: Tensor, **options: Any) -> Any:
+            return answer(super().forward(*given, **options)[0])
+
+    with pytest.raises(UsageError) as caught:
+        network(Odd)(*graph(12, 40, node=7, edge=3))
+    assert "Odd" in str(caught.value.where)
 
 
 def test_operator_of_others() -> None:

@@ -129,6 +129,21 @@ def test_other_errors_bring_their_traceback() -> None:
     assert "pool_tasks.py" in str(caught.value)
 
 
+def test_a_package_that_fails_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Where the line that raised belongs to one that adds a split, it is the package that is told of."""
+    about = tmp_path / "tasks-1.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: tasks\nVersion: 1\n")
+    (about / "entry_points.txt").write_text("[lagbench.generators]\nwaves = pool_tasks\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    with Pool(1) as pool:
+        pool.submit(Task(name="a", function=pool_tasks.crash))
+        with pytest.raises(WorkFailedError) as caught:
+            list(pool.events())
+    assert "pool_tasks.py" in str(caught.value.where)
+    assert "ZeroDivisionError" in str(caught.value.got)
+
+
 def test_leaving_the_pool_kills_its_workers(tmp_path: Path) -> None:
     """No worker outlives the with block, however busy."""
     marker = tmp_path / "pid"

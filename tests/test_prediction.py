@@ -412,9 +412,13 @@ def test_models_of_any_size_have_the_same_weights_at_each() -> None:
         assert shapes[0] == shapes[1], model.method
 
 
-@pytest.mark.parametrize("name", ["weights.pt", "training.nc", "."])
+@pytest.mark.parametrize("name", ["weights.pt", "training.nc", ".", "predictions.json", "taken.nc"])
 def test_nothing_else_is_replaced(run: Predict, tmp_path: Path, name: str) -> None:
-    """Not the weights, nor the record of their training, whose name that of the cost would be; no folder."""
+    """Not the weights, nor the record of their training, whose name that of the cost would be; no folder.
+
+    Predictions and their cost have two names.
+    """
+    (tmp_path / "taken.json").mkdir()
     record = {**UNFINISHED, "state": "finished"}
     (tmp_path / "training.json").write_text(json.dumps(record))
     with pytest.raises(UsageError) as caught:
@@ -424,6 +428,9 @@ def test_nothing_else_is_replaced(run: Predict, tmp_path: Path, name: str) -> No
     assert load(tmp_path / "weights.pt").baseline == "drift"
     run(name="predictions.nc")
     run(name="predictions.nc")
+    (tmp_path / "predictions.json").write_text('{"seconds_per_frame": 1.0}')  # as scores have it too
+    with pytest.raises(UsageError):
+        run(name="predictions.nc")
 
 
 def test_no_scenario_is_replaced(run: Predict, tmp_path: Path, generated: GenerationResult) -> None:

@@ -535,6 +535,8 @@ def test_no_place_beyond_an_epoch(train: Open) -> None:
     assert json.loads(json.dumps(sampler.state_dict())) == sampler.state_dict()
     with pytest.raises(UsageError):
         sampler.seek(4, len(data) + 1)
+    with pytest.raises(UsageError):
+        sampler.load_state_dict({"seed": 9, "epoch": 4, "position": len(data) + 1})
     assert sampler.state_dict() == {"seed": 0, "epoch": 3, "position": len(data)}
 
 

@@ -101,8 +101,12 @@ def collect(
         try:
             size = described.size(entry.split, entry.size)
         except UsageError as error:
-            fix = "install the package that adds the split; lagbench list names those that are known"
-            raise DataError(error.what, where=str(place.path / path), fix=fix) from error
+            fix = error.fix
+            if entry.split not in described.splits:
+                fix = "install the package that adds the split; lagbench list names those that are known"
+            raise DataError(
+                error.what, where=str(place.path / path), expected=error.expected, fix=fix
+            ) from error
         current = is_current(entry.dataset, size)
         try:
             stored = [read_stored(place.path / path, size) for path in entry.score_paths]

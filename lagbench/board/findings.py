@@ -225,7 +225,8 @@ def finding_of(check: str, error: LagbenchError, where: object) -> Finding:
 def print_of(tallies: Mapping[int, Tally]) -> str:
     """Return what only the same predictions share: their errors in every scenario and frame.
 
-    Those that lagbench measures: what a package adds, or somebody makes up, tells nothing apart.
+    Those that lagbench measures: what a package measures beside them tells nothing apart. What is changed
+    by hand, scoring again tells.
     """
     digest = hashlib.sha256()
     for scenario, tally in sorted(tallies.items()):

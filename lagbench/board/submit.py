@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
-from lagbench.atomic import move_together
+from lagbench.atomic import move_together, refuse_folders
 from lagbench.data.hdf5 import check_file
 from lagbench.data.registry import Registry, load
 from lagbench.errors import ChecksFailedError, Mistakes, UsageError, WorkFailedError
@@ -377,9 +377,10 @@ def _publish(
         records = {name.with_suffix(".json") for name in moves if name.suffix == ".pt"}
         idle = sorted((set(before.files if before else ()) - set(entry.files)) | (records - set(moves)))
         folder.require_unlinked([*moves, *(name.parent for name in idle), Path(FLOORS, *place[:2])])
+        removed = [path for name in idle if os.path.lexists(path := folder.path / name)]
+        refuse_folders(removed)
         floors = write_floors(cards[0], folder)
         move_together([(source, folder.path / name) for name, source in moves.items()])
-    removed = [path for name in idle if os.path.lexists(path := folder.path / name)]
     for path in removed:
         path.unlink()
     summary = entry.score.metrics[entry.score.ranking_metric]

@@ -6,7 +6,6 @@ import errno
 import io
 import os
 import sys
-import traceback
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -15,7 +14,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from lagbench.errors import LagbenchError, WorkFailedError, printable
+from lagbench.errors import LagbenchError, WorkFailedError, package_at_fault, printable
 
 from . import board, data, draw, exchange, scoring, training
 from . import demo as tour
@@ -52,26 +51,13 @@ class _Commands(TyperGroup):
                 raise
             again = f"LAGBENCH_DEBUG=1 lagbench {' '.join(sys.argv[1:])}"
             fix = f"this is a fault of lagbench; please report it with the output of\n       {again}"
-            if (place := _in_a_package(error)) is not None:
+            if (place := package_at_fault(error)) is not None:
                 fix = f"mend or uninstall the package of {place};\n       {again} has the whole trace"
             typer.echo(
                 f"lagbench: unexpected {type(error).__name__}: {printable(str(error))}\n  fix: {fix}",
                 err=True,
             )
             raise typer.Exit(FAILED) from error
-
-
-def _in_a_package(error: Exception) -> str | None:
-    """Return the innermost place of a trace in what another package adds; None where there is none."""
-    from lagbench.data.registry import installed
-
-    groups = (f"lagbench.{group}" for group in ("baselines", "generators", "metrics"))
-    added = {point.value.partition(":")[0].split(".")[0] for group in groups for point in installed(group)}
-    place = None
-    for frame, line in traceback.walk_tb(error.__traceback__):
-        if str(frame.f_globals.get("__name__")).split(".")[0] in added - {"lagbench"}:
-            place = f"{frame.f_code.co_filename}, line {line}"
-    return place
 
 
 @contextmanager

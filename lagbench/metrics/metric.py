@@ -11,6 +11,7 @@ import enum
 import math
 import re
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -154,6 +155,10 @@ class Metric:
             raise UsageError(
                 what, expected=known, got=repr(self.direction), fix="name one of these"
             ) from None
+        given: object = self.of
+        if isinstance(given, str):
+            what = f"metric {self.name!r} follows from a text, not from a tuple of statistics"
+            raise UsageError(what, expected=f"({given!r},)", got=repr(given), fix="add the comma")
         for name in (self.name, *self.of):
             if not isinstance(name, str) or not NAME.fullmatch(name) or name in RESERVED:
                 expected = "up to 64 small letters, digits and underscores, as in my_error; not skill"
@@ -169,17 +174,17 @@ class Metric:
         """Return the statistic of a frame pair, NaN where it is undefined."""
         if self.statistic is None or not self.defined(pair):
             return math.nan
-        value = self.statistic(pair)
-        try:
-            return float(value)
-        except (TypeError, ValueError) as error:
-            raise WorkFailedError(
-                "a metric gave no number",
-                where=f"{getattr(self.statistic, '__module__', '?')}, {self.name}",
-                expected="a float",
-                got=type(value).__name__,
-                fix="mend or uninstall the package that adds it",
-            ) from error
+        value: object = self.statistic(pair)
+        with suppress(TypeError, ValueError, OverflowError):
+            if np.ndim(number := np.asarray(value)) == 0 and number.dtype.kind in "fiub":
+                return float(number)
+        raise WorkFailedError(
+            "a metric gave no number",
+            where=f"{getattr(self.statistic, '__module__', '?')}, {self.name}",
+            expected="a float",
+            got=f"{type(value).__name__}: {value!r:.60}",
+            fix="mend or uninstall the package that adds it",
+        )
 
     def loss(self, value: float) -> float:
         """Return the value turned so that smaller is better.

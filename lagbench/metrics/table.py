@@ -63,6 +63,16 @@ def available() -> dict[str, Metric]:
                     where=f"entry point {point.name} = {point.value}",
                     fix="rename one, or uninstall its package",
                 )
+    for metric in known.values():
+        if unknown := sorted(
+            name for name in metric.of if getattr(known.get(name), "statistic", None) is None
+        ):
+            raise UsageError(
+                f"metric {metric.name!r} follows from what no metric measures",
+                expected="names of metrics that have a statistic",
+                got=", ".join(unknown),
+                fix="mend or uninstall the package that adds it",
+            )
     return known
 
 
@@ -74,7 +84,7 @@ def _load(point: EntryPoint) -> Sequence[Metric]:
         raise UsageError(
             "a package's metrics cannot be loaded",
             where=f"entry point {point.name} = {point.value}",
-            got=str(error) if isinstance(error, LagbenchError) else f"{type(error).__name__}: {error}",
+            got=error.what if isinstance(error, LagbenchError) else f"{type(error).__name__}: {error}",
             fix="mend or uninstall that package",
         ) from error
     for metric in found:

@@ -357,6 +357,6 @@ def _floats(values: Iterable[float | None]) -> list[float]:
     found = [math.nan if value is None else float(value) for value in held]
     if any(isinstance(value, bool) for value in held):
         raise ValueError("a value that is no number")
-    if any(abs(value) > LARGEST for value in found):
+    if any(abs(value) > float(f"{LARGEST:.9g}") for value in found):  # as rounded in the file
         raise ValueError(f"a value beyond {LARGEST:.3g}, which scores do not exceed")
     return found

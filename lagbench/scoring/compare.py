@@ -11,6 +11,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -274,7 +275,10 @@ def _seeds_of(path: Path) -> list[Path]:
     What is not there may be the name that a leaderboard's files of several seeds share.
     """
     if not os.path.isdir(path):  # unlike Path.is_dir, it takes any name
-        on_a_board = path.suffix == ".nc" and Path(os.path.abspath(path)).parts[-4:-3] == ("scores",)
+        place = path
+        with suppress(OSError):  # the working folder is gone
+            place = Path(os.path.abspath(path))
+        on_a_board = path.suffix == ".nc" and place.parts[-4:-3] == ("scores",)
         shared = sorted(path.parent.glob("*.nc")) if on_a_board and not os.path.lexists(path) else []
         name = re.compile(rf"{re.escape(path.stem)}_[0-9]+")
         return [file for file in shared if name.fullmatch(file.stem)] or [path]

@@ -27,7 +27,7 @@ from multiprocessing.connection import Connection, wait
 from types import TracebackType
 from typing import Any, Self
 
-from lagbench.errors import LagbenchError, UsageError, WorkFailedError
+from lagbench.errors import LagbenchError, UsageError, WorkFailedError, package_at_fault
 
 from .machine import available_cores
 
@@ -222,6 +222,9 @@ class Pool:
 
 def crashed(error: Exception) -> WorkFailedError:
     """Return what a task raised that it should not, as an error of ours."""
+    if (place := package_at_fault(error)) is not None:
+        fix = "mend or uninstall that package"
+        return WorkFailedError("a package failed in a worker", where=place, got=repr(error), fix=fix)
     last = "".join(traceback.format_exception(error, limit=-6))
     return WorkFailedError("a worker crashed", got=f"{error!r}\n{last}")
 
