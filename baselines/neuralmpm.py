@@ -9,6 +9,13 @@ of a material or of all together: only what particles have beyond it is damped, 
 keep their energy. A node's accelerations are those of the matter that is there in frame f, wherever
 it goes in the bundle: one transfer each way serves all of its frames. Training unrolls several
 calls. The U-Net's last layer starts at zero: an untrained model keeps every velocity.
+
+With ``conserve`` bodies push each other and themselves as those of the material-point method do,
+
+    a(f+k) = g + G2P(w(f+k) - P2G(s(f+k) grad b) / P2G(1))
+
+by stresses s of each material and, beside walls only, accelerations w: away from them momentum is
+conserved, whatever the weights. Matter of all materials moves with one grid.
 """
 
 from __future__ import annotations
@@ -19,7 +26,6 @@ from dataclasses import dataclass, replace
 import torch
 from pydantic import Field
 from torch import Tensor, nn
-from torch.nn.functional import gelu
 
 from lagbench.errors import DataError, UsageError
 
@@ -28,11 +34,14 @@ from .baseline import Baseline, Batch, Facts, Options, check_moving_walls, last_
 from .graph import MATERIALS
 from .particle_grid import ParticleGrid, Stencil
 from .strain import Rest, first_frame
+from .unet import COARSEST, UNet
 
 EMPTY = 1e-3  # below this weight, in units of particles a radius apart, a node's velocity fades to 0
 REACH = 4  # cells over which the U-Net sees how far a wall is
 LIQUID = 0  # material without a shape to come back to
-COARSEST = 4  # nodes of the U-Net's finest level to one of its coarsest, along each axis
+BESIDE = 2.5  # cells from a wall within which it may push and rub
+STIFF = 4.0  # what a stress of 1 is, in deviations of accelerations times a cell
+HEAVY = 10.0  # what a fall of 1 is, in deviations of accelerations
 
 
 class NeuralMPMOptions(Options):
@@ -58,6 +67,8 @@ class NeuralMPMOptions(Options):
     wall_velocity: bool = False  # whether the velocity of the walls in the coming frames is a channel
     # whether particles are damped towards the velocity of all materials together: one grid carries them all
     mixture: bool = False
+    # whether the U-Net gives stresses, and accelerations beside walls only: elsewhere momentum is conserved
+    conserve: bool = False
     # whether the U-Net sees how far solids are strained since the scenario's first frame
     strain: bool = False
     symmetry: Symmetry = Symmetry.NONE  # images that training windows are replaced by at random
@@ -78,54 +89,6 @@ class GridState:
     context: Tensor  # what the given frames told, shape [window, context]
     rest: Rest | None = None  # None where strain is not asked for
     coming: tuple[Tensor, ...] = ()  # predicted positions that are not yet given out
-
-
-class Block(nn.Module):
-    """Two convolutions beside a shortcut."""
-
-    def __init__(self, inputs: int, outputs: int) -> None:
-        super().__init__()
-        self.first = nn.Conv2d(inputs, outputs, 3, padding=1)
-        self.norm = nn.GroupNorm(4, outputs)
-        self.second = nn.Conv2d(outputs, outputs, 3, padding=1)
-        self.shortcut = nn.Conv2d(inputs, outputs, 1) if inputs != outputs else nn.Identity()
-
-    def forward(self, field: Tensor) -> Tensor:
-        """Return the field after the block, shape [window, outputs, x node, y node]."""
-        changed: Tensor = self.second(gelu(self.norm(self.first(gelu(field)))))
-        past: Tensor = self.shortcut(field)
-        return changed + past
-
-
-class UNet(nn.Module):
-    """Three levels of resolution with shortcuts between equal ones (Ronneberger et al. 2015)."""
-
-    def __init__(self, inputs: int, outputs: int, width: int) -> None:
-        super().__init__()
-        fine, middle, coarse = width, 2 * width, 4 * width
-        self.begin = nn.Conv2d(inputs, fine, 3, padding=1)
-        self.down_fine, self.down_middle = Block(fine, fine), Block(middle, middle)
-        self.halve_fine = nn.Conv2d(fine, middle, 2, stride=2)
-        self.halve_middle = nn.Conv2d(middle, coarse, 2, stride=2)
-        self.bottom = nn.Sequential(Block(coarse, coarse), Block(coarse, coarse))
-        self.double_coarse = nn.ConvTranspose2d(coarse, middle, 2, stride=2)
-        self.double_middle = nn.ConvTranspose2d(middle, fine, 2, stride=2)
-        self.up_middle, self.up_fine = Block(2 * middle, middle), Block(2 * fine, fine)
-        self.end = nn.Conv2d(fine, outputs, 3, padding=1)
-        for parameter in self.end.parameters():
-            nn.init.zeros_(parameter)
-
-    def forward(self, field: Tensor) -> Tensor:
-        """Return the output in float32, shape [window, outputs, x node, y node]; sides are multiples of 4."""
-        fine = self.down_fine(self.begin(field))
-        middle = self.down_middle(self.halve_fine(fine))
-        coarse = self.double_coarse(self.bottom(self.halve_middle(middle)))
-        middle = self.double_middle(self.up_middle(torch.cat([coarse, middle], dim=1)))
-        fine = self.up_fine(torch.cat([middle, fine], dim=1))
-        # Three digits of bfloat16 are too few for what is added to velocities every frame.
-        with torch.autocast(field.device.type, enabled=False):
-            output: Tensor = self.end(gelu(fine.to(field.dtype)))
-        return output
 
 
 class Context(nn.Module):
@@ -197,7 +160,12 @@ class NeuralMPM(Baseline):
         seen = kinds * (1 + 2 * options.velocities + 3 * options.strain) + len(geometry)
         self.context = Context(seen, options.context, options.width) if options.context else None
         forcing = 2 * frames * options.wall_velocity
-        self.network = UNet(seen + forcing + options.context, 2 * kinds * frames, options.width)
+        outputs = (3 * kinds + 2 if options.conserve else 2 * kinds) * frames
+        self.network = UNet(seen + forcing + options.context, outputs, options.width)
+        # what all matter falls by; images of the square fall nowhere
+        self.fall: nn.Parameter | None = None
+        if options.conserve and options.symmetry is not Symmetry.SQUARE:
+            self.fall = nn.Parameter(torch.zeros(()))
 
     @property
     def history(self) -> int:
@@ -314,11 +282,15 @@ class NeuralMPM(Baseline):
         seen = torch.cat(parts, dim=1)
         whole = average and self.options.average
         output = (self._mean_over_images(seen) if whole else self.network(seen)) * self.change
-        # accelerations in the coming frames [length/frame^2], shape [layer, 2 bundle, x node, y node]
-        changes = output.reshape(-1, 2 * self.options.bundle, *self.grid.shape)
-        predicted = torch.cat([on_grid, changes], dim=1)
-        gathered = self.grid.gather(stencil, predicted).view(len(stencil.weight), -1, 2)
-        on_grid, *accelerations = gathered.unbind(dim=1)
+        if self.options.conserve:
+            on_grid = self.grid.gather(stencil, on_grid)
+            accelerations = self._pushed(state, stencil, output)
+        else:
+            # accelerations in the coming frames [length/frame^2], shape [layer, 2 bundle, x node, y node]
+            changes = output.reshape(-1, 2 * self.options.bundle, *self.grid.shape)
+            predicted = torch.cat([on_grid, changes], dim=1)
+            gathered = self.grid.gather(stencil, predicted).view(len(stencil.weight), -1, 2)
+            on_grid, *accelerations = gathered.unbind(dim=1)
         position, velocity = state.position, state.velocity[:, -1]
         frames: list[tuple[Tensor, Tensor]] = []
         for acceleration in accelerations:
@@ -333,6 +305,27 @@ class NeuralMPM(Baseline):
         walls = state.walls[:, min(len(frames), state.walls.shape[1] - 1) :]
         return replace(state, position=position, velocity=velocities, walls=walls), frames
 
+    def _pushed(self, state: GridState, stencil: Stencil, output: Tensor) -> Sequence[Tensor]:
+        """Return the accelerations in the coming frames [length/frame^2], shape [particle, 2] each.
+
+        Args:
+            state: where they are.
+            stencil: nodes of their materials around them.
+            output: stresses of each material in each frame, (xx, xy, yy) / STIFF [length^2/frame^2 per cell],
+                and accelerations beside walls, shape [window, channel, x node, y node].
+        """
+        windows, frames = len(output), self.options.bundle
+        stress, beside = output.tensor_split([3 * len(self.options.materials) * frames], dim=1)
+        stress = STIFF * stress.reshape(-1, 3 * frames, *self.grid.shape)
+        of_particle = self.grid.gather(stencil, stress).view(-1, frames, 3)
+        shared = self.grid.stencil(state.position, state.sample)  # one layer for all materials
+        pushed = self.grid.pushed(shared, state.position, of_particle, windows)
+        near = (1.0 - self.grid.wall_distance(BESIDE * self.grid.spacing).amin(dim=0)).clamp(0.0, 1.0)
+        accelerations = self.grid.gather(shared, pushed + near * beside).view(-1, frames, 2)
+        if self.fall is not None:
+            accelerations = accelerations + HEAVY * self.change * torch.stack([0.0 * self.fall, self.fall])
+        return accelerations.unbind(dim=1)
+
     def _mean_over_images(self, seen: Tensor) -> Tensor:
         """Return the mean over all images of what the U-Net says of one, turned back.
 
@@ -345,8 +338,11 @@ class NeuralMPM(Baseline):
             forcing = [matrix] * options.bundle if options.wall_velocity else []
             blocks = [self._turn(matrix), torch.eye(options.context), *forcing]
             said = self.network(field_image(seen, matrix, _diagonal(blocks)))
-            back = _diagonal([matrix.T] * (len(options.materials) * options.bundle))
-            outputs.append(field_image(said, matrix.T, back))
+            inner = len(options.materials) * options.bundle
+            back = [matrix.T] * inner
+            if options.conserve:
+                back = [strain_image(matrix.T)] * inner + [matrix.T] * options.bundle
+            outputs.append(field_image(said, matrix.T, _diagonal(back)))
         return torch.stack(outputs).mean(dim=0)
 
     def _turn(self, matrix: Tensor) -> Tensor:

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from .graph import Bounds
-from .torch_grid import nine_nodes, spline_weights
+from .torch_grid import nine_nodes, spline_slopes, spline_weights
 
 __all__ = ["ParticleGrid", "Stencil"]
 
@@ -68,14 +68,19 @@ class ParticleGrid(nn.Module):
             position: particle positions [length], shape [particle, 2].
             layer: layer of each particle, int64, shape [particle].
         """
+        base, s = self._corner(position)
+        column, row = base.long().unbind(dim=1)
+        node = nine_nodes(layer, column, row, self.shape)
+        return Stencil(spline_weights(s).flatten(1), node.flatten())
+
+    def _corner(self, position: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the first of the nodes around particles, and where they lie from it on [cell]."""
         columns, rows = self.shape
         s = (position - torch.stack([self.axis_x[0], self.axis_y[0]])) / self.spacing
         # On the far wall the third node has weight 0 and may not exist; NaN must not become an index.
         last = s.new_tensor([columns - 3, rows - 3])
         base = torch.floor(s.detach() - 0.5).nan_to_num(0.0).clamp(min=0.0).minimum(last)
-        column, row = base.long().unbind(dim=1)
-        node = nine_nodes(layer, column, row, self.shape)
-        return Stencil(spline_weights(s - base).flatten(1), node.flatten())
+        return base, s - base
 
     def spread(self, stencil: Stencil, value: Tensor, layers: int) -> Tensor:
         """Return the sums at the nodes, shape [layer, channel, x node, y node].
@@ -100,6 +105,32 @@ class ParticleGrid(nn.Module):
         channels = field.shape[1]
         nodes = field.permute(0, 2, 3, 1).reshape(-1, channels).index_select(0, stencil.node)
         return (stencil.weight[:, :, None] * nodes.view(-1, 9, channels)).sum(dim=1)
+
+    def pushed(self, stencil: Stencil, position: Tensor, stress: Tensor, layers: int) -> Tensor:
+        """Return the accelerations of the nodes of matter under stress, 0 where there is none.
+
+            m_i a_i = -sum_p s_p grad b_i(x_p),   m_i = sum_p b_i(x_p)
+
+        the weak form of the material-point method (Sulsky, Chen and Schreyer 1994), with grad per cell.
+        As the b_i sum to 1 and the s_p are symmetric, momentum and angular momentum of the nodes are kept.
+
+        Args:
+            stencil: what :meth:`stencil` returned.
+            position: the same positions [length], shape [particle, 2].
+            stress: components (xx, xy, yy) for each particle, shape [particle, frame, 3].
+            layers: number of layers.
+
+        Returns:
+            Components (x, y) for each frame, shape [layer, 2 frame, x node, y node].
+        """
+        columns, rows = self.shape
+        along_x, along_y = spline_slopes(self._corner(position)[1]).flatten(2)[..., None].unbind(dim=1)
+        xx, xy, yy = stress[:, None].unbind(dim=3)
+        force = -torch.stack([xx * along_x + xy * along_y, xy * along_x + yy * along_y], dim=3)
+        parts, nodes = force.flatten(2).flatten(0, 1), layers * columns * rows
+        sums = force.new_zeros(nodes, parts.shape[1]).index_add(0, stencil.node, parts)
+        mass = force.new_zeros(nodes).index_add(0, stencil.node, stencil.weight.flatten())
+        return (sums / mass.clamp(min=1e-9)[:, None]).view(layers, columns, rows, -1).permute(0, 3, 1, 2)
 
     def offsets(self, stencil: Stencil, position: Tensor) -> Tensor:
         """Return how far the nine nodes lie from each particle [length], shape [particle, 9, 2]."""

@@ -148,6 +148,14 @@ def spline_weights(s: Tensor) -> Tensor:
     return b[:, :, None, 0] * b[:, None, :, 1]
 
 
+def spline_slopes(s: Tensor) -> Tensor:
+    """Return the slopes of those weights along x and y [1/cell], shape [particle, 2, 3, 3]."""
+    b = torch.stack([0.5 * (1.5 - s) ** 2, 0.75 - (s - 1.0) ** 2, 0.5 * (s - 0.5) ** 2], dim=1)
+    d = torch.stack([s - 1.5, 2.0 - 2.0 * s, s - 0.5], dim=1)
+    along_x, along_y = d[:, :, None, 0] * b[:, None, :, 1], b[:, :, None, 0] * d[:, None, :, 1]
+    return torch.stack([along_x, along_y], dim=1)
+
+
 def nine_nodes(layer: Tensor, column: Tensor, row: Tensor, shape: tuple[int, int]) -> Tensor:
     """Return the numbers of the nine nodes from a corner on, among those of all layers of a shape."""
     columns, rows = shape

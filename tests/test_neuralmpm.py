@@ -69,9 +69,10 @@ def test_smoothing_damps_what_the_grid_does_not_see() -> None:
     assert bool((spread[1:] < 0.85 * spread[:-1]).all())
 
 
-def test_particles_stay_inside_the_walls() -> None:
+@pytest.mark.parametrize("conserve", [False, True])
+def test_particles_stay_inside_the_walls(conserve: bool) -> None:
     """Whatever the network says, positions stay in the box and velocities true to them."""
-    model = surrogate(awake=30.0)
+    model = surrogate(awake=30.0, conserve=conserve)
     given = batch(swirl(0, 3), swirl(1, 3))
     found = rolled(model, given, 12)
     low, high = torch.tensor(facts().bounds).T
@@ -82,9 +83,10 @@ def test_particles_stay_inside_the_walls() -> None:
     torch.testing.assert_close(frames[1][0] - frames[0][0], frames[1][1], rtol=0, atol=2e-7)
 
 
-def test_windows_side_by_side_do_not_see_each_other() -> None:
+@pytest.mark.parametrize("conserve", [False, True])
+def test_windows_side_by_side_do_not_see_each_other(conserve: bool) -> None:
     """Two windows in one batch roll out as they do alone, walls and context included."""
-    model = surrogate(awake=0.1, context=3, wall_velocity=True)
+    model = surrogate(awake=0.1, context=3, wall_velocity=True, conserve=conserve)
     windows = [batch(swirl(seed, 3), walls=True) for seed in (0, 1)]
     both = rolled(model, batch(swirl(0, 3), swirl(1, 3), walls=True), 5)
     torch.testing.assert_close(both, torch.cat([rolled(model, w, 5) for w in windows]), rtol=0, atol=1e-6)
@@ -127,17 +129,50 @@ def test_the_way_back_is_asked_for(after: float) -> None:
         assert float(model(window)["velocity"]) == pytest.approx(expected, rel=1e-2)
 
 
+def test_momentum_is_conserved_away_from_walls() -> None:
+    """Whatever stresses are said: two materials push each other apart, and their mean goes on and falls."""
+    model = surrogate(awake=0.3, conserve=True, smoothing=0.3, strain=True)
+    nn.init.constant_(model.fall, -0.05)
+    window = drift((2e-3, -1e-3), 3)
+    given = batch(window)
+    given.material[::2] = 2
+    found = rolled(model, given, 4).diff(dim=1).double()
+    fall = -0.05 * 10.0 * model.change
+    mean = found.mean(dim=0).numpy()
+    np.testing.assert_allclose(mean, [(2e-3, -1e-3 + fall * k) for k in (2, 3, 4)], rtol=0, atol=2e-7)
+    apart = found[::2].mean(dim=0) - found[1::2].mean(dim=0)
+    assert float(apart.abs().max()) > 1e-5
+
+
+def test_walls_push_where_they_are() -> None:
+    """Beside a wall momentum changes; a body in the middle is not reached."""
+    model = surrogate(conserve=True, materials=[0])
+    nn.init.constant_(model.network.end.bias[-4:], 1.0)
+    for low, pushed in ((0.05, True), (0.4, False)):
+        given = batch(np.repeat(jittered(0, low=low, high=low + 0.2)[None], 3, axis=0))
+        given.material.zero_()
+        moved = rolled(model, given, 2)[:, -1] - given.position[:, -1]
+        assert bool(moved.abs().max() > 1e-5) is pushed
+
+
+@pytest.mark.parametrize("conserve", [False, True])
 @pytest.mark.parametrize("number", range(8))
-def test_the_mean_over_images_has_the_symmetry_of_the_box(number: int) -> None:
+def test_the_mean_over_images_has_the_symmetry_of_the_box(number: int, conserve: bool) -> None:
     """Strain, walls that move and context included, the rollout of an image is the image of the rollout."""
     matrix = images(Symmetry.SQUARE)[number]
-    options = {"strain": True, "wall_velocity": True, "context": 3, "symmetry": "square", "awake": 0.1}
+    options = {
+        "strain": True,
+        "wall_velocity": True,
+        "context": 3,
+        "symmetry": "square",
+        "conserve": conserve,
+    }
     given = batch(swirl(0, 3), walls=True)
     sheared = torch.tensor([[0.9, 0.15], [0.0, 1.05]])
     given = replace(given, origin=(given.position[:, 0] - 0.5) @ sheared + 0.5)
 
     def apart(*, average: bool) -> float:
-        model = surrogate(**options, average=average)
+        model = surrogate(**options, awake=0.1, average=average)
         nn.init.normal_(model.context.numbers[-1].weight, std=3.0)
         here, there = (rolled(model, one, 4) for one in (given, image(given, matrix[None], facts().bounds)))
         return float((there - ((here - 0.5) @ matrix.T + 0.5)).abs().max())

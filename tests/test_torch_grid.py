@@ -214,6 +214,34 @@ def test_gather_is_the_adjoint_of_spread() -> None:
     assert float(left) == pytest.approx(float(right), rel=1e-5)
 
 
+def test_stresses_push_as_the_slopes_of_the_splines_say() -> None:
+    """Forces by torch's own gradients of the weights; their sum and their moment vanish at the nodes."""
+    grid, place = ParticleGrid(BOX, 9, multiple=4), cloud(200)
+    layer = torch.arange(200) % 2
+    rng = torch.Generator().manual_seed(0)
+    stress = torch.randn(200, 3, 3, generator=rng)
+    stencil = grid.stencil(place, layer)
+    found = grid.pushed(stencil, place, stress, 2)
+    moved = place.clone().requires_grad_()
+    weight = grid.stencil(moved, layer).weight
+    slopes = torch.stack(
+        [torch.autograd.grad(weight[:, node].sum(), moved, retain_graph=True)[0] for node in range(9)], dim=1
+    )
+    matrix = stress[..., [0, 1, 1, 2]].unflatten(2, (2, 2))
+    pulled = -grid.spacing * torch.einsum("pfcd,pnd->pnfc", matrix, slopes)
+    columns, rows = grid.shape
+    force = torch.zeros(2 * columns * rows, 3, 2).index_add(0, stencil.node, pulled.flatten(0, 1))
+    mass = grid.spread(stencil, torch.ones(200, 1), 2)
+    ours = (found * mass).permute(0, 2, 3, 1).reshape(-1, 3, 2)
+    torch.testing.assert_close(ours, force, rtol=0, atol=2e-5)
+    x, y = torch.meshgrid(grid.axis_x, grid.axis_y, indexing="ij")
+    moment = (
+        x.flatten().repeat(2)[:, None] * ours[..., 1] - y.flatten().repeat(2)[:, None] * ours[..., 0]
+    ).sum(0)
+    torch.testing.assert_close(ours.sum(dim=0), torch.zeros(3, 2), rtol=0, atol=1e-4)
+    torch.testing.assert_close(moment, torch.zeros(3), rtol=0, atol=1e-4)
+
+
 def test_layers_do_not_mix() -> None:
     """Particles of one layer give what they give alone."""
     grid, place = ParticleGrid(BOX, 9), cloud(100)
