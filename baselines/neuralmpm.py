@@ -14,8 +14,8 @@ With ``conserve`` bodies push each other and themselves as those of the material
 
     a(f+k) = g + G2P(w(f+k) - P2G(s(f+k) grad b) / P2G(1))
 
-by stresses s of each material and, beside walls only, accelerations w: away from them momentum is
-conserved, whatever the weights. Matter of all materials moves with one grid.
+by stresses s of each material, which vanish where matter ends, and, beside walls only, accelerations
+w: away from walls momentum is conserved, whatever the weights. One grid pushes all materials.
 """
 
 from __future__ import annotations
@@ -41,6 +41,7 @@ REACH = 4  # cells over which the U-Net sees how far a wall is
 LIQUID = 0  # material without a shape to come back to
 BESIDE = 2.5  # cells from a wall within which it may push and rub
 STIFF = 4.0  # what a stress of 1 is, in deviations of accelerations times a cell
+FULL = 2.5  # weight inside a body whose particles lie 1.6 to a radius
 HEAVY = 10.0  # what a fall of 1 is, in deviations of accelerations
 
 
@@ -317,9 +318,11 @@ class NeuralMPM(Baseline):
         windows, frames = len(output), self.options.bundle
         stress, beside = output.tensor_split([3 * len(self.options.materials) * frames], dim=1)
         stress = STIFF * stress.reshape(-1, 3 * frames, *self.grid.shape)
-        of_particle = self.grid.gather(stencil, stress).view(-1, frames, 3)
         shared = self.grid.stencil(state.position, state.sample)  # one layer for all materials
-        pushed = self.grid.pushed(shared, state.position, of_particle, windows)
+        mass = self.grid.spread(shared, torch.ones_like(state.position[:, :1]), windows) / self.unit
+        inside = (self.grid.gather(shared, mass) / FULL).clamp(max=1.0).square()  # free surfaces bear no load
+        of_particle = self.grid.gather(stencil, stress) * inside
+        pushed = self.grid.pushed(shared, state.position, of_particle.view(-1, frames, 3), windows)
         near = (1.0 - self.grid.wall_distance(BESIDE * self.grid.spacing).amin(dim=0)).clamp(0.0, 1.0)
         accelerations = self.grid.gather(shared, pushed + near * beside).view(-1, frames, 2)
         if self.fall is not None:
