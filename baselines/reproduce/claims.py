@@ -102,6 +102,11 @@ CLAIMS = (
         rivals=("neuralmpm-unmixed",),
     ),
     Claim(
+        question="Does NeuralMPM gain by conserved momentum, shorter bundles and more of the first frames?",
+        first="neuralmpm-conserving",
+        rivals=("neuralmpm-long", "neuralmpm"),
+    ),
+    Claim(
         question="Does NeuralMPM gain by the mean over the images of the box, with the same weights?",
         first="neuralmpm-averaged",
         rivals=("neuralmpm",),
