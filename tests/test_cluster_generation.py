@@ -39,6 +39,7 @@ def workers() -> Iterator[Any]:
         yield running
 
 
+@pytest.mark.slow
 def test_a_worker_killed_and_one_slowed(
     workers: Any,
     tmp_path: Path,
@@ -74,6 +75,7 @@ def test_a_worker_killed_and_one_slowed(
     assert writers(tmp_path) == {}
 
 
+@pytest.mark.slow
 def test_a_lost_scheduler_is_an_error_and_resumed(
     tmp_path: Path, unmeasured: Registry, generated: GenerationResult
 ) -> None:

@@ -122,6 +122,7 @@ def test_the_demo_ends_with_a_leaderboard_of_its_own(run: Run, copied: Callable[
 
 
 @pytest.mark.usefixtures("only_one")
+@pytest.mark.slow
 def test_what_another_version_left_is_trained_anew(
     copied: Callable[[], Path], run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:

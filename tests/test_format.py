@@ -194,6 +194,7 @@ def test_flipped_byte_in_a_compressed_chunk_names_the_variable(tmp_path: Path) -
         damaged(path, "damaged", "variable 'velocity'", "lagbench generate", check=check)
 
 
+@pytest.mark.slow
 def test_no_flipped_byte_escapes_as_another_error(written: tuple[Path, str]) -> None:
     """Each of 600 flips all over the file leaves the content as it is or gives a DataError."""
     path, content = written

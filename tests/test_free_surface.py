@@ -173,7 +173,7 @@ def test_states_that_do_not_fit_are_refused() -> None:
     solver, good = start(CONSTANTS, [ball(Material.LIQUID)]), ball(Material.LIQUID)
     with pytest.raises(UsageError, match="number of scenarios"):
         solver.load([good, good])
-    with pytest.raises(UsageError, match="shape of positions"):
+    with pytest.raises(UsageError, match="shape of position"):
         solver.load([dataclasses.replace(good, position=good.position[:-1])])
     with pytest.raises(WorkFailedError, match="bounds"):
         solver.load([dataclasses.replace(good, position=good.position * np.nan)])

@@ -67,6 +67,7 @@ def test_the_notebook_runs(tmp_path: Path) -> None:
     assert (tmp_path / "truth.gif").read_bytes().startswith(b"GIF89a")
 
 
+@pytest.mark.slow
 def test_the_quickstart_programs_run(tmp_path: Path, tiny_split: Callable[..., GenerationResult]) -> None:
     """The blocks of the quickstart page, one after the other on one data set; the stated number comes out."""
     root = tiny_split("cavity").root
