@@ -67,7 +67,7 @@ def _check_gathered(operator: Operator, answer: Any, particles: int) -> None:  #
             "an operator returned no pair of what is gathered and losses",
             where=f"{type(operator).__qualname__}.forward",
             expected=f"a tensor of shape {wanted}, and a dict of losses of shape (), which may be empty",
-            got=", ".join(map(str, shapes)),
+            got=("" if pair else "alone: ") + ", ".join(map(str, shapes)),
             fix="mend that class; docs/baselines.md has an example",
         )
 

@@ -14,7 +14,7 @@ With ``conserve`` bodies push each other and themselves as those of the material
 
     a(f+k) = g + G2P(w(f+k) - P2G(s(f+k) grad b) / P2G(1))
 
-by stresses s of each material, which vanish where matter ends, and, beside walls only, accelerations
+by stresses s of each material, which fade where matter is thin, and, beside walls only, accelerations
 w: away from walls momentum is conserved, whatever the weights. One grid pushes all materials.
 """
 
@@ -39,9 +39,9 @@ from .unet import COARSEST, UNet
 EMPTY = 1e-3  # below this weight, in units of particles a radius apart, a node's velocity fades to 0
 REACH = 4  # cells over which the U-Net sees how far a wall is
 LIQUID = 0  # material without a shape to come back to
-BESIDE = 2.5  # cells from a wall within which it may push and rub
+BESIDE = 2.5  # cells from a wall to nodes that it cannot push; particles feel it half a cell further
 STIFF = 4.0  # what a stress of 1 is, in deviations of accelerations times a cell
-FULL = 2.5  # weight inside a body whose particles lie 1.6 to a radius
+FULL = 2.5  # weight inside a body whose particles lie 1.6 to a radius, and from which on it bears all
 HEAVY = 10.0  # what a fall of 1 is, in deviations of accelerations
 
 
@@ -312,7 +312,7 @@ class NeuralMPM(Baseline):
         Args:
             state: where they are.
             stencil: nodes of their materials around them.
-            output: stresses of each material in each frame, (xx, xy, yy) / STIFF [length^2/frame^2 per cell],
+            output: stresses of each material in each frame, (xx, xy, yy) / STIFF [length cell/frame^2],
                 and accelerations beside walls, shape [window, channel, x node, y node].
         """
         windows, frames = len(output), self.options.bundle
@@ -320,7 +320,7 @@ class NeuralMPM(Baseline):
         stress = STIFF * stress.reshape(-1, 3 * frames, *self.grid.shape)
         shared = self.grid.stencil(state.position, state.sample)  # one layer for all materials
         mass = self.grid.spread(shared, torch.ones_like(state.position[:, :1]), windows) / self.unit
-        inside = (self.grid.gather(shared, mass) / FULL).clamp(max=1.0).square()  # free surfaces bear no load
+        inside = (self.grid.gather(shared, mass) / FULL).clamp(max=1.0).square()  # a surface bears less
         of_particle = self.grid.gather(stencil, stress) * inside
         pushed = self.grid.pushed(shared, state.position, of_particle.view(-1, frames, 3), windows)
         near = (1.0 - self.grid.wall_distance(BESIDE * self.grid.spacing).amin(dim=0)).clamp(0.0, 1.0)

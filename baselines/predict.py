@@ -183,13 +183,13 @@ def predict(
 
 def check_replaceable(output: Path) -> None:
     """Refuse to write predictions, and what they cost beside them, over files that are something else."""
-    cost = output.with_suffix(".json")
+    cost = output if output.is_dir() else output.with_suffix(".json")  # a folder may have no name of its own
+    if cost.is_dir():
+        fix = f"name a file, as in -o {cost / 'predictions.nc'}"
+        raise UsageError("the output is a folder", where="--output", got=str(cost), fix=fix)
     if output == cost:
         fix = f"name it {output.with_suffix('.nc').name}: what the predictions cost goes to {cost.name}"
         raise UsageError("predictions are no JSON", where="--output", got=str(output), fix=fix)
-    if (folder := next((path for path in (output, cost) if path.is_dir()), None)) is not None:
-        fix = f"name a file, as in -o {folder / 'predictions.nc'}"
-        raise UsageError("the output is a folder", where="--output", got=str(folder), fix=fix)
     # scores have no format of data, scenarios no hash of the whole data set
     of_predictions, of_cost = (b"lagbench_format", b"dataset_sha256"), (b"seconds_without_search",)
     for path, ours in ((output, of_predictions), (cost, of_cost)):

@@ -104,7 +104,7 @@ class TrainingOptions(_Strict):
     windows: tuple[str, ...] = ("train",)  # subsets to train on
     # share of the windows that are drawn from those that begin in a scenario's first frames, so many of them:
     # bodies meet once, and rest for hundreds of frames
-    opening_share: float = Field(default=0.0, ge=0.0, le=1.0)
+    opening_share: float = Field(default=0.0, ge=0.0, le=1.0, allow_inf_nan=False)
     opening_frames: int = Field(default=40, gt=0)
     # steps between validations, 0 never; by default up to eight, as many as take 15 % of the processor time
     validate_every: int | None = Field(default=None, ge=0)
@@ -159,8 +159,15 @@ class TrainingOptions(_Strict):
 
 
 LATER: Mapping[str, Mapping[str, object]] = {
-    "training": {"compile": False, "ema": 0.0},
-    "model": {"pushforward": 0, "recovery": None, "strain": False, "mixture": False, "average": False},
+    "training": {"compile": False, "ema": 0.0, "opening_share": 0.0, "opening_frames": 40},
+    "model": {
+        "pushforward": 0,
+        "recovery": None,
+        "strain": False,
+        "mixture": False,
+        "average": False,
+        "conserve": False,
+    },
 }
 """Options that records of earlier trainings lack, with what they did: such trainings can go on."""
 
@@ -247,6 +254,9 @@ def recipe_for(
             parts = [other.split("/")[1] for other in file.recipes if other.split("/")[0] in (split, ANY)]
             variants = [other.removeprefix(f"{size}-") for other in parts if other.startswith(f"{size}-")]
             fix = f"{nearest(variant, variants)}; or " if variants else "" if size in parts else fix
+            held = [other.removesuffix(f"-{variant}") for other in parts if other.endswith(f"-{variant}")]
+            if held and size in parts:
+                fix = f"--size {' or '.join(held)} has it; or "
             fix += f"leave --recipe out, for that of {size}; or " if size in parts else ""
         raise UsageError(
             f"{entry.name} has no recipe {name!r}",

@@ -144,11 +144,14 @@ class Driver(ABC, Generic[Parameters]):
             "material": (count,),
         }
         for name, shape in shapes.items():
-            held = getattr(state, name, None)
-            got = getattr(held, "shape", type(held).__name__)
-            if got != shape:
-                what = f"wrong shape of {name} in an initial state"
-                raise UsageError(what, where=f"scenario {index}", expected=shape, got=got)
+            held = np.asarray(getattr(state, name))
+            if held.shape != shape or held.dtype.kind not in ("iu" if name == "material" else "f"):
+                raise UsageError(
+                    f"wrong shape of {name} in an initial state, or no such numbers",
+                    where=f"scenario {index}",
+                    expected=f"{shape}, {'whole' if name == 'material' else 'floating'}",
+                    got=f"{held.shape}, {held.dtype}",
+                )
         known, area = [int(one) for one in Material], np.float64(state.area)
         outside = np.count_nonzero((state.position < 0.0) | (state.position > 1.0))
         if outside or not np.isin(state.material, known).all() or not 0.0 < area <= 1.0:

@@ -152,7 +152,7 @@ def package_at_fault(error: BaseException) -> str | None:
 
     groups = (f"lagbench.{group}" for group in ("baselines", "generators", "metrics"))
     points = [point for group in groups for point in entry_points(group=group)]
-    added = {point.module.split(".")[0] for point in points} - {"lagbench"}
+    added = {point.value.partition(":")[0].split(".")[0].strip() for point in points} - {"lagbench"}
     place = None
     for frame, line in traceback.walk_tb(error.__traceback__):
         if str(frame.f_globals.get("__name__")).split(".")[0] in added:

@@ -419,3 +419,11 @@ def test_a_baseline_that_reads_numbers_is_built(monkeypatch: pytest.MonkeyPatch)
     model = restore(Checkpoint(baseline="reading", options={}, facts=FACTS, weights=weights))
     assert isinstance(model, Reading)
     assert (model.half, model.a.item()) == (0.5, 0.25)
+
+
+def test_weights_of_the_board_can_be_run() -> None:
+    """Every file that stands beside an entry is one that today's models are built from."""
+    files = sorted((Path(__file__).parent.parent / "leaderboard" / "weights").rglob("*.pt"))
+    assert len(files) > 60
+    for file in files:
+        assert restore(load(file), where=str(file)).method

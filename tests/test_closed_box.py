@@ -222,6 +222,8 @@ def test_states_outside_the_bounds_are_refused() -> None:
         {"affine": state.velocity},
         {"material": None},
         {"material": state.material + 9},
+        {"material": state.material.astype(float)},
+        {"position": state.position.astype(str)},
         {"position": state.position + 5.0},
         {"area": 0.0},
         {"area": None},

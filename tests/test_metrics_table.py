@@ -326,7 +326,17 @@ def test_selection_brings_what_a_metric_follows_from() -> None:
     assert replace(OTHERS, direction="higher").direction is Direction.HIGHER  # as a package may write it
 
 
-@pytest.mark.parametrize("value", [None, "much", "1.5", np.zeros(3), 1j, np.complex128(3), 10**400])
+class Refusing:
+    """What raises when it is asked for a number, as a tensor on a GPU's graph may."""
+
+    def __float__(self) -> float:
+        """Refuse."""
+        raise RuntimeError
+
+
+@pytest.mark.parametrize(
+    "value", [None, "much", "1.5", np.zeros(3), 1j, np.complex128(3), 10**400, Refusing()]
+)
 def test_what_is_no_number_is_told_with_its_metric(value: object) -> None:
     """A statistic of another package that gives something else is named, and where it comes from."""
     truth = rollout()

@@ -144,6 +144,25 @@ def test_momentum_is_conserved_away_from_walls() -> None:
     assert float(apart.abs().max()) > 1e-5
 
 
+def test_thin_matter_bears_less() -> None:
+    """Under one pressure a lattice bursts at its rim; with a quarter of the particles far less."""
+
+    def bursting(spacing: float) -> float:
+        model = surrogate(conserve=True, materials=[0], bundle=1, smoothing=0.0)
+        nn.init.constant_(model.network.end.bias[:3:2], 1.0)
+        axis = np.arange(0.3 + spacing / 2, 0.7, spacing)
+        given = batch(np.repeat(np.stack(np.meshgrid(axis, axis), axis=-1).reshape(1, -1, 2), 3, axis=0))
+        given.material.zero_()
+        with torch.no_grad():
+            _, ((_, velocity),) = model.call(model.start(given))
+        return float(velocity.norm(dim=1).max())
+
+    dense, full, thin, thinner = (bursting(spacing) for spacing in (0.0125, 0.025, 0.05, 0.1))
+    assert full == pytest.approx(dense, rel=0.2)
+    assert thin < full / 5
+    assert thinner < thin / 10
+
+
 def test_walls_push_where_they_are() -> None:
     """Beside a wall momentum changes; a body in the middle is not reached."""
     model = surrogate(conserve=True, materials=[0])

@@ -25,7 +25,7 @@ from lagbench.baselines.checkpoint import Checkpoint, load, save
 from lagbench.baselines.job import MOST_RECORD, OVER
 from lagbench.baselines.machine import threads_used
 from lagbench.baselines.neuralmpm import NeuralMPM
-from lagbench.baselines.predict import PredictionResult, UnfinishedWarning, predict
+from lagbench.baselines.predict import PredictionResult, UnfinishedWarning, check_replaceable, predict
 from lagbench.baselines.recipe import recipe_for
 from lagbench.baselines.rollout import as_published, roll_out, single
 from lagbench.data.registry import Registry
@@ -413,7 +413,9 @@ def test_models_of_any_size_have_the_same_weights_at_each() -> None:
 
 
 @pytest.mark.parametrize("name", ["weights.pt", "training.nc", ".", "predictions.json", "taken.nc"])
-def test_nothing_else_is_replaced(run: Predict, tmp_path: Path, name: str) -> None:
+def test_nothing_else_is_replaced(
+    run: Predict, tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Not the weights, nor the record of their training, whose name that of the cost would be; no folder.
 
     Predictions and their cost have two names.
@@ -426,6 +428,9 @@ def test_nothing_else_is_replaced(run: Predict, tmp_path: Path, name: str) -> No
     assert caught.value.where == "--output"
     assert json.loads((tmp_path / "training.json").read_text()) == record
     assert load(tmp_path / "weights.pt").baseline == "drift"
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UsageError):
+        check_replaceable(Path())
     run(name="predictions.nc")
     run(name="predictions.nc")
     (tmp_path / "predictions.json").write_text('{"seconds_per_frame": 1.0}')  # as scores have it too

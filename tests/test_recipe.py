@@ -250,6 +250,8 @@ def test_no_such_recipe(entry: Entry) -> None:
         recipe_for(entry, "curl-noise", "mini", variant="long")  # of any split there is one without a variant
     with pytest.raises(UsageError, match="cavity/tiny"):
         recipe_for(entry, "cavity", "huge", variant="long")
+    with pytest.raises(UsageError, match="--size mini or full has it"):
+        recipe_for(find("neuralmpm"), "multimaterial", "tiny", variant="conserving")
     bare = replace(entry, recipes=None)
     assert recipe_for(bare, "cavity", "tiny").name == "cavity/tiny"
     with pytest.raises(UsageError):

@@ -312,6 +312,7 @@ def test_the_mean_of_the_weights_is_published(
 def test_batches_from_any_step(generated: GenerationResult, unmeasured: Registry, ranks: int) -> None:
     """The windows of step k are the same whether the order is read from step 0 or from step k."""
     data = WindowDataset("curl-noise", size="tiny", root=generated.root, history=2, registry=unmeasured)
+    drawn_here: list[list[int]] = []
     for rank in range(ranks):
 
         def drawn(first: int, share: float = 0.0, rank: int = rank) -> list[list[int]]:
@@ -329,6 +330,8 @@ def test_batches_from_any_step(generated: GenerationResult, unmeasured: Registry
         assert 0.4 * 115 < len(changed) < 0.75 * 115
         assert {data[window].frame for window in changed} == {0, 1, 2}
         assert {data[window].scenario for window in changed} == set(data.scenarios)
+        drawn_here.append(changed)
+    assert len(set(map(tuple, drawn_here))) == ranks  # no two processes draw alike
 
 
 def test_closed_forms_go_through_the_same_door(run: Run) -> None:

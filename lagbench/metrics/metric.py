@@ -175,9 +175,9 @@ class Metric:
         if self.statistic is None or not self.defined(pair):
             return math.nan
         value: object = self.statistic(pair)
-        with suppress(TypeError, ValueError, OverflowError):
-            if np.ndim(number := np.asarray(value)) == 0 and number.dtype.kind in "fiub":
-                return float(number)
+        with suppress(TypeError, ValueError, OverflowError, RuntimeError):  # as arrays of others raise
+            if not isinstance(value, (str, bytes, complex)):
+                return float(value)  # type: ignore[arg-type]
         raise WorkFailedError(
             "a metric gave no number",
             where=f"{getattr(self.statistic, '__module__', '?')}, {self.name}",
