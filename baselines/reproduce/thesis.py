@@ -232,7 +232,6 @@ _MODELS = (
     ),
     Model("neuralmpm-conserving-averaged", "NeuralMPM, momentum conserved, mean over images"),
     Model("neuralmpm-conserving-of-mini", "NeuralMPM, momentum conserved, trained at mini"),
-    Model("neuralmpm-conserving-started", "NeuralMPM, momentum conserved, started from another size"),
     Model("neuralmpm-longer", "NeuralMPM from its own rollouts, for longer"),
     Model("neuralmpm-longer-averaged", "NeuralMPM from its own rollouts, for longer, mean over images"),
     Model("neuralmpm-started", "NeuralMPM, started from another size"),
