@@ -68,7 +68,7 @@ def _check_gathered(operator: Operator, answer: Any, particles: int) -> None:  #
             where=f"{type(operator).__qualname__}.forward",
             expected=f"a tensor of shape {wanted}, and a dict of losses of shape (), which may be empty",
             got=("" if pair else "alone: ") + ", ".join(map(str, shapes)),
-            fix="mend that class; docs/baselines.md has an example",
+            fix="mend that class; docs/extending.md has an example",
         )
 
 

@@ -125,8 +125,8 @@ class Metric:
     the frame is undefined: left out of the mean and counted.
 
     Raises:
-        UsageError: neither a statistic nor others' series, a target without its value, a name that
-            is not of small letters, digits and underscores, or no direction.
+        UsageError: neither a statistic nor others' series, a text as ``of``, a target without its value,
+            a name that is not of small letters, digits and underscores, or no direction.
     """
 
     name: str  # unique
@@ -171,7 +171,11 @@ class Metric:
             object.__setattr__(self, "of", (self.name,))
 
     def measure(self, pair: FramePair) -> float:
-        """Return the statistic of a frame pair, NaN where it is undefined."""
+        """Return the statistic of a frame pair, NaN where it is undefined.
+
+        Raises:
+            WorkFailedError: it is no number.
+        """
         if self.statistic is None or not self.defined(pair):
             return math.nan
         value: object = self.statistic(pair)
