@@ -16,12 +16,16 @@ With ``conserve`` bodies push each other and themselves as those of the material
 
 by stresses s of each material, which fade where matter is thin, and, beside walls only, accelerations
 w: away from walls momentum is conserved, whatever the weights. One grid pushes all materials.
+
+With ``shape`` and ``density`` positions are then drawn to where elastic bodies have the shape of the first
+frame and no matter is denser than there (:mod:`~lagbench.baselines.projection`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import torch
 from pydantic import Field
@@ -33,6 +37,7 @@ from .augmentation import Symmetry, disturbed, field_image, images, strain_image
 from .baseline import Baseline, Batch, Facts, Options, check_moving_walls, last_velocities
 from .graph import MATERIALS
 from .particle_grid import ParticleGrid, Stencil
+from .projection import Drawn, Projection
 from .strain import Rest, first_frame
 from .unet import COARSEST, UNet
 
@@ -72,6 +77,10 @@ class NeuralMPMOptions(Options):
     conserve: bool = False
     # whether the U-Net sees how far solids are strained since the scenario's first frame
     strain: bool = False
+    # cells across the box of the grids on which elastic bodies are held in shape, one after the other
+    shape: tuple[Annotated[int, Field(ge=2, le=256)], ...] = ()
+    # the same of those on which matter is kept from being denser than in the first frame
+    density: tuple[Annotated[int, Field(ge=2, le=256)], ...] = ()
     symmetry: Symmetry = Symmetry.NONE  # images that training windows are replaced by at random
     # whether calls of rollouts, not of training, are means over those images, at as many times the cost
     average: bool = False
@@ -89,6 +98,7 @@ class GridState:
     walls: Tensor
     context: Tensor  # what the given frames told, shape [window, context]
     rest: Rest | None = None  # None where strain is not asked for
+    drawn: Drawn | None = None  # None where no projection is asked for
     coming: tuple[Tensor, ...] = ()  # predicted positions that are not yet given out
 
 
@@ -167,6 +177,9 @@ class NeuralMPM(Baseline):
         self.fall: nn.Parameter | None = None
         if options.conserve and options.symmetry is not Symmetry.SQUARE:
             self.fall = nn.Parameter(torch.zeros(()))
+        self.projection: Projection | None = None
+        if options.shape or options.density:
+            self.projection = Projection(facts.bounds, shape=options.shape, density=options.density)
 
     @property
     def history(self) -> int:
@@ -180,8 +193,8 @@ class NeuralMPM(Baseline):
 
     @property
     def origin(self) -> bool:
-        """Strain is counted from the scenario's first frame."""
-        return self.options.strain
+        """Strain is counted from the scenario's first frame, where bodies have their shape."""
+        return self.options.strain or self.projection is not None
 
     def forward(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """Return the squared error of velocity over the deviation of accelerations, mean over frames [1].
@@ -244,8 +257,12 @@ class NeuralMPM(Baseline):
             walls=walls,
             context=position.new_zeros(given.windows, 0),
         )
+        layers = given.windows * len(self.options.materials)
+        if self.projection is not None:
+            first = first_frame(given)
+            drawn = self.projection.start(first, given.material, given.sample, given.windows)
+            state = replace(state, drawn=drawn)
         if self.options.strain:
-            layers = given.windows * len(self.options.materials)
             solid = given.material != LIQUID
             state = replace(
                 state, rest=Rest.of(self.grid, first_frame(given), state.layer, layers, solid=solid)
@@ -296,6 +313,8 @@ class NeuralMPM(Baseline):
         frames: list[tuple[Tensor, Tensor]] = []
         for acceleration in accelerations:
             velocity = (1.0 - share) * velocity + share * on_grid + acceleration
+            if self.projection is not None and state.drawn is not None:
+                velocity = self.projection(state.drawn, position + velocity) - position
             velocity = velocity.clamp(self.grid.low - position, self.grid.high - position)
             # The sum may round to a number beyond the wall.
             position = (position + velocity).clamp(self.grid.low, self.grid.high)

@@ -153,6 +153,21 @@ class ParticleGrid(nn.Module):
         distance = torch.stack([x - left, right - x, y - bottom, top - y])
         return (distance / reach).clamp(-1.0, 1.0)
 
+    def inside(self) -> Tensor:
+        """Return the shares of the nodes' splines that lie in the box [1], shape [x node, y node]."""
+        sides = []
+        for axis, low, high in zip((self.axis_x, self.axis_y), self.low, self.high, strict=True):
+            sides.append(_below((high - axis) / self.spacing) - _below((low - axis) / self.spacing))
+        return sides[0][:, None] * sides[1]
+
     def beside_walls(self) -> Tensor:
         """Return 1 at the two rows of nodes beside each wall, else 0, shape [wall, x node, y node]."""
         return (self.wall_distance(self.spacing).abs() < 1.0).to(torch.float32)
+
+
+def _below(s: Tensor) -> Tensor:
+    """Return the integral of the spline up to a distance from its node [cell]."""
+    s = s.clamp(-1.5, 1.5)
+    near = 0.5 + s * (0.75 - s * s / 3.0)
+    far = (1.5 - s.abs()) ** 3 / 6.0
+    return torch.where(s.abs() < 0.5, near, torch.where(s < 0.0, far, 1.0 - far))

@@ -167,6 +167,8 @@ LATER: Mapping[str, Mapping[str, object]] = {
         "mixture": False,
         "average": False,
         "conserve": False,
+        "shape": [],
+        "density": [],
     },
 }
 """Options that records of earlier trainings lack, with what they did: such trainings can go on."""

@@ -30,6 +30,8 @@ SMALL: dict[str, object] = {
     "materials": [0, 1, 2, 3],
 }
 
+PROJECTED: dict[str, object] = {"shape": [4, 8], "density": [8]}
+
 
 def surrogate(*, awake: float = 0.0, changes: Mapping[str, object] | None = None, **options: object) -> Any:
     """Return a small model; `awake` is the deviation of its last layer's weights."""
@@ -129,13 +131,14 @@ def test_the_way_back_is_asked_for(after: float) -> None:
         assert float(model(window)["velocity"]) == pytest.approx(expected, rel=1e-2)
 
 
-def test_momentum_is_conserved_away_from_walls() -> None:
+@pytest.mark.parametrize("projected", [{}, PROJECTED])
+def test_momentum_is_conserved_away_from_walls(projected: dict[str, object]) -> None:
     """Whatever stresses are said: two materials push each other apart, and their mean goes on and falls."""
-    model = surrogate(awake=0.3, conserve=True, smoothing=0.3, strain=True)
+    model = surrogate(awake=0.3, conserve=True, smoothing=0.3, strain=True, **projected)
     nn.init.constant_(model.fall, -0.05)
     window = drift((2e-3, -1e-3), 3)
     given = batch(window)
-    given.material[::2] = 2
+    given.material[::2] = 3
     found = rolled(model, given, 4).diff(dim=1).double()
     fall = -0.05 * 10.0 * model.change
     mean = found.mean(dim=0).numpy()
@@ -174,9 +177,9 @@ def test_walls_push_where_they_are() -> None:
         assert bool(moved.abs().max() > 1e-5) is pushed
 
 
-@pytest.mark.parametrize("conserve", [False, True])
+@pytest.mark.parametrize("changes", [{}, {"conserve": True}, {"conserve": True} | PROJECTED])
 @pytest.mark.parametrize("number", range(8))
-def test_the_mean_over_images_has_the_symmetry_of_the_box(number: int, conserve: bool) -> None:
+def test_the_mean_over_images_has_the_symmetry_of_the_box(number: int, changes: dict[str, object]) -> None:
     """Strain, walls that move and context included, the rollout of an image is the image of the rollout."""
     matrix = images(Symmetry.SQUARE)[number]
     options = {
@@ -184,8 +187,7 @@ def test_the_mean_over_images_has_the_symmetry_of_the_box(number: int, conserve:
         "wall_velocity": True,
         "context": 3,
         "symmetry": "square",
-        "conserve": conserve,
-    }
+    } | changes
     given = batch(swirl(0, 3), walls=True)
     sheared = torch.tensor([[0.9, 0.15], [0.0, 1.05]])
     given = replace(given, origin=(given.position[:, 0] - 0.5) @ sheared + 0.5)
@@ -196,7 +198,7 @@ def test_the_mean_over_images_has_the_symmetry_of_the_box(number: int, conserve:
         here, there = (rolled(model, one, 4) for one in (given, image(given, matrix[None], facts().bounds)))
         return float((there - ((here - 0.5) @ matrix.T + 0.5)).abs().max())
 
-    assert apart(average=True) < 2e-6
+    assert apart(average=True) < 5e-6
     assert (apart(average=False) > 1e-5) is (number > 0)  # the weights have no symmetry
 
 

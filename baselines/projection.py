@@ -1,0 +1,215 @@
+"""Projections: what positions are drawn to in every frame, whatever a network has said of forces.
+
+Waves cross a stiff body or a liquid within few frames. From one to the next its parts move almost
+rigidly, or without being pressed together, which forces that are told once a frame on a coarse grid
+do not achieve. Constraints on positions do (position-based dynamics, Mueller et al. 2007,
+doi 10.1016/j.jvcir.2007.01.005); velocities are then those of the positions. Momentum is kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import cast
+
+import torch
+from torch import Tensor, nn
+
+from .graph import MATERIALS, Bounds
+from .particle_grid import ParticleGrid, Stencil
+
+ELASTIC = (1, 3)  # jelly and rope, the materials that come back to their shape
+HEAVY = 10.0  # what a weight counts for: the few here are to be learned as fast as thousands of others
+HELD = 3.0  # log-odds of the share of the way to their shape that bodies go, before training
+MOST_PUSH = 2.0  # greatest k of Density
+LIMIT = 0.2  # what a change of 1 is to the density that is not too much
+
+TINY = 1e-16
+"""Square of a cluster's moment [length^4] below which it has no direction."""
+
+LEAST = 0.02
+"""Least share of a node's cell inside the box that its weight is divided by; two walls leave 1/36."""
+
+MOST_EXCESS = 1.0
+"""Excess of density beyond which matter is pushed no farther at once [1]."""
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Overlapping clusters of a body's particles, one around each node of its first frame.
+
+        x'_p = sum_i b_i(X_p) (c_i + R_i (X_p - C_i))
+
+    with C_i and c_i the means of positions in the first frame and now, weighted by the b_i, and R_i the
+    rotation that fits a cluster's motion best: shape matching (Mueller et al. 2005,
+    doi 10.1145/1073204.1073216) by overlapping regions (Rivers and James 2007,
+    doi 10.1145/1276377.1276480). As the b_i sum to 1 and the R_i fit best, x' has the momentum and the
+    angular momentum of x.
+    """
+
+    stencil: Stencil  # nodes around X
+    nodes: int  # of all layers
+    inverse: Tensor  # 1 over the sum of the weights at a node [1], shape [node, 1]
+    arm: Tensor  # X_p - C_i [length], shape [particle, 9, 2]
+
+    @classmethod
+    def of(cls, grid: ParticleGrid, position: Tensor, layer: Tensor, layers: int) -> Shape:
+        """Return the clusters of bodies.
+
+        Args:
+            grid: its nodes; clusters reach one and a half of its cells.
+            position: X [length], shape [particle, 2].
+            layer: layer of each particle, int64, shape [particle]; bodies have their own.
+            layers: number of layers.
+        """
+        position = position.clamp(grid.low, grid.high)
+        stencil = grid.stencil(position, layer)
+        sums = grid.spread(stencil, torch.cat([torch.ones_like(position[:, :1]), position], dim=1), layers)
+        sums = sums.permute(0, 2, 3, 1).reshape(-1, 3)
+        inverse = 1.0 / sums[:, :1].clamp(min=1e-6)
+        centre = (sums[:, 1:] * inverse).index_select(0, stencil.node).view(-1, 9, 2)
+        return cls(stencil, len(inverse), inverse, position[:, None] - centre)
+
+    def matched(self, position: Tensor) -> Tensor:
+        """Return x', the mean of where the clusters of a particle have it [length], shape [particle, 2].
+
+        Args:
+            position: x, positions of the same particles now [length], shape [particle, 2].
+        """
+        weight, (along_x, along_y) = self.stencil.weight, self.arm.unbind(dim=2)
+        x, y = position[:, None].unbind(dim=2)
+        cosine, sine = x * along_x + y * along_y, y * along_x - x * along_y
+        moments = torch.stack([x.expand_as(weight), y.expand_as(weight), cosine, sine], dim=2)
+        parts = (weight[..., None] * moments).flatten(0, 1)
+        sums = parts.new_zeros(self.nodes, 4).index_add(0, self.stencil.node, parts)
+        # A lone particle turns nothing: the root's gradient must not be infinite there.
+        length = (sums[:, 2:].square().sum(dim=1, keepdim=True) + TINY).sqrt()
+        motion = torch.cat([sums[:, :2] * self.inverse, sums[:, 2:] / length], dim=1)
+        x, y, cosine, sine = motion.index_select(0, self.stencil.node).view(-1, 9, 4).unbind(dim=2)
+        there = [x + cosine * along_x - sine * along_y, y + sine * along_x + cosine * along_y]
+        return (weight[..., None] * torch.stack(there, dim=2)).sum(dim=1)
+
+
+@dataclass(frozen=True)
+class Density:
+    """How dense matter was at most in the first frame, and a push out of where it is denser.
+
+        x' = x + d G2P(a),   m_i a_i = k sum_p max(rho_p - l_p, 0) grad b_i(x_p)
+
+    with d the width of a cell, a from :meth:`ParticleGrid.pushed` by that pressure, and rho = G2P(P2G(1) / V)
+    the density over that of the window's densest place in the first frame, V the share of a node's
+    cell inside the box: what density constraints of particles (Macklin and Mueller 2013,
+    doi 10.1145/2461912.2461984) and density projection on grids (Kugelstadt et al. 2019,
+    doi 10.1109/TVCG.2019.2947437) do, by one explicit step. Away from walls momentum is kept.
+    """
+
+    grid: ParticleGrid  # where density is measured
+    inverse: Tensor  # 1 / V [1], shape [x node, y node]
+    sample: Tensor  # window of each particle, int64, shape [particle]
+    most: Tensor  # greatest density in the first frame of each window [particle/cell], shape [window]
+
+    @classmethod
+    def of(cls, grid: ParticleGrid, position: Tensor, sample: Tensor, windows: int) -> Density:
+        """Return the density of first frames.
+
+        Args:
+            grid: where it is measured.
+            position: positions in the first frame [length], shape [particle, 2].
+            sample: window of each particle, int64, shape [particle].
+            windows: number of windows.
+        """
+        inverse = 1.0 / grid.inside().clamp(min=LEAST)
+        empty = cls(grid, inverse, sample, position.new_ones(windows))
+        found = empty.relative(grid.stencil(position.clamp(grid.low, grid.high), sample))
+        return cls(
+            grid, inverse, sample, position.new_zeros(windows).scatter_reduce(0, sample, found, "amax")
+        )
+
+    def relative(self, stencil: Stencil) -> Tensor:
+        """Return rho of particles whose nodes these are [1], shape [particle]."""
+        one = torch.ones_like(stencil.weight[:, :1])
+        mass = self.grid.spread(stencil, one, len(self.most)) * self.inverse
+        return self.grid.gather(stencil, mass)[:, 0] / self.most[self.sample]
+
+    def eased(self, position: Tensor, push: Tensor, limit: Tensor) -> Tensor:
+        """Return x' [length], shape [particle, 2].
+
+        Args:
+            position: x, positions of the same particles now [length], shape [particle, 2].
+            push: k [1], one number; about 1 takes away what is too much within a few steps.
+            limit: l, densities that are not too much [1], shape [particle].
+        """
+        position = position.clamp(self.grid.low, self.grid.high)
+        stencil = self.grid.stencil(position, self.sample)
+        pressure = push * (self.relative(stencil) - limit).clamp(0.0, MOST_EXCESS)
+        none = torch.zeros_like(pressure)
+        stress = -torch.stack([pressure, none, pressure], dim=1)[:, None]
+        moved = self.grid.gather(stencil, self.grid.pushed(stencil, position, stress, len(self.most)))
+        return position + self.grid.spacing * moved
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """What a batch of windows is drawn to."""
+
+    elastic: Tensor  # numbers of the particles that come back to their shape, int64, shape [elastic particle]
+    kind: Tensor  # where their materials stand in ELASTIC, int64, shape [elastic particle]
+    shapes: tuple[Shape, ...]
+    densities: tuple[Density, ...]
+    material: Tensor  # of each particle, int64, shape [particle]
+
+
+class Projection(nn.Module):
+    """Matter pushed out of where it is too dense, then elastic bodies drawn to their shape.
+
+    How far, and what is too dense for a material, is learned.
+
+    Args:
+        bounds: box (low, high) along x and y [length].
+        shape: cells across the box of the grids of :class:`Shape`, one after the other.
+        density: the same of :class:`Density`.
+    """
+
+    def __init__(self, bounds: Bounds, *, shape: Sequence[int], density: Sequence[int]) -> None:
+        super().__init__()
+        self.clusters = nn.ModuleList(ParticleGrid(bounds, cells) for cells in shape)
+        self.cells = nn.ModuleList(ParticleGrid(bounds, cells) for cells in density)
+        self.held = nn.Parameter(torch.full((len(shape), len(ELASTIC)), HELD / HEAVY))
+        self.push = nn.Parameter(torch.zeros(len(density)))
+        self.limit = nn.Parameter(torch.zeros(MATERIALS))
+
+    def start(self, first: Tensor, material: Tensor, sample: Tensor, windows: int) -> Drawn:
+        """Return what windows are drawn to.
+
+        Args:
+            first: positions in the scenarios' first frames [length], shape [particle, 2].
+            material: of each particle, int64, shape [particle]; those of one material are one body.
+            sample: window of each particle, int64, shape [particle].
+            windows: number of windows.
+        """
+        kind = torch.full((MATERIALS,), -1, device=material.device)
+        kind[list(ELASTIC)] = torch.arange(len(ELASTIC), device=material.device)
+        elastic = (kind[material] >= 0).nonzero()[:, 0]
+        kind = kind[material[elastic]]
+        layer, bodies = sample[elastic] * len(ELASTIC) + kind, windows * len(ELASTIC)
+        shapes = [Shape.of(cast(ParticleGrid, grid), first[elastic], layer, bodies) for grid in self.clusters]
+        densities = [Density.of(cast(ParticleGrid, grid), first, sample, windows) for grid in self.cells]
+        return Drawn(elastic, kind, tuple(shapes), tuple(densities), material)
+
+    def forward(self, drawn: Drawn, position: Tensor) -> Tensor:
+        """Return the positions that a frame comes to [length], shape [particle, 2]; walls do not count.
+
+        Args:
+            drawn: what :meth:`start` returned.
+            position: where particles would be without [length], shape [particle, 2].
+        """
+        if drawn.densities:
+            limit = (1.0 + HEAVY * LIMIT * self.limit)[drawn.material]
+            for push, density in zip(MOST_PUSH * (HEAVY * self.push).sigmoid(), drawn.densities, strict=True):
+                position = density.eased(position, push, limit)
+        if drawn.shapes and len(drawn.elastic):
+            there = position.index_select(0, drawn.elastic)
+            for share, shape in zip((HEAVY * self.held).sigmoid(), drawn.shapes, strict=True):
+                there = there + share[drawn.kind][:, None] * (shape.matched(there) - there)
+            position = position.index_copy(0, drawn.elastic, there)
+        return position

@@ -1,0 +1,141 @@
+"""Projections: shapes against SciPy's rotations, densities against lattices, momentum kept by both."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from simple_models import facts, jittered
+from torch import Tensor
+
+from lagbench.baselines.particle_grid import ParticleGrid
+from lagbench.baselines.projection import Density, Projection, Shape
+
+BOUNDS = facts().bounds
+
+
+def body(seed: int, low: float = 0.3, high: float = 0.7) -> Tensor:
+    """Return a square body in double precision."""
+    return torch.from_numpy(jittered(seed, low=low, high=high)).double()
+
+
+def grid(cells: int) -> ParticleGrid:
+    """Return a grid in double precision."""
+    return ParticleGrid(BOUNDS, cells).double()
+
+
+def shape(position: Tensor, cells: int = 8) -> Shape:
+    """Return the clusters of one body."""
+    return Shape.of(grid(cells), position, torch.zeros(len(position), dtype=torch.int64), 1)
+
+
+def crowd(position: Tensor, cells: int = 8) -> Density:
+    """Return the densities of one window."""
+    return Density.of(grid(cells), position, torch.zeros(len(position), dtype=torch.int64), 1)
+
+
+def turn(position: Tensor, angle: float) -> Tensor:
+    """Return positions turned about the middle of the box."""
+    cosine, sine = np.cos(angle), np.sin(angle)
+    return (position - 0.5) @ torch.tensor([[cosine, sine], [-sine, cosine]]) + 0.5
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.4, 2.0, -3.1])
+def test_rigid_motion_is_left_as_it_is(angle: float) -> None:
+    """However far a body turns and flies, it has its shape."""
+    first = body(0)
+    moved = turn(first, angle) + torch.tensor([0.1, -0.2])
+    torch.testing.assert_close(shape(first).matched(moved), moved, rtol=0, atol=1e-9)
+
+
+def test_clusters_turn_as_scipy_says() -> None:
+    """Each cluster's rotation is the best weighted one, found by SciPy node by node."""
+    rng = np.random.default_rng(0)
+    first = body(0, low=0.4, high=0.6)[:40]
+    now = turn(first, 0.7) + torch.from_numpy(rng.normal(0.0, 0.01, (40, 2)))
+    found = shape(first, cells=6)
+    weight = np.zeros((found.nodes, 40))
+    for particle, (nodes, shares) in enumerate(
+        zip(found.stencil.node.view(-1, 9), found.stencil.weight, strict=True)
+    ):
+        weight[nodes.numpy(), particle] = shares.numpy()
+    expected = np.zeros((40, 2))
+    for each in weight[weight.sum(axis=1) > 0.0]:
+        x, y = (np.pad(one.numpy(), ((0, 0), (0, 1))) for one in (first, now))
+        here, there = (np.average(one, axis=0, weights=each) for one in (x, y))
+        best, _ = Rotation.align_vectors(y - there, x - here, weights=each)
+        angle = best.as_rotvec()[2]  # in the plane: no other axis
+        flat = Rotation.from_rotvec([0.0, 0.0, angle])
+        expected += each[:, None] * (there + flat.apply(x - here))[:, :2]
+    np.testing.assert_allclose(found.matched(now).numpy(), expected, rtol=0, atol=1e-9)
+
+
+def test_shape_matching_keeps_both_momenta_and_restores_the_shape() -> None:
+    """Whatever a body is pressed to, its centre and its spin stay, and every step is nearer to its shape."""
+    rng = np.random.default_rng(1)
+    first, found = body(0), shape(body(0))
+    now = turn(first, 0.3) + torch.from_numpy(rng.normal(0.0, 0.02, first.shape))
+    there = found.matched(now)
+    pushed = there - now
+    torch.testing.assert_close(pushed.sum(dim=0), torch.zeros(2).double(), rtol=0, atol=1e-9)
+    spin = (now[:, 0] * pushed[:, 1] - now[:, 1] * pushed[:, 0]).sum()
+    assert abs(float(spin)) < 1e-9 < float(pushed.abs().sum())
+    before, after = ((torch.pdist(one) - torch.pdist(first)).square().mean() for one in (now, there))
+    assert float(after) < 0.1 * float(before)
+
+
+def test_a_lone_particle_has_finite_gradients() -> None:
+    """It has no direction and stays where it is."""
+    first = torch.tensor([[0.51, 0.52]], dtype=torch.float64)
+    now = torch.tensor([[0.3, 0.4]], dtype=torch.float64, requires_grad=True)
+    there = shape(first).matched(now)
+    there.sum().backward()
+    torch.testing.assert_close(there, now)
+    assert now.grad is not None
+    assert bool(now.grad.isfinite().all())
+
+
+@pytest.mark.parametrize("cells", [6, 10])
+def test_a_full_box_is_evenly_dense(cells: int) -> None:
+    """Beside walls too, where nodes lie partly outside."""
+    (low, high), _ = BOUNDS
+    axis = low + (high - low) * (torch.arange(120).double() + 0.5) / 120
+    lattice = torch.cartesian_prod(axis, axis)
+    found = crowd(lattice, cells)
+    rho = found.relative(found.grid.stencil(lattice, torch.zeros(len(lattice), dtype=torch.int64)))
+    torch.testing.assert_close(rho, torch.ones_like(rho), rtol=2e-3, atol=0)
+    assert float(found.most) == pytest.approx((120 / cells) ** 2, rel=2e-3)
+
+
+def test_what_is_pressed_together_comes_apart() -> None:
+    """At rest nothing moves, by a bit; two bodies in one place part, and their centre stays."""
+    first = torch.cat([body(0, 0.3, 0.45), body(1, 0.55, 0.7)])
+    found, limit = crowd(first), torch.ones(len(first)).double()
+    assert torch.equal(found.eased(first, torch.tensor(1.0), limit), first)
+    now = first.clone()
+    now[256:] -= 0.22
+    there, most = now, []
+    for _ in range(12):
+        most.append(float(found.relative(found.grid.stencil(there, found.sample)).max()))
+        there = found.eased(there, torch.tensor(1.0), limit)
+    torch.testing.assert_close(there.mean(dim=0), now.mean(dim=0), rtol=0, atol=1e-9)
+    assert most[0] > 1.6
+    assert most[-1] < 1.15
+
+
+def test_liquids_and_other_windows_are_none_of_a_shape() -> None:
+    """Only jelly and rope come back; windows side by side have what each has alone."""
+    first = torch.cat([body(0), body(1)]).float()
+    now = first + 0.02 * torch.randn(first.shape, generator=torch.Generator().manual_seed(0))
+    sample = torch.arange(2).repeat_interleave(256)
+    model = Projection(BOUNDS, shape=(4, 8), density=(8,))
+    material = torch.tensor([0, 1, 2, 3]).repeat(128)
+    together = model(model.start(first, material, sample, 2), now)
+    for window in range(2):
+        own = sample == window
+        alone = model(model.start(first[own], material[own], torch.zeros(256).long(), 1), now[own])
+        torch.testing.assert_close(together[own], alone, rtol=0, atol=1e-6)
+    still = Projection(BOUNDS, shape=(4, 8), density=())
+    moved = (still(still.start(first, material, sample, 2), now) - now).abs().amax(dim=1) > 0.0
+    assert torch.equal(moved, (material == 1) | (material == 3))
