@@ -19,10 +19,10 @@ from .graph import MATERIALS, Bounds
 from .particle_grid import ParticleGrid, Stencil
 
 ELASTIC = (1, 3)  # jelly and rope, the materials that come back to their shape
-HEAVY = 10.0  # what a weight counts for: the few here are to be learned as fast as thousands of others
+HEAVY = 30.0  # what a weight counts for: the few here are to be learned as fast as thousands of others
 HELD = 3.0  # log-odds of the share of the way to their shape that bodies go, before training
 MOST_PUSH = 2.0  # greatest k of Density
-LIMIT = 0.02  # what a change of 1 is to the density that is not too much: hardly learned, it would blow bodies up
+LIMIT = 0.2  # what a change of 1 is to the density that is not too much: hardly learned, it would blow bodies up
 
 TINY = 1e-16
 """Square of a cluster's moment [length^4] below which it has no direction."""
@@ -204,7 +204,7 @@ class Projection(nn.Module):
             position: where particles would be without [length], shape [particle, 2].
         """
         if drawn.densities:
-            limit = (1.0 + HEAVY * LIMIT * self.limit)[drawn.material]
+            limit = (1.0 + LIMIT * self.limit)[drawn.material]
             for push, density in zip(MOST_PUSH * (HEAVY * self.push).sigmoid(), drawn.densities, strict=True):
                 position = density.eased(position, push, limit)
         if drawn.shapes and len(drawn.elastic):
