@@ -22,7 +22,7 @@ ELASTIC = (1, 3)  # jelly and rope, the materials that come back to their shape
 HEAVY = 30.0  # what a weight counts for: the few here are to be learned as fast as thousands of others
 HELD = 3.0  # log-odds of the share of the way to their shape that bodies go, before training
 MOST_PUSH = 2.0  # greatest k of Density
-LIMIT = 0.2  # what a change of 1 is to the density that is not too much: hardly learned, it would blow bodies up
+LIMIT = 0.2  # what a change of 1 is to the density that is not too much; with more, bodies are blown up
 
 TINY = 1e-16
 """Square of a cluster's moment [length^4] below which it has no direction."""
@@ -121,9 +121,8 @@ class Density:
         inverse = 1.0 / grid.inside().clamp(min=LEAST)
         empty = cls(grid, inverse, sample, position.new_ones(windows))
         found = empty.relative(grid.stencil(position.clamp(grid.low, grid.high), sample))
-        return cls(
-            grid, inverse, sample, position.new_zeros(windows).scatter_reduce(0, sample, found, "amax")
-        )
+        most = position.new_zeros(windows).scatter_reduce(0, sample, found, "amax")
+        return cls(grid, inverse, sample, most)
 
     def relative(self, stencil: Stencil) -> Tensor:
         """Return rho of particles whose nodes these are [1], shape [particle]."""
@@ -174,9 +173,12 @@ class Projection(nn.Module):
         super().__init__()
         self.clusters = nn.ModuleList(ParticleGrid(bounds, cells) for cells in shape)
         self.cells = nn.ModuleList(ParticleGrid(bounds, cells) for cells in density)
-        self.held = nn.Parameter(torch.full((len(shape), len(ELASTIC)), HELD / HEAVY))
-        self.push = nn.Parameter(torch.zeros(len(density)))
-        self.limit = nn.Parameter(torch.zeros(MATERIALS))
+        # Weights that no grid needs would get no gradient, which training on several devices refuses.
+        if shape:
+            self.held = nn.Parameter(torch.full((len(shape), len(ELASTIC)), HELD / HEAVY))
+        if density:
+            self.push = nn.Parameter(torch.zeros(len(density)))
+            self.limit = nn.Parameter(torch.zeros(MATERIALS))
 
     def start(self, first: Tensor, material: Tensor, sample: Tensor, windows: int) -> Drawn:
         """Return what windows are drawn to.
@@ -207,7 +209,7 @@ class Projection(nn.Module):
             limit = (1.0 + LIMIT * self.limit)[drawn.material]
             for push, density in zip(MOST_PUSH * (HEAVY * self.push).sigmoid(), drawn.densities, strict=True):
                 position = density.eased(position, push, limit)
-        if drawn.shapes and len(drawn.elastic):
+        if drawn.shapes:
             there = position.index_select(0, drawn.elastic)
             for share, shape in zip((HEAVY * self.held).sigmoid(), drawn.shapes, strict=True):
                 there = there + share[drawn.kind][:, None] * (shape.matched(there) - there)

@@ -139,3 +139,13 @@ def test_liquids_and_other_windows_are_none_of_a_shape() -> None:
     still = Projection(BOUNDS, shape=(4, 8), density=())
     moved = (still(still.start(first, material, sample, 2), now) - now).abs().amax(dim=1) > 0.0
     assert torch.equal(moved, (material == 1) | (material == 3))
+
+
+def test_every_weight_has_a_gradient() -> None:
+    """Where nothing is elastic or dense too, as training on several devices asks for."""
+    first = body(0).float()
+    for material in (0, 1):
+        model = Projection(BOUNDS, shape=(4, 8), density=(8,))
+        drawn = model.start(first, torch.full((256,), material), torch.zeros(256).long(), 1)
+        model(drawn, first + 0.3).sum().backward()
+        assert all(each.grad is not None for each in model.parameters())
