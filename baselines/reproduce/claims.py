@@ -107,6 +107,11 @@ CLAIMS = (
         rivals=("neuralmpm-long", "neuralmpm"),
     ),
     Claim(
+        question="Does NeuralMPM gain by holding bodies in shape and matter from being pressed together?",
+        first="neuralmpm-projected",
+        rivals=("neuralmpm-conserving",),
+    ),
+    Claim(
         question="Does NeuralMPM gain by the mean over the images of the box, with the same weights?",
         first="neuralmpm-averaged",
         rivals=("neuralmpm",),
