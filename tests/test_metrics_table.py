@@ -344,3 +344,13 @@ def test_what_is_no_number_is_told_with_its_metric(value: object) -> None:
     with pytest.raises(WorkFailedError) as caught:
         bad.measure(pairs_of(scenario_of(truth), truth, truth)[0])
     assert caught.value.where == f"{__name__}, enstrophy_error"
+
+
+def test_what_a_statistic_raises_is_told_with_metric_and_frame() -> None:
+    """The error itself goes on, with a note."""
+    truth = rollout()
+    bad = replace(OTHERS, statistic=lambda pair: 1 / (pair.frame - pair.frame))
+    pair = pairs_of(scenario_of(truth), truth, truth)[0]
+    with pytest.raises(ZeroDivisionError) as caught:
+        bad.measure(pair)
+    assert caught.value.__notes__ == [f"in metric enstrophy_error, frame {pair.frame}"]

@@ -53,10 +53,8 @@ class _Commands(TyperGroup):
             fix = f"this is a fault of lagbench; please report it with the output of\n       {again}"
             if (place := package_at_fault(error)) is not None:
                 fix = f"mend or uninstall the package of {place};\n       {again} has the whole trace"
-            typer.echo(
-                f"lagbench: unexpected {type(error).__name__}: {printable(str(error))}\n  fix: {fix}",
-                err=True,
-            )
+            said = printable(", ".join([str(error), *getattr(error, "__notes__", ())]))
+            typer.echo(f"lagbench: unexpected {type(error).__name__}: {said}\n  fix: {fix}", err=True)
             raise typer.Exit(FAILED) from error
 
 

@@ -178,7 +178,11 @@ class Metric:
         """
         if self.statistic is None or not self.defined(pair):
             return math.nan
-        value: object = self.statistic(pair)
+        try:
+            value: object = self.statistic(pair)
+        except Exception as error:
+            error.add_note(f"in metric {self.name}, frame {pair.frame}")
+            raise
         with suppress(TypeError, ValueError, OverflowError, RuntimeError):  # as arrays of others raise
             if not isinstance(value, (str, bytes, complex)):
                 return float(value)  # type: ignore[arg-type]

@@ -224,7 +224,8 @@ def crashed(error: Exception) -> WorkFailedError:
     """Return what a task raised that it should not, as an error of ours."""
     if (place := package_at_fault(error)) is not None:
         fix = "mend or uninstall that package"
-        return WorkFailedError("a package failed in a worker", where=place, got=repr(error), fix=fix)
+        got = ", ".join([repr(error), *getattr(error, "__notes__", ())])
+        return WorkFailedError("a package failed in a worker", where=place, got=got, fix=fix)
     last = "".join(traceback.format_exception(error, limit=-6))
     return WorkFailedError("a worker crashed", got=f"{error!r}\n{last}")
 
