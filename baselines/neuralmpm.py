@@ -8,7 +8,8 @@ after Rochman Sharabi, Lewin and Louppe (2024), arXiv 2408.15753. u is the veloc
 of a material or of all together: only what particles have beyond it is damped, so that rollouts
 keep their energy. A node's accelerations are those of the matter that is there in frame f, wherever
 it goes in the bundle: one transfer each way serves all of its frames. Training unrolls several
-calls. The U-Net's last layer starts at zero: an untrained model keeps every velocity.
+calls. The U-Net's last layer starts at zero: an untrained model keeps every velocity, but for what
+``shape`` and ``density`` change.
 
 With ``conserve`` bodies push each other and themselves as those of the material-point method do,
 
@@ -18,7 +19,7 @@ by stresses s of each material, which fade where matter is thin, and, beside wal
 w: away from walls momentum is conserved, whatever the weights. One grid pushes all materials.
 
 With ``shape`` and ``density`` positions are then drawn to where elastic bodies have the shape of the first
-frame and no matter is denser than there (:mod:`~lagbench.baselines.projection`).
+frame and matter is less dense than there (:mod:`~lagbench.baselines.projection`).
 """
 
 from __future__ import annotations
@@ -49,11 +50,14 @@ STIFF = 4.0  # what a stress of 1 is, in deviations of accelerations times a cel
 FULL = 2.5  # weight inside a body whose particles lie 1.6 to a radius, and from which on it bears all
 HEAVY = 10.0  # what a fall of 1 is, in deviations of accelerations
 
+Grids = Annotated[tuple[Annotated[int, Field(ge=2, le=256)], ...], Field(max_length=8)]
+
 
 class NeuralMPMOptions(Options):
     """Options of the grid surrogate."""
 
     in_training = frozenset({"calls", "pushforward", "recovery", "noise_std"})
+    of_weights = frozenset({"shape", "density"})  # weights are of grids in this order
 
     # cells of the network's grid across the box; even, so that walls lie between two nodes on all sides
     cells: int = Field(default=18, ge=4, le=256, multiple_of=2)
@@ -78,9 +82,9 @@ class NeuralMPMOptions(Options):
     # whether the U-Net sees how far solids are strained since the scenario's first frame
     strain: bool = False
     # cells across the box of the grids on which elastic bodies are held in shape, one after the other
-    shape: tuple[Annotated[int, Field(ge=2, le=256)], ...] = ()
-    # the same of those on which matter is kept from being denser than in the first frame
-    density: tuple[Annotated[int, Field(ge=2, le=256)], ...] = ()
+    shape: Grids = ()
+    # the same of those on which matter is pushed out of where it is denser than in the first frame
+    density: Grids = ()
     symmetry: Symmetry = Symmetry.NONE  # images that training windows are replaced by at random
     # whether calls of rollouts, not of training, are means over those images, at as many times the cost
     average: bool = False
@@ -338,10 +342,12 @@ class NeuralMPM(Baseline):
         stress, beside = output.tensor_split([3 * len(self.options.materials) * frames], dim=1)
         stress = STIFF * stress.reshape(-1, 3 * frames, *self.grid.shape)
         shared = self.grid.stencil(state.position, state.sample)  # one layer for all materials
-        mass = self.grid.spread(shared, torch.ones_like(state.position[:, :1]), windows) / self.unit
-        inside = (self.grid.gather(shared, mass) / FULL).clamp(max=1.0).square()  # a surface bears less
+        mass = self.grid.spread(shared, torch.ones_like(state.position[:, :1]), windows)
+        inside = (
+            (self.grid.gather(shared, mass / self.unit) / FULL).clamp(max=1.0).square()
+        )  # a surface bears less
         of_particle = self.grid.gather(stencil, stress) * inside
-        pushed = self.grid.pushed(shared, state.position, of_particle.view(-1, frames, 3), windows)
+        pushed = self.grid.pushed(shared, state.position, of_particle.view(-1, frames, 3), mass)
         near = (1.0 - self.grid.wall_distance(BESIDE * self.grid.spacing).amin(dim=0)).clamp(0.0, 1.0)
         accelerations = self.grid.gather(shared, pushed + near * beside).view(-1, frames, 2)
         if self.fall is not None:

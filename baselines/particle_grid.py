@@ -106,7 +106,7 @@ class ParticleGrid(nn.Module):
         nodes = field.permute(0, 2, 3, 1).reshape(-1, channels).index_select(0, stencil.node)
         return (stencil.weight[:, :, None] * nodes.view(-1, 9, channels)).sum(dim=1)
 
-    def pushed(self, stencil: Stencil, position: Tensor, stress: Tensor, layers: int) -> Tensor:
+    def pushed(self, stencil: Stencil, position: Tensor, stress: Tensor, mass: Tensor) -> Tensor:
         """Return the accelerations of the nodes of matter under stress, 0 where there is none.
 
             m_i a_i = -sum_p s_p grad b_i(x_p),   m_i = sum_p b_i(x_p)
@@ -118,7 +118,7 @@ class ParticleGrid(nn.Module):
             stencil: what :meth:`stencil` returned.
             position: the same positions [length], shape [particle, 2].
             stress: components (xx, xy, yy) for each particle, shape [particle, frame, 3].
-            layers: number of layers.
+            mass: what :meth:`spread` returned of 1, shape [layer, 1, x node, y node].
 
         Returns:
             Components (x, y) for each frame, shape [layer, 2 frame, x node, y node].
@@ -127,10 +127,10 @@ class ParticleGrid(nn.Module):
         along_x, along_y = spline_slopes(self._corner(position)[1]).flatten(2)[..., None].unbind(dim=1)
         xx, xy, yy = stress[:, None].unbind(dim=3)
         force = -torch.stack([xx * along_x + xy * along_y, xy * along_x + yy * along_y], dim=3)
-        parts, nodes = force.flatten(2).flatten(0, 1), layers * columns * rows
-        sums = force.new_zeros(nodes, parts.shape[1]).index_add(0, stencil.node, parts)
-        mass = force.new_zeros(nodes).index_add(0, stencil.node, stencil.weight.flatten())
-        return (sums / mass.clamp(min=1e-9)[:, None]).view(layers, columns, rows, -1).permute(0, 3, 1, 2)
+        parts = force.flatten(2).flatten(0, 1)
+        sums = force.new_zeros(mass.numel(), parts.shape[1]).index_add(0, stencil.node, parts)
+        sums = sums / mass.flatten().clamp(min=1e-9)[:, None]
+        return sums.view(len(mass), columns, rows, -1).permute(0, 3, 1, 2)
 
     def offsets(self, stencil: Stencil, position: Tensor) -> Tensor:
         """Return how far the nine nodes lie from each particle [length], shape [particle, 9, 2]."""

@@ -3,7 +3,8 @@
 Waves cross a stiff body or a liquid within few frames. From one to the next its parts move almost
 rigidly, or without being pressed together, which forces that are told once a frame on a coarse grid
 do not achieve. Constraints on positions do (position-based dynamics, Mueller et al. 2007,
-doi 10.1016/j.jvcir.2007.01.005); velocities are then those of the positions. Momentum is kept.
+doi 10.1016/j.jvcir.2007.01.005); velocities are then those of the positions. Where all particles have
+one mass and walls are far, no projection moves a centre of mass.
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ LIMIT = 0.2  # what a change of 1 is to the density that is not too much; with m
 TINY = 1e-16
 """Square of a cluster's moment [length^4] below which it has no direction."""
 
-LEAST = 0.02
-"""Least share of a node's cell inside the box that its weight is divided by; two walls leave 1/36."""
+LEAST = 4e-4
+"""Least share of a node's spline inside the box that its weight is divided by; no node in reach has less."""
 
 MOST_EXCESS = 1.0
 """Excess of density beyond which matter is pushed no farther at once [1]."""
@@ -43,11 +44,13 @@ class Shape:
     with C_i and c_i the means of positions in the first frame and now, weighted by the b_i, and R_i the
     rotation that fits a cluster's motion best: shape matching (Mueller et al. 2005,
     doi 10.1145/1073204.1073216) by overlapping regions (Rivers and James 2007,
-    doi 10.1145/1276377.1276480). As the b_i sum to 1 and the R_i fit best, x' has the momentum and the
-    angular momentum of x.
+    doi 10.1145/1276377.1276480). As the b_i sum to 1 and the R_i fit best, the sums of x' - x and of
+    x cross (x' - x) over a body are 0: it is neither moved nor turned.
     """
 
     stencil: Stencil  # nodes around X
+    layer: Tensor  # layer of each particle, int64, shape [particle]
+    count: Tensor  # particles of each layer, at least 1, shape [layer, 1]
     nodes: int  # of all layers
     inverse: Tensor  # 1 over the sum of the weights at a node [1], shape [node, 1]
     arm: Tensor  # X_p - C_i [length], shape [particle, 9, 2]
@@ -64,11 +67,15 @@ class Shape:
         """
         position = position.clamp(grid.low, grid.high)
         stencil = grid.stencil(position, layer)
-        sums = grid.spread(stencil, torch.cat([torch.ones_like(position[:, :1]), position], dim=1), layers)
+        # A cluster whose arms do not add up to 0 turns a little in every frame: rounding would spin bodies.
+        exact, one = position.double(), torch.ones_like(position[:, :1])
+        exact_stencil = Stencil(stencil.weight.double(), stencil.node)
+        sums = grid.spread(exact_stencil, torch.cat([one.double(), exact], dim=1), layers)
         sums = sums.permute(0, 2, 3, 1).reshape(-1, 3)
         inverse = 1.0 / sums[:, :1].clamp(min=1e-6)
-        centre = (sums[:, 1:] * inverse).index_select(0, stencil.node).view(-1, 9, 2)
-        return cls(stencil, len(inverse), inverse, position[:, None] - centre)
+        arm = exact[:, None] - (sums[:, 1:] * inverse).index_select(0, stencil.node).view(-1, 9, 2)
+        count = position.new_zeros(layers, 1).index_add(0, layer, one).clamp(min=1.0)
+        return cls(stencil, layer, count, len(inverse), inverse.to(position), arm.to(position))
 
     def matched(self, position: Tensor) -> Tensor:
         """Return x', the mean of where the clusters of a particle have it [length], shape [particle, 2].
@@ -77,7 +84,10 @@ class Shape:
             position: x, positions of the same particles now [length], shape [particle, 2].
         """
         weight, (along_x, along_y) = self.stencil.weight, self.arm.unbind(dim=2)
-        x, y = position[:, None].unbind(dim=2)
+        # Moments are taken about the middle of each body: about a far point they would be rounded more.
+        mean = position.new_zeros(len(self.count), 2).index_add(0, self.layer, position) / self.count
+        middle = mean.index_select(0, self.layer)
+        x, y = (position - middle)[:, None].unbind(dim=2)
         cosine, sine = x * along_x + y * along_y, y * along_x - x * along_y
         moments = torch.stack([x.expand_as(weight), y.expand_as(weight), cosine, sine], dim=2)
         parts = (weight[..., None] * moments).flatten(0, 1)
@@ -87,18 +97,18 @@ class Shape:
         motion = torch.cat([sums[:, :2] * self.inverse, sums[:, 2:] / length], dim=1)
         x, y, cosine, sine = motion.index_select(0, self.stencil.node).view(-1, 9, 4).unbind(dim=2)
         there = [x + cosine * along_x - sine * along_y, y + sine * along_x + cosine * along_y]
-        return (weight[..., None] * torch.stack(there, dim=2)).sum(dim=1)
+        return middle + (weight[..., None] * torch.stack(there, dim=2)).sum(dim=1)
 
 
 @dataclass(frozen=True)
 class Density:
-    """How dense matter was at most in the first frame, and a push out of where it is denser.
+    """How dense matter was at most in the first frame, and a push out of where it is too dense beside that.
 
-        x' = x + d G2P(a),   m_i a_i = k sum_p max(rho_p - l_p, 0) grad b_i(x_p)
+        x' = x + d G2P(a),   m_i a_i = k sum_p min(max(rho_p - l_p, 0), 1) grad b_i(x_p)
+        rho = G2P(P2G(1) / V) / (its greatest value in the window's first frame)
 
-    with d the width of a cell, a from :meth:`ParticleGrid.pushed` by that pressure, and rho = G2P(P2G(1) / V)
-    the density over that of the window's densest place in the first frame, V the share of a node's
-    cell inside the box: what density constraints of particles (Macklin and Mueller 2013,
+    with d the width of a cell, a from :meth:`ParticleGrid.pushed` by that pressure, and V the share of a
+    node's spline inside the box: what density constraints of particles (Macklin and Mueller 2013,
     doi 10.1145/2461912.2461984) and density projection on grids (Kugelstadt et al. 2019,
     doi 10.1109/TVCG.2019.2947437) do, by one explicit step. Away from walls momentum is kept.
     """
@@ -120,15 +130,15 @@ class Density:
         """
         inverse = 1.0 / grid.inside().clamp(min=LEAST)
         empty = cls(grid, inverse, sample, position.new_ones(windows))
-        found = empty.relative(grid.stencil(position.clamp(grid.low, grid.high), sample))
+        found, _ = empty.relative(grid.stencil(position.clamp(grid.low, grid.high), sample))
         most = position.new_zeros(windows).scatter_reduce(0, sample, found, "amax")
         return cls(grid, inverse, sample, most)
 
-    def relative(self, stencil: Stencil) -> Tensor:
-        """Return rho of particles whose nodes these are [1], shape [particle]."""
+    def relative(self, stencil: Stencil) -> tuple[Tensor, Tensor]:
+        """Return rho of particles whose nodes these are [1], shape [particle], and P2G(1)."""
         one = torch.ones_like(stencil.weight[:, :1])
-        mass = self.grid.spread(stencil, one, len(self.most)) * self.inverse
-        return self.grid.gather(stencil, mass)[:, 0] / self.most[self.sample]
+        mass = self.grid.spread(stencil, one, len(self.most))
+        return self.grid.gather(stencil, mass * self.inverse)[:, 0] / self.most[self.sample], mass
 
     def eased(self, position: Tensor, push: Tensor, limit: Tensor) -> Tensor:
         """Return x' [length], shape [particle, 2].
@@ -140,10 +150,11 @@ class Density:
         """
         position = position.clamp(self.grid.low, self.grid.high)
         stencil = self.grid.stencil(position, self.sample)
-        pressure = push * (self.relative(stencil) - limit).clamp(0.0, MOST_EXCESS)
+        rho, mass = self.relative(stencil)
+        pressure = push * (rho - limit).clamp(0.0, MOST_EXCESS)
         none = torch.zeros_like(pressure)
         stress = -torch.stack([pressure, none, pressure], dim=1)[:, None]
-        moved = self.grid.gather(stencil, self.grid.pushed(stencil, position, stress, len(self.most)))
+        moved = self.grid.gather(stencil, self.grid.pushed(stencil, position, stress, mass))
         return position + self.grid.spacing * moved
 
 
@@ -161,7 +172,8 @@ class Drawn:
 class Projection(nn.Module):
     """Matter pushed out of where it is too dense, then elastic bodies drawn to their shape.
 
-    How far, and what is too dense for a material, is learned.
+    How far is learned, for each grid, and so is which share of the first frame's greatest density is too
+    dense for a material: a little below 1 a liquid is under pressure, which the network learns to bear.
 
     Args:
         bounds: box (low, high) along x and y [length].
@@ -199,7 +211,9 @@ class Projection(nn.Module):
         return Drawn(elastic, kind, tuple(shapes), tuple(densities), material)
 
     def forward(self, drawn: Drawn, position: Tensor) -> Tensor:
-        """Return the positions that a frame comes to [length], shape [particle, 2]; walls do not count.
+        """Return the positions that a frame comes to [length], shape [particle, 2].
+
+        They may lie beyond walls; where densities are asked for, what lies there is put back first.
 
         Args:
             drawn: what :meth:`start` returned.

@@ -86,7 +86,7 @@ def first_frame(given: Batch) -> Tensor:
         return given.origin
     if bool((given.frame != 0).any()):
         raise UsageError(
-            "strain is counted from the scenario's first frame",
+            "the model needs the positions in the scenario's first frame",
             where="batch.origin",
             expected="the positions in it",
             got=f"none, in windows from frame {int(given.frame.max())}",

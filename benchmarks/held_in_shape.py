@@ -57,7 +57,7 @@ def figures(size: Size, root: Path, read: Read | None, cells: tuple[int, int]) -
         for frame in frames:
             now = torch.from_numpy(truth[frame] if read is None else read(scenario, frame))
             off = (shape.matched(now) - now).norm(dim=1)
-            dense = density.relative(nodes.stencil(now, one))
+            dense, _ = density.relative(nodes.stencil(now, one))
             for kind in sorted(set(material.tolist())):
                 own = material == kind
                 rows[kind].append([float(off[own].mean()), float(dense[own].quantile(0.95))])

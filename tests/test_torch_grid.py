@@ -221,7 +221,8 @@ def test_stresses_push_as_the_slopes_of_the_splines_say() -> None:
     rng = torch.Generator().manual_seed(0)
     stress = torch.randn(200, 3, 3, generator=rng)
     stencil = grid.stencil(place, layer)
-    found = grid.pushed(stencil, place, stress, 2)
+    mass = grid.spread(stencil, torch.ones_like(place[:, :1]), 2)
+    found = grid.pushed(stencil, place, stress, mass)
     moved = place.clone().requires_grad_()
     weight = grid.stencil(moved, layer).weight
     slopes = torch.stack(
