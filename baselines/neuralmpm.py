@@ -19,7 +19,7 @@ by stresses s of each material, which fade where matter is thin, and, beside wal
 w: away from walls momentum is conserved, whatever the weights. One grid pushes all materials.
 
 With ``shape`` and ``density`` positions are then drawn to where elastic bodies have the shape of the first
-frame and matter is less dense than there (:mod:`~lagbench.baselines.projection`).
+frame and matter is not pressed together (:mod:`~lagbench.baselines.projection`).
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from .graph import MATERIALS
 from .particle_grid import ParticleGrid, Stencil
 from .projection import Drawn, Projection
 from .strain import Rest, first_frame
-from .unet import COARSEST, UNet
+from .unet import COARSEST, Context, UNet
 
 EMPTY = 1e-3  # below this weight, in units of particles a radius apart, a node's velocity fades to 0
 REACH = 4  # cells over which the U-Net sees how far a wall is
@@ -83,7 +83,7 @@ class NeuralMPMOptions(Options):
     strain: bool = False
     # cells across the box of the grids on which elastic bodies are held in shape, one after the other
     shape: Grids = ()
-    # the same of those on which matter is pushed out of where it is denser than in the first frame
+    # the same of those on which matter is pushed out of where it is denser than it was anywhere at first
     density: Grids = ()
     symmetry: Symmetry = Symmetry.NONE  # images that training windows are replaced by at random
     # whether calls of rollouts, not of training, are means over those images, at as many times the cost
@@ -104,27 +104,6 @@ class GridState:
     rest: Rest | None = None  # None where strain is not asked for
     drawn: Drawn | None = None  # None where no projection is asked for
     coming: tuple[Tensor, ...] = ()  # predicted positions that are not yet given out
-
-
-class Context(nn.Module):
-    """A few numbers that the given frames tell about a scenario as a whole."""
-
-    def __init__(self, inputs: int, outputs: int, width: int) -> None:
-        super().__init__()
-        self.fields = nn.Sequential(
-            nn.Conv2d(inputs, width, 3, padding=1),
-            nn.GELU(),
-            nn.Conv2d(width, width, 3, stride=2, padding=1),
-            nn.GELU(),
-            nn.Conv2d(width, width, 3, padding=1),
-            nn.GELU(),
-        )
-        self.numbers = nn.Sequential(nn.Linear(width, width), nn.GELU(), nn.Linear(width, outputs))
-
-    def forward(self, field: Tensor) -> Tensor:
-        """Return the numbers, shape [window, outputs]."""
-        numbers: Tensor = self.numbers(self.fields(field).mean(dim=(2, 3)))
-        return numbers.to(field.dtype)
 
 
 class NeuralMPM(Baseline):
@@ -261,12 +240,12 @@ class NeuralMPM(Baseline):
             walls=walls,
             context=position.new_zeros(given.windows, 0),
         )
-        layers = given.windows * len(self.options.materials)
         if self.projection is not None:
             first = first_frame(given)
             drawn = self.projection.start(first, given.material, given.sample, given.windows)
             state = replace(state, drawn=drawn)
         if self.options.strain:
+            layers = given.windows * len(self.options.materials)
             solid = given.material != LIQUID
             state = replace(
                 state, rest=Rest.of(self.grid, first_frame(given), state.layer, layers, solid=solid)
@@ -343,10 +322,10 @@ class NeuralMPM(Baseline):
         stress = STIFF * stress.reshape(-1, 3 * frames, *self.grid.shape)
         shared = self.grid.stencil(state.position, state.sample)  # one layer for all materials
         mass = self.grid.spread(shared, torch.ones_like(state.position[:, :1]), windows)
-        inside = (
+        load = (
             (self.grid.gather(shared, mass / self.unit) / FULL).clamp(max=1.0).square()
         )  # a surface bears less
-        of_particle = self.grid.gather(stencil, stress) * inside
+        of_particle = self.grid.gather(stencil, stress) * load
         pushed = self.grid.pushed(shared, state.position, of_particle.view(-1, frames, 3), mass)
         near = (1.0 - self.grid.wall_distance(BESIDE * self.grid.spacing).amin(dim=0)).clamp(0.0, 1.0)
         accelerations = self.grid.gather(shared, pushed + near * beside).view(-1, frames, 2)

@@ -1,4 +1,4 @@
-"""A U-Net on the nodes of a grid: three levels of resolution, shortcuts between equal ones."""
+"""Convolutions on the nodes of a grid: a U-Net, and what tells a few numbers about the whole of it."""
 
 from __future__ import annotations
 
@@ -56,3 +56,24 @@ class UNet(nn.Module):
         with torch.autocast(field.device.type, enabled=False):
             output: Tensor = self.end(gelu(fine.to(field.dtype)))
         return output
+
+
+class Context(nn.Module):
+    """A few numbers that the given frames tell about a scenario as a whole."""
+
+    def __init__(self, inputs: int, outputs: int, width: int) -> None:
+        super().__init__()
+        self.fields = nn.Sequential(
+            nn.Conv2d(inputs, width, 3, padding=1),
+            nn.GELU(),
+            nn.Conv2d(width, width, 3, stride=2, padding=1),
+            nn.GELU(),
+            nn.Conv2d(width, width, 3, padding=1),
+            nn.GELU(),
+        )
+        self.numbers = nn.Sequential(nn.Linear(width, width), nn.GELU(), nn.Linear(width, outputs))
+
+    def forward(self, field: Tensor) -> Tensor:
+        """Return the numbers, shape [window, outputs]."""
+        numbers: Tensor = self.numbers(self.fields(field).mean(dim=(2, 3)))
+        return numbers.to(field.dtype)
