@@ -129,11 +129,10 @@ def test_what_is_pressed_together_comes_apart(shift: tuple[float, float]) -> Non
 
 
 def test_a_heap_is_not_thrown_apart() -> None:
-    """All in one place: what is pushed goes about a cell, not dozens."""
-    first = body(0)
-    found, heap = crowd(first), 0.5 + 1e-3 * body(1)
+    """A body in a twenty-fifth of its place: what is pushed goes a cell or two, however dense it is."""
+    found, heap = crowd(body(0)), 0.5 + 0.2 * (body(1) - 0.5)
     moved = found.eased(heap, torch.tensor(1.0), torch.ones(256).double()) - heap
-    assert 1e-3 < float(moved.norm(dim=1).max()) < 1.5 * found.grid.spacing
+    assert 1.0 < float(moved.norm(dim=1).max()) / found.grid.spacing < 2.5
 
 
 def test_nothing_spins_by_rounding() -> None:
