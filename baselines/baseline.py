@@ -13,10 +13,10 @@ from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self, get_args
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationInfo, field_validator
 from torch import Tensor, nn
 
 from lagbench.data.layout import dataset_folder
@@ -40,15 +40,29 @@ __all__ = [
 ]
 
 
-class Options(BaseModel):
-    """Base of the options of a model: frozen, unknown keys are errors.
+class Settings(BaseModel):
+    """Base of what recipes and ``--set`` fill: frozen; unknown keys are errors, and so is yes for a number."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _no_number(cls, value: object, info: ValidationInfo) -> object:
+        kind = cls.model_fields[str(info.field_name)].annotation
+        if isinstance(value, bool) and bool not in {kind, *get_args(kind)}:
+            message = "a value that is not yes or no"  # which would count as 1 or 0
+            raise ValueError(message)
+        return value
+
+
+class Options(Settings):
+    """Base of the options of a model.
 
     Class attributes:
         in_training: names of the options of the training; a trained model refuses changes of them.
         of_weights: names of options that say what weights mean where their shapes do not tell; likewise.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
     in_training: ClassVar[frozenset[str]] = frozenset()
     of_weights: ClassVar[frozenset[str]] = frozenset()
 

@@ -31,14 +31,11 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from lagbench.data.yamlfile import read_yaml
 from lagbench.errors import LagbenchError, UnreadableFileError, UsageError, nearest
 
+from .baseline import Settings
 from .catalogue import Entry, names
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class Schedule(_Strict):
+class Schedule(Settings):
     """Learning rate over the steps, as a factor on the recipe's rate.
 
     ``constant`` 1; ``cosine`` (1 + cos(pi t)) / 2 falling to ``floor``, t from 0 to 1 after the
@@ -77,7 +74,7 @@ LSTM 4.
 """
 
 
-class TrainingOptions(_Strict):
+class TrainingOptions(Settings):
     """Options of a training; recipes fill them."""
 
     steps: int | None = Field(default=None, gt=0)  # optimiser steps; or give 'epochs'
@@ -200,10 +197,9 @@ class Recipe:
         return {"baseline": self.baseline, "name": self.name, **told, **start}
 
 
-class _Part(BaseModel):
+class _Part(Settings):
     """One recipe: what differs from the defaults of its file."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
     model: Layer = Field(default_factory=dict)
     training: Layer = Field(default_factory=dict)
 

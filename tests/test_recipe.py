@@ -228,6 +228,10 @@ def test_own_file(entry: Entry, tmp_path: Path) -> None:
         (["training.windows=[test]"], "never on test"),
         (["training.windows=[train, valid]"], "not on valid"),
         (["training.learning_rate=.inf"], "finite"),
+        (["training.opening_share=true"], "opening_share"),
+        (["training.schedule.factor=yes"], "schedule.factor"),
+        (["training.steps=on"], "training.steps"),
+        (["model.start=true"], "model.start"),
         (["training.steps=5", "training.epochs=5"], ""),
     ],
 )

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -158,6 +159,7 @@ def score_scenario(job: ScenarioJob, report: Report) -> ScenarioScores:
     """Score one scenario of a submission and of the floors that are to be measured."""
     metrics = _selected(job.metrics)
     with (
+        _told_of(job.scenario),
         job.task.opened(job.scenario) as truth,
         open_predictions(job.predictions, checked=job.anatomy) as predictions,
     ):
@@ -167,6 +169,16 @@ def score_scenario(job: ScenarioJob, report: Report) -> ScenarioScores:
         photographer = PreviewRecorder(job.scenario, scenario) if job.pictured else None
         tallies, trace = measure_rows(scenario, truth.snapshots(), rows, metrics, photographer, report)
     return ScenarioScores(job.scenario, tallies, trace, photographer.result() if photographer else None)
+
+
+@contextmanager
+def _told_of(scenario: int) -> Iterator[None]:
+    """Name the scenario beside what a package's metric or our own code raises there."""
+    try:
+        yield
+    except Exception as error:
+        error.add_note(f"scenario {scenario}")
+        raise
 
 
 def floor_snapshots(name: str, truth: OpenScenario, task: ScoredTask) -> Iterator[Snapshot]:
