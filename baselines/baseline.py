@@ -41,7 +41,7 @@ __all__ = [
 
 
 class Settings(BaseModel):
-    """Base of what recipes and ``--set`` fill: frozen; unknown keys are errors, and so is yes for a number."""
+    """Base of what recipes and ``--set`` fill: frozen; unknown keys and yes for a number are errors."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
