@@ -94,6 +94,19 @@ class Baseline(nn.Module):
         """Return an untrained model; options are checked by pydantic."""
         return cls(cls.Options.model_validate(dict(options)), facts)
 
+    def adapted(
+        self, weights: Mapping[str, Tensor], options: Mapping[str, Any]
+    ) -> tuple[Mapping[str, Tensor], Mapping[str, Any]]:
+        """Return weights that a training starts from, and their options, as far as this model takes them on.
+
+        As they are by default: weights of other options are refused where these say what weights mean.
+
+        Args:
+            weights: parameters and buffers by name, of a model with those options.
+            options: plain values by name, without those of the training.
+        """
+        return weights, options
+
     @property
     @abstractmethod
     def history(self) -> int:

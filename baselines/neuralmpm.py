@@ -24,9 +24,9 @@ frame and matter is not pressed together (:mod:`~lagbench.baselines.projection`)
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 from pydantic import Field
@@ -178,6 +178,13 @@ class NeuralMPM(Baseline):
     def origin(self) -> bool:
         """Strain is counted from the scenario's first frame, where bodies have their shape."""
         return self.options.strain or self.projection is not None
+
+    def adapted(
+        self, weights: Mapping[str, Tensor], options: Mapping[str, Any]
+    ) -> tuple[Mapping[str, Tensor], Mapping[str, Any]]:
+        """Take weights of the first of our grids of ``shape`` and ``density``; the others start anew."""
+        known = weights, options
+        return self.projection.adapted(*known, prefix="projection.") if self.projection else known
 
     def forward(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """Return the squared error of velocity over the deviation of accelerations, mean over frames [1].

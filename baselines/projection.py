@@ -9,9 +9,9 @@ one mass and walls are far, no projection moves a centre of mass.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -24,6 +24,9 @@ HEAVY = 30.0  # what a weight counts for: the few here are to be learned as fast
 HELD = 3.0  # log-odds of the share of the way to their shape that bodies go, before training
 MOST_PUSH = 2.0  # greatest k of Density
 LIMIT = 0.2  # what a change of 1 is to the density that is not too much; with more, bodies are blown up
+
+LEARNED = {"shape": ("held",), "density": ("push", "limit")}
+"""Weights of a :class:`Projection` by the option that asks for its grids."""
 
 TINY = 1e-16
 """Square of a cluster's moment [length^4] below which it has no direction."""
@@ -183,6 +186,7 @@ class Projection(nn.Module):
 
     def __init__(self, bounds: Bounds, *, shape: Sequence[int], density: Sequence[int]) -> None:
         super().__init__()
+        self.across = {"shape": tuple(shape), "density": tuple(density)}
         self.clusters = nn.ModuleList(ParticleGrid(bounds, cells) for cells in shape)
         self.cells = nn.ModuleList(ParticleGrid(bounds, cells) for cells in density)
         # Weights that no grid needs would get no gradient, which training on several devices refuses.
@@ -191,6 +195,28 @@ class Projection(nn.Module):
         if density:
             self.push = nn.Parameter(torch.zeros(len(density)))
             self.limit = nn.Parameter(torch.zeros(MATERIALS))
+
+    def adapted(
+        self, weights: Mapping[str, Tensor], options: Mapping[str, Any], *, prefix: str
+    ) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Return weights and options with our own start for grids that follow those of the weights.
+
+        Where the grids of the weights are not the first of ours, nothing is changed.
+
+        Args:
+            weights: of the model that they are of, by name, in which ours begin with the prefix.
+            options: of that model, with its grids as ``shape`` and ``density``.
+            prefix: name of this module in a model, and a dot.
+        """
+        weights, options, own = dict(weights), dict(options), self.state_dict(prefix=prefix)
+        for option, names in LEARNED.items():
+            ours, known = list(self.across[option]), list(options[option])
+            if len(ours) > len(known) and ours[: len(known)] == known:
+                options[option] = ours
+                for name in (prefix + name for name in names):
+                    learned = weights.get(name, own[name][:0])
+                    weights[name] = torch.cat([learned, own[name][len(learned) :].to(learned.dtype)])
+        return weights, options
 
     def start(self, first: Tensor, material: Tensor, sample: Tensor, windows: int) -> Drawn:
         """Return what windows are drawn to.

@@ -45,10 +45,11 @@ class Start:
             UsageError: they are of another network, or mean something else there.
         """
         ours = model.options.model_dump(mode="json")
-        other = sorted(name for name, value in self.options.items() if ours[name] != value)
+        adapted, options = model.adapted(self.weights, self.options)
+        other = sorted(name for name, value in options.items() if ours[name] != value)
         held, needed = (
             {name: value.shape for name, value in weights.items()}
-            for weights in (self.weights, model.state_dict())
+            for weights in (adapted, model.state_dict())
         )
         if held != needed or model.options.of_weights.intersection(other):
             raise UsageError(
@@ -59,7 +60,7 @@ class Start:
                 + ", ".join(f"model.{name}={self.options[name]}" for name in other)[:500],
                 fix="leave out what was --set of these, or start from other weights",
             )
-        load_weights(model, self.weights, where=str(self.path))
+        load_weights(model, adapted, where=str(self.path))
 
 
 class LastStateWarning(UserWarning):

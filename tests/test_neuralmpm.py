@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from lagbench.baselines.augmentation import Symmetry, image, images
 from lagbench.baselines.catalogue import find
 from lagbench.baselines.neuralmpm import NeuralMPM
 from lagbench.baselines.recipe import recipe_for
+from lagbench.baselines.start import Start
 from lagbench.data.registry import load
 from lagbench.errors import DataError, UsageError
 
@@ -408,3 +410,40 @@ def test_recipes_fit_every_split(split: str, size: str) -> None:
     assert recipe.model["symmetry"] == ("mirror" if gravity and gravity.value else "square")
     assert len(recipe.model["materials"]) == (4 if split == "multimaterial" else 1)
     assert 2 * sum(p.numel() for p in model.parameters()) <= 4e6  # bytes of its weights in bfloat16
+
+
+def started(model: NeuralMPM, earlier: NeuralMPM) -> NeuralMPM:
+    """Return a model that goes on from the weights of an earlier one."""
+    options = earlier.options.model_dump(mode="json", exclude=set(earlier.options.in_training))
+    known: dict[str, Any] = {"weights": earlier.state_dict(), "options": options, "record": {}}
+    Start(path=Path("earlier.pt"), facts=earlier.facts, **known).fill(model)
+    return model
+
+
+@pytest.mark.parametrize("earlier", [{}, {"shape": [4]}, {"density": [8]}, {"shape": [4], "density": [8]}])
+def test_finer_grids_go_on_from_weights_of_the_first(earlier: dict[str, object]) -> None:
+    """What the weights know is kept; grids that follow start as in a new model."""
+    grids: dict[str, object] = {"shape": [4, 8], "density": [8, 16]}
+    before, new = surrogate(awake=0.1, **earlier), surrogate(**grids)
+    with torch.no_grad():
+        for weight in before.parameters():
+            weight.add_(0.01)
+    found = started(surrogate(**grids), before).state_dict()
+    held, own = before.state_dict(), new.state_dict()
+    for name, value in found.items():
+        first = len(held[name]) if name in held and value.ndim else 0
+        if name in held:
+            torch.testing.assert_close(value[:first] if value.ndim else value, held[name], rtol=0, atol=0)
+        if name not in held or value.ndim:
+            torch.testing.assert_close(value[first:], own[name][first:], rtol=0, atol=0)
+    assert {name for name in found if name.startswith("projection.")} == {
+        f"projection.{name}" for name in ("held", "push", "limit")
+    }
+
+
+@pytest.mark.parametrize("grids", [{"shape": [8]}, {"shape": [8, 4]}, {"shape": []}, {"density": [4, 8]}])
+def test_other_grids_are_refused(grids: dict[str, object]) -> None:
+    """Weights of grids that are not the first of the model's mean something else there."""
+    with pytest.raises(UsageError) as caught:
+        started(surrogate(**(PROJECTED | grids)), surrogate(**(PROJECTED | {"shape": [4]})))
+    assert caught.value.where == "--start"
