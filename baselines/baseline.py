@@ -13,10 +13,17 @@ from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Self, get_args
+from typing import Annotated, Any, ClassVar, Self
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationInfo, field_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    TypeAdapter,
+    ValidatorFunctionWrapHandler,
+    field_validator,
+)
 from torch import Tensor, nn
 
 from lagbench.data.layout import dataset_folder
@@ -33,6 +40,7 @@ __all__ = [
     "Batch",
     "Facts",
     "Options",
+    "Settings",
     "check_moving_walls",
     "facts_of",
     "last_velocities",
@@ -45,14 +53,25 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    @field_validator("*", mode="before")
+    @field_validator("*", mode="wrap")
     @classmethod
-    def _no_number(cls, value: object, info: ValidationInfo) -> object:
-        kind = cls.model_fields[str(info.field_name)].annotation
-        if isinstance(value, bool) and bool not in {kind, *get_args(kind)}:
-            message = "a value that is not yes or no"  # which would count as 1 or 0
+    def _no_number(cls, value: object, handler: ValidatorFunctionWrapHandler) -> object:
+        found: object = handler(value)
+        if _counted(value, found):
+            message = "a number, not yes or no"
             raise ValueError(message)
-        return value
+        return found
+
+
+def _counted(given: object, found: object) -> bool:
+    """Tell whether a yes or no became 1 or 0 anywhere in a value that was checked."""
+    if isinstance(given, bool):
+        return isinstance(found, int | float) and not isinstance(found, bool)
+    if isinstance(given, Mapping) and isinstance(found, Mapping):
+        return any(_counted(value, found.get(name)) for name, value in given.items())
+    if isinstance(given, list | tuple) and isinstance(found, list | tuple):
+        return any(map(_counted, given, found))
+    return False
 
 
 class Options(Settings):
@@ -97,9 +116,10 @@ class Baseline(nn.Module):
     def adapted(
         self, weights: Mapping[str, Tensor], options: Mapping[str, Any]
     ) -> tuple[Mapping[str, Tensor], Mapping[str, Any]]:
-        """Return weights that a training starts from, and their options, as far as this model takes them on.
+        """Return weights that a training starts from, and their options, as this model takes them on.
 
-        As they are by default: weights of other options are refused where these say what weights mean.
+        As they are by default. Weights are refused whose shapes are not this model's, or whose options, those
+        returned, differ in what says what weights mean.
 
         Args:
             weights: parameters and buffers by name, of a model with those options.

@@ -183,8 +183,9 @@ class NeuralMPM(Baseline):
         self, weights: Mapping[str, Tensor], options: Mapping[str, Any]
     ) -> tuple[Mapping[str, Tensor], Mapping[str, Any]]:
         """Take weights of the first of our grids of ``shape`` and ``density``; the others start anew."""
-        known = weights, options
-        return self.projection.adapted(*known, prefix="projection.") if self.projection else known
+        if self.projection is None:
+            return weights, options
+        return self.projection.adapted(weights, options, prefix="projection.")
 
     def forward(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """Return the squared error of velocity over the deviation of accelerations, mean over frames [1].
@@ -329,9 +330,8 @@ class NeuralMPM(Baseline):
         stress = STIFF * stress.reshape(-1, 3 * frames, *self.grid.shape)
         shared = self.grid.stencil(state.position, state.sample)  # one layer for all materials
         mass = self.grid.spread(shared, torch.ones_like(state.position[:, :1]), windows)
-        load = (
-            (self.grid.gather(shared, mass / self.unit) / FULL).clamp(max=1.0).square()
-        )  # a surface bears less
+        filled = self.grid.gather(shared, mass / self.unit) / FULL
+        load = filled.clamp(max=1.0).square()  # a surface bears less
         of_particle = self.grid.gather(stencil, stress) * load
         pushed = self.grid.pushed(shared, state.position, of_particle.view(-1, frames, 3), mass)
         near = (1.0 - self.grid.wall_distance(BESIDE * self.grid.spacing).amin(dim=0)).clamp(0.0, 1.0)

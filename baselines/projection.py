@@ -204,18 +204,19 @@ class Projection(nn.Module):
         Where the grids of the weights are not the first of ours, nothing is changed.
 
         Args:
-            weights: of the model that they are of, by name, in which ours begin with the prefix.
+            weights: of a model, by name, ours with the prefix: ``held`` of shape [grid, elastic material],
+                ``push`` [grid], ``limit`` [material].
             options: of that model, with its grids as ``shape`` and ``density``.
             prefix: name of this module in a model, and a dot.
         """
         weights, options, own = dict(weights), dict(options), self.state_dict(prefix=prefix)
         for option, names in LEARNED.items():
             ours, known = list(self.across[option]), list(options[option])
-            if len(ours) > len(known) and ours[: len(known)] == known:
+            if ours[: len(known)] == known:
                 options[option] = ours
                 for name in (prefix + name for name in names):
                     learned = weights.get(name, own[name][:0])
-                    weights[name] = torch.cat([learned, own[name][len(learned) :].to(learned.dtype)])
+                    weights[name] = torch.cat([learned, own[name][len(learned) :]])
         return weights, options
 
     def start(self, first: Tensor, material: Tensor, sample: Tensor, windows: int) -> Drawn:

@@ -213,7 +213,7 @@ def statistic(pair):
 
 METRICS = (
     Metric(
-        name="of_mine", family="mine", unit="1", direction=Direction.LOWER, perfect=0.0,
+        name="my_enstrophy", family="mine", unit="1", direction=Direction.LOWER, perfect=0.0,
         source="here", summary="fails", statistic=statistic,
     ),
 )
@@ -224,18 +224,18 @@ def test_where_a_metric_of_a_package_fails(
     run: Run, predictions: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What a user's own metric raises is told with its line, name, frame and scenario."""
-    module, about = tmp_path / "of_mine.py", tmp_path / "of_mine-1.dist-info"
+    module, about = tmp_path / "failing_metric.py", tmp_path / "failing-1.dist-info"
     module.write_text(FAILING)
     about.mkdir()
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: of-mine\nVersion: 1\n")
-    (about / "entry_points.txt").write_text("[lagbench.metrics]\nof_mine = of_mine:METRICS\n")
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: failing\nVersion: 1\n")
+    (about / "entry_points.txt").write_text("[lagbench.metrics]\nfails = failing_metric:METRICS\n")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delenv("LAGBENCH_DEBUG", raising=False)
     with h5py.File(predictions) as file:
         first = min(file["scenario"][:])
     result = run("score", predictions)
     assert result.exit_code == 5
-    for told in (f"{module}, line 6", "of_mine", "frame 10", f"scenario {first}"):
+    for told in (f"{module}, line 6", "my_enstrophy", "frame 10", f"scenario {first}"):
         assert told in result.stderr
     assert not predictions.with_name("scores.json").exists()
 

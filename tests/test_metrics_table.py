@@ -341,9 +341,10 @@ def test_what_is_no_number_is_told_with_its_metric(value: object) -> None:
     """A statistic of another package that gives something else is named, and where it comes from."""
     truth = rollout()
     bad = replace(OTHERS, statistic=lambda pair: value)
+    pair = pairs_of(scenario_of(truth), truth, truth)[0]
     with pytest.raises(WorkFailedError) as caught:
-        bad.measure(pairs_of(scenario_of(truth), truth, truth)[0])
-    assert caught.value.where == f"{__name__}, enstrophy_error"
+        bad.measure(pair)
+    assert caught.value.where == f"{__name__}, enstrophy_error, frame {pair.frame}"
 
 
 def test_what_a_statistic_raises_is_told_with_metric_and_frame() -> None:

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from lagbench.baselines.augmentation import Symmetry, image, images
 from lagbench.baselines.catalogue import find
+from lagbench.baselines.checkpoint import rounded_weights
 from lagbench.baselines.neuralmpm import NeuralMPM
 from lagbench.baselines.recipe import recipe_for
 from lagbench.baselines.start import Start
@@ -415,7 +416,7 @@ def test_recipes_fit_every_split(split: str, size: str) -> None:
 def started(model: NeuralMPM, earlier: NeuralMPM) -> NeuralMPM:
     """Return a model that goes on from the weights of an earlier one."""
     options = earlier.options.model_dump(mode="json", exclude=set(earlier.options.in_training))
-    known: dict[str, Any] = {"weights": earlier.state_dict(), "options": options, "record": {}}
+    known: dict[str, Any] = {"weights": rounded_weights(earlier), "options": options, "record": {}}
     Start(path=Path("earlier.pt"), facts=earlier.facts, **known).fill(model)
     return model
 
@@ -429,11 +430,12 @@ def test_finer_grids_go_on_from_weights_of_the_first(earlier: dict[str, object])
         for weight in before.parameters():
             weight.add_(0.01)
     found = started(surrogate(**grids), before).state_dict()
-    held, own = before.state_dict(), new.state_dict()
+    held, own = rounded_weights(before), new.state_dict()
     for name, value in found.items():
         first = len(held[name]) if name in held and value.ndim else 0
         if name in held:
-            torch.testing.assert_close(value[:first] if value.ndim else value, held[name], rtol=0, atol=0)
+            known = held[name].to(value.dtype)
+            torch.testing.assert_close(value[:first] if value.ndim else value, known, rtol=0, atol=0)
         if name not in held or value.ndim:
             torch.testing.assert_close(value[first:], own[name][first:], rtol=0, atol=0)
     assert {name for name in found if name.startswith("projection.")} == {

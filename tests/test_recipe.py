@@ -7,12 +7,14 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, Literal
 
 import pytest
 import torch
+from pydantic import ValidationError
 from simple_models import Drift, batch, facts, install, rolled, swirl
 
-from lagbench.baselines.baseline import Baseline
+from lagbench.baselines.baseline import Baseline, Settings
 from lagbench.baselines.catalogue import Entry, every_entry, find, names
 from lagbench.baselines.job import settings_of
 from lagbench.baselines.recipe import (
@@ -231,6 +233,8 @@ def test_own_file(entry: Entry, tmp_path: Path) -> None:
         (["training.opening_share=true"], "opening_share"),
         (["training.schedule.factor=yes"], "schedule.factor"),
         (["training.steps=on"], "training.steps"),
+        (["training.clip=no"], "training.clip"),
+        (["training.precision=off"], "'bf16'"),
         (["model.start=true"], "model.start"),
         (["training.steps=5", "training.epochs=5"], ""),
     ],
@@ -300,6 +304,45 @@ def test_warm_up() -> None:
     """The rate rises in equal parts: with 3 warm-up steps 1/4, 2/4, 3/4, then 1."""
     rates = [Schedule().at(step, steps=10, warmup=3) for step in range(5)]
     assert rates == [0.25, 0.5, 0.75, 1.0, 1.0]
+
+
+class Kinds(Settings):
+    """Options of many kinds, as packages may have them."""
+
+    number: float = 0.0
+    either: bool | int | None = None
+    word: Literal["auto", True] = "auto"
+    several: tuple[int, ...] = ()
+    flags: tuple[bool, ...] = ()
+    named: dict[str, float] | None = None
+    anything: Any = None
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"number": 1, "either": True, "word": True, "flags": [True, False], "anything": [True]},
+        {"either": 1, "several": [1, 2], "named": {"a": 1}, "anything": False},
+    ],
+)
+def test_yes_and_no_where_they_are_meant(given: dict[str, object]) -> None:
+    """Options that may be yes or no, or anything, take it and keep it."""
+    found = Kinds.model_validate(given)
+    for name, value in given.items():
+        kept = getattr(found, name)
+        assert repr(list(kept) if isinstance(kept, tuple) else kept) == repr(
+            value if name not in {"number", "named"} else kept
+        )
+
+
+@pytest.mark.parametrize("name", ["number", "several", "named"])
+@pytest.mark.parametrize("value", [True, False])
+def test_yes_and_no_are_no_numbers(name: str, value: bool) -> None:
+    """Which pydantic would make 1 and 0, inside of lists and mappings too."""
+    given = {"number": value, "several": [3, value], "named": {"a": value}}
+    with pytest.raises(ValidationError) as caught:
+        Kinds.model_validate({name: given[name]})
+    assert [error["loc"] for error in caught.value.errors()] == [(name,)]
 
 
 def test_budget_is_one() -> None:

@@ -188,7 +188,7 @@ class Metric:
                 return float(value)  # type: ignore[arg-type]
         raise WorkFailedError(
             "a metric gave no number",
-            where=f"{getattr(self.statistic, '__module__', '?')}, {self.name}",
+            where=f"{getattr(self.statistic, '__module__', '?')}, {self.name}, frame {pair.frame}",
             expected="a float",
             got=f"{type(value).__name__}: {value!r:.60}",
             fix="mend or uninstall the package that adds it",
