@@ -122,6 +122,16 @@ CLAIMS = (
         rivals=("neuralmpm",),
     ),
     Claim(
+        question="Does NeuralMPM that is held in shape gain by starting from the weights of another size?",
+        first="neuralmpm-projected-started",
+        rivals=("neuralmpm-projected",),
+    ),
+    Claim(
+        question="Does it gain by grids of shape and density as fine as those of full at full?",
+        first="neuralmpm-projected-finer",
+        rivals=("neuralmpm-projected-started", "neuralmpm-projected"),
+    ),
+    Claim(
         question="Does LSTM + MLP come first among the frame models (Table 4.8: it does)?",
         first="lstm-mlp",
         rivals=tuple(name for name in FRAME_MODELS if name != "lstm-mlp"),

@@ -240,6 +240,16 @@ _MODELS = (
     ),
     Model("neuralmpm-projected-averaged", "NeuralMPM, held in shape, mean over images"),
     Model("neuralmpm-projected-of-mini", "NeuralMPM, held in shape, trained at mini"),
+    Model("neuralmpm-projected-started", "NeuralMPM, held in shape, started from another size"),
+    Model(
+        "neuralmpm-projected-started-averaged",
+        "NeuralMPM, held in shape, started from another size, mean over images",
+    ),
+    Model("neuralmpm-projected-finer", "NeuralMPM, held in shape by finer grids, started from another size"),
+    Model(
+        "neuralmpm-projected-finer-averaged",
+        "NeuralMPM, held in shape by finer grids, started from another size, mean over images",
+    ),
     Model("neuralmpm-longer", "NeuralMPM from its own rollouts, for longer"),
     Model("neuralmpm-longer-averaged", "NeuralMPM from its own rollouts, for longer, mean over images"),
     Model("neuralmpm-started", "NeuralMPM, started from another size"),
