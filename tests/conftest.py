@@ -243,6 +243,31 @@ def run(monkeypatch: pytest.MonkeyPatch, unmeasured_path: Path) -> Callable[...,
 
 
 @pytest.fixture
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Path]]:
+    """A function that installs a package of another author: group of its entry point, the object, its source.
+
+    It returns the module's file, which is there only where a source is given.
+    """
+    modules: list[str] = []
+
+    def call(group: str, value: str, source: str | None = None, *, name: str = "mine") -> Path:
+        module, about = value.partition(":")[0], tmp_path / f"{name}-1.dist-info"
+        about.mkdir()
+        (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1\n")
+        (about / "entry_points.txt").write_text(f"[lagbench.{group}]\n{name} = {value}\n")
+        if source is not None:
+            (tmp_path / f"{module}.py").write_text(source)
+            modules.append(module)
+        monkeypatch.syspath_prepend(tmp_path)
+        monkeypatch.delenv("LAGBENCH_DEBUG", raising=False)
+        return tmp_path / f"{module}.py"
+
+    yield call
+    for module in modules:
+        sys.modules.pop(module, None)
+
+
+@pytest.fixture
 def copied(generated: GenerationResult, tmp_path: Path) -> Callable[[], Path]:
     """A function that copies the generated data set to a root folder that a test may damage."""
 

@@ -59,17 +59,9 @@ class Mine(Drift):
 """
 
 
-def test_a_fault_of_a_package_is_told_as_one(
-    lagbench: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_fault_of_a_package_is_told_as_one(lagbench: Command, package: Callable[..., Path]) -> None:
     """What a user's own class raises is not to be reported to us: its line is named."""
-    module, about = tmp_path / "my_model.py", tmp_path / "mine-1.dist-info"
-    module.write_text(BROKEN)
-    about.mkdir()
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: mine\nVersion: 1\n")
-    (about / "entry_points.txt").write_text("[lagbench.baselines]\nmine = my_model:Mine\n")
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.delenv("LAGBENCH_DEBUG", raising=False)
+    module = package("baselines", "my_model:Mine", BROKEN)
     result = lagbench("train", "--baseline", "mine", *TINY, "--set", "training.steps=2")
     assert result.exit_code == 5
     assert f"{module}, line 6" in result.stderr

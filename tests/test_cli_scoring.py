@@ -220,17 +220,9 @@ METRICS = (
 """
 
 
-def test_where_a_metric_of_a_package_fails(
-    run: Run, predictions: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_where_a_metric_of_a_package_fails(run: Run, predictions: Path, package: Callable[..., Path]) -> None:
     """What a user's own metric raises is told with its line, name, frame and scenario."""
-    module, about = tmp_path / "failing_metric.py", tmp_path / "failing-1.dist-info"
-    module.write_text(FAILING)
-    about.mkdir()
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: failing\nVersion: 1\n")
-    (about / "entry_points.txt").write_text("[lagbench.metrics]\nfails = failing_metric:METRICS\n")
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.delenv("LAGBENCH_DEBUG", raising=False)
+    module = package("metrics", "failing_metric:METRICS", FAILING)
     with h5py.File(predictions) as file:
         first = min(file["scenario"][:])
     result = run("score", predictions)

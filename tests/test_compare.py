@@ -379,15 +379,10 @@ def test_wide_tables_come_in_blocks() -> None:
 
 
 def test_metrics_that_cannot_be_loaded(
-    run: Callable[..., Result], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: Callable[..., Result], tmp_path: Path, package: Callable[..., Path]
 ) -> None:
     """Metrics that cannot be imported: the entry point is named, not the file of scores."""
-    (tmp_path / "broken_metric.py").write_text("raise KeyError('mine')\n")
-    about = tmp_path / "broken-1.dist-info"
-    about.mkdir()
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1\n")
-    (about / "entry_points.txt").write_text("[lagbench.metrics]\nbroken = broken_metric:METRICS\n")
-    monkeypatch.syspath_prepend(tmp_path)
+    package("metrics", "broken_metric:METRICS", "raise KeyError('mine')\n")
     scores = published(tmp_path, [1.0] * 6, method="a")
     result = run("compare", scores, scores)
     assert result.exit_code == 2

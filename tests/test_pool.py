@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pool_tasks
@@ -129,13 +130,9 @@ def test_other_errors_bring_their_traceback() -> None:
     assert "pool_tasks.py" in str(caught.value)
 
 
-def test_a_package_that_fails_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_package_that_fails_is_named(package: Callable[..., Path]) -> None:
     """Where the line that raised belongs to one that adds a split, it is the package that is told of."""
-    about = tmp_path / "tasks-1.dist-info"
-    about.mkdir()
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: tasks\nVersion: 1\n")
-    (about / "entry_points.txt").write_text("[lagbench.generators]\nwaves = pool_tasks\n")
-    monkeypatch.syspath_prepend(tmp_path)
+    package("generators", "pool_tasks")
     with Pool(1) as pool:
         pool.submit(Task(name="a", function=pool_tasks.crash))
         with pytest.raises(WorkFailedError) as caught:
