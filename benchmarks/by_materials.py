@@ -9,6 +9,7 @@ mean over the test scenarios of each set of materials, and over all. Data are re
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from lagbench.data.registry import load
 from lagbench.data.scenario import read_scenario
 from lagbench.data.writer import MATERIALS
 from lagbench.draw.markdown import table
+from lagbench.errors import LagbenchError, nearest
 from lagbench.floors import shipped
 from lagbench.scoring.stored import published
 from lagbench.scoring.task import ranking_metric
@@ -44,7 +46,11 @@ def main() -> int:
     rows = {name: floor.scores[metric].values for name, floor in (shipped(size) or {}).items()}
     folder = BOARD / "scores" / asked.split / asked.size
     for method in asked.methods:
-        files = sorted({*folder.glob(f"{method}.nc"), *folder.glob(f"{method}_[0-9]*.nc")})
+        files = [path for path in sorted(folder.glob("*.nc")) if method == path.stem.rpartition("_")[0]]
+        files = [folder / f"{method}.nc"] if (folder / f"{method}.nc").is_file() else files
+        if not files:
+            known = sorted({path.stem.partition("_")[0] for path in folder.glob("*.nc")})
+            parser.error(f"no entry {method!r} of {asked.split} {asked.size}: {nearest(method, known)}")
         seeds = [published(path).scores["submission"][metric].values for path in files]
         rows[method] = np.mean(seeds, axis=0)
     sets = sorted(set(kinds))
@@ -60,4 +66,8 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    try:
+        raise SystemExit(main())
+    except LagbenchError as error:
+        print(f"by_materials: {error}", file=sys.stderr)
+        raise SystemExit(error.exit_code) from error

@@ -347,10 +347,11 @@ def test_what_is_no_number_is_told_with_its_metric(value: object) -> None:
     assert caught.value.where == f"{__name__}, enstrophy_error, frame {pair.frame}"
 
 
-def test_what_a_statistic_raises_is_told_with_metric_and_frame() -> None:
+@pytest.mark.parametrize("what", ["statistic", "defined"])
+def test_what_a_metric_raises_is_told_with_its_name_and_the_frame(what: str) -> None:
     """The error itself goes on, with a note."""
     truth = rollout()
-    bad = replace(OTHERS, statistic=lambda pair: 1 / (pair.frame - pair.frame))
+    bad = replace(OTHERS, **{what: lambda pair: 1 / (pair.frame - pair.frame)})
     pair = pairs_of(scenario_of(truth), truth, truth)[0]
     with pytest.raises(ZeroDivisionError) as caught:
         bad.measure(pair)

@@ -176,10 +176,10 @@ class Metric:
         Raises:
             WorkFailedError: it is no number.
         """
-        if self.statistic is None or not self.defined(pair):
+        if self.statistic is None:
             return math.nan
         try:
-            value: object = self.statistic(pair)
+            value: object = self.statistic(pair) if self.defined(pair) else math.nan
         except Exception as error:
             error.add_note(f"in metric {self.name}, frame {pair.frame}")
             raise
