@@ -212,7 +212,7 @@ class Projection(nn.Module):
         weights, options, own = dict(weights), dict(options), self.state_dict(prefix=prefix)
         for option, names in LEARNED.items():
             ours, known = list(self.across[option]), list(options[option])
-            if ours[: len(known)] == known:
+            if len(ours) > len(known) and ours[: len(known)] == known:  # of no grids there are no weights
                 options[option] = ours
                 for name in (prefix + name for name in names):
                     learned = weights.get(name, own[name][:0])

@@ -56,9 +56,7 @@ def main() -> int:
     sets = sorted(set(kinds))
     lines = []
     for name, values in rows.items():
-        means = [
-            float(np.mean([x for x, kind in zip(values, kinds, strict=True) if kind == one])) for one in sets
-        ]
+        means = [float(np.mean(np.asarray(values)[np.array(kinds) == one])) for one in sets]
         lines.append([name, *(f"{mean:.4f}" for mean in [*means, float(np.mean(values))])])
     head = [f"{one} ({kinds.count(one)})" for one in sets]
     print(table([metric, *head, f"all ({len(kinds)})"], lines))

@@ -421,6 +421,13 @@ def started(model: NeuralMPM, earlier: NeuralMPM) -> NeuralMPM:
     return model
 
 
+@pytest.mark.parametrize("option", ["shape", "density"])
+def test_grids_of_one_kind_alone_go_on(option: str) -> None:
+    """A model without the other kind has no weights for it."""
+    found = started(surrogate(**{option: [4, 8]}), surrogate(**{option: [4]}))
+    assert getattr(found.options, option) == (4, 8)
+
+
 @pytest.mark.parametrize("earlier", [{}, {"shape": [4]}, {"density": [8]}, {"shape": [4], "density": [8]}])
 def test_finer_grids_go_on_from_weights_of_the_first(earlier: dict[str, object]) -> None:
     """What the weights know is kept; grids that follow start as in a new model."""

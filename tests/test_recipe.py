@@ -321,18 +321,14 @@ class Kinds(Settings):
 @pytest.mark.parametrize(
     "given",
     [
-        {"number": 1, "either": True, "word": True, "flags": [True, False], "anything": [True]},
-        {"either": 1, "several": [1, 2], "named": {"a": 1}, "anything": False},
+        {"number": 1.0, "either": True, "word": True, "flags": [True, False], "anything": [True]},
+        {"either": 1, "several": [1, 2], "named": {"a": 1.0}, "anything": False},
     ],
 )
 def test_yes_and_no_where_they_are_meant(given: dict[str, object]) -> None:
     """Options that may be yes or no, or anything, take it and keep it."""
-    found = Kinds.model_validate(given)
-    for name, value in given.items():
-        kept = getattr(found, name)
-        assert repr(list(kept) if isinstance(kept, tuple) else kept) == repr(
-            value if name not in {"number", "named"} else kept
-        )
+    found = Kinds.model_validate(given).model_dump(mode="json", include=set(given))
+    assert json.dumps(found, sort_keys=True) == json.dumps(given, sort_keys=True)
 
 
 @pytest.mark.parametrize("name", ["number", "several", "named"])
