@@ -236,6 +236,7 @@ class NeuralMPM(Baseline):
                 where="model.materials",
                 expected=list(self.options.materials),
                 got=sorted(set(given.material.tolist())),
+                fix="predict with weights that were trained with these materials",
             )
         walls = position.new_zeros(given.windows, 1, len(self.beside), 2)
         if self.options.wall_velocity and given.wall_velocity is not None:

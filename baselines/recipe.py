@@ -300,9 +300,12 @@ def changed_options(entry: Entry, options: Mapping[str, Any], settings: Iterable
         for layer in (dict(options), changed)
     )
     kept = entry.model.Options.in_training | entry.model.Options.of_weights
-    if idle := sorted(f"model.{name}" for name in kept if before[name] != after[name]):
+    if idle := sorted(name for name in kept if before[name] != after[name]):
         fix = "leave it out, or train with it; docs/baselines.md says what a trained model takes"
-        raise UsageError("an option of the training", where="--set", got=", ".join(idle), fix=fix)
+        expected, got = (
+            ", ".join(f"model.{name}={layer[name]}" for name in idle) for layer in (before, after)
+        )
+        raise UsageError("an option of the training", where="--set", expected=expected, got=got, fix=fix)
     return after
 
 
@@ -375,5 +378,7 @@ def _complaint(
         fix = nearest(str(first["loc"][-1]), list(options.model_fields))
         return kind(f"unknown key {key!r}", where=where, fix=fix)
     expected = first["msg"].removeprefix("Value error, ")
+    if first["type"] == "tuple_type":
+        expected = "a list, as in [6,15]"
     got = None if isinstance(first["input"], Mapping) else repr(first["input"])[:80]
     return kind(f"{key} does not fit", where=where, expected=expected, got=got)

@@ -45,6 +45,11 @@ class LagbenchError(Exception):
         parts += [f"{label}: {text}" for label, text in labelled.items() if text is not None]
         return printable("\n  ".join(parts))
 
+    def add_note(self, note: str, /) -> None:
+        """Say more of where it is."""
+        self.where = note if self.where is None else f"{self.where}, {note}"
+        self.args = (self._compose(),)
+
     def __reduce__(self) -> tuple[object, ...]:
         """Rebuild with keyword arguments, so that errors cross process borders."""
         return _rebuild, (type(self), self.what, self.where, self.expected, self.got, self.fix)

@@ -5,7 +5,9 @@ from __future__ import annotations
 import functools
 import itertools
 import math
+import pickle
 import re
+import sys
 from dataclasses import replace
 from importlib.metadata import EntryPoint, entry_points
 
@@ -345,6 +347,18 @@ def test_what_is_no_number_is_told_with_its_metric(value: object) -> None:
     with pytest.raises(WorkFailedError) as caught:
         bad.measure(pair)
     assert caught.value.where == f"{__name__}, enstrophy_error, frame {pair.frame}"
+
+
+def test_a_metric_does_not_end_the_program() -> None:
+    """As one that parses arguments would: it is named as one that gives no number is, with any note."""
+    truth = rollout()
+    pair = pairs_of(scenario_of(truth), truth, truth)[0]
+    with pytest.raises(WorkFailedError) as caught:
+        replace(OTHERS, statistic=lambda pair: sys.exit(0)).measure(pair)
+    caught.value.add_note("scenario 3")
+    again = pickle.loads(pickle.dumps(caught.value))
+    assert again.where == f"{__name__}, enstrophy_error, frame {pair.frame}, scenario 3"
+    assert all("scenario 3" in str(error) for error in (caught.value, again))
 
 
 @pytest.mark.parametrize("what", ["statistic", "defined"])

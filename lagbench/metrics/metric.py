@@ -174,12 +174,15 @@ class Metric:
         """Return the statistic of a frame pair, NaN where it is undefined.
 
         Raises:
-            WorkFailedError: it is no number.
+            WorkFailedError: it is no number, or would end the program.
         """
         if self.statistic is None:
             return math.nan
+        value: object
         try:
-            value: object = self.statistic(pair) if self.defined(pair) else math.nan
+            value = self.statistic(pair) if self.defined(pair) else math.nan
+        except SystemExit as left:
+            value = left
         except Exception as error:
             error.add_note(f"in metric {self.name}, frame {pair.frame}")
             raise
