@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import enum
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -69,16 +70,17 @@ def images(symmetry: Symmetry) -> Tensor:
     return upright[: 2 if symmetry is Symmetry.MIRROR else 1]
 
 
-def field_image(field: Tensor, matrix: Tensor, channels: Tensor) -> Tensor:
+def field_image(field: Tensor, matrix: Tensor, channels: Sequence[Tensor]) -> Tensor:
     """Return the image of a field on a grid that lies in its box as its images do.
 
     Args:
         field: values at the nodes, shape [window, channel, x node, y node].
         matrix: image, a signed permutation of the axes, shape [2, 2].
-        channels: what it does to the values of a node, shape [channel, channel].
+        channels: what it does to the values of a node, blocks of a diagonal matrix.
     """
+    turned: Tensor = torch.block_diag(*channels)  # type: ignore[no-untyped-call]
     with torch.autocast(field.device.type, enabled=False):
-        moved = torch.einsum("dc,wcxy->wdxy", channels.to(field), field)
+        moved = torch.einsum("dc,wcxy->wdxy", turned.to(field), field)
     if bool(matrix[0, 1] != 0.0):
         moved = moved.transpose(2, 3)
     return moved.flip([2 + axis for axis in range(2) if float(matrix[axis].sum()) < 0.0])

@@ -351,20 +351,20 @@ class NeuralMPM(Baseline):
         options, outputs = self.options, []
         for matrix in images(options.symmetry):
             forcing = [matrix] * options.bundle if options.wall_velocity else []
-            blocks = [self._turn(matrix), torch.eye(options.context), *forcing]
-            said = self.network(field_image(seen, matrix, _diagonal(blocks)))
+            blocks = [*self._turn(matrix), torch.eye(options.context), *forcing]
+            said = self.network(field_image(seen, matrix, blocks))
             inner = len(options.materials) * options.bundle
             back = [matrix.T] * inner
             if options.conserve:
                 back = [strain_image(matrix.T)] * inner + [matrix.T] * options.bundle
-            outputs.append(field_image(said, matrix.T, _diagonal(back)))
+            outputs.append(field_image(said, matrix.T, back))
         return torch.stack(outputs).mean(dim=0)
 
-    def _turn(self, matrix: Tensor) -> Tensor:
-        """Return what an image does to the channels of :meth:`_fields`, shape [channel, channel]."""
+    def _turn(self, matrix: Tensor) -> list[Tensor]:
+        """Return what an image does to the channels of :meth:`_fields`, blocks of a diagonal matrix."""
         one = [torch.ones(1, 1), *[matrix] * self.options.velocities]
         one += [strain_image(matrix)] if self.options.strain else []
-        return _diagonal([*one * len(self.options.materials), wall_permutation(matrix)])
+        return [*one * len(self.options.materials), wall_permutation(matrix)]
 
     def _fields(self, state: GridState, stencil: Stencil) -> tuple[Tensor, Tensor]:
         """Return what the U-Net sees of the particles, and the last velocity on the grid [length/frame].
@@ -393,9 +393,3 @@ class NeuralMPM(Baseline):
         whole = sums[:, : 1 + shown].view(windows, kinds, -1, *self.grid.shape).sum(dim=1) / self.unit
         mean = whole[:, -2:] / whole[:, :1].clamp(min=EMPTY)
         return fields, mean.repeat_interleave(kinds, dim=0)
-
-
-def _diagonal(blocks: Sequence[Tensor]) -> Tensor:
-    """Return the matrix that has blocks on its diagonal."""
-    matrix: Tensor = torch.block_diag(*blocks)  # type: ignore[no-untyped-call]
-    return matrix
