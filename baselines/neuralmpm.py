@@ -182,7 +182,7 @@ class NeuralMPM(Baseline):
     def adapted(
         self, weights: Mapping[str, Tensor], options: Mapping[str, Any]
     ) -> tuple[Mapping[str, Tensor], Mapping[str, Any]]:
-        """Take weights of the first of our grids of ``shape`` and ``density``; the others start anew."""
+        """Take weights of grids of ``shape`` and ``density`` that stand first in both; others start anew."""
         if self.projection is None:
             return weights, options
         return self.projection.adapted(weights, options, prefix="projection.")

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import takewhile
 from typing import Any, cast
 
 import torch
@@ -25,8 +26,8 @@ HELD = 3.0  # log-odds of the share of the way to their shape that bodies go, be
 MOST_PUSH = 2.0  # greatest k of Density
 LIMIT = 0.2  # what a change of 1 is to the density that is not too much; with more, bodies are blown up
 
-LEARNED = {"shape": ("held",), "density": ("push", "limit")}
-"""Weights of a :class:`Projection` by the option that asks for its grids."""
+PER_GRID = {"shape": "held", "density": "push"}
+"""Weights of a :class:`Projection` that are of one grid each, by the option that asks for its grids."""
 
 TINY = 1e-16
 """Square of a cluster's moment [length^4] below which it has no direction."""
@@ -199,9 +200,7 @@ class Projection(nn.Module):
     def adapted(
         self, weights: Mapping[str, Tensor], options: Mapping[str, Any], *, prefix: str
     ) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """Return weights and options with our own start for grids that follow those of the weights.
-
-        Where the grids of the weights are not the first of ours, nothing is changed.
+        """Return weights and options with our own start for all grids but those that stand first in both.
 
         Args:
             weights: of a model, by name, ours with the prefix: ``held`` of shape [grid, elastic material],
@@ -210,14 +209,14 @@ class Projection(nn.Module):
             prefix: name of this module in a model, and a dot.
         """
         weights, options, own = dict(weights), dict(options), self.state_dict(prefix=prefix)
-        for option, names in LEARNED.items():
+        for option, name in PER_GRID.items():
             ours, known = list(self.across[option]), list(options[option])
-            if len(ours) > len(known) and ours[: len(known)] == known:  # of no grids there are no weights
-                options[option] = ours
-                for name in (prefix + name for name in names):
-                    learned = weights.get(name, own[name][:0])
-                    weights[name] = torch.cat([learned, own[name][len(learned) :]])
-        return weights, options
+            same = len(list(takewhile(lambda pair: pair[0] == pair[1], zip(ours, known, strict=False))))
+            options[option], learned = ours, weights.pop(prefix + name, None)
+            if learned is not None and ours:
+                weights[prefix + name] = torch.cat([learned[:same], own[prefix + name][same:]])
+        kept = {name: value for name, value in weights.items() if name in own or not name.startswith(prefix)}
+        return {**own, **kept}, options
 
     def start(self, first: Tensor, material: Tensor, sample: Tensor, windows: int) -> Drawn:
         """Return what windows are drawn to.

@@ -58,8 +58,7 @@ class Start:
                 expected="weights of the network that is trained",
                 got="weights of one with "
                 + ", ".join(f"model.{name}={self.options[name]}" for name in other)[:500],
-                fix="leave out what was --set of these (further grids of projections may follow those of the"
-                " weights), or start from other weights",
+                fix="leave out what was --set of these, or start from other weights",
             )
         load_weights(model, adapted, where=str(self.path))
 
