@@ -450,9 +450,24 @@ def test_finer_grids_go_on_from_weights_of_the_first(earlier: dict[str, object])
     }
 
 
-@pytest.mark.parametrize("grids", [{"shape": [8]}, {"shape": [8, 4]}, {"shape": []}, {"density": [4, 8]}])
-def test_other_grids_are_refused(grids: dict[str, object]) -> None:
-    """Weights of grids that are not the first of the model's mean something else there."""
-    with pytest.raises(UsageError) as caught:
-        started(surrogate(**(PROJECTED | grids)), surrogate(**(PROJECTED | {"shape": [4]})))
-    assert caught.value.where == "--start"
+@pytest.mark.parametrize(
+    ("earlier", "later", "same"),
+    [([4], [8], 0), ([4, 8], [4, 16], 1), ([4, 8], [4], 1), ([4, 8], [8, 4], 0), ([4, 8], [], 0)],
+)
+def test_of_other_grids_those_go_on_that_stand_first_in_both(
+    earlier: list[int], later: list[int], same: int
+) -> None:
+    """Their weights are kept; others start as in a new model, and those that are left out are dropped."""
+    before, new = (surrogate(shape=grids, density=grids[:1] or [4]) for grids in (earlier, later))
+    with torch.no_grad():
+        for weight in before.parameters():
+            weight.add_(0.01)
+    options = {"shape": later, "density": later[:1] or [4]}
+    found, held, own = (model.state_dict() for model in (started(surrogate(**options), before), before, new))
+    assert found.keys() == own.keys()
+    for name in found.keys() - {"projection.held", "projection.push"}:
+        torch.testing.assert_close(found[name], held[name].bfloat16().to(found[name].dtype), rtol=0, atol=0)
+    if later:
+        kept = rounded_weights(before)["projection.held"][:same].to(torch.float32)
+        expected = torch.cat([kept, own["projection.held"][same:]])
+        torch.testing.assert_close(found["projection.held"], expected, rtol=0, atol=0)
