@@ -16,7 +16,7 @@ from importlib.metadata import EntryPoint
 from pathlib import Path
 
 from lagbench.data.registry import PluginWarning, installed
-from lagbench.errors import LagbenchError, UsageError, nearest
+from lagbench.errors import LagbenchError, UsageError, loaded, nearest
 
 from .baseline import Baseline
 
@@ -85,22 +85,22 @@ def _points() -> dict[str, EntryPoint]:
 
 
 def _entry(point: EntryPoint) -> Entry:
-    loaded = point.load()
-    if not inspect.isclass(loaded):
+    found = loaded(point)
+    if not inspect.isclass(found):
         raise UsageError(f"{point.value} is no class", expected="a subclass of Baseline or Operator")
-    if issubclass(loaded, Baseline):
-        bare = [name for name in REQUIRED if getattr(loaded, name) is getattr(Baseline, name)]
+    if issubclass(found, Baseline):
+        bare = [name for name in REQUIRED if getattr(found, name) is getattr(Baseline, name)]
         if bare:
             raise UsageError(f"{point.value} lacks {', '.join(bare)}", expected=", ".join(REQUIRED))
-        return Entry(name=point.name, model=loaded, recipes=_recipes(loaded, point.name))
+        return Entry(name=point.name, model=found, recipes=_recipes(found, point.name))
     from lagbench.baselines.operators.operator import Operator
 
     from .simulator import GraphNetwork
 
-    if not issubclass(loaded, Operator):
+    if not issubclass(found, Operator):
         raise UsageError(f"{point.value} is no baseline", expected="a subclass of Baseline or Operator")
-    model = GraphNetwork.with_operator(loaded)
-    return Entry(name=point.name, model=model, recipes=_recipes(loaded, OPERATOR_RECIPES))
+    model = GraphNetwork.with_operator(found)
+    return Entry(name=point.name, model=model, recipes=_recipes(found, OPERATOR_RECIPES))
 
 
 def _recipes(loaded: type, name: str) -> Path | None:

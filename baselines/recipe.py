@@ -299,13 +299,14 @@ def changed_options(entry: Entry, options: Mapping[str, Any], settings: Iterable
         _checked(entry.model.Options, layer, "model", "--set").model_dump(mode="json")
         for layer in (dict(options), changed)
     )
-    kept = entry.model.Options.in_training | entry.model.Options.of_weights
-    if idle := sorted(name for name in kept if before[name] != after[name]):
-        fix = "leave it out, or train with it; docs/baselines.md says what a trained model takes"
-        expected, got = (
-            ", ".join(f"model.{name}={layer[name]}" for name in idle) for layer in (before, after)
-        )
-        raise UsageError("an option of the training", where="--set", expected=expected, got=got, fix=fix)
+    kinds = {"training": entry.model.Options.in_training, "weights": entry.model.Options.of_weights}
+    for kind, fixed in kinds.items():
+        if other := sorted(name for name in fixed if before[name] != after[name]):
+            expected, got = (
+                ", ".join(f"model.{name}={layer[name]}" for name in other) for layer in (before, after)
+            )
+            fix = "leave it out, or train with it; docs/baselines.md says what a trained model takes"
+            raise UsageError(f"an option of the {kind}", where="--set", expected=expected, got=got, fix=fix)
     return after
 
 
@@ -379,6 +380,6 @@ def _complaint(
         return kind(f"unknown key {key!r}", where=where, fix=fix)
     expected = first["msg"].removeprefix("Value error, ")
     if first["type"] == "tuple_type":
-        expected = "a list, as in [6,15]"
+        expected = "a list in brackets"
     got = None if isinstance(first["input"], Mapping) else repr(first["input"])[:80]
     return kind(f"{key} does not fit", where=where, expected=expected, got=got)

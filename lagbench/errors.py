@@ -15,7 +15,10 @@ import importlib.util
 import traceback
 from collections.abc import Iterable
 from types import ModuleType
-from typing import ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 
 class LagbenchError(Exception):
@@ -163,6 +166,18 @@ def package_at_fault(error: BaseException) -> str | None:
         if str(frame.f_globals.get("__name__")).split(".")[0] in added:
             place = f"{frame.f_code.co_filename}, line {line}"
     return place
+
+
+def loaded(point: EntryPoint) -> Any:  # noqa: ANN401 (a stranger's)
+    """Import what an entry point of another package names.
+
+    Raises:
+        ImportError: its module would end the program. Others raise what they like.
+    """
+    try:
+        return point.load()
+    except SystemExit as left:
+        raise ImportError(f"its module would end the program: {left!r}") from left
 
 
 def require(module: str, *, extra: str) -> ModuleType:

@@ -10,6 +10,8 @@ import re
 import sys
 from dataclasses import replace
 from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -359,6 +361,27 @@ def test_a_metric_does_not_end_the_program() -> None:
     again = pickle.loads(pickle.dumps(caught.value))
     assert again.where == f"{__name__}, enstrophy_error, frame {pair.frame}, scenario 3"
     assert all("scenario 3" in str(error) for error in (caught.value, again))
+
+
+def test_whether_a_metric_is_defined_is_true_or_false() -> None:
+    """A forgotten return would leave out every frame."""
+    truth = rollout()
+    pair = pairs_of(scenario_of(truth), truth, truth)[0]
+    forgetful: Any = lambda pair: None  # noqa: E731
+    with pytest.raises(WorkFailedError):
+        replace(OTHERS, defined=forgetful).measure(pair)
+    assert math.isnan(replace(OTHERS, defined=lambda pair: np.bool_(0)).measure(pair))
+
+
+def test_a_module_that_would_end_the_program_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Not with exit code 0 and nothing done."""
+    (tmp_path / "leaving.py").write_text("raise SystemExit")
+    monkeypatch.syspath_prepend(tmp_path)
+    point = EntryPoint(name="others", value="leaving:METRICS", group=table_module.GROUP)
+    monkeypatch.setattr(table_module, "installed", lambda group: [point])
+    with pytest.raises(UsageError) as caught:
+        available()
+    assert caught.value.where == "entry point others = leaving:METRICS"
 
 
 @pytest.mark.parametrize("what", ["statistic", "defined"])

@@ -21,6 +21,7 @@ from . import demo as tour
 
 INTERRUPTED = 130
 FAILED = 5
+RESUMED = {"generate", "download", "train"}  # commands that go on where they stopped
 UNREAD = 141  # what shells say of a command whose reader left, 128 + SIGPIPE
 FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
@@ -40,7 +41,8 @@ class _Commands(TyperGroup):
             with _plain_warnings(), _told(), _refused_output():
                 return super().invoke(ctx)
         except KeyboardInterrupt:
-            typer.echo("lagbench: interrupted; the same command goes on where it stopped", err=True)
+            more = "; the same command goes on where it stopped" if ctx.invoked_subcommand in RESUMED else ""
+            typer.echo(f"lagbench: interrupted{more}", err=True)
             raise typer.Exit(INTERRUPTED) from None
         except (typer.Exit, typer.Abort):
             raise

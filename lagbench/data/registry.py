@@ -32,7 +32,7 @@ from pydantic import (
     model_validator,
 )
 
-from lagbench.errors import LagbenchError, UnreadableFileError, UsageError, nearest
+from lagbench.errors import LagbenchError, UnreadableFileError, UsageError, loaded, nearest
 
 from .layout import ScenarioKey, dataset_folder, scenario_path
 from .limits import check_frames, check_parameters, check_subsets
@@ -169,7 +169,7 @@ def added_splits(own: Mapping[str, str], read: Callable[[Path, str], Found]) -> 
 
 def _registry_path(point: EntryPoint) -> Path:
     """Return the datasets.yaml that a split's module names as REGISTRY."""
-    module = point.load()
+    module = loaded(point)
     if not hasattr(module, "REGISTRY"):
         raise UsageError(
             "its module has no registry", expected="an attribute REGISTRY: the path of its datasets.yaml"

@@ -174,26 +174,34 @@ class Metric:
         """Return the statistic of a frame pair, NaN where it is undefined.
 
         Raises:
-            WorkFailedError: it is no number, or would end the program.
+            WorkFailedError: it is no number, whether it is defined is neither true nor false, or it would end
+                the program.
         """
         if self.statistic is None:
             return math.nan
-        value: object
         try:
-            value = self.statistic(pair) if self.defined(pair) else math.nan
+            known: object = self.defined(pair)
+            value: object = self.statistic(pair) if known else math.nan
         except SystemExit as left:
-            value = left
+            raise self._broken("a metric would end the program", pair, "a float", left) from left
         except Exception as error:
             error.add_note(f"in metric {self.name}, frame {pair.frame}")
             raise
+        if not isinstance(known, (bool, np.bool_)):
+            what = "whether a metric is defined is neither true nor false"
+            raise self._broken(what, pair, "True or False", known)
         with suppress(TypeError, ValueError, OverflowError, RuntimeError):  # as arrays of others raise
             if not isinstance(value, (str, bytes, complex)):
                 return float(value)  # type: ignore[arg-type]
-        raise WorkFailedError(
-            "a metric gave no number",
+        raise self._broken("a metric gave no number", pair, "a float", value)
+
+    def _broken(self, what: str, pair: FramePair, expected: str, got: object) -> WorkFailedError:
+        """Return the error of a metric that does not do what it must."""
+        return WorkFailedError(
+            what,
             where=f"{getattr(self.statistic, '__module__', '?')}, {self.name}, frame {pair.frame}",
-            expected="a float",
-            got=f"{type(value).__name__}: {value!r:.60}",
+            expected=expected,
+            got=f"{type(got).__name__}: {got!r:.60}",
             fix="mend or uninstall the package that adds it",
         )
 

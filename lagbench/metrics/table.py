@@ -12,7 +12,7 @@ from importlib.metadata import EntryPoint
 from types import MappingProxyType
 
 from lagbench.data.registry import installed
-from lagbench.errors import LagbenchError, UsageError, nearest
+from lagbench.errors import LagbenchError, UsageError, loaded, nearest
 
 from . import bodies, conservation, distributions, pointwise, transport, vorticity
 from .metric import Metric
@@ -78,8 +78,8 @@ def available() -> dict[str, Metric]:
 
 def _load(point: EntryPoint) -> Sequence[Metric]:
     try:
-        loaded = point.load()
-        found = (loaded,) if isinstance(loaded, Metric) else tuple(loaded)
+        given = loaded(point)
+        found = (given,) if isinstance(given, Metric) else tuple(given)
     except Exception as error:  # a stranger's module: importing it may raise anything
         raise UsageError(
             "a package's metrics cannot be loaded",
