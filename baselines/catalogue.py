@@ -103,12 +103,12 @@ def _entry(point: EntryPoint) -> Entry:
     return Entry(name=point.name, model=model, recipes=_recipes(found, OPERATOR_RECIPES))
 
 
-def _recipes(loaded: type, name: str) -> Path | None:
+def _recipes(found: type, name: str) -> Path | None:
     """Return the file that a class names as ``recipes``, from its module's folder, else ours of that name."""
-    given = getattr(loaded, "recipes", None)
+    given = getattr(found, "recipes", None)
     path = Path(given) if given else RECIPES / f"{name}.yaml"
     if not path.is_absolute():
-        owner = next(base for base in loaded.__mro__ if "recipes" in vars(base))
+        owner = next(base for base in found.__mro__ if "recipes" in vars(base))
         path = Path(inspect.getfile(owner)).parent / path
     return path if given or path.is_file() else None
 

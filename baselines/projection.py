@@ -202,6 +202,8 @@ class Projection(nn.Module):
     ) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Return weights and options with our own start for all grids but those that stand first in both.
 
+        Limits are of materials, not of grids: they are kept.
+
         Args:
             weights: of a model, by name, ours with the prefix: ``held`` of shape [grid, elastic material],
                 ``push`` [grid], ``limit`` [material].
@@ -211,10 +213,10 @@ class Projection(nn.Module):
         weights, options, own = dict(weights), dict(options), self.state_dict(prefix=prefix)
         for option, name in PER_GRID.items():
             ours, known = list(self.across[option]), list(options[option])
-            same = len(list(takewhile(lambda pair: pair[0] == pair[1], zip(ours, known, strict=False))))
+            shared = len(list(takewhile(lambda pair: pair[0] == pair[1], zip(ours, known, strict=False))))
             options[option], learned = ours, weights.pop(prefix + name, None)
             if learned is not None and ours:
-                weights[prefix + name] = torch.cat([learned[:same], own[prefix + name][same:]])
+                weights[prefix + name] = torch.cat([learned[:shared], own[prefix + name][shared:]])
         kept = {name: value for name, value in weights.items() if name in own or not name.startswith(prefix)}
         return {**own, **kept}, options
 

@@ -4,7 +4,7 @@ Every error a user can cause is a :class:`LagbenchError`; its ``exit_code`` is w
 command line returns. Codes: 1 checks failed, 2 usage, 3 a file the user gave is unreadable,
 4 data set missing, damaged or of another hash, 5 the work itself failed.
 
-Optional dependencies: import one, or say which extra installs it.
+Optional dependencies: import one, or say which extra installs it. Packages that add something: import them.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class LagbenchError(Exception):
         return printable("\n  ".join(parts))
 
     def add_note(self, note: str, /) -> None:
-        """Say more of where it is."""
+        """Say more of where it is, in place of Python's notes, which no message of ours shows."""
         self.where = note if self.where is None else f"{self.where}, {note}"
         self.args = (self._compose(),)
 

@@ -363,13 +363,33 @@ def test_a_metric_does_not_end_the_program() -> None:
     assert all("scenario 3" in str(error) for error in (caught.value, again))
 
 
+@pytest.mark.parametrize("what", ["applies", "series", "over_frames"])
+@pytest.mark.parametrize("left", [SystemExit(0), KeyError("mine")])
+def test_all_that_a_metric_does_is_told_with_its_name(what: str, left: BaseException) -> None:
+    """Not its statistic alone; nothing of it ends the program."""
+
+    def fail(*_: object) -> Any:
+        raise left
+
+    truth = rollout()
+    scenario = scenario_of(truth)
+    bad: Any = replace(OTHERS, **{what: fail})
+    with pytest.raises((WorkFailedError, KeyError)) as caught:
+        aggregate(
+            [bad], {0: tally(pairs_of(scenario, truth, truth), [bad], scenario.setting.predicted_frames)}
+        )
+    told = getattr(caught.value, "where", None) or caught.value.__notes__[0]
+    assert "enstrophy_error" in told
+
+
 def test_whether_a_metric_is_defined_is_true_or_false() -> None:
     """A forgotten return would leave out every frame."""
     truth = rollout()
     pair = pairs_of(scenario_of(truth), truth, truth)[0]
-    forgetful: Any = lambda pair: None  # noqa: E731
-    with pytest.raises(WorkFailedError):
-        replace(OTHERS, defined=forgetful).measure(pair)
+    for told in (None, "no", np.array([True, False])):
+        forgetful: Any = lambda pair, told=told: told  # noqa: E731
+        with pytest.raises(WorkFailedError):
+            replace(OTHERS, defined=forgetful).measure(pair)
     assert math.isnan(replace(OTHERS, defined=lambda pair: np.bool_(0)).measure(pair))
 
 

@@ -21,7 +21,7 @@ from . import demo as tour
 
 INTERRUPTED = 130
 FAILED = 5
-RESUMED = {"generate", "download", "train"}  # commands that go on where they stopped
+RESUMED = {"demo", "generate", "download", "train"}  # commands that go on where they stopped
 UNREAD = 141  # what shells say of a command whose reader left, 128 + SIGPIPE
 FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 

@@ -107,7 +107,17 @@ class Tally:
 
 def measure(pair: FramePair, metrics: Iterable[Metric]) -> dict[str, float]:
     """Return the statistics of one frame pair by name, NaN where one is undefined."""
-    return {m.name: m.measure(pair) for m in metrics if m.statistic is not None and m.applies(pair)}
+    found = {}
+    for metric in metrics:
+        if metric.statistic is None:
+            continue
+        try:
+            applies = metric.applies(pair)
+        except (Exception, SystemExit) as error:
+            raise metric.blamed(error, f"frame {pair.frame}") from error.__cause__
+        if applies:
+            found[metric.name] = metric.measure(pair)
+    return found
 
 
 def tally(pairs: Iterable[FramePair], metrics: Sequence[Metric], frames: Sequence[int]) -> Tally:
@@ -305,13 +315,17 @@ def score(metric: Metric, tallies: Mapping[int, Tally]) -> Score | None:
     asked = np.stack([_measured(metric, tallies[i]) for i in scenarios])
     if metric.horizon > len(frames) or not asked.any():
         return None
-    series = np.stack([_series(metric, tallies[i]) for i in scenarios])
+    try:
+        series = np.stack([_series(metric, tallies[i]) for i in scenarios])
+        values = _over_frames(metric, series)
+    except (Exception, SystemExit) as error:
+        raise metric.blamed(error, "over all frames") from error.__cause__
     return Score(
         metric=metric,
         scenarios=scenarios,
         frames=frames,
         per_frame=series,
-        values=_over_frames(metric, series),
+        values=values,
         undefined=tuple(np.count_nonzero(asked & np.isnan(series), axis=1).tolist()),
     )
 

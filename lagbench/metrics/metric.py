@@ -179,27 +179,37 @@ class Metric:
         """
         if self.statistic is None:
             return math.nan
+        place = f"frame {pair.frame}"
         try:
             known: object = self.defined(pair)
-            value: object = self.statistic(pair) if known else math.nan
-        except SystemExit as left:
-            raise self._broken("a metric would end the program", pair, "a float", left) from left
-        except Exception as error:
-            error.add_note(f"in metric {self.name}, frame {pair.frame}")
-            raise
-        if not isinstance(known, (bool, np.bool_)):
-            what = "whether a metric is defined is neither true nor false"
-            raise self._broken(what, pair, "True or False", known)
+            is_known = isinstance(known, (bool, np.bool_))
+            value: object = self.statistic(pair) if is_known and known else math.nan
+        except (Exception, SystemExit) as error:
+            raise self.blamed(error, place) from error.__cause__
+        if not is_known:
+            raise self._broken(
+                "whether a metric is defined is neither true nor false", place, "a bool", known
+            )
         with suppress(TypeError, ValueError, OverflowError, RuntimeError):  # as arrays of others raise
             if not isinstance(value, (str, bytes, complex)):
                 return float(value)  # type: ignore[arg-type]
-        raise self._broken("a metric gave no number", pair, "a float", value)
+        raise self._broken("a metric gave no number", place, "a float", value)
 
-    def _broken(self, what: str, pair: FramePair, expected: str, got: object) -> WorkFailedError:
+    def blamed(self, error: Exception | SystemExit, place: str) -> Exception:
+        """Return what to raise for what the metric raised: the same with name and place, or our own."""
+        if isinstance(error, SystemExit):
+            return self._broken("a metric would end the program", place, "a number", error)
+        error.add_note(f"in metric {self.name}, {place}")
+        return error
+
+    def _broken(self, what: str, place: str, expected: str, got: object) -> WorkFailedError:
         """Return the error of a metric that does not do what it must."""
+        package = next(
+            (each.__module__ for each in (self.statistic, self.series) if each not in (None, identity)), "?"
+        )
         return WorkFailedError(
             what,
-            where=f"{getattr(self.statistic, '__module__', '?')}, {self.name}, frame {pair.frame}",
+            where=f"{package}, {self.name}, {place}",
             expected=expected,
             got=f"{type(got).__name__}: {got!r:.60}",
             fix="mend or uninstall the package that adds it",
