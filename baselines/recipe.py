@@ -269,6 +269,8 @@ def recipe_for(
             raise UnreadableFileError(f"unknown baseline {other!r}", where=where, fix=nearest(other, names()))
     own = part.baselines.get(entry.name, _Part())
     model, training = _merge(_merge(model, own.model), dict(learned or {})), _merge(training, own.training)
+    settings = tuple(settings)
+    where = f"{path.name if path else entry.name}, {name}" + (", and --set" if settings else "")
     for setting in settings:
         group, changes = _setting(setting)
         if group == "model":
@@ -277,7 +279,6 @@ def recipe_for(
             training = _merge(training, changes)
     if seed is not None:
         training["seed"] = seed
-    where = f"{path.name if path else entry.name}, {name}"
     return Recipe(
         baseline=entry.name,
         name=name,
@@ -343,6 +344,7 @@ def _setting(text: str) -> tuple[str, Layer]:
             where="--set",
             expected="model.KEY=VALUE or training.KEY=VALUE",
             got=text,
+            fix=nearest(group, ("model", "training")) if equals and path else None,
         )
     try:
         layer: Any = yaml.safe_load(value)
@@ -381,5 +383,6 @@ def _complaint(
     expected = first["msg"].removeprefix("Value error, ")
     if first["type"] == "tuple_type":
         expected = "a list in brackets"
-    got = None if isinstance(first["input"], Mapping) else repr(first["input"])[:80]
+    whole = isinstance(first["input"], Mapping) and not first["type"].endswith("_type")
+    got = None if whole else repr(first["input"])[:80]
     return kind(f"{key} does not fit", where=where, expected=expected, got=got)

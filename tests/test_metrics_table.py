@@ -281,6 +281,7 @@ OTHERS = Metric(
 )
 CLASHING = (replace(OTHERS, name="vorticity_mse", of=()),)
 NO_METRIC = ("vorticity",)
+NUMBER = 3
 ROOTLESS = (replace(OTHERS, statistic=None, of=("velocity_mse", "nothing_known")),)
 
 
@@ -301,7 +302,7 @@ def test_another_package_adds_a_metric(monkeypatch: pytest.MonkeyPatch) -> None:
     assert aggregate(metrics, {0: pieces})["enstrophy_error"].mean == 1.0
 
 
-@pytest.mark.parametrize("name", ["CLASHING", "NO_METRIC", "ROOTLESS"])
+@pytest.mark.parametrize("name", ["CLASHING", "NO_METRIC", "NUMBER", "ROOTLESS"])
 def test_a_bad_entry_point_is_named(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     """A taken name, no metric, or one of statistics that nothing measures: refused, and said where it is."""
     with_entry_point(monkeypatch, name)

@@ -79,7 +79,7 @@ def available() -> dict[str, Metric]:
 def _load(point: EntryPoint) -> Sequence[Metric]:
     try:
         given = loaded(point)
-        found = (given,) if isinstance(given, Metric) else tuple(given)
+        found = tuple(given) if isinstance(given, Iterable) else (given,)
     except Exception as error:  # a stranger's module: importing it may raise anything
         raise UsageError(
             "a package's metrics cannot be loaded",
