@@ -38,7 +38,7 @@ from .augmentation import Symmetry, disturbed, field_image, images, strain_image
 from .baseline import Baseline, Batch, Facts, Options, check_moving_walls, last_velocities
 from .graph import MATERIALS
 from .particle_grid import ParticleGrid, Stencil
-from .projection import PER_GRID, Drawn, Projection
+from .projection import Drawn, Projection
 from .strain import Rest, first_frame
 from .unet import COARSEST, Context, UNet
 
@@ -183,11 +183,8 @@ class NeuralMPM(Baseline):
         self, weights: Mapping[str, Tensor], options: Mapping[str, Any]
     ) -> tuple[Mapping[str, Tensor], Mapping[str, Any]]:
         """Take weights of grids of ``shape`` and ``density`` that stand first in both; others start anew."""
-        if self.projection is None:
-            grids = {name: list(getattr(self.options, name)) for name in PER_GRID}
-            known = {name: each for name, each in weights.items() if not name.startswith("projection.")}
-            return known, {**options, **grids}
-        return self.projection.adapted(weights, options, prefix="projection.")
+        projection = self.projection or Projection(self.facts.bounds, shape=(), density=())
+        return projection.adapted(weights, options, prefix="projection.")
 
     def forward(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """Return the squared error of velocity over the deviation of accelerations, mean over frames [1].

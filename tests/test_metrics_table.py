@@ -383,6 +383,33 @@ def test_all_that_a_metric_does_is_told_with_its_name(what: str, left: BaseExcep
     assert "enstrophy_error" in told
 
 
+def test_what_a_metric_raises_keeps_what_it_came_from() -> None:
+    """A package's author sees the first error too."""
+
+    def fail(_: FramePair) -> float:
+        try:
+            return float({}["missing"])
+        except KeyError:
+            return [][0]
+
+    truth = rollout()
+    pair = pairs_of(scenario_of(truth), truth, truth)[0]
+    with pytest.raises(IndexError) as caught:
+        replace(OTHERS, statistic=fail).measure(pair)
+    assert isinstance(caught.value.__context__, KeyError)
+    assert not caught.value.__suppress_context__
+
+
+def test_a_metric_without_a_module_is_told_too() -> None:
+    """As a ufunc or a partial may be."""
+    truth = rollout()
+    pair = pairs_of(scenario_of(truth), truth, truth)[0]
+    bare: Any = np.frompyfunc(lambda pair: None, 1, 1)
+    with pytest.raises(WorkFailedError) as caught:
+        replace(OTHERS, statistic=bare).measure(pair)
+    assert "enstrophy_error" in str(caught.value.where)
+
+
 def test_whether_a_metric_is_defined_is_true_or_false() -> None:
     """A forgotten return would leave out every frame."""
     truth = rollout()

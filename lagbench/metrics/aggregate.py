@@ -114,7 +114,7 @@ def measure(pair: FramePair, metrics: Iterable[Metric]) -> dict[str, float]:
         try:
             applies = metric.applies(pair)
         except (Exception, SystemExit) as error:
-            raise metric.blamed(error, f"frame {pair.frame}") from error.__cause__
+            metric.blame(error, f"frame {pair.frame}")
         if applies:
             found[metric.name] = metric.measure(pair)
     return found
@@ -319,7 +319,7 @@ def score(metric: Metric, tallies: Mapping[int, Tally]) -> Score | None:
         series = np.stack([_series(metric, tallies[i]) for i in scenarios])
         values = _over_frames(metric, series)
     except (Exception, SystemExit) as error:
-        raise metric.blamed(error, "over all frames") from error.__cause__
+        metric.blame(error, "over all frames")
     return Score(
         metric=metric,
         scenarios=scenarios,

@@ -13,7 +13,7 @@ import re
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -181,32 +181,32 @@ class Metric:
             return math.nan
         place = f"frame {pair.frame}"
         try:
-            known: object = self.defined(pair)
-            is_known = isinstance(known, (bool, np.bool_))
-            value: object = self.statistic(pair) if is_known and known else math.nan
+            told: object = self.defined(pair)
+            clear = isinstance(told, (bool, np.bool_))
+            value: object = self.statistic(pair) if clear and told else math.nan
         except (Exception, SystemExit) as error:
-            raise self.blamed(error, place) from error.__cause__
-        if not is_known:
-            raise self._broken(
-                "whether a metric is defined is neither true nor false", place, "a bool", known
-            )
+            self.blame(error, place)
+        if not clear:
+            raise self._broken("whether a metric is defined is neither true nor false", place, "a bool", told)
         with suppress(TypeError, ValueError, OverflowError, RuntimeError):  # as arrays of others raise
             if not isinstance(value, (str, bytes, complex)):
                 return float(value)  # type: ignore[arg-type]
         raise self._broken("a metric gave no number", place, "a float", value)
 
-    def blamed(self, error: Exception | SystemExit, place: str) -> Exception:
-        """Return what to raise for what the metric raised: the same with name and place, or our own."""
+    def blame(self, error: Exception | SystemExit, place: str) -> NoReturn:
+        """Raise again what the metric raised, with its name and place.
+
+        Raises:
+            WorkFailedError: it would have ended the program.
+        """
         if isinstance(error, SystemExit):
-            return self._broken("a metric would end the program", place, "a number", error)
+            raise self._broken("a metric would end the program", place, "a number", error) from error
         error.add_note(f"in metric {self.name}, {place}")
-        return error
+        raise error
 
     def _broken(self, what: str, place: str, expected: str, got: object) -> WorkFailedError:
         """Return the error of a metric that does not do what it must."""
-        package = next(
-            (each.__module__ for each in (self.statistic, self.series) if each not in (None, identity)), "?"
-        )
+        package = getattr(self.series if self.statistic is None else self.statistic, "__module__", "?")
         return WorkFailedError(
             what,
             where=f"{package}, {self.name}, {place}",
