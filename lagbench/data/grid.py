@@ -174,12 +174,12 @@ def transfer(position: ArrayLike, velocity: ArrayLike, grid: Grid) -> Transfer:
         )
     sums = np.empty((*x.shape[:-2], 3, grid.nodes, grid.nodes))
     for frame in np.ndindex(x.shape[:-2]):  # a frame fits the cache, a batch does not
-        sums[frame] = _scatter(x[frame], u[frame], grid)
+        _scatter(x[frame], u[frame], grid, sums[frame])
     return Transfer(sums[..., 0, :, :], np.moveaxis(sums[..., 1:, :, :], -3, -1))
 
 
-def _scatter(x: Floats, u: Floats, grid: Grid) -> Floats:
-    """Return ``sum(w)`` and the components of ``sum(w u)`` of one frame, shape [3, x node, y node]."""
+def _scatter(x: Floats, u: Floats, grid: Grid, out: Floats) -> None:
+    """Put out ``sum(w)`` and the components of ``sum(w u)`` of one frame, shape [3, x node, y node]."""
     if not (x.min(initial=0.0) >= 0.0 and x.max(initial=1.0) <= 1.0):  # NaN is not inside either
         inside = ((x >= 0.0) & (x <= 1.0)).all(axis=1)
         x, u = x[inside], u[inside]
@@ -192,21 +192,22 @@ def _scatter(x: Floats, u: Floats, grid: Grid) -> Floats:
     base += _LOW
     base[0] *= side
     corner = (base[0] + base[1]).astype(np.intp)
-    velocity = np.ascontiguousarray(u.T)
+    velocity = np.empty(len(corner), np.complex128)
+    velocity.real, velocity.imag = u[:, 0], u[:, 1]
 
+    # node numbers stay those of the corner; what is added to is shifted to the node instead
     size = side * side
-    sums, weight, product = np.zeros((3, size)), np.empty(len(corner)), np.empty(len(corner))
+    sums, momenta = (np.zeros(size + 2 * side + 2, kind) for kind in (np.float64, np.complex128))
+    weight, product = np.empty(len(corner)), np.empty_like(velocity)
     for i in range(3):
         for k in range(3):
-            # node numbers stay those of the corner; its sums are shifted to the node instead
             shift = i * side + k
             np.multiply(weight_x[i], weight_y[k], out=weight)
-            # one sum at a time: the particles and the nodes of all three do not fit the fast cache
-            sums[0, shift:] += np.bincount(corner, weight, size)[: size - shift]
-            for component, along in zip(sums[1:], velocity, strict=True):
-                np.multiply(weight, along, out=product)
-                component[shift:] += np.bincount(corner, product, size)[: size - shift]
-    return sums.reshape(3, side, side)[:, _LOW:-_HIGH, _LOW:-_HIGH]
+            np.add.at(sums[shift:], corner, weight)
+            np.multiply(weight, velocity, out=product)  # both components in one sum: a quarter faster
+            np.add.at(momenta[shift:], corner, product)
+    for field, kind in zip(out, (sums, momenta.real, momenta.imag), strict=True):
+        field[:] = kind[:size].reshape(side, side)[_LOW:-_HIGH, _LOW:-_HIGH]
 
 
 def _spline(s: Floats) -> Floats:

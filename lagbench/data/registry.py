@@ -36,7 +36,6 @@ from lagbench.errors import LagbenchError, UnreadableFileError, UsageError, load
 
 from .layout import ScenarioKey, dataset_folder, scenario_path
 from .limits import check_frames, check_parameters, check_subsets
-from .yamlfile import read_yaml
 
 __all__ = [
     "MAX_ID",
@@ -515,6 +514,8 @@ def _read_split(path: Path, name: str) -> tuple[Split, dict[str, Measured], Path
 
 def _read(path: Path) -> _File:
     """Validate one datasets.yaml; say where and what is wrong with it."""
+    from .yamlfile import read_yaml  # a child that validates is told of the sizes, and starts sooner without
+
     try:
         return _File.model_validate(read_yaml(path))
     except ValidationError as error:

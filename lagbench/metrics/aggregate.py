@@ -179,20 +179,23 @@ class Resampling:
             return self.mean, self.mean
         tails = (1.0 - LEVEL) / 2.0, (1.0 + LEVEL) / 2.0
         wider = student_quantile(self.freedom, tails[1]) / NormalDist().inv_cdf(tails[1])
-        ordered = np.sort(self.deviations)
-        low, high = (self.mean + wider * quantile(ordered, tail) for tail in tails)
+        low, high = (self.mean + wider * tail for tail in quantiles(self.deviations, tails))
         return low, high
 
 
-def quantile(ordered: Floats, share: float) -> float:
-    """Return a quantile of two or more ascending values, linear between them: the bits of ``np.quantile``.
+def quantiles(values: Floats, shares: Sequence[float]) -> list[float]:
+    """Return quantiles of two or more values, linear between them: the bits of ``np.quantile``.
 
-    NumPy partitions anew and takes several times as long as a sort of ten thousand values.
+    Only what stands beside them is put in its place: of ten thousand values in a ninth of the time of a sort.
     """
-    place = share * (len(ordered) - 1)
-    below = min(int(place), len(ordered) - 2)
-    part, (low, high) = place - below, ordered[below : below + 2].tolist()
-    return float(low + (high - low) * part if part < 0.5 else high - (high - low) * (1.0 - part))
+    places = [share * (len(values) - 1) for share in shares]
+    lower = [min(int(place), len(values) - 2) for place in places]
+    placed = np.partition(values, [i for below in lower for i in (below, below + 1)])
+    found = []
+    for place, below in zip(places, lower, strict=True):
+        part, (low, high) = place - below, placed[below : below + 2].tolist()
+        found.append(low + (high - low) * part if part < 0.5 else high - (high - low) * (1.0 - part))
+    return found
 
 
 @functools.cache

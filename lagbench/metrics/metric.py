@@ -179,13 +179,15 @@ class Metric:
         """
         if self.statistic is None:
             return math.nan
-        place = f"frame {pair.frame}"
         try:
             told: object = self.defined(pair)
             clear = isinstance(told, (bool, np.bool_))
             value: object = self.statistic(pair) if clear and told else math.nan
         except (Exception, SystemExit) as error:
-            self.blame(error, place)
+            self.blame(error, f"frame {pair.frame}")
+        if clear and isinstance(value, float):  # nearly always
+            return float(value)
+        place = f"frame {pair.frame}"
         if not clear:
             raise self._broken("whether a metric is defined is neither true nor false", place, "a bool", told)
         with suppress(TypeError, ValueError, OverflowError, RuntimeError):  # as arrays of others raise
