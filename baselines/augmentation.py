@@ -26,7 +26,7 @@ from torch import Tensor
 
 from lagbench.data.registry import Size
 from lagbench.errors import UsageError
-from lagbench.torch import Batch
+from lagbench.tensors import Batch
 
 from .graph import Bounds
 

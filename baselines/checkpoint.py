@@ -30,15 +30,15 @@ from torch import Tensor, nn
 from torch.nn.modules.module import register_module_parameter_registration_hook
 from torch.nn.parameter import is_lazy
 
-from lagbench.atomic import atomic_path
-from lagbench.data.layout import check_regular
+from lagbench.atomic import atomic_path, check_regular
 from lagbench.data.registry import Registry
 from lagbench.data.registry import load as load_registry
 from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError, WorkFailedError
 from lagbench.submission.budget import Budget, budget_in
 
-from .baseline import Baseline, Facts, facts_of
+from .baseline import Baseline, Facts
 from .catalogue import find
+from .facts import facts_of
 
 SPARE = 2**20  # numbers that a model may have beside those of its file: buffers that are not stored
 PARTS = 1000  # tensors that it may have beside those of its file

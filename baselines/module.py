@@ -27,7 +27,7 @@ from torch.optim import AdamW, Optimizer
 from torch.utils.data import DataLoader
 
 from lagbench.errors import UsageError, WorkFailedError
-from lagbench.torch import Window
+from lagbench.tensors import Window
 
 from .baseline import Baseline, Batch
 from .checkpoint import load, rounded_weights, save

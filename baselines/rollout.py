@@ -25,12 +25,12 @@ from lagbench.errors import UsageError
 from lagbench.metrics.aggregate import Tally, score, tally
 from lagbench.metrics.frame import FramePair, snapshots
 from lagbench.metrics.table import METRICS, select
-from lagbench.scoring.scenario import as_stored
-from lagbench.scoring.task import ScoredTask, load_scored_task, ranking_metric
+from lagbench.scoring.task import ScoredTask, as_stored, load_scored_task, ranking_metric
 from lagbench.store.copy import scenario_files
 from lagbench.store.windows import window_of
 from lagbench.submission.checks import MAX_DISTANCE
-from lagbench.torch import Window, collate, tensors
+from lagbench.tensors import Window, collate
+from lagbench.torch import tensors
 
 from .baseline import Baseline, Batch, Facts
 from .recipe import TrainingOptions

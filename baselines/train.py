@@ -24,13 +24,15 @@ from lagbench.data.local import locate
 from lagbench.data.registry import Registry
 from lagbench.errors import DataError, UsageError
 from lagbench.submission.budget import Track, track_of
-from lagbench.torch import Window, WindowDataset, WindowSampler, collate
+from lagbench.tensors import Window, collate
+from lagbench.torch import WindowDataset, WindowSampler
 from lagbench.work.progress import Meter, Progress
 
 from .augmentation import check_symmetry
-from .baseline import Baseline, Facts, facts_of
+from .baseline import Baseline, Facts
 from .catalogue import find
 from .checkpoint import Checkpoint, load_weights, rounded_weights, save
+from .facts import facts_of
 from .job import STOPPED_EARLY, RunFolder, TrainingJob, TrainingRecord, parameter_count, start_words
 from .machine import (
     bound_memory,

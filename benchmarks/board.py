@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lagbench.board.build import build
 from lagbench.board.check import check_board
 from lagbench.board.entry import (
     Cost,
@@ -34,7 +35,6 @@ from lagbench.board.entry import (
 )
 from lagbench.board.entry_file import spell
 from lagbench.board.folder import Folder, score_paths
-from lagbench.board.page import build
 from lagbench.board.ranking import combine, summarise, write_floors
 from lagbench.cli.output import spell_bytes
 from lagbench.data.checksums import file_sha256
@@ -44,10 +44,9 @@ from lagbench.floors.table import FLOORS
 from lagbench.metrics import METRICS, Direction, Setting, Tally, aggregate
 from lagbench.metrics.distributions import BINS
 from lagbench.scoring.card import ScoreCard
-from lagbench.scoring.scenario import FRAMES, PARTICLES, SUBMISSION, Preview, as_stored
 from lagbench.scoring.score_file import write_statistics
 from lagbench.scoring.stored import read_stored, reported_frames
-from lagbench.scoring.task import ranking_metric
+from lagbench.scoring.task import FRAMES, PARTICLES, SUBMISSION, Preview, as_stored, ranking_metric
 from lagbench.submission import Header
 from lagbench.submission.task_checks import frames_to_predict
 

@@ -14,11 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
+from lagbench.data import MATERIALS
 from lagbench.data.layout import resolve_root
 from lagbench.data.registry import load
 from lagbench.data.scenario import read_scenario
-from lagbench.data.writer import MATERIALS
-from lagbench.draw.markdown import table
+from lagbench.draw.tables import markdown
 from lagbench.errors import LagbenchError, nearest
 from lagbench.floors import shipped
 from lagbench.scoring.stored import published
@@ -59,7 +59,7 @@ def main() -> int:
         means = [float(np.mean(np.asarray(values)[np.array(kinds) == one])) for one in sets]
         lines.append([name, *(f"{mean:.4f}" for mean in [*means, float(np.mean(values))])])
     head = [f"{one} ({kinds.count(one)})" for one in sets]
-    print(table([metric, *head, f"all ({len(kinds)})"], lines))
+    print(markdown([metric, *head, f"all ({len(kinds)})"], lines))
     return 0
 
 

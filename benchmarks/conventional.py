@@ -27,8 +27,9 @@ import time
 import numpy as np
 import taichi as ti
 
+from lagbench.data import WALLS
 from lagbench.generators.acceptance.experiment import Case, initial_state, plan, solver_parameters
-from lagbench.generators.split import WALLS, ClosedBoxParameters, InitialState
+from lagbench.generators.split import ClosedBoxParameters, InitialState
 
 
 @ti.data_oriented

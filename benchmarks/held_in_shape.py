@@ -26,7 +26,7 @@ from lagbench.baselines.projection import Density, Shape
 from lagbench.data.layout import resolve_root
 from lagbench.data.registry import Size, load
 from lagbench.data.scenario import read_scenario
-from lagbench.draw.markdown import table
+from lagbench.draw.tables import markdown
 from lagbench.submission.predictions import Predictions, open_predictions
 
 SPLIT = "multimaterial"
@@ -88,7 +88,7 @@ def main() -> int:
                 mean, most = values.mean(dim=0).tolist(), values.amax(dim=0).tolist()
                 pairs = [f"{each:.2g}" for pair in zip(mean, most, strict=True) for each in pair]
                 lines.append([name, NAMES[kind], *pairs])
-    print(table(["of", "material", "off its shape", "at most", "density", "at most"], lines))
+    print(markdown(["of", "material", "off its shape", "at most", "density", "at most"], lines))
     return 0
 
 

@@ -24,7 +24,7 @@ from lagbench.baselines.catalogue import find
 from lagbench.baselines.recipe import recipe_for
 from lagbench.baselines.rollout import roll_out
 from lagbench.data.registry import load
-from lagbench.draw.markdown import table
+from lagbench.draw.tables import markdown
 
 SPLIT, SIZE = "curl-noise", "mini"
 MODELS = ("gns", "mlp", "neuralmpm")
@@ -120,7 +120,7 @@ def main() -> int:
         slopes = [float(np.polyfit(np.log(counts), np.log(found[name]), 1)[0]) for name in MODELS]
         lines.append(["", "exponent", *(f"{slope:.2f}" for slope in slopes)])
     said = f"Processor time of a frame [ms] on one core; untrained models, recipes of {SPLIT} {SIZE}."
-    text = f"{said}\n\n{table(['q', 'particles', *MODELS], lines)}\n"
+    text = f"{said}\n\n{markdown(['q', 'particles', *MODELS], lines)}\n"
     print(text)
     if asked.output:
         (asked.output / "inference_cost.md").write_text(text, encoding="utf-8")

@@ -17,8 +17,9 @@ from pathlib import Path
 
 import torch
 
-from lagbench.baselines.baseline import Baseline, facts_of
+from lagbench.baselines.baseline import Baseline
 from lagbench.baselines.catalogue import find
+from lagbench.baselines.facts import facts_of
 from lagbench.baselines.machine import multiplies_bfloat16
 from lagbench.baselines.recipe import Recipe, recipe_for
 from lagbench.torch import WindowDataset, collate

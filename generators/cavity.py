@@ -20,9 +20,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.data import WALLS
+
 from .constants import closed_box_walls, constants, interval
 from .draws import RandomSource, choice, fill, log_uniform, quantise, uniform
-from .split import WALLS, ClosedBoxParameters, InitialState, Material
+from .split import ClosedBoxParameters, InitialState, Material
 
 if TYPE_CHECKING:
     from lagbench.data.registry import Size

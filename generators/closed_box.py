@@ -13,12 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.data import WALLS
 from lagbench.errors import UsageError
 
 from .driver import Driver, stack
 from .nodal_stress import JACOBIAN_BOUND, NodalStress
 from .solver import Health
-from .split import WALLS, ClosedBoxParameters, InitialState
+from .split import ClosedBoxParameters, InitialState
 
 
 class ClosedBox(Driver[ClosedBoxParameters]):

@@ -16,11 +16,7 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from lagbench.data.registry import Size
 
-__all__ = ["WALLS", "ClosedBoxParameters", "FreeSurfaceParameters", "InitialState", "Material", "Split"]
-
-
-WALLS = ("left", "right", "bottom", "top")
-"""Order of the walls wherever an array has a wall axis."""
+__all__ = ["ClosedBoxParameters", "FreeSurfaceParameters", "InitialState", "Material", "Split"]
 
 
 class Material(enum.IntEnum):

@@ -17,8 +17,8 @@ import yaml
 from made_up import PLACE, SCORES, BoardBench, copied, damped, nearer, noisy, reform, scale, set_mean, still
 
 from lagbench.board import submit as submitting
+from lagbench.board.build import collect
 from lagbench.board.check import CheckResult, check_board
-from lagbench.board.collect import collect
 from lagbench.errors import UnreadableFileError, UsageError
 from lagbench.metrics.table import available
 from lagbench.scoring import score

@@ -14,9 +14,9 @@ import yaml
 from made_up import PLACE, SCORES, BoardBench, copied, master, reform, scale, set_mean
 
 from lagbench.board import check as checking
+from lagbench.board.build import build
 from lagbench.board.check import check_board
 from lagbench.board.findings import CHECKS, skeleton
-from lagbench.board.page import build
 from lagbench.data.registry import load
 from lagbench.errors import ChecksFailedError
 

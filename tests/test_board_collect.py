@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 from made_up import PLACE, BoardBench, copied, master, noisy
 
-from lagbench.board.collect import CURVE_FRAMES, RESIDUAL_BINS, collect, curve, residuals
+from lagbench.board.build import CURVE_FRAMES, RESIDUAL_BINS, build, collect, curve, residuals
 from lagbench.board.folder import Folder
 from lagbench.board.model import Board, Row
-from lagbench.board.page import build
 from lagbench.board.ranking import Combined, combine
 from lagbench.board.show import as_plain, chosen_data_sets, tables
 from lagbench.data.registry import Registry
@@ -22,9 +21,9 @@ from lagbench.errors import ChecksFailedError, DataError, LagbenchError, UsageEr
 from lagbench.floors.table import FLOORS
 from lagbench.metrics import METRICS, Score, bootstrap_interval
 from lagbench.scoring.card import ScoreCard, digits
-from lagbench.scoring.scenario import SUBMISSION
 from lagbench.scoring.score_file import read_statistics
 from lagbench.scoring.stored import read_stored
+from lagbench.scoring.task import SUBMISSION
 
 
 @pytest.fixture(scope="module")

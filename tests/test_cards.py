@@ -21,7 +21,7 @@ from lagbench.data import registry
 from lagbench.data.layout import dataset_folder
 from lagbench.data.manifest import Manifest, describe_file, merge
 from lagbench.data.registry import Size
-from lagbench.draw.markdown import escape, table
+from lagbench.draw.tables import escape, markdown
 from lagbench.make import cards
 from lagbench.make.cards import croissant_json
 
@@ -252,7 +252,7 @@ def test_escaping_only_adds_backslashes(text: str) -> None:
 
 def test_tables_set_numbers_flush_right() -> None:
     """Whole columns of numbers are flush right, with thousands apart; code stays code."""
-    assert table(("n", "`code`|"), [(1234, "`a_b`"), (5, "c_d")]).splitlines() == [
+    assert markdown(("n", "`code`|"), [(1234, "`a_b`"), (5, "c_d")]).splitlines() == [
         r"| n | \`code\`\| |",
         "| ---: | --- |",
         "| 1,234 | `a_b` |",

@@ -16,11 +16,13 @@ import pytest
 from score_bench import ScoreBench, half_right, still, straight
 from typer.testing import Result
 
+from lagbench.cli import output
+from lagbench.draw.tables import Table
 from lagbench.errors import DataError, UnreadableFileError, UsageError
 from lagbench.metrics import differ
 from lagbench.scoring.card import digits
 from lagbench.scoring.compare import ComparisonResult, compare
-from lagbench.scoring.tables import Table, card_tables, comparison_tables, flag_lines
+from lagbench.scoring.tables import card_tables, comparison_tables, flag_lines
 
 
 @pytest.fixture(scope="module")
@@ -368,7 +370,7 @@ def test_wide_tables_come_in_blocks() -> None:
     """Every block fits and repeats what a row is; side by side they hold every cell once."""
     columns = ("row", *(f"column-{i}" for i in range(20)))
     rows = tuple((f"row {j}", *(f"{i}.{j} [0.25, 0.75]" for i in range(20))) for j in range(3))
-    blocks = list(Table("wide", columns, rows).blocks(80))
+    blocks = list(output.blocks(Table("wide", columns, rows), 80))
     assert len(blocks) > 1
     for block in blocks:
         widths = [max(map(len, column)) for column in zip(block.columns, *block.rows, strict=True)]

@@ -13,7 +13,7 @@ import yaml
 from conftest import SIZE, SPLIT
 from typer.testing import Result
 
-from lagbench.cli import demo_steps
+from lagbench.cli import demo
 from lagbench.cli.machine import SolverBench
 from lagbench.data.registry import Registry, load
 from lagbench.data.yamlfile import read_yaml
@@ -43,8 +43,8 @@ def only_one(run: Run, monkeypatch: pytest.MonkeyPatch, unmeasured_path: Path, t
     path = tmp_path / "datasets.yaml"
     path.write_text(json.dumps({**file, "splits": {"large": large, SPLIT: small}}))  # JSON is YAML
     monkeypatch.setenv("LAGBENCH_REGISTRY", str(path))
-    monkeypatch.setattr(demo_steps, "MODEL_SPLIT", SPLIT)
-    monkeypatch.setattr(demo_steps, "SETTINGS", ("training.steps=2", "model.width=4"))
+    monkeypatch.setattr(demo, "MODEL_SPLIT", SPLIT)
+    monkeypatch.setattr(demo, "SETTINGS", ("training.steps=2", "model.width=4"))
     timed = SolverBench(split=SPLIT, size=SIZE, particles=1, substeps=1, frames=1, seconds_per_frame=0.5)
     monkeypatch.setattr("lagbench.cli.machine.bench_apart", lambda *_: timed)
     return load(path)
@@ -72,13 +72,13 @@ def test_without_the_extra_the_data_are_made_and_one_line_says_how_to_get_the_re
         raise WorkFailedError("the solver could not be timed")
 
     monkeypatch.setattr("lagbench.cli.machine.bench_apart", no_solver)
-    assert demo_steps._solver_time() is None  # then the page shows no speed-up
-    assert demo_steps.model_left_out(only_one) is None
-    without = demo_steps.model_left_out(Registry({"large": only_one.split("large")}, {}))
+    assert demo._solver_time() is None  # then the page shows no speed-up
+    assert demo.model_left_out(only_one) is None
+    without = demo.model_left_out(Registry({"large": only_one.split("large")}, {}))
     assert without == f"the registry has no {SPLIT} {SIZE}"
-    monkeypatch.setattr(demo_steps, "check_installed", no_torch)
+    monkeypatch.setattr(demo, "check_installed", no_torch)
     root = copied()
-    assert demo_steps.demo_splits(only_one) == [SPLIT]
+    assert demo.demo_splits(only_one) == [SPLIT]
     result = run("demo", "--root", root)
     assert result.exit_code == 0, result.output
     assert "1 data sets, verified and drawn, in" in result.stdout
@@ -130,9 +130,9 @@ def test_what_another_version_left_is_trained_anew(
     root = copied()
     made_by(run("demo", "--root", root, "--json"))
     (root / "runs" / f"{SPLIT}-neuralmpm" / "checkpoint.pt").write_bytes(b"damaged")
-    assert demo_steps.demo_model(root=root).training.state == "finished"
-    monkeypatch.setattr(demo_steps, "SETTINGS", ("training.steps=3", "model.width=4"))
-    again = demo_steps.demo_model(root=root).training
+    assert demo.demo_model(root=root).training.state == "finished"
+    monkeypatch.setattr(demo, "SETTINGS", ("training.steps=3", "model.width=4"))
+    again = demo.demo_model(root=root).training
     assert (again.state, again.step, again.steps) == ("finished", 3, 3)
     assert torch.load(again.weights, weights_only=True)
 

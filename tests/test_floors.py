@@ -21,8 +21,8 @@ from lagbench.data.scenario import read_scenario
 from lagbench.errors import DataError
 from lagbench.floors import FLOORS, Given, floors_of, given_in, shipped
 from lagbench.floors.analog import DIRECTIONS, Start, assigned, distance, nearest, start_of
-from lagbench.floors.carried import linear_field, mirrored
 from lagbench.floors.coarse_solver import coarser, predict_with, spread_subset
+from lagbench.floors.floor import linear_field, mirrored
 from lagbench.floors.frozen_field import decay
 from lagbench.floors.shipped import FOLDER, shipped_path
 from lagbench.generators.batch import solver_constants
@@ -30,8 +30,7 @@ from lagbench.generators.solver import build
 from lagbench.generators.split import InitialState
 from lagbench.scoring.card import best_floor
 from lagbench.scoring.floors import measurable
-from lagbench.scoring.scenario import SUBMISSION
-from lagbench.scoring.task import ranking_metric
+from lagbench.scoring.task import SUBMISSION, ranking_metric
 
 Floats = NDArray[np.float64]
 

@@ -16,8 +16,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scenario_factory import DIMS, PARAMETERS, frames_of, make_key, write_scenario
 
+from lagbench.data import MATERIALS
 from lagbench.data.checksums import content_hash, file_sha256
-from lagbench.data.writer import MATERIALS, ScenarioWriter, check_scenario, read_scenario, rehash
+from lagbench.data.writer import ScenarioWriter, check_scenario, read_scenario, rehash
 from lagbench.errors import DataError, WorkFailedError
 from lagbench.generators.split import Material
 

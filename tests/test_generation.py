@@ -16,6 +16,7 @@ import pytest
 from conftest import DRAW, SIZE, SPLIT
 from independent_hash import content_hash, dumps
 
+from lagbench.data import WALLS
 from lagbench.data.manifest import read_manifest
 from lagbench.data.registry import Registry, load
 from lagbench.data.scenario import check_scenario, read_scenario
@@ -23,7 +24,6 @@ from lagbench.errors import DataError, UsageError, WorkFailedError
 from lagbench.generators.batch import draw, substeps_of
 from lagbench.generators.draws import generator
 from lagbench.generators.simulate import active_frames, nudge
-from lagbench.generators.split import WALLS
 from lagbench.make import cards
 from lagbench.make.generate import GenerationResult, generate
 from lagbench.make.plan import SECONDS_TO_START, estimate, select

@@ -10,8 +10,9 @@ import torch
 from numpy.typing import NDArray
 from simple_models import SMALL, batch, facts, jittered, network, oracle, rolled, swirl
 
-from lagbench.baselines.baseline import Batch, facts_of
+from lagbench.baselines.baseline import Batch
 from lagbench.baselines.catalogue import find
+from lagbench.baselines.facts import facts_of
 from lagbench.baselines.operators.supergat import SuperGAT
 from lagbench.baselines.recipe import recipe_for
 from lagbench.baselines.simulator import (

@@ -11,8 +11,8 @@ import h5py
 import numpy as np
 import pytest
 
+from lagbench.atomic import check_regular
 from lagbench.data.hdf5 import Structure, check_structure, opened
-from lagbench.data.layout import check_regular
 from lagbench.errors import UnreadableFileError
 
 ANY = Structure(groups=None)

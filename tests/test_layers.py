@@ -21,7 +21,7 @@ LAYERS = (
     ("work",),
     ("data",),
     ("store",),
-    ("generators", "metrics", "draw", "torch"),
+    ("generators", "metrics", "draw", "tensors", "torch"),
     ("submission",),
     ("make",),
     ("floors",),

@@ -19,9 +19,10 @@ from simple_models import FACTS, Bursting, Drift, State, install
 from torch import Tensor
 
 from lagbench.baselines import predict as prediction
-from lagbench.baselines.baseline import Batch, Facts, facts_of
+from lagbench.baselines.baseline import Batch, Facts
 from lagbench.baselines.catalogue import every_entry, find
 from lagbench.baselines.checkpoint import Checkpoint, load, save
+from lagbench.baselines.facts import facts_of
 from lagbench.baselines.job import MOST_RECORD, OVER
 from lagbench.baselines.machine import threads_used
 from lagbench.baselines.neuralmpm import NeuralMPM

@@ -13,7 +13,7 @@ import pytest
 from lagbench.baselines import catalogue
 from lagbench.baselines.reproduce import __main__ as command
 from lagbench.baselines.reproduce import tables
-from lagbench.baselines.reproduce.runs import Plan
+from lagbench.baselines.reproduce.plan import Plan
 from lagbench.baselines.reproduce.thesis import STUDIES
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError

@@ -16,8 +16,8 @@ from lagbench.errors import UnreadableFileError, WorkFailedError
 from lagbench.metrics import Tally, aggregate, select
 from lagbench.metrics.distributions import histograms
 from lagbench.scoring.card import ScoreCard, digits, read_scores
-from lagbench.scoring.scenario import FRAMES, PARTICLES, SUBMISSION, as_stored
 from lagbench.scoring.score_file import read_statistics, write_statistics
+from lagbench.scoring.task import FRAMES, PARTICLES, SUBMISSION, as_stored
 
 
 @pytest.fixture(scope="module")

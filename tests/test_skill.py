@@ -24,9 +24,9 @@ from lagbench.scoring import score as scoring
 from lagbench.scoring.card import ScoreCard, best_floor, skill
 from lagbench.scoring.floors import differences, kept_in, measurable, measure, measured_again, measured_sizes
 from lagbench.scoring.record import record
-from lagbench.scoring.scenario import SUBMISSION
 from lagbench.scoring.score_file import read_statistics
 from lagbench.scoring.tables import card_tables
+from lagbench.scoring.task import SUBMISSION
 
 
 def scored(values: list[float], metric: str = "vorticity_rmse", first: int = 0) -> Score:

@@ -12,11 +12,10 @@ from hypothesis import strategies as st
 from scenario_draws import all_of, changed, draw, neighbours, state_of
 from scipy.interpolate import CubicHermiteSpline
 
-from lagbench.data import registry
+from lagbench.data import WALLS, registry
 from lagbench.errors import UsageError
 from lagbench.generators import draws
 from lagbench.generators.cavity import is_classic
-from lagbench.generators.split import WALLS
 
 
 def test_cavity_scenarios_draw_what_the_design_says() -> None:

@@ -14,8 +14,9 @@ import pytest
 import torch
 from simple_models import Drift, trainer
 
-from lagbench.baselines.baseline import Facts, facts_of
+from lagbench.baselines.baseline import Facts
 from lagbench.baselines.checkpoint import Checkpoint, load, save
+from lagbench.baselines.facts import facts_of
 from lagbench.baselines.predict import predict, training_words
 from lagbench.baselines.train import TrainingResult
 from lagbench.data.checksums import file_sha256

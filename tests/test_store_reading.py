@@ -15,7 +15,7 @@ from object_stores import Store, files, holding, machine
 from typer.testing import CliRunner
 
 import lagbench
-from lagbench.baselines.baseline import facts_of
+from lagbench.baselines.facts import facts_of
 from lagbench.cli.app import app
 from lagbench.data.layout import as_url, resolve_root, url_of
 from lagbench.data.registry import Registry

@@ -13,8 +13,8 @@ import pytest
 import torch
 from simple_models import Drift, trainer
 
-from lagbench.baselines.baseline import facts_of
 from lagbench.baselines.checkpoint import load, restore
+from lagbench.baselines.facts import facts_of
 from lagbench.baselines.predict import predict
 from lagbench.baselines.recipe import TrainingOptions
 from lagbench.baselines.rollout import Validation

@@ -27,7 +27,8 @@ from lagbench.work.pool import worker_count
 from .catalogue import FIGURES
 from .drawing import Figure, write_sheet
 from .evidence import STUDIES, WEIGHTS
-from .runs import Plan, Run, budget, complain, make_runs, note, outlook, score_committed
+from .plan import Plan
+from .runs import Run, budget, complain, make_runs, note, outlook, score_committed
 from .tables import TABLES, make_studies
 from .thesis import EXPECTED, ROSTER, Model, label, number
 

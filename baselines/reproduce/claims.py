@@ -14,10 +14,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from lagbench.draw.tables import Table
 from lagbench.metrics.metric import Direction
 from lagbench.metrics.significance import SIGNIFICANCE, Comparison, compare, holm
 from lagbench.metrics.table import CHOSEN
-from lagbench.scoring.tables import Table
 
 from .evidence import Evidence, ordered
 from .thesis import FRAME_MODELS, OPERATORS, ROSTER, interval, key_frame, label, number

@@ -15,16 +15,15 @@ from numpy.typing import NDArray
 
 from lagbench.atomic import write_atomically
 from lagbench.data.scenario import ScenarioFile
-from lagbench.draw.markdown import table
 from lagbench.draw.panels import Panel, colour_bar, colour_scale, draw, draw_walls, limit_of
 from lagbench.draw.recording import Recording, Scene, open_recording
 from lagbench.draw.style import INK, figure, pixels_of, png_bytes
+from lagbench.draw.tables import Table, markdown
 from lagbench.errors import require
 from lagbench.metrics.frame import FramePair, Scenario, Snapshot
-from lagbench.scoring.tables import Table
 from lagbench.submission.predictions import Predictions, open_predictions
 
-from .runs import Plan
+from .plan import Plan
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -229,7 +228,7 @@ class Sheet:
     @property
     def text(self) -> str:
         """Notes and tables as Markdown."""
-        return "\n\n".join([*self.notes, *(table(held.columns, held.rows) for held in self.tables)])
+        return "\n\n".join([*self.notes, *(markdown(held.columns, held.rows) for held in self.tables)])
 
 
 def write_sheet(sheet: Sheet, folder: Path, name: str, head: str) -> str:
@@ -237,7 +236,7 @@ def write_sheet(sheet: Sheet, folder: Path, name: str, head: str) -> str:
     parts = [head, *sheet.notes]
     for count, held in enumerate(sheet.tables, start=1):
         parts += [f"**{held.title}**"] if held.title else []
-        parts.append(table(held.columns, held.rows))
+        parts.append(markdown(held.columns, held.rows))
         ending = f"-{count}" if len(sheet.tables) > 1 else ""
         with io.StringIO() as buffer:
             csv.writer(buffer, lineterminator="\n").writerows([held.columns, *held.rows])

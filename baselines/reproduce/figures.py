@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.registry import Size
+from lagbench.draw.tables import Table
 from lagbench.metrics.aggregate import Score
 from lagbench.metrics.metric import mean
 from lagbench.metrics.table import METRICS
-from lagbench.scoring.tables import Table
 
 from .claims import compared, comparison_table
 from .drawing import (
@@ -28,7 +28,7 @@ from .drawing import (
     png,
     tidy,
 )
-from .runs import Plan
+from .plan import Plan
 from .thesis import LOSS_SNAPSHOTS, TABLE_4_8, colour, key_frame, label, number, scenario_of
 
 TIMES = 6  # columns of a picture that shows a whole rollout

@@ -17,12 +17,12 @@ from itertools import combinations
 from pathlib import Path
 
 from lagbench.atomic import write_atomically
-from lagbench.draw.markdown import table
+from lagbench.draw.tables import Table, markdown
 from lagbench.errors import LagbenchError
 from lagbench.floors.table import FLOORS
 from lagbench.metrics.metric import Direction, Metric
 from lagbench.metrics.table import CHOSEN
-from lagbench.scoring.tables import ARROWS, Table
+from lagbench.scoring.tables import ARROWS
 
 from .claims import CLAIMS, answer, claim_rows, comparison_table, floors_ahead
 from .evidence import BOARD, STUDIES, WEIGHTS, Evidence, Method, Sources, read_json
@@ -106,7 +106,7 @@ def _claims(learned: Sequence[Evidence]) -> Iterator[str]:
         " otherwise. Two methods are compared by the seeds that both have, by all where they share none. A"
         " dash where an entry is missing."
     )
-    yield table(
+    yield markdown(
         ["", *(e.where for e in learned)],
         [
             [claim.question, *(answer(found) or "-" for found in held.values())]
@@ -133,7 +133,7 @@ def _claims(learned: Sequence[Evidence]) -> Iterator[str]:
     )
     heads = ("model", "steps x windows", "epochs", "CPU hours per seed", "skill", "validated")
     learning = ("validation at 1/4", "1/2", "1", "last doubling")
-    yield table(("where", *heads, *learning), [row for e in learned for row in _training_rows(e)])
+    yield markdown(("where", *heads, *learning), [row for e in learned for row in _training_rows(e)])
 
 
 def _training_rows(evidence: Evidence) -> Iterator[list[str]]:
@@ -218,7 +218,7 @@ def _chapter(evidence: Evidence) -> Iterator[str]:
                 *map(number, paid),
             ]
         )
-    yield table(("model", *heads, "speed-up"), rows)
+    yield markdown(("model", *heads, "speed-up"), rows)
 
 
 def _horizon(evidence: Evidence) -> str:
@@ -250,7 +250,7 @@ def _horizon(evidence: Evidence) -> str:
     for m in shown:  # as in "position_rmse [length], lower"
         goal = f" {m.perfect:g}" if m.direction is Direction.TARGET else ""
         heads.append(f"{m.name} [{m.unit}], {ARROWS[m.direction]}{goal}")
-    return table(heads, rows)
+    return markdown(heads, rows)
 
 
 def _vorticity_at(evidence: Evidence) -> Iterator[str]:
@@ -271,7 +271,7 @@ def _vorticity_at(evidence: Evidence) -> Iterator[str]:
             row.append(f"{number(values[0])} ({number(values[1])})")
             row += [number(thesis.get(name, {}).get(measure), 4)] if thesis else []
         rows.append(row)
-    yield table(["model", *heads], rows)
+    yield markdown(["model", *heads], rows)
     both = [name for name in thesis if name in models]
     if len(both) > 1:
         ours = {name: models[name].at("vorticity_mse", frame) for name in both}
@@ -332,7 +332,7 @@ def _how(model: Model) -> str:
 
 
 def _markdown(held: Table) -> str:
-    return table(held.columns, held.rows)
+    return markdown(held.columns, held.rows)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -4,129 +4,26 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lagbench.atomic import write_atomically
 from lagbench.baselines.job import OVER
-from lagbench.data.local import rooted
-from lagbench.data.manifest import read_manifest
-from lagbench.data.registry import Registry, Size
 from lagbench.errors import DataError, LagbenchError, UsageError
 from lagbench.scoring.card import JSON_NAME
 from lagbench.scoring.score_file import NETCDF_NAME, read_statistics
-from lagbench.scoring.task import ScoredTask, load_scored_task
 from lagbench.submission.predictions import open_predictions
 from lagbench.work.pool import Report, crashed
 from lagbench.work.run import run_all
 
-from .evidence import RECORD_NAME, STUDIES, WEIGHTS, Evidence, Sources, read_json
+from .evidence import RECORD_NAME, read_json
+from .plan import PREDICTIONS, Plan
 from .thesis import Model
 
 if TYPE_CHECKING:
     from lagbench.baselines.recipe import Recipe
 
-PREDICTIONS = "predictions.nc"
-
 OTHER = "name another folder of runs with --runs, or remove this run"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Plan:
-    """One size to reproduce: what was asked for, and where everything of it lies."""
-
-    size: str
-    root: Path  # folder of all data sets
-    runs: Path  # folder of runs; what is there is not made again
-    output: Path  # folder of tables and pictures
-    weights: Path = WEIGHTS  # folder of committed weights
-    studies: Path = STUDIES  # folder of committed results that are no entries
-    seeds: tuple[int, ...] = (0,)  # seeds of every training; pictures show the first
-    recipe: str | None = None  # variant of the recipes, as in short; None for the size's own
-    settings: tuple[str, ...] = ()  # changes to every recipe, as in training.steps=100
-    device: str = "auto"
-    threads: int | None = None  # of a training on the CPU; one per core by default, one with workers
-    registry: Registry | None = None  # where splits are described; ours when None
-    # folders of runs that could not be made, or are not those that were asked for: nothing of them is shown
-    failed: set[Path] = field(default_factory=set, compare=False, repr=False)
-    _evidence: dict[str, Evidence] = field(default_factory=dict, compare=False, repr=False)
-    _subsets: dict[str, ScoredTask] = field(default_factory=dict, compare=False, repr=False)
-
-    @cached_property
-    def described(self) -> Registry:
-        """Splits, those of the root folder included."""
-        return rooted(self.root, self.registry)
-
-    def tier(self, split: str) -> Size:
-        """Return what the registry says of a split at this size."""
-        return self.described.size(split, self.size)
-
-    def hash(self, split: str) -> str | None:
-        """Return the hash of a split's data, those at hand before those recorded; None where unknown."""
-        tier = self.tier(split)
-        manifest = read_manifest(self.root, tier.split, tier.name, tier.major)
-        recorded = tier.measured.dataset_sha256 if tier.measured else None
-        return (manifest.dataset_sha256 if manifest else None) or recorded
-
-    def has_recipe(self, split: str, model: Model) -> bool:
-        """Return whether a model has the variant of the recipes that was asked for."""
-        if self.recipe is None or self.recipe.endswith((".yaml", ".yml")):
-            return True
-        from lagbench.baselines.catalogue import find
-        from lagbench.baselines.recipe import recipe_names
-
-        try:
-            known = recipe_names(find(model.baseline))
-        except UsageError:  # it cannot be loaded: training says why
-            return True
-        return any(f"{where}/{self.size}-{self.recipe}" in known for where in (split, "*"))
-
-    def home(self, split: str) -> Path:
-        """Return the folder of a split's runs: ``runs/<split>/<size>[-<recipe>]``."""
-        return self.runs / split / (f"{self.size}-{self.recipe}" if self.recipe else self.size)
-
-    def folder(self, split: str, name: str, seed: int) -> Path:
-        """Return the folder of one training."""
-        return self.home(split) / f"{name}-{seed}"
-
-    def predictions(self, split: str, name: str) -> Path | None:
-        """Return a model's predictions, those of the first seed asked for; None where none were scored."""
-        method = self.evidence(split).methods.get(name)
-        held = sorted(method.seeds if method else (), key=lambda one: one.seed != self.seeds[0])
-        paths = [one.path.with_name(PREDICTIONS) for one in held]
-        return next((path for path in paths if path.is_file()), None)
-
-    @property
-    def sources(self) -> Sources:
-        """Where the evidence of these runs lies."""
-        return Sources(
-            board=None,
-            weights=self.weights,
-            runs=self.runs,
-            recipe=self.recipe,
-            registry=self.described,
-            studies=self.studies,
-            left_out=frozenset(self.failed),
-        )
-
-    def evidence(self, split: str) -> Evidence:
-        """Return scores, costs and records of a split's runs; read once, after they are made."""
-        if split not in self._evidence:
-            self._evidence[split] = Evidence(self.sources, split, self.size)
-        return self._evidence[split]
-
-    @property
-    def stale(self) -> list[Path]:
-        """Score files of other data among the evidence that was read; they are left out."""
-        return [path for evidence in self._evidence.values() for path in evidence.stale]
-
-    def test_subset(self, split: str) -> ScoredTask:
-        """Return the test subset of a split as the scorer sees it."""
-        if split not in self._subsets:
-            self._subsets[split] = load_scored_task(self.tier(split), self.root)
-        return self._subsets[split]
 
 
 Run = tuple[str, Model, int]

@@ -20,14 +20,15 @@ from numpy.typing import NDArray
 
 from lagbench.atomic import write_atomically
 from lagbench.data.manifest import read_manifest
+from lagbench.draw.tables import Table
 from lagbench.errors import DataError
 from lagbench.metrics.distributions import kl, normalised
 from lagbench.metrics.table import METRICS
-from lagbench.scoring.tables import Table
 
 from .drawing import Figure, Sheet, charts, loss_over_steps, opened, plot_losses, png, tidy
 from .evidence import RECORD_NAME, Evidence, read_json
-from .runs import Plan, budget, check_training, make_training
+from .plan import Plan
+from .runs import budget, check_training, make_training
 from .thesis import (
     FRAME_MODELS,
     OPERATORS,
@@ -313,7 +314,8 @@ def one_step_error(plan: Plan, split: str, folder: Path, subset: str) -> float:
     import torch
 
     from lagbench.baselines.checkpoint import load, restore
-    from lagbench.torch import WindowDataset, collate
+    from lagbench.tensors import collate
+    from lagbench.torch import WindowDataset
 
     model = restore(load(folder / "weights.pt")).eval()
     data = WindowDataset(

@@ -29,10 +29,10 @@ from numpy.typing import NDArray
 from lagbench.atomic import write_atomically
 from lagbench.data.registry import load
 from lagbench.data.scenario import read_scenario
-from lagbench.scoring.tables import Table
+from lagbench.draw.tables import Table
 
 from .drawing import Figure, Sheet
-from .runs import Plan
+from .plan import Plan
 from .thesis import SECTION_4_8_3, number
 
 TRAIN, VALID = 0.70, 0.15

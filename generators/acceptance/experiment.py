@@ -22,13 +22,13 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.data import registry
+from lagbench.data import WALLS, registry
 from lagbench.errors import UsageError
 from lagbench.generators import cavity, curl_noise
 from lagbench.generators.draws import fill, quantise
 from lagbench.generators.noise import gradients
 from lagbench.generators.solver import Device, build
-from lagbench.generators.split import WALLS, ClosedBoxParameters, InitialState, Material
+from lagbench.generators.split import ClosedBoxParameters, InitialState, Material
 
 from .diagnostics import (
     Deviation,

@@ -21,10 +21,10 @@ from lagbench.errors import ChecksFailedError, UnreadableFileError, UsageError
 from lagbench.metrics.aggregate import Tally
 from lagbench.metrics.table import METRICS, STATISTICS
 from lagbench.scoring.card import ScoreCard
-from lagbench.scoring.scenario import LONG_BITS, LONG_ROLLOUT, SUBMISSION
 from lagbench.scoring.score import score
 from lagbench.scoring.score_file import FILM_RANGE, LEVELS, StoredScores, write_statistics
 from lagbench.scoring.stored import read_stored
+from lagbench.scoring.task import LONG_BITS, LONG_ROLLOUT, SUBMISSION
 from lagbench.submission.findings import Finding
 from lagbench.work.progress import Progress
 
@@ -32,6 +32,7 @@ from .entry import Entry, ScoredFile
 from .entry_file import MAX_ENTRY_BYTES
 from .findings import FLOORS_ANEW, finding
 from .folder import FLOORS, SCORES, SUBMISSIONS, VERIFIED, WEIGHTS, Folder
+from .ranking import scored_file
 
 TOLERANCE = 1e-6
 """Relative difference up to which two numbers are equal; NumPy versions may differ in the last bits."""
@@ -125,7 +126,7 @@ class Rescoring:
         with tempfile.TemporaryDirectory() as scratch:
             file = Path(scratch) / "scores.nc"
             write_statistics(card, file)
-            ours, stored = ScoredFile.of(card, file), read_stored(file)
+            ours, stored = scored_file(card, file), read_stored(file)
         differing, difference = _unlike(dict(stored.scores.tallies), theirs.scores)
         step = max(stored.precision, theirs.precision)
         for name, room in {"vorticity": 1.01 * step, "film": 1.01 * FILM_STEP}.items():

@@ -28,11 +28,11 @@ from lagbench.submission.findings import Finding
 from lagbench.work.progress import Progress
 
 from .audit import TOLERANCE, Confirmation, Rescoring, check_base
+from .build import build
 from .entry import Entry, EntryBudget, Status, Summary, last_day
 from .entry_file import examine, load_plain, read_verified, record, verification_of
 from .findings import finding, finding_of, impossible, print_of, skeleton
 from .folder import VERIFIED, Folder, Place, entry_path
-from .page import build
 from .ranking import combine, dataset_of, is_current, summarise
 from .weights import check_weights
 

@@ -15,7 +15,7 @@ import unicodedata
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 from urllib.parse import urlsplit
 
 from pydantic import (
@@ -28,14 +28,11 @@ from pydantic import (
     model_validator,
 )
 
-from lagbench.data.checksums import file_sha256, round_digits
+from lagbench.data.checksums import round_digits
 from lagbench.submission.budget import Budget, Track, track_of
 from lagbench.submission.format import Header
 
 from .folder import Place, entry_path, score_paths, weights_path
-
-if TYPE_CHECKING:
-    from lagbench.scoring.card import ScoreCard
 
 ID = r"^[a-z0-9]+(-[a-z0-9]+)*$"
 WEB = r"^https?://[A-Za-z0-9][!#-&(-;=?-\[\]_a-z~]*$"  # nothing that could end an HTML attribute
@@ -266,27 +263,6 @@ class ScoredFile(Strict):
     diverged_at: Annotated[dict[int, int], Field(max_length=10_000)] = Field(default_factory=dict)
     flags: Annotated[tuple[Flag, ...], Field(max_length=20, strict=False)] = ()
     warnings: Annotated[tuple[Flag, ...], Field(max_length=100, strict=False)] = ()
-
-    @classmethod
-    def of(cls, card: ScoreCard, path: Path, outside: float | None = None) -> Self:
-        """Return what an entry says of the score file that was written from a card.
-
-        ``outside`` is the share of positions beyond the box [1], where the scorer warns of them.
-        """
-
-        def flag(name: str, reasons: Sequence[str], share: float | None = None) -> Flag:
-            return Flag(name=name, reasons=tuple(said[:LONGEST_TEXT] for said in reasons), share=share)
-
-        return cls(
-            sha256=file_sha256(path),
-            predictions_sha256=card.predictions_sha256,
-            diverged_at=dict(sorted(card.header.diverged_at.items())),
-            flags=tuple(flag(one.name, one.reasons) for one in card.flags if one.raised),
-            warnings=tuple(
-                flag(one.check, (f"{one.what}: {one.got}",), outside if one.check == OUTSIDE else None)
-                for one in card.warnings
-            ),
-        )
 
 
 class ScoreBlock(Strict):

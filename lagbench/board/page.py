@@ -13,18 +13,10 @@ import functools
 import hashlib
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from importlib.resources import files
-from pathlib import Path
 
-from lagbench.atomic import write_atomically
-from lagbench.data.registry import Registry
-from lagbench.errors import ChecksFailedError
 from lagbench.report.html import join, tag
 
-from .collect import collect
-from .entry_file import schema_bytes
-from .folder import PAGE, SCHEMA, Folder
 from .model import Board
 from .payload import FINENESS, Fineness, embedded, payload
 from .sections import empty, lede, navigation, overview, section, stage
@@ -52,70 +44,6 @@ FOOT = (
     "This page is one file, built by lagbench leaderboard build from the score files, and asks nothing of the"
     " network. How to cite a data set: lagbench cite.",
 )
-
-
-@dataclass(frozen=True, kw_only=True)
-class BuildResult:
-    """A page that was drawn."""
-
-    page: Path
-    bytes: int
-    tabs: int  # splits and sizes on it
-    rows: int  # entries on it
-    written: tuple[Path, ...]  # files that were missing or had other bytes
-
-
-def build(
-    board: str | Path,
-    *,
-    check: bool = False,
-    registry: Registry | None = None,
-) -> BuildResult:
-    """Write the page and schema.json of a leaderboard's folder; files that are right stay untouched.
-
-    Args:
-        board: the leaderboard's folder.
-        check: write nothing, fail where a file would change.
-        registry: where splits are described; ours when None.
-
-    Raises:
-        UsageError: no leaderboard there.
-        UnreadableFileError: an entry or a score file cannot be read.
-        ChecksFailedError: an entry does not fit, or with ``check`` a file is stale.
-        WorkFailedError: the disk is full or not writable.
-    """
-    folder, held = Folder(board), collect(board, registry=registry)
-    links = {label: path for label, path in LINKS.items() if (folder.path / path).exists()}
-    page = folder.path / PAGE
-    if check and page.is_file():  # a copy of the folder elsewhere still has the links of where it was drawn
-        said = page.read_bytes()
-        links = {n: path for n, path in LINKS.items() if str(tag("a", n, href=path)).encode() in said}
-    wanted = {page: render(held, links).encode(), folder.path / SCHEMA: schema_bytes()}
-    stale = [
-        path
-        for path, data in wanted.items()
-        if path.is_symlink()
-        or not path.is_file()
-        or path.stat().st_size != len(data)
-        or path.read_bytes() != data
-    ]
-    if stale and check:
-        raise ChecksFailedError(
-            "the page is not what the submissions give",
-            where=", ".join(str(path) for path in stale),
-            expected=", ".join(f"{path.name} of {len(wanted[path])} bytes" for path in stale),
-            got="another content, or no file",
-            fix=f"lagbench leaderboard build --board {board}",
-        )
-    for path in stale:
-        write_atomically(path, wanted[path], option="--board")
-    return BuildResult(
-        page=page,
-        bytes=len(wanted[page]),
-        tabs=len(held.tabs),
-        rows=sum(len(tab.rows) for tab in held.tabs),
-        written=tuple(stale),
-    )
 
 
 def render(board: Board, links: Mapping[str, str] = LINKS) -> str:

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lagbench.data.checksums import file_sha256
 from lagbench.data.layout import major_of
 from lagbench.data.registry import Size
 from lagbench.errors import UnreadableFileError
@@ -22,11 +23,11 @@ from lagbench.floors.table import FLOORS as KNOWN
 from lagbench.metrics.aggregate import Score, aggregate, bootstrap_interval, mean_over_seeds
 from lagbench.metrics.table import METRICS
 from lagbench.scoring.card import ScoreCard, digits
-from lagbench.scoring.scenario import SUBMISSION
 from lagbench.scoring.score_file import StoredScores, write_statistics
 from lagbench.scoring.stored import read_stored
+from lagbench.scoring.task import SUBMISSION
 
-from .entry import DataSet, Summary
+from .entry import LONGEST_TEXT, OUTSIDE, DataSet, Flag, ScoredFile, Summary
 from .folder import FLOORS, Folder
 
 
@@ -143,3 +144,24 @@ def write_floors(card: ScoreCard, folder: Folder) -> tuple[Path, ...]:
         write_statistics(floor, path, option="--board")
         written.append(path)
     return tuple(sorted(written))
+
+
+def scored_file(card: ScoreCard, path: Path, outside: float | None = None) -> ScoredFile:
+    """Return what an entry says of the score file that was written from a card.
+
+    ``outside`` is the share of positions beyond the box [1], where the scorer warns of them.
+    """
+
+    def flag(name: str, reasons: Sequence[str], share: float | None = None) -> Flag:
+        return Flag(name=name, reasons=tuple(said[:LONGEST_TEXT] for said in reasons), share=share)
+
+    return ScoredFile(
+        sha256=file_sha256(path),
+        predictions_sha256=card.predictions_sha256,
+        diverged_at=dict(sorted(card.header.diverged_at.items())),
+        flags=tuple(flag(one.name, one.reasons) for one in card.flags if one.raised),
+        warnings=tuple(
+            flag(one.check, (f"{one.what}: {one.got}",), outside if one.check == OUTSIDE else None)
+            for one in card.warnings
+        ),
+    )

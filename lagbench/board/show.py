@@ -6,9 +6,9 @@ import math
 from collections.abc import Collection, Iterator
 from typing import Any
 
+from lagbench.draw.tables import Table
 from lagbench.errors import UsageError, nearest
 from lagbench.scoring.card import digits
-from lagbench.scoring.tables import Table
 
 from .columns import held
 from .model import Board, Floor, Row, Value

@@ -23,10 +23,10 @@ from lagbench.data.registry import Registry, load
 from lagbench.errors import ChecksFailedError, Mistakes, UsageError, WorkFailedError
 from lagbench.floors.table import FLOORS as KNOWN_FLOORS
 from lagbench.scoring.card import ScoreCard
-from lagbench.scoring.scenario import SUBMISSION
 from lagbench.scoring.score import score
 from lagbench.scoring.score_file import write_statistics
 from lagbench.scoring.stored import MAX_SCORE_BYTES, read_stored
+from lagbench.scoring.task import SUBMISSION
 from lagbench.submission.checks import outside_share
 from lagbench.submission.findings import ValidationResult
 from lagbench.submission.format import WRITE, Header
@@ -48,13 +48,12 @@ from .entry import (
     Meta,
     Prediction,
     ScoreBlock,
-    ScoredFile,
     last_day,
 )
 from .entry_file import Model, active_beside, examine, listed, read_verified, readable, spell, unverified
 from .findings import print_of, prints_of, skeleton
 from .folder import FLOORS, SUBMISSIONS, VERIFIED, Folder, Place, entry_path, score_paths
-from .ranking import combine, summarise, write_floors
+from .ranking import combine, scored_file, summarise, write_floors
 from .weights import named_weights, require_weights, stage_weights
 
 BOARD = Path("leaderboard")  # the leaderboard's folder, from the root of the repository
@@ -352,7 +351,7 @@ def _publish(
                     got=f"{length} bytes",
                     fix="uninstall packages that add metrics, and submit again",
                 )
-        files = tuple(map(ScoredFile.of, cards, staged, outside))
+        files = tuple(map(scored_file, cards, staged, outside))
         kept = named_weights(folder, place, made, sources, before, others)
         made = [one.model_copy(update={"weights": held}) for one, held in zip(made, kept, strict=True)]
         header = cards[0].header

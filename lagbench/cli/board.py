@@ -132,7 +132,7 @@ def build(
     quiet: QuietFlag = False,
 ) -> None:
     """Draw the page: one self-contained index.html; the same submissions give the same bytes."""
-    from lagbench.board.page import build as run
+    from lagbench.board.build import build as run
 
     result = run(board, check=check)
     state = "written" if result.page in result.written else "up to date"
@@ -243,7 +243,7 @@ def picture(
 ) -> None:
     """Draw accuracy against cost of a data set as an SVG file."""
     from lagbench.atomic import write_atomically
-    from lagbench.board.collect import collect
+    from lagbench.board.build import collect
     from lagbench.board.cost import picture as draw
     from lagbench.data.local import locate_new
 
@@ -270,7 +270,7 @@ def show(
     as_json: JsonFlag = False,
 ) -> None:
     """Print the tables of the leaderboard."""
-    from lagbench.board.collect import collect
+    from lagbench.board.build import collect
     from lagbench.board.folder import Folder
     from lagbench.board.show import as_plain, chosen_data_sets, tables
 

@@ -16,18 +16,21 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from lagbench.draw.tables import Table
 from lagbench.work.progress import watched
 
 if TYPE_CHECKING:
-    from lagbench.scoring.tables import Table
     from lagbench.submission.findings import ValidationResult
     from lagbench.work.progress import Progress as State
 
-LAST_COLUMN = 24
-"""Characters that the last column of a table, which wraps, keeps at least."""
+WIDTH = 80
+"""Characters that a table may be wide; a wider one comes in blocks."""
 
-COLUMN_GAP = 3
-"""Characters between two columns of a table."""
+GAP = 3
+"""Characters between two columns."""
+
+LAST = 24
+"""Characters to which the last column, which wraps, may shrink."""
 
 SECONDS_PER_LINE = 60.0
 """Time between two lines of progress that go to a file [s]."""
@@ -69,10 +72,31 @@ def complain(result: ValidationResult) -> None:
         typer.echo("\n".join(str(finding) for finding in result.errors), err=True)
 
 
+def blocks(table: Table, width: int = WIDTH) -> Iterator[Table]:
+    """Yield a table in pieces that are no wider, each with the columns that say what a row is."""
+    columns = list(zip(table.columns, *table.rows, strict=True))
+    widths = [max(len(line) for cell in column for line in cell.split("\n")) for column in columns]
+    widths[-1] = min(widths[-1], LAST)
+    own, chosen = sum(widths[: table.keys]) + GAP * table.keys, list[list[int]]([[]])
+    for i in range(table.keys, len(columns)):
+        taken = own + sum(widths[j] + GAP for j in chosen[-1])
+        if chosen[-1] and taken + widths[i] > width:
+            chosen.append([])
+        chosen[-1].append(i)
+    for number, block in enumerate(chosen):
+        kept = [*range(table.keys), *block]
+        yield Table(
+            table.title if number == 0 else "",
+            tuple(table.columns[i] for i in kept),
+            tuple(tuple(row[i] for i in kept) for row in table.rows),
+            table.keys,
+        )
+
+
 def print_blocks(tables: Iterable[Table]) -> None:
-    """Print tables that know how wide they are, in blocks that fit."""
+    """Print tables in blocks that fit."""
     for table in tables:
-        for block in table.blocks():
+        for block in blocks(table):
             print_table(block.title, block.columns, block.rows)
 
 
@@ -90,12 +114,12 @@ def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[obje
     """Print a table on stdout; only its last column wraps, numbers stand on the right."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
-    from rich.table import Table
+    from rich.table import Table as Drawn
     from rich.text import Text
 
     cells = [[str(cell) for cell in row] for row in rows]
     heading = Text(title) if title else None
-    table = Table(title=heading, box=SIMPLE_HEAD, title_justify="left", pad_edge=False, show_edge=False)
+    table = Drawn(title=heading, box=SIMPLE_HEAD, title_justify="left", pad_edge=False, show_edge=False)
     for number, column in enumerate(columns, start=1):
         numeric = all(row[number - 1][:1] in "0123456789-" for row in cells)
         table.add_column(Text(column), justify="right" if numeric else "left", no_wrap=number < len(columns))
@@ -106,7 +130,7 @@ def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[obje
     width = console.width if console.is_terminal else 120
     # On a narrow terminal long lines run on to the next: a number cut short would be worse.
     widths = [max(map(len, column)) for column in zip(columns, *cells, strict=True)]
-    least = sum(widths[:-1]) + min(widths[-1], LAST_COLUMN) + COLUMN_GAP * len(widths)
+    least = sum(widths[:-1]) + min(widths[-1], LAST) + GAP * len(widths)
     Console(width=max(width, least)).print(table, "")
 
 

@@ -19,9 +19,8 @@ from typing import Any, NamedTuple
 import h5py
 import numpy as np
 
+from lagbench.atomic import check_regular
 from lagbench.errors import LagbenchError, UnreadableFileError
-
-from .layout import check_regular
 
 MAX_LINKS = 1000
 """Most entries of a group that are looked at."""

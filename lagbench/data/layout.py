@@ -17,13 +17,12 @@ import hashlib
 import json
 import os
 import re
-import stat
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from lagbench.atomic import write_atomically
-from lagbench.errors import UnreadableFileError, UsageError
+from lagbench.errors import UsageError
 
 CACHE_VARIABLE = "LAGBENCH_CACHE"
 """Environment variable that names the folder of working copies and of what this machine measured."""
@@ -222,32 +221,3 @@ def dataset_folder(root: Path, split: str, size: str, major: int) -> Path:
 def scenario_path(root: Path, key: ScenarioKey) -> Path:
     """Return the path of a scenario file."""
     return dataset_folder(root, key.split, key.size, key.major) / key.subset / f"{key.scenario:04d}.nc"
-
-
-def check_regular(path: Path, *, longest: int | None = None, fix: str | None = None) -> int:
-    """Refuse what is no regular file, or a long one; return its length [bytes].
-
-    Devices never end and a FIFO waits for ever, so this comes before anything is opened.
-    """
-    try:
-        status = path.stat()
-    except (OSError, ValueError) as error:
-        raise UnreadableFileError(
-            "cannot open the file",
-            where=str(path),
-            expected="a readable file",
-            got=getattr(error, "strerror", None) or error,
-            fix="check the path and that you may read the file",
-        ) from error
-    if not stat.S_ISREG(status.st_mode):
-        kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a device, socket or pipe"
-        raise UnreadableFileError("not a file", where=str(path), expected="a file", got=kind, fix=fix)
-    if longest is not None and status.st_size > longest:
-        raise UnreadableFileError(
-            "the file is too long",
-            where=str(path),
-            expected=f"at most {longest} bytes",
-            got=f"{status.st_size} bytes",
-            fix=fix,
-        )
-    return status.st_size

@@ -17,9 +17,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
+from lagbench.atomic import check_regular
 from lagbench.errors import UnreadableFileError, UsageError, nearest
 
-from .layout import check_regular, dataset_folder, expanded, resolve_root, url_of
+from .layout import dataset_folder, expanded, resolve_root, url_of
 from .registry import NO_GENERATOR, Measured, Registry, Size, Split, load
 
 DESCRIPTION = "split.yaml"

@@ -24,20 +24,12 @@ from pydantic import (
     field_validator,
 )
 
-from lagbench.atomic import write_atomically
+from lagbench.atomic import check_regular, write_atomically
 from lagbench.errors import DataError, UnreadableFileError, WorkFailedError
 from lagbench.work.machine import may_differ
 
 from .checksums import HASHED_SUBSETS, dataset_hash, file_sha256, round_digits, subset_hash
-from .layout import (
-    MANIFEST_NAME,
-    NOTES_NAME,
-    ScenarioKey,
-    check_regular,
-    dataset_folder,
-    major_of,
-    scenario_path,
-)
+from .layout import MANIFEST_NAME, NOTES_NAME, ScenarioKey, dataset_folder, major_of, scenario_path
 from .registry import Size
 from .scenario import read_scenario
 

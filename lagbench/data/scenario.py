@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from lagbench.errors import DataError, LagbenchError
 
+from . import MATERIALS
 from .checksums import ContentHasher, plain
 from .layout import ScenarioKey
 
@@ -33,10 +34,6 @@ if TYPE_CHECKING:
     import h5py
 
 
-MATERIALS = ("liquid", "jelly", "snow", "rope")
-"""Meaning of the values 0, 1, 2, 3 of ``material``."""
-
-WALLS = ("left", "right", "bottom", "top")
 AXES = ("x", "y")
 
 ATTRIBUTES: Mapping[str, Mapping[str, object]] = {

@@ -20,13 +20,12 @@ from numpy.typing import ArrayLike, NDArray
 from lagbench.atomic import atomic_path
 from lagbench.errors import DataError, LagbenchError, WorkFailedError
 
+from . import WALLS
 from .checksums import ContentHasher, plain
 from .layout import ScenarioKey, scenario_path
 from .scenario import (
     AXES,
-    MATERIALS,
     MOST_IN_ROW,
-    WALLS,
     ScenarioFile,
     ScenarioHeader,
     attributes_of,
@@ -37,7 +36,6 @@ from .scenario import (
 
 __all__ = [
     "FORMAT",
-    "MATERIALS",
     "ScenarioFile",
     "ScenarioHeader",
     "ScenarioKey",
@@ -77,7 +75,7 @@ class ScenarioWriter:
         particles: particles in every frame.
         frames: frames that will be appended.
         frame_interval: time between frames [s].
-        material: value of :data:`MATERIALS` for each particle, shape [particle].
+        material: value of :data:`lagbench.data.MATERIALS` for each particle, shape [particle].
         particle_mass: mass of a particle, rho L^2 / n.
         wall_velocity: [length/s], shape [wall, 2] (constant) or [frame, wall, 2], entry f being what
             acts from frame f-1 to f; walls left, right, bottom, top; None where there are no moving

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.data.scenario import MATERIALS
+from lagbench.data import MATERIALS
 
 from .recording import Recording, Scene
 from .style import INK, MATERIAL_COLOURS, MOVING, PAPER, WALL, speed_map, vorticity_map

@@ -17,9 +17,9 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.data import MATERIALS
 from lagbench.data.hdf5 import Structure, check_structure, opened
 from lagbench.data.registry import MAX_ID
-from lagbench.data.scenario import MATERIALS
 from lagbench.errors import DataError, LagbenchError, UnreadableFileError
 
 from .mistakes import check_meaning

@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter, ValidationError
 
 from lagbench.atomic import write_atomically
+from lagbench.data import MATERIALS
 from lagbench.data.registry import Size
-from lagbench.data.scenario import MATERIALS
 from lagbench.errors import UnreadableFileError, UsageError, nearest
 
 NAME = "metadata.json"

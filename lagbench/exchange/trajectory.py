@@ -52,7 +52,7 @@ class Trajectory:
 
     name: str  # file and key, for messages
     frames: int  # recorded frames
-    material: NDArray[np.int8]  # value of ``lagbench.data.scenario.MATERIALS`` of each particle, [particle]
+    material: NDArray[np.int8]  # value of ``lagbench.data.MATERIALS`` of each particle, [particle]
     read: Callable[[], Iterator[Frame]]  # returns the frames in order, one at a time
     wall_velocity: Array | None = None  # [length/s], [wall, 2] or [frame, wall, 2]; None without walls
     parameters: Mapping[str, object] = field(default_factory=dict)  # facts that the file states and hashes

@@ -27,8 +27,7 @@ from lagbench.data.scenario import ScenarioFile, read_scenario
 from lagbench.errors import DataError
 from lagbench.store.copy import bring
 
-from .carried import linear_field, mirrored
-from .floor import Floats, Floor, Given, Prediction, fills_box, given_in, wall_motion
+from .floor import Floats, Floor, Given, Prediction, fills_box, given_in, linear_field, mirrored, wall_motion
 
 ANGLES = np.arange(64) * (np.pi / 64)
 DIRECTIONS = np.stack([np.cos(ANGLES), np.sin(ANGLES)])

@@ -3,7 +3,7 @@
 What a surrogate must be compared with: accuracy against cost. It learns nothing either, but it
 knows the equations, the viscosity, the materials and the motion of the walls to the end. A seeded
 subset of the particles, as many as the smaller size has and as evenly spread as they are, carries
-the mass. In a full box the others move as those around them do (see :mod:`.carried`); on a free
+the mass. In a full box the others move as those around them do (see :mod:`.floor`); on a free
 surface each keeps its offset to the nearest of its material that carries mass.
 
 The solver starts from displacements alone: in full boxes the velocity of the last given frame is
@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 from lagbench.data.registry import Size, load
 from lagbench.errors import require
 
-from .carried import linear_field, mirrored
-from .floor import Floats, Floor, Given, Prediction, fills_box
+from .floor import Floats, Floor, Given, Prediction, fills_box, linear_field, mirrored
 
 if TYPE_CHECKING:
     from lagbench.generators.solver import Solver
@@ -104,6 +103,7 @@ def _state(given: Given, carriers: NDArray[np.intp]) -> InitialState:
     else:
         fall = np.array([0.0, -0.5 * float(given.size.value("gravity")) * interval])
         velocity = given.step / interval + fall
+    walls = given.walls[given.predicted_frames[0] - 1 :] / interval
     return InitialState(
         position=given.last[carriers],
         velocity=velocity[carriers],
@@ -112,18 +112,13 @@ def _state(given: Given, carriers: NDArray[np.intp]) -> InitialState:
         area=given.area,
         viscosity=float(str(given.parameters.get("viscosity", 0.0))),
         friction=float(str(given.parameters.get("friction", 0.0))),
-        wall_velocity=given.walls[given.predicted_frames[0]] / interval,
+        wall_velocity=walls if given.driven else walls[0],
     )
 
 
 def _paths(given: Given, solver: Solver, substeps: int) -> Iterator[Floats]:
     """Yield the positions of the particles that carry mass, frame by frame."""
-    from lagbench.generators.closed_box import ClosedBox
-
-    for frame in given.predicted_frames:
-        if isinstance(solver, ClosedBox):
-            walls = given.walls[frame] / given.size.frame_interval
-            solver.move_walls(walls[None].astype(np.float32))
+    for _ in given.predicted_frames:
         solver.advance(substeps)
         yield solver.position()[0].astype(np.float64)
 

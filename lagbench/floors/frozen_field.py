@@ -13,8 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .carried import linear_field, mirrored
-from .floor import Floats, Floor, Given, Prediction, fills_box
+from .floor import Floats, Floor, Given, Prediction, fills_box, linear_field, mirrored
 
 
 def decay(position: Floats) -> float:

@@ -16,7 +16,7 @@ from pathlib import Path
 from lagbench.atomic import write_atomically
 from lagbench.data.manifest import Manifest
 from lagbench.data.registry import Registry, Size, Split, spell_ids
-from lagbench.draw.markdown import escape, table
+from lagbench.draw.tables import escape, markdown
 
 CONFORMS_TO = "http://mlcommons.org/croissant/1.1"
 LICENCES = {"CC-BY-4.0": "https://creativecommons.org/licenses/by/4.0/"}
@@ -214,7 +214,9 @@ def dataset_card(size: Size, split: Split, manifest: Manifest, *, pictures: list
     statistics = (
         "## Statistics of train",
         "With the frame as unit of time: velocity is x(f) - x(f-1), acceleration its difference.",
-        table(("", "x", "y"), [(name.replace("_", " "), *row) for name, row in manifest.statistics.items()]),
+        markdown(
+            ("", "x", "y"), [(name.replace("_", " "), *row) for name, row in manifest.statistics.items()]
+        ),
     )
     parameters = [
         (f"`{name}`", f"{p.value:g}" if isinstance(p.value, float) else p.value, p.unit, p.description)
@@ -239,12 +241,12 @@ def dataset_card(size: Size, split: Split, manifest: Manifest, *, pictures: list
         f'data = lagbench.open_split("{size.split}", subset="train", size="{size.name}")\n'
         'position = data["position"]  # (scenario, frame, particle, space), read when computed\n'
         "```",
-        table(("variable", "dimensions", "type", "unit", "meaning"), VARIABLES),
+        markdown(("variable", "dimensions", "type", "unit", "meaning"), VARIABLES),
         "## Task",
         _task(size, manifest),
         *(statistics if manifest.statistics else ()),
         "## Parameters",
-        table(("parameter", "value", "unit", "meaning"), parameters),
+        markdown(("parameter", "value", "unit", "meaning"), parameters),
         "## Regenerate and verify",
         BITWISE if manifest.identity == "bitwise" else TOLERANCE,
         "```sh\n"
@@ -283,7 +285,7 @@ def _facts(size: Size, manifest: Manifest) -> str:
         ("box", " x ".join(f"[{low:.9g}, {high:.9g}]" for low, high in size.bounds)),
         ("bytes", sum(entry.bytes for entry in manifest.files)),
     ]
-    return table(("", ""), rows)
+    return markdown(("", ""), rows)
 
 
 def _subsets(size: Size, manifest: Manifest) -> str:
@@ -301,7 +303,7 @@ def _subsets(size: Size, manifest: Manifest) -> str:
                 f"`{digest}`" if digest else "incomplete",
             )
         )
-    return table(("subset", "ids", "scenarios", "frames", "bytes", "hash"), rows)
+    return markdown(("subset", "ids", "scenarios", "frames", "bytes", "hash"), rows)
 
 
 def _task(size: Size, manifest: Manifest) -> str:
@@ -319,7 +321,7 @@ def _task(size: Size, manifest: Manifest) -> str:
         first, last = (sum(floor[i] for floor in floors) / len(floors) for i in (0, -1))
         text = f"position RMSE {first:.3g} at the first predicted frame, {last:.3g} at the last"
         rows.append(("twin that starts 2^-20 away", text))
-    return table(("", ""), rows)
+    return markdown(("", ""), rows)
 
 
 def _scenarios(manifest: Manifest) -> str:
@@ -334,7 +336,7 @@ def _scenarios(manifest: Manifest) -> str:
         )
         for entry in manifest.files
     ]
-    listing = table(
+    listing = markdown(
         ("id", "file", "frames", *(name.replace("_", " ") for name in names), "content hash"), rows
     )
     return f"<details><summary>{len(rows)} files</summary>\n\n{listing}\n\n</details>"

@@ -15,8 +15,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lagbench.data import MATERIALS
 from lagbench.data.grid import Fields, Grid, Placement, fields, vorticity
-from lagbench.data.scenario import MATERIALS
 from lagbench.errors import ChecksFailedError, UsageError
 
 Floats = NDArray[np.float64]
@@ -48,6 +48,16 @@ PERCENTILES = (5, 25, 50, 75, 95)
 def average(values: Floats) -> float:
     """Return the mean of all values: the bits of ``np.mean``, which takes twice as long on few values."""
     return float(np.add.reduce(values, axis=None)) / values.size
+
+
+def mean_squared_error(error: Floats) -> float:
+    """Return ``MSE = mean((y - yhat)^2)`` over particles and components (Eq. 3.3)."""
+    return average(error**2)
+
+
+def mean_absolute_error(error: Floats) -> float:
+    """Return ``MAE = mean(|y - yhat|)`` over particles and components (Eq. 3.4)."""
+    return average(np.abs(error))
 
 
 def dot(a: Floats, b: Floats) -> float:
@@ -190,7 +200,7 @@ class Scenario:
 
     setting: Setting  # the split and size
     given: NDArray[np.floating]  # true positions from frame 0 to the last given one, [frame, particle, 2]
-    material: NDArray[np.integer]  # index into lagbench.data.writer.MATERIALS, shape [particle]
+    material: NDArray[np.integer]  # index into lagbench.data.MATERIALS, shape [particle]
     particle_mass: float  # of every particle [mass]
     area: float  # that the particles cover at first [length^2]
     active_frames: int | None = None  # predicted frames until the truth rests; None: the whole horizon

@@ -15,25 +15,15 @@ from functools import partial
 
 import numpy as np
 
-from lagbench.data.scenario import MATERIALS
+from lagbench.data import MATERIALS
 
-from .frame import Floats, FramePair, average
+from .frame import Floats, FramePair, average, mean_absolute_error, mean_squared_error
 from .metric import Direction, FirstFrames, Metric, last, mean, metric, root_mean_square
 
 HORIZONS = (1, 5, 10, 20, 50)
 """Predicted frames at which ``mse_avg`` and ``mse_end`` are taken besides the whole rollout."""
 
 SQUARED = {"length": "length^2", "length/frame": "length^2/frame^2"}
-
-
-def mean_squared_error(error: Floats) -> float:
-    """Return ``MSE = mean((y - yhat)^2)`` over particles and components (Eq. 3.3)."""
-    return average(error**2)
-
-
-def mean_absolute_error(error: Floats) -> float:
-    """Return ``MAE = mean(|y - yhat|)`` over particles and components (Eq. 3.4)."""
-    return average(np.abs(error))
 
 
 _error = partial(Metric, family="pointwise", direction=Direction.LOWER, perfect=0.0)

@@ -13,7 +13,7 @@ from functools import partial
 
 import numpy as np
 
-from .frame import PERCENTILES, Floats, FramePair, average
+from .frame import PERCENTILES, Floats, FramePair, average, mean_absolute_error, mean_squared_error
 from .metric import (
     Direction,
     Metric,
@@ -25,7 +25,6 @@ from .metric import (
     root_mean_square,
     turning,
 )
-from .pointwise import mean_absolute_error, mean_squared_error
 
 STABLE_PEARSON = 0.95
 """A rollout is stable until the vorticity correlation falls below this; at 0.8 good models saturate."""

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.data.scenario import MATERIALS
+from lagbench.data import MATERIALS
 from lagbench.draw.style import MATERIAL_COLOURS, rgb
 from lagbench.metrics.frame import FramePair, Snapshot
 from lagbench.scoring.task import ScoredTask

@@ -15,7 +15,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -23,8 +24,8 @@ from typing import Any
 
 import numpy as np
 
+from lagbench.atomic import check_regular
 from lagbench.data.checksums import round_digits
-from lagbench.data.layout import check_regular
 from lagbench.errors import UnreadableFileError
 from lagbench.floors.table import FLOORS
 from lagbench.metrics.aggregate import Score, Tally, bootstrap_interval, mean_over_seeds
@@ -36,7 +37,7 @@ from lagbench.submission.findings import Finding
 from lagbench.submission.format import MAX_NAME, Header
 
 from .flags import Flag
-from .scenario import LARGEST, SUBMISSION, Preview
+from .task import LARGEST, SUBMISSION, Preview
 
 FORMAT = 1
 """Number of the layout of scores.json and scores.nc; stored as ``lagbench_scores``."""
@@ -205,6 +206,20 @@ class ScoreCard:
         if score.metric.per_frame:
             said["at"] = {str(frame): _at(score, frame, row) for frame in self.reported_frames}
         return said
+
+
+def told_apart(methods: Sequence[str], taken: Collection[str] = ()) -> list[str]:
+    """Return the methods; those that occur twice, or have a taken name, with a number.
+
+    >>> told_apart(["gns", "gat", "gns"])
+    ['gns (1)', 'gat', 'gns (2)']
+    """
+    count, seen = Counter([*methods, *taken]), Counter[str]()
+    names = []
+    for method in methods:
+        seen[method] += 1
+        names.append(f"{method} ({seen[method]})" if count[method] > 1 else method)
+    return names
 
 
 def digits(value: float) -> float | None:

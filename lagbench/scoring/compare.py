@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import os
 import re
-from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from lagbench.data.layout import check_regular
+from lagbench.atomic import check_regular
 from lagbench.data.registry import Registry
 from lagbench.errors import ChecksFailedError, DataError, UnreadableFileError, UsageError, nearest
 from lagbench.floors.table import FLOORS
@@ -26,26 +25,11 @@ from lagbench.metrics.significance import FEWEST_SCENARIOS, Comparison
 from lagbench.metrics.significance import compare as compare_scores
 from lagbench.submission.format import MAX_NAME
 
-from .card import JSON_NAME, PublishedScores, digits, parse_scores, read_scores
-from .scenario import SUBMISSION
+from .card import JSON_NAME, PublishedScores, digits, parse_scores, read_scores, told_apart
 from .score import score
 from .score_file import NETCDF_NAME
 from .stored import MAX_SCORE_BYTES, published, unreadable_in_child
-
-
-def told_apart(methods: Sequence[str], taken: Collection[str] = ()) -> list[str]:
-    """Return the methods; those that occur twice, or have a taken name, with a number.
-
-    >>> told_apart(["gns", "gat", "gns"])
-    ['gns (1)', 'gat', 'gns (2)']
-    """
-    count, seen = Counter([*methods, *taken]), Counter[str]()
-    names = []
-    for method in methods:
-        seen[method] += 1
-        names.append(f"{method} ({seen[method]})" if count[method] > 1 else method)
-    return names
-
+from .task import SUBMISSION
 
 SAME = ("split", "size", "dataset_sha256")
 """What two submissions must share."""

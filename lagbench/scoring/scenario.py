@@ -11,11 +11,10 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lagbench.floors.floor import given_in
 from lagbench.floors.table import FLOORS
@@ -29,31 +28,7 @@ from lagbench.submission.predictions import Predictions, open_predictions
 from lagbench.work.pool import Report
 
 from .flags import Trace, Tracer
-from .task import OpenScenario, ScoredTask
-
-FRAMES = 45
-"""Frames of the particle film, evenly spaced over the horizon."""
-
-PARTICLES = 200
-"""Particles of the film, evenly spaced over the particle numbers."""
-
-
-@dataclass(frozen=True, eq=False)
-class Preview:
-    """Pictures of one scenario; index 0 of ``side`` is the truth, 1 the prediction."""
-
-    scenario: int  # id of the scenario
-    map_frames: tuple[int, ...]  # frames of interest and the last one
-    # at the compared nodes, NaN elsewhere [1/frame], shape [side, map frame, x node, y node]
-    vorticity: NDArray[np.float32]
-    # shares of 64 bins over the truth's range of omega, NaN where there is none [1], shape
-    # [side, map frame, bin]
-    histogram: NDArray[np.float32]
-    histogram_range: NDArray[np.float32]  # that range [1/frame], shape [map frame, 2]
-    film_frames: tuple[int, ...]
-    particles: tuple[int, ...]  # numbers of the particles in the film
-    material: NDArray[np.int8]  # their materials, shape [film particle]
-    film: NDArray[np.float32]  # their positions [length], shape [side, film frame, film particle, 2]
+from .task import FRAMES, PARTICLES, SUBMISSION, OpenScenario, Preview, ScoredTask, as_stored
 
 
 class PreviewRecorder:
@@ -115,18 +90,6 @@ def _spaced(numbers: range, count: int) -> tuple[int, ...]:
     if len(numbers) <= count:
         return tuple(numbers)
     return tuple(numbers[i * (len(numbers) - 1) // (count - 1)] for i in range(count))
-
-
-SUBMISSION = "submission"
-"""Row of the submission; the floors have rows of their names."""
-
-LARGEST = float(np.finfo(np.float32).max)
-
-LONG_ROLLOUT = 100
-"""Predicted frames beyond which statistics are rounded more coarsely than float32."""
-
-LONG_BITS = 11
-"""Significant bits of statistics of a long rollout: a relative error of 4.9e-4 at most."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -211,21 +174,6 @@ def measure_rows(
     names = [m.name for m in metrics if m.statistic is not None]
     tallies = {name: as_stored(Tally.of(names, frames, values)) for name, values in measured.items()}
     return tallies, tracer.result()
-
-
-def as_stored(tally: Tally) -> Tally:
-    """Return a tally rounded as scores.nc holds it: to float32, of long rollouts to 11 bits.
-
-    Scores are formed from rounded statistics, so that whoever aggregates scores.nc again gets
-    the same digits. Long rollouts have so many frames that their float32 would not fit into a
-    small file, and that rounding averages out. Beyond float32 a statistic saturates.
-    """
-    total = tally.total
-    if len(tally.frames) > LONG_ROLLOUT:
-        mantissa, exponent = np.frexp(total)
-        total = np.ldexp(np.rint(np.ldexp(mantissa, LONG_BITS)), exponent - LONG_BITS)
-    stored = np.clip(total, -LARGEST, LARGEST).astype(np.float32)
-    return replace(tally, total=stored.astype(np.float64))
 
 
 def _predicted(predictions: Predictions, number: int, scenario: Scenario) -> Iterator[Snapshot]:

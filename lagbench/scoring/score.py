@@ -28,9 +28,9 @@ from lagbench.work.run import run_all
 from .card import JSON_NAME, ScoreCard, read_scores, spell
 from .flags import Flag, below_twin_floor, copy_suspect, physics
 from .floors import measurable
-from .scenario import SUBMISSION, ScenarioJob, ScenarioScores, score_scenario
+from .scenario import ScenarioJob, ScenarioScores, score_scenario
 from .score_file import NETCDF_NAME, write_statistics
-from .task import ScoredTask, load_scored_task, ranking_metric
+from .task import SUBMISSION, ScoredTask, load_scored_task, ranking_metric
 from .usable import OF_NODES, few_nodes
 
 PREDICTIONS = "predictions.nc"

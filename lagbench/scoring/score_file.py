@@ -2,7 +2,7 @@
 
 Every score of the submission follows from it: ``read_statistics(path).scores()`` gives the
 digits of scores.json. Statistics are float32 and NaN where undefined, those of long rollouts
-rounded to 11 significant bits (see :func:`lagbench.scoring.scenario.as_stored`), so that no full size takes
+rounded to 11 significant bits (see :func:`lagbench.scoring.task.as_stored`), so that no full size takes
 more than 1 MB; ``measured`` tells which were measured at all. What the best floor scores in
 the ranking metric stands beside them, so that the skill can be formed again.
 """
@@ -24,7 +24,7 @@ from lagbench.metrics.aggregate import Score, Tally, aggregate
 from lagbench.metrics.table import available
 
 from .card import FORMAT, IDENTITY, ScoreCard, Skill, printable, skill, unreadable_scores
-from .scenario import SUBMISSION, Preview
+from .task import SUBMISSION, Preview
 
 NETCDF_NAME = "scores.nc"
 

@@ -18,10 +18,10 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.atomic import check_regular
 from lagbench.data.checksums import round_digits
 from lagbench.data.grid import Grid, Placement
 from lagbench.data.hdf5 import Structure, check_structure, opened
-from lagbench.data.layout import check_regular
 from lagbench.data.registry import Size
 from lagbench.errors import UnreadableFileError
 from lagbench.metrics.distributions import BINS
@@ -29,9 +29,8 @@ from lagbench.submission.task_checks import frames_to_predict
 from lagbench.work.machine import in_child
 
 from .card import PublishedScores, unreadable_scores
-from .scenario import FRAMES, PARTICLES, SUBMISSION, Preview
 from .score_file import FILM_RANGE, StoredScores, read_statistics
-from .task import ranking_metric
+from .task import FRAMES, PARTICLES, SUBMISSION, Preview, ranking_metric
 
 MAX_SCORE_BYTES = 1_000_000  # longest score file [bytes]
 MAX_UNPACKED = 32 << 20  # most that a score file may unpack to [bytes]; the largest of ours takes 3 MB

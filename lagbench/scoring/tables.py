@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass
 
+from lagbench.draw.tables import Table
 from lagbench.floors.shipped import DIGITS
 from lagbench.metrics.aggregate import Score
 from lagbench.metrics.metric import Direction, Metric, mean
@@ -13,7 +13,7 @@ from lagbench.metrics.table import CHOSEN
 
 from .card import ScoreCard
 from .compare import ComparisonResult
-from .scenario import SUBMISSION
+from .task import SUBMISSION
 
 SHOWN_AT_FRAMES = (
     *("vorticity_mse", "vorticity_mae", "vorticity_rmse", "vorticity_pearson", "vorticity_kl"),
@@ -24,45 +24,6 @@ SHOWN_AT_FRAMES = (
 
 ARROWS = {Direction.LOWER: " ↓", Direction.HIGHER: " ↑", Direction.TARGET: " ◎", Direction.NONE: ""}
 """How the better side of a metric is marked, behind its name."""
-
-WIDTH = 80
-"""Characters that a table may be wide; a wider one comes in blocks."""
-
-GAP = 3
-"""Characters between two columns."""
-
-LAST = 24
-"""Characters to which the last column, which wraps, may shrink."""
-
-
-@dataclass(frozen=True)
-class Table:
-    """A table of text."""
-
-    title: str  # what it shows
-    columns: tuple[str, ...]  # names of the columns, perhaps in lines
-    rows: tuple[tuple[str, ...], ...]  # cells, row by row
-    keys: int = 1  # how many columns say what a row is
-
-    def blocks(self, width: int = WIDTH) -> Iterator[Table]:
-        """Yield the table in pieces that are no wider, each with the columns that say what a row is."""
-        columns = list(zip(self.columns, *self.rows, strict=True))
-        widths = [max(len(line) for cell in column for line in cell.split("\n")) for column in columns]
-        widths[-1] = min(widths[-1], LAST)
-        own, chosen = sum(widths[: self.keys]) + GAP * self.keys, list[list[int]]([[]])
-        for i in range(self.keys, len(columns)):
-            taken = own + sum(widths[j] + GAP for j in chosen[-1])
-            if chosen[-1] and taken + widths[i] > width:
-                chosen.append([])
-            chosen[-1].append(i)
-        for number, block in enumerate(chosen):
-            kept = [*range(self.keys), *block]
-            yield Table(
-                self.title if number == 0 else "",
-                tuple(self.columns[i] for i in kept),
-                tuple(tuple(row[i] for i in kept) for row in self.rows),
-                self.keys,
-            )
 
 
 def card_tables(card: ScoreCard, *, every: bool = False, floors: bool = False) -> Iterator[Table]:

@@ -1,11 +1,22 @@
-"""Markdown from values: escaped text and aligned tables."""
+"""Tables of text, and how Markdown spells them: escaped and aligned."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 _SPECIAL = re.compile(r"([\\`*_\[\]<>|#&~$])")
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of text."""
+
+    title: str  # what it shows
+    columns: tuple[str, ...]  # names of the columns, perhaps in lines
+    rows: tuple[tuple[str, ...], ...]  # cells, row by row
+    keys: int = 1  # how many columns say what a row is
 
 
 def escape(text: object) -> str:
@@ -17,8 +28,8 @@ def escape(text: object) -> str:
     return _SPECIAL.sub(r"\\\1", " ".join(str(text).split()))
 
 
-def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """Return a table; numbers are set flush right, everything is escaped.
+def markdown(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    """Return a table in Markdown; numbers are set flush right, everything is escaped.
 
     Cells that start and end with a backtick are code and stay as they are.
     """

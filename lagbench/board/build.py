@@ -1,4 +1,4 @@
-"""Read entries and score files, and form the board: every number from score files anew.
+"""Build the leaderboard: read entries and score files, form every number anew, write the page.
 
 What the YAML files say of scores is not used; ``lagbench leaderboard check`` compares it.
 """
@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lagbench.atomic import write_atomically
 from lagbench.data.registry import Registry, Size, load
 from lagbench.errors import ChecksFailedError, DataError, UnreadableFileError, UsageError
 from lagbench.floors.shipped import FloorScores, solver_seconds
@@ -21,15 +22,17 @@ from lagbench.metrics.aggregate import Score
 from lagbench.metrics.metric import mean
 from lagbench.metrics.significance import FEWEST_SCENARIOS, Standing, mean_loss, standings
 from lagbench.metrics.table import METRICS
+from lagbench.report.html import tag
 from lagbench.scoring.card import skill
-from lagbench.scoring.scenario import Preview
 from lagbench.scoring.stored import Stored, read_stored, reported_frames
+from lagbench.scoring.task import Preview
 from lagbench.submission.task_checks import frames_to_predict
 
 from .entry import Cost, Entry, Status, Verification
-from .entry_file import read_entry, read_verified, verification_of
-from .folder import Folder
+from .entry_file import read_entry, read_verified, schema_bytes, verification_of
+from .folder import PAGE, SCHEMA, Folder
 from .model import Board, Curve, Floor, Histogram, Pictures, Row, Tab, Value
+from .page import LINKS, render
 from .payload import spaced
 from .ranking import Combined, combine, is_current, read_floors
 
@@ -306,3 +309,67 @@ def residuals(preview: Preview) -> tuple[Histogram, ...]:
         shares = counts / values.size if values.size else np.full(RESIDUAL_BINS, np.nan)
         found.append(Histogram(low=-end if values.size else 0.0, high=end, shares=shares))
     return tuple(found)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BuildResult:
+    """A page that was drawn."""
+
+    page: Path
+    bytes: int
+    tabs: int  # splits and sizes on it
+    rows: int  # entries on it
+    written: tuple[Path, ...]  # files that were missing or had other bytes
+
+
+def build(
+    board: str | Path,
+    *,
+    check: bool = False,
+    registry: Registry | None = None,
+) -> BuildResult:
+    """Write the page and schema.json of a leaderboard's folder; files that are right stay untouched.
+
+    Args:
+        board: the leaderboard's folder.
+        check: write nothing, fail where a file would change.
+        registry: where splits are described; ours when None.
+
+    Raises:
+        UsageError: no leaderboard there.
+        UnreadableFileError: an entry or a score file cannot be read.
+        ChecksFailedError: an entry does not fit, or with ``check`` a file is stale.
+        WorkFailedError: the disk is full or not writable.
+    """
+    folder, held = Folder(board), collect(board, registry=registry)
+    links = {label: path for label, path in LINKS.items() if (folder.path / path).exists()}
+    page = folder.path / PAGE
+    if check and page.is_file():  # a copy of the folder elsewhere still has the links of where it was drawn
+        said = page.read_bytes()
+        links = {n: path for n, path in LINKS.items() if str(tag("a", n, href=path)).encode() in said}
+    wanted = {page: render(held, links).encode(), folder.path / SCHEMA: schema_bytes()}
+    stale = [
+        path
+        for path, data in wanted.items()
+        if path.is_symlink()
+        or not path.is_file()
+        or path.stat().st_size != len(data)
+        or path.read_bytes() != data
+    ]
+    if stale and check:
+        raise ChecksFailedError(
+            "the page is not what the submissions give",
+            where=", ".join(str(path) for path in stale),
+            expected=", ".join(f"{path.name} of {len(wanted[path])} bytes" for path in stale),
+            got="another content, or no file",
+            fix=f"lagbench leaderboard build --board {board}",
+        )
+    for path in stale:
+        write_atomically(path, wanted[path], option="--board")
+    return BuildResult(
+        page=page,
+        bytes=len(wanted[page]),
+        tabs=len(held.tabs),
+        rows=sum(len(tab.rows) for tab in held.tabs),
+        written=tuple(stale),
+    )
