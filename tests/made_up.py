@@ -241,10 +241,10 @@ class BoardBench:
         seed = f"_{labels['seed']}" if "seed" in labels else ""
         return self.data.submit(self.folder.parent / f"{name}{seed}.nc", method, name, **labels)
 
-    def submit(self, *paths: Path, replace: bool = False, **keys: Any) -> SubmitResult:
+    def submit(self, *paths: Path, replace: bool = False, add: bool = False, **keys: Any) -> SubmitResult:
         """Submit predictions."""
         meta = Meta(**{"authors": ("A. Author",), "command": "make", "date": DAY, **keys})
-        return submit(paths, meta, replace=replace, new_board=True, **self.where)
+        return submit(paths, meta, replace=replace, add=add, new_board=True, **self.where)
 
     @property
     def where(self) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from lagbench.board.entry import Meta
 from lagbench.board.entry_file import read_entry
 from lagbench.board.submit import SubmitResult, submit
 from lagbench.data.checksums import file_sha256
-from lagbench.errors import UnreadableFileError, UsageError, WorkFailedError
+from lagbench.errors import LagbenchError, UnreadableFileError, UsageError, WorkFailedError
 from lagbench.submission import open_predictions
 from lagbench.submission.budget import Budget
 
@@ -437,3 +437,53 @@ def test_a_track_is_not_stated(own: BoardBench) -> None:
     with pytest.raises(UsageError) as caught:
         own.submit(trained(own, 0) / "predictions.nc", budget={"track": "converged"})
     assert caught.value.where == "budget.track"
+
+
+def test_seeds_that_come_later_make_the_entry_of_all_at_once(
+    own: BoardBench, home: Path, tmp_path: Path
+) -> None:
+    """Byte for byte, weights included, though the predictions of the first seeds are gone by then."""
+    runs = [trained(own, seed) for seed in (0, 3, 5)]
+    submitted(own, runs[0])
+    (runs[0] / "predictions.nc").rename(tmp_path / "gone.nc")
+    for run in runs[1:]:
+        result = submitted(own, run, add=True)
+    assert found(own) == set()
+    assert {path.name for path in result.files} == {"drift.yaml", *(f"drift_{i}.nc" for i in (0, 3, 5))} | {
+        "drift_5.pt",
+        "drift_5.json",
+    }
+    assert not (own.folder / "scores/cavity/tiny/drift.nc").exists()
+    (tmp_path / "gone.nc").rename(runs[0] / "predictions.nc")
+    (tmp_path / "other").mkdir()
+    other = copied(home, tmp_path / "other")
+    submitted(other, *runs)
+    assert own.state() == other.state()
+
+
+def test_what_seeds_to_add_must_share_with_the_entry(own: BoardBench) -> None:
+    """An entry of that method, its parameters, training in words and score files; another seed."""
+    first, same = trained(own, 0), trained(own, 3)
+    other = trained(own, 4, training="cavity tiny train, recipe cavity/other, step 6")
+    many = trained(own, 6, parameters=7)
+
+    def refused(*folders: Path, **options: Any) -> str:
+        before = own.state()
+        with pytest.raises(LagbenchError) as caught:
+            submitted(own, *folders, weights=(), **{"add": True, **options})
+        assert own.state() == before
+        return f"{caught.value.what} {caught.value.fix}"
+
+    assert "no entry" in refused(first)
+    submitted(own, first)
+    assert "added to or replaced" in refused(same, replace=True)
+    assert "training" in refused(other)
+    assert "parameters" in refused(many)
+    assert "seeds that differ" in refused(first)
+    file = own.folder / "scores/cavity/tiny/drift.nc"
+    held = file.read_bytes()
+    file.write_bytes(held + b"more")
+    assert "score file" in refused(same)
+    file.write_bytes(held)
+    submitted(own, same, add=True)
+    assert found(own) == set()

@@ -11,6 +11,7 @@ from __future__ import annotations
 import datetime
 import os
 import re
+import shutil
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -54,6 +55,7 @@ from .entry_file import Model, active_beside, examine, listed, read_verified, re
 from .findings import print_of, prints_of, skeleton
 from .folder import FLOORS, SUBMISSIONS, VERIFIED, Folder, Place, entry_path, score_paths
 from .ranking import combine, scored_file, summarise, write_floors
+from .seeds import entry_to_add_to, seeds_of
 from .weights import named_weights, require_weights, stage_weights
 
 BOARD = Path("leaderboard")  # the leaderboard's folder, from the root of the repository
@@ -86,6 +88,7 @@ def submit(
     board: str | Path = BOARD,
     root: str | Path | None = None,
     replace: bool = False,
+    add: bool = False,
     new_board: bool = False,
     workers: int | None = None,
     registry: Registry | None = None,
@@ -101,6 +104,8 @@ def submit(
         board: the leaderboard's folder.
         root: folder of all data sets.
         replace: whether an entry of that name may be replaced.
+        add: whether the files are further seeds of the entry of that name, whose other predictions need not
+            be at hand. What it says of the method stays, but for what ``meta`` says.
         new_board: whether to begin a leaderboard where there is none.
         workers: worker processes of the scorer.
         registry: where splits are described; ours when None.
@@ -118,7 +123,10 @@ def submit(
     folder, paths = Folder(board), [Path(path) for path in predictions]
     mistakes = Mistakes()
     with mistakes:
-        _require_said(meta)
+        if add and replace:
+            raise UsageError("an entry is added to or replaced", where="--add, --replace", fix="give one")
+        if not add:
+            _require_said(meta)
     with mistakes:
         if new_board:
             folder.require_room()
@@ -143,24 +151,29 @@ def submit(
             warned = any(found.check == OUTSIDE for found in result.warnings)
             outside.append(outside_share(opened, size) if warned else None)
     with mistakes:
-        seeds = _seeds(headers)
-    with mistakes:
-        about = _about(headers, meta)
+        seeds = seeds_of(headers)
     with mistakes:
         if meta.urls and len(meta.urls) != len(headers):
             fix = f"give {len(headers)}, one per file in their order, or none"
             raise UsageError("addresses do not match the files", where="--url", got=len(meta.urls), fix=fix)
         urls = meta.urls or (None,) * len(headers)
     others: dict[Path, Entry] = {}
+    before: Entry | None = None
     with mistakes:
         place = (headers[0].split, headers[0].size, _method(headers[0], meta))
         others = active_beside(folder, place)
-        _require_free(folder, place, _name(headers[0], meta), others, replace=replace)
+        if add:
+            before = entry_to_add_to(folder, place, headers)
+        label = before.name if before and not meta.name else _name(headers[0], meta)
+        _require_free(folder, place, label, others, replace=replace or add)
         read_verified(folder)  # a line of it may have to go
+    with mistakes:
+        about = _about(headers, meta, before)
     with mistakes:
         sources = require_weights(weights, headers, others)
     mistakes.tell()
-    taken = {made.sha256: str(where) for where, entry in others.items() for made in entry.predictions}
+    rivals = others | ({} if before is None else {before.yaml_path: before})
+    taken = {made.sha256: str(where) for where, entry in rivals.items() for made in entry.predictions}
     _require_new(hashes, paths, taken)
     made = []
     for path, sha256, header, seed, url in zip(paths, hashes, headers, seeds, urls, strict=True):
@@ -181,9 +194,9 @@ def submit(
         )
         for path, result in zip(paths, results, strict=True)
     ]
-    _require_new([print_of(card.tallies[SUBMISSION]) for card in cards], paths, prints_of(folder, others))
+    _require_new([print_of(card.tallies[SUBMISSION]) for card in cards], paths, prints_of(folder, rivals))
     try:
-        return _publish(place, about, cards, made, folder, outside, sources, others)
+        return _publish(place, about, cards, made, folder, outside, sources, others, before)
     except OSError as error:
         raise WorkFailedError(
             "cannot write there",
@@ -209,31 +222,6 @@ def _require_files(paths: Sequence[Path]) -> None:
     if not 1 <= len(paths) <= MOST_SEEDS:
         what = "too many files" if paths else "no predictions"
         raise UsageError(what, expected=f"1 to {MOST_SEEDS}, one per seed", got=len(paths))
-
-
-def _seeds(headers: Sequence[Header]) -> tuple[int | None, ...]:
-    """Return the seeds of files that belong together; refuse those that do not."""
-    alike = ("split", "size", "dataset_sha256", "method", "parameters")
-    told = {name: [str(getattr(header, name)) for header in headers] for name in alike}
-    # each seed has its own step of the best weights, and its own weights to start from
-    words = [re.sub(r"(, step |, weights )\w+", "", header.training or "") for header in headers]
-    if all(", recipe " in one for one in words):
-        told["training"] = words
-    for name, values in told.items():
-        if len(found := dict.fromkeys(values)) > 1:
-            rename = "; or write seeds of one method under one name: lagbench predict --method NAME"
-            fix = "submit each on its own" + rename * (name == "method")
-            raise UsageError(f"the files differ in {name}", got=", ".join(map(ascii, found)), fix=fix)
-    seeds = tuple(header.seed for header in headers)
-    if any(seed is not None and not 0 <= seed < 2**63 for seed in seeds):
-        raise UsageError("a seed does not fit", expected="0 to 2^63 - 1", got=seeds)
-    if len(seeds) > 1 and (None in seeds or len(set(seeds)) < len(seeds)):
-        raise UsageError(
-            "several files need seeds that differ",
-            got=", ".join("none" if seed is None else str(seed) for seed in seeds),
-            fix="write them with submission.write(..., seed=0), seed=1 and so on",
-        )
-    return seeds
 
 
 def _method(header: Header, meta: Meta) -> str:
@@ -284,9 +272,14 @@ def _require_new(prints: Sequence[str], paths: Sequence[Path], known: Mapping[st
         found[print_] = str(path)
 
 
-def _about(headers: Sequence[Header], meta: Meta) -> About:
-    """Return what is said of the method, with what the predictions say where nothing is."""
-    first = headers[0]
+def _about(headers: Sequence[Header], meta: Meta, before: Entry | None) -> About:
+    """Return what is said of the method: by ``meta``, else by the entry before, else by the predictions."""
+    first, budgets = headers[0], [header.budget for header in headers]
+    if before is not None:
+        budgets = [*(made.budget for made in before.predictions), *budgets]
+        said = {name: getattr(meta, name) for name in meta.model_fields_set}
+        stays = {name: getattr(before, name) for name in About.model_fields if name not in ("budget", "date")}
+        meta = meta.model_copy(update=stays | said)
     held = {name: getattr(meta, name) for name in About.model_fields}
     held["name"] = _name(first, meta)
     held["date"] = meta.date or datetime.datetime.now(datetime.UTC).date()
@@ -295,14 +288,15 @@ def _about(headers: Sequence[Header], meta: Meta) -> About:
     held["training"] = meta.training or (first.training or "")[:LONGEST_TEXT]
     if meta.parameters is None:
         held["parameters"] = first.parameters
-    held["cost"] = meta.cost or Cost.told(headers, meta.solver_seconds_per_frame)
+    if meta.cost is None and before is None:
+        held["cost"] = Cost.told(headers, meta.solver_seconds_per_frame)
     if meta.budget is not None and meta.budget.track is not None:
         raise UsageError(
             "a track is not stated",
             where="budget.track",
             fix="leave it out: it follows from the budget that `lagbench predict` writes into predictions.nc",
         )
-    held["budget"] = EntryBudget.of(first.size, [header.budget for header in headers]) or meta.budget
+    held["budget"] = EntryBudget.of(first.size, budgets) or meta.budget
     return _fitting(About, held)
 
 
@@ -330,17 +324,23 @@ def _publish(
     outside: Sequence[float | None],
     sources: Sequence[Path | None],
     others: Mapping[Path, Entry],
+    added_to: Entry | None,
 ) -> SubmitResult:
     """Write all files beside their places, then move them there, the entry last; remove the old one's others.
 
-    A full disk is met before anything of the old entry is touched.
+    A full disk is met before anything of the old entry is touched. An entry that is added to keeps its
+    score files, under new names where it had but one.
     """
+    stay = added_to.predictions if added_to else ()
+    made, sources = [*stay, *made], [*(None for _ in stay), *sources]
     names, yaml_path = score_paths(place, [one.seed for one in made]), entry_path(place)
     before = readable(folder.path / yaml_path)
     (folder.path / SUBMISSIONS).mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=STAGE, dir=folder.path) as stage:
         staged = [Path(stage) / name.name for name in names]
-        for card, target in zip(cards, staged, strict=True):
+        for path, target in zip(added_to.score_paths if added_to else (), staged, strict=False):
+            shutil.copyfile(folder.path / path, target)
+        for card, target in zip(cards, staged[len(stay) :], strict=True):
             write_statistics(card, target, option="--board")
             length = target.stat().st_size
             if length > MAX_SCORE_BYTES:
@@ -351,7 +351,8 @@ def _publish(
                     got=f"{length} bytes",
                     fix="uninstall packages that add metrics, and submit again",
                 )
-        files = tuple(map(scored_file, cards, staged, outside))
+        files = (*(added_to.score.files if added_to else ()),)
+        files += tuple(map(scored_file, cards, staged[len(stay) :], outside))
         kept = named_weights(folder, place, made, sources, before, others)
         made = [one.model_copy(update={"weights": held}) for one, held in zip(made, kept, strict=True)]
         header = cards[0].header

@@ -61,6 +61,9 @@ def submit(
         ),
     ] = None,
     replace: Annotated[bool, typer.Option("--replace", help="Replace the entry of that name.")] = False,
+    add: Annotated[
+        bool, typer.Option("--add", help="Add seeds to the entry of that name; its others stay.")
+    ] = False,
     new_board: Annotated[
         bool, typer.Option("--new-board", help="Begin a leaderboard in --board, where there is none.")
     ] = False,
@@ -84,6 +87,7 @@ def submit(
             board=board,
             root=root,
             replace=replace,
+            add=add,
             new_board=new_board,
             workers=workers,
             progress=draw,
