@@ -7,14 +7,12 @@ to the next, whichever scenario it belongs to. On ``Device.CPU`` a batch is one 
 from __future__ import annotations
 
 import functools
-import importlib
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,10 +20,10 @@ from numpy.typing import NDArray
 from lagbench.data.registry import Size
 from lagbench.errors import UsageError, WorkFailedError
 
-from .constants import blamed_on_parameters
+from .constants import blamed_on_parameters, solver_constants, split_module
 from .draws import generator
 from .solver import Device, Solver, build
-from .split import ClosedBoxParameters, FreeSurfaceParameters, InitialState, Split
+from .split import ClosedBoxParameters, FreeSurfaceParameters, InitialState
 
 STRIDE = 4_000_000  # particle-substeps between two reports: about a tenth of a second on a core
 
@@ -41,27 +39,6 @@ class SimulationJob:
     scenarios: tuple[int, ...]  # ids that advance together; one on Device.CPU
     root: Path  # folder that holds all data sets
     device: Device = Device.CPU  # where the solver runs
-
-
-def split_module(size: Size) -> Split:
-    """Return the module that draws the scenarios of a size."""
-    try:
-        module = importlib.import_module(size.generator)
-    except ImportError as error:
-        raise UsageError(
-            f"the generator of split {size.split!r} cannot be imported", where=size.generator, got=error
-        ) from error
-    missing = [name for name in ("solver_parameters", "initial_state") if not hasattr(module, name)]
-    if missing:
-        raise UsageError(f"a generator lacks {' and '.join(missing)}", where=size.generator)
-    return cast("Split", module)
-
-
-def solver_constants(size: Size) -> ClosedBoxParameters | FreeSurfaceParameters:
-    """Return the constants of the solver of a size; an impossible parameter is an UnreadableFileError."""
-    module = split_module(size)
-    with blamed_on_parameters(size, "choosing the solver's constants"):
-        return module.solver_parameters(size)
 
 
 def draw(size: Size, scenario: int) -> InitialState:

@@ -1,21 +1,22 @@
-"""From a size in datasets.yaml to constants, walls and the ranges of what is drawn.
+"""From a size in datasets.yaml to its split's module, constants, walls and the ranges of what is drawn.
 
 What the constants of a solver may be: wrong names and values are told before work starts.
 """
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import MISSING, fields
 from difflib import get_close_matches
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, TypeVar, cast
 
 from lagbench.data.limits import Limit
 from lagbench.errors import UnreadableFileError, UsageError
 
 from .shapes import Region
-from .split import ClosedBoxParameters, FreeSurfaceParameters
+from .split import ClosedBoxParameters, FreeSurfaceParameters, Split
 
 if TYPE_CHECKING:
     from lagbench.data.registry import Size
@@ -28,6 +29,8 @@ __all__ = [
     "free_surface_walls",
     "interval",
     "ranges",
+    "solver_constants",
+    "split_module",
 ]
 
 
@@ -169,3 +172,24 @@ def interval(size: Size, name: str) -> tuple[float, float]:
 def ranges(size: Size, name: str) -> Region:
     """Return the intervals of ``<name>_x`` and ``<name>_y``."""
     return interval(size, f"{name}_x"), interval(size, f"{name}_y")
+
+
+def split_module(size: Size) -> Split:
+    """Return the module that draws the scenarios of a size."""
+    try:
+        module = importlib.import_module(size.generator)
+    except ImportError as error:
+        raise UsageError(
+            f"the generator of split {size.split!r} cannot be imported", where=size.generator, got=error
+        ) from error
+    missing = [name for name in ("solver_parameters", "initial_state") if not hasattr(module, name)]
+    if missing:
+        raise UsageError(f"a generator lacks {' and '.join(missing)}", where=size.generator)
+    return cast("Split", module)
+
+
+def solver_constants(size: Size) -> ClosedBoxParameters | FreeSurfaceParameters:
+    """Return the constants of the solver of a size; an impossible parameter is an UnreadableFileError."""
+    module = split_module(size)
+    with blamed_on_parameters(size, "choosing the solver's constants"):
+        return module.solver_parameters(size)

@@ -30,7 +30,8 @@ from lagbench.data.registry import Size, Task
 from lagbench.data.scenario import read_scenario
 from lagbench.data.writer import ScenarioWriter
 
-from .batch import Batch, Report, SimulationJob, split_module, substeps_of
+from .batch import Batch, Report, SimulationJob, substeps_of
+from .constants import split_module
 from .draws import QUANTUM, entropy, seed_text
 from .split import ClosedBoxParameters, FreeSurfaceParameters, InitialState
 

@@ -17,7 +17,8 @@ from lagbench.data.registry import Registry, Size, load
 from lagbench.errors import WorkFailedError
 from lagbench.generators import batch
 from lagbench.generators import simulate as twin
-from lagbench.generators.batch import Batch, SimulationJob, split_module
+from lagbench.generators.batch import Batch, SimulationJob
+from lagbench.generators.constants import split_module
 from lagbench.generators.simulate import simulate
 from lagbench.generators.solver import Device, Solver, build
 from lagbench.generators.split import InitialState

@@ -25,7 +25,7 @@ from lagbench.floors.coarse_solver import coarser, predict_with, spread_subset
 from lagbench.floors.floor import linear_field, mirrored
 from lagbench.floors.frozen_field import decay
 from lagbench.floors.shipped import FOLDER, shipped_path
-from lagbench.generators.batch import solver_constants
+from lagbench.generators.constants import solver_constants
 from lagbench.generators.solver import build
 from lagbench.generators.split import InitialState
 from lagbench.scoring.card import best_floor

@@ -130,7 +130,8 @@ def bench_solver(split: str, size: str, *, frames: int = FRAMES) -> SolverBench:
     """
     tier = load().size(split, size)
     check_installed("taichi", extra="generate")
-    from lagbench.generators.batch import draw, solver_constants
+    from lagbench.generators.batch import draw
+    from lagbench.generators.constants import solver_constants
     from lagbench.generators.solver import build
 
     solver = build(solver_constants(tier))

@@ -20,7 +20,7 @@ from lagbench.data.manifest import read_manifest
 from lagbench.data.registry import Registry, Size
 from lagbench.data.scenario import ScenarioFile, read_scenario
 from lagbench.errors import DataError, UsageError
-from lagbench.generators.batch import solver_constants
+from lagbench.generators.constants import solver_constants
 from lagbench.store.copy import scenario_files
 from lagbench.work.progress import Meter, Progress
 

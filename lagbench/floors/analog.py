@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 from lagbench.data.grid import Grid, Placement, node_velocity, transfer
 from lagbench.data.scenario import ScenarioFile, read_scenario
 from lagbench.errors import DataError
-from lagbench.store.copy import bring
 
 from .floor import Floats, Floor, Given, Prediction, fills_box, given_in, linear_field, mirrored, wall_motion
 
@@ -71,10 +70,9 @@ def distance(one: Start, other: Start) -> float:
 
 
 def nearest(given: Given) -> int:
-    """Return the id of the scenario of train that starts most like this one; all must be there."""
+    """Return the id of the scenario of train that starts most like this one; all must be at hand."""
     size, own = given.size, start_of(given)
     needed = size.task.input_frames + size.task.horizon
-    bring(size, given.root, size.subsets["train"])
     found = {}
     for scenario in size.subsets["train"]:
         if size.frame_count(scenario) >= needed:

@@ -56,7 +56,7 @@ def predict(given: Given) -> Prediction:
 def predict_with(given: Given, coarse: Size) -> Prediction:
     """Yield positions that the solver finds with the constants of a size."""
     require("taichi", extra="generate")
-    from lagbench.generators.batch import solver_constants
+    from lagbench.generators.constants import solver_constants
 
     constants = solver_constants(coarse)
     count = min(coarse.particles, len(given.last))

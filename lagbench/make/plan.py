@@ -134,7 +134,8 @@ def estimate(
             where=f"{size.split} {size.name}",
             fix="lagbench import or lagbench adopt makes it again from the data that it came from",
         )
-    from lagbench.generators.batch import solver_constants, substeps_of
+    from lagbench.generators.batch import substeps_of
+    from lagbench.generators.constants import solver_constants
 
     solver_constants(size)
     step = 1 if drawn is None else max(1, len(scenarios) // drawn)
@@ -226,7 +227,7 @@ def _path() -> Path:
 
 def _kind(size: Size) -> str:
     """Return which of the solvers a size is simulated with."""
-    from lagbench.generators.batch import solver_constants
+    from lagbench.generators.constants import solver_constants
     from lagbench.generators.split import ClosedBoxParameters
 
     return "closed_box" if isinstance(solver_constants(size), ClosedBoxParameters) else "free_surface"

@@ -27,7 +27,7 @@ from lagbench.work.pool import Report
 from lagbench.work.progress import Meter, Progress
 from lagbench.work.run import run_all
 
-from .scenario import measure_rows
+from .scenario import measure_rows, predicted_by
 from .task import ScoredTask, load_scored_task
 
 TOLERANCE = 1e-4
@@ -107,7 +107,7 @@ def measure_scenario(job: FloorJob, report: Report) -> FloorTallies:
     with job.task.opened(job.scenario) as truth:
         given = given_in(truth.file, job.task.size, job.task.truth.root)
         rows = {
-            name: snapshots(truth.scenario, _timed(FLOORS[name].predict(given), taken))
+            name: snapshots(truth.scenario, _timed(predicted_by(FLOORS[name], given), taken))
             for name, taken in seconds.items()
         }
         tallies, _ = measure_rows(truth.scenario, truth.snapshots(), rows, select(job.metrics), report=report)

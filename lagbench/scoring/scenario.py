@@ -16,13 +16,14 @@ from pathlib import Path
 
 import numpy as np
 
-from lagbench.floors.floor import given_in
+from lagbench.floors.floor import Floor, Given, Prediction, given_in
 from lagbench.floors.table import FLOORS
 from lagbench.metrics.aggregate import Tally, measure
 from lagbench.metrics.distributions import BINS, histograms
 from lagbench.metrics.frame import FramePair, Scenario, Snapshot, snapshots
 from lagbench.metrics.metric import Metric
 from lagbench.metrics.table import select
+from lagbench.store.copy import bring
 from lagbench.submission.format import Anatomy
 from lagbench.submission.predictions import Predictions, open_predictions
 from lagbench.work.pool import Report
@@ -147,7 +148,14 @@ def _told_of(scenario: int) -> Iterator[None]:
 def floor_snapshots(name: str, truth: OpenScenario, task: ScoredTask) -> Iterator[Snapshot]:
     """Yield the snapshots that a floor predicts."""
     given = given_in(truth.file, task.size, task.truth.root)
-    return snapshots(truth.scenario, FLOORS[name].predict(given))
+    return snapshots(truth.scenario, predicted_by(FLOORS[name], given))
+
+
+def predicted_by(floor: Floor, given: Given) -> Prediction:
+    """Return what a floor predicts; what it reads of train is brought first."""
+    if floor.reads_train:
+        bring(given.size, given.root, given.size.subsets["train"])
+    return floor.predict(given)
 
 
 def measure_rows(
