@@ -11,13 +11,13 @@ from typing import Any
 
 import pytest
 from full_disk import largest_file
-from made_up import BoardBench, copied, noisy
+from made_up import BoardBench, copied, nearer, noisy, still
 from simple_models import FACTS, Drift
 
 from lagbench.baselines.checkpoint import Checkpoint, load, rounded_weights, save
 from lagbench.board import weights as kept
 from lagbench.board.check import check_board
-from lagbench.board.entry import Meta
+from lagbench.board.entry import EntryBudget, Meta
 from lagbench.board.entry_file import read_entry
 from lagbench.board.submit import SubmitResult, submit
 from lagbench.data.checksums import file_sha256
@@ -449,10 +449,13 @@ def test_seeds_that_come_later_make_the_entry_of_all_at_once(
     for run in runs[1:]:
         result = submitted(own, run, add=True)
     assert found(own) == set()
-    assert {path.name for path in result.files} == {"drift.yaml", *(f"drift_{i}.nc" for i in (0, 3, 5))} | {
+    written = {path.name for path in result.files}
+    assert written == {
+        "drift.yaml",
+        "drift_5.nc",
         "drift_5.pt",
         "drift_5.json",
-    }
+    }  # the others stay as they lie
     assert not (own.folder / "scores/cavity/tiny/drift.nc").exists()
     (tmp_path / "gone.nc").rename(runs[0] / "predictions.nc")
     (tmp_path / "other").mkdir()
@@ -479,11 +482,29 @@ def test_what_seeds_to_add_must_share_with_the_entry(own: BoardBench) -> None:
     assert "added to or replaced" in refused(same, replace=True)
     assert "training" in refused(other)
     assert "parameters" in refused(many)
-    assert "seeds that differ" in refused(first)
+    assert "such a seed already" in refused(first)
+    unlike = own.predict(noisy, "another", seed=9, training=OURS).rename(many / "predictions.nc").parent
+    assert "method" in refused(unlike)
+    assert "need numbers" in refused(
+        own.predict(noisy, "drift", training=OURS).rename(many / "predictions.nc").parent
+    )
     file = own.folder / "scores/cavity/tiny/drift.nc"
     held = file.read_bytes()
     file.write_bytes(held + b"more")
     assert "score file" in refused(same)
     file.write_bytes(held)
     submitted(own, same, add=True)
+    assert found(own) == set()
+
+
+def test_what_is_said_of_a_method_stays_when_seeds_are_added(own: BoardBench) -> None:
+    """Budget and parameters of meta.yaml too, where the files say none; what is said anew wins."""
+    files = [own.predict(nearer, "mine", seed=0), own.predict(still, "mine", seed=1)]
+    budget = EntryBudget(epochs=10.0, gpu_hours=2.5)
+    own.submit(files[0], parameters=1000, budget=budget, notes="first", hardware="a GPU")
+    files[0].unlink()
+    own.submit(files[1], add=True, notes="both")
+    entry = read_entry(own.entry("mine"))
+    assert (entry.budget, entry.parameters, entry.notes, entry.hardware) == (budget, 1000, "both", "a GPU")
+    assert [made.seed for made in entry.predictions] == [0, 1]
     assert found(own) == set()

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 from lagbench.data.checksums import file_sha256
 from lagbench.errors import ChecksFailedError, UsageError
+from lagbench.scoring.stored import read_stored
+from lagbench.submission.findings import quoted
 from lagbench.submission.format import Header
 
-from .entry import MOST_SEEDS, Entry, Status
+from .entry import LONGEST_TEXT, MOST_SEEDS, Entry, Meta, Status
 from .entry_file import read_entry
 from .folder import Folder, Place, entry_path
 
@@ -29,57 +32,51 @@ def seeds_of(headers: Sequence[Header]) -> tuple[int | None, ...]:
     seeds = tuple(header.seed for header in headers)
     if any(seed is not None and not 0 <= seed < 2**63 for seed in seeds):
         raise UsageError("a seed does not fit", expected="0 to 2^63 - 1", got=seeds)
-    if len(seeds) > 1:
-        _require_different(seeds)
+    if len(seeds) > 1 and (None in seeds or len(set(seeds)) < len(seeds)):
+        fix = "write them with submission.write(..., seed=0), seed=1 and so on"
+        raise UsageError("several files need seeds that differ", got=_spelled(seeds), fix=fix)
     return seeds
 
 
 def _alike(trainings: Sequence[str]) -> list[str]:
-    """Return trainings in words without what is each seed's own: its best step, and what it started from."""
+    """Return trainings in words without what is each seed's own: its best step, and what it started from.
+
+    Nothing where no recipe is named: words of people are not compared.
+    """
     words = [re.sub(r"(, step |, weights )\w+", "", one) for one in trainings]
-    return words if all(", recipe " in one for one in words) else []
+    return words if any(", recipe " in one for one in words) else []
 
 
-def _require_different(seeds: Sequence[int | None]) -> None:
-    if None in seeds or len(set(seeds)) < len(seeds):
-        raise UsageError(
-            "several files need seeds that differ",
-            got=", ".join("none" if seed is None else str(seed) for seed in seeds),
-            fix="write them with submission.write(..., seed=0), seed=1 and so on",
-        )
-
-
-def entry_to_add_to(folder: Folder, place: Place, headers: Sequence[Header]) -> Entry:
+def entry_to_add_to(folder: Folder, place: Place, headers: Sequence[Header], meta: Meta) -> Entry:
     """Return the entry that gets more seeds; refuse one that files of other seeds do not belong to.
 
-    Its own predictions need not be at hand: what they scored is read from its score files, which must be
-    those that it names.
+    Its own predictions need not be at hand: what they were called and scored is read from its score files,
+    which must be those that it names. What ``meta`` says of parameters or training is not compared.
     """
     path, first = folder.path / entry_path(place), headers[0]
+    anew = "or submit all seeds anew: --replace"
     if not path.exists():
         fix = "submit it without --add; --method names the entry"
         raise UsageError("there is no entry to add seeds to", where=str(path), fix=fix)
     entry = read_entry(path)
     if entry.status is not Status.ACTIVE:
-        raise UsageError("the entry is not active", where=str(path), got=entry.status, fix=OWN)
-    told = {
-        "dataset_sha256": (entry.dataset.sha256, first.dataset_sha256),
-        "parameters": (entry.parameters, first.parameters),
-        "training": _alike([entry.training, first.training or ""]) or ("", ""),
-    }
-    for name, (theirs, ours) in told.items():
-        if theirs != ours:
-            raise UsageError(
-                f"the files differ from the entry in {name}",
-                where=str(path),
-                expected=ascii(theirs),
-                got=ascii(ours),
-                fix=f"{OWN}, by another --method; or submit all seeds anew: --replace",
-            )
-    seeds = [*(made.seed for made in entry.predictions), *(header.seed for header in headers)]
-    _require_different(seeds)
-    if len(seeds) > MOST_SEEDS:
-        raise UsageError("too many seeds", where=str(path), expected=f"at most {MOST_SEEDS}", got=len(seeds))
+        fix = "submit by another --method"
+        raise UsageError("seeds are added to active entries only", where=str(path), got=entry.status, fix=fix)
+    own = [made.seed for made in entry.predictions]
+    seeds = [header.seed for header in headers]
+    if None in own or None in seeds:
+        raise UsageError(
+            "seeds that are added need numbers, those of the entry too",
+            where=str(path),
+            got=f"the entry has {_spelled(own)}, the files {_spelled(seeds)}",
+            fix="write every file with a seed, as submission.write(..., seed=0) does; submit all: --replace",
+        )
+    if common := sorted({*own} & {*seeds}, key=str):
+        fix = f"leave out what is there, {anew}"
+        got = f"seed {_spelled(common)}; the entry has {_spelled(own)}"
+        raise UsageError("the entry has such a seed already", where=str(path), got=got, fix=fix)
+    if (count := len(own) + len(seeds)) > MOST_SEEDS:
+        raise UsageError("too many seeds", where=str(path), expected=f"at most {MOST_SEEDS}", got=count)
     for inner, said in zip(entry.score_paths, entry.score.files, strict=True):
         file = folder.path / inner
         if folder.link_in(inner) is not None or not file.is_file() or file_sha256(file) != said.sha256:
@@ -87,6 +84,40 @@ def entry_to_add_to(folder: Folder, place: Place, headers: Sequence[Header]) -> 
                 "a score file of the entry is not the one that it names",
                 where=str(file),
                 expected=f"SHA-256 {said.sha256[:16]}",
-                fix="restore it, as `git checkout` does, or submit all seeds anew: --replace",
+                fix=f"restore it, as `git checkout` does, {anew}",
+            )
+    label = read_stored(folder.path / entry.score_paths[0]).scores.identity["method"]
+    told: dict[str, tuple[object, object]] = {
+        "method": (label, first.method),
+        "dataset_sha256": (entry.dataset.sha256, first.dataset_sha256),
+    }
+    if "parameters" not in meta.model_fields_set and first.parameters is not None:
+        told["parameters"] = (entry.parameters, first.parameters)
+    words = _alike([entry.training, (first.training or "")[:LONGEST_TEXT]])
+    if "training" not in meta.model_fields_set and words:
+        told["training"] = (words[0], words[1])
+    for name, (theirs, ours) in told.items():
+        if theirs != ours:
+            raise UsageError(
+                f"the files differ from the entry in {name}",
+                where=str(path),
+                expected=quoted(theirs),
+                got=quoted(ours),
+                fix=f"{OWN}, by another --method; {anew}",
             )
     return entry
+
+
+def _spelled(seeds: Sequence[int | None]) -> str:
+    return ", ".join("none" if seed is None else str(seed) for seed in seeds)
+
+
+def require_new(prints: Sequence[str], paths: Sequence[Path], known: Mapping[str, str]) -> None:
+    """Refuse files that another entry or another seed has: `known` says whose a print is."""
+    found = dict(known)
+    for print_, path in zip(prints, paths, strict=True):
+        if print_ in found:
+            fix = "submit the file of each seed once; what goes by a new name supersedes its old entry"
+            got = f"those of {found[print_]}"
+            raise UsageError("the same predictions are there", where=str(path), got=got, fix=fix)
+        found[print_] = str(path)

@@ -55,7 +55,7 @@ from .entry_file import Model, active_beside, examine, listed, read_verified, re
 from .findings import print_of, prints_of, skeleton
 from .folder import FLOORS, SUBMISSIONS, VERIFIED, Folder, Place, entry_path, score_paths
 from .ranking import combine, scored_file, summarise, write_floors
-from .seeds import entry_to_add_to, seeds_of
+from .seeds import entry_to_add_to, require_new, seeds_of
 from .weights import named_weights, require_weights, stage_weights
 
 BOARD = Path("leaderboard")  # the leaderboard's folder, from the root of the repository
@@ -163,7 +163,7 @@ def submit(
         place = (headers[0].split, headers[0].size, _method(headers[0], meta))
         others = active_beside(folder, place)
         if add:
-            before = entry_to_add_to(folder, place, headers)
+            before = entry_to_add_to(folder, place, headers, meta)
         label = before.name if before and not meta.name else _name(headers[0], meta)
         _require_free(folder, place, label, others, replace=replace or add)
         read_verified(folder)  # a line of it may have to go
@@ -174,7 +174,7 @@ def submit(
     mistakes.tell()
     rivals = others | ({} if before is None else {before.yaml_path: before})
     taken = {made.sha256: str(where) for where, entry in rivals.items() for made in entry.predictions}
-    _require_new(hashes, paths, taken)
+    require_new(hashes, paths, taken)
     made = []
     for path, sha256, header, seed, url in zip(paths, hashes, headers, seeds, urls, strict=True):
         inside, whole = path.resolve(), folder.path.resolve()
@@ -194,7 +194,7 @@ def submit(
         )
         for path, result in zip(paths, results, strict=True)
     ]
-    _require_new([print_of(card.tallies[SUBMISSION]) for card in cards], paths, prints_of(folder, rivals))
+    require_new([print_of(card.tallies[SUBMISSION]) for card in cards], paths, prints_of(folder, rivals))
     try:
         return _publish(place, about, cards, made, folder, outside, sources, others, before)
     except OSError as error:
@@ -251,7 +251,7 @@ def _require_free(
     """Refuse the place of another entry, unless that is to be replaced, and a name like another's."""
     own = entry_path(place)
     if (folder.path / own).exists() and not replace:
-        fix = "replace it with --replace, or give this one another --method, and another name: in meta.yaml"
+        fix = "a further seed: --add; instead of it: --replace; else another --method, and name: in meta.yaml"
         raise UsageError("there is such an entry already", where=str(folder.path / own), fix=fix)
     names = {floor: f"the floor {floor}" for floor in KNOWN_FLOORS}
     names |= {entry.name: str(path) for path, entry in others.items()}
@@ -259,17 +259,6 @@ def _require_free(
         if skeleton(name) == skeleton(label):
             fix = "choose another, or say what differs, in meta.yaml: `name: GNS, six terms`"
             raise UsageError("the name looks like another's", where=holder, got=ascii(label), fix=fix)
-
-
-def _require_new(prints: Sequence[str], paths: Sequence[Path], known: Mapping[str, str]) -> None:
-    """Refuse files that another entry or another seed has: `known` says whose a print is."""
-    found = dict(known)
-    for print_, path in zip(prints, paths, strict=True):
-        if print_ in found:
-            fix = "submit the file of each seed once; what goes by a new name supersedes its old entry"
-            got = f"those of {found[print_]}"
-            raise UsageError("the same predictions are there", where=str(path), got=got, fix=fix)
-        found[print_] = str(path)
 
 
 def _about(headers: Sequence[Header], meta: Meta, before: Entry | None) -> About:
@@ -288,8 +277,11 @@ def _about(headers: Sequence[Header], meta: Meta, before: Entry | None) -> About
     held["training"] = meta.training or (first.training or "")[:LONGEST_TEXT]
     if meta.parameters is None:
         held["parameters"] = first.parameters
-    if meta.cost is None and before is None:
-        held["cost"] = Cost.told(headers, meta.solver_seconds_per_frame)
+    if before is None:
+        held["cost"] = meta.cost or Cost.told(headers, meta.solver_seconds_per_frame)
+    elif meta.cost is not None and meta.solver_seconds_per_frame is not None:
+        solver = {"solver_seconds_per_frame": meta.solver_seconds_per_frame}
+        held["cost"] = meta.cost.model_copy(update=solver)
     if meta.budget is not None and meta.budget.track is not None:
         raise UsageError(
             "a track is not stated",
@@ -297,6 +289,8 @@ def _about(headers: Sequence[Header], meta: Meta, before: Entry | None) -> About
             fix="leave it out: it follows from the budget that `lagbench predict` writes into predictions.nc",
         )
     held["budget"] = EntryBudget.of(first.size, budgets) or meta.budget
+    if held["budget"] is None and before is not None and before.budget is not None:
+        held["budget"] = before.budget.model_copy(update={"track": None})  # a track follows from all budgets
     return _fitting(About, held)
 
 
@@ -367,7 +361,8 @@ def _publish(
         held |= dict(zip(("format", "split", "size", "method"), (2, *place), strict=True))
         held["dataset"] = DataSet(version=header.dataset_version, sha256=header.dataset_sha256)
         entry = _fitting(Entry, {**held, "predictions": tuple(made), "score": block})
-        moves = dict(zip(names, staged, strict=True))
+        lying = added_to.score_paths if added_to else ()  # the same bytes as staged
+        moves = {name: path for name, path in zip(names, staged, strict=True) if name not in lying}
         moves |= stage_weights(Path(stage), kept, sources)
         texts = {Path(VERIFIED): unverified(folder, entry), yaml_path: spell(entry)}  # the entry last
         for number, (name, text) in enumerate(texts.items()):
