@@ -15,13 +15,16 @@ from made_up import BoardBench, copied, nearer, noisy, still
 from simple_models import FACTS, Drift
 
 from lagbench.baselines.checkpoint import Checkpoint, load, rounded_weights, save
+from lagbench.board import submit as submitting
 from lagbench.board import weights as kept
 from lagbench.board.check import check_board
 from lagbench.board.entry import EntryBudget, Meta
 from lagbench.board.entry_file import read_entry
 from lagbench.board.submit import SubmitResult, submit
 from lagbench.data.checksums import file_sha256
-from lagbench.errors import LagbenchError, UnreadableFileError, UsageError, WorkFailedError
+from lagbench.errors import ChecksFailedError, LagbenchError, UnreadableFileError, UsageError, WorkFailedError
+from lagbench.scoring.card import ScoreCard
+from lagbench.scoring.score import score
 from lagbench.submission import open_predictions
 from lagbench.submission.budget import Budget
 
@@ -508,3 +511,46 @@ def test_what_is_said_of_a_method_stays_when_seeds_are_added(own: BoardBench) ->
     assert (entry.budget, entry.parameters, entry.notes, entry.hardware) == (budget, 1000, "both", "a GPU")
     assert [made.seed for made in entry.predictions] == [0, 1]
     assert found(own) == set()
+
+
+def test_only_sound_active_entries_get_seeds(own: BoardBench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not a withdrawn one, nor one whose weights changed, nor one that changed while files were scored."""
+    runs = [trained(own, seed) for seed in (0, 3, 5)]
+    submitted(own, runs[0])
+    file = own.folder / "weights/cavity/tiny/drift_0.pt"
+    held = file.read_bytes()
+    file.write_bytes(held + b"more")
+    with pytest.raises(ChecksFailedError, match="weights"):
+        submitted(own, runs[1], add=True)
+    file.write_bytes(held)
+    own.edit("drift", lambda entry: entry.update(status="withdrawn", reason="a mistake"))
+    with pytest.raises(UsageError, match="active"):
+        submitted(own, runs[1], add=True)
+    own.edit("drift", lambda entry: entry.update(status="active", reason="it was none"))
+
+    def meanwhile(*args: Any, **options: Any) -> ScoreCard:
+        monkeypatch.undo()
+        submitted(own, runs[1], add=True)
+        return score(*args, **options)
+
+    monkeypatch.setattr(submitting, "score", meanwhile)
+    with pytest.raises(UsageError, match="while"):
+        submitted(own, runs[2], add=True)
+    entry = read_entry(own.entry("drift"))
+    assert ([made.seed for made in entry.predictions], entry.reason) == ([0, 3], "it was none")
+    assert found(own) == set()
+
+
+def test_each_seed_has_its_own_step_and_start(
+    own: BoardBench, run: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Trainings that differ in these alone belong together, on the command line too."""
+    words = "cavity tiny train, recipe cavity/tiny, step {}, started from cavity/mini, weights {}"
+    own.submit(own.predict(nearer, "mine", seed=0, training=words.format(6, "0123abcd")), name="My model")
+    added = own.predict(still, "mine", seed=1, training=words.format(8, "4567cdef"))
+    monkeypatch.setenv("LAGBENCH_REGISTRY", str(own.data.file))
+    where = ["--board", own.folder, "--root", own.data.root, "--method", "mine"]
+    result = run("submit", added, "--add", *where, "--command", "make both")
+    assert result.exit_code == 0, result.output
+    entry = read_entry(own.entry("mine"))
+    assert (entry.name, entry.command, len(entry.predictions)) == ("My model", "make both", 2)

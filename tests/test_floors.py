@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pytest
@@ -31,6 +31,9 @@ from lagbench.generators.split import InitialState
 from lagbench.scoring.card import best_floor
 from lagbench.scoring.floors import measurable
 from lagbench.scoring.task import SUBMISSION, ranking_metric
+
+if TYPE_CHECKING:
+    from lagbench.generators.closed_box import ClosedBox
 
 Floats = NDArray[np.float64]
 
@@ -250,6 +253,28 @@ def test_the_coarse_solver_at_full_resolution_is_the_solver() -> None:
     rest = {"affine": np.zeros((count, 2, 2)), "material": np.zeros(count, np.int8), "area": 0.04}
     solver.load([InitialState(position=path[-1], velocity=velocity, **rest)])
     for frame in found:
+        solver.advance(size.substeps_per_frame)
+        np.testing.assert_array_equal(frame, solver.position()[0])
+
+
+def test_the_coarse_solver_is_driven_by_the_walls_of_each_frame() -> None:
+    """A solver that is told each frame's walls before it moves there goes the same way, to the bit."""
+    size = load().size("cavity", "tiny")
+    n, frames = size.task.input_frames, size.task.input_frames + size.task.horizon
+    (left, right), (bottom, top) = size.bounds
+    unit = (np.stack(np.meshgrid(np.arange(18), np.arange(18)), axis=-1).reshape(-1, 2) + 0.5) / 18
+    place = np.array([left, bottom]) + unit * np.array([right - left, top - bottom])
+    walls = np.zeros((frames, 4, 2))
+    walls[:, 3, 0] = 0.2 * np.random.default_rng(0).normal(size=frames) * size.frame_interval
+    held = given("cavity", np.stack([place] * n), area=(right - left) * (top - bottom))
+    held = replace(held, walls=walls, parameters={"viscosity": 1e-3})
+    found = list(predict_with(held, size))
+    solver = cast("ClosedBox", build(replace(solver_constants(size), particles=len(place))))
+    still = {"affine": np.zeros((len(place), 2, 2)), "material": held.material, "area": held.area}
+    still |= {"velocity": np.zeros_like(place), "wall_velocity": np.zeros((4, 2)), "viscosity": 1e-3}
+    solver.load([InitialState(position=place, **still)])
+    for frame, speed in zip(found, walls[n:] / size.frame_interval, strict=True):
+        solver.move_walls(speed[None].astype(np.float32))
         solver.advance(size.substeps_per_frame)
         np.testing.assert_array_equal(frame, solver.position()[0])
 

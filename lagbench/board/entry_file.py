@@ -22,11 +22,12 @@ from pydantic import BaseModel, RootModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from lagbench.atomic import write_atomically
+from lagbench.data.checksums import file_sha256
 from lagbench.data.yamlfile import read_yaml, spell_yaml
 from lagbench.errors import ChecksFailedError, UnreadableFileError, UsageError, nearest
 from lagbench.submission.findings import quoted
 
-from .entry import PATTERNS, Entry, Meta, Status, Verification
+from .entry import PATTERNS, Entry, Meta, Status, Verification, Weights
 from .folder import VERIFIED, Folder, Place, entry_path
 
 MAX_ENTRY_BYTES = 64_000
@@ -186,6 +187,14 @@ def readable(path: Path) -> Entry | None:
     with suppress(ChecksFailedError, UnreadableFileError):
         return read_entry(path) if path.exists() else None
     return None
+
+
+def is_there(folder: Folder, weights: Weights) -> bool:
+    """Tell whether weights lie where their entry says, as it says, and not behind a link."""
+    file = folder.path / weights.path
+    return (
+        file.is_file() and folder.link_in(Path(weights.path)) is None and file_sha256(file) == weights.sha256
+    )
 
 
 def active_beside(folder: Folder, place: Place) -> dict[Path, Entry]:

@@ -13,7 +13,7 @@ from lagbench.submission.findings import quoted
 from lagbench.submission.format import Header
 
 from .entry import LONGEST_TEXT, MOST_SEEDS, Entry, Meta, Status
-from .entry_file import read_entry
+from .entry_file import is_there, read_entry
 from .folder import Folder, Place, entry_path
 
 OWN = "submit each on its own"
@@ -47,7 +47,7 @@ def _alike(trainings: Sequence[str]) -> list[str]:
     return words if any(", recipe " in one for one in words) else []
 
 
-def entry_to_add_to(folder: Folder, place: Place, headers: Sequence[Header], meta: Meta) -> Entry:
+def extendable(folder: Folder, place: Place, headers: Sequence[Header], meta: Meta) -> Entry:
     """Return the entry that gets more seeds; refuse one that files of other seeds do not belong to.
 
     Its own predictions need not be at hand: what they were called and scored is read from its score files,
@@ -85,6 +85,14 @@ def entry_to_add_to(folder: Folder, place: Place, headers: Sequence[Header], met
                 where=str(file),
                 expected=f"SHA-256 {said.sha256[:16]}",
                 fix=f"restore it, as `git checkout` does, {anew}",
+            )
+    for made in entry.predictions:
+        if made.weights is not None and not is_there(folder, made.weights):
+            raise ChecksFailedError(
+                "weights of the entry are not those that it names",
+                where=str(folder.path / made.weights.path),
+                expected=f"SHA-256 {made.weights.sha256[:16]}",
+                fix=f"restore them, as `git checkout` does, {anew}",
             )
     label = read_stored(folder.path / entry.score_paths[0]).scores.identity["method"]
     told: dict[str, tuple[object, object]] = {

@@ -55,7 +55,7 @@ from .entry_file import Model, active_beside, examine, listed, read_verified, re
 from .findings import print_of, prints_of, skeleton
 from .folder import FLOORS, SUBMISSIONS, VERIFIED, Folder, Place, entry_path, score_paths
 from .ranking import combine, scored_file, summarise, write_floors
-from .seeds import entry_to_add_to, require_new, seeds_of
+from .seeds import extendable, require_new, seeds_of
 from .weights import named_weights, require_weights, stage_weights
 
 BOARD = Path("leaderboard")  # the leaderboard's folder, from the root of the repository
@@ -163,7 +163,7 @@ def submit(
         place = (headers[0].split, headers[0].size, _method(headers[0], meta))
         others = active_beside(folder, place)
         if add:
-            before = entry_to_add_to(folder, place, headers, meta)
+            before = extendable(folder, place, headers, meta)
         label = before.name if before and not meta.name else _name(headers[0], meta)
         _require_free(folder, place, label, others, replace=replace or add)
         read_verified(folder)  # a line of it may have to go
@@ -325,16 +325,19 @@ def _publish(
     A full disk is met before anything of the old entry is touched. An entry that is added to keeps its
     score files, under new names where it had but one.
     """
-    stay = added_to.predictions if added_to else ()
-    made, sources = [*stay, *made], [*(None for _ in stay), *sources]
+    staying = added_to.predictions if added_to else ()
+    made, sources = [*staying, *made], [*(None for _ in staying), *sources]
     names, yaml_path = score_paths(place, [one.seed for one in made]), entry_path(place)
     before = readable(folder.path / yaml_path)
+    if added_to is not None and before != added_to:
+        fix = "submit again: what was added meanwhile stays"
+        raise UsageError("the entry changed while the files were scored", where=str(yaml_path), fix=fix)
     (folder.path / SUBMISSIONS).mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=STAGE, dir=folder.path) as stage:
         staged = [Path(stage) / name.name for name in names]
         for path, target in zip(added_to.score_paths if added_to else (), staged, strict=False):
             shutil.copyfile(folder.path / path, target)
-        for card, target in zip(cards, staged[len(stay) :], strict=True):
+        for card, target in zip(cards, staged[len(staying) :], strict=True):
             write_statistics(card, target, option="--board")
             length = target.stat().st_size
             if length > MAX_SCORE_BYTES:
@@ -345,8 +348,8 @@ def _publish(
                     got=f"{length} bytes",
                     fix="uninstall packages that add metrics, and submit again",
                 )
-        files = (*(added_to.score.files if added_to else ()),)
-        files += tuple(map(scored_file, cards, staged[len(stay) :], outside))
+        files = added_to.score.files if added_to else ()
+        files += tuple(map(scored_file, cards, staged[len(staying) :], outside))
         kept = named_weights(folder, place, made, sources, before, others)
         made = [one.model_copy(update={"weights": held}) for one, held in zip(made, kept, strict=True)]
         header = cards[0].header
@@ -358,6 +361,7 @@ def _publish(
             metrics=summarise(combine([read_stored(target).scores for target in staged])),
         )
         held = {name: getattr(about, name) for name in About.model_fields}
+        held["reason"] = added_to.reason if added_to else ""
         held |= dict(zip(("format", "split", "size", "method"), (2, *place), strict=True))
         held["dataset"] = DataSet(version=header.dataset_version, sha256=header.dataset_sha256)
         entry = _fitting(Entry, {**held, "predictions": tuple(made), "score": block})

@@ -19,6 +19,7 @@ from lagbench.submission.findings import Finding
 from lagbench.submission.format import Header
 
 from .entry import Entry, Prediction, Status, Weights
+from .entry_file import is_there
 from .findings import finding
 from .folder import Folder, Place, weights_path
 
@@ -138,7 +139,7 @@ def named_weights(
         if one.weights is not None
         and one.weights.sha256 not in lying
         and one.weights.path == weights_path(place, one.seed).as_posix()
-        and _is_there(folder, one.weights)
+        and is_there(folder, one.weights)
     }
     return tuple(
         kept.get((one.seed, one.sha256))
@@ -152,14 +153,6 @@ def _holders(entries: Mapping[Path, Entry]) -> dict[str, str]:
     """Return the entries that have weights, by the SHA-256 of these."""
     held = [(made.weights, where) for where, entry in entries.items() for made in entry.predictions]
     return {weights.sha256: str(where) for weights, where in held if weights is not None}
-
-
-def _is_there(folder: Folder, weights: Weights) -> bool:
-    """Tell whether weights lie where their entry says, as it says, and not behind a link."""
-    file = folder.path / weights.path
-    return (
-        file.is_file() and folder.link_in(Path(weights.path)) is None and file_sha256(file) == weights.sha256
-    )
 
 
 def _is_record(path: Path) -> bool:

@@ -179,7 +179,7 @@ def transfer(position: ArrayLike, velocity: ArrayLike, grid: Grid) -> Transfer:
 
 
 def _scatter(x: Floats, u: Floats, grid: Grid, out: Floats) -> None:
-    """Put out ``sum(w)`` and the components of ``sum(w u)`` of one frame, shape [3, x node, y node]."""
+    """Write ``sum(w)`` and the components of ``sum(w u)`` of one frame to ``out``, [3, x node, y node]."""
     if not (x.min(initial=0.0) >= 0.0 and x.max(initial=1.0) <= 1.0):  # NaN is not inside either
         inside = ((x >= 0.0) & (x <= 1.0)).all(axis=1)
         x, u = x[inside], u[inside]
@@ -192,22 +192,23 @@ def _scatter(x: Floats, u: Floats, grid: Grid, out: Floats) -> None:
     base += _LOW
     base[0] *= side
     corner = (base[0] + base[1]).astype(np.intp)
-    velocity = np.empty(len(corner), np.complex128)
-    velocity.real, velocity.imag = u[:, 0], u[:, 1]
+    along_x, along_y = np.ascontiguousarray(u.T)
 
     # node numbers stay those of the corner; what is added to is shifted to the node instead
     size = side * side
-    sums, momenta = (np.zeros(size + 2 * side + 2, kind) for kind in (np.float64, np.complex128))
-    weight, product = np.empty(len(corner)), np.empty_like(velocity)
+    sums, momenta = (np.zeros(size + 2 * side + 2, dtype) for dtype in (np.float64, np.complex128))
+    weight, product = np.empty(len(corner)), np.empty(len(corner), np.complex128)
     for i in range(3):
         for k in range(3):
             shift = i * side + k
             np.multiply(weight_x[i], weight_y[k], out=weight)
             np.add.at(sums[shift:], corner, weight)
-            np.multiply(weight, velocity, out=product)  # both components in one sum: a quarter faster
+            # both components go into one sum of complex numbers, which takes less than two of real ones
+            np.multiply(weight, along_x, out=product.real)
+            np.multiply(weight, along_y, out=product.imag)
             np.add.at(momenta[shift:], corner, product)
-    for field, kind in zip(out, (sums, momenta.real, momenta.imag), strict=True):
-        field[:] = kind[:size].reshape(side, side)[_LOW:-_HIGH, _LOW:-_HIGH]
+    for field, held in zip(out, (sums, momenta.real, momenta.imag), strict=True):
+        field[:] = held[:size].reshape(side, side)[_LOW:-_HIGH, _LOW:-_HIGH]
 
 
 def _spline(s: Floats) -> Floats:

@@ -103,6 +103,7 @@ def _state(given: Given, carriers: NDArray[np.intp]) -> InitialState:
     else:
         fall = np.array([0.0, -0.5 * float(given.size.value("gravity")) * interval])
         velocity = given.step / interval + fall
+    # row 0 of a program never acts: row 1 is on the way to the first predicted frame
     walls = given.walls[given.predicted_frames[0] - 1 :] / interval
     return InitialState(
         position=given.last[carriers],

@@ -1,4 +1,4 @@
-"""The test subset as metrics see it: what submissions are scored on.
+"""The test subset as metrics see it: what submissions are scored on; and the forms in which scores are kept.
 
 Scoring needs the files of ``test`` only; what follows from ``train`` stands in datasets.yaml
 or, for a data set that is not recorded there, in its manifest.
