@@ -548,7 +548,7 @@ def test_each_seed_has_its_own_step_and_start(
     words = "cavity tiny train, recipe cavity/tiny, step {}, started from cavity/mini, weights {}"
     own.submit(own.predict(nearer, "mine", seed=0, training=words.format(6, "0123abcd")), name="My model")
     added = own.predict(still, "mine", seed=1, training=words.format(8, "4567cdef"))
-    monkeypatch.setenv("LAGBENCH_REGISTRY", str(own.data.file))
+    monkeypatch.setenv("LAGBENCH_REGISTRY", str(own.registry.files["cavity"]))
     where = ["--board", own.folder, "--root", own.data.root, "--method", "mine"]
     result = run("submit", added, "--add", *where, "--command", "make both")
     assert result.exit_code == 0, result.output
