@@ -113,10 +113,10 @@ def submit(
         examined: told what the validation of each file found.
 
     Raises:
-        UsageError: a key is missing, the entry is there already, the files do not belong
-            together, name or predictions are another's, or there is no leaderboard.
+        UsageError: a key is missing, the entry is there already or, with ``add``, is not or has changed
+            meanwhile, the files do not belong together, name or predictions are another's, or no leaderboard.
         UnreadableFileError: predictions or weights cannot be read.
-        ChecksFailedError: they are not valid.
+        ChecksFailedError: they are not valid; with ``add``, what lies beside the entry is not what it names.
         DataError: the test subset is missing, or they were made from another data set.
         WorkFailedError: the disk is full or not writable, or a score file became too long.
     """

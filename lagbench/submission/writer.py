@@ -262,7 +262,7 @@ class PredictionsWriter:
     ) -> None:
         packing: dict[str, Any] = {"endian": "little", "fill_value": False}
         if len(dims) > 1:
-            # not packed: zlib saves about a fifth of the bytes, and takes several times as long, also to read
+            # not packed: zlib saves little of digits that hardly repeat, and unpacking makes scoring slower
             packing |= {"fletcher32": True, "chunksizes": (1, 1, *self.shape[1:]), "chunk_cache": CHUNK_CACHE}
         variable = self._file.createVariable(name, dtype, dims, **packing)
         variable.setncatts(_ATTRIBUTES[name])
