@@ -30,10 +30,17 @@ from torch import Tensor, nn
 from torch.nn.modules.module import register_module_parameter_registration_hook
 from torch.nn.parameter import is_lazy
 
-from lagbench.atomic import atomic_path, check_regular
+from lagbench.atomic import atomic_path
 from lagbench.data.registry import Registry
 from lagbench.data.registry import load as load_registry
-from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError, WorkFailedError
+from lagbench.errors import (
+    DataError,
+    LagbenchError,
+    UnreadableFileError,
+    UsageError,
+    WorkFailedError,
+    check_regular,
+)
 from lagbench.submission.budget import Budget, budget_in
 
 from .baseline import Baseline, Facts

@@ -17,8 +17,7 @@ from typing import Any
 import torch
 
 from lagbench.atomic import write_atomically
-from lagbench.data.layout import resolve_root
-from lagbench.data.local import rooted
+from lagbench.data.local import resolve_root, rooted
 from lagbench.data.registry import Registry
 from lagbench.errors import UnreadableFileError, UsageError
 from lagbench.submission.writer import PredictionsWriter

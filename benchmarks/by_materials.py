@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from lagbench.data import MATERIALS
-from lagbench.data.layout import resolve_root
+from lagbench.data.local import resolve_root
 from lagbench.data.registry import load
 from lagbench.data.scenario import read_scenario
 from lagbench.draw.tables import markdown

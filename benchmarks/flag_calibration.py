@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.grid import Grid, fields
-from lagbench.data.layout import resolve_root
+from lagbench.data.local import resolve_root
 from lagbench.data.registry import load
 from lagbench.metrics import FramePair, Scenario, snapshots
 from lagbench.scoring.flags import Trace, Tracer, copy_suspect, evidence

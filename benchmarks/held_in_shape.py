@@ -23,7 +23,7 @@ from torch import Tensor
 
 from lagbench.baselines.particle_grid import ParticleGrid
 from lagbench.baselines.projection import Density, Shape
-from lagbench.data.layout import resolve_root
+from lagbench.data.local import resolve_root
 from lagbench.data.registry import Size, load
 from lagbench.data.scenario import read_scenario
 from lagbench.draw.tables import markdown

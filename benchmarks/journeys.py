@@ -42,7 +42,7 @@ def sources() -> dict[str, Path]:
 
 def journey(words: list[str]) -> tuple[int, int]:
     """Run a command; return the files whose functions ran, and the functions."""
-    from lagbench.cli.app import app
+    from lagbench.__main__ import app
 
     ours = {str(path.resolve()) for path in sources().values()}
     known: dict[str, str] = {}

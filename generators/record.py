@@ -20,7 +20,8 @@ from pathlib import Path
 
 from lagbench.atomic import write_atomically
 from lagbench.data.checksums import file_sha256
-from lagbench.data.layout import dataset_folder, resolve_root
+from lagbench.data.layout import dataset_folder
+from lagbench.data.local import resolve_root
 from lagbench.data.manifest import Manifest, read_manifest
 from lagbench.data.registry import Measured, Size, default_path, load
 from lagbench.data.statistics import file_statistics

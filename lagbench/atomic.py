@@ -6,12 +6,11 @@ import errno
 import functools
 import os
 import secrets
-import stat
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from .errors import LagbenchError, UnreadableFileError, WorkFailedError
+from .errors import LagbenchError, WorkFailedError
 
 SUFFIX = ".partial"
 """Ending of temporary names; nothing but this module creates or removes such files."""
@@ -146,32 +145,3 @@ def _flush(path: Path) -> None:
 def _flush_folder(path: Path) -> None:
     with suppress(PermissionError):  # Windows opens no folder
         _flush(path)
-
-
-def check_regular(path: Path, *, longest: int | None = None, fix: str | None = None) -> int:
-    """Refuse what is no regular file, or a long one; return its length [bytes].
-
-    Devices never end and a FIFO waits for ever, so this comes before anything is opened.
-    """
-    try:
-        status = path.stat()
-    except (OSError, ValueError) as error:
-        raise UnreadableFileError(
-            "cannot open the file",
-            where=str(path),
-            expected="a readable file",
-            got=getattr(error, "strerror", None) or error,
-            fix="check the path and that you may read the file",
-        ) from error
-    if not stat.S_ISREG(status.st_mode):
-        kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a device, socket or pipe"
-        raise UnreadableFileError("not a file", where=str(path), expected="a file", got=kind, fix=fix)
-    if longest is not None and status.st_size > longest:
-        raise UnreadableFileError(
-            "the file is too long",
-            where=str(path),
-            expected=f"at most {longest} bytes",
-            got=f"{status.st_size} bytes",
-            fix=fix,
-        )
-    return status.st_size

@@ -4,7 +4,8 @@ Every error a user can cause is a :class:`LagbenchError`; its ``exit_code`` is w
 command line returns. Codes: 1 checks failed, 2 usage, 3 a file the user gave is unreadable,
 4 data set missing, damaged or of another hash, 5 the work itself failed.
 
-Optional dependencies: import one, or say which extra installs it. Packages that add something: import them.
+Files that a user names: refused unless they are regular and of bounded length. Optional dependencies:
+import one, or say which extra installs it. Packages that add something: import them.
 """
 
 from __future__ import annotations
@@ -12,8 +13,10 @@ from __future__ import annotations
 import difflib
 import importlib
 import importlib.util
+import stat
 import traceback
 from collections.abc import Iterable
+from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -140,6 +143,35 @@ class WorkFailedError(LagbenchError):
     """The work itself failed: blow-up, disk full, worker lost."""
 
     exit_code = 5
+
+
+def check_regular(path: Path, *, longest: int | None = None, fix: str | None = None) -> int:
+    """Refuse what is no regular file, or a long one; return its length [bytes].
+
+    Devices never end and a FIFO waits for ever, so this comes before anything is opened.
+    """
+    try:
+        status = path.stat()
+    except (OSError, ValueError) as error:
+        raise UnreadableFileError(
+            "cannot open the file",
+            where=str(path),
+            expected="a readable file",
+            got=getattr(error, "strerror", None) or error,
+            fix="check the path and that you may read the file",
+        ) from error
+    if not stat.S_ISREG(status.st_mode):
+        kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a device, socket or pipe"
+        raise UnreadableFileError("not a file", where=str(path), expected="a file", got=kind, fix=fix)
+    if longest is not None and status.st_size > longest:
+        raise UnreadableFileError(
+            "the file is too long",
+            where=str(path),
+            expected=f"at most {longest} bytes",
+            got=f"{status.st_size} bytes",
+            fix=fix,
+        )
+    return status.st_size
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

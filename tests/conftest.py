@@ -26,7 +26,7 @@ from score_bench import ScoreBench, bench_of
 from typer.main import get_command
 from typer.testing import CliRunner, Result
 
-from lagbench.cli.app import app
+from lagbench.__main__ import app
 from lagbench.data.checksums import file_sha256
 from lagbench.data.layout import dataset_folder
 from lagbench.data.registry import Registry, Size, default_path, load

@@ -20,9 +20,9 @@ import torch
 from click.testing import Result
 from typer.testing import CliRunner
 
+from lagbench.__main__ import app
 from lagbench.baselines.catalogue import names
 from lagbench.baselines.checkpoint import load
-from lagbench.cli.app import app
 from lagbench.errors import DataError, WorkFailedError
 from lagbench.exchange.local_split import LocalSplit
 from lagbench.make.generate import GenerationResult

@@ -12,9 +12,9 @@ import pytest
 from board_worlds import make_board
 from typer.testing import CliRunner
 
+from lagbench.__main__ import app
 from lagbench.board.cost import Mark, draw, front, marks_of
 from lagbench.board.model import Tab
-from lagbench.cli.app import app
 from lagbench.data.registry import load
 from lagbench.floors import shipped, solver_seconds
 from lagbench.report.chart import close_logarithmic

@@ -19,7 +19,7 @@ from conftest import SIZE, SPLIT
 from typer.main import get_command
 from typer.testing import CliRunner, Result
 
-from lagbench.cli.app import app
+from lagbench.__main__ import app
 from lagbench.cli.machine import NEEDED
 from lagbench.cli.output import progress_bar
 from lagbench.data.registry import default_path, load

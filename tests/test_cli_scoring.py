@@ -19,7 +19,7 @@ from typer.testing import Result
 
 import lagbench
 from lagbench import submission
-from lagbench.cli.app import app
+from lagbench.__main__ import app
 from lagbench.make.generate import GenerationResult
 from lagbench.scoring import score
 from lagbench.submission import validation

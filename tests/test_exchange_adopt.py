@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 import lagbench
-from lagbench.cli.app import app
+from lagbench.__main__ import app
 from lagbench.data.checksums import dataset_hash, subset_hash
 from lagbench.data.local import locate
 from lagbench.data.scenario import check_scenario, read_scenario

@@ -18,7 +18,7 @@ from exchange_readers import straight_runs
 from exchange_writers import METADATA, write_gns, write_h5
 from typer.testing import CliRunner
 
-from lagbench.cli.app import app
+from lagbench.__main__ import app
 from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError
 from lagbench.exchange import adopt, import_split, trajectory
 from lagbench.exchange.metadata import parse_kinds

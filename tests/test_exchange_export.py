@@ -17,7 +17,7 @@ from exchange_readers import Trajectory, frame_statistics, read_gns, read_h5, re
 from typer.testing import CliRunner
 
 import lagbench
-from lagbench.cli.app import app
+from lagbench.__main__ import app
 from lagbench.data.registry import Registry
 from lagbench.errors import DataError, UsageError, WorkFailedError
 from lagbench.exchange import adopt, export, import_split

@@ -14,7 +14,7 @@ from exchange_writers import SUBSETS, write_gns, write_h5
 from typer.testing import CliRunner
 
 import lagbench
-from lagbench.cli.app import app
+from lagbench.__main__ import app
 from lagbench.data.local import locate
 from lagbench.data.registry import Registry
 from lagbench.errors import DataError, UnreadableFileError

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
-from lagbench.cli.app import app
+from lagbench.__main__ import app
 from lagbench.data.layout import dataset_folder
 from lagbench.data.scenario import read_scenario
 from lagbench.errors import DataError

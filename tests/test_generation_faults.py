@@ -150,7 +150,7 @@ def test_two_generations_at_once(tmp_path: Path, unmeasured: Registry, generated
 # --- interruptions ---------------------------------------------------------------------------
 
 
-CALL = "from lagbench.cli import main; main()"
+CALL = "from lagbench.__main__ import app; app()"
 
 INTERRUPTED = f"""
 import os, signal

@@ -11,9 +11,8 @@ import h5py
 import numpy as np
 import pytest
 
-from lagbench.atomic import check_regular
 from lagbench.data.hdf5 import Structure, check_structure, opened
-from lagbench.errors import UnreadableFileError
+from lagbench.errors import UnreadableFileError, check_regular
 
 ANY = Structure(groups=None)
 

@@ -146,7 +146,7 @@ def test_light_things_stay_light(code: str, forbidden: set[str]) -> None:
         calls = [
             f"assert CliRunner().invoke(app, {line.split()}).exit_code == 0" for line in code.split("; ")
         ]
-        code = "\n".join(["from typer.testing import CliRunner", "from lagbench.cli.app import app", *calls])
+        code = "\n".join(["from typer.testing import CliRunner", "from lagbench.__main__ import app", *calls])
     command = [sys.executable, "-c", code + "\nimport sys\nprint(*sys.modules)"]
     empty = {**os.environ, "LAGBENCH_ROOT": str(PACKAGE / "none")}  # files that are there would be read
     done = subprocess.run(command, env=empty, capture_output=True, text=True, check=True)

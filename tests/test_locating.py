@@ -14,9 +14,9 @@ from scenario_factory import make_key
 from typer.testing import CliRunner
 
 import lagbench
-from lagbench.cli.app import app
-from lagbench.data.layout import dataset_folder, resolve_root, scenario_path
-from lagbench.data.local import home, is_name, locate, locate_new, rooted
+from lagbench.__main__ import app
+from lagbench.data.layout import dataset_folder, scenario_path
+from lagbench.data.local import home, is_name, locate, locate_new, resolve_root, rooted
 from lagbench.data.registry import load
 from lagbench.errors import UnreadableFileError, UsageError
 from lagbench.exchange import adopt

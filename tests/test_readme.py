@@ -18,9 +18,9 @@ from simple_models import install
 from typer.main import get_command
 
 import lagbench
+from lagbench.__main__ import app
 from lagbench.baselines.predict import predict
 from lagbench.baselines.train import train
-from lagbench.cli.app import app
 from lagbench.data import registry
 from lagbench.make.generate import GenerationResult, generate
 from lagbench.metrics import METRICS

@@ -367,7 +367,7 @@ def test_a_broken_package_breaks_no_command(tmp_path: Path) -> None:
     folder.mkdir()
     (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: wave-splits\nVersion: 1.0\n")
     (folder / "entry_points.txt").write_text(f"[{registry.GROUP}]\nwaves = wave_splits.gone\n")
-    code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); from lagbench.cli import main; main()"
+    code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); from lagbench.__main__ import app; app()"
     command = [sys.executable, "-c", code, "cite", "cavity", "--json"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stderr

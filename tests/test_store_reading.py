@@ -15,9 +15,10 @@ from object_stores import Store, files, holding, machine
 from typer.testing import CliRunner
 
 import lagbench
+from lagbench.__main__ import app
 from lagbench.baselines.facts import facts_of
-from lagbench.cli.app import app
-from lagbench.data.layout import as_url, resolve_root, url_of
+from lagbench.data.layout import as_url, url_of
+from lagbench.data.local import resolve_root
 from lagbench.data.registry import Registry
 from lagbench.errors import DataError
 from lagbench.exchange import export

@@ -12,7 +12,7 @@ from object_stores import files, machine
 from typer.testing import CliRunner
 
 import lagbench
-from lagbench.cli.app import app
+from lagbench.__main__ import app
 from lagbench.data.layout import CACHE_VARIABLE
 from lagbench.errors import DataError, LagbenchError, UsageError, WorkFailedError
 from lagbench.exchange import download

@@ -17,7 +17,8 @@ from object_stores import files, fill, machine, objects, put, remove
 
 from lagbench.atomic import write_atomically
 from lagbench.data.checksums import file_sha256
-from lagbench.data.layout import resolve_root, url_of
+from lagbench.data.layout import url_of
+from lagbench.data.local import resolve_root
 from lagbench.data.manifest import read_manifest
 from lagbench.data.registry import Registry
 from lagbench.errors import DataError, UsageError, WorkFailedError

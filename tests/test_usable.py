@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 import lagbench
-from lagbench.cli.app import app
+from lagbench.__main__ import app
 from lagbench.data.grid import Grid, Placement
 from lagbench.data.local import locate
 from lagbench.errors import WorkFailedError

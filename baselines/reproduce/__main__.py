@@ -17,8 +17,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
-from lagbench.data.layout import resolve_root
-from lagbench.data.local import remedy
+from lagbench.data.local import remedy, resolve_root
 from lagbench.data.manifest import read_manifest
 from lagbench.data.registry import Registry, load
 from lagbench.errors import LagbenchError, UsageError, nearest

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from lagbench.data.checksums import file_sha256
-from lagbench.data.layout import resolve_root
+from lagbench.data.local import resolve_root
 from lagbench.data.registry import Registry, Size, load
 from lagbench.errors import LagbenchError, UnreadableFileError, UsageError
 from lagbench.floors.shipped import shipped_path

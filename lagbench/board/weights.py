@@ -12,9 +12,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lagbench.atomic import check_regular
 from lagbench.data.checksums import file_sha256
-from lagbench.errors import UnreadableFileError, UsageError, check_installed
+from lagbench.errors import UnreadableFileError, UsageError, check_installed, check_regular
 from lagbench.submission.findings import Finding
 from lagbench.submission.format import Header
 

@@ -3,14 +3,3 @@
 Commands import what they need inside their bodies, so that ``lagbench --help`` loads typer
 and rich only.
 """
-
-from __future__ import annotations
-
-__all__ = ["main"]
-
-
-def main() -> None:
-    """Run the command line; the entry point ``lagbench``."""
-    from .app import app
-
-    app()

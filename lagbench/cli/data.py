@@ -172,8 +172,8 @@ def _verified(result: VerificationResult) -> Iterator[str]:
 
 def list_splits(root: RootOption = None, as_json: JsonFlag = False) -> None:
     """List the splits and sizes, what they cost, and what is generated here."""
-    from lagbench.data.layout import resolve_root, url_of
-    from lagbench.data.local import rooted
+    from lagbench.data.layout import url_of
+    from lagbench.data.local import resolve_root, rooted
     from lagbench.data.registry import load
     from lagbench.make.inventory import overview
 

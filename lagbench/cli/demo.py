@@ -87,7 +87,7 @@ def demo_split(
     progress: Callable[[Progress], None] | None = None,
 ) -> DemoResult:
     """Generate, verify and draw one split at size ``tiny``; the picture lies in ``pictures/`` of the root."""
-    from lagbench.data.layout import resolve_root
+    from lagbench.data.local import resolve_root
     from lagbench.data.registry import load
     from lagbench.draw.plot import plot_frame
     from lagbench.make.generate import generate
@@ -120,7 +120,7 @@ def model_left_out(registry: Registry) -> str | None:
 def demo_board(root: str | Path | None = None) -> Path:
     """Return the folder of the demo's leaderboard; refuse one with entries of other sizes."""
     from lagbench.board.folder import Folder
-    from lagbench.data.layout import resolve_root
+    from lagbench.data.local import resolve_root
 
     board = Folder(resolve_root(root) / "leaderboard")
     others = [path for path in board.entries() if path.parts[2] != DEMO_SIZE]
@@ -148,7 +148,7 @@ def demo_model(
     from lagbench.baselines.train import train
     from lagbench.board.build import build
     from lagbench.board.submit import submit
-    from lagbench.data.layout import resolve_root
+    from lagbench.data.local import resolve_root
     from lagbench.scoring.score import score
 
     folder, board = resolve_root(root), demo_board(root)

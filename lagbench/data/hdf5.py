@@ -19,8 +19,7 @@ from typing import Any, NamedTuple
 import h5py
 import numpy as np
 
-from lagbench.atomic import check_regular
-from lagbench.errors import LagbenchError, UnreadableFileError
+from lagbench.errors import LagbenchError, UnreadableFileError, check_regular
 
 MAX_LINKS = 1000
 """Most entries of a group that are looked at."""

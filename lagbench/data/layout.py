@@ -1,7 +1,7 @@
-"""Where data sets live: the root folder and the path of every scenario.
+"""Where data sets live: the path of every scenario below a root folder.
 
 ``<root>/<split>/<size>/v<MAJOR>/<subset>/<id:04d>.nc``, with ``manifest.json`` beside the
-subsets. Nothing here writes to the disk, but that a root in an object store gets its working copy.
+subsets. Nothing here writes to the disk.
 
 The local folder that stands for a root folder in an object store.
 
@@ -12,7 +12,6 @@ Everything works on that folder; ``lagbench.store`` brings objects there and put
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import json
 import os
@@ -21,7 +20,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from lagbench.atomic import write_atomically
 from lagbench.errors import UsageError
 
 CACHE_VARIABLE = "LAGBENCH_CACHE"
@@ -30,7 +28,6 @@ CACHE_VARIABLE = "LAGBENCH_CACHE"
 MARK = "store.json"
 """Name of the file that says what a folder is a working copy of."""
 
-_NO_REST = re.compile(r"[a-z][a-z0-9+.-]+:/*")
 _URL = re.compile(r"([a-z][a-z0-9+.-]+):/(.*)", re.DOTALL)
 
 
@@ -51,15 +48,6 @@ def as_url(root: str | Path) -> str | None:
     return f"{scheme}://{lead}{rest.strip('/')}"
 
 
-def open_copy(url: str) -> Path:
-    """Return the working copy of a root in a store; make and mark it where it is not there."""
-    folder = _place(url)
-    if url_of(folder) != url:
-        text = json.dumps({"url": url}, indent=1) + "\n"
-        write_atomically(folder / MARK, text.encode(), option=CACHE_VARIABLE)
-    return folder
-
-
 def url_of(root: Path) -> str | None:
     """Return the URL that a root folder is the working copy of; None for any other folder.
 
@@ -69,21 +57,17 @@ def url_of(root: Path) -> str | None:
         url = json.loads((root / MARK).read_text(encoding="utf-8"))["url"]
     except (OSError, ValueError, TypeError, KeyError):
         return None
-    return url if isinstance(url, str) and as_url(url) == url and root == _place(url) else None
+    return url if isinstance(url, str) and as_url(url) == url and root == place_of(url) else None
 
 
-def _place(url: str) -> Path:
-    return cache_folder("stores") / _name(url)
+def place_of(url: str) -> Path:
+    """Return the working copy of a root in a store, by a name that says the URL readably, and no other's.
 
-
-def _name(url: str) -> str:
-    """Return a file name that says the URL readably, and tells it from all others.
-
-    >>> _name("s3://bucket/data")
+    >>> place_of("s3://bucket/data").name
     's3-bucket-data-397b84d8'
     """
     words = re.sub(r"[^A-Za-z0-9._]+", "-", url).strip("-.")[:60]
-    return f"{words}-{hashlib.sha256(url.encode()).hexdigest()[:8]}"
+    return cache_folder("stores") / f"{words}-{hashlib.sha256(url.encode()).hexdigest()[:8]}"
 
 
 def cache_folder(part: str) -> Path:
@@ -95,11 +79,6 @@ def cache_folder(part: str) -> Path:
 
     return platformdirs.user_cache_path("lagbench", appauthor=False) / part
 
-
-ROOT_VARIABLE = "LAGBENCH_ROOT"
-"""Environment variable that names the root folder."""
-
-_ROOT = f"--root or {ROOT_VARIABLE}"
 
 MANIFEST_NAME = "manifest.json"
 
@@ -144,46 +123,6 @@ def major_of(version: str) -> int:
     return int(version.split(".")[0])
 
 
-def resolve_root(root: str | Path | None = None) -> Path:
-    """Return the folder that holds all data sets.
-
-    Args:
-        root: what the user gave; else ``LAGBENCH_ROOT``; else the platform's user data folder.
-            A URL (``s3://bucket/prefix``) stands for its working copy, see
-            :mod:`lagbench.data.layout`.
-
-    Raises:
-        UsageError: no file system can have a folder of that name.
-        WorkFailedError: the working copy of a URL cannot be made.
-    """
-    given = _given(root)
-    if given is None:
-        import platformdirs
-
-        return platformdirs.user_data_path("lagbench", appauthor=False)
-    url = as_url(given)
-    return _nameable(expanded(given, _ROOT)) if url is None else open_copy(url)
-
-
-def root_url(root: str | Path | None) -> str | None:
-    """Return the URL that the root of :func:`resolve_root` is; None for a folder. No copy is made."""
-    given = _given(root)
-    return None if given is None else as_url(given)
-
-
-def _given(root: str | Path | None) -> str | Path | None:
-    """Return the root that is given; refuse one that names nothing."""
-    given = os.environ.get(ROOT_VARIABLE) or None if root is None else root
-    if given is not None and (not str(given).strip() or _NO_REST.fullmatch(str(given))):
-        raise UsageError(
-            "that names no root",
-            where=_ROOT,
-            expected="a folder, or s3://bucket/prefix",
-            got=ascii(str(given)),
-        )
-    return given
-
-
 def expanded(path: str | Path, where: str) -> Path:
     """Return a path made absolute, ~ replaced by the home folder; refuse the home of nobody."""
     try:
@@ -191,22 +130,6 @@ def expanded(path: str | Path, where: str) -> Path:
     except RuntimeError as error:
         got = ascii(str(path))
         raise UsageError("there is no such home folder", where=where, got=got, fix="write it out") from error
-
-
-def _nameable(folder: Path) -> Path:
-    """Return a folder, whether it is there or not; refuse a name that the operating system refuses."""
-    try:
-        folder.lstat()
-    except (OSError, ValueError) as error:
-        too_long = isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG
-        if too_long or isinstance(error, ValueError):
-            raise UsageError(
-                "no folder can have that name",
-                where=_ROOT,
-                expected="a path",
-                got=f"{str(folder)[:60]!a}..., {len(str(folder))} characters",
-            ) from error
-    return folder
 
 
 def dataset_folder(root: Path, split: str, size: str, major: int) -> Path:

@@ -1,5 +1,7 @@
 """Where a split is described and where its data live: by its name, or by the path of its folder.
 
+The *root folder* holds all data sets; one in an object store is a working copy on this machine.
+
 A *local split* is a folder ``<root>/<name>/`` with its own description, ``split.yaml`` (laid out
 as datasets.yaml), and its data in the same places as those of any other split. So
 ``--split path/to/own`` means the split ``own`` with the root folder ``path/to``; once the root
@@ -11,22 +13,88 @@ What makes a data set whole again, in words for the user.
 
 from __future__ import annotations
 
+import errno
+import json
 import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from lagbench.atomic import check_regular
-from lagbench.errors import UnreadableFileError, UsageError, nearest
+from lagbench.atomic import write_atomically
+from lagbench.errors import UnreadableFileError, UsageError, check_regular, nearest
 
-from .layout import dataset_folder, expanded, resolve_root, url_of
+from .layout import CACHE_VARIABLE, MARK, as_url, dataset_folder, expanded, place_of, url_of
 from .registry import NO_GENERATOR, Measured, Registry, Size, Split, load
+
+ROOT_VARIABLE = "LAGBENCH_ROOT"
+"""Environment variable that names the root folder."""
+
+_ROOT = f"--root or {ROOT_VARIABLE}"
+
+_NO_REST = re.compile(r"[a-z][a-z0-9+.-]+:/*")
 
 DESCRIPTION = "split.yaml"
 """Name of the file that describes a local split; it stands in the split's folder."""
 
 _NAME = re.compile(r"[a-z][a-z0-9_-]{0,63}")
+
+
+def resolve_root(root: str | Path | None = None) -> Path:
+    """Return the folder that holds all data sets.
+
+    Args:
+        root: what the user gave; else ``LAGBENCH_ROOT``; else the platform's user data folder.
+            A URL (``s3://bucket/prefix``) stands for its working copy, see
+            :mod:`lagbench.data.layout`.
+
+    Raises:
+        UsageError: no file system can have a folder of that name.
+        WorkFailedError: the working copy of a URL cannot be made.
+    """
+    given = _given(root)
+    if given is None:
+        import platformdirs
+
+        return platformdirs.user_data_path("lagbench", appauthor=False)
+    if (url := as_url(given)) is not None:
+        copy = place_of(url)
+        if url_of(copy) != url:
+            text = json.dumps({"url": url}, indent=1) + "\n"
+            write_atomically(copy / MARK, text.encode(), option=CACHE_VARIABLE)
+        return copy
+    folder = expanded(given, _ROOT)
+    try:
+        folder.lstat()
+    except (OSError, ValueError) as error:
+        too_long = isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG
+        if too_long or isinstance(error, ValueError):
+            raise UsageError(
+                "no folder can have that name",
+                where=_ROOT,
+                expected="a path",
+                got=f"{str(folder)[:60]!a}..., {len(str(folder))} characters",
+            ) from error
+    return folder
+
+
+def root_url(root: str | Path | None) -> str | None:
+    """Return the URL that the root of :func:`resolve_root` is; None for a folder. No copy is made."""
+    given = _given(root)
+    return None if given is None else as_url(given)
+
+
+def _given(root: str | Path | None) -> str | Path | None:
+    """Return the root that is given; refuse one that names nothing."""
+    given = os.environ.get(ROOT_VARIABLE) or None if root is None else root
+    if given is not None and (not str(given).strip() or _NO_REST.fullmatch(str(given))):
+        raise UsageError(
+            "that names no root",
+            where=_ROOT,
+            expected="a folder, or s3://bucket/prefix",
+            got=ascii(str(given)),
+        )
+    return given
 
 
 class Home(NamedTuple):

@@ -24,8 +24,8 @@ from pydantic import (
     field_validator,
 )
 
-from lagbench.atomic import check_regular, write_atomically
-from lagbench.errors import DataError, UnreadableFileError, WorkFailedError
+from lagbench.atomic import write_atomically
+from lagbench.errors import DataError, UnreadableFileError, WorkFailedError, check_regular
 from lagbench.work.machine import may_differ
 
 from .checksums import HASHED_SUBSETS, dataset_hash, file_sha256, round_digits, subset_hash

@@ -87,7 +87,7 @@ def download(
             :mod:`lagbench.store.archive`; else the mirrors of datasets.yaml in order, then releases.
         subset: some subsets only.
         scenarios: some ids only.
-        root: folder of all data sets, see :func:`lagbench.data.layout.resolve_root`.
+        root: folder of all data sets, see :func:`lagbench.data.local.resolve_root`.
         connections: files that are fetched side by side.
         or_generate: whether to simulate what no store has, or when none answers.
         workers: worker processes of the simulation.

@@ -81,7 +81,7 @@ def export(
         size: name of the size; the only one that is there when None.
         format: "gns-npz" or "lagrangebench-h5".
         output: folder for the files.
-        root: folder of all data sets, see :func:`lagbench.data.layout.resolve_root`.
+        root: folder of all data sets, see :func:`lagbench.data.local.resolve_root`.
         from_walls: lagrangebench-h5 only: measure positions from the lower walls, so that the
             bounds that its models see are the walls; no bit is lost. Else positions are ours,
             and the bounds those of the unit box, which that program's neighbour search needs.

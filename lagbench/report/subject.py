@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.data.layout import resolve_root
-from lagbench.data.local import rooted
+from lagbench.data.local import resolve_root, rooted
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
 from lagbench.metrics.aggregate import Score

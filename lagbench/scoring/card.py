@@ -24,9 +24,8 @@ from typing import Any
 
 import numpy as np
 
-from lagbench.atomic import check_regular
 from lagbench.data.checksums import round_digits
-from lagbench.errors import UnreadableFileError
+from lagbench.errors import UnreadableFileError, check_regular
 from lagbench.floors.table import FLOORS
 from lagbench.metrics.aggregate import Score, Tally, bootstrap_interval, mean_over_seeds
 from lagbench.metrics.frame import Setting

@@ -15,9 +15,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from lagbench.atomic import check_regular
 from lagbench.data.registry import Registry
-from lagbench.errors import ChecksFailedError, DataError, UnreadableFileError, UsageError, nearest
+from lagbench.errors import (
+    ChecksFailedError,
+    DataError,
+    UnreadableFileError,
+    UsageError,
+    check_regular,
+    nearest,
+)
 from lagbench.floors.table import FLOORS
 from lagbench.metrics.aggregate import FEWEST_FOR_INTERVAL, Score, mean_over_seeds
 from lagbench.metrics.metric import Direction, Metric, mean

@@ -20,7 +20,7 @@ import sys
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
-from lagbench.data.layout import resolve_root
+from lagbench.data.local import resolve_root
 from lagbench.data.registry import Size
 from lagbench.errors import DataError, LagbenchError, UsageError, WorkFailedError
 from lagbench.floors.shipped import FOLDER, shipped_path, write_shipped, write_solver_seconds

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from lagbench.atomic import atomic_path, check_writable
-from lagbench.data.layout import resolve_root
-from lagbench.data.local import rooted
+from lagbench.data.local import resolve_root, rooted
 from lagbench.data.registry import Registry
 from lagbench.errors import UnreadableFileError, UsageError, nearest
 from lagbench.floors import extrapolation

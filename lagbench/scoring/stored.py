@@ -18,12 +18,11 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.atomic import check_regular
 from lagbench.data.checksums import round_digits
 from lagbench.data.grid import Grid, Placement
 from lagbench.data.hdf5 import Structure, check_structure, opened
 from lagbench.data.registry import Size
-from lagbench.errors import UnreadableFileError
+from lagbench.errors import UnreadableFileError, check_regular
 from lagbench.metrics.distributions import BINS
 from lagbench.submission.task_checks import frames_to_predict
 from lagbench.work.machine import in_child

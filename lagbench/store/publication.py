@@ -15,7 +15,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from lagbench.data.checksums import file_sha256
-from lagbench.data.layout import MANIFEST_NAME, root_url, url_of
+from lagbench.data.layout import MANIFEST_NAME, url_of
+from lagbench.data.local import root_url
 from lagbench.data.manifest import FileEntry, Manifest, merged, write_manifest
 from lagbench.data.registry import Size
 from lagbench.errors import DataError, LagbenchError

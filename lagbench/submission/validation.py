@@ -16,8 +16,7 @@ from typing import Any
 import h5py
 
 from lagbench.data.hdf5 import check_file, opened
-from lagbench.data.layout import resolve_root
-from lagbench.data.local import RootedRegistry, rooted
+from lagbench.data.local import RootedRegistry, resolve_root, rooted
 from lagbench.data.registry import Registry, Size
 from lagbench.errors import DataError, UnreadableFileError, UsageError, nearest
 from lagbench.work.machine import in_child
