@@ -22,10 +22,10 @@ from lagbench.data.local import locate
 from lagbench.data.registry import Registry
 from lagbench.data.scenario import read_scenario
 from lagbench.errors import UsageError
-from lagbench.metrics.aggregate import Tally, score, tally
+from lagbench.metrics.aggregate import Tally, as_stored, score, tally
 from lagbench.metrics.frame import FramePair, snapshots
-from lagbench.metrics.table import METRICS, select
-from lagbench.scoring.task import ScoredTask, as_stored, load_scored_task, ranking_metric
+from lagbench.metrics.table import METRICS, ranking_metric, select
+from lagbench.scoring.task import ScoredTask, load_scored_task
 from lagbench.store.copy import scenario_files
 from lagbench.store.windows import window_of
 from lagbench.submission.checks import MAX_DISTANCE

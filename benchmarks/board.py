@@ -40,13 +40,14 @@ from lagbench.cli.output import spell_bytes
 from lagbench.data.checksums import file_sha256
 from lagbench.data.grid import Grid, Placement
 from lagbench.data.registry import Size, load
-from lagbench.floors.table import FLOORS
+from lagbench.floors.table import FLOORS, counting
 from lagbench.metrics import METRICS, Direction, Setting, Tally, aggregate
+from lagbench.metrics.aggregate import as_stored
 from lagbench.metrics.distributions import BINS
-from lagbench.scoring.card import ScoreCard
+from lagbench.metrics.table import ranking_metric
+from lagbench.scoring.card import FRAMES, PARTICLES, SUBMISSION, Preview, ScoreCard, skill
 from lagbench.scoring.score_file import write_statistics
 from lagbench.scoring.stored import read_stored, reported_frames
-from lagbench.scoring.task import FRAMES, PARTICLES, SUBMISSION, Preview, as_stored, ranking_metric
 from lagbench.submission import Header
 from lagbench.submission.task_checks import frames_to_predict
 
@@ -177,6 +178,8 @@ def made_up(size: Size, method: str, seed: int, quality: float) -> ScoreCard:
         diverged_at={},
     )
     grid = Grid(task.score_grid.cells, Placement(task.score_grid.placement))
+    scores = {row: aggregate([METRICS[ranking]], held) for row, held in tallies.items()}
+    floors = counting({row: held[ranking] for row, held in scores.items()})
     return ScoreCard(
         header=header,
         predictions_sha256=f"{seed:064x}",
@@ -192,7 +195,8 @@ def made_up(size: Size, method: str, seed: int, quality: float) -> ScoreCard:
         ),
         ranking=ranking,
         tallies=tallies,
-        scores={row: aggregate([METRICS[ranking]], held) for row, held in tallies.items()},
+        scores=scores,
+        skill=skill([scores[SUBMISSION][ranking]], floors),
         flags=(),
         warnings=(),
         preview=_preview(size, grid.nodes, rng),

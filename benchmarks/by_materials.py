@@ -21,8 +21,8 @@ from lagbench.data.scenario import read_scenario
 from lagbench.draw.tables import markdown
 from lagbench.errors import LagbenchError, nearest
 from lagbench.floors import shipped
+from lagbench.metrics.table import ranking_metric
 from lagbench.scoring.stored import published
-from lagbench.scoring.task import ranking_metric
 
 BOARD = Path(__file__).parent.parent / "leaderboard"
 

@@ -20,8 +20,9 @@ import numpy as np
 
 from lagbench.data.registry import Size, load
 from lagbench.floors import FloorScores, shipped
+from lagbench.floors.table import counting
+from lagbench.metrics.table import ranking_metric
 from lagbench.scoring.card import best_floor
-from lagbench.scoring.task import ranking_metric
 
 FALLEN, SHARE, ERROR = 0.8, 0.75, 0.8
 ACCEPTED = ("full", "mini")
@@ -51,7 +52,7 @@ def main() -> int:
 
 def _print_floors(size: Size, floors: Mapping[str, FloorScores]) -> None:
     ranking = ranking_metric(size)
-    best = best_floor({name: floor.scores[ranking] for name, floor in floors.items()})
+    best = best_floor(counting({name: floor.scores[ranking] for name, floor in floors.items()}))
     for name, floor in floors.items():
         score = floor.scores[ranking]
         low, high = score.interval

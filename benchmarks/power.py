@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from lagbench.data.registry import load
 from lagbench.metrics import differ
 from lagbench.metrics.significance import SIGNIFICANCE
+from lagbench.metrics.table import ranking_metric
 from lagbench.scoring.score_file import read_statistics
-from lagbench.scoring.task import ranking_metric
 
 Floats = NDArray[np.float64]
 

@@ -20,10 +20,9 @@ from lagbench.data.registry import Registry
 from lagbench.errors import ChecksFailedError, DataError, LagbenchError, UsageError
 from lagbench.floors.table import FLOORS
 from lagbench.metrics import METRICS, Score, bootstrap_interval
-from lagbench.scoring.card import ScoreCard, digits
+from lagbench.scoring.card import SUBMISSION, ScoreCard, digits
 from lagbench.scoring.score_file import read_statistics
 from lagbench.scoring.stored import read_stored
-from lagbench.scoring.task import SUBMISSION
 
 
 @pytest.fixture(scope="module")

@@ -23,9 +23,9 @@ from lagbench.baselines.reproduce import results
 from lagbench.baselines.reproduce.__main__ import main
 from lagbench.baselines.reproduce.catalogue import FIGURES
 from lagbench.baselines.reproduce.drawing import opened
-from lagbench.baselines.reproduce.evidence import Evidence, Method, Seeded, Sources
+from lagbench.baselines.reproduce.evidence import Evidence, Method, Seeded, Sources, budget
 from lagbench.baselines.reproduce.plan import Plan
-from lagbench.baselines.reproduce.runs import budget, make_runs
+from lagbench.baselines.reproduce.runs import make_runs
 from lagbench.baselines.reproduce.thesis import EXPECTED, ROSTER
 from lagbench.data.grid import fields
 from lagbench.data.registry import Registry, Size, load

@@ -12,8 +12,8 @@ import pytest
 
 from lagbench.baselines import catalogue
 from lagbench.baselines.reproduce import __main__ as command
-from lagbench.baselines.reproduce import tables
-from lagbench.baselines.reproduce.plan import Plan
+from lagbench.baselines.reproduce import runs, tables
+from lagbench.baselines.reproduce.plan import Plan, known_studies
 from lagbench.baselines.reproduce.thesis import STUDIES
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
@@ -95,8 +95,9 @@ def test_studies_are_what_was_asked_for(
 
     What a row came to lies in one file, which suffices for its table, unless it is of other data.
     """
-    monkeypatch.setattr(tables, "TABLES", {"table_4_2": ("4.2", SPLIT)})
-    monkeypatch.setattr(tables, "study_rows", lambda _: STUDIES[:1])
+    for module in (runs, tables):
+        monkeypatch.setattr(module, "TABLES", {"table_4_2": ("4.2", SPLIT)})
+        monkeypatch.setattr(module, "study_rows", lambda _: STUDIES[:1])
     for steps in (1, 2):
         plan = Plan(
             size="tiny",
@@ -109,26 +110,26 @@ def test_studies_are_what_was_asked_for(
             registry=unmeasured,
         )
         if steps == 1:
-            tables.make_studies(plan, "table_4_2")
+            runs.make_studies(plan, "table_4_2")
             home = plan.home(SPLIT)
             first = {path: path.stat().st_mtime_ns for path in home.rglob("*.*")}
-            tables.make_studies(plan, "table_4_2")
+            runs.make_studies(plan, "table_4_2")
             assert {path: path.stat().st_mtime_ns for path in home.rglob("*.*")} == first
-            known = tables.known_studies([home], plan.hash(SPLIT))
+            known = known_studies([home], plan.hash(SPLIT))
             assert known["mlp-4-2-1"]["train"] > 0.0
             assert known["mlp-4-2-1"]["training"]["step"] == 1
             (row,) = tables.studies_beside_thesis("table_4_2", "tiny", known).tables[0].rows
             assert f"{known['mlp-4-2-1']['valid']:.3g}" in row
-            assert tables.known_studies([home], "f" * 64) == {}
+            assert known_studies([home], "f" * 64) == {}
             stale = {"mlp-4-2-1": {**known["mlp-4-2-1"], "training": {"dataset_sha256": "f" * 64}}}
             (tmp_path / "mlp_studies.json").write_text(json.dumps(stale))
-            assert tables.known_studies([home, tmp_path], plan.hash(SPLIT)) == known
+            assert known_studies([home, tmp_path], plan.hash(SPLIT)) == known
             later = {"mlp-4-2-1": {**known["mlp-4-2-1"], "train": 9.0}}
             (tmp_path / "mlp_studies.json").write_text(json.dumps(later))
-            assert tables.known_studies([home, tmp_path], plan.hash(SPLIT)) == later
+            assert known_studies([home, tmp_path], plan.hash(SPLIT)) == later
         else:
             with pytest.raises(UsageError):
-                tables.make_studies(plan, "table_4_2")
+                runs.make_studies(plan, "table_4_2")
 
 
 @pytest.fixture

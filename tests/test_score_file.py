@@ -14,10 +14,10 @@ from score_bench import ScoreBench, straight
 
 from lagbench.errors import UnreadableFileError, WorkFailedError
 from lagbench.metrics import Tally, aggregate, select
+from lagbench.metrics.aggregate import as_stored
 from lagbench.metrics.distributions import histograms
-from lagbench.scoring.card import ScoreCard, digits, read_scores
+from lagbench.scoring.card import FRAMES, PARTICLES, SUBMISSION, ScoreCard, digits, read_scores
 from lagbench.scoring.score_file import read_statistics, write_statistics
-from lagbench.scoring.task import FRAMES, PARTICLES, SUBMISSION, as_stored
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def noisy(card: ScoreCard) -> ScoreCard:
         **{name: array.astype(np.float32) for name, array in arrays.items()},
     )
     scores = {SUBMISSION: card.submission}  # floors have other scenarios than these
-    return replace(card, tallies={SUBMISSION: tallies}, scores=scores, preview=preview)
+    return replace(card, tallies={SUBMISSION: tallies}, scores=scores, skill=None, preview=preview)
 
 
 def scattered(card: ScoreCard) -> ScoreCard:
@@ -72,7 +72,7 @@ def scattered(card: ScoreCard) -> ScoreCard:
     few = {"histogram": preview.histogram[:, :2], "histogram_range": preview.histogram_range[:2]}
     preview = replace(preview, **few)
     scores = {SUBMISSION: card.submission}  # floors have other scenarios than these
-    return replace(card, tallies={SUBMISSION: tallies}, scores=scores, preview=preview)
+    return replace(card, tallies={SUBMISSION: tallies}, scores=scores, skill=None, preview=preview)
 
 
 def test_full_submissions_take_300_kb(card: ScoreCard, tmp_path: Path) -> None:

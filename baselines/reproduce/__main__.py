@@ -25,10 +25,9 @@ from lagbench.work.pool import worker_count
 
 from .catalogue import FIGURES
 from .drawing import Figure, write_sheet
-from .evidence import STUDIES, WEIGHTS
-from .plan import Plan
-from .runs import Run, budget, complain, make_runs, note, outlook, score_committed
-from .tables import TABLES, make_studies
+from .evidence import STUDIES, WEIGHTS, budget
+from .plan import TABLES, Plan
+from .runs import Run, complain, make_runs, make_studies, note, outlook, score_committed
 from .thesis import EXPECTED, ROSTER, Model, label, number
 
 

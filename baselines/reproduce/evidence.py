@@ -25,12 +25,12 @@ from lagbench.data.registry import Registry, Size, load
 from lagbench.data.yamlfile import read_yaml
 from lagbench.errors import UnreadableFileError
 from lagbench.floors.shipped import shipped, shipped_path
-from lagbench.floors.table import FLOORS
+from lagbench.floors.table import FLOORS, counting
 from lagbench.metrics.aggregate import Score
 from lagbench.metrics.metric import mean
+from lagbench.metrics.table import ranking_metric
 from lagbench.scoring.card import best_floor
 from lagbench.scoring.score_file import NETCDF_NAME, read_statistics
-from lagbench.scoring.task import ranking_metric
 
 from .thesis import ROSTER
 
@@ -284,9 +284,8 @@ class Evidence:
     @property
     def best_floor(self) -> str | None:
         """Name of the floor that skill is measured from, as the scorer has it; None where none was scored."""
-        return best_floor(
-            {n: m.scores[self.ranking] for n, m in self.floors.items() if self.ranking in m.scores}
-        )
+        ranked = {n: m.scores[self.ranking] for n, m in self.floors.items() if self.ranking in m.scores}
+        return best_floor(counting(ranked))
 
     def skill(self, name: str) -> float:
         """Return ``1 - score / score of the best floor`` by the ranking metric: 1 perfect, 0 no learning."""
@@ -353,3 +352,21 @@ def read_json(path: Path) -> dict[str, Any]:
     if not isinstance(held, dict):
         raise UnreadableFileError("no JSON mapping", where=str(path), got=type(held).__name__)
     return held
+
+
+def budget(record: Mapping[str, Any]) -> str:
+    """Return steps and windows of a step, as in "5,000 x 2"; a dash where unknown."""
+    if "windows" not in record:
+        return "closed form" if record.get("step") == 1 else "-"
+    return f"{record['step']:,} x {record['recipe']['training']['batch']}"
+
+
+def hardware(record: Mapping[str, Any]) -> str:
+    """Return the machine of a training: its GPU, or its processor and threads."""
+    said = record.get("hardware")
+    if not said:
+        return "-"
+    if said["device"] != "cpu":
+        return str(said["device"])
+    threads = "1 thread" if said["threads"] == 1 else f"{said['threads']} threads"
+    return f"{said['processor']}, {threads}"

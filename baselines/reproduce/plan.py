@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 from lagbench.data.local import rooted
 from lagbench.data.manifest import read_manifest
@@ -12,10 +14,24 @@ from lagbench.data.registry import Registry, Size
 from lagbench.errors import UsageError
 from lagbench.scoring.task import ScoredTask, load_scored_task
 
-from .evidence import STUDIES, WEIGHTS, Evidence, Sources
-from .thesis import Model
+from .evidence import STUDIES as COMMITTED
+from .evidence import WEIGHTS, Evidence, Sources, read_json
+from .thesis import STUDIES, Model, Study
 
 PREDICTIONS = "predictions.nc"
+
+TABLES: Mapping[str, tuple[str, str]] = {
+    "table_4_2": ("4.2", "fluid"),
+    "table_4_3": ("4.3", "fluid"),
+    "table_4_4": ("4.4", "multimaterial"),
+    "table_4_5": ("4.5", "multimaterial"),
+}
+"""Number of the table in the thesis, and the split it is made on."""
+
+SHARES: Mapping[str, tuple[float, int]] = {"mini": (0.1, 16), "tiny": (0.01, 64)}
+"""Share of the thesis's epochs, and what its batch is divided by, by size."""
+
+STUDY_FILE = "mlp_studies.json"  # what the rows came to, in a folder of runs or of committed studies
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,7 +43,7 @@ class Plan:
     runs: Path  # folder of runs; what is there is not made again
     output: Path  # folder of tables and pictures
     weights: Path = WEIGHTS  # folder of committed weights
-    studies: Path = STUDIES  # folder of committed results that are no entries
+    studies: Path = COMMITTED  # folder of committed results that are no entries
     seeds: tuple[int, ...] = (0,)  # seeds of every training; pictures show the first
     recipe: str | None = None  # variant of the recipes, as in short; None for the size's own
     settings: tuple[str, ...] = ()  # changes to every recipe, as in training.steps=100
@@ -112,3 +128,30 @@ class Plan:
         if split not in self._subsets:
             self._subsets[split] = load_scored_task(self.tier(split), self.root)
         return self._subsets[split]
+
+
+def study_name(study: Study) -> str:
+    """Return what a row is called in files and folders, as in ``mlp-4-2-1``."""
+    return f"mlp-{study.table.replace('.', '-')}-{study.row}"
+
+
+def study_rows(name: str) -> tuple[Study, ...]:
+    """Return the rows of a table."""
+    return tuple(study for study in STUDIES if study.table == TABLES[name][0])
+
+
+def study_folder(plan: Plan, name: str, study: Study) -> Path:
+    """Return the folder of a row's training; it lies apart from the runs that are scored."""
+    return plan.home(TABLES[name][1]) / "studies" / f"{study_name(study)}-{plan.seeds[0]}"
+
+
+def known_studies(homes: Iterable[Path], data: str | None) -> dict[str, Any]:
+    """Return what rows came to, by :func:`study_name`: ``train``, ``valid`` and the record of ``training``.
+
+    A row of a later folder goes before that of an earlier one; rows of data with another hash are left out.
+    """
+    held: dict[str, Any] = {}
+    for home in homes:
+        rows = read_json(home / STUDY_FILE).items()
+        held |= {name: row for name, row in rows if data in (None, row["training"]["dataset_sha256"])}
+    return held

@@ -25,9 +25,9 @@ from lagbench.metrics.table import CHOSEN
 from lagbench.scoring.tables import ARROWS
 
 from .claims import CLAIMS, answer, claim_rows, comparison_table, floors_ahead
-from .evidence import BOARD, STUDIES, WEIGHTS, Evidence, Method, Sources, read_json
-from .runs import budget, hardware
-from .tables import TABLES, known_studies, rollout_table, studies_beside_thesis, study_name, study_rows
+from .evidence import BOARD, STUDIES, WEIGHTS, Evidence, Method, Sources, budget, hardware, read_json
+from .plan import TABLES, known_studies, study_name, study_rows
+from .tables import rollout_table, studies_beside_thesis
 from .thesis import (
     EXPECTED,
     OPERATORS,

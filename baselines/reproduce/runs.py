@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from lagbench.atomic import write_atomically
 from lagbench.baselines.job import OVER
@@ -17,8 +18,8 @@ from lagbench.work.pool import Report, crashed
 from lagbench.work.run import run_all
 
 from .evidence import RECORD_NAME, read_json
-from .plan import PREDICTIONS, Plan
-from .thesis import Model
+from .plan import PREDICTIONS, SHARES, STUDY_FILE, TABLES, Plan, study_folder, study_name, study_rows
+from .thesis import Model, Study
 
 if TYPE_CHECKING:
     from lagbench.baselines.recipe import Recipe
@@ -28,6 +29,9 @@ OTHER = "name another folder of runs with --runs, or remove this run"
 
 Run = tuple[str, Model, int]
 """Split, model and seed."""
+
+
+WINDOWS = 4096  # most windows of a subset that an error is measured over, evenly spaced
 
 
 def make_runs(plan: Plan, runs: Sequence[Run], *, workers: int = 1) -> int:
@@ -172,6 +176,65 @@ def check_training(plan: Plan, split: str, model: Model, seed: int, *, folder: P
         )
 
 
+def study_model(plan: Plan, study: Study) -> Model:
+    """Return what to train for a row: at ``full`` its own recipe, else the size's recipe with changes."""
+    name, unvalidated = study_name(study), "training.validate_every=0"
+    if plan.size == "full":
+        # what tells a row's recipe from the others of its table
+        ends = {"4.2": study.activation, "4.3": study.widths[0], "4.4": len(study.widths), "4.5": study.row}
+        variant = f"table-{study.table}-{ends[study.table]}"
+        return Model(name, name, varied="mlp", settings=(unvalidated,), recipe=variant)
+    share, divisor = SHARES[plan.size]
+    settings = (
+        unvalidated,
+        f"model.widths={list(study.widths)}",
+        f"model.activation={study.activation}",
+        *("model.target=state", "model.noise_std=0", "model.material=false"),
+        f"training.epochs={max(1.0, share * study.epochs):g}",
+        f"training.batch={study.batch // divisor}",
+        *("training.learning_rate=0.001", "training.schedule=constant"),
+    )
+    return Model(name, name, varied="mlp", settings=settings)
+
+
+def make_studies(plan: Plan, name: str) -> None:
+    """Train the rows of a table and measure their errors, unless that was done."""
+    split, seed = TABLES[name][1], plan.seeds[0]
+    path = plan.home(split) / STUDY_FILE
+    for study in study_rows(name):
+        folder, model, held = study_folder(plan, name, study), study_model(plan, study), read_json(path)
+        check_training(plan, split, model, seed, folder=folder)
+        if held.get(model.name, {}).get("seed") == seed and (folder / "weights.pt").is_file():
+            continue
+        make_training(plan, split, model, seed, folder=folder)
+        errors = {subset: one_step_error(plan, split, folder, subset) for subset in ("train", "valid")}
+        held[model.name] = {"seed": seed, **errors, "training": read_json(folder / RECORD_NAME)}
+        write_atomically(path, json.dumps(held, indent=1, sort_keys=True).encode())
+
+
+def one_step_error(plan: Plan, split: str, folder: Path, subset: str) -> float:
+    """Return the mean of Eq. 4.16 over the windows of a subset [standardised^2]."""
+    import torch
+
+    from lagbench.baselines.checkpoint import load, restore
+    from lagbench.tensors import collate
+    from lagbench.torch import WindowDataset
+
+    model = restore(load(folder / "weights.pt")).eval()
+    data = WindowDataset(
+        split, subset=subset, size=plan.size, root=plan.root, history=model.history, registry=plan.registry
+    )
+    count = min(len(data), WINDOWS)
+    chosen = [i * len(data) // count for i in range(count)]
+    total = 0.0
+    with torch.no_grad():
+        for first in range(0, count, 128):
+            windows = [data[i] for i in chosen[first : first + 128]]
+            terms = model(collate(windows))
+            total += len(windows) * float(terms["position"] + terms["velocity"]) / 2.0
+    return total / count
+
+
 def outlook(plan: Plan, split: str, model: Model, seed: int) -> str:
     """Return what :func:`make_run` would do, in words; nothing is made."""
     folder = plan.folder(split, model.name, seed)
@@ -218,21 +281,3 @@ def _complete(folder: Path) -> bool:
     if not (folder / "weights.pt").is_file():
         return False
     return not record.is_file() or read_json(record).get("state") in OVER
-
-
-def budget(record: Mapping[str, Any]) -> str:
-    """Return steps and windows of a step, as in "5,000 x 2"; a dash where unknown."""
-    if "windows" not in record:
-        return "closed form" if record.get("step") == 1 else "-"
-    return f"{record['step']:,} x {record['recipe']['training']['batch']}"
-
-
-def hardware(record: Mapping[str, Any]) -> str:
-    """Return the machine of a training: its GPU, or its processor and threads."""
-    said = record.get("hardware")
-    if not said:
-        return "-"
-    if said["device"] != "cpu":
-        return str(said["device"])
-    threads = "1 thread" if said["threads"] == 1 else f"{said['threads']} threads"
-    return f"{said['processor']}, {threads}"

@@ -9,16 +9,14 @@ exist at full only.
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.atomic import write_atomically
 from lagbench.data.manifest import read_manifest
 from lagbench.draw.tables import Table
 from lagbench.errors import DataError
@@ -26,20 +24,16 @@ from lagbench.metrics.distributions import kl, normalised
 from lagbench.metrics.table import METRICS
 
 from .drawing import Figure, Sheet, charts, loss_over_steps, opened, plot_losses, png, tidy
-from .evidence import RECORD_NAME, Evidence, read_json
-from .plan import Plan
-from .runs import budget, check_training, make_training
+from .evidence import Evidence, budget
+from .plan import SHARES, TABLES, Plan, known_studies, study_folder, study_name, study_rows
 from .thesis import (
     FRAME_MODELS,
     OPERATORS,
     STATISTICS,
-    STUDIES,
     TABLE_4_7,
     TABLE_4_8,
     TABLE_5_4,
-    Model,
     Rollout,
-    Study,
     colour,
     key_frame,
     label,
@@ -221,85 +215,6 @@ def vorticity_bars(plan: Plan, figure: Figure) -> Sheet:
     )
 
 
-TABLES: Mapping[str, tuple[str, str]] = {
-    "table_4_2": ("4.2", "fluid"),
-    "table_4_3": ("4.3", "fluid"),
-    "table_4_4": ("4.4", "multimaterial"),
-    "table_4_5": ("4.5", "multimaterial"),
-}
-"""Number of the table in the thesis, and the split it is made on."""
-
-SHARES: Mapping[str, tuple[float, int]] = {"mini": (0.1, 16), "tiny": (0.01, 64)}
-"""Share of the thesis's epochs, and what its batch is divided by, by size."""
-
-WINDOWS = 4096  # most windows of a subset that an error is measured over, evenly spaced
-
-FILE = "mlp_studies.json"  # what the rows came to, in a folder of runs or of committed studies
-
-
-def study_name(study: Study) -> str:
-    """Return what a row is called in files and folders, as in ``mlp-4-2-1``."""
-    return f"mlp-{study.table.replace('.', '-')}-{study.row}"
-
-
-def study_model(plan: Plan, study: Study) -> Model:
-    """Return what to train for a row: at ``full`` its own recipe, else the size's recipe with changes."""
-    name, unvalidated = study_name(study), "training.validate_every=0"
-    if plan.size == "full":
-        # what tells a row's recipe from the others of its table
-        ends = {"4.2": study.activation, "4.3": study.widths[0], "4.4": len(study.widths), "4.5": study.row}
-        variant = f"table-{study.table}-{ends[study.table]}"
-        return Model(name, name, varied="mlp", settings=(unvalidated,), recipe=variant)
-    share, divisor = SHARES[plan.size]
-    settings = (
-        unvalidated,
-        f"model.widths={list(study.widths)}",
-        f"model.activation={study.activation}",
-        *("model.target=state", "model.noise_std=0", "model.material=false"),
-        f"training.epochs={max(1.0, share * study.epochs):g}",
-        f"training.batch={study.batch // divisor}",
-        *("training.learning_rate=0.001", "training.schedule=constant"),
-    )
-    return Model(name, name, varied="mlp", settings=settings)
-
-
-def study_rows(name: str) -> tuple[Study, ...]:
-    """Return the rows of a table."""
-    return tuple(study for study in STUDIES if study.table == TABLES[name][0])
-
-
-def study_folder(plan: Plan, name: str, study: Study) -> Path:
-    """Return the folder of a row's training; it lies apart from the runs that are scored."""
-    return plan.home(TABLES[name][1]) / "studies" / f"{study_name(study)}-{plan.seeds[0]}"
-
-
-def make_studies(plan: Plan, name: str) -> None:
-    """Train the rows of a table and measure their errors, unless that was done."""
-    split, seed = TABLES[name][1], plan.seeds[0]
-    path = plan.home(split) / FILE
-    for study in study_rows(name):
-        folder, model, held = study_folder(plan, name, study), study_model(plan, study), read_json(path)
-        check_training(plan, split, model, seed, folder=folder)
-        if held.get(model.name, {}).get("seed") == seed and (folder / "weights.pt").is_file():
-            continue
-        make_training(plan, split, model, seed, folder=folder)
-        errors = {subset: one_step_error(plan, split, folder, subset) for subset in ("train", "valid")}
-        held[model.name] = {"seed": seed, **errors, "training": read_json(folder / RECORD_NAME)}
-        write_atomically(path, json.dumps(held, indent=1, sort_keys=True).encode())
-
-
-def known_studies(homes: Iterable[Path], data: str | None) -> dict[str, Any]:
-    """Return what rows came to, by :func:`study_name`: ``train``, ``valid`` and the record of ``training``.
-
-    A row of a later folder goes before that of an earlier one; rows of data with another hash are left out.
-    """
-    held: dict[str, Any] = {}
-    for home in homes:
-        rows = read_json(home / FILE).items()
-        held |= {name: row for name, row in rows if data in (None, row["training"]["dataset_sha256"])}
-    return held
-
-
 def _known(plan: Plan, figure: Figure) -> dict[str, Any]:
     """Return what the rows of a figure came to with the plan's seed; committed ones are by plain recipes."""
     split = TABLES[figure.studies][1]
@@ -307,29 +222,6 @@ def _known(plan: Plan, figure: Figure) -> dict[str, Any]:
     homes = ([plan.studies / split / plan.size] if plain else []) + [plan.home(split)]
     known = known_studies(homes, plan.hash(split))
     return {name: row for name, row in known.items() if row["seed"] == plan.seeds[0]}
-
-
-def one_step_error(plan: Plan, split: str, folder: Path, subset: str) -> float:
-    """Return the mean of Eq. 4.16 over the windows of a subset [standardised^2]."""
-    import torch
-
-    from lagbench.baselines.checkpoint import load, restore
-    from lagbench.tensors import collate
-    from lagbench.torch import WindowDataset
-
-    model = restore(load(folder / "weights.pt")).eval()
-    data = WindowDataset(
-        split, subset=subset, size=plan.size, root=plan.root, history=model.history, registry=plan.registry
-    )
-    count = min(len(data), WINDOWS)
-    chosen = [i * len(data) // count for i in range(count)]
-    total = 0.0
-    with torch.no_grad():
-        for first in range(0, count, 128):
-            windows = [data[i] for i in chosen[first : first + 128]]
-            terms = model(collate(windows))
-            total += len(windows) * float(terms["position"] + terms["velocity"]) / 2.0
-    return total / count
 
 
 def studies(plan: Plan, figure: Figure) -> Sheet:

@@ -18,13 +18,12 @@ import yaml
 
 from lagbench.data.registry import Registry
 from lagbench.errors import ChecksFailedError, UnreadableFileError, UsageError
-from lagbench.metrics.aggregate import Tally
+from lagbench.metrics.aggregate import LONG_BITS, LONG_ROLLOUT, Tally
 from lagbench.metrics.table import METRICS, STATISTICS
-from lagbench.scoring.card import ScoreCard
+from lagbench.scoring.card import SUBMISSION, ScoreCard
 from lagbench.scoring.score import score
 from lagbench.scoring.score_file import FILM_RANGE, LEVELS, StoredScores, write_statistics
 from lagbench.scoring.stored import read_stored
-from lagbench.scoring.task import LONG_BITS, LONG_ROLLOUT, SUBMISSION
 from lagbench.submission.findings import Finding
 from lagbench.work.progress import Progress
 

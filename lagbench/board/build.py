@@ -17,15 +17,14 @@ from lagbench.atomic import write_atomically
 from lagbench.data.registry import Registry, Size, load
 from lagbench.errors import ChecksFailedError, DataError, UnreadableFileError, UsageError
 from lagbench.floors.shipped import FloorScores, solver_seconds
-from lagbench.floors.table import FLOORS
+from lagbench.floors.table import FLOORS, counting
 from lagbench.metrics.aggregate import Score
 from lagbench.metrics.metric import mean
 from lagbench.metrics.significance import FEWEST_SCENARIOS, Standing, mean_loss, standings
 from lagbench.metrics.table import METRICS
 from lagbench.report.html import tag
-from lagbench.scoring.card import skill
+from lagbench.scoring.card import Preview, skill
 from lagbench.scoring.stored import Stored, read_stored, reported_frames
-from lagbench.scoring.task import Preview
 from lagbench.submission.task_checks import frames_to_predict
 
 from .entry import Cost, Entry, Status, Verification
@@ -200,7 +199,7 @@ def _row(
     preview, ranking = held.stored[0].preview, held.stored[0].scores.ranking
     scores = {name: found.score for name, found in held.scores.items()}
     better, known = None, {floor.name: floor.scores[ranking] for floor in floors if ranking in floor.scores}
-    if held.current and (found := skill(held.scores[ranking].seeds, known)) is not None:
+    if held.current and (found := skill(held.scores[ranking].seeds, counting(known))) is not None:
         low, high = found.interval
         better = Value(
             mean=found.value, std=found.std, low=low, high=high, per_scenario=(), at={}, undefined=0

@@ -22,10 +22,9 @@ from lagbench.floors.shipped import FloorScores, shipped
 from lagbench.floors.table import FLOORS as KNOWN
 from lagbench.metrics.aggregate import Score, aggregate, bootstrap_interval, mean_over_seeds
 from lagbench.metrics.table import METRICS
-from lagbench.scoring.card import ScoreCard, digits
+from lagbench.scoring.card import SUBMISSION, ScoreCard, digits
 from lagbench.scoring.score_file import StoredScores, write_statistics
 from lagbench.scoring.stored import read_stored
-from lagbench.scoring.task import SUBMISSION
 
 from .entry import LONGEST_TEXT, OUTSIDE, DataSet, Flag, ScoredFile, Summary
 from .folder import FLOORS, Folder

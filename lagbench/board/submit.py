@@ -23,11 +23,10 @@ from lagbench.data.hdf5 import check_file
 from lagbench.data.registry import Registry, load
 from lagbench.errors import ChecksFailedError, Mistakes, UsageError, WorkFailedError
 from lagbench.floors.table import FLOORS as KNOWN_FLOORS
-from lagbench.scoring.card import ScoreCard
+from lagbench.scoring.card import SUBMISSION, ScoreCard
 from lagbench.scoring.score import score
 from lagbench.scoring.score_file import write_statistics
 from lagbench.scoring.stored import MAX_SCORE_BYTES, read_stored
-from lagbench.scoring.task import SUBMISSION
 from lagbench.submission.checks import outside_share
 from lagbench.submission.findings import ValidationResult
 from lagbench.submission.format import WRITE, Header

@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from statistics import NormalDist
 from typing import Self
@@ -22,6 +22,14 @@ from lagbench.errors import UsageError
 
 from .frame import Floats, FramePair
 from .metric import Metric, mean
+
+LARGEST = float(np.finfo(np.float32).max)
+
+LONG_ROLLOUT = 100
+"""Predicted frames beyond which statistics are rounded more coarsely than float32."""
+
+LONG_BITS = 11
+"""Significant bits of statistics of a long rollout: a relative error of 4.9e-4 at most."""
 
 LEVEL = 0.95
 """Share of the resampled means that an interval holds."""
@@ -103,6 +111,21 @@ class Tally:
     def measured(self, name: str) -> NDArray[np.bool_]:
         """Tell at which frames a statistic was measured, defined or not: shape [frame], read-only."""
         return self._rows[name][1]
+
+
+def as_stored(tally: Tally) -> Tally:
+    """Return a tally rounded as scores.nc holds it: to float32, of long rollouts to 11 bits.
+
+    Scores are formed from rounded statistics, so that whoever aggregates scores.nc again gets
+    the same digits. Long rollouts have so many frames that their float32 would not fit into a
+    small file, and that rounding averages out. Beyond float32 a statistic saturates.
+    """
+    total = tally.total
+    if len(tally.frames) > LONG_ROLLOUT:
+        mantissa, exponent = np.frexp(total)
+        total = np.ldexp(np.rint(np.ldexp(mantissa, LONG_BITS)), exponent - LONG_BITS)
+    stored = np.clip(total, -LARGEST, LARGEST).astype(np.float32)
+    return replace(tally, total=stored.astype(np.float64))
 
 
 def measure(pair: FramePair, metrics: Iterable[Metric]) -> dict[str, float]:

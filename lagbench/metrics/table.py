@@ -11,7 +11,8 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from importlib.metadata import EntryPoint
 from types import MappingProxyType
 
-from lagbench.data.registry import installed
+from lagbench.data.grid import Placement
+from lagbench.data.registry import Size, installed
 from lagbench.errors import LagbenchError, UsageError, loaded, nearest
 
 from . import bodies, conservation, distributions, pointwise, transport, vorticity
@@ -48,6 +49,17 @@ CHOSEN = (
     *("shape_error", "connectivity", "sliced_w2", "sinkhorn_pot"),
 )
 """Metrics of the short tables, the one that ranks aside; a data set has some of them."""
+
+
+RANKING: Mapping[Placement, str] = MappingProxyType(
+    {Placement.CELL_CENTRES: "vorticity_nrmse", Placement.NODES: "cloud_distance"}
+)
+"""Metric that ranks: of vorticity where the material fills the box, of clouds where it has a surface."""
+
+
+def ranking_metric(size: Size) -> str:
+    """Return the metric that ranks."""
+    return RANKING[Placement(size.task.score_grid.placement)]
 
 
 def available() -> dict[str, Metric]:

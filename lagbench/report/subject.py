@@ -17,8 +17,8 @@ from lagbench.errors import UsageError
 from lagbench.metrics.aggregate import Score
 from lagbench.metrics.frame import FramePair, Scenario, Snapshot
 from lagbench.metrics.metric import Metric
-from lagbench.scoring.card import ScoreCard, told_apart
-from lagbench.scoring.task import SUBMISSION, OpenScenario, ScoredTask, load_scored_task
+from lagbench.scoring.card import SUBMISSION, ScoreCard, told_apart
+from lagbench.scoring.task import OpenScenario, ScoredTask, load_scored_task
 from lagbench.submission.predictions import open_predictions
 
 COLOURS = 6  # series that differ in colour; further ones are dashed

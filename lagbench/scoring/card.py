@@ -18,16 +18,15 @@ import math
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lagbench.data.checksums import round_digits
 from lagbench.errors import UnreadableFileError, check_regular
-from lagbench.floors.table import FLOORS
-from lagbench.metrics.aggregate import Score, Tally, bootstrap_interval, mean_over_seeds
+from lagbench.metrics.aggregate import LARGEST, Score, Tally, bootstrap_interval, mean_over_seeds
 from lagbench.metrics.frame import Setting
 from lagbench.metrics.metric import Direction, Metric, mean
 from lagbench.metrics.significance import Comparison, compare
@@ -36,7 +35,6 @@ from lagbench.submission.findings import Finding
 from lagbench.submission.format import MAX_NAME, Header
 
 from .flags import Flag
-from .task import LARGEST, SUBMISSION, Preview
 
 FORMAT = 1
 """Number of the layout of scores.json and scores.nc; stored as ``lagbench_scores``."""
@@ -45,6 +43,9 @@ JSON_NAME = "scores.json"
 
 IDENTITY = ("split", "size", "dataset_version", "dataset_sha256", "method")
 """What says which data set was predicted, and by what."""
+
+SUBMISSION = "submission"
+"""Row of the submission; the floors have rows of their names."""
 
 LABELS = ("seconds_per_frame", "device", "seed", "parameters", "training")
 
@@ -68,9 +69,8 @@ class Skill:
 
 
 def best_floor(floors: Mapping[str, Score]) -> str | None:
-    """Return the floor with the least mean; None where none that counts has a mean above 0."""
-    means = {name: score.mean for name, score in floors.items() if name in FLOORS and FLOORS[name].counts}
-    known = {name: value for name, value in means.items() if value > 0.0}
+    """Return which of the floors that count has the least mean; None where none has one above 0."""
+    known = {name: score.mean for name, score in floors.items() if score.mean > 0.0}
     return min(known, key=lambda name: known[name]) if known else None
 
 
@@ -84,7 +84,7 @@ def skill(seeds: Sequence[Score], floors: Mapping[str, Score]) -> Skill | None:
 
     Args:
         seeds: score of each seed, over the same scenarios.
-        floors: scores of the floors by name.
+        floors: scores of the floors that count, by name.
 
     Returns:
         None without a floor that counts, without a scenario that both have, and for a metric of
@@ -114,6 +114,31 @@ def skill(seeds: Sequence[Score], floors: Mapping[str, Score]) -> Skill | None:
     )
 
 
+FRAMES = 45
+"""Frames of the particle film, evenly spaced over the horizon."""
+
+PARTICLES = 200
+"""Particles of the film, evenly spaced over the particle numbers."""
+
+
+@dataclass(frozen=True, eq=False)
+class Preview:
+    """Pictures of one scenario; index 0 of ``side`` is the truth, 1 the prediction."""
+
+    scenario: int  # id of the scenario
+    map_frames: tuple[int, ...]  # frames of interest and the last one
+    # at the compared nodes, NaN elsewhere [1/frame], shape [side, map frame, x node, y node]
+    vorticity: NDArray[np.float32]
+    # shares of 64 bins over the truth's range of omega, NaN where there is none [1], shape
+    # [side, map frame, bin]
+    histogram: NDArray[np.float32]
+    histogram_range: NDArray[np.float32]  # that range [1/frame], shape [map frame, 2]
+    film_frames: tuple[int, ...]
+    particles: tuple[int, ...]  # numbers of the particles in the film
+    material: NDArray[np.int8]  # their materials, shape [film particle]
+    film: NDArray[np.float32]  # their positions [length], shape [side, film frame, film particle, 2]
+
+
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class ScoreCard:
     """What the scorer says of one submission."""
@@ -125,6 +150,7 @@ class ScoreCard:
     # statistics by row and scenario: of the submission, and of floors that were measured beside it
     tallies: Mapping[str, Mapping[int, Tally]]
     scores: Mapping[str, Mapping[str, Score]]  # scores by row (submission, then floors) and metric
+    skill: Skill | None  # how much better than the best floor; None where no floor that counts has a score
     flags: tuple[Flag, ...]  # what a reader should know
     warnings: tuple[Finding, ...]  # findings of the validation that do not reject
     preview: Preview  # pictures of the first scenario
@@ -150,13 +176,6 @@ class ScoreCard:
     def submission(self) -> Mapping[str, Score]:
         """Scores of the submission, by metric."""
         return self.scores[SUBMISSION]
-
-    @cached_property
-    def skill(self) -> Skill | None:
-        """How much better than the best floor; None where no floor that counts has a score."""
-        floors = {row: scores for row, scores in self.scores.items() if row != SUBMISSION}
-        ranked = {row: scores[self.ranking] for row, scores in floors.items() if self.ranking in scores}
-        return skill([self.submission[self.ranking]], ranked)
 
     def against(self, row: str) -> Comparison:
         """Compare the submission with a floor in the ranking metric."""

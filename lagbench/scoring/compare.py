@@ -31,11 +31,10 @@ from lagbench.metrics.significance import FEWEST_SCENARIOS, Comparison
 from lagbench.metrics.significance import compare as compare_scores
 from lagbench.submission.format import MAX_NAME
 
-from .card import JSON_NAME, PublishedScores, digits, parse_scores, read_scores, told_apart
+from .card import JSON_NAME, SUBMISSION, PublishedScores, digits, parse_scores, read_scores, told_apart
 from .score import score
 from .score_file import NETCDF_NAME
 from .stored import MAX_SCORE_BYTES, published, unreadable_in_child
-from .task import SUBMISSION
 
 SAME = ("split", "size", "dataset_sha256")
 """What two submissions must share."""

@@ -18,7 +18,7 @@ import numpy as np
 
 from lagbench.floors.floor import Floor, Given, Prediction, given_in
 from lagbench.floors.table import FLOORS
-from lagbench.metrics.aggregate import Tally, measure
+from lagbench.metrics.aggregate import Tally, as_stored, measure
 from lagbench.metrics.distributions import BINS, histograms
 from lagbench.metrics.frame import FramePair, Scenario, Snapshot, snapshots
 from lagbench.metrics.metric import Metric
@@ -28,8 +28,9 @@ from lagbench.submission.format import Anatomy
 from lagbench.submission.predictions import Predictions, open_predictions
 from lagbench.work.pool import Report
 
+from .card import FRAMES, PARTICLES, SUBMISSION, Preview
 from .flags import Trace, Tracer
-from .task import FRAMES, PARTICLES, SUBMISSION, OpenScenario, Preview, ScoredTask, as_stored
+from .task import OpenScenario, ScoredTask
 
 
 class PreviewRecorder:

@@ -13,9 +13,10 @@ from lagbench.data.registry import Registry
 from lagbench.errors import UnreadableFileError, UsageError, nearest
 from lagbench.floors import extrapolation
 from lagbench.floors.shipped import shipped
+from lagbench.floors.table import counting
 from lagbench.metrics.aggregate import Score, Tally, aggregate
 from lagbench.metrics.metric import Metric
-from lagbench.metrics.table import available, select
+from lagbench.metrics.table import available, ranking_metric, select
 from lagbench.submission.findings import Finding, ValidationResult
 from lagbench.submission.format import Anatomy, Header
 from lagbench.submission.predictions import open_predictions
@@ -24,12 +25,12 @@ from lagbench.work.machine import available_cores
 from lagbench.work.progress import Meter, Progress
 from lagbench.work.run import run_all
 
-from .card import JSON_NAME, ScoreCard, read_scores, spell
+from .card import JSON_NAME, SUBMISSION, ScoreCard, read_scores, skill, spell
 from .flags import Flag, below_twin_floor, copy_suspect, physics
 from .floors import measurable
 from .scenario import ScenarioJob, ScenarioScores, score_scenario
 from .score_file import NETCDF_NAME, write_statistics
-from .task import SUBMISSION, ScoredTask, load_scored_task, ranking_metric
+from .task import ScoredTask, load_scored_task
 from .usable import OF_NODES, few_nodes
 
 PREDICTIONS = "predictions.nc"
@@ -109,14 +110,17 @@ def score(
     }
     scores: dict[str, Mapping[str, Score]] = {row: aggregate(metrics, held) for row, held in tallies.items()}
     scores |= {name: floor.scores for name, floor in known.items()}
+    ranking = ranking_metric(task.size)
+    floored = counting({row: held[ranking] for row, held in scores.items() if ranking in held})
     preview = next(outcome.preview for outcome in outcomes if outcome.preview is not None)
     card = ScoreCard(
         header=header,
         predictions_sha256=content,
         setting=task.setting,
-        ranking=ranking_metric(task.size),
+        ranking=ranking,
         tallies=tallies,
         scores=scores,
+        skill=skill([scores[SUBMISSION][ranking]], floored),
         flags=_flags(task, outcomes, scores),
         warnings=(*result.warnings, *_undefined(task, tallies[SUBMISSION])),
         preview=preview,

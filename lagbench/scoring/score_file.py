@@ -2,7 +2,7 @@
 
 Every score of the submission follows from it: ``read_statistics(path).scores()`` gives the
 digits of scores.json. Statistics are float32 and NaN where undefined, those of long rollouts
-rounded to 11 significant bits (see :func:`lagbench.scoring.task.as_stored`), so that no full size takes
+rounded to 11 significant bits (see :func:`as_stored`), so that no full size takes
 more than 1 MB; ``measured`` tells which were measured at all. What the best floor scores in
 the ranking metric stands beside them, so that the skill can be formed again.
 """
@@ -19,12 +19,10 @@ from numpy.typing import NDArray
 
 from lagbench.atomic import atomic_path
 from lagbench.errors import WorkFailedError
-from lagbench.floors.table import FLOORS
 from lagbench.metrics.aggregate import Score, Tally, aggregate
 from lagbench.metrics.table import available
 
-from .card import FORMAT, IDENTITY, ScoreCard, Skill, printable, skill, unreadable_scores
-from .task import SUBMISSION, Preview
+from .card import FORMAT, IDENTITY, SUBMISSION, Preview, ScoreCard, Skill, printable, skill, unreadable_scores
 
 NETCDF_NAME = "scores.nc"
 
@@ -189,11 +187,13 @@ def read_statistics(path: Path) -> StoredScores:
             names = tuple(str(file.statistics).split())
             frames = tuple(file["frame"][:].tolist())
             scenarios = file["scenario"][:].tolist()
-            floor, of_floor = _best_floor(file, len(scenarios))
+            of_floor = np.empty(0)
+            if "best_floor" in file.ncattrs():
+                of_floor = np.asarray(file["best_floor_value"][:], np.float64)
+                if of_floor.shape != (len(scenarios),) or np.isinf(of_floor).any():
+                    raise ValueError("not the scores of a floor")
             values, measured = file["value"][:].astype(np.float64), file["measured"][:]
-            held = {
-                name: file.getncattr(name) for name in (*IDENTITY, "predictions_sha256", "ranking_metric")
-            }
+            held = {name: file.getncattr(name) for name in file.ncattrs()}
             return StoredScores(
                 identity={name: printable(held, name) for name in IDENTITY},
                 predictions_sha256=printable(held, "predictions_sha256"),
@@ -202,20 +202,11 @@ def read_statistics(path: Path) -> StoredScores:
                     scenario: _tally(names, frames, values[:, i], measured[:, i])
                     for i, scenario in enumerate(scenarios)
                 },
-                best_floor=floor,
+                best_floor=printable(held, "best_floor") if "best_floor" in held else None,
                 best_floor_values=of_floor,
             )
     except Exception as error:  # HDF5 on damaged bytes raises nearly any type
         raise unreadable_scores(path, error) from error
-
-
-def _best_floor(file: Any, scenarios: int) -> tuple[str | None, NDArray[np.float64]]:  # noqa: ANN401
-    if "best_floor" not in file.ncattrs():
-        return None, np.empty(0)
-    name, values = str(file.best_floor), np.asarray(file["best_floor_value"][:], np.float64)
-    if name not in FLOORS or values.shape != (scenarios,) or np.isinf(values).any():
-        raise ValueError("not the scores of a floor")
-    return name, values
 
 
 def _tally(

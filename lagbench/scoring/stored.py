@@ -24,12 +24,12 @@ from lagbench.data.hdf5 import Structure, check_structure, opened
 from lagbench.data.registry import Size
 from lagbench.errors import UnreadableFileError, check_regular
 from lagbench.metrics.distributions import BINS
+from lagbench.metrics.table import ranking_metric
 from lagbench.submission.task_checks import frames_to_predict
 from lagbench.work.machine import in_child
 
-from .card import PublishedScores, unreadable_scores
+from .card import FRAMES, PARTICLES, SUBMISSION, Preview, PublishedScores, unreadable_scores
 from .score_file import FILM_RANGE, StoredScores, read_statistics
-from .task import FRAMES, PARTICLES, SUBMISSION, Preview, ranking_metric
 
 MAX_SCORE_BYTES = 1_000_000  # longest score file [bytes]
 MAX_UNPACKED = 32 << 20  # most that a score file may unpack to [bytes]; the largest of ours takes 3 MB

@@ -11,9 +11,8 @@ from lagbench.metrics.aggregate import Score
 from lagbench.metrics.metric import Direction, Metric, mean
 from lagbench.metrics.table import CHOSEN
 
-from .card import ScoreCard
+from .card import SUBMISSION, ScoreCard
 from .compare import ComparisonResult
-from .task import SUBMISSION
 
 SHOWN_AT_FRAMES = (
     *("vorticity_mse", "vorticity_mae", "vorticity_rmse", "vorticity_pearson", "vorticity_kl"),

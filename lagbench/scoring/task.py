@@ -1,4 +1,4 @@
-"""The test subset as metrics see it: what submissions are scored on; and the forms in which scores are kept.
+"""The test subset as metrics see it: what submissions are scored on.
 
 Scoring needs the files of ``test`` only; what follows from ``train`` stands in datasets.yaml
 or, for a data set that is not recorded there, in its manifest.
@@ -8,9 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,49 +21,12 @@ from lagbench.data.manifest import Manifest, read_manifest
 from lagbench.data.registry import Size
 from lagbench.data.scenario import ScenarioFile
 from lagbench.errors import DataError
-from lagbench.metrics.aggregate import Tally
 from lagbench.metrics.frame import Scenario, Setting, Snapshot, snapshots
 from lagbench.store.copy import bring
 from lagbench.submission.truth import Truth
 
 BLOCK_BYTES = 1 << 20
 """True positions are read in blocks of about this size: a call for each frame costs more than its bytes."""
-
-
-SUBMISSION = "submission"
-"""Row of the submission; the floors have rows of their names."""
-
-LARGEST = float(np.finfo(np.float32).max)
-
-LONG_ROLLOUT = 100
-"""Predicted frames beyond which statistics are rounded more coarsely than float32."""
-
-LONG_BITS = 11
-"""Significant bits of statistics of a long rollout: a relative error of 4.9e-4 at most."""
-
-FRAMES = 45
-"""Frames of the particle film, evenly spaced over the horizon."""
-
-PARTICLES = 200
-"""Particles of the film, evenly spaced over the particle numbers."""
-
-
-@dataclass(frozen=True, eq=False)
-class Preview:
-    """Pictures of one scenario; index 0 of ``side`` is the truth, 1 the prediction."""
-
-    scenario: int  # id of the scenario
-    map_frames: tuple[int, ...]  # frames of interest and the last one
-    # at the compared nodes, NaN elsewhere [1/frame], shape [side, map frame, x node, y node]
-    vorticity: NDArray[np.float32]
-    # shares of 64 bins over the truth's range of omega, NaN where there is none [1], shape
-    # [side, map frame, bin]
-    histogram: NDArray[np.float32]
-    histogram_range: NDArray[np.float32]  # that range [1/frame], shape [map frame, 2]
-    film_frames: tuple[int, ...]
-    particles: tuple[int, ...]  # numbers of the particles in the film
-    material: NDArray[np.int8]  # their materials, shape [film particle]
-    film: NDArray[np.float32]  # their positions [length], shape [side, film frame, film particle, 2]
 
 
 @dataclass(frozen=True)
@@ -120,17 +82,6 @@ class ScoredTask:
                 active_frames=_active_frames(file),
             )
             yield OpenScenario(held, file)
-
-
-RANKING: Mapping[Placement, str] = MappingProxyType(
-    {Placement.CELL_CENTRES: "vorticity_nrmse", Placement.NODES: "cloud_distance"}
-)
-"""Metric that ranks: of vorticity where the material fills the box, of clouds where it has a surface."""
-
-
-def ranking_metric(size: Size) -> str:
-    """Return the metric that ranks."""
-    return RANKING[Placement(size.task.score_grid.placement)]
 
 
 def load_scored_task(size: Size, root: Path, *, subset: str = "test") -> ScoredTask:
@@ -205,18 +156,3 @@ def _floor(manifest: Manifest | None, test: Sequence[int]) -> tuple[float, ...]:
     if len(rows) < len(test) or len({len(row) for row in rows}) != 1:
         return ()
     return tuple(np.mean(rows, axis=0).tolist())
-
-
-def as_stored(tally: Tally) -> Tally:
-    """Return a tally rounded as scores.nc holds it: to float32, of long rollouts to 11 bits.
-
-    Scores are formed from rounded statistics, so that whoever aggregates scores.nc again gets
-    the same digits. Long rollouts have so many frames that their float32 would not fit into a
-    small file, and that rounding averages out. Beyond float32 a statistic saturates.
-    """
-    total = tally.total
-    if len(tally.frames) > LONG_ROLLOUT:
-        mantissa, exponent = np.frexp(total)
-        total = np.ldexp(np.rint(np.ldexp(mantissa, LONG_BITS)), exponent - LONG_BITS)
-    stored = np.clip(total, -LARGEST, LARGEST).astype(np.float32)
-    return replace(tally, total=stored.astype(np.float64))

@@ -16,9 +16,10 @@ from lagbench.data.registry import Size
 from lagbench.errors import LagbenchError
 from lagbench.metrics.coverage import Cloud, covered_nodes, fitting_cells
 from lagbench.metrics.metric import MINIMUM_NODES
+from lagbench.metrics.table import ranking_metric
 from lagbench.submission.findings import Finding, Severity
 
-from .task import ScoredTask, load_scored_task, ranking_metric
+from .task import ScoredTask, load_scored_task
 
 OF_NODES = "vorticity_nrmse"
 """The ranking metric that needs nodes."""
