@@ -40,7 +40,7 @@ from lagbench.cli.output import spell_bytes
 from lagbench.data.checksums import file_sha256
 from lagbench.data.grid import Grid, Placement
 from lagbench.data.registry import Size, load
-from lagbench.floors.table import FLOORS, counting
+from lagbench.floors.table import COUNTING, FLOORS
 from lagbench.metrics import METRICS, Direction, Setting, Tally, aggregate
 from lagbench.metrics.aggregate import as_stored
 from lagbench.metrics.distributions import BINS
@@ -179,7 +179,7 @@ def made_up(size: Size, method: str, seed: int, quality: float) -> ScoreCard:
     )
     grid = Grid(task.score_grid.cells, Placement(task.score_grid.placement))
     scores = {row: aggregate([METRICS[ranking]], held) for row, held in tallies.items()}
-    floors = counting({row: held[ranking] for row, held in scores.items()})
+    floors = {row: held[ranking] for row, held in scores.items() if row in COUNTING}
     return ScoreCard(
         header=header,
         predictions_sha256=f"{seed:064x}",

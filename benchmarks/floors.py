@@ -20,7 +20,7 @@ import numpy as np
 
 from lagbench.data.registry import Size, load
 from lagbench.floors import FloorScores, shipped
-from lagbench.floors.table import counting
+from lagbench.floors.table import COUNTING
 from lagbench.metrics.table import ranking_metric
 from lagbench.scoring.card import best_floor
 
@@ -52,7 +52,7 @@ def main() -> int:
 
 def _print_floors(size: Size, floors: Mapping[str, FloorScores]) -> None:
     ranking = ranking_metric(size)
-    best = best_floor(counting({name: floor.scores[ranking] for name, floor in floors.items()}))
+    best = best_floor({name: floors[name].scores[ranking] for name in COUNTING.intersection(floors)})
     for name, floor in floors.items():
         score = floor.scores[ranking]
         low, high = score.interval

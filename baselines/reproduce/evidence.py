@@ -25,7 +25,7 @@ from lagbench.data.registry import Registry, Size, load
 from lagbench.data.yamlfile import read_yaml
 from lagbench.errors import UnreadableFileError
 from lagbench.floors.shipped import shipped, shipped_path
-from lagbench.floors.table import FLOORS, counting
+from lagbench.floors.table import COUNTING, FLOORS
 from lagbench.metrics.aggregate import Score
 from lagbench.metrics.metric import mean
 from lagbench.metrics.table import ranking_metric
@@ -284,8 +284,8 @@ class Evidence:
     @property
     def best_floor(self) -> str | None:
         """Name of the floor that skill is measured from, as the scorer has it; None where none was scored."""
-        ranked = {n: m.scores[self.ranking] for n, m in self.floors.items() if self.ranking in m.scores}
-        return best_floor(counting(ranked))
+        counting = {n: m for n, m in self.methods.items() if n in COUNTING and self.ranking in m.scores}
+        return best_floor({n: m.scores[self.ranking] for n, m in counting.items()})
 
     def skill(self, name: str) -> float:
         """Return ``1 - score / score of the best floor`` by the ranking metric: 1 perfect, 0 no learning."""

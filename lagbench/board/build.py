@@ -17,7 +17,7 @@ from lagbench.atomic import write_atomically
 from lagbench.data.registry import Registry, Size, load
 from lagbench.errors import ChecksFailedError, DataError, UnreadableFileError, UsageError
 from lagbench.floors.shipped import FloorScores, solver_seconds
-from lagbench.floors.table import FLOORS, counting
+from lagbench.floors.table import COUNTING, FLOORS
 from lagbench.metrics.aggregate import Score
 from lagbench.metrics.metric import mean
 from lagbench.metrics.significance import FEWEST_SCENARIOS, Standing, mean_loss, standings
@@ -198,8 +198,15 @@ def _row(
 ) -> Row:
     preview, ranking = held.stored[0].preview, held.stored[0].scores.ranking
     scores = {name: found.score for name, found in held.scores.items()}
-    better, known = None, {floor.name: floor.scores[ranking] for floor in floors if ranking in floor.scores}
-    if held.current and (found := skill(held.scores[ranking].seeds, counting(known))) is not None:
+    better, known = (
+        None,
+        {
+            floor.name: floor.scores[ranking]
+            for floor in floors
+            if floor.name in COUNTING and ranking in floor.scores
+        },
+    )
+    if held.current and (found := skill(held.scores[ranking].seeds, known)) is not None:
         low, high = found.interval
         better = Value(
             mean=found.value, std=found.std, low=low, high=high, per_scenario=(), at={}, undefined=0

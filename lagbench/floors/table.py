@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from types import MappingProxyType
 
 from lagbench.data.registry import Size
-from lagbench.metrics.aggregate import Score
 
 from . import analog, coarse_solver, extrapolation, frozen_field
 from .floor import Floor
@@ -26,10 +25,8 @@ FLOORS: Mapping[str, Floor] = MappingProxyType(
 )
 """All floors by name, in the order in which they are shown."""
 
-
-def counting(scores: Mapping[str, Score]) -> dict[str, Score]:
-    """Return the scores of the floors that count: those that skill may be measured against."""
-    return {name: score for name, score in scores.items() if name in FLOORS and FLOORS[name].counts}
+COUNTING = frozenset(name for name, floor in FLOORS.items() if floor.counts)
+"""Names of those that skill may be measured against."""
 
 
 def floors_of(size: Size) -> tuple[Floor, ...]:

@@ -13,7 +13,7 @@ from lagbench.data.registry import Registry
 from lagbench.errors import UnreadableFileError, UsageError, nearest
 from lagbench.floors import extrapolation
 from lagbench.floors.shipped import shipped
-from lagbench.floors.table import counting
+from lagbench.floors.table import COUNTING
 from lagbench.metrics.aggregate import Score, Tally, aggregate
 from lagbench.metrics.metric import Metric
 from lagbench.metrics.table import available, ranking_metric, select
@@ -111,7 +111,7 @@ def score(
     scores: dict[str, Mapping[str, Score]] = {row: aggregate(metrics, held) for row, held in tallies.items()}
     scores |= {name: floor.scores for name, floor in known.items()}
     ranking = ranking_metric(task.size)
-    floored = counting({row: held[ranking] for row, held in scores.items() if ranking in held})
+    floored = {row: held[ranking] for row, held in scores.items() if row in COUNTING and ranking in held}
     preview = next(outcome.preview for outcome in outcomes if outcome.preview is not None)
     card = ScoreCard(
         header=header,
