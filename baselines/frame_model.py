@@ -63,14 +63,13 @@ class FrameState(nn.Module):
 
 def side_by_side(batch: Batch, particles: int) -> tuple[Tensor, Tensor]:
     """Return positions [length], shape [window, frame, particle, 2], and materials, [window, particle]."""
-    count = torch.bincount(batch.sample, minlength=batch.windows)
-    if not bool((count == particles).all()):
-        got = ", ".join(map(str, sorted(set(count.tolist()))))
+    counts = set(torch.bincount(batch.sample, minlength=batch.windows).tolist())
+    if counts != {particles}:
         raise DataError(
             "a model of whole frames needs every particle",
             where="batch",
             expected=f"{particles} particles in each window",
-            got=got,
+            got=", ".join(map(str, sorted(counts))),
             fix="use a graph network for scenarios of other sizes",
         )
     position = batch.position.view(batch.windows, particles, batch.frames, -1)
@@ -185,11 +184,6 @@ class FrameNetworkOptions(baseline.Options):
     noise_std: float = Field(default=0.0, ge=0, allow_inf_nan=False)
 
 
-def material_feature(material: Tensor) -> Tensor:
-    """Return the constant fifth feature: 0, 1, 2, 3 mapped to -1 ... 1, shape [..., 1]."""
-    return (material.to(torch.float32) * (2.0 / (MATERIALS - 1)) - 1.0).unsqueeze(-1)
-
-
 class FrameNetwork(FrameModel):
     """Base of the networks: their inputs are states, with the material where the recipe wants it."""
 
@@ -217,8 +211,9 @@ class FrameNetwork(FrameModel):
         """Return the inputs of the network [1], shape [window, frame, particle, 4 or 5]."""
         if not self.options.material:
             return window.state
-        constant = material_feature(window.material).unsqueeze(1)
-        return torch.cat([window.state, constant.expand(-1, window.state.shape[1], -1, -1)], dim=-1)
+        constant = window.material.to(torch.float32) * (2.0 / (MATERIALS - 1)) - 1.0  # 0 ... 3 to -1 ... 1
+        constant = constant[:, None, :, None].expand(-1, window.state.shape[1], -1, -1)
+        return torch.cat([window.state, constant], dim=-1)
 
     def meant(self, output: Tensor, window: FrameWindow) -> Tensor:
         """Return the state that an output of shape [window, feature] means, shape [window, particle, 4]."""

@@ -45,6 +45,7 @@ class MLP(FrameNetwork):
     """
 
     method = "mlp"
+    inputs = 1
 
     class Options(FrameNetworkOptions):
         """Options of the MLP."""
@@ -60,11 +61,6 @@ class MLP(FrameNetwork):
         super().__init__(options, facts)
         inputs = self.input_features * facts.particles
         self.network = dense((inputs, *options.widths, self.features), options.activation)
-
-    @property
-    def inputs(self) -> int:
-        """One frame."""
-        return 1
 
     @property
     def weights(self) -> Mapping[str, float]:

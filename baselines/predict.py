@@ -281,8 +281,8 @@ def _model(
         ) from error
 
 
+# before a recipe's name and before the settings of a prediction, in the words for a training
 RECIPE, PREDICTED_WITH = ", recipe ", ", predicted with "
-"""What comes before a recipe's name and before the settings of a prediction, in the words for a training."""
 
 
 def training_words(checkpoint: Checkpoint) -> str:

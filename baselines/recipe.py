@@ -119,18 +119,16 @@ class TrainingOptions(Settings):
     @classmethod
     def _one_budget(cls, data: object) -> object:
         if isinstance(data, Mapping) and data.get("steps") and data.get("epochs"):
-            message = "give steps or epochs, not both"
-            raise ValueError(message)
+            raise ValueError("give steps or epochs, not both")
         return data
 
     @model_validator(mode="after")
     def _own_subsets(self) -> TrainingOptions:
         if {"test", "valid"} & set(self.windows) or not self.windows:
-            message = (
+            raise ValueError(
                 f"windows={self.windows}: a model is trained on train (and extra), never on test, and not on"
                 " valid, by which its weights are chosen"
             )
-            raise ValueError(message)
         return self
 
     def total_steps(self, windows: int, *, processes: int = 1) -> int:
@@ -272,11 +270,8 @@ def recipe_for(
     settings = tuple(settings)
     where = f"{path.name if path else entry.name}, {name}" + (", and --set" if settings else "")
     for setting in settings:
-        group, changes = _setting(setting)
-        if group == "model":
-            model = _merge(model, changes)
-        else:
-            training = _merge(training, changes)
+        changes = _setting(setting)
+        model, training = _merge(model, changes["model"]), _merge(training, changes["training"])
     if seed is not None:
         training["seed"] = seed
     return Recipe(
@@ -291,11 +286,11 @@ def changed_options(entry: Entry, options: Mapping[str, Any], settings: Iterable
     """Return the options of a trained model with settings such as ``model.average=true``."""
     changed = dict(options)
     for setting in settings:
-        group, changes = _setting(setting)
-        if group != "model":
+        changes = _setting(setting)
+        if changes["training"]:
             fix = "set options of the model: --set model.KEY=VALUE"
             raise UsageError("the training is over", where="--set", got=setting, fix=fix)
-        changed = _merge(changed, changes)
+        changed = _merge(changed, changes["model"])
     before, after = (
         _checked(entry.model.Options, layer, "model", "--set").model_dump(mode="json")
         for layer in (dict(options), changed)
@@ -312,11 +307,7 @@ def changed_options(entry: Entry, options: Mapping[str, Any], settings: Iterable
 
 
 def _read(path: Path) -> _File:
-    content = read_yaml(path)
-    try:
-        return _File.model_validate(content)
-    except ValidationError as error:
-        raise _complaint(error, _File, "", str(path), UnreadableFileError) from None
+    return _checked(_File, read_yaml(path), "", str(path), UnreadableFileError)
 
 
 def _merge(below: Layer, above: Layer) -> Layer:
@@ -334,8 +325,8 @@ def _merge(below: Layer, above: Layer) -> Layer:
     return joined
 
 
-def _setting(text: str) -> tuple[str, Layer]:
-    """Return group and changes of a text such as ``training.schedule.every=100``."""
+def _setting(text: str) -> dict[str, Layer]:
+    """Return the changes of both groups by a text such as ``training.schedule.every=100``."""
     key, equals, value = text.partition("=")
     group, *path = key.strip().split(".")
     if not equals or not path or group not in ("model", "training"):
@@ -354,35 +345,36 @@ def _setting(text: str) -> tuple[str, Layer]:
         ) from None
     for name in reversed(path):
         layer = {name: layer}
-    return group, layer
+    return {"model": {}, "training": {}, group: layer}
 
 
-def _checked(options: type[Checked], values: Layer, group: str, where: str) -> Checked:
+def _checked(
+    options: type[Checked],
+    values: object,
+    group: str,
+    where: str,
+    kind: type[LagbenchError] = UsageError,
+) -> Checked:
+    """Return options, or say what is wrong with them first, with the nearest key for an unknown one."""
     try:
         return options.model_validate(values)
     except ValidationError as error:
-        raise _complaint(error, options, group, where, UsageError) from None
-
-
-def _complaint(
-    error: ValidationError, options: type[BaseModel], group: str, where: str, kind: type[LagbenchError]
-) -> LagbenchError:
-    """Return the first thing that is wrong with options, with the nearest key for an unknown one."""
-    first = error.errors()[0]
+        first = error.errors()[0]
     key = ".".join(str(part) for part in (group, *first["loc"]) if part != "")
     if first["type"] == "extra_forbidden":
+        holder: type[BaseModel] = options
         for step in first["loc"][:-1]:  # the keys of options nested below a path
-            field = options.model_fields.get(str(step))
+            field = holder.model_fields.get(str(step))
             inner = field.annotation if field else None
             if isinstance(inner, type) and issubclass(inner, BaseModel):
-                options = inner
-            elif step == "recipes" or options is _File:
-                options = _Shared
-        fix = nearest(str(first["loc"][-1]), list(options.model_fields))
-        return kind(f"unknown key {key!r}", where=where, fix=fix)
+                holder = inner
+            elif step == "recipes" or holder is _File:
+                holder = _Shared
+        fix = nearest(str(first["loc"][-1]), list(holder.model_fields))
+        raise kind(f"unknown key {key!r}", where=where, fix=fix)
     expected = first["msg"].removeprefix("Value error, ")
     if first["type"] == "tuple_type":
         expected = "a list in brackets"
     whole = isinstance(first["input"], Mapping) and not first["type"].endswith("_type")
     got = None if whole else repr(first["input"])[:80]
-    return kind(f"{key} does not fit", where=where, expected=expected, got=got)
+    raise kind(f"{key} does not fit", where=where, expected=expected, got=got)

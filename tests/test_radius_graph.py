@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from lagbench.baselines.graph import _graph_torch, radius_graph
+from lagbench.baselines.graph import edge_numbers, radius_graph
 from lagbench.errors import UsageError
 
 Floats = NDArray[np.float32]
@@ -26,7 +26,14 @@ def on_cpu(position: Tensor, radius: float, sample: Tensor | None, self_edges: b
     return radius_graph(position, radius, sample, self_edges=self_edges)
 
 
-BOTH = pytest.mark.parametrize("search", [on_cpu, _graph_torch], ids=["numpy", "torch"])
+def by_torch(position: Tensor, radius: float, sample: Tensor | None, self_edges: bool) -> Tensor:
+    """Search by the operations that a GPU runs."""
+    window = torch.zeros(len(position), dtype=torch.int64) if sample is None else sample
+    edges = edge_numbers(torch, position.double(), window, radius, self_edges).sort().values
+    return torch.stack([edges & 0xFFFFFFFF, edges >> 32])
+
+
+BOTH = pytest.mark.parametrize("search", [on_cpu, by_torch], ids=["numpy", "torch"])
 
 
 def brute_force(
