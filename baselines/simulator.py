@@ -16,10 +16,9 @@ particle. Weights are applied by the trainer.
 from __future__ import annotations
 
 import enum
-import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import torch
 from pydantic import Field
@@ -115,7 +114,7 @@ def loss_terms(
         full = float((sums.weight**2).sum() / sums.weight.sum())
         velocity = node_velocity(sums, full)
         true = Fields(grid, sums.weight, velocity, counted_nodes(sums.weight, full), full)
-    where = {"full": full, "sample": sample, "windows": windows, "counted": true.counted}
+    where: dict[str, Any] = {"full": full, "sample": sample, "windows": windows, "counted": true.counted}
     with _graph(weights, *GRID_TERMS):  # the prediction's fields at the nodes that count in the truth
         own = fields(predicted.position, predicted.velocity, grid, **where)
     with _graph(weights, "density"):
@@ -243,11 +242,12 @@ class GraphNetwork(Baseline):
             nn.init.zeros_(parameter)
 
     @classmethod
-    @functools.cache
     def with_operator(cls, operator: type[Operator]) -> type[GraphNetwork]:
         """Return the graph network with an operator; the same class for the same operator."""
-        names = {"operator": operator, "method": operator.method, "__doc__": operator.__doc__}
-        return type(f"{operator.__name__}Network", (cls,), names)
+        if operator not in _CLASSES:
+            names = {"operator": operator, "method": operator.method, "__doc__": operator.__doc__}
+            _CLASSES[operator] = type(f"{operator.__name__}Network", (cls,), names)
+        return _CLASSES[operator]
 
     @property
     def history(self) -> int:
@@ -366,3 +366,6 @@ class GraphNetwork(Baseline):
             return position
         low, high = position.new_tensor(self.facts.bounds).T
         return position.detach().clamp(low, high) + (position - position.detach())
+
+
+_CLASSES: dict[type[Operator], type[GraphNetwork]] = {}

@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from itertools import chain, count, islice, pairwise
 from pathlib import Path
 
@@ -336,10 +337,9 @@ def fit(job: TrainingJob, model: Baseline) -> tuple[TrainingRecord, int]:
         )
 
     def scenarios() -> Iterator[NDArray[np.float32]]:
-        where = {"size": job.facts.size, "root": job.root, "registry": job.registry}
-        wanted = job.recipe.training.windows
-        found = (scenario_paths(job.facts.split, subset=subset, **where).values() for subset in wanted)
-        paths = [*chain.from_iterable(found)]
+        find_in = partial(scenario_paths, job.facts.split, size=job.facts.size, root=job.root)
+        parts = (find_in(subset=one, registry=job.registry) for one in job.recipe.training.windows)
+        paths = [path for part in parts for path in part.values()]
         job.meter.begin("fitting", total=len(paths) + 1, scenarios=len(paths))
         for path in paths:
             yield scenario_batch(path).position.transpose(0, 1).numpy()

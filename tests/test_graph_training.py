@@ -21,7 +21,6 @@ from lagbench.baselines.simulator import (
     GraphNetwork,
     LossNorm,
     Motion,
-    Scales,
     State,
     loss_terms,
 )
@@ -31,7 +30,9 @@ from lagbench.make.generate import GenerationResult
 from lagbench.torch import WindowDataset, collate
 
 GRID = scoring.Grid(10)
-SCALES = Scales(torch.tensor([0.25, 0.3]), torch.tensor([0.004, 0.003]), torch.tensor([2e-4, 1e-4]))
+DEVIATIONS = {"position": (0.25, 0.3), "velocity": (0.004, 0.003), "acceleration": (2e-4, 1e-4)}
+SCALES = {name: torch.tensor(pair) for name, pair in DEVIATIONS.items()}
+SPEED = np.sqrt((0.004**2 + 0.003**2) / 2)
 WINDOWS = 2
 SAMPLE = torch.arange(WINDOWS).repeat_interleave(256)
 
@@ -59,7 +60,7 @@ def by_numpy(predicted: Motion, target: Motion, p: int) -> dict[str, float]:
     """Return the six terms by NumPy and lagbench.data.grid, term after term as Eqs. 5.29-5.34 stand."""
     found = {}
     for name in ("acceleration", "velocity", "position"):
-        error = (getattr(predicted, name) - getattr(target, name)).numpy() / getattr(SCALES, name).numpy()
+        error = (getattr(predicted, name) - getattr(target, name)).numpy() / SCALES[name].numpy()
         found[name] = (np.abs(error) ** p).sum(axis=1).mean()
     shape = (WINDOWS, 256, 2)
     true_x, true_u, own_x, own_u = (
@@ -70,9 +71,8 @@ def by_numpy(predicted: Motion, target: Motion, p: int) -> dict[str, float]:
     true = scoring.fields(true_x, true_u, GRID, full=full)
     own = scoring.fields(own_x, own_u, GRID, full=full, counted=true.counted)
     found["density"] = (np.abs(own.density - true.density) ** p).mean()
-    speed = np.sqrt((0.004**2 + 0.003**2) / 2)
     for name in ("divergence", "vorticity"):
-        error = (getattr(own, name) - getattr(true, name)) / speed
+        error = (getattr(own, name) - getattr(true, name)) / SPEED
         found[name] = np.nanmean(np.abs(error) ** p)
     return found
 
@@ -118,7 +118,7 @@ def test_a_linear_flow_costs_what_its_gradient_says(name: str) -> None:
         norm=LossNorm.L2,
         weights={},
     )
-    expected = (0.004 / float(SCALES.speed)) ** 2
+    expected = (0.004 / SPEED) ** 2
     assert float(found[name]) == pytest.approx(expected, rel=0.02)
     other = ({"vorticity", "divergence"} - {name}).pop()
     assert float(found[other]) < 1e-9 * expected
@@ -194,7 +194,7 @@ def test_training_and_rollouts_take_the_same_step() -> None:
     model = network(awake=True, rollout_loss_steps=3)
     found = model(window)
     state, each = model.start(window.part(slice(6))), []
-    scales = Scales(model.position.std, model.velocity.std, model.acceleration.std)
+    scales = {name: getattr(model, name).std for name in SCALES}
     for frame in (6, 7, 8):
         last = state.velocity[:, -1]
         state, position = model.advance(state)

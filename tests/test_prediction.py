@@ -100,26 +100,28 @@ def run(
     return call
 
 
-def truth(root: Path) -> dict[int, np.ndarray]:
-    """Return the positions of the test scenarios by id, read without our code."""
-    found = {}
-    for file in sorted((root / "curl-noise/tiny/v2/test").glob("*.nc")):
-        with netCDF4.Dataset(file) as data:
-            found[int(file.stem)] = np.asarray(data["position"][:], np.float64)
-    return found
-
-
 def written(path: Path, name: str = "position") -> np.ndarray:
-    """Return a variable of a predictions.nc."""
+    """Return a variable of a file, read without our code."""
     with netCDF4.Dataset(path) as data:
         return np.asarray(data[name][:])
+
+
+def said(path: Path) -> dict[str, Any]:
+    """Return the attributes of a file."""
+    with netCDF4.Dataset(path) as data:
+        return {name: data.getncattr(name) for name in data.ncattrs()}
+
+
+def truth(folder: Path) -> dict[int, np.ndarray]:
+    """Return the positions of the test scenarios by id."""
+    return {int(file.stem): written(file).astype(float) for file in sorted(folder.glob("test/*.nc"))}
 
 
 def test_a_drift_in_closed_form(run: Predict, generated: GenerationResult) -> None:
     """With a = 1/2 the k-th position is x + (1 - 2^-k) u, u the last given velocity."""
     result = run(start=0.5)
     shares = 1 - 0.5 ** np.arange(1, 21)
-    for row, position in enumerate(truth(generated.root).values()):
+    for row, position in enumerate(truth(generated.folder).values()):
         last, velocity = position[5], position[5] - position[4]
         expected = last + shares[:, None, None] * velocity
         assert np.abs(written(result.path)[row] - expected).max() < 1e-6
@@ -129,11 +131,10 @@ def test_the_file_is_valid_and_says_what_made_it(
     run: Predict, generated: GenerationResult, unmeasured: Registry
 ) -> None:
     """The file passes every check, and holds cost, device, seed, parameters and training."""
-    result = run(method="my drift")
+    result = run(method="my drift", training={"best_step": 4})  # of a state that is not the best
     report = examine(result.path, root=generated.root, registry=unmeasured)
     assert report.valid, report.findings
-    with netCDF4.Dataset(result.path) as data:
-        found = {name: data.getncattr(name) for name in data.ncattrs()}
+    found = said(result.path)
     assert (found["method"], found["seed"], found["parameters"]) == ("my drift", 3, 1)
     assert "curl-noise/tiny, step 9" in found["training"]
     assert "1 thread" in found["device"]
@@ -152,12 +153,16 @@ def test_batches_do_not_matter(run: Predict) -> None:
 def test_a_rollout_is_frozen_where_it_diverges(run: Predict, generated: GenerationResult) -> None:
     """From frame 6 + 4 on, positions are those of frame 9, and the file says so."""
     result = run(model={"explode_at": 5})
-    position = written(result.path)
-    assert result.diverged == dict.fromkeys(truth(generated.root), 10)
+    position, given = written(result.path), truth(generated.folder)
+    assert result.diverged == dict.fromkeys(given, 10)
     assert written(result.path, "diverged_at").tolist() == [10, 10]
     assert np.isfinite(position).all()
     assert (position[:, 4:] == position[:, 3:4]).all()
     assert (position[:, 3] != position[:, 2]).any()
+    never = run(model={"explode_at": 1}, name="never.nc")  # stays at the last given frame
+    for row, position in enumerate(given.values()):
+        assert (written(never.path)[row] == position[5].astype(np.float32)).all()
+    assert set(never.diverged.values()) == {6}
 
 
 @pytest.mark.parametrize(("batch", "seconds"), [(1, 1.0), (2, 1.5)])
@@ -178,21 +183,6 @@ def test_frozen_frames_are_not_timed(
     assert list(result.diverged.values()) == [9, 9]
     assert result.seconds_per_frame == seconds
     assert result.clock == "processor"  # one thread: what else runs here does not count
-
-
-def test_the_last_state_is_called_by_its_own_step(run: Predict) -> None:
-    """Of checkpoint.pt, which is not the best, the file says the step that it was stored at."""
-    result = run(training={"best_step": 4})
-    with netCDF4.Dataset(result.path) as data:
-        assert "step 9" in data.getncattr("training")
-
-
-def test_divergence_in_the_first_frame(run: Predict, generated: GenerationResult) -> None:
-    """A rollout that is never finite stays at the last given frame."""
-    result = run(model={"explode_at": 1})
-    for row, position in enumerate(truth(generated.root).values()):
-        assert (written(result.path)[row] == position[5].astype(np.float32)).all()
-    assert set(result.diverged.values()) == {6}
 
 
 def windows(firsts: list[float]) -> Batch:
@@ -267,15 +257,11 @@ def test_what_is_no_frame_is_not_broadcast(answer: Any, monkeypatch: pytest.Monk
     assert caught.value.where == "Wrong.advance"
 
 
-def test_rollouts_keep_the_mode() -> None:
-    """A model in training is rolled out without dropout, and is in training afterwards."""
-    model = Drift.build({}, FACTS).train()
-    roll_out(model, windows([0.9]), 1)
-    assert model.training
-
-
-def test_rounding_for_a_while() -> None:
-    """Weights are in bfloat16 inside and have all their bits again outside."""
+def test_rollouts_keep_mode_and_weights() -> None:
+    """In training it is in training afterwards; rounded to bfloat16 for a while it has all its bits again."""
+    drift = Drift.build({}, FACTS).train()
+    roll_out(drift, windows([0.9]), 1)
+    assert drift.training
     model = torch.nn.Linear(8, 8)
     before = {name: value.clone() for name, value in model.state_dict().items()}
     with as_published(model):
@@ -316,28 +302,19 @@ def test_another_size_than_that_of_the_training(
     ones = dict.fromkeys(here.statistics, (1.0, 1.0))
     trained = replace(here, size="mini", dataset_sha256="0" * 64, radius=0.5, horizon=3, statistics=ones)
     trained = replace(trained, particles=4 * here.particles)
-    budget = {
-        "cpu_hours": 0.1,
-        "steps": 9,
-        "metric": "vorticity_nrmse",
-        "best": 0.2,
-        "validations": [[9, 0.2]],
-    }
+    valid = {"metric": "vorticity_nrmse", "best": 0.2, "validations": [[9, 0.2]]}
+    budget = {"cpu_hours": 0.1, "steps": 9, **valid}
     result = run("scaled", start=0.5, facts=trained, size="tiny", training={"budget": budget})
     assert (result.size, result.trained_size) == ("tiny", "mini")
     assert Scaled.told == replace(here, radius=1.0, statistics=ones)
     assert np.array_equal(written(result.path), written(run(start=0.5, name="own.nc").path))
     report = examine(result.path, root=generated.root, registry=unmeasured)
     assert report.valid, report.findings
-    with netCDF4.Dataset(result.path) as data:
-        assert json.loads(data.getncattr("budget")) == {"cpu_hours": 0.1, "steps": 9}
-        assert data.getncattr("training").startswith("curl-noise mini train")
+    assert json.loads(said(result.path)["budget"]) == {"cpu_hours": 0.1, "steps": 9}
+    assert said(result.path)["training"].startswith("curl-noise mini train")
     other = replace(trained, frame_interval=2.0 * here.frame_interval)
-    for name, facts, size in (
-        ("drift", trained, "tiny"),
-        ("scaled", other, "tiny"),
-        ("scaled", trained, "small"),
-    ):
+    wrong = (("drift", trained, "tiny"), ("scaled", other, "tiny"), ("scaled", trained, "small"))
+    for name, facts, size in wrong:
         with pytest.raises(UsageError):
             run(name, size=size, facts=facts)
     with pytest.raises(DataError):
@@ -348,9 +325,7 @@ def test_what_the_training_changed_is_told(run: Predict) -> None:
     """The file says by which ``--set`` the recipe became another, apart from changes of the prediction."""
     recipe = recipe_for(find("gns"), "curl-noise", "tiny", settings=["training.steps=77"]).as_json()
     result = run(training={"recipe": recipe}, settings=["model.explode_at=3"])
-    with netCDF4.Dataset(result.path) as data:
-        told = data.getncattr("training")
-    before, _, after = told.partition("predicted with")
+    before, _, after = said(result.path)["training"].partition("predicted with")
     assert "training.steps=77" in before
     assert "model.explode_at=3" not in before
     assert "model.explode_at=3" in after
@@ -365,8 +340,7 @@ def test_a_model_is_changed_where_that_needs_no_weights(
         written(result.path), written(run(model={"explode_at": 3}, name="trained.nc").path), equal_nan=True
     )
     assert set(result.diverged.values()) == {8}
-    with netCDF4.Dataset(result.path) as data:
-        assert data.getncattr("training").endswith("model.explode_at=3")
+    assert said(result.path)["training"].endswith("model.explode_at=3")
     install(monkeypatch, several=Several)
     for setting in ("training.steps=3", "model.explode=1", "model.count=2"):
         with pytest.raises(UsageError):
@@ -396,12 +370,8 @@ def test_at_its_own_size_a_model_keeps_its_radius(run: Predict, generated: Gener
 
 def test_models_of_any_size_have_the_same_weights_at_each() -> None:
     """No parameter of theirs depends on the number of particles; MLPs and the like are not among them."""
-    statistics = {
-        f"{name}_{of}": (0.5, 0.5)
-        for name in ("position", "velocity", "acceleration")
-        for of in ("mean", "std")
-    }
-    small = replace(FACTS, statistics=statistics)
+    kinds = [f"{name}_{of}" for name in ("position", "velocity", "acceleration") for of in ("mean", "std")]
+    small = replace(FACTS, statistics=dict.fromkeys(kinds, (0.5, 0.5)))
     large = replace(small, size="full", particles=12, radius=0.05)
     models = {name: entry.model for name, entry in every_entry().items() if entry.model.any_size}
     assert {"neuralmpm", "gns", "supergat"} <= set(models) <= set(every_entry()) - {"mlp", "lstm", "var"}
@@ -413,14 +383,18 @@ def test_models_of_any_size_have_the_same_weights_at_each() -> None:
         assert shapes[0] == shapes[1], model.method
 
 
-@pytest.mark.parametrize("name", ["weights.pt", "training.nc", ".", "predictions.json", "taken.nc"])
+@pytest.mark.parametrize(
+    "name", ["weights.pt", "training.nc", ".", "predictions.json", "taken.nc", "scenario.nc"]
+)
 def test_nothing_else_is_replaced(
-    run: Predict, tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
+    run: Predict, tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch, generated: GenerationResult
 ) -> None:
     """Not the weights, nor the record of their training, whose name that of the cost would be; no folder.
 
-    Predictions and their cost have two names.
+    No scenario, which is a file of the same format. Predictions and their cost have two names.
     """
+    scenario = next(generated.folder.glob("test/*.nc")).read_bytes()
+    (tmp_path / "scenario.nc").write_bytes(scenario)
     (tmp_path / "taken.json").mkdir()
     record = {**UNFINISHED, "state": "finished"}
     (tmp_path / "training.json").write_text(json.dumps(record))
@@ -429,6 +403,7 @@ def test_nothing_else_is_replaced(
     assert caught.value.where == "--output"
     assert json.loads((tmp_path / "training.json").read_text()) == record
     assert load(tmp_path / "weights.pt").baseline == "drift"
+    assert (tmp_path / "scenario.nc").read_bytes() == scenario
     monkeypatch.chdir(tmp_path)
     with pytest.raises(UsageError):
         check_replaceable(Path())
@@ -437,15 +412,6 @@ def test_nothing_else_is_replaced(
     (tmp_path / "predictions.json").write_text('{"seconds_per_frame": 1.0}')  # as scores have it too
     with pytest.raises(UsageError):
         run(name="predictions.nc")
-
-
-def test_no_scenario_is_replaced(run: Predict, tmp_path: Path, generated: GenerationResult) -> None:
-    """It is a file of the same format, and the truth."""
-    scenario = next(generated.folder.glob("test/*.nc")).read_bytes()
-    (tmp_path / "scenario.nc").write_bytes(scenario)
-    with pytest.raises(UsageError):
-        run(name="scenario.nc")
-    assert (tmp_path / "scenario.nc").read_bytes() == scenario
 
 
 def test_out_of_memory(run: Predict, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -496,25 +462,28 @@ def test_what_is_no_record_of_these_weights_is_passed_over(
     assert run(training={"state": "running"}).path.is_file()
 
 
+CORES = len(os.sched_getaffinity(0))
+
+
 @pytest.mark.parametrize(
-    ("count", "environment", "expected"),
-    [(3, "2", 3), (None, "2", 2), (None, "0", 1), (None, "", None), (None, "many", None)],
+    ("count", "environment", "processes", "expected"),
+    [
+        *(
+            (3, "2", 1, 3),
+            (None, "2", 1, 2),
+            (None, "0", 1, 1),
+            (None, "", 1, CORES),
+            (None, "many", 1, CORES),
+        ),
+        *((None, "", CORES, 1), (None, "", CORES + 1, 1)),
+    ],
 )
 def test_threads_are_those_asked_for(
-    monkeypatch: pytest.MonkeyPatch, count: int | None, environment: str, expected: int | None
+    monkeypatch: pytest.MonkeyPatch, count: int | None, environment: str, processes: int, expected: int
 ) -> None:
-    """The option wins over OMP_NUM_THREADS, that over one per core; afterwards all is as before."""
+    """The option wins over OMP_NUM_THREADS, that over a share of the cores; afterwards all is as before."""
     monkeypatch.setenv("OMP_NUM_THREADS", environment)
     before = torch.get_num_threads()
-    with threads_used(count):
-        assert torch.get_num_threads() == (expected or len(os.sched_getaffinity(0)))
+    with threads_used(count, processes=processes):
+        assert torch.get_num_threads() == expected
     assert torch.get_num_threads() == before
-
-
-def test_processes_share_the_cores(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As many processes as cores have one thread each."""
-    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
-    cores = len(os.sched_getaffinity(0))
-    for processes in (cores, cores + 1):
-        with threads_used(None, processes=processes):
-            assert torch.get_num_threads() == 1
