@@ -1,16 +1,12 @@
 """A model of whole frames: the next state from the last few, fed with its own predictions.
 
-Training and rollouts call the same :meth:`FrameModel.next_state`; a model is a file with its
-layers and that one method.
-
-The state of a whole frame: positions and velocities of all particles, standardised.
+A model is a file with its layers and :meth:`FrameModel.next_state`, for training and rollouts. A state is
+positions and velocities of all particles, standardised.
 
     z = (q - mean) / std,   q = (x, y, u, v),   u(f) = x(f) - x(f-1)          (Eq. 4.15)
 
 with the public statistics of the training scenarios, one figure per feature. The first frame of
 a window has no frame before it: it takes the velocity of the second.
-
-What MLP and LSTM share: material as an input, what the output means, noise in training.
 """
 
 from __future__ import annotations
@@ -91,10 +87,7 @@ def squared_errors(truth: Tensor, predicted: Tensor) -> dict[str, Tensor]:
 
 
 class FrameModel(Baseline):
-    """Base of MLP, LSTM and VAR.
-
-    The loss terms are the two halves of Eq. 4.16, in standardised units: the mean squared error
-    of positions and that of velocities. A rollout feeds the predicted velocities back too.
+    """Base of MLP, LSTM and VAR. A rollout feeds the predicted velocities back too.
 
     Class attributes:
         precision: type of the states; predicted positions are float32 whatever it is.

@@ -9,10 +9,8 @@ the cells above a particle's own, and the three beside it in the next column, ar
 consecutive particles; their distances are all that has to be computed. NumPy does this on the
 CPU, torch elsewhere, with the same roundings: they agree to the last edge.
 
-What a graph network sees: motion, walls and material of a particle, its neighbours' places.
-
-Positions enter only as differences, so that away from walls the features do not change when
-all particles move by the same vector.
+What a graph network sees: motion, walls and material of a particle, its neighbours' places; of positions
+only differences, so that away from walls the features do not change when all particles move by one vector.
 """
 
 from __future__ import annotations

@@ -64,7 +64,6 @@ class TrainingModule(LightningModule):
         self._rate = options.learning_rate * processes
         self._loader = loader  # returns the batches of a process, by its rank among so many
         self._resumed = optimizer
-        self._noise: torch.Generator | None = None
 
     @property
     def learning_rate(self) -> float:
@@ -98,9 +97,7 @@ class TrainingModule(LightningModule):
         where = f"{type(self.model).__qualname__}.forward"
         seed = seed_of(self.recipe.seed, self.step, self.global_rank)
         reseed(seed)
-        if self._noise is None:
-            self._noise = torch.Generator(device=self.device)
-        terms = self.model(batch, self._noise.manual_seed(seed))
+        terms = self.model(batch, torch.Generator(device=self.device).manual_seed(seed))
         named = terms if isinstance(terms, Mapping) else {"no dict": terms}
         fit = named is terms and all(isinstance(one, Tensor) and one.numel() == 1 for one in named.values())
         if not named or not fit:

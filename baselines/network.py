@@ -1,8 +1,4 @@
-"""Encode, process, decode: the graph network that all six operators share, and its layers.
-
-They are fast and exact on CPUs: products go to oneDNN, normalising layers learn in bfloat16 too, and
-large edge updates keep no hidden layer: the backward pass computes them again.
-"""
+"""Encode, process, decode: the graph network that all six operators share, and its layers for CPUs."""
 
 from __future__ import annotations
 

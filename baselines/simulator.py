@@ -18,7 +18,7 @@ from __future__ import annotations
 import enum
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import ClassVar, NamedTuple, Self
 
 import torch
 from pydantic import Field
@@ -32,7 +32,7 @@ from .augmentation import Symmetry, disturbed
 from .baseline import Baseline, Batch, Facts, Options, check_moving_walls, last_velocities
 from .graph import EDGE_FEATURES, NodeFeatures, Scale, edge_features, radius_graph
 from .network import EncodeProcessDecode
-from .torch_grid import Fields, counted_nodes, fields, node_velocity, transfer
+from .torch_grid import fields, transfer
 
 
 class Motion(NamedTuple):
@@ -112,11 +112,10 @@ def loss_terms(
         # A node's weight around a particle, on the average: the full weight of a box that is full,
         # and defined for a splash too, whose area is not known here.
         full = float((sums.weight**2).sum() / sums.weight.sum())
-        velocity = node_velocity(sums, full)
-        true = Fields(grid, sums.weight, velocity, counted_nodes(sums.weight, full), full)
-    where: dict[str, Any] = {"full": full, "sample": sample, "windows": windows, "counted": true.counted}
+        true = fields(sums, grid, full)
     with _graph(weights, *GRID_TERMS):  # the prediction's fields at the nodes that count in the truth
-        own = fields(predicted.position, predicted.velocity, grid, **where)
+        sums = transfer(predicted.position, predicted.velocity, grid, sample=sample, windows=windows)
+        own = fields(sums, grid, full, true.counted)
     with _graph(weights, "density"):
         terms["density"] = mean_norm((own.density - true.density).unsqueeze(-1), norm)
     count = true.differentiable.sum().clamp(min=1)

@@ -170,14 +170,10 @@ class StableVAR(Fitted):
     def __init__(self, options: Options, facts: Facts) -> None:
         super().__init__(options, facts)
         rank = min(options.rank, self.features)
-        shapes = {
-            "mean": (self.features,),
-            "drift": (self.features,),
-            "directions": (self.features, rank),
-            "response": (rank, self.features),
-        }
-        for name, shape in shapes.items():
-            self.register_buffer(name, torch.zeros(shape))
+        self.register_buffer("mean", torch.zeros(self.features))
+        self.register_buffer("drift", torch.zeros(self.features))
+        self.register_buffer("directions", torch.zeros(self.features, rank))
+        self.register_buffer("response", torch.zeros(rank, self.features))
 
     def fit(self, scenarios: Iterable[NDArray[np.float32]]) -> Mapping[str, float]:
         """Fit mean, drift, directions and response; return the share of variance they hold."""
@@ -321,7 +317,4 @@ def principal_directions(
 
 def _squared(blocks: Iterable[Matrix], basis: Matrix) -> Matrix:
     """Return X'X times a basis."""
-    total = np.zeros_like(basis)
-    for x in blocks:
-        total += x.T @ (x @ basis)
-    return total
+    return sum((x.T @ (x @ basis) for x in blocks), np.zeros_like(basis))

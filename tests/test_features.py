@@ -23,10 +23,9 @@ def node_features(**options: bool) -> NodeFeatures:
     """Return the features of the test's box, the scales without noise."""
     statistics = facts().statistics
     torch.manual_seed(0)
-    velocity, acceleration = (
-        Scale(statistics[f"{name}_mean"], statistics[f"{name}_std"]) for name in ("velocity", "acceleration")
-    )
-    return NodeFeatures(BOUNDS, velocity, acceleration, RADIUS, **options)
+    kinds = ("velocity", "acceleration")
+    scales = (Scale(statistics[f"{kind}_mean"], statistics[f"{kind}_std"]) for kind in kinds)
+    return NodeFeatures(BOUNDS, *scales, RADIUS, **options)
 
 
 def test_noise_widens_the_deviation_of_the_data() -> None:
@@ -119,14 +118,12 @@ def test_features_do_not_see_where_particles_are() -> None:
     assert torch.equal(edge_features(position, edges, RADIUS), edge_features(shifted, edges, RADIUS))
 
 
-@pytest.fixture(scope="module")
-def walks() -> torch.Tensor:
-    """Noise of deviation 0.3 on six frames of 40,000 particles."""
-    return random_walk(40_000, 6, 0.3, generator())
+def test_noise_has_the_stated_deviation_at_the_last_velocity() -> None:
+    """Velocity noise is a walk: covariance of steps j and k is std^2 min(j, k) / 5 (80,000 draws).
 
-
-def test_noise_has_the_stated_deviation_at_the_last_velocity(walks: torch.Tensor) -> None:
-    """Velocity noise is a walk: covariance of steps j and k is std^2 min(j, k) / 5 (80,000 draws)."""
+    That of x and y, and of neighbours in the row, is uncorrelated.
+    """
+    walks = random_walk(40_000, 6, 0.3, generator())
     velocity = walks.diff(dim=1)
     covariance = torch.einsum("pjc,pkc->jk", velocity, velocity) / velocity[:, 0].numel()
     step = torch.arange(1.0, 6.0)
@@ -135,11 +132,7 @@ def test_noise_has_the_stated_deviation_at_the_last_velocity(walks: torch.Tensor
     torch.testing.assert_close(covariance, expected, rtol=0.0, atol=0.025 * 0.09)
     assert abs(float(velocity[:, -1].std()) - 0.3) < 0.003
     assert not walks[:, 0].any()
-
-
-def test_components_and_particles_are_disturbed_on_their_own(walks: torch.Tensor) -> None:
-    """Noise of x and y, and of neighbours in the row, is uncorrelated."""
-    last = walks.diff(dim=1)[:, -1] / 0.3
+    last = velocity[:, -1] / 0.3
     for one, other in ((last[:, 0], last[:, 1]), (last[1:, 0], last[:-1, 0])):
         assert abs(float((one * other).mean())) < 5 / np.sqrt(len(one))
 
@@ -186,7 +179,10 @@ def test_walls_move_with_the_particles_on_them() -> None:
 
 
 def test_images_are_per_window_and_leave_the_data_alone() -> None:
-    """The first window stays, the second is mirrored in x: x becomes 1 - x in this box."""
+    """The first window stays, the second is mirrored in x: x becomes 1 - x in this box.
+
+    Mixed precision does not round positions or wall velocities to bfloat16.
+    """
     windows = batch(swirl(0, 3), swirl(1, 3), walls=True)
     kept = windows.position.clone()
     matrix = torch.stack([torch.eye(2), torch.diag(torch.tensor([-1.0, 1.0]))])
@@ -195,11 +191,6 @@ def test_images_are_per_window_and_leave_the_data_alone() -> None:
     torch.testing.assert_close(turned.position[:256], kept[:256])
     torch.testing.assert_close(turned.position[256:, :, 0], 1.0 - kept[256:, :, 0])
     torch.testing.assert_close(turned.position[256:, :, 1], kept[256:, :, 1])
-
-
-def test_images_are_exact_under_autocast() -> None:
-    """Mixed precision does not round positions or wall velocities to bfloat16."""
-    windows = batch(swirl(0, 3), swirl(1, 3), walls=True)
     matrix = draw(Symmetry.SQUARE, 2, generator(3))
     plain = image(windows, matrix, BOUNDS)
     with torch.autocast("cpu", torch.bfloat16):

@@ -96,19 +96,19 @@ def test_the_loss_is_equation_4_16() -> None:
     assert loss == pytest.approx(float((predicted - state[2]).square().mean().detach()), rel=1e-5)
 
 
-def test_windows_do_not_mix() -> None:
-    """A rollout of two scenarios side by side equals those of each alone."""
+def test_windows_do_not_mix_and_are_of_as_many_particles() -> None:
+    """A rollout of two scenarios side by side equals those of each alone, of their last two frames.
+
+    Scenarios of another size raise an error that says how many particles it takes.
+    """
     model = MLP.build(SMALL, FACTS)
     both = rolled(model, batch_of([SCENARIOS[0][:2], SCENARIOS[1][:2]]), 5)
     alone = [rolled(model, batch_of([x[:2]]), 5) for x in SCENARIOS[:2]]
     torch.testing.assert_close(both, torch.cat(alone), atol=1e-6, rtol=1e-5)
-
-
-def test_only_the_last_frame_and_its_velocity_count() -> None:
-    """Six given frames start the rollout that their last two do."""
-    model = MLP.build(SMALL, FACTS)
     long, short = (rolled(model, batch_of([SCENARIOS[0][first:6]]), 3) for first in (0, 4))
     assert torch.equal(long, short)
+    with pytest.raises(DataError, match="12 particles in each window\n  got: 11"):
+        model.start(batch_of([SCENARIOS[0][:2, :11]]))
 
 
 def test_a_change_of_nothing_is_persistence() -> None:
@@ -130,20 +130,13 @@ def test_noise_is_as_large_as_asked_and_only_in_training() -> None:
     assert torch.equal(model.disturbed(state, None), state)
 
 
-def test_other_particles_are_refused() -> None:
-    """Scenarios of another size raise an error that says how many particles it takes."""
-    model = MLP.build(SMALL, FACTS)
-    with pytest.raises(DataError, match="12 particles in each window\n  got: 11"):
-        model.start(batch_of([SCENARIOS[0][:2, :11]]))
-
-
 GATED: dict[str, Any] = {"latent": 8, "decoder": [6]}
 BOTH = pytest.mark.parametrize("kind", [LSTM, LSTMWithMLP])
 
 
-def window_of(frames: int = 2) -> FrameWindow:
-    """Return the states of the first scenario's first frames."""
-    state = FrameState(FACTS).of(torch.from_numpy(SCENARIOS[0][:frames]))
+def window_of() -> FrameWindow:
+    """Return the states of the first scenario's first two frames."""
+    state = FrameState(FACTS).of(torch.from_numpy(SCENARIOS[0][:2]))
     return FrameWindow(state[None], torch.zeros(1, 12, dtype=torch.int64))
 
 
@@ -159,19 +152,10 @@ def test_parameters_of_table_4_6(kind: type[LSTM], material: int) -> None:
     assert sum(p.numel() for p in model.parameters()) == expected
 
 
-def elu(a: Array) -> Array:
-    """Return x or exp(x) - 1."""
-    return np.where(a > 0, a, np.expm1(a))
-
-
-def sigmoid(a: Array) -> Array:
-    """Return 1 / (1 + exp(-x))."""
-    return 1 / (1 + np.exp(-a))
-
-
 def cells(layer: torch.nn.LSTM, inputs: Array) -> Array:
     """Return the outputs of an LSTM layer over time by its gates, shape [time, latent]."""
     (w, r, b, c) = (p.detach().numpy().astype(float) for p in layer.parameters())
+    sigmoid = ACTIVATIONS["sigmoid"]
     h = cell = np.zeros(layer.hidden_size)
     outputs = []
     for x in inputs:
@@ -192,8 +176,7 @@ def linear(layer: torch.nn.Module, x: Array) -> Array:
 @BOTH
 def test_a_step_is_the_equations(kind: type[LSTM]) -> None:
     """Encoder, pooling, gates, the MLP between, and decoder, written out, give the same state."""
-    model = kind.build(GATED, FACTS).eval()
-    window = window_of()
+    model, window, elu = kind.build(GATED, FACTS).eval(), window_of(), ACTIVATIONS["elu"]
     latent = elu(linear(model.encoder[0], window.state[0].numpy().astype(float))).mean(axis=1)
     latent = cells(model.first, latent)
     if model.between is not None:
@@ -202,22 +185,10 @@ def test_a_step_is_the_equations(kind: type[LSTM]) -> None:
     expected = linear(model.decoder[2], elu(linear(model.decoder[0], last))).reshape(12, 4)
     found = model.next_state(window)[0].detach().numpy()
     np.testing.assert_allclose(found, expected, atol=1e-5)
-
-
-@BOTH
-def test_pooling_forgets_the_order_of_particles(kind: type[LSTM]) -> None:
-    """Renumbered particles give the same prediction, one to each number."""
-    model = kind.build(GATED, FACTS).eval()
-    window = window_of()
+    # the order of particles is nothing, that of frames is not
     order = torch.randperm(12, generator=torch.Generator().manual_seed(0))
     shuffled = FrameWindow(window.state[:, :, order], window.material)
     torch.testing.assert_close(model.next_state(window), model.next_state(shuffled), atol=1e-6, rtol=1e-5)
-
-
-def test_both_frames_count() -> None:
-    """The earlier of the two states changes the prediction."""
-    model = LSTM.build(GATED, FACTS).eval()
-    window = window_of()
     doubled = FrameWindow(window.state[:, [1, 1]], window.material)
     assert not torch.allclose(model.next_state(window), model.next_state(doubled), atol=1e-6)
 
@@ -225,12 +196,10 @@ def test_both_frames_count() -> None:
 def test_a_rollout_starts_from_two_frames() -> None:
     """Two given frames are enough: the first takes the second's velocity, as its own is unknown."""
     model = LSTM.build(GATED, FACTS)
-    given = SCENARIOS[0][:2]
-    states = model.start(batch_of([given])).state[0]
-    assert torch.equal(states[0, :, 2:], states[1, :, 2:])
+    short, long = (model.start(batch_of([SCENARIOS[0][:frames]])).state[0] for frames in (2, 6))
+    assert torch.equal(short[0, :, 2:], short[1, :, 2:])
+    assert not torch.equal(long[0, :, 2:], long[1, :, 2:])
     assert model.history == 3
-    longer = model.start(batch_of([SCENARIOS[0][:6]])).state[0]
-    assert not torch.equal(longer[0, :, 2:], longer[1, :, 2:])
 
 
 def test_dropout_acts_in_training_only() -> None:

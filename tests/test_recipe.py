@@ -244,7 +244,7 @@ def test_no_such_recipe(entry: Entry) -> None:
         (entry, "curl-noise", "mini", "long", "leave --recipe out"),  # of any split one has no variant
         (entry, "cavity", "huge", "long", "cavity/tiny"),
         (find("neuralmpm"), "multimaterial", "tiny", "conserving", "--size mini or full has it"),
-        (bare, "cavity", "tiny", "long", ""),
+        (bare, "cavity", "tiny", "long", "no recipe"),
     ):
         with pytest.raises(UsageError, match=words):
             recipe_for(asked, split, size, variant=variant)

@@ -172,16 +172,15 @@ def test_seeds(run: Run) -> None:
 
 def test_chance_of_the_caller_is_left_alone(run: Run) -> None:
     """Training draws nothing from the caller's generators."""
-
-    def drawn(train: bool) -> tuple[float, ...]:
+    drawn = []
+    for steps in (2, 0):
         random.seed(5)
         np.random.seed(5)  # noqa: NPY002 (it must not change)
         torch.manual_seed(5)
-        if train:
-            run("drift", "steps=2")
-        return random.random(), float(np.random.random()), float(torch.rand(1))  # noqa: NPY002
-
-    assert drawn(train=True) == drawn(train=False)
+        if steps:
+            run("drift", f"steps={steps}")
+        drawn.append((random.random(), float(np.random.random()), float(torch.rand(1))))  # noqa: NPY002
+    assert drawn[0] == drawn[1]
 
 
 def test_a_loss_that_is_not_finite(run: Run, tmp_path: Path) -> None:
@@ -194,12 +193,6 @@ def test_a_loss_that_is_not_finite(run: Run, tmp_path: Path) -> None:
     assert kept.training["step"] == 4
     assert torch.isfinite(kept.weights["a"]).all()
     assert json.loads((tmp_path / "run/training.json").read_text())["state"] == "failed"
-
-
-def test_out_of_memory(run: Run) -> None:
-    """When memory is full, the message says what to lower."""
-    with pytest.raises(WorkFailedError, match=r"lower --set training\.batch"):
-        run("greedy", "steps=2")
 
 
 def test_a_training_that_stopped_early_is_over(run: Run) -> None:
@@ -362,13 +355,18 @@ def test_a_full_disk(run: Run) -> None:
     assert path.read_bytes() == before
 
 
-@pytest.mark.parametrize("baseline", ["gns", "var"])
-def test_a_model_that_memory_cannot_hold(run: Run, baseline: str) -> None:
-    """A model of 10^15 numbers ends with what to lower, before any step."""
-    setting = "model.lags=1000000000" if baseline == "var" else "model.latent=10000000"
-    with pytest.raises(WorkFailedError, match="out of memory") as caught:
+@pytest.mark.parametrize(
+    ("baseline", "setting", "lower"),
+    [
+        ("greedy", "training.steps=2", r"lower --set training\.batch"),
+        ("gns", "model.latent=10000000", "latent"),
+        ("var", "model.lags=1000000000", "lags"),
+    ],
+)
+def test_out_of_memory(run: Run, baseline: str, setting: str, lower: str) -> None:
+    """When memory is full, by a model of 10^15 numbers before any step, the message says what to lower."""
+    with pytest.raises(WorkFailedError, match=rf"out of memory(.|\n)*{lower}"):
         run(baseline, setting)
-    assert setting.partition("=")[0].partition(".")[2] in str(caught.value)
 
 
 @pytest.mark.parametrize("key", ["noise_std", "radius", "loss.vorticity", "link_weight", "epochs", "clip"])
