@@ -190,13 +190,11 @@ class TrainingCallback(Callback):
         ledger: TrainingRecord,
         *,
         validation: Validation | None,
-        steps: int,
         windows: int,
     ) -> None:
         self.job = job  # the training that was asked for
         self.ledger = ledger  # what it has done so far
         self.validation = validation  # None validates never
-        self.steps = steps  # of the whole training
         self.windows = windows  # of the training subsets
         self._interrupted = False
         self._handlers: dict[int, Any] = {}
@@ -206,8 +204,8 @@ class TrainingCallback(Callback):
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
                 self._handlers[number] = signal.signal(number, self._interrupt)
-        steps = self.steps
-        self.job.meter.begin("training", total=steps, scenarios=steps, done=_of(module).step)
+        steps, step = _of(module).steps, _of(module).step
+        self.job.meter.begin("training", total=steps, scenarios=steps, done=step)
         if self.validation is not None and self.job.recipe.start and not self.ledger.validation:
             self._validate(trainer, _of(module), self.validation)
             self._store(trainer, _of(module))  # weights without a checkpoint could not be gone on with
@@ -217,7 +215,7 @@ class TrainingCallback(Callback):
     ) -> None:
         """Do what is due after a step."""
         trained = _of(module)
-        step, steps, recipe = trained.step, self.steps, trained.recipe
+        step, steps, recipe = trained.step, trained.steps, trained.recipe
         seen = step * recipe.batch * trainer.world_size
         self.ledger.step, self.ledger.windows_seen, self.ledger.epochs = step, seen, seen / self.windows
         last = step >= steps
@@ -311,8 +309,8 @@ class TrainingCallback(Callback):
 
     def _write_record(self, trainer: Trainer, module: TrainingModule) -> None:
         self.ledger.read_clocks(trainer.world_size, device=self.job.device)
-        more = {"steps": self.steps, "windows": self.windows}
-        self.job.folder.write_record(self.job.record(module.model, self.ledger, **more))
+        record = self.job.record(module.model, self.ledger, steps=module.steps, windows=self.windows)
+        self.job.folder.write_record(record)
 
 
 def _of(module: LightningModule) -> TrainingModule:

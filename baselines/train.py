@@ -282,7 +282,7 @@ def descend(job: TrainingJob, model: Baseline) -> tuple[TrainingRecord, int]:
         optimizer=job.earlier.optimizer if job.earlier else None,
     )
     validation = validation_of(options, facts, root=job.root, registry=job.registry)
-    keeper = TrainingCallback(job, ledger, validation=validation, steps=steps, windows=len(data))
+    keeper = TrainingCallback(job, ledger, validation=validation, windows=len(data))
     half = options.precision == "auto" and multiplies_bfloat16(job.device)
     with quiet():
         trainer = Trainer(

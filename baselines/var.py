@@ -186,12 +186,10 @@ class StableVAR(Fitted):
             drift += (y - x[:, 1:]).sum(0) / rows.rows
             squares += float(np.square(x[:, 1:]).sum())
         spread = squares - rows.rows * float(mean @ mean)
-
-        def centred() -> Iterator[Matrix]:
-            return (x[:, 1:] - mean for x, _ in rows)
-
         kept = self.directions.shape[1]
-        directions, eigenvalues = principal_directions(centred, self.features, rank=kept)
+        directions, eigenvalues = principal_directions(
+            lambda: (x[:, 1:] - mean for x, _ in rows), self.features, rank=kept
+        )
         response = np.zeros((kept, self.features))
         for x, y in rows:
             response += ((x[:, 1:] - mean) @ directions).T @ (y - x[:, 1:] - drift)
@@ -231,12 +229,8 @@ def solve(blocks: LaggedRows) -> LeastSquares:
     if blocks.rows >= shape[0]:  # the Gram matrix of the regressors, by blocks of rows
         divided, condition, floor = _factor(lambda: _gram((x for x, _ in blocks), shape[0]))
         found = divided(_products(blocks, shape))
-
-        def residual(x: Matrix, y: Matrix) -> Matrix:  # Y - X B of one block, C-ordered
-            transposed: Matrix = blas.dgemm(-1.0, found, x.T, trans_a=True, beta=1.0, c=y.T)
-            return transposed.T
-
-        found += divided(_products(((x, residual(x, y)) for x, y in blocks), shape))
+        residual = partial(blas.dgemm, -1.0, found, trans_a=True, beta=1.0)  # (Y - X B)' of a block
+        found += divided(_products(((x, residual(x.T, c=y.T).T) for x, y in blocks), shape))
     else:  # the Gram matrix of the rows, which all fit
         x, y = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
         divided, condition, floor = _factor(lambda: _gram([np.ascontiguousarray(x.T)], len(x)))

@@ -52,21 +52,16 @@ OPERATORS: tuple[type[Operator], ...] = (GNS, SuperGAT, SuperGATDot, GAT, GATv2,
 
 
 class Drift(Baseline):
-    """``x(f+1) = x(f) + a (x(f) - x(f-1))``; the best ``a`` is a quotient of two sums.
-
-    Options:
-        fail_at: call of `forward` whose loss is NaN; 0 is none.
-        explode_at: frame of a rollout that is infinite; 0 is none.
-    """
+    """``x(f+1) = x(f) + a (x(f) - x(f-1))``; the best ``a`` is a quotient of two sums."""
 
     method = "Drift"
 
     class Options(Base):
-        """See above."""
+        """Its start, and where it fails."""
 
         start: float = 0.0
-        fail_at: int = 0
-        explode_at: int = 0
+        fail_at: int = 0  # call of `forward` whose loss is NaN; 0 is none
+        explode_at: int = 0  # frame of a rollout that is infinite; 0 is none
 
     def __init__(self, options: Any, facts: Facts) -> None:
         super().__init__(options, facts)

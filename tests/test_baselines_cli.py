@@ -84,15 +84,11 @@ def test_every_baseline_trains_and_predicts(lagbench: Command, baseline: str) ->
 
 def test_from_a_name_to_scores_in_words(lagbench: Command) -> None:
     """Without --json each command says what it did and which one comes next, down to the scores."""
-    trained = lagbench(
-        "train", "curl-noise", "--size", "tiny", "--baseline", "gns", "--set", "training.steps=1"
-    )
+    train = ("train", "curl-noise", "--size", "tiny", "--baseline", "gns", "--set", "training.steps=1")
+    trained = lagbench(*train)
     assert "next: lagbench predict runs/curl-noise/tiny/gns-0/weights.pt" in trained.stdout
     assert "hint: tiny is for tests" in trained.stdout
-    again = lagbench(
-        "train", "curl-noise", "--size", "tiny", "--baseline", "gns", "--set", "training.steps=1"
-    )
-    assert "it was over before" in again.stdout
+    assert "it was over before" in lagbench(*train).stdout
     assert "it was over before" not in trained.stdout
     predict = ("predict", "runs/curl-noise/tiny/gns-0/weights.pt", "--threads", "1", "--no-bench")
     assert lagbench(*predict, "--set", "model.latent=7").exit_code == 2
@@ -145,8 +141,7 @@ def test_mistakes_of_train(lagbench: Command, words: tuple[str, ...], code: int,
 def test_mistakes_of_predict(lagbench: Command, tmp_path: Path) -> None:
     """A pickle, a missing file and data of another version are refused with 3, 3 and 4."""
     (tmp_path / "bomb.pt").write_bytes(pickle.dumps(os.getcwd))
-    assert lagbench("predict", "bomb.pt").exit_code == 3
-    assert lagbench("predict", "none.pt").exit_code == 3
+    assert lagbench("predict", "bomb.pt").exit_code == lagbench("predict", "none.pt").exit_code == 3
     lagbench("train", "--baseline", "gns", *TINY, "--set", "training.steps=1")
     weights = tmp_path / "runs/curl-noise/tiny/gns-0/weights.pt"
     content = torch.load(weights, weights_only=True)

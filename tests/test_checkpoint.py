@@ -51,7 +51,6 @@ def test_round_trip(tmp_path: Path) -> None:
     assert (found.baseline, found.options, found.facts) == (stored.baseline, stored.options, FACTS)
     assert found.training == stored.training
     assert torch.equal(found.weights["a"], stored.weights["a"])
-    assert found.optimizer is not None
     # Adam's first moment after one step: (1 - 0.9) x gradient.
     assert found.optimizer["state"][0]["exp_avg"].tolist() == pytest.approx([0.05, 0.2])
 
@@ -102,9 +101,8 @@ def test_a_pickle_is_refused_and_not_run(tmp_path: Path, writer: str) -> None:
 def test_text_is_no_pickle(tmp_path: Path) -> None:
     """Of any other file it is said that it is no checkpoint; of a folder, which file to name."""
     (tmp_path / "notes.md").write_text("# hello\n")
-    with pytest.raises(UnreadableFileError, match="lagbench train") as caught:
+    with pytest.raises(UnreadableFileError, match=r"not a checkpoint(.|\n)*lagbench train"):
         load(tmp_path / "notes.md")
-    assert "more than tensors" not in str(caught.value)
     with pytest.raises(UnreadableFileError) as caught:
         load(tmp_path)
     assert "weights.pt" not in str(caught.value)
@@ -231,12 +229,13 @@ def test_unknown_baseline() -> None:
 
 def test_data_of_another_version(generated: GenerationResult, unmeasured: Registry) -> None:
     """The data at hand must have the hash of the data that the model was trained on."""
-    root, elsewhere = generated.root, example(facts=replace(FACTS, split="my-river"))
-    for found, there, words in (
-        (example(), root, "another version"),
-        (example(), root / "nowhere", "lagbench generate"),
-        (elsewhere, root, "where: a.pt"),  # a local split of another root
+    root = generated.root
+    for split, there, words in (
+        ("curl-noise", root, "another version"),
+        ("curl-noise", root / "nowhere", "lagbench generate"),
+        ("my-river", root, "where: a.pt"),  # a local split of another root
     ):
+        found = example(facts=replace(FACTS, split=split))
         with pytest.raises(DataError, match=words):
             check_data(found, root=there, registry=unmeasured, where="a.pt")
 
@@ -291,28 +290,21 @@ def test_a_flipped_byte_is_seen(tmp_path: Path) -> None:
 KINDS = [f"{name}_{of}" for name in ("position", "velocity", "acceleration") for of in ("mean", "std")]
 WHOLE = replace(FACTS, statistics=dict.fromkeys(KINDS, (0.5, 0.5)))
 
-SMALL: dict[str, dict[str, Any]] = {
-    "neuralmpm": {"cells": 8, "width": 4, "materials": [0, 1, 2, 3]},
-    "mlp": {"widths": [4]},
-    "lstm": {"latent": 4, "decoder": [4]},
-    "lstm-mlp": {"latent": 4, "decoder": [4]},
-    "var": {"lags": 1},
-    "var-stable": {"rank": 2},
+SIZES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
+    "neuralmpm": ({"cells": 8, "width": 4, "materials": [0, 1, 2, 3]}, {"width": 4 * 10**5}),
+    "mlp": ({"widths": [4]}, {"widths": [10**7, 10**7]}),
+    **dict.fromkeys(("lstm", "lstm-mlp"), ({"latent": 4, "decoder": [4]}, {"latent": 10**7})),
+    "var": ({"lags": 1}, {"lags": 10**9}),
+    "var-stable": ({"rank": 2}, {}),
 }
-"""Options of small models; those of graph networks are below."""
+"""Options of small models, and of such as no machine holds."""
 
-LARGE: dict[str, dict[str, Any]] = {
-    "mlp": {"widths": [10**7, 10**7]},
-    "neuralmpm": {"width": 4 * 10**5},
-    "var": {"lags": 10**9},
-    "var-stable": {},
-}
-"""Options of models that no machine holds; by default a latent vector of 10^7 numbers."""
+GRAPHS = {"latent": 4, "layers": 2}, {"latent": 10**7}  # the same of graph networks
 
 
 def stored(baseline: str) -> Checkpoint:
     """Return the checkpoint of a small model."""
-    options = SMALL.get(baseline, {"latent": 4, "layers": 2})
+    options, _ = SIZES.get(baseline, GRAPHS)
     weights = find(baseline).model.build(options, WHOLE).state_dict()
     return Checkpoint(baseline=baseline, options=options, facts=WHOLE, weights=weights)
 
@@ -336,7 +328,7 @@ def test_larger_models_are_refused(baseline: str) -> None:
     """Options for 10^10 numbers and more are refused as those of an unreadable file, at once."""
     found = stored(baseline)
     facts = replace(WHOLE, particles=10**9) if baseline == "var-stable" else WHOLE
-    options = {**found.options, **LARGE.get(baseline, {"latent": 10**7})}
+    options = {**found.options, **SIZES.get(baseline, GRAPHS)[1]}
     with pytest.raises(UnreadableFileError, match=r"larger model(.|\n)*weights of"):
         restore(replace(found, options=options, facts=facts), where="theirs.pt")
 

@@ -22,7 +22,6 @@ from lagbench.baselines.operators.transformer import Transformer
 
 Array = NDArray[np.float64]
 LATENT, HIDDEN = 6, 5
-EVERY = pytest.mark.parametrize("operator", OPERATORS)
 
 
 def small(seed: int = 0) -> Graph:
@@ -112,16 +111,13 @@ def supergat_sd(w: dict[str, Array], x: Array, i: int, near: list[tuple[int, Arr
 
 def transformer(w: dict[str, Array], x: Array, i: int, near: list[tuple[int, Array]]) -> Array:
     """Return Shi et al. (2021), Eqs. 3 and 4, with a linear skip connection."""
-    product = {
-        name: x @ w[f"conv.lin_{name}.weight"].T + w[f"conv.lin_{name}.bias"]
+    key, query, value, skip = (
+        x @ w[f"conv.lin_{name}.weight"].T + w[f"conv.lin_{name}.bias"]
         for name in ("key", "query", "value", "skip")
-    }
-    edges = [w["conv.lin_edge.weight"] @ e for _, e in near]
-    keys = [product["key"][j] + e for e, (j, _) in zip(edges, near, strict=True)]
-    values = [product["value"][j] + e for e, (j, _) in zip(edges, near, strict=True)]
-    a = softmax([product["query"][i] @ key / np.sqrt(LATENT) for key in keys]) if near else np.zeros(0)
-    heard = np.sum([a_j * value for a_j, value in zip(a, values, strict=True)], axis=0)
-    return product["skip"][i] + heard
+    )
+    told = [(j, w["conv.lin_edge.weight"] @ e) for j, e in near]
+    a = softmax([query[i] @ (key[j] + e) / np.sqrt(LATENT) for j, e in told]) if near else []
+    return skip[i] + np.sum([a_j * (value[j] + e) for a_j, (j, e) in zip(a, told, strict=True)], axis=0)
 
 
 def gns(w: dict[str, Array], x: Array, i: int, near: list[tuple[int, Array]]) -> Array:
@@ -167,7 +163,7 @@ def test_pointnet_is_that_of_pyg() -> None:
     torch.testing.assert_close(ours, theirs(x, position, inputs.edge_index), rtol=1e-12, atol=1e-12)
 
 
-@EVERY
+@pytest.mark.parametrize("operator", OPERATORS)
 def test_order_and_lack_of_edges(operator: type[Operator]) -> None:
     """Particles in another order get the same updates in that order; the order of edges is nothing.
 

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import netCDF4
 import numpy as np
@@ -37,12 +38,8 @@ from lagbench.submission import validate as examine
 Predict = Callable[..., PredictionResult]
 
 
-UNFINISHED = {
-    "state": "running",
-    "step": 9,
-    "steps": 70,
-    "recipe": {"name": "curl-noise/tiny", "training": {"seed": 3}},
-}
+RECIPE = {"name": "curl-noise/tiny", "training": {"seed": 3}}
+UNFINISHED = {"state": "running", "step": 9, "steps": 70, "recipe": RECIPE}
 """Record of a training whose weights the fixture has, and which goes on."""
 
 
@@ -87,11 +84,7 @@ def run(
             options=model.options.model_dump(),
             facts=facts,
             weights=model.state_dict(),
-            training={
-                "step": 9,
-                "recipe": {"name": "curl-noise/tiny", "training": {"seed": 3}},
-                **options.pop("training", {}),
-            },
+            training={"step": 9, "recipe": RECIPE, **options.pop("training", {})},
         )
         save(tmp_path / "weights.pt", stored)
         output = tmp_path / options.pop("name", "predictions.nc")
@@ -145,7 +138,7 @@ def test_the_file_is_valid_and_says_what_made_it(
 
 def test_batches_do_not_matter(run: Predict) -> None:
     """Scenarios predicted side by side are those predicted one by one."""
-    alone, together = run(name="a.nc", batch=1), run(name="b.nc", batch=2)
+    alone, together = (run(name=f"{batch}.nc", batch=batch) for batch in (1, 2))
     assert (alone.batch, together.batch) == (1, 2)
     assert np.array_equal(written(alone.path), written(together.path))
 
@@ -170,15 +163,9 @@ def test_frozen_frames_are_not_timed(
     run: Predict, monkeypatch: pytest.MonkeyPatch, batch: int, seconds: float
 ) -> None:
     """With a second per step, 4 of 20 frames before a burst cost 4 s, side by side 4 s in vain before."""
-    ticks = []
-    step = Drift.advance
-
-    def slow(self: Drift, state: Any) -> Any:
-        ticks.append(1)
-        return step(self, state)
-
-    monkeypatch.setattr(Drift, "advance", slow)
-    monkeypatch.setattr(prediction, "time", SimpleNamespace(process_time=lambda: float(len(ticks))))
+    slow = Mock(side_effect=Drift.advance)
+    monkeypatch.setattr(Drift, "advance", lambda self, state: slow(self, state))
+    monkeypatch.setattr(prediction, "time", SimpleNamespace(process_time=lambda: float(slow.call_count)))
     result = run(model={"explode_at": 4}, batch=batch)
     assert list(result.diverged.values()) == [9, 9]
     assert result.seconds_per_frame == seconds
@@ -211,23 +198,6 @@ def test_a_diverging_scenario_leaves_others_alone() -> None:
     assert good.position.shape == bad.position.shape == (8, 3, 2)
 
 
-class Fleeing(Drift):
-    """A Drift whose particles go a box farther to the right in every frame."""
-
-    def advance(self, state: State) -> tuple[State, Tensor]:
-        """Advance by one frame."""
-        state, position = super().advance(state)
-        return state, position + torch.tensor([float(state[2] - 1), 0.0])
-
-
-def test_a_rollout_is_frozen_before_it_is_too_far(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What the scorer would refuse is frozen within ten boxes, as what ceases to be finite is."""
-    found = roll_out(Fleeing.build({"start": 0.0}, FACTS), windows([0.9]), 30)[0]
-    assert found.diverged_at is not None
-    assert 8.0 < float(found.position.max()) < 10.6
-    assert torch.isfinite(found.position).all()
-
-
 class Wrong(Drift):
     """A Drift with another answer."""
 
@@ -237,6 +207,19 @@ class Wrong(Drift):
         """Give the answer."""
         state, position = super().advance(state)
         return self.answer(state, position)
+
+
+def test_a_rollout_is_frozen_before_it_is_too_far(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the scorer would refuse is frozen within ten boxes, as what ceases to be finite is."""
+
+    def fleeing(state: State, position: Tensor) -> Any:  # a box farther to the right in every frame
+        return state, position + torch.tensor([float(state[2] - 1), 0.0])
+
+    monkeypatch.setattr(Wrong, "answer", staticmethod(fleeing))
+    found = roll_out(Wrong.build({"start": 0.0}, FACTS), windows([0.9]), 30)[0]
+    assert found.diverged_at is not None
+    assert 8.0 < float(found.position.max()) < 10.6
+    assert torch.isfinite(found.position).all()
 
 
 @pytest.mark.parametrize(
@@ -284,12 +267,11 @@ def test_only_the_given_frames_are_read(run: Predict, copied: Callable[[], Path]
 
 def test_mistakes(run: Predict, generated: GenerationResult, tmp_path: Path) -> None:
     """Missing data, a missing checkpoint and a missing device have errors of their own."""
-    result = run()
-    weights = tmp_path / "weights.pt"
+    made = run().path
     with pytest.raises(DataError, match="lagbench generate"):
-        predict(weights, result.path, root=tmp_path / "nowhere")
+        predict(tmp_path / "weights.pt", made, root=tmp_path / "nowhere")
     with pytest.raises(UnreadableFileError, match=r"none\.pt"):
-        predict(tmp_path / "none.pt", result.path, root=generated.root)
+        predict(tmp_path / "none.pt", made, root=generated.root)
     with pytest.raises(UsageError, match="no device 'tpu'"):
         run(device="tpu")
 
@@ -319,28 +301,26 @@ def test_another_size_than_that_of_the_training(
             run(name, size=size, facts=facts)
     with pytest.raises(DataError):
         run("scaled", size="tiny", facts=replace(trained, version="0.9.0"))
-
-
-def test_what_the_training_changed_is_told(run: Predict) -> None:
-    """The file says by which ``--set`` the recipe became another, apart from changes of the prediction."""
-    recipe = recipe_for(find("gns"), "curl-noise", "tiny", settings=["training.steps=77"]).as_json()
-    result = run(training={"recipe": recipe}, settings=["model.explode_at=3"])
-    before, _, after = said(result.path)["training"].partition("predicted with")
-    assert "training.steps=77" in before
-    assert "model.explode_at=3" not in before
-    assert "model.explode_at=3" in after
+    run("scaled", facts=replace(here, radius=0.5))
+    assert Scaled.told.radius == 0.5  # hashes do not hold it: at its own size that of the training counts
 
 
 def test_a_model_is_changed_where_that_needs_no_weights(
     run: Predict, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An option of the model is as if it had been trained with, and the file says so; others are refused."""
-    result = run(settings=["model.explode_at=3"])
-    assert np.array_equal(
-        written(result.path), written(run(model={"explode_at": 3}, name="trained.nc").path), equal_nan=True
-    )
+    """An option of the model is as if it had been trained with, and the file says so; others are refused.
+
+    By which ``--set`` the training's recipe became another is told apart from that.
+    """
+    recipe = recipe_for(find("gns"), "curl-noise", "tiny", settings=["training.steps=77"]).as_json()
+    result = run(training={"recipe": recipe}, settings=["model.explode_at=3"])
+    trained = run(model={"explode_at": 3}, name="trained.nc")
+    assert np.array_equal(written(result.path), written(trained.path), equal_nan=True)
     assert set(result.diverged.values()) == {8}
-    assert said(result.path)["training"].endswith("model.explode_at=3")
+    before, _, after = said(result.path)["training"].partition("predicted with")
+    assert "training.steps=77" in before
+    assert "model.explode_at=3" not in before
+    assert after.endswith("model.explode_at=3")
     install(monkeypatch, several=Several)
     for setting in ("training.steps=3", "model.explode=1", "model.count=2"):
         with pytest.raises(UsageError):
@@ -359,13 +339,6 @@ def test_no_image_falls_sideways(tiny_split: Callable[..., GenerationResult], tm
     with pytest.raises(UsageError, match="gravity"):
         predict(tmp_path / "weights.pt", tmp_path / "p.nc", root=root, settings=["model.symmetry=square"])
     assert not (tmp_path / "p.nc").exists()
-
-
-def test_at_its_own_size_a_model_keeps_its_radius(run: Predict, generated: GenerationResult) -> None:
-    """Hashes do not hold the radius: that of the training counts."""
-    here = facts_of("curl-noise", "tiny", root=generated.root)
-    run("scaled", facts=replace(here, radius=0.5))
-    assert Scaled.told.radius == 0.5
 
 
 def test_models_of_any_size_have_the_same_weights_at_each() -> None:
@@ -416,11 +389,7 @@ def test_nothing_else_is_replaced(
 
 def test_out_of_memory(run: Predict, monkeypatch: pytest.MonkeyPatch) -> None:
     """When memory is full, the message says what to lower, and no file appears."""
-
-    def full(self: Drift, state: object) -> object:
-        raise torch.OutOfMemoryError("no memory left")
-
-    monkeypatch.setattr(Drift, "advance", full)
+    monkeypatch.setattr(Drift, "advance", Mock(side_effect=torch.OutOfMemoryError("no memory left")))
     with pytest.raises(WorkFailedError, match="lower --batch"):
         run(name="none.nc")
 

@@ -101,21 +101,19 @@ def test_options_of_the_training(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "setting"),
+    ("name", "option", "value"),
     [
-        *(("mlp", "model.target=change"), ("mlp", "model.activation=tanh")),
-        *(("lstm", "model.target=change"), ("gns", "model.target=velocity")),
-        ("gns", "model.sum_messages=false"),
+        *(("mlp", "target", "change"), ("mlp", "activation", "tanh"), ("lstm", "target", "change")),
+        *(("gns", "target", "velocity"), ("gns", "sum_messages", "false")),
     ],
 )
-def test_weights_keep_their_meaning(name: str, setting: str) -> None:
+def test_weights_keep_their_meaning(name: str, option: str, value: str) -> None:
     """A trained model refuses options that its weights were made for, though they would fit."""
-    baseline = find(name)
+    baseline, setting = find(name), f"model.{option}={value}"
     stored = baseline.model.Options().model_dump(mode="json")
     with pytest.raises(UsageError):
         changed_options(baseline, stored, [setting])
-    group, _, value = setting.partition("=")
-    assert changed_options(baseline, {**stored, group.partition(".")[2]: value}, [setting])
+    assert changed_options(baseline, {**stored, option: value}, [setting])
 
 
 def test_layers(entry: Entry, tmp_path: Path) -> None:
@@ -316,14 +314,6 @@ def test_yes_and_no_where_they_are_meant() -> None:
             assert [error["loc"] for error in caught.value.errors()] == [(name,)]
 
 
-class NoBaseline:
-    """Neither a baseline nor an operator."""
-
-
-class Half(Baseline):
-    """A baseline that defines too little."""
-
-
 def test_other_packages_add_baselines(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A class of another package is found by its name, its recipes beside its module; ours stay."""
     install(monkeypatch, drift=Drift, gns=Drift)
@@ -339,7 +329,7 @@ def test_other_packages_add_baselines(monkeypatch: pytest.MonkeyPatch, tmp_path:
 
 def test_a_baseline_is_whole_and_has_a_name(monkeypatch: pytest.MonkeyPatch) -> None:
     """What lacks methods or is no baseline cannot be loaded and only warns beside others, as odd names do."""
-    install(monkeypatch, half=Half, broken=NoBaseline, **{"Bad Name/x": Drift})
+    install(monkeypatch, half=Baseline, broken=Settings, **{"Bad Name/x": Drift})
     with pytest.warns(UserWarning, match="adds no baseline") as told:
         found = every_entry()
     words = " ".join(str(warning.message) for warning in told)

@@ -84,7 +84,6 @@ def test_a_mirrored_model_in_a_mirrored_world(target: str, axis: int) -> None:
     rng = np.random.default_rng(0)
     windows = [jittered(seed) + rng.normal(0.0, 2e-3, (6, 256, 2)).cumsum(axis=0) for seed in (0, 1)]
     given = batch(*windows, walls=True)
-    assert given.wall_velocity is not None
     given.wall_velocity[1] *= -0.5
     matrix = torch.eye(2).repeat(2, 1, 1)
     matrix[:, axis, axis] = -1.0
@@ -122,6 +121,9 @@ def test_two_frames_are_enough_to_start_from() -> None:
     assert torch.equal(long.velocity, given.position[:, 2:].diff(dim=1))
     with pytest.raises(UsageError, match="2 or more"):
         model.start(given.part(slice(1)))
+    model = network(awake=True, velocities=1)  # sees two frames and starts from two
+    assert (model.history, model.features.count) == (2, 22)
+    assert torch.equal(rolled(model, given, 2), rolled(model, given.part(slice(6, 8)), 2))
 
 
 def test_a_state_moved_by_the_truth_is_the_next_start() -> None:
@@ -135,29 +137,24 @@ def test_a_state_moved_by_the_truth_is_the_next_start() -> None:
 
 
 def test_walls_move_per_frame() -> None:
-    """Wall velocities per second become per frame (half a second here), each particle its window's."""
+    """Wall velocities per second become per frame (half a second here), each particle its window's.
+
+    A predicted frame moves with its own wall velocity; after the last known one that stays.
+    """
     given = batch(swirl(0, 6), swirl(1, 6), walls=True)
-    assert given.wall_velocity is not None
     given.wall_velocity[1] *= 3.0
     state = network(wall_velocity=True).start(given)
-    assert state.wall_velocity is not None
     torch.testing.assert_close(state.wall_velocity[0, 0], torch.arange(1.0, 9.0).reshape(4, 2) / 200)
     torch.testing.assert_close(state.wall_velocity[1], 3.0 * state.wall_velocity[0])
     assert network().start(given).wall_velocity is None
     with pytest.raises(UsageError) as caught:
         network(wall_velocity=True, changes={"moving_walls": False})
     assert caught.value.where == "model.wall_velocity"
-
-
-def test_a_step_sees_the_walls_of_the_next_frame() -> None:
-    """A predicted frame moves with its own wall velocity; after the last known one that stays."""
     whole = batch(swirl(0, 8), walls=True)
-    assert whole.wall_velocity is not None
     whole.wall_velocity.mul_(torch.arange(8.0)[:, None, None])
     state = network(wall_velocity=True).start(whole.part(slice(6)))
     seen = []
     for _ in range(3):
-        assert state.wall_velocity is not None
         seen.append(float(state.wall_velocity[0, 0, 0, 0]))
         state = state.moved(state.position, state.velocity[:, -1])
     assert seen == pytest.approx([6 * 0.005, 7 * 0.005, 7 * 0.005])
@@ -222,7 +219,6 @@ def test_a_wall_passes_gradients_on() -> None:
 def test_forcing_of_the_next_frame_moves_particles_near_walls() -> None:
     """Another wall velocity in the coming frame changes the step near walls, in an older frame nothing."""
     window = batch(np.repeat(jittered(0)[None], 7, axis=0), walls=True)
-    assert window.wall_velocity is not None
     model = network(awake=True, layers=1, wall_velocity=True, wall_reach=1.0)
     found = []
     for frame in (None, 5, 6):
@@ -239,14 +235,6 @@ def test_forcing_of_the_next_frame_moves_particles_near_walls() -> None:
     near = torch.minimum(place - low, high - place).amin(dim=1)
     assert bool(changed[near < 0.9 * RADIUS].all())
     assert not bool(changed[near > 2.0 * RADIUS].any())  # one layer: a neighbour's wall at most
-
-
-def test_velocities_shown_are_the_last_ones() -> None:
-    """A model of one velocity sees two frames and starts from two, in training and in rollouts."""
-    model = network(awake=True, velocities=1)
-    assert (model.history, model.features.count) == (2, 22)
-    given = batch(swirl(0, 6))
-    assert torch.equal(rolled(model, given, 2), rolled(model, given.part(slice(4, 6)), 2))
 
 
 def test_forgetful_windows_know_what_a_rollout_knows_at_its_start() -> None:

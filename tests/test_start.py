@@ -27,6 +27,7 @@ from lagbench.submission.budget import Budget, track_of
 from lagbench.work.progress import Progress
 
 Run = Callable[..., TrainingResult]
+Changes = dict[str, Any] | None
 STILL = ("steps=1", "learning_rate=1e-30")
 """One step that changes no weight by as much as its rounding."""
 
@@ -71,20 +72,19 @@ def stored(generated: GenerationResult, unmeasured: Registry, tmp_path: Path) ->
     def call(
         baseline: str = "any",
         *,
-        facts: dict[str, Any] | None = None,
-        model: dict[str, Any] | None = None,
-        weights: dict[str, torch.Tensor] | None = None,
-        **training: Any,
+        facts: Changes = None,
+        model: Changes = None,
+        weights: Changes = None,
+        **more: Any,
     ) -> Path:
         here = facts_of("curl-noise", "tiny", root=generated.root, registry=unmeasured)
         built = AnySize.build({"start": 0.5, **(model or {})}, here)
-        told = {"step": 9, "recipe": {"name": "curl-noise/mini-made-up"}, **training}
         checkpoint = Checkpoint(
             baseline=baseline,
             options=built.options.model_dump(),
             facts=replace(here, **(facts or {})),
-            weights=built.state_dict() if weights is None else weights,
-            training=told,
+            weights=weights or built.state_dict(),
+            training={"step": 9, "recipe": {"name": "curl-noise/mini-made-up"}, **more},
         )
         save(tmp_path / "start.pt", checkpoint)
         return tmp_path / "start.pt"
@@ -181,14 +181,12 @@ def test_nothing_is_lost(run: Run, stored: Callable[..., Path]) -> None:
     link = first.folder.with_name("link.pt")
     link.symlink_to(first.checkpoint)
     for baseline, start in (
-        ("any", first.weights),
-        ("any", link),
-        ("any", stored(weights=odd)),
-        ("drift", stored()),
-        ("any", stored(model={"unit": 2.0})),
+        *(("any", first.weights), ("any", link)),
+        *(("any", {"weights": odd}), ("drift", {}), ("any", {"model": {"unit": 2.0}})),
     ):
+        path = stored(**start) if isinstance(start, dict) else start
         with pytest.raises(LagbenchError):
-            run(baseline, "steps=2", "model.unit=1", start=start, fresh=True)
+            run(baseline, "steps=2", "model.unit=1", start=path, fresh=True)
         assert (first.weights.read_bytes(), first.checkpoint.read_bytes()) == held
 
 

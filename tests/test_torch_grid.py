@@ -85,18 +85,6 @@ def test_counted_nodes_may_be_those_of_the_truth() -> None:
     compare(found, expected, 1e-12)
 
 
-def test_rotation_has_twice_its_rate() -> None:
-    """A lattice turning at rate 3 has vorticity 6 and no divergence at every inner node."""
-    grid = Grid(10)
-    axis = (torch.arange(20, dtype=torch.float64) + 0.5) / 20  # two particles per cell and axis
-    x = torch.cartesian_prod(axis, axis)
-    u = 3.0 * torch.stack([0.5 - x[:, 1], x[:, 0] - 0.5], dim=1)
-    found = fields(x, u, grid, full=4.0)
-    inner = (slice(2, -2), slice(2, -2))  # the outermost nodes lack particles on one side
-    torch.testing.assert_close(found.vorticity[inner], torch.full((6, 6), 6.0, dtype=torch.float64))
-    torch.testing.assert_close(found.divergence[inner], torch.zeros(6, 6, dtype=torch.float64))
-
-
 @pytest.mark.parametrize("name", ["density", "velocity", "vorticity", "divergence"])
 @pytest.mark.parametrize("cells", [4, 5])
 def test_gradients(name: str, cells: int) -> None:
@@ -137,7 +125,6 @@ def test_lost_particles_have_no_weight_and_no_gradient() -> None:
     torch.testing.assert_close(found.velocity, kept.velocity)
     (found.vorticity.square().sum() + found.density.square().sum()).backward()
     for gradient in (x.grad, u.grad):
-        assert gradient is not None
         assert bool(gradient.isfinite().all())
         assert not bool(gradient[:3].any())
         assert bool(gradient[3:].any())
@@ -184,14 +171,10 @@ def test_weights_are_a_partition_of_unity(
     assert 0 <= int(stencil.node.min()) <= int(stencil.node.max()) < grid.shape[0] * grid.shape[1]
     sums = grid.spread(stencil, torch.ones(500, 1), 1)
     assert float(sums.sum()) == pytest.approx(500, rel=1e-5)
-
-
-def test_linear_fields_are_gathered_exactly() -> None:
-    """Quadratic B-splines reproduce 2 + 3 x - 5 y."""
-    grid, place = ParticleGrid(BOX, 10), cloud(300)
-    field = 2.0 + 3.0 * grid.axis_x[:, None] - 5.0 * grid.axis_y
-    found = grid.gather(grid.stencil(place, torch.zeros(300, dtype=torch.int64)), field[None, None])
-    torch.testing.assert_close(found[:, 0], 2.0 + 3.0 * place[:, 0] - 5.0 * place[:, 1], rtol=0, atol=1e-5)
+    # quadratic B-splines reproduce 2 + 3 x - 5 y
+    field, (x, y) = 2.0 + 3.0 * grid.axis_x[:, None] - 5.0 * grid.axis_y, place.clamp(low, high).T
+    found = grid.gather(stencil, field[None, None])[:, 0]
+    torch.testing.assert_close(found, 2.0 + 3.0 * x - 5.0 * y, rtol=0, atol=1e-5)
 
 
 def test_spread_is_the_scorers_transfer() -> None:
@@ -252,29 +235,25 @@ def test_stresses_push_as_the_slopes_of_the_splines_say() -> None:
 @pytest.mark.parametrize("signs", [(1, 1), (-1, 1), (1, -1), (-1, -1)])
 def test_the_image_of_a_transfer_is_the_transfer_of_the_image(signs: tuple[int, int], swap: bool) -> None:
     """All eight images of the square: mirrored and turned particles give mirrored and turned sums."""
-    grid, place = ParticleGrid(BOX, 11, multiple=4), cloud(300)
-    zero = torch.zeros(300, dtype=torch.int64)
+    grid, place, zero = ParticleGrid(BOX, 11, multiple=4), cloud(300), torch.zeros(300, dtype=torch.int64)
     turned = (place - 0.5) * torch.tensor(signs) + 0.5
-    turned = turned.flip(1) if swap else turned
-    found = grid.spread(grid.stencil(turned, zero), torch.ones(300, 1), 1)[0, 0]
-    here = grid.spread(grid.stencil(place, zero), torch.ones(300, 1), 1)[0, 0]
+    both = (place, turned.flip(1) if swap else turned)
+    here, found = (grid.spread(grid.stencil(x, zero), torch.ones(300, 1), 1)[0, 0] for x in both)
     expected = here.flip([axis for axis, sign in enumerate(signs) if sign < 0])
     torch.testing.assert_close(found, expected.T if swap else expected, rtol=0, atol=1e-4)
 
 
 def test_walls_lie_between_two_rows_of_nodes() -> None:
-    """The nodes beside a wall are half a cell from it, on both sides."""
+    """The nodes beside a wall are half a cell from it, on both sides.
+
+    A rollout that diverges gives NaN, which the rollout freezes, and no error of an index.
+    """
     grid = ParticleGrid(BOX, 7)
     distance = grid.wall_distance(1.0)
     for wall, beside in enumerate(grid.beside_walls()):
         assert int(beside.sum()) == 2 * grid.shape[wall // 2]
         near = distance[wall][beside.bool()].abs()
         torch.testing.assert_close(near, torch.full_like(near, grid.spacing / 2))
-
-
-def test_places_that_are_no_numbers_stay_so() -> None:
-    """A rollout that diverges gives NaN, which the rollout freezes, and no error of an index."""
-    grid = ParticleGrid(BOX, 7)
     place = torch.tensor([[torch.nan, 0.5], [0.5, 0.5]])
     stencil = grid.stencil(place, torch.zeros(2, dtype=torch.int64))
     found = grid.gather(stencil, torch.ones(1, 1, *grid.shape))
