@@ -138,23 +138,17 @@ def _turned(matrix: Tensor, vector: Tensor) -> Tensor:
     return (matrix * vector.unsqueeze(-2)).sum(dim=-1)
 
 
-def random_walk(particles: int, frames: int, std: float, generator: torch.Generator) -> Tensor:
-    """Return position noise [length], shape [particle, frame, 2], with the last velocity's deviation.
-
-    The velocity noise is a walk of ``frames - 1`` steps of ``std / sqrt(frames - 1)`` each; the
-    position noise is its sum, 0 in the first frame.
-    """
-    shape = (particles, frames - 1, 2)
-    step = torch.randn(shape, generator=generator, device=generator.device) * (std / math.sqrt(frames - 1))
-    position = step.cumsum(dim=1).cumsum(dim=1)
-    return torch.cat([torch.zeros_like(position[:, :1]), position], dim=1)
-
-
 def noisy(position: Tensor, history: int, std: float, generator: torch.Generator) -> Tensor:
-    """Return the positions of windows with noise on their history; the frames after it move along."""
-    walk = random_walk(len(position), history, std, generator).to(position)
-    after = walk[:, -1:].expand(-1, position.shape[1] - history, -1)
-    return position + torch.cat([walk, after], dim=1)
+    """Return the positions of windows with noise on their history; the frames after it move along.
+
+    The noise of velocities is a walk of ``history - 1`` steps of ``std / sqrt(history - 1)`` each; that of
+    positions [length] is its sum, 0 in the first frame.
+    """
+    shape = (len(position), history - 1, 2)
+    step = torch.randn(shape, generator=generator, device=generator.device) * (std / math.sqrt(history - 1))
+    walk = step.cumsum(dim=1).cumsum(dim=1).to(position)
+    first, after = torch.zeros_like(walk[:, :1]), walk[:, -1:].expand(-1, position.shape[1] - history, -1)
+    return position + torch.cat([first, walk, after], dim=1)
 
 
 def way_back(gap: Tensor, frames: float | None, *, change: float) -> Tensor:

@@ -31,7 +31,6 @@ from torch.nn.parameter import is_lazy
 
 from lagbench.atomic import atomic_path, check_regular
 from lagbench.data.registry import Registry
-from lagbench.data.registry import load as load_registry
 from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError, WorkFailedError
 from lagbench.submission.budget import Budget, budget_in
 
@@ -257,27 +256,27 @@ def check_data(
     checkpoint: Checkpoint,
     *,
     root: Path,
-    registry: Registry | None = None,
+    registry: Registry,
     size: str | None = None,
     where: str,
 ) -> Facts:
     """Check that a model can be run on the data at hand, of its own or another size; return their facts."""
-    trained, known = checkpoint.facts, registry or load_registry()
+    trained = checkpoint.facts
     try:
-        known.split(trained.split)
+        registry.split(trained.split)
     except UsageError as error:
         what = f"{trained.split}, which the model was trained on, is not there"
         raise DataError(what, where=where, got=f"in {root}", fix="name its folder: --root") from error
     if size in (None, trained.size):
-        here = facts_of(trained.split, trained.size, root=root, registry=known)
+        here = facts_of(trained.split, trained.size, root=root, registry=registry)
         expected, got = trained.dataset_sha256, here.dataset_sha256
     else:
-        size, entry = known.size(trained.split, str(size)).name, find(checkpoint.baseline)
+        size, entry = registry.size(trained.split, str(size)).name, find(checkpoint.baseline)
         train = f"train it there: lagbench train --baseline {entry.name} {trained.split} --size {size}"
         if not entry.model.any_size:
             message = f"{entry.model.method} has weights for the particles of one size"
             raise UsageError(message, where="--size", expected=trained.size, got=size, fix=train)
-        here = facts_of(trained.split, size, root=root, registry=known)
+        here = facts_of(trained.split, size, root=root, registry=registry)
         if (here.bounds, here.frame_interval) != (trained.bounds, trained.frame_interval):
             raise UsageError(
                 f"sizes {trained.size} and {size} of {trained.split} differ in more than resolution",
@@ -286,7 +285,7 @@ def check_data(
                 got=f"box {here.bounds}, {here.frame_interval:g} s",
                 fix=train,
             )
-        measured = known.size(trained.split, trained.size).measured
+        measured = registry.size(trained.split, trained.size).measured
         if measured is not None:
             expected, got = trained.dataset_sha256, measured.dataset_sha256
         else:

@@ -22,12 +22,7 @@ class Activation(enum.StrEnum):
     SIGMOID = "sigmoid"
 
 
-LAYERS: Mapping[Activation, type[nn.Module]] = {
-    Activation.ELU: nn.ELU,
-    Activation.RELU: nn.ReLU,
-    Activation.TANH: nn.Tanh,
-    Activation.SIGMOID: nn.Sigmoid,
-}
+LAYERS = dict(zip(Activation, (nn.ELU, nn.ReLU, nn.Tanh, nn.Sigmoid), strict=True))
 
 
 def dense(widths: tuple[int, ...], activation: Activation) -> nn.Sequential:

@@ -260,40 +260,39 @@ def recipe_for(
             fix=f"{fix}write your own: --recipe FILE.yaml, see docs/baselines.md",
         )
     part = part or _Shared()
-    model, training = _merge(file.model, part.model), _merge(file.training, part.training)
     for other in part.baselines:
         if other not in names():
             where = f"{path}, {name}, baselines"
             raise UnreadableFileError(f"unknown baseline {other!r}", where=where, fix=nearest(other, names()))
-    own = part.baselines.get(entry.name, _Part())
-    model, training = _merge(_merge(model, own.model), dict(learned or {})), _merge(training, own.training)
-    settings = tuple(settings)
+    layers: Layer = {"model": file.model, "training": file.training}
+    own, settings = part.baselines.get(entry.name, _Part()), tuple(settings)
+    for above in (part, own, _Part(model=dict(learned or {}))):
+        layers = _merge(layers, {"model": above.model, "training": above.training})
     where = f"{path.name if path else entry.name}, {name}" + (", and --set" if settings else "")
     for setting in settings:
-        changes = _setting(setting)
-        model, training = _merge(model, changes["model"]), _merge(training, changes["training"])
+        layers = _merge(layers, _setting(setting))
     if seed is not None:
-        training["seed"] = seed
+        layers["training"]["seed"] = seed
     return Recipe(
         baseline=entry.name,
         name=name,
-        model=_checked(entry.model.Options, model, "model", where).model_dump(mode="json"),
-        training=_checked(TrainingOptions, training, "training", where),
+        model=_checked(entry.model.Options, layers["model"], "model", where).model_dump(mode="json"),
+        training=_checked(TrainingOptions, layers["training"], "training", where),
     )
 
 
 def changed_options(entry: Entry, options: Mapping[str, Any], settings: Iterable[str]) -> Layer:
     """Return the options of a trained model with settings such as ``model.average=true``."""
-    changed = dict(options)
+    given: Layer = {"model": dict(options)}
+    changed = given
     for setting in settings:
-        changes = _setting(setting)
-        if changes["training"]:
+        changed = _merge(changed, _setting(setting))
+        if "training" in changed:
             fix = "set options of the model: --set model.KEY=VALUE"
             raise UsageError("the training is over", where="--set", got=setting, fix=fix)
-        changed = _merge(changed, changes["model"])
     before, after = (
-        _checked(entry.model.Options, layer, "model", "--set").model_dump(mode="json")
-        for layer in (dict(options), changed)
+        _checked(entry.model.Options, layers["model"], "model", "--set").model_dump(mode="json")
+        for layers in (given, changed)
     )
     kinds = {"training": entry.model.Options.in_training, "weights": entry.model.Options.of_weights}
     for kind, fixed in kinds.items():
@@ -325,8 +324,8 @@ def _merge(below: Layer, above: Layer) -> Layer:
     return joined
 
 
-def _setting(text: str) -> dict[str, Layer]:
-    """Return the changes of both groups by a text such as ``training.schedule.every=100``."""
+def _setting(text: str) -> Layer:
+    """Return the change by a text such as ``training.schedule.every=100``."""
     key, equals, value = text.partition("=")
     group, *path = key.strip().split(".")
     if not equals or not path or group not in ("model", "training"):
@@ -343,9 +342,9 @@ def _setting(text: str) -> dict[str, Layer]:
         raise UsageError(
             "the value is no YAML", where=f"--set {key}", got=" ".join(str(error).split())
         ) from None
-    for name in reversed(path):
+    for name in reversed((group, *path)):
         layer = {name: layer}
-    return {"model": {}, "training": {}, group: layer}
+    return dict(layer)
 
 
 def _checked(

@@ -7,7 +7,7 @@ import pytest
 import torch
 from simple_models import RADIUS, batch, facts, jittered, swirl
 
-from lagbench.baselines.augmentation import Symmetry, draw, image, noisy, random_walk
+from lagbench.baselines.augmentation import Symmetry, draw, image, noisy
 from lagbench.baselines.graph import NodeFeatures, Scale, edge_features, radius_graph, wall_distance
 from lagbench.errors import UsageError
 
@@ -76,8 +76,7 @@ def test_a_particle_shows_thirty_numbers() -> None:
     # deviations (0.004, 0.003) and (0.0002, 0.0001): changes of 1, 2, 3, 4 deviations end at 0.002 and 0.001
     velocity = torch.tensor([0.0, 1.0, 3.0, 6.0, 10.0])[None, :, None] * torch.tensor([0.0002, 0.0001])
     shown = features(torch.tensor([[0.5, 0.5]]), velocity, torch.tensor([2]))
-    assert shown.shape == (1, 30)
-    assert features.count == 30
+    assert shown.shape == (1, features.count) == (1, 30)
     expected = torch.tensor([0.5, 1 / 3, 1.0, 1.0, 2.0, 2.0, 3.0, 3.0, 4.0, 4.0])
     torch.testing.assert_close(shown[0, :10], expected)
     assert shown[0, 10:14].tolist() == [1.0] * 4
@@ -118,7 +117,7 @@ def test_noise_has_the_stated_deviation_at_the_last_velocity() -> None:
 
     That of x and y, and of neighbours in the row, is uncorrelated.
     """
-    walks = random_walk(40_000, 6, 0.3, generator())
+    walks = noisy(torch.zeros(40_000, 6, 2), 6, 0.3, generator())
     velocity = walks.diff(dim=1)
     covariance = torch.einsum("pjc,pkc->jk", velocity, velocity) / velocity[:, 0].numel()
     step = torch.arange(1.0, 6.0)

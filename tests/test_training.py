@@ -176,9 +176,8 @@ def test_chance_of_the_caller_is_left_alone(run: Run) -> None:
 
 def test_a_loss_that_is_not_finite(run: Run, tmp_path: Path) -> None:
     """NaN stops with the step and the term; the checkpoint before it stays."""
-    with pytest.raises(WorkFailedError, match="swirl") as caught:
+    with pytest.raises(WorkFailedError, match=r"step 6(.|\n)*swirl") as caught:
         run("drift", "model.fail_at=6", "steps=9", "checkpoint_every=4")
-    assert "step 6" in str(caught.value)
     assert "motion" not in str(caught.value)
     kept = load(tmp_path / "run/checkpoint.pt")
     assert kept.training["step"] == 4
