@@ -145,13 +145,18 @@ def _product(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
 
 def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
     """Return ``x W^T + b``, as ``torch.nn.functional.linear`` does; shapes [row, input], [output, input]."""
-    rows = x.device.type == "cpu" and x.dim() == 2 and x.numel() > 0
-    exact = x.dtype == weight.dtype == torch.float32 and not torch.is_autocast_enabled("cpu")
-    known = not torch.compiler.is_compiling() and hasattr(torch.ops.mkldnn, "_linear_pointwise")
-    if rows and exact and known:
+    if _fast(x, weight):
         product: Tensor = _OneDNNLinear.apply(x, weight, bias)  # type: ignore[no-untyped-call]
         return product
     return nn.functional.linear(x, weight, bias)
+
+
+def _fast(x: Tensor, weight: Tensor) -> bool:
+    """Return whether oneDNN can and should do it: rows of float32 on a CPU."""
+    rows = x.device.type == "cpu" and x.dim() == 2 and x.numel() > 0
+    exact = x.dtype == weight.dtype == torch.float32 and not torch.is_autocast_enabled("cpu")
+    known = not torch.compiler.is_compiling() and hasattr(torch.ops.mkldnn, "_linear_pointwise")
+    return rows and exact and known
 
 
 class Linear(nn.Linear):
