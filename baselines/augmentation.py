@@ -28,10 +28,11 @@ from lagbench.data.registry import Size
 from lagbench.errors import UsageError
 from lagbench.tensors import Batch
 
+from .baseline import Baseline
 from .graph import Bounds
 
+# outward, of the walls left, right, bottom, top
 _NORMALS = torch.tensor([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])
-"""Outward normals of the walls left, right, bottom, top."""
 
 
 class Symmetry(enum.StrEnum):
@@ -71,12 +72,9 @@ def images(symmetry: Symmetry) -> Tensor:
 
 
 def field_image(field: Tensor, matrix: Tensor, channels: Sequence[Tensor]) -> Tensor:
-    """Return the image of a field on a grid that lies in its box as its images do.
+    """Return the image of a field, shape [window, channel, x node, y node], in a box of that symmetry.
 
-    Args:
-        field: values at the nodes, shape [window, channel, x node, y node].
-        matrix: image, a signed permutation of the axes, shape [2, 2].
-        channels: what it does to the values of a node, blocks of a diagonal matrix.
+    ``channels`` is what the image does to the values of a node, blocks of a diagonal matrix.
     """
     turned: Tensor = torch.block_diag(*channels)  # type: ignore[no-untyped-call]
     with torch.autocast(field.device.type, enabled=False):
@@ -140,58 +138,38 @@ def _turned(matrix: Tensor, vector: Tensor) -> Tensor:
     return (matrix * vector.unsqueeze(-2)).sum(dim=-1)
 
 
-def random_walk(particles: int, frames: int, std: float, generator: torch.Generator) -> Tensor:
-    """Return position noise [length], shape [particle, frame, 2], with the last velocity's deviation.
-
-    The velocity noise is a walk of ``frames - 1`` steps of ``std / sqrt(frames - 1)`` each; the
-    position noise is its sum, 0 in the first frame.
-    """
-    steps = frames - 1
-    shape = (particles, steps, 2)
-    step = torch.randn(shape, generator=generator, device=generator.device) * (std / math.sqrt(steps))
-    position = step.cumsum(dim=1).cumsum(dim=1)
-    return torch.cat([torch.zeros_like(position[:, :1]), position], dim=1)
-
-
 def noisy(position: Tensor, history: int, std: float, generator: torch.Generator) -> Tensor:
-    """Return the positions of windows with noise on their history; the frames after it move along."""
-    walk = random_walk(len(position), history, std, generator).to(position)
-    after = walk[:, -1:].expand(-1, position.shape[1] - history, -1)
-    return position + torch.cat([walk, after], dim=1)
+    """Return the positions of windows with noise on their history; the frames after it move along.
 
-
-LOST = 3.0
-"""Greatest velocity back to the true path, in deviations of accelerations: what is lost is not run after."""
+    The noise of velocities is a walk of ``history - 1`` steps of ``std / sqrt(history - 1)`` each; that of
+    positions [length] is its sum, 0 in the first frame.
+    """
+    shape = (len(position), history - 1, 2)
+    step = torch.randn(shape, generator=generator, device=generator.device) * (std / math.sqrt(history - 1))
+    walk = step.cumsum(dim=1).cumsum(dim=1).to(position)
+    first, after = torch.zeros_like(walk[:, :1]), walk[:, -1:].expand(-1, position.shape[1] - history, -1)
+    return position + torch.cat([first, walk, after], dim=1)
 
 
 def way_back(gap: Tensor, frames: float | None, *, change: float) -> Tensor:
     """Return the velocity that leads back to the true path [length/frame], shape [particle, 2].
 
-    Args:
-        gap: true less reached positions [length], shape [particle, 2].
-        frames: what the gap is divided by: formed anew each frame, it closes by 1/frames of what is left,
-            to a third in as many frames; None for no way back.
-        change: deviation of accelerations [length/frame^2].
+    The gap, true less reached positions [length], is divided by ``frames``: formed anew each frame, it closes
+    by 1/frames of what is left; None for no way back. ``change`` is the deviation of accelerations: at most
+    three of them, for what is lost is not run after.
     """
     if frames is None:
         return torch.zeros_like(gap)
-    back, most = gap / frames, LOST * change
+    back, most = gap / frames, 3.0 * change
     speed: Tensor = torch.linalg.vector_norm(back, dim=1, keepdim=True)
     return back * most / speed.clamp(min=most)
 
 
-def disturbed(
-    batch: Batch,
-    generator: torch.Generator,
-    *,
-    symmetry: Symmetry,
-    bounds: Bounds,
-    history: int,
-    noise_std: float,
-) -> Batch:
-    """Return the batch as its random image, with noise."""
+def disturbed(model: Baseline, batch: Batch, generator: torch.Generator) -> Batch:
+    """Return the batch as a random image, with noise, as the model's options ask for."""
+    symmetry, std = model.options.symmetry, model.options.noise_std
     if symmetry is not Symmetry.NONE:
-        batch = image(batch, draw(symmetry, batch.windows, generator), bounds)
-    if noise_std > 0.0:
-        batch = replace(batch, position=noisy(batch.position, history, noise_std, generator))
+        batch = image(batch, draw(symmetry, batch.windows, generator), model.facts.bounds)
+    if std > 0.0:
+        batch = replace(batch, position=noisy(batch.position, model.history, std, generator))
     return batch

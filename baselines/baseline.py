@@ -11,18 +11,11 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Self
 
 import torch
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    Field,
-    TypeAdapter,
-    ValidatorFunctionWrapHandler,
-    field_validator,
-)
+from pydantic import BaseModel, ConfigDict, Field, ValidatorFunctionWrapHandler, field_validator
 from torch import Tensor, nn
 
 from lagbench.errors import UsageError
@@ -50,8 +43,7 @@ class Settings(BaseModel):
     def _no_number(cls, value: object, handler: ValidatorFunctionWrapHandler) -> object:
         found: object = handler(value)
         if _counted(value, found):
-            message = "a number, not yes or no"
-            raise ValueError(message)
+            raise ValueError("a number, not yes or no")
         return found
 
 
@@ -227,15 +219,6 @@ class Facts:
     # over train: position_mean, position_std [length], velocity_mean, velocity_std [length/frame],
     # acceleration_mean, acceleration_std [length/frame^2], one (x, y) pair each
     statistics: Mapping[str, Pair]
-
-    def as_json(self) -> dict[str, Any]:
-        """Return plain values, as checkpoints hold them."""
-        return asdict(self)
-
-    @classmethod
-    def from_json(cls, values: object) -> Self:
-        """Return the facts that :meth:`as_json` gave."""
-        return TypeAdapter(cls).validate_python(values)
 
 
 def rescaled(trained: Facts, here: Facts) -> Facts:

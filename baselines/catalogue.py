@@ -20,9 +20,7 @@ from lagbench.errors import LagbenchError, UsageError, loaded, nearest
 
 from .baseline import Baseline
 
-GROUP = "lagbench.baselines"
-
-OWN = "lagbench.baselines."
+GROUP = "lagbench.baselines"  # of entry points; where ours lie
 RECIPES = Path(__file__).parent / "recipes"
 NAME = re.compile("[a-z0-9]+(-[a-z0-9]+)*")  # of a baseline: it names folders
 REQUIRED = ("history", "forward", "start", "advance")  # what a subclass of Baseline defines
@@ -74,7 +72,7 @@ def every_entry() -> dict[str, Entry]:
 def _points() -> dict[str, EntryPoint]:
     """Return the entry points by name; ours are not to be replaced."""
     found: dict[str, EntryPoint] = {}
-    for point in sorted(installed(GROUP), key=lambda point: not point.value.startswith(OWN)):
+    for point in sorted(installed(GROUP), key=lambda point: not point.value.startswith(f"{GROUP}.")):
         reason = "a name has small letters, digits and single hyphens"
         if NAME.fullmatch(point.name):
             reason = "its name is taken" if found.setdefault(point.name, point).value != point.value else ""

@@ -17,30 +17,21 @@ import pickle
 import re
 import warnings
 import zipfile
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from torch import Tensor, nn
 from torch.nn.modules.module import register_module_parameter_registration_hook
 from torch.nn.parameter import is_lazy
 
 from lagbench.atomic import atomic_path
 from lagbench.data.registry import Registry
-from lagbench.data.registry import load as load_registry
-from lagbench.errors import (
-    DataError,
-    LagbenchError,
-    UnreadableFileError,
-    UsageError,
-    WorkFailedError,
-    check_regular,
-)
+from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError, WorkFailedError
 from lagbench.submission.budget import Budget, budget_in
 
 from .baseline import Baseline, Facts
@@ -48,7 +39,6 @@ from .catalogue import find
 from .facts import facts_of
 
 SPARE = 2**20  # numbers that a model may have beside those of its file: buffers that are not stored
-PARTS = 1000  # tensors that it may have beside those of its file
 
 
 def check_footprint(
@@ -63,63 +53,47 @@ def check_footprint(
 
     A model that cannot be built without numbers, as a stranger's baseline may be, passes.
     """
+
+    def too_large(expected: str, got: str) -> UnreadableFileError:
+        return UnreadableFileError(
+            "the options ask for a larger model than the weights that come with them",
+            where=where,
+            expected=expected,
+            got=got,
+            fix="do not trust the file, or train anew",
+        )
+
     stored = {  # tensors that share their bytes count once
         value.untyped_storage().data_ptr(): value.untyped_storage().nbytes() // value.element_size()
         for value in weights.values()
     }
-    held = sum(stored.values())
-    try:
-        with _parts_bound(len(weights) + PARTS), torch.device("meta"):
-            built = model.build(options, facts)
-        asked = sum(one.numel() for one in chain(built.parameters(), built.buffers()) if not is_lazy(one))
-    except _TooManyPartsError as error:
-        raise _too_large(where, f"weights for {len(weights)} tensors", f"options for {error}") from None
-    except (RuntimeError, TypeError) as error:
-        if "overflow" not in str(error):
-            return
-        raise _too_large(where, f"weights of {held} numbers", str(error).split("\n")[0][:200]) from None
-    if asked > held + SPARE:
-        raise _too_large(where, f"weights of {held} numbers", f"options for {asked}")
-
-
-class _TooManyPartsError(Exception):
-    """More parameters than the file has tensors."""
-
-
-@contextmanager
-def _parts_bound(most: int) -> Iterator[None]:
-    """Stop whoever registers more parameters than so many: layers without number take memory too."""
-    count = 0
+    held, parts, most = sum(stored.values()), 0, len(weights) + 1000
 
     def counted(module: nn.Module, name: str, parameter: nn.Parameter | None) -> None:
-        nonlocal count
-        count += parameter is not None
-        if count > most:
-            raise _TooManyPartsError(f"more than {most}")
+        nonlocal parts
+        parts += parameter is not None
+        if parts > most:  # layers without number take memory too
+            raise too_large(f"weights for {len(weights)} tensors", f"options for more than {most}")
 
     hook = register_module_parameter_registration_hook(counted)
     try:
-        yield
+        with torch.device("meta"):
+            built = model.build(options, facts)
+        asked = sum(one.numel() for one in chain(built.parameters(), built.buffers()) if not is_lazy(one))
+    except (RuntimeError, TypeError) as error:
+        if "overflow" not in str(error):
+            return
+        raise too_large(f"weights of {held} numbers", str(error).split("\n")[0][:200]) from None
     finally:
         hook.remove()
-
-
-def _too_large(where: str, expected: str, got: str) -> UnreadableFileError:
-    return UnreadableFileError(
-        "the options ask for a larger model than the weights that come with them",
-        where=where,
-        expected=expected,
-        got=got,
-        fix="do not trust the file, or train anew",
-    )
+    if asked > held + SPARE:
+        raise too_large(f"weights of {held} numbers", f"options for {asked}")
 
 
 FORMAT = 1
 KEY = "lagbench_checkpoint"
 SAFE = "a checkpoint that lagbench train wrote"
-RECIPE_NAME = r"^[A-Za-z0-9._/*-]{1,100}$"
-"""What a recipe's name may be, in a file of weights to start from."""
-
+RECIPE_NAME = r"^[A-Za-z0-9._/*-]{1,100}$"  # in a file of weights to start from
 _FOREIGN = re.compile(r"GLOBAL ([\w.]+)")  # how torch's refusal names what a pickle would call
 
 
@@ -173,7 +147,7 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
     about = {
         "baseline": checkpoint.baseline,
         "options": dict(checkpoint.options),
-        "facts": checkpoint.facts.as_json(),
+        "facts": asdict(checkpoint.facts),
         "training": dict(checkpoint.training),
     }
     content: dict[str, Any] = {
@@ -208,25 +182,20 @@ def load(path: str | Path) -> Checkpoint:
         if not isinstance(weights, Mapping):
             raise TypeError("weights are no mapping")
         for name, value in weights.items():
-            if not isinstance(name, str) or not isinstance(value, Tensor) or not _is_plain(value):
+            fit = isinstance(name, str) and isinstance(value, Tensor) and value.layout is torch.strided
+            fit = fit and not (value.is_quantized or value.is_complex() or value.is_meta)
+            if not fit or value.numel() * value.element_size() > value.untyped_storage().nbytes():
                 raise TypeError(f"weight {name!r} is no tensor of plain numbers that the file holds")
         return Checkpoint(
             baseline=str(about["baseline"]),
             options=dict(about["options"]),
-            facts=Facts.from_json(about["facts"]),
+            facts=TypeAdapter(Facts).validate_python(about["facts"]),
             weights=dict(weights),
             training=dict(about["training"]),
             optimizer=content.get("optimizer"),
         )
     except (KeyError, TypeError, ValueError, RecursionError) as error:
         raise _unfit(file, SAFE, f"{type(error).__name__}: {' '.join(str(error).split())[:200]}") from None
-
-
-def _is_plain(value: Tensor) -> bool:
-    """Tell whether a tensor is dense and real, and no larger than the bytes behind it."""
-    if value.layout is not torch.strided or value.is_quantized or value.is_complex() or value.is_meta:
-        return False
-    return value.numel() * value.element_size() <= value.untyped_storage().nbytes()
 
 
 def restore(checkpoint: Checkpoint, *, where: str = "the checkpoint") -> Baseline:
@@ -287,35 +256,36 @@ def check_data(
     checkpoint: Checkpoint,
     *,
     root: Path,
-    registry: Registry | None = None,
+    registry: Registry,
     size: str | None = None,
     where: str,
 ) -> Facts:
-    """Check that a model can be run on the data at hand; return their facts.
-
-    Args:
-        checkpoint: the model and the facts of what it was trained on.
-        root: folder of all data sets.
-        registry: where splits are described; ours when None.
-        size: size of the split to run it on; that of its training when None.
-        where: what errors name.
-
-    Raises:
-        DataError: the data are not there, or not of the version that it was trained on.
-        UsageError: no such size, the model knows one only, or box or frames there are others.
-    """
-    trained, known = checkpoint.facts, registry or load_registry()
+    """Check that a model can be run on the data at hand, of its own or another size; return their facts."""
+    trained = checkpoint.facts
     try:
-        known.split(trained.split)
+        registry.split(trained.split)
     except UsageError as error:
         what = f"{trained.split}, which the model was trained on, is not there"
         raise DataError(what, where=where, got=f"in {root}", fix="name its folder: --root") from error
     if size in (None, trained.size):
-        here = facts_of(trained.split, trained.size, root=root, registry=known)
+        here = facts_of(trained.split, trained.size, root=root, registry=registry)
         expected, got = trained.dataset_sha256, here.dataset_sha256
     else:
-        here = _facts_at(checkpoint, known.size(trained.split, str(size)).name, root=root, registry=known)
-        measured = known.size(trained.split, trained.size).measured
+        size, entry = registry.size(trained.split, str(size)).name, find(checkpoint.baseline)
+        train = f"train it there: lagbench train --baseline {entry.name} {trained.split} --size {size}"
+        if not entry.model.any_size:
+            message = f"{entry.model.method} has weights for the particles of one size"
+            raise UsageError(message, where="--size", expected=trained.size, got=size, fix=train)
+        here = facts_of(trained.split, size, root=root, registry=registry)
+        if (here.bounds, here.frame_interval) != (trained.bounds, trained.frame_interval):
+            raise UsageError(
+                f"sizes {trained.size} and {size} of {trained.split} differ in more than resolution",
+                where="--size",
+                expected=f"box {trained.bounds}, {trained.frame_interval:g} s between frames",
+                got=f"box {here.bounds}, {here.frame_interval:g} s",
+                fix=train,
+            )
+        measured = registry.size(trained.split, trained.size).measured
         if measured is not None:
             expected, got = trained.dataset_sha256, measured.dataset_sha256
         else:
@@ -327,25 +297,6 @@ def check_data(
             expected=f"{trained.split} {trained.size} {trained.version}, {expected}",
             got=f"{here.version}, {got}",
             fix="train again on the data at hand, or generate the version that it was trained on",
-        )
-    return here
-
-
-def _facts_at(checkpoint: Checkpoint, size: str, *, root: Path, registry: Registry) -> Facts:
-    """Return the facts of another size than that of the training, for a model that can be run there."""
-    trained, entry = checkpoint.facts, find(checkpoint.baseline)
-    train = f"train it there: lagbench train --baseline {entry.name} {trained.split} --size {size}"
-    if not entry.model.any_size:
-        message = f"{entry.model.method} has weights for the particles of one size"
-        raise UsageError(message, where="--size", expected=trained.size, got=size, fix=train)
-    here = facts_of(trained.split, size, root=root, registry=registry)
-    if (here.bounds, here.frame_interval) != (trained.bounds, trained.frame_interval):
-        raise UsageError(
-            f"sizes {trained.size} and {size} of {trained.split} differ in more than resolution",
-            where="--size",
-            expected=f"box {trained.bounds}, {trained.frame_interval:g} s between frames",
-            got=f"box {here.bounds}, {here.frame_interval:g} s",
-            fix=train,
         )
     return here
 

@@ -1,16 +1,12 @@
 """A model of whole frames: the next state from the last few, fed with its own predictions.
 
-Training and rollouts call the same :meth:`FrameModel.next_state`; a model is a file with its
-layers and that one method.
-
-The state of a whole frame: positions and velocities of all particles, standardised.
+A model is a file with its layers and :meth:`FrameModel.next_state`, for training and rollouts. A state is
+positions and velocities of all particles, standardised.
 
     z = (q - mean) / std,   q = (x, y, u, v),   u(f) = x(f) - x(f-1)          (Eq. 4.15)
 
 with the public statistics of the training scenarios, one figure per feature. The first frame of
 a window has no frame before it: it takes the velocity of the second.
-
-What MLP and LSTM share: material as an input, what the output means, noise in training.
 """
 
 from __future__ import annotations
@@ -63,14 +59,13 @@ class FrameState(nn.Module):
 
 def side_by_side(batch: Batch, particles: int) -> tuple[Tensor, Tensor]:
     """Return positions [length], shape [window, frame, particle, 2], and materials, [window, particle]."""
-    count = torch.bincount(batch.sample, minlength=batch.windows)
-    if not bool((count == particles).all()):
-        got = ", ".join(map(str, sorted(set(count.tolist()))))
+    counts = set(torch.bincount(batch.sample, minlength=batch.windows).tolist())
+    if counts != {particles}:
         raise DataError(
             "a model of whole frames needs every particle",
             where="batch",
             expected=f"{particles} particles in each window",
-            got=got,
+            got=", ".join(map(str, sorted(counts))),
             fix="use a graph network for scenarios of other sizes",
         )
     position = batch.position.view(batch.windows, particles, batch.frames, -1)
@@ -92,10 +87,7 @@ def squared_errors(truth: Tensor, predicted: Tensor) -> dict[str, Tensor]:
 
 
 class FrameModel(Baseline):
-    """Base of MLP, LSTM and VAR.
-
-    The loss terms are the two halves of Eq. 4.16, in standardised units: the mean squared error
-    of positions and that of velocities. A rollout feeds the predicted velocities back too.
+    """Base of MLP, LSTM and VAR. A rollout feeds the predicted velocities back too.
 
     Class attributes:
         precision: type of the states; predicted positions are float32 whatever it is.
@@ -185,11 +177,6 @@ class FrameNetworkOptions(baseline.Options):
     noise_std: float = Field(default=0.0, ge=0, allow_inf_nan=False)
 
 
-def material_feature(material: Tensor) -> Tensor:
-    """Return the constant fifth feature: 0, 1, 2, 3 mapped to -1 ... 1, shape [..., 1]."""
-    return (material.to(torch.float32) * (2.0 / (MATERIALS - 1)) - 1.0).unsqueeze(-1)
-
-
 class FrameNetwork(FrameModel):
     """Base of the networks: their inputs are states, with the material where the recipe wants it."""
 
@@ -217,8 +204,9 @@ class FrameNetwork(FrameModel):
         """Return the inputs of the network [1], shape [window, frame, particle, 4 or 5]."""
         if not self.options.material:
             return window.state
-        constant = material_feature(window.material).unsqueeze(1)
-        return torch.cat([window.state, constant.expand(-1, window.state.shape[1], -1, -1)], dim=-1)
+        constant = window.material.to(torch.float32) * (2.0 / (MATERIALS - 1)) - 1.0  # 0 ... 3 to -1 ... 1
+        constant = constant[:, None, :, None].expand(-1, window.state.shape[1], -1, -1)
+        return torch.cat([window.state, constant], dim=-1)
 
     def meant(self, output: Tensor, window: FrameWindow) -> Tensor:
         """Return the state that an output of shape [window, feature] means, shape [window, particle, 4]."""

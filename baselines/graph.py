@@ -7,29 +7,25 @@ A pair is connected where, in float64 of the positions as they are stored,
 Particles are sorted by square cells a little wider than the radius. In the order (column, row)
 the cells above a particle's own, and the three beside it in the next column, are two runs of
 consecutive particles; their distances are all that has to be computed. NumPy does this on the
-CPU, torch elsewhere; both compute the inequality with the same roundings and agree to the last edge.
+CPU, torch elsewhere, with the same roundings: they agree to the last edge.
 
-What a graph network sees: motion, walls and material of a particle, its neighbours' places.
-
-Positions enter only as differences, so that away from walls the features do not change when
-all particles move by the same vector.
+What a graph network sees: motion, walls and material of a particle, its neighbours' places; of positions
+only differences, so that away from walls the features do not change when all particles move by one vector.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from lagbench.errors import UsageError
 
 Bounds = tuple[tuple[float, float], tuple[float, float]]
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 MARGIN = 1e-6  # cells are wider than the radius by this share, more than rounding can move a particle
 FAR = 1 << 20  # cells that are told apart on either side of the origin; what lies beyond shares the last
@@ -55,94 +51,50 @@ def radius_graph(
     if sample is not None and not fits:
         raise UsageError(
             "windows do not fit the particles",
-            where="radius_graph, sample",
+            where=f"{where}, sample",
             expected=f"{len(position)} ascending numbers",
             got=f"shape {tuple(sample.shape)}",
         )
-    search = _graph_numpy if position.device.type == "cpu" else _graph_torch
-    return search(position, radius, sample, self_edges)
-
-
-def _graph_numpy(position: Tensor, radius: float, sample: Tensor | None, self_edges: bool) -> Tensor:
-    """Search on the CPU."""
-    x = position.detach().double().numpy()
-    finite = np.isfinite(x).all(axis=1)
-    kept = np.flatnonzero(finite)
-    window = np.zeros(len(x), np.int64) if sample is None else sample.numpy()
-    key, stride = _cells_numpy(x[kept], window[kept], radius)
-    order = np.argsort(key, kind="stable")
-    i, j = _pairs_numpy(x[kept[order]], key[order], stride, radius)
-    particle = kept[order]
-    i, j = particle[i], particle[j]
-    edges = [(i << 32) | j, (j << 32) | i]
-    if self_edges:
-        edges.append((kept << 32) | kept)
-    sorted_edges = np.concatenate(edges)
-    sorted_edges.sort()
-    return torch.from_numpy(np.stack([sorted_edges & 0xFFFFFFFF, sorted_edges >> 32]))
-
-
-def _cells_numpy(x: Floats, window: Ints, radius: float) -> tuple[Ints, int]:
-    """Return each particle's cell number, ascending along y, and the step to the next column."""
-    if not len(x):
-        return np.zeros(0, np.int64), 0
-    cell = np.floor(x * (1.0 / (radius * (1.0 + MARGIN)))).clip(-FAR, FAR).astype(np.int64)
-    cell -= cell.min(axis=0)
-    columns, rows = cell.max(axis=0)
-    # An empty row after each column and an empty column after each window keep them apart.
-    stride = int(rows) + 2
-    return (window * (columns + 2) + cell[:, 0]) * stride + cell[:, 1], stride
-
-
-def _pairs_numpy(x: Floats, key: Ints, stride: int, radius: float) -> tuple[Ints, Ints]:
-    """Return the pairs among particles sorted by cell, each once."""
-    own = np.arange(len(x))
-    above = np.searchsorted(key, key + 2)
-    beside = np.searchsorted(key, key + (stride - 1))
-    past = np.searchsorted(key, key + (stride + 2))
-    start = np.concatenate([own + 1, beside])
-    count = np.concatenate([above - (own + 1), past - beside])
-    i = np.repeat(np.concatenate([own, own]), count)
-    j = np.arange(len(i)) + np.repeat(start - (np.cumsum(count) - count), count)
-    x_0, x_1 = x.T.copy()
-    dx, dy = x_0[i] - x_0[j], x_1[i] - x_1[j]
-    near = np.flatnonzero(dx * dx + dy * dy <= radius * radius)
-    return i[near], j[near]
-
-
-def _graph_torch(position: Tensor, radius: float, sample: Tensor | None, self_edges: bool) -> Tensor:
-    """Search as :func:`_graph_numpy`, with torch operations alone, on any device."""
     x = position.detach().double()
-    kept = x.isfinite().all(dim=1).nonzero().squeeze(1)
-    window = x.new_zeros(len(x), dtype=torch.int64) if sample is None else sample
-    x, key = x[kept], window[kept]
-    stride: Tensor | int = 0
+    window = torch.zeros(len(x), dtype=torch.int64, device=x.device) if sample is None else sample
+    if x.device.type == "cpu":
+        edges = edge_numbers(np, x.numpy(), window.numpy(), radius, self_edges)
+        edges.sort()
+        edges = torch.from_numpy(edges)
+    else:
+        edges = edge_numbers(torch, x, window, radius, self_edges).sort().values
+    return torch.stack([edges & 0xFFFFFFFF, edges >> 32])
+
+
+def edge_numbers(xp: Any, x: Any, window: Any, radius: float, self_edges: bool) -> Any:  # noqa: ANN401
+    """Return receiver * 2^32 + sender of every edge, by arrays of NumPy or of torch as ``xp``."""
+    repeat = np.repeat if xp is np else torch.repeat_interleave
+    kept = xp.where(xp.isfinite(x).all(1))[0]
+    x, key, stride = x[kept], window[kept], 0
     if len(x):
-        cell = (x * (1.0 / (radius * (1.0 + MARGIN)))).floor().clamp(-FAR, FAR).long()
-        cell = cell - cell.amin(dim=0)
-        columns, rows = cell.amax(dim=0)
-        stride = rows + 2  # stays on the device
+        cell = xp.floor(x * (1.0 / (radius * (1.0 + MARGIN))))
+        cell = xp.asarray(xp.clip(cell, -FAR, FAR), dtype=xp.int64)
+        cell = cell - xp.amin(cell, 0)
+        columns, rows = xp.amax(cell, 0)
+        # An empty row after each column and an empty column after each window keep them apart.
+        stride = rows + 2
         key = (key * (columns + 2) + cell[:, 0]) * stride + cell[:, 1]
-    key, order = key.sort()
-    x, particle = x[order], kept[order]
-    own = torch.arange(len(x), device=x.device)
-    above = torch.searchsorted(key, key + 2)
-    beside = torch.searchsorted(key, key + (stride - 1))
-    past = torch.searchsorted(key, key + (stride + 2))
-    start = torch.cat([own + 1, beside])
-    count = torch.cat([above - (own + 1), past - beside])
-    run = torch.repeat_interleave(count)
-    i = torch.cat([own, own])[run]
-    j = torch.arange(len(run), device=x.device) + (start - (count.cumsum(0) - count))[run]
-    x_0, x_1 = x.T.contiguous()
-    dx, dy = x_0[i] - x_0[j], x_1[i] - x_1[j]
-    near = (dx * dx + dy * dy <= radius * radius).nonzero().squeeze(1)
+    order = xp.argsort(key, stable=True)
+    x, key, particle = x[order], key[order], kept[order]
+    own = xp.arange(len(x), device=x.device)
+    above = xp.searchsorted(key, key + 2)
+    beside = xp.searchsorted(key, key + (stride - 1))
+    past = xp.searchsorted(key, key + (stride + 2))
+    start = xp.concatenate([own + 1, beside])
+    count = xp.concatenate([above - (own + 1), past - beside])
+    i = repeat(xp.concatenate([own, own]), count)
+    j = xp.arange(len(i), device=x.device) + repeat(start - (xp.cumsum(count, 0) - count), count)
+    along_x, along_y = xp.stack([x[:, 0], x[:, 1]])
+    dx, dy = along_x[i] - along_x[j], along_y[i] - along_y[j]
+    near = xp.where(dx * dx + dy * dy <= radius * radius)[0]
     i, j = particle[i[near]], particle[j[near]]
-    edges = [(i << 32) | j, (j << 32) | i]
-    if self_edges:
-        edges.append((kept << 32) | kept)
-    sorted_edges = torch.cat(edges).sort().values
-    return torch.stack([sorted_edges & 0xFFFFFFFF, sorted_edges >> 32])
+    loops = [(kept << 32) | kept] if self_edges else []
+    return xp.concatenate([(i << 32) | j, (j << 32) | i, *loops])
 
 
 MATERIALS = 4  # that datasets.yaml knows: 0 liquid, 1 jelly, 2 snow, 3 rope

@@ -12,10 +12,10 @@ import platform
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import yaml
 from torch import Tensor
@@ -23,7 +23,7 @@ from torch import Tensor
 from lagbench.atomic import write_atomically
 from lagbench.data.checksums import round_digits
 from lagbench.data.registry import Registry
-from lagbench.errors import LagbenchError, UnreadableFileError, UsageError, check_regular
+from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError
 from lagbench.submission.budget import MOST_VALIDATIONS, Budget, track_of
 from lagbench.work.progress import Meter
 
@@ -62,16 +62,6 @@ class TrainingRecord:
         """Start the clocks."""
         self._cpu, self._wall = _processor_seconds(), time.monotonic()
 
-    @classmethod
-    def from_json(cls, values: Mapping[str, Any]) -> Self:
-        """Return a ledger that goes on where stored values end."""
-        known = {name: values[name] for name in cls.__dataclass_fields__ if name in values}
-        return cls(**known)
-
-    def as_json(self) -> dict[str, Any]:
-        """Return plain values."""
-        return {name: getattr(self, name) for name in self.__dataclass_fields__}
-
     def read_clocks(self, processes: int = 1, *, device: str = "cpu") -> None:
         """Add the time since the last reading, of as many processes as train alike."""
         cpu, wall = _processor_seconds(), time.monotonic()
@@ -79,11 +69,6 @@ class TrainingRecord:
         self.gpu_seconds += (wall - self._wall) * processes * (device != "cpu")
         self.wall_seconds += wall - self._wall
         self._cpu, self._wall = cpu, wall
-
-    def stepped(self, step: int, *, batch: int, windows: int) -> None:
-        """Enter a step of so many windows out of a training set of so many."""
-        self.step, self.windows_seen = step, step * batch
-        self.epochs = self.windows_seen / windows
 
     @contextmanager
     def validating(self, processes: int = 1, *, device: str = "cpu") -> Iterator[None]:
@@ -105,8 +90,7 @@ class TrainingRecord:
 
     def since_best(self) -> int:
         """Return how many validations came after the best one."""
-        steps = [int(entry["step"]) for entry in self.validation]
-        return sum(step > (self.best_step or 0) for step in steps)
+        return sum(entry["step"] > (self.best_step or 0) for entry in self.validation)
 
 
 def _processor_seconds() -> float:
@@ -124,7 +108,9 @@ class RunFolder:
         self.record = path / "training.json"  # what the training did and cost
         self.logs = path / "tensorboard"  # folder of TensorBoard's files
 
-    def earlier(self, recipe: Recipe, *, resume: bool, fresh: bool) -> Checkpoint | None:
+    def earlier(
+        self, recipe: Recipe, facts: Facts, *, processes: int, resume: bool, fresh: bool
+    ) -> Checkpoint | None:
         """Return the checkpoint to go on from; None for a training from the start."""
         left = [file for file in (self.checkpoint, self.weights, self.record) if file.exists()]
         if fresh or not left:
@@ -169,14 +155,26 @@ class RunFolder:
             )
         if not resume:
             raise taken
+        if found.facts.dataset_sha256 != facts.dataset_sha256:
+            raise DataError(
+                "the training began on another version of the data set",
+                where=where,
+                expected=found.facts.dataset_sha256,
+                got=facts.dataset_sha256,
+                fix="train anew with --fresh",
+            )
+        if found.training.get("processes") != processes:
+            raise UsageError(
+                "the training began with another number of processes",
+                where="--processes",
+                expected=found.training.get("processes"),
+                got=processes,
+                fix="the learning rate and the order of windows follow from it; or train anew with --fresh",
+            )
         return found
 
     def unfinished(self, trained: Mapping[str, Any]) -> tuple[int, int] | None:
-        """Return step and steps of a training that is not over, by its record.
-
-        None where it is over, where there is no record, and where the record is that of another recipe
-        than the one that the weights say they were trained by.
-        """
+        """Return step and steps of a training that is not over, if its record has the weights' recipe."""
         said = self._recorded()
         step, steps = said.get("step"), said.get("steps")
         if said.get("state") in OVER or said.get("recipe") != trained.get("recipe"):
@@ -222,9 +220,7 @@ def first_difference(wanted: dict[str, Any], found: object, path: str = "") -> s
     return "the same recipe"
 
 
-UNTOLD = ("seed", "compile", "log_every", "checkpoint_every")
-"""Options of a training that do not say what was learned."""
-
+UNTOLD = ("seed", "compile", "log_every", "checkpoint_every")  # options that do not say what was learned
 LONGEST_VALUE = 200  # letters of a changed option that are told
 
 
@@ -286,7 +282,7 @@ def _spelled(value: object) -> str:
     return text if bare else json.dumps(value)
 
 
-FORMAT = 1
+FORMAT = 1  # of training.json
 # whose versions decide the result
 LIBRARIES = ("lagbench", "torch", "torch-geometric", "pytorch-lightning", "numpy", "scipy")
 
@@ -308,7 +304,10 @@ class TrainingJob:
 
     def ledger(self) -> TrainingRecord:
         """Return the ledger that goes on where an earlier run ended, in the state that it ended in."""
-        return TrainingRecord() if self.earlier is None else TrainingRecord.from_json(self.earlier.training)
+        stored = self.earlier.training if self.earlier else {}
+        return TrainingRecord(
+            **{one.name: stored[one.name] for one in fields(TrainingRecord) if one.name in stored}
+        )
 
     def budget(self, ledger: TrainingRecord) -> Budget:
         """Return what the training took so far, as predictions and entries say it.
@@ -358,16 +357,11 @@ class TrainingJob:
             options=self.recipe.model,
             facts=self.facts,
             weights=weights,
-            training={**fixed, **ledger.as_json(), "budget": self.budget(ledger).model_dump(mode="json")},
+            training={**fixed, **asdict(ledger), "budget": self.budget(ledger).model_dump(mode="json")},
             optimizer=optimizer,
         )
 
-    def record(
-        self,
-        model: Baseline,
-        ledger: TrainingRecord,
-        **more: Any,  # noqa: ANN401 (plain values)
-    ) -> dict[str, Any]:
+    def record(self, model: Baseline, ledger: TrainingRecord, **more: int) -> dict[str, Any]:
         """Return what training.json says."""
         facts, budget = self.facts, self.budget(ledger)
         return {
@@ -386,7 +380,7 @@ class TrainingJob:
             "budget": budget.model_dump(mode="json"),
             "track": track_of(facts.size, budget),
             **more,
-            **ledger.as_json(),
+            **asdict(ledger),
         }
 
 

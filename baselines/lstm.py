@@ -29,6 +29,7 @@ class LSTM(FrameNetwork):
     """
 
     method = "lstm"
+    inputs = 2
     interleaved: ClassVar[bool] = False
 
     class Options(FrameNetworkOptions):
@@ -56,11 +57,6 @@ class LSTM(FrameNetwork):
         self.second = nn.LSTM(latent, latent, batch_first=True)
         self.dropout = nn.ModuleList(nn.Dropout(share) for share in options.dropout)
         self.decoder = dense((latent, *options.decoder, self.features), Activation.ELU)
-
-    @property
-    def inputs(self) -> int:
-        """Two frames."""
-        return 2
 
     @property
     def weights(self) -> Mapping[str, float]:

@@ -22,12 +22,7 @@ class Activation(enum.StrEnum):
     SIGMOID = "sigmoid"
 
 
-LAYERS: Mapping[Activation, type[nn.Module]] = {
-    Activation.ELU: nn.ELU,
-    Activation.RELU: nn.ReLU,
-    Activation.TANH: nn.Tanh,
-    Activation.SIGMOID: nn.Sigmoid,
-}
+LAYERS = dict(zip(Activation, (nn.ELU, nn.ReLU, nn.Tanh, nn.Sigmoid), strict=True))
 
 
 def dense(widths: tuple[int, ...], activation: Activation) -> nn.Sequential:
@@ -45,6 +40,7 @@ class MLP(FrameNetwork):
     """
 
     method = "mlp"
+    inputs = 1
 
     class Options(FrameNetworkOptions):
         """Options of the MLP."""
@@ -60,11 +56,6 @@ class MLP(FrameNetwork):
         super().__init__(options, facts)
         inputs = self.input_features * facts.particles
         self.network = dense((inputs, *options.widths, self.features), options.activation)
-
-    @property
-    def inputs(self) -> int:
-        """One frame."""
-        return 1
 
     @property
     def weights(self) -> Mapping[str, float]:

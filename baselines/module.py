@@ -14,7 +14,7 @@ import signal
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from types import FrameType
 from typing import Any
@@ -34,36 +34,10 @@ from .checkpoint import load, rounded_weights, save
 from .job import STOPPED_EARLY, TrainingJob, TrainingRecord
 from .machine import return_memory
 from .recipe import TrainingOptions
-from .rollout import Validation
+from .rollout import Validation, replaced
 
 MEAN = "mean"  # name of a weight's running mean in the optimiser's state
 TOTAL = "total"  # name of the weighted sum among the loss terms
-
-
-def weighted_sum(terms: Mapping[str, Tensor], weights: Mapping[str, float]) -> Tensor:
-    """Return sum_i w_i L_i; terms that no weight is given for have 1, those of weight 0 are left out."""
-    used = {name: value for name, value in terms.items() if weights.get(name, 1.0) != 0}
-    parts = [value.reshape(()) * weights.get(name, 1.0) for name, value in used.items()]
-    if not parts:
-        raise WorkFailedError("every term of the loss has weight 0", got=", ".join(terms))
-    return torch.stack(parts).sum()
-
-
-def _check_terms(model: Baseline, terms: object) -> None:
-    """Refuse a loss of a user's own class that nothing can be learned from."""
-    named = dict(terms) if isinstance(terms, Mapping) else {"no dict": terms}
-    fit = isinstance(terms, Mapping) and all(
-        isinstance(one, Tensor) and one.numel() == 1 for one in named.values()
-    )
-    held = ", ".join(f"{name}: {getattr(one, 'shape', type(one).__name__)}" for name, one in named.items())
-    if not fit or not named:
-        raise UsageError(
-            "a model returned no loss",
-            where=f"{type(model).__qualname__}.forward",
-            expected="a dict of terms, tensors of one number each",
-            got=held or "an empty dict",
-            fix="mend that class; docs/baselines.md has an example",
-        )
 
 
 class TrainingModule(LightningModule):
@@ -90,7 +64,6 @@ class TrainingModule(LightningModule):
         self._rate = options.learning_rate * processes
         self._loader = loader  # returns the batches of a process, by its rank among so many
         self._resumed = optimizer
-        self._noise: torch.Generator | None = None
 
     @property
     def learning_rate(self) -> float:
@@ -118,25 +91,33 @@ class TrainingModule(LightningModule):
             self._optimizer.load_state_dict(dict(self._resumed))
         return self._optimizer
 
-    def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
-        """Return the batch on the device; Lightning knows no dataclasses."""
-        del dataloader_idx
-        return batch.to(device)
-
     def training_step(self, batch: Batch, index: int) -> Tensor:
         """Return the loss of a batch, and keep its raw terms."""
         del index
+        where = f"{type(self.model).__qualname__}.forward"
         seed = seed_of(self.recipe.seed, self.step, self.global_rank)
         reseed(seed)
-        if self._noise is None:
-            self._noise = torch.Generator(device=self.device)
-        terms = self.model(batch, self._noise.manual_seed(seed))
-        _check_terms(self.model, terms)
-        total = weighted_sum(terms, self.model.weights)
+        terms = self.model(batch, torch.Generator(device=self.device).manual_seed(seed))
+        named = terms if isinstance(terms, Mapping) else {"no dict": terms}
+        fit = named is terms and all(isinstance(one, Tensor) and one.numel() == 1 for one in named.values())
+        if not named or not fit:
+            shapes = [f"{name}: {getattr(one, 'shape', type(one).__name__)}" for name, one in named.items()]
+            raise UsageError(
+                "a model returned no loss",
+                where=where,
+                expected="a dict of terms, tensors of one number each",
+                got=", ".join(shapes) or "an empty dict",
+                fix="mend that class; docs/baselines.md has an example",
+            )
+        weights = {name: self.model.weights.get(name, 1.0) for name in terms}
+        parts = [terms[name].reshape(()) * weight for name, weight in weights.items() if weight != 0]
+        if not parts:
+            raise WorkFailedError("every term of the loss has weight 0", got=", ".join(terms))
+        total = torch.stack(parts).sum()
         if not total.requires_grad:
             raise UsageError(
                 "nothing can be learned from the loss",
-                where=f"{type(self.model).__qualname__}.forward",
+                where=where,
                 expected="a term, of a weight above 0, that depends on the model's parameters",
                 got=", ".join(terms),
                 fix="mend that class, or the weights",
@@ -179,19 +160,10 @@ class TrainingModule(LightningModule):
                     state[MEAN] = parameter.detach().clone()
                 state[MEAN].lerp_(parameter.detach(), 1.0 - kept)
 
-    @contextmanager
-    def published(self) -> Iterator[Baseline]:
+    def published(self) -> AbstractContextManager[None]:
         """Put the mean of the weights in their place for a while, where one is kept."""
-        kept = {parameter: state[MEAN] for parameter, state in self._optimizer.state.items() if MEAN in state}
-        last = {parameter: parameter.detach().clone() for parameter in kept}
-        with torch.no_grad():
-            for parameter, mean in kept.items():
-                parameter.copy_(mean)
-            try:
-                yield self.model
-            finally:
-                for parameter, value in last.items():
-                    parameter.copy_(value)
+        states = self._optimizer.state.items()
+        return replaced({parameter: state[MEAN] for parameter, state in states if MEAN in state})
 
     def not_finite(self) -> WorkFailedError:
         """Return the error that names step and terms."""
@@ -218,13 +190,11 @@ class TrainingCallback(Callback):
         ledger: TrainingRecord,
         *,
         validation: Validation | None,
-        steps: int,
         windows: int,
     ) -> None:
         self.job = job  # the training that was asked for
         self.ledger = ledger  # what it has done so far
         self.validation = validation  # None validates never
-        self.steps = steps  # of the whole training
         self.windows = windows  # of the training subsets
         self._interrupted = False
         self._handlers: dict[int, Any] = {}
@@ -234,8 +204,8 @@ class TrainingCallback(Callback):
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
                 self._handlers[number] = signal.signal(number, self._interrupt)
-        steps = self.steps
-        self.job.meter.begin("training", total=steps, scenarios=steps, done=_of(module).step)
+        steps, step = _of(module).steps, _of(module).step
+        self.job.meter.begin("training", total=steps, scenarios=steps, done=step)
         if self.validation is not None and self.job.recipe.start and not self.ledger.validation:
             self._validate(trainer, _of(module), self.validation)
             self._store(trainer, _of(module))  # weights without a checkpoint could not be gone on with
@@ -245,8 +215,9 @@ class TrainingCallback(Callback):
     ) -> None:
         """Do what is due after a step."""
         trained = _of(module)
-        step, steps, recipe = trained.step, self.steps, trained.recipe
-        self.ledger.stepped(step, batch=recipe.batch * trainer.world_size, windows=self.windows)
+        step, steps, recipe = trained.step, trained.steps, trained.recipe
+        seen = step * recipe.batch * trainer.world_size
+        self.ledger.step, self.ledger.windows_seen, self.ledger.epochs = step, seen, seen / self.windows
         last = step >= steps
         if last or step % recipe.log_every == 0 or step == 1:
             terms = self.ledger.loss = {name: float(value) for name, value in trained.terms.items()}
@@ -298,8 +269,8 @@ class TrainingCallback(Callback):
         value = 0.0
         with self.ledger.validating(trainer.world_size, device=self.job.device):
             if trainer.is_global_zero:
-                with module.published() as model:
-                    value = validation(model)
+                with module.published():
+                    value = validation(module.model)
             value = float(trainer.strategy.broadcast(value))
         better = self.ledger.validated(validation.metric, value)
         if trainer.logger is not None:
@@ -313,8 +284,8 @@ class TrainingCallback(Callback):
 
     def _publish(self, module: TrainingModule) -> None:
         """Write the weights to predict from."""
-        with module.published() as model:
-            save(self.job.folder.weights, self.job.checkpoint(self.ledger, rounded_weights(model)))
+        with module.published():
+            save(self.job.folder.weights, self.job.checkpoint(self.ledger, rounded_weights(module.model)))
 
     def _store(self, trainer: Trainer, module: TrainingModule) -> None:
         """Write checkpoint and record; a model whose weights are not finite is not stored."""
@@ -338,8 +309,8 @@ class TrainingCallback(Callback):
 
     def _write_record(self, trainer: Trainer, module: TrainingModule) -> None:
         self.ledger.read_clocks(trainer.world_size, device=self.job.device)
-        more = {"steps": self.steps, "windows": self.windows}
-        self.job.folder.write_record(self.job.record(module.model, self.ledger, **more))
+        record = self.job.record(module.model, self.ledger, steps=module.steps, windows=self.windows)
+        self.job.folder.write_record(record)
 
 
 def _of(module: LightningModule) -> TrainingModule:
@@ -372,13 +343,11 @@ def generators_kept() -> Iterator[None]:
             np.random.set_state(numpy)  # noqa: NPY002
 
 
-LOGGERS = ("lightning.pytorch", "lightning.fabric", "pytorch_lightning", "lightning_fabric")
-
-
 @contextmanager
 def quiet() -> Iterator[None]:
     """Keep Lightning's advice from our users: none of it is about what they asked for."""
-    loggers = [logging.getLogger(name) for name in LOGGERS]
+    names = ("lightning.pytorch", "lightning.fabric", "pytorch_lightning", "lightning_fabric")
+    loggers = [logging.getLogger(name) for name in names]
     levels = [logger.level for logger in loggers]
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", module=r"(pytorch_lightning|lightning_fabric|tensorboard)(\..*)?")

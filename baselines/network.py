@@ -1,8 +1,4 @@
-"""Encode, process, decode: the graph network that all six operators share, and its layers.
-
-They are fast and exact on CPUs: products go to oneDNN, normalising layers learn in bfloat16 too, and
-large edge updates keep no hidden layer: the backward pass computes them again.
-"""
+"""Encode, process, decode: the graph network that all six operators share, and its layers for CPUs."""
 
 from __future__ import annotations
 
@@ -49,27 +45,23 @@ class ProcessorLayer(nn.Module):
         if self.sum_messages and self.operator.reads_nodes:
             given = torch.cat([node, summed(edge_index, message, len(node))], dim=-1)
         answer = self.operator(given, edge_index, message, generator=generator)
-        if not torch.compiler.is_compiling():
-            _check_gathered(self.operator, answer, len(node))
+        if not torch.compiler.is_compiling():  # an operator of a user's own may return anything
+            pair = isinstance(answer, tuple) and len(answer) == 2 and isinstance(answer[1], Mapping)
+            held = [answer[0], *answer[1].values()] if pair else [answer]
+            shapes = [tuple(one.shape) if isinstance(one, Tensor) else type(one).__name__ for one in held]
+            wanted = (len(node), self.operator.latent)
+            if not pair or shapes[0] != wanted or any(shape != () for shape in shapes[1:]):
+                raise UsageError(
+                    "an operator returned no pair of what is gathered and losses",
+                    where=f"{type(self.operator).__qualname__}.forward",
+                    expected=f"a tensor of shape {wanted}, and a dict of losses of shape (),"
+                    " which may be empty",
+                    got=("" if pair else "alone: ") + ", ".join(map(str, shapes)),
+                    fix="mend that class; docs/extending.md has an example",
+                )
         gathered, losses = answer
         update = self.update(torch.cat([node, gathered], dim=-1))
         return node + update, edge + message, losses
-
-
-def _check_gathered(operator: Operator, answer: Any, particles: int) -> None:  # noqa: ANN401 (it may be anything)
-    """Refuse what an operator of a user's own may return instead of the pair that it should."""
-    pair = isinstance(answer, tuple) and len(answer) == 2 and isinstance(answer[1], Mapping)
-    held = [answer[0], *answer[1].values()] if pair else [answer]
-    shapes = [tuple(one.shape) if isinstance(one, Tensor) else type(one).__name__ for one in held]
-    wanted = (particles, operator.latent)
-    if not pair or shapes[0] != wanted or any(shape != () for shape in shapes[1:]):
-        raise UsageError(
-            "an operator returned no pair of what is gathered and losses",
-            where=f"{type(operator).__qualname__}.forward",
-            expected=f"a tensor of shape {wanted}, and a dict of losses of shape (), which may be empty",
-            got=("" if pair else "alone: ") + ", ".join(map(str, shapes)),
-            fix="mend that class; docs/extending.md has an example",
-        )
 
 
 class EncodeProcessDecode(nn.Module):
@@ -85,21 +77,18 @@ class EncodeProcessDecode(nn.Module):
         *,
         node_features: int,
         edge_features: int,
-        outputs: int = 2,
         latent: int = 128,
         layers: int = 10,
-        hidden: int | None = None,
         sum_messages: bool = True,
     ) -> None:
         super().__init__()
-        hidden = latent if hidden is None else hidden
-        self.node_encoder = mlp([node_features, hidden, hidden, latent])
-        self.edge_encoder = mlp([edge_features, hidden, hidden, latent])
+        self.node_encoder = mlp([node_features, latent, latent, latent])
+        self.edge_encoder = mlp([edge_features, latent, latent, latent])
         self.processor = nn.ModuleList(
-            ProcessorLayer(operator, latent=latent, hidden=hidden, sum_messages=sum_messages)
+            ProcessorLayer(operator, latent=latent, hidden=latent, sum_messages=sum_messages)
             for _ in range(layers)
         )
-        self.decoder = mlp([latent, hidden, hidden, outputs], norm=False)
+        self.decoder = mlp([latent, latent, latent, 2], norm=False)
 
     def compile_layers(self) -> None:
         """Compile the edges' encoder and the processor layers, for any number of edges.
@@ -112,7 +101,7 @@ class EncodeProcessDecode(nn.Module):
     def forward(
         self, node: Tensor, edge_index: Tensor, edge: Tensor, generator: torch.Generator | None = None
     ) -> tuple[Tensor, Losses]:
-        """Return the prediction, shape [particle, outputs], and the operators' own losses, layer means."""
+        """Return the prediction, shape [particle, 2], and the operators' own losses, layer means."""
         given = node.dtype
         node, edge = self.node_encoder(node), self.edge_encoder(edge)
         losses: list[Losses] = []
@@ -164,15 +153,10 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
 
 def _fast(x: Tensor, weight: Tensor) -> bool:
     """Return whether oneDNN can and should do it: rows of float32 on a CPU."""
-    return (
-        x.device.type == "cpu"
-        and x.dim() == 2
-        and x.numel() > 0
-        and x.dtype == weight.dtype == torch.float32
-        and not torch.is_autocast_enabled("cpu")
-        and not torch.compiler.is_compiling()
-        and hasattr(torch.ops.mkldnn, "_linear_pointwise")
-    )
+    rows = x.device.type == "cpu" and x.dim() == 2 and x.numel() > 0
+    exact = x.dtype == weight.dtype == torch.float32 and not torch.is_autocast_enabled("cpu")
+    known = not torch.compiler.is_compiling() and hasattr(torch.ops.mkldnn, "_linear_pointwise")
+    return rows and exact and known
 
 
 class Linear(nn.Linear):
@@ -206,8 +190,7 @@ def edge_map(
 ) -> Tensor:
     """Return ``f(s_j + r_i + W_e e_ij)``, shape [edge, output].
 
-    f is the rest of an MLP from its first hidden layer on; s and r, shape [particle, hidden], are that
-    layer of each particle as a sender and as a receiver.
+    f is the rest of an MLP from its first hidden layer on, of which s and r are the parts of a particle.
     """
     hidden = _gathered(edge_index, sender, receiver)
     hidden += linear(edge, weight)  # In place: an edge tensor of a full scenario is 32 MB.

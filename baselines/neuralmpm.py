@@ -157,9 +157,8 @@ class NeuralMPM(Baseline):
         outputs = (3 * kinds + 2 if options.conserve else 2 * kinds) * frames
         self.network = UNet(seen + forcing + options.context, outputs, options.width)
         # what all matter falls by; images of the square fall nowhere
-        self.fall: nn.Parameter | None = None
-        if options.conserve and options.symmetry is not Symmetry.SQUARE:
-            self.fall = nn.Parameter(torch.zeros(()))
+        falls = options.conserve and options.symmetry is not Symmetry.SQUARE
+        self.fall = nn.Parameter(torch.zeros(())) if falls else None
         self.projection: Projection | None = None
         if options.shape or options.density:
             self.projection = Projection(facts.bounds, shape=options.shape, density=options.density)
@@ -193,14 +192,7 @@ class NeuralMPM(Baseline):
         """
         options = self.options
         if generator is not None:
-            batch = disturbed(
-                batch,
-                generator,
-                symmetry=options.symmetry,
-                bounds=self.facts.bounds,
-                history=self.history,
-                noise_std=options.noise_std,
-            )
+            batch = disturbed(self, batch, generator)
         state = self.start(batch.part(slice(self.history)), average=False)
         following = self.history  # the first frame whose error counts
         if generator is not None and options.pushforward:
@@ -240,24 +232,23 @@ class NeuralMPM(Baseline):
         walls = position.new_zeros(given.windows, 1, len(self.beside), 2)
         if self.options.wall_velocity and given.wall_velocity is not None:
             walls = given.wall_velocity[:, given.frames - 1 :] * self.facts.frame_interval
+        kinds, drawn, rest = len(self.options.materials), None, None
+        layer = given.sample * kinds + slot
+        if self.projection is not None:
+            drawn = self.projection.start(first_frame(given), given.material, given.sample, given.windows)
+        if self.options.strain:
+            solid = given.material != LIQUID
+            rest = Rest.of(self.grid, first_frame(given), layer, given.windows * kinds, solid=solid)
         state = GridState(
             position=position[:, -1],
             velocity=velocity,
             sample=given.sample,
-            layer=given.sample * len(self.options.materials) + slot,
+            layer=layer,
             walls=walls,
             context=position.new_zeros(given.windows, 0),
+            rest=rest,
+            drawn=drawn,
         )
-        if self.projection is not None:
-            first = first_frame(given)
-            drawn = self.projection.start(first, given.material, given.sample, given.windows)
-            state = replace(state, drawn=drawn)
-        if self.options.strain:
-            layers = given.windows * len(self.options.materials)
-            solid = given.material != LIQUID
-            state = replace(
-                state, rest=Rest.of(self.grid, first_frame(given), state.layer, layers, solid=solid)
-            )
         if self.context is None:
             return state
         fields, _ = self._fields(state, self.grid.stencil(state.position, state.layer))
@@ -319,11 +310,8 @@ class NeuralMPM(Baseline):
     def _pushed(self, state: GridState, stencil: Stencil, output: Tensor) -> Sequence[Tensor]:
         """Return the accelerations in the coming frames [length/frame^2], shape [particle, 2] each.
 
-        Args:
-            state: where they are.
-            stencil: nodes of their materials around them.
-            output: stresses of each material in each frame, (xx, xy, yy) / STIFF [length cell/frame^2],
-                and accelerations beside walls, shape [window, channel, x node, y node].
+        The U-Net's output are stresses of each material in each frame, (xx, xy, yy) / STIFF
+        [length cell/frame^2], then accelerations beside walls.
         """
         windows, frames = len(output), self.options.bundle
         stress, beside = output.tensor_split([3 * len(self.options.materials) * frames], dim=1)
@@ -343,9 +331,8 @@ class NeuralMPM(Baseline):
     def _mean_over_images(self, seen: Tensor) -> Tensor:
         """Return the mean over all images of what the U-Net says of one, turned back.
 
-        Fields in and out have the shape [window, channel, x node, y node] and no unit. A rollout of an
-        image is then the image of the rollout: frame averaging over the whole group (Puny et al. 2022,
-        arXiv 2110.03336).
+        A rollout of an image is then the image of the rollout: frame averaging over the whole group (Puny et
+        al. 2022, arXiv 2110.03336).
         """
         options, outputs = self.options, []
         for matrix in images(options.symmetry):

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from .graph import Bounds
+from .graph import Bounds, wall_distance
 from .torch_grid import nine_nodes, spline_slopes, spline_weights
 
 __all__ = ["ParticleGrid", "Stencil"]
@@ -46,6 +46,7 @@ class ParticleGrid(nn.Module):
 
     def __init__(self, bounds: Bounds, cells: int, *, multiple: int = 1) -> None:
         super().__init__()
+        self.bounds = bounds
         self.spacing = max(high - low for low, high in bounds) / cells
         for name, (low, high) in zip(("axis_x", "axis_y"), bounds, strict=True):
             nodes = math.ceil((high - low) / self.spacing - 1e-6) + 2
@@ -62,12 +63,7 @@ class ParticleGrid(nn.Module):
         return len(self.axis_x), len(self.axis_y)
 
     def stencil(self, position: Tensor, layer: Tensor) -> Stencil:
-        """Return the nodes around particles.
-
-        Args:
-            position: particle positions [length], shape [particle, 2].
-            layer: layer of each particle, int64, shape [particle].
-        """
+        """Return the nodes around particles [length], shape [particle, 2], in layers, int64, [particle]."""
         base, s = self._corner(position)
         column, row = base.long().unbind(dim=1)
         node = nine_nodes(layer, column, row, self.shape)
@@ -83,45 +79,27 @@ class ParticleGrid(nn.Module):
         return base, s - base
 
     def spread(self, stencil: Stencil, value: Tensor, layers: int) -> Tensor:
-        """Return the sums at the nodes, shape [layer, channel, x node, y node].
-
-        Args:
-            stencil: what :meth:`stencil` returned.
-            value: values of the particles, shape [particle, channel].
-            layers: number of layers.
-        """
+        """Return sums at the nodes, [layer, channel, x node, y node], of values [particle, channel]."""
         columns, rows = self.shape
         parts = (stencil.weight[:, :, None] * value[:, None]).flatten(0, 1)
         sums = value.new_zeros(layers * columns * rows, value.shape[1]).index_add(0, stencil.node, parts)
         return sums.view(layers, columns, rows, -1).permute(0, 3, 1, 2)
 
     def gather(self, stencil: Stencil, field: Tensor) -> Tensor:
-        """Return a field at the particles, shape [particle, channel].
-
-        Args:
-            stencil: what :meth:`stencil` returned.
-            field: values at the nodes, shape [layer, channel, x node, y node].
-        """
+        """Return a field, [layer, channel, x node, y node], at the particles, [particle, channel]."""
         channels = field.shape[1]
         nodes = field.permute(0, 2, 3, 1).reshape(-1, channels).index_select(0, stencil.node)
         return (stencil.weight[:, :, None] * nodes.view(-1, 9, channels)).sum(dim=1)
 
     def pushed(self, stencil: Stencil, position: Tensor, stress: Tensor, mass: Tensor) -> Tensor:
-        """Return the accelerations of the nodes of matter under stress, 0 where there is none.
+        """Return accelerations (x, y) of nodes of matter under stress, [layer, 2 frame, x node, y node].
 
             m_i a_i = -sum_p s_p grad b_i(x_p),   m_i = sum_p b_i(x_p)
 
-        the weak form of the material-point method (Sulsky, Chen and Schreyer 1994), with grad per cell.
-        As the b_i sum to 1 and the s_p are symmetric, momentum and angular momentum of the nodes are kept.
-
-        Args:
-            stencil: what :meth:`stencil` returned.
-            position: the same positions [length], shape [particle, 2].
-            stress: components (xx, xy, yy) for each particle, shape [particle, frame, 3].
-            mass: what :meth:`spread` returned of 1, shape [layer, 1, x node, y node].
-
-        Returns:
-            Components (x, y) for each frame, shape [layer, 2 frame, x node, y node].
+        the weak form of the material-point method (Sulsky, Chen and Schreyer 1994), with grad per cell; 0
+        where there is no matter. As the b_i sum to 1 and the s_p are symmetric, momentum and angular momentum
+        of the nodes are kept. ``stress`` has components (xx, xy, yy), shape [particle, frame, 3]; where the
+        stencil is, is ``position``; ``mass`` is what :meth:`spread` returns of 1.
         """
         columns, rows = self.shape
         along_x, along_y = spline_slopes(self._corner(position)[1]).flatten(2)[..., None].unbind(dim=1)
@@ -140,25 +118,17 @@ class ParticleGrid(nn.Module):
         return places - position[:, None]
 
     def wall_distance(self, reach: float) -> Tensor:
-        """Return the distances to left, right, bottom and top wall over a reach, within [-1, 1].
-
-        Args:
-            reach: distance beyond which a wall looks like one at it [length].
-
-        Returns:
-            Negative outside the box, shape [wall, x node, y node].
-        """
-        (left, bottom), (right, top) = self.low, self.high
-        x, y = (self.axis_x[:, None].expand(self.shape), self.axis_y.expand(self.shape))
-        distance = torch.stack([x - left, right - x, y - bottom, top - y])
-        return (distance / reach).clamp(-1.0, 1.0)
+        """Return the nodes' distances to the walls as particles see theirs, shape [wall, x node, y node]."""
+        places = torch.stack(torch.meshgrid(self.axis_x, self.axis_y, indexing="ij"), dim=-1)
+        return wall_distance(places, self.bounds, reach).permute(2, 0, 1).contiguous()
 
     def inside(self) -> Tensor:
         """Return the shares of the nodes' splines that lie in the box [1], shape [x node, y node]."""
-        sides = []
-        for axis, low, high in zip((self.axis_x, self.axis_y), self.low, self.high, strict=True):
-            sides.append(_below((high - axis) / self.spacing) - _below((low - axis) / self.spacing))
-        return sides[0][:, None] * sides[1]
+        of_x, of_y = (
+            _below((high - axis) / self.spacing) - _below((low - axis) / self.spacing)
+            for axis, low, high in zip((self.axis_x, self.axis_y), self.low, self.high, strict=True)
+        )
+        return of_x[:, None] * of_y
 
     def beside_walls(self) -> Tensor:
         """Return 1 at the two rows of nodes beside each wall, else 0, shape [wall, x node, y node]."""

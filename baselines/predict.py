@@ -280,8 +280,8 @@ def _model(
         ) from error
 
 
+# before a recipe's name and before the settings of a prediction, in the words for a training
 RECIPE, PREDICTED_WITH = ", recipe ", ", predicted with "
-"""What comes before a recipe's name and before the settings of a prediction, in the words for a training."""
 
 
 def training_words(checkpoint: Checkpoint) -> str:
@@ -313,11 +313,8 @@ def _provenance(checkpoint: Checkpoint, here: Facts, settings: Sequence[str]) ->
     words = training_words(checkpoint) + (f"{PREDICTED_WITH}{', '.join(settings)}" if settings else "")
     seed = done.get("recipe", {}).get("training", {}).get("seed", 0)
     found: dict[str, Any] = {"training": words, "seed": int(seed)}
-    budget = checkpoint.budget
-    if budget is None:
-        return found
-    if here.size != facts.size:
-        budget = budget.model_copy(
-            update=dict.fromkeys(("metric", "best", "best_step")) | {"validations": ()}
-        )
-    return {**found, "budget": budget.model_dump_json(exclude_defaults=True)}
+    if budget := checkpoint.budget:
+        unknown = {"metric": None, "best": None, "best_step": None, "validations": ()}
+        budget = budget if here.size == facts.size else budget.model_copy(update=unknown)
+        found["budget"] = budget.model_dump_json(exclude_defaults=True)
+    return found

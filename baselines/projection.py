@@ -26,17 +26,9 @@ HELD = 3.0  # log-odds of the share of the way to their shape that bodies go, be
 MOST_PUSH = 2.0  # greatest k of Density
 LIMIT = 0.2  # what a change of 1 is to the density that is not too much; with more, bodies are blown up
 
-PER_GRID = {"shape": "held", "density": "push"}
-"""Weights of a :class:`Projection` that are of one grid each, by the option that asks for its grids."""
-
-TINY = 1e-16
-"""Square of a cluster's moment [length^4] below which it has no direction."""
-
-LEAST = 4e-4
-"""Least share of a node's spline inside the box that its weight is divided by; no node in reach has less."""
-
-MOST_EXCESS = 1.0
-"""Excess of density beyond which matter is pushed no farther at once [1]."""
+TINY = 1e-16  # square of a cluster's moment [length^4] below which it has no direction
+LEAST = 4e-4  # least share of a node's spline inside the box that divides its weight; in reach none is less
+MOST_EXCESS = 1.0  # excess of density beyond which matter is pushed no farther at once [1]
 
 
 @dataclass(frozen=True)
@@ -61,14 +53,7 @@ class Shape:
 
     @classmethod
     def of(cls, grid: ParticleGrid, position: Tensor, layer: Tensor, layers: int) -> Shape:
-        """Return the clusters of bodies.
-
-        Args:
-            grid: its nodes; clusters reach one and a half of its cells.
-            position: X [length], shape [particle, 2].
-            layer: layer of each particle, int64, shape [particle]; bodies have their own.
-            layers: number of layers.
-        """
+        """Return the clusters of bodies at X, each in a layer of its own; they reach one and a half cells."""
         position = position.clamp(grid.low, grid.high)
         stencil = grid.stencil(position, layer)
         # A cluster whose arms do not add up to 0 turns a little in every frame: rounding would spin bodies.
@@ -82,11 +67,7 @@ class Shape:
         return cls(stencil, layer, count, len(inverse), inverse.to(position), arm.to(position))
 
     def matched(self, position: Tensor) -> Tensor:
-        """Return x', the mean of where the clusters of a particle have it [length], shape [particle, 2].
-
-        Args:
-            position: x, positions of the same particles now [length], shape [particle, 2].
-        """
+        """Return x', the mean of where the clusters of a particle have it, from x [length], [particle, 2]."""
         weight, (along_x, along_y) = self.stencil.weight, self.arm.unbind(dim=2)
         # Moments are taken about the middle of each body: about a far point they would be rounded more.
         mean = position.new_zeros(len(self.count), 2).index_add(0, self.layer, position) / self.count
@@ -124,14 +105,7 @@ class Density:
 
     @classmethod
     def of(cls, grid: ParticleGrid, position: Tensor, sample: Tensor, windows: int) -> Density:
-        """Return the density of first frames.
-
-        Args:
-            grid: where it is measured.
-            position: positions in the first frame [length], shape [particle, 2].
-            sample: window of each particle, int64, shape [particle].
-            windows: number of windows.
-        """
+        """Return the density in windows whose particles have these positions in the first frame."""
         inverse = 1.0 / grid.inside().clamp(min=LEAST)
         empty = cls(grid, inverse, sample, position.new_ones(windows))
         found, _ = empty.relative(grid.stencil(position.clamp(grid.low, grid.high), sample))
@@ -145,12 +119,9 @@ class Density:
         return self.grid.gather(stencil, mass * self.inverse)[:, 0] / self.most[self.sample], mass
 
     def eased(self, position: Tensor, push: Tensor, limit: Tensor) -> Tensor:
-        """Return x' [length], shape [particle, 2].
+        """Return x' [length] from x, both of shape [particle, 2], with l [1], shape [particle], as the limit.
 
-        Args:
-            position: x, positions of the same particles now [length], shape [particle, 2].
-            push: k [1], one number; about 1 takes away what is too much within a few steps.
-            limit: l, densities that are not too much [1], shape [particle].
+        A push k of about 1 takes away what is too much within a few steps.
         """
         position = position.clamp(self.grid.low, self.grid.high)
         stencil = self.grid.stencil(position, self.sample)
@@ -202,16 +173,11 @@ class Projection(nn.Module):
     ) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Return weights and options with our own start for all grids but those that stand first in both.
 
-        Limits are of materials, not of grids: they are kept.
-
-        Args:
-            weights: of a model, by name, ours with the prefix: ``held`` of shape [grid, elastic material],
-                ``push`` [grid], ``limit`` [material].
-            options: of that model, with its grids as ``shape`` and ``density``.
-            prefix: name of this module in a model, and a dot.
+        Limits are of materials, not of grids: they are kept. ``prefix`` is this module's name in the model of
+        weights and options, and a dot.
         """
         weights, options, own = dict(weights), dict(options), self.state_dict(prefix=prefix)
-        for option, name in PER_GRID.items():
+        for option, name in (("shape", "held"), ("density", "push")):  # what is of one grid each
             ours, known = list(self.across[option]), list(options[option])
             shared = len(list(takewhile(lambda pair: pair[0] == pair[1], zip(ours, known, strict=False))))
             options[option], learned = ours, weights.pop(prefix + name, None)
@@ -221,14 +187,7 @@ class Projection(nn.Module):
         return {**own, **kept}, options
 
     def start(self, first: Tensor, material: Tensor, sample: Tensor, windows: int) -> Drawn:
-        """Return what windows are drawn to.
-
-        Args:
-            first: positions in the scenarios' first frames [length], shape [particle, 2].
-            material: of each particle, int64, shape [particle]; those of one material are one body.
-            sample: window of each particle, int64, shape [particle].
-            windows: number of windows.
-        """
+        """Return what windows are drawn to, from first frames; particles of one material are one body."""
         kind = torch.full((MATERIALS,), -1, device=material.device)
         kind[list(ELASTIC)] = torch.arange(len(ELASTIC), device=material.device)
         elastic = (kind[material] >= 0).nonzero()[:, 0]
@@ -242,10 +201,6 @@ class Projection(nn.Module):
         """Return the positions that a frame comes to [length], shape [particle, 2].
 
         They may lie beyond walls; where densities are asked for, what lies there is put back first.
-
-        Args:
-            drawn: what :meth:`start` returned.
-            position: where particles would be without [length], shape [particle, 2].
         """
         if drawn.densities:
             limit = (1.0 + LIMIT * self.limit)[drawn.material]

@@ -119,18 +119,16 @@ class TrainingOptions(Settings):
     @classmethod
     def _one_budget(cls, data: object) -> object:
         if isinstance(data, Mapping) and data.get("steps") and data.get("epochs"):
-            message = "give steps or epochs, not both"
-            raise ValueError(message)
+            raise ValueError("give steps or epochs, not both")
         return data
 
     @model_validator(mode="after")
     def _own_subsets(self) -> TrainingOptions:
         if {"test", "valid"} & set(self.windows) or not self.windows:
-            message = (
+            raise ValueError(
                 f"windows={self.windows}: a model is trained on train (and extra), never on test, and not on"
                 " valid, by which its weights are chosen"
             )
-            raise ValueError(message)
         return self
 
     def total_steps(self, windows: int, *, processes: int = 1) -> int:
@@ -262,43 +260,39 @@ def recipe_for(
             fix=f"{fix}write your own: --recipe FILE.yaml, see docs/baselines.md",
         )
     part = part or _Shared()
-    model, training = _merge(file.model, part.model), _merge(file.training, part.training)
     for other in part.baselines:
         if other not in names():
             where = f"{path}, {name}, baselines"
             raise UnreadableFileError(f"unknown baseline {other!r}", where=where, fix=nearest(other, names()))
-    own = part.baselines.get(entry.name, _Part())
-    model, training = _merge(_merge(model, own.model), dict(learned or {})), _merge(training, own.training)
-    settings = tuple(settings)
+    layers: Layer = {"model": file.model, "training": file.training}
+    own, settings = part.baselines.get(entry.name, _Part()), tuple(settings)
+    for above in (part, own, _Part(model=dict(learned or {}))):
+        layers = _merge(layers, {"model": above.model, "training": above.training})
     where = f"{path.name if path else entry.name}, {name}" + (", and --set" if settings else "")
     for setting in settings:
-        group, changes = _setting(setting)
-        if group == "model":
-            model = _merge(model, changes)
-        else:
-            training = _merge(training, changes)
+        layers = _merge(layers, _setting(setting))
     if seed is not None:
-        training["seed"] = seed
+        layers["training"]["seed"] = seed
     return Recipe(
         baseline=entry.name,
         name=name,
-        model=_checked(entry.model.Options, model, "model", where).model_dump(mode="json"),
-        training=_checked(TrainingOptions, training, "training", where),
+        model=_checked(entry.model.Options, layers["model"], "model", where).model_dump(mode="json"),
+        training=_checked(TrainingOptions, layers["training"], "training", where),
     )
 
 
 def changed_options(entry: Entry, options: Mapping[str, Any], settings: Iterable[str]) -> Layer:
     """Return the options of a trained model with settings such as ``model.average=true``."""
-    changed = dict(options)
+    given: Layer = {"model": dict(options)}
+    changed = given
     for setting in settings:
-        group, changes = _setting(setting)
-        if group != "model":
+        changed = _merge(changed, _setting(setting))
+        if "training" in changed:
             fix = "set options of the model: --set model.KEY=VALUE"
             raise UsageError("the training is over", where="--set", got=setting, fix=fix)
-        changed = _merge(changed, changes)
     before, after = (
-        _checked(entry.model.Options, layer, "model", "--set").model_dump(mode="json")
-        for layer in (dict(options), changed)
+        _checked(entry.model.Options, layers["model"], "model", "--set").model_dump(mode="json")
+        for layers in (given, changed)
     )
     kinds = {"training": entry.model.Options.in_training, "weights": entry.model.Options.of_weights}
     for kind, fixed in kinds.items():
@@ -312,11 +306,7 @@ def changed_options(entry: Entry, options: Mapping[str, Any], settings: Iterable
 
 
 def _read(path: Path) -> _File:
-    content = read_yaml(path)
-    try:
-        return _File.model_validate(content)
-    except ValidationError as error:
-        raise _complaint(error, _File, "", str(path), UnreadableFileError) from None
+    return _checked(_File, read_yaml(path), "", str(path), UnreadableFileError)
 
 
 def _merge(below: Layer, above: Layer) -> Layer:
@@ -334,8 +324,8 @@ def _merge(below: Layer, above: Layer) -> Layer:
     return joined
 
 
-def _setting(text: str) -> tuple[str, Layer]:
-    """Return group and changes of a text such as ``training.schedule.every=100``."""
+def _setting(text: str) -> Layer:
+    """Return the change by a text such as ``training.schedule.every=100``."""
     key, equals, value = text.partition("=")
     group, *path = key.strip().split(".")
     if not equals or not path or group not in ("model", "training"):
@@ -352,37 +342,38 @@ def _setting(text: str) -> tuple[str, Layer]:
         raise UsageError(
             "the value is no YAML", where=f"--set {key}", got=" ".join(str(error).split())
         ) from None
-    for name in reversed(path):
+    for name in reversed((group, *path)):
         layer = {name: layer}
-    return group, layer
+    return dict(layer)
 
 
-def _checked(options: type[Checked], values: Layer, group: str, where: str) -> Checked:
+def _checked(
+    options: type[Checked],
+    values: object,
+    group: str,
+    where: str,
+    kind: type[LagbenchError] = UsageError,
+) -> Checked:
+    """Return options, or say what is wrong with them first, with the nearest key for an unknown one."""
     try:
         return options.model_validate(values)
     except ValidationError as error:
-        raise _complaint(error, options, group, where, UsageError) from None
-
-
-def _complaint(
-    error: ValidationError, options: type[BaseModel], group: str, where: str, kind: type[LagbenchError]
-) -> LagbenchError:
-    """Return the first thing that is wrong with options, with the nearest key for an unknown one."""
-    first = error.errors()[0]
+        first = error.errors()[0]
     key = ".".join(str(part) for part in (group, *first["loc"]) if part != "")
     if first["type"] == "extra_forbidden":
+        holder: type[BaseModel] = options
         for step in first["loc"][:-1]:  # the keys of options nested below a path
-            field = options.model_fields.get(str(step))
+            field = holder.model_fields.get(str(step))
             inner = field.annotation if field else None
             if isinstance(inner, type) and issubclass(inner, BaseModel):
-                options = inner
-            elif step == "recipes" or options is _File:
-                options = _Shared
-        fix = nearest(str(first["loc"][-1]), list(options.model_fields))
-        return kind(f"unknown key {key!r}", where=where, fix=fix)
+                holder = inner
+            elif step == "recipes" or holder is _File:
+                holder = _Shared
+        fix = nearest(str(first["loc"][-1]), list(holder.model_fields))
+        raise kind(f"unknown key {key!r}", where=where, fix=fix)
     expected = first["msg"].removeprefix("Value error, ")
     if first["type"] == "tuple_type":
         expected = "a list in brackets"
     whole = isinstance(first["input"], Mapping) and not first["type"].endswith("_type")
     got = None if whole else repr(first["input"])[:80]
-    return kind(f"{key} does not fit", where=where, expected=expected, got=got)
+    raise kind(f"{key} does not fit", where=where, expected=expected, got=got)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -56,16 +56,19 @@ def roll_out(model: Baseline, given: Batch, frames: int) -> list[Rollout]:
     was_training = model.training
     model.eval()
     try:
-        if given.windows == 1:
-            return [_alone(model, given, frames)]
         predicted, finite = _advance(model, given, frames)
-        if finite < frames:
-            return [_alone(model, single(given, window), frames) for window in range(given.windows)]
+        if finite < frames and given.windows > 1:
+            alone = (single(given, window) for window in range(given.windows))
+            return [rollout for window in alone for rollout in roll_out(model, window, frames)]
     finally:
         model.train(was_training)
+    mark = None
+    if finite < frames:
+        predicted[finite:] = predicted[finite - 1] if finite else given.position[:, -1].cpu().float()
+        mark = int(given.frame[0]) + given.frames + finite
     sample = given.sample.cpu()
     return [
-        Rollout(scenario=int(scenario), position=predicted[:, sample == window], diverged_at=None)
+        Rollout(scenario=int(scenario), position=predicted[:, sample == window], diverged_at=mark)
         for window, scenario in enumerate(given.scenario)
     ]
 
@@ -85,62 +88,48 @@ def single(batch: Batch, window: int) -> Batch:
     )
 
 
-def _alone(model: Baseline, given: Batch, frames: int) -> Rollout:
-    """Return the rollout of the only window, frozen where it diverges."""
-    predicted, finite = _advance(model, given, frames)
-    scenario = int(given.scenario[0])
-    if finite == frames:
-        return Rollout(scenario=scenario, position=predicted, diverged_at=None)
-    last = predicted[finite - 1] if finite else given.position[:, -1].cpu().float()
-    predicted[finite:] = last
-    mark = int(given.frame[0]) + given.frames + finite
-    return Rollout(scenario=scenario, position=predicted, diverged_at=mark)
-
-
 def _advance(model: Baseline, given: Batch, frames: int) -> tuple[Tensor, int]:
     """Return positions, shape [frame, particle, 2], and how many frames are finite and near the box."""
     predicted = torch.empty((frames, len(given.position), 2), dtype=torch.float32)
     state = model.start(given)
     for frame in range(frames):
-        state, position = _answer(model, state, predicted[frame].shape)
-        predicted[frame] = position
+        found: object = model.advance(state)
+        parts = found if isinstance(found, tuple | list) else (found,)
+        # What has another shape a frame could be broadcast from.
+        shape, position = predicted[frame].shape, parts[1] if len(parts) == 2 else None
+        if not isinstance(position, Tensor) or position.shape != shape:
+            raise UsageError(
+                "a model returned no positions of the next frame",
+                where=f"{type(model).__qualname__}.advance",
+                expected=f"the next state and a tensor of shape {list(shape)}: [particle, 2]",
+                got=", ".join(str(getattr(part, "shape", type(part).__name__)) for part in parts),
+                fix="mend that class",
+            )
+        state, predicted[frame] = parts[0], position
         # The scorer refuses what lies farther out; of NaN nothing is true.
         if not ((predicted[frame] - 0.5).abs() <= MAX_DISTANCE).all():
             return predicted, frame
     return predicted, frames
 
 
-def _answer(model: Baseline, state: object, shape: torch.Size) -> tuple[object, Tensor]:
-    """Return the next state and positions of a model; refuse what a frame could only be broadcast from."""
-    found: object = model.advance(state)
-    if isinstance(found, tuple | list) and len(found) == 2:
-        state, position = found
-        if isinstance(position, Tensor) and position.shape == shape:
-            return state, position
-    parts = found if isinstance(found, tuple | list) else (found,)
-    raise UsageError(
-        "a model returned no positions of the next frame",
-        where=f"{type(model).__qualname__}.advance",
-        expected=f"the next state and a tensor of shape {list(shape)}: [particle, 2]",
-        got=", ".join(str(getattr(part, "shape", type(part).__name__)) for part in parts),
-        fix="mend that class",
-    )
-
-
 @contextmanager
-def as_published(model: nn.Module) -> Iterator[None]:
-    """Round the parameters to bfloat16 for a while."""
-    kept: list[tuple[Tensor, Tensor]] = []
+def replaced(values: Mapping[Tensor, Tensor]) -> Iterator[None]:
+    """Give parameters other values for a while."""
+    kept = {parameter: parameter.detach().clone() for parameter in values}
     with torch.no_grad():
-        for parameter in model.parameters():
-            kept.append((parameter, parameter.detach().clone()))
-            parameter.copy_(parameter.to(torch.bfloat16))
+        for parameter, value in values.items():
+            parameter.copy_(value)
     try:
         yield
     finally:
         with torch.no_grad():
-            for tensor, value in kept:
-                tensor.copy_(value)
+            for parameter, value in kept.items():
+                parameter.copy_(value)
+
+
+def as_published(model: nn.Module) -> AbstractContextManager[None]:
+    """Round the parameters to bfloat16 for a while."""
+    return replaced({parameter: parameter.detach().to(torch.bfloat16) for parameter in model.parameters()})
 
 
 def scenario_batch(paths: Path | Sequence[Path], frames: slice = slice(None)) -> Batch:
@@ -233,6 +222,6 @@ def validation_of(
     task = replace(task, setting=replace(task.setting, horizon=horizon))
     frames = {}
     for i in task.scenarios[: options.validation_scenarios]:
-        with task.opened(i) as opened:
-            frames[i] = len(opened.scenario.active)
+        with task.opened(i) as truth:
+            frames[i] = len(truth.scenario.active)
     return Validation(task=task, frames=frames, compiled=options.compile)

@@ -32,7 +32,7 @@ from .augmentation import Symmetry, disturbed
 from .baseline import Baseline, Batch, Facts, Options, check_moving_walls, last_velocities
 from .graph import EDGE_FEATURES, NodeFeatures, Scale, edge_features, radius_graph
 from .network import EncodeProcessDecode
-from .torch_grid import Fields, counted_nodes, fields, node_velocity, transfer
+from .torch_grid import fields, transfer
 
 
 class Motion(NamedTuple):
@@ -78,19 +78,6 @@ class LossNorm(enum.StrEnum):
     L2 = "l2"
 
 
-class Scales(NamedTuple):
-    """Deviations that errors are divided by, (x, y) each, shape [2]; named as in :class:`Motion`."""
-
-    position: Tensor
-    velocity: Tensor
-    acceleration: Tensor
-
-    @property
-    def speed(self) -> Tensor:
-        """Root mean square of the velocity's two deviations [length/frame], shape []."""
-        return (self.velocity**2).mean().sqrt()
-
-
 def mean_norm(error: Tensor, norm: LossNorm, count: Tensor | int | None = None) -> Tensor:
     """Return ``(1/N) sum_i ||e_i||_p`` of normalised errors, shape [..., component] (Eqs. 5.29-5.34).
 
@@ -106,40 +93,36 @@ def loss_terms(
     sample: Tensor,
     *,
     grid: Grid,
-    scales: Scales,
+    scales: Mapping[str, Tensor],
     norm: LossNorm,
     weights: Mapping[str, float],
 ) -> dict[str, Tensor]:
-    """Return the six terms, raw; those of weight 0 without a graph. Missing weights are 1."""
+    """Return the six terms, raw; those of weight 0 without a graph. Missing weights are 1.
+
+    Errors are divided by ``scales``, deviations (x, y) by the names in :class:`Motion`.
+    """
     terms = {}
     for name in PARTICLE_TERMS:
         with _graph(weights, name):
             error = getattr(predicted, name) - getattr(target, name)
-            terms[name] = mean_norm(error / getattr(scales, name), norm)
+            terms[name] = mean_norm(error / scales[name], norm)
     windows = int(sample[-1]) + 1
     with torch.no_grad():
         sums = transfer(target.position, target.velocity, grid, sample=sample, windows=windows)
         # A node's weight around a particle, on the average: the full weight of a box that is full,
         # and defined for a splash too, whose area is not known here.
         full = float((sums.weight**2).sum() / sums.weight.sum())
-        velocity = node_velocity(sums, full)
-        true = Fields(grid, sums.weight, velocity, counted_nodes(sums.weight, full), full)
+        true = fields(sums, grid, full)
     with _graph(weights, *GRID_TERMS):  # the prediction's fields at the nodes that count in the truth
-        own = fields(
-            predicted.position,
-            predicted.velocity,
-            grid,
-            full=full,
-            sample=sample,
-            windows=windows,
-            counted=true.counted,
-        )
+        sums = transfer(predicted.position, predicted.velocity, grid, sample=sample, windows=windows)
+        own = fields(sums, grid, full, true.counted)
     with _graph(weights, "density"):
         terms["density"] = mean_norm((own.density - true.density).unsqueeze(-1), norm)
     count = true.differentiable.sum().clamp(min=1)
+    speed = (scales["velocity"] ** 2).mean().sqrt()
     for name in ("divergence", "vorticity"):
         with _graph(weights, name):
-            error = (getattr(own, name) - getattr(true, name)) / scales.speed
+            error = (getattr(own, name) - getattr(true, name)) / speed
             terms[name] = mean_norm(error.unsqueeze(-1), norm, count)
     return terms
 
@@ -234,10 +217,9 @@ class GraphNetwork(Baseline):
         noise, statistics = options.noise_std, facts.statistics
         self.radius = facts.radius if options.radius is None else options.radius
         self.grid = Grid(facts.score_cells, Placement(facts.score_placement))
-        self.position = Scale(statistics["position_mean"], statistics["position_std"])
-        self.velocity = Scale(statistics["velocity_mean"], statistics["velocity_std"], noise=noise)
-        self.acceleration = Scale(
-            statistics["acceleration_mean"], statistics["acceleration_std"], noise=noise
+        self.position, self.velocity, self.acceleration = (
+            Scale(statistics[f"{name}_mean"], statistics[f"{name}_std"], noise=widening)
+            for name, widening in (("position", 0.0), ("velocity", noise), ("acceleration", noise))
         )
         self.features = NodeFeatures(
             facts.bounds,
@@ -261,11 +243,10 @@ class GraphNetwork(Baseline):
     @classmethod
     def with_operator(cls, operator: type[Operator]) -> type[GraphNetwork]:
         """Return the graph network with an operator; the same class for the same operator."""
-        key = (cls, operator)
-        if key not in _CLASSES:
+        if operator not in _CLASSES:
             names = {"operator": operator, "method": operator.method, "__doc__": operator.__doc__}
-            _CLASSES[key] = type(f"{operator.__name__}Network", (cls,), names)
-        return _CLASSES[key]
+            _CLASSES[operator] = type(f"{operator.__name__}Network", (cls,), names)
+        return _CLASSES[operator]
 
     @property
     def history(self) -> int:
@@ -293,32 +274,33 @@ class GraphNetwork(Baseline):
         """Return the six terms of Eq. 5.35 and the operator's own, raw, means over the steps."""
         options = self.options
         if generator is not None:
-            batch = disturbed(
-                batch,
-                generator,
-                symmetry=options.symmetry,
-                bounds=self.facts.bounds,
-                history=self.history,
-                noise_std=options.noise_std,
-            )
+            batch = disturbed(self, batch, generator)
             if options.noise_std > 0.0:
                 batch = replace(batch, position=self._inside(batch.position))
         state = self.start(batch.part(slice(self.history)))
         if generator is not None and options.forgetful > 0.0 and options.velocities > 1:
-            state = self._forgetful(state, batch.windows, generator)
+            # Some windows know but their last velocities, of which the first repeats.
+            last, device = options.velocities, generator.device
+            forgotten = torch.randint(1, last, (batch.windows,), generator=generator, device=device)
+            forgotten *= torch.rand(batch.windows, generator=generator, device=device) < options.forgetful
+            first = forgotten.to(state.sample.device)[state.sample, None]
+            index = torch.arange(last, device=first.device).expand(len(first), -1).clamp(min=first)
+            known = state.velocity.gather(1, index[..., None].expand(-1, -1, 2))
+            state = replace(state, velocity=known)
+        scales = {name: getattr(self, name).std for name in PARTICLE_TERMS}
         steps = []
         for frame in range(self.history, self.history + self.future):
             following, own = self.step(state, generator)
             target = batch.position[:, frame]
             velocity = target - batch.position[:, frame - 1]
             # both accelerations start from the state's velocity
-            last, predicted = state.velocity[:, -1], following.velocity[:, -1]
+            before, predicted = state.velocity[:, -1], following.velocity[:, -1]
             terms = loss_terms(
-                Motion(following.position, predicted, predicted - last),
-                Motion(target, velocity, velocity - last),
+                Motion(following.position, predicted, predicted - before),
+                Motion(target, velocity, velocity - before),
                 state.sample,
                 grid=self.grid,
-                scales=Scales(self.position.std, self.velocity.std, self.acceleration.std),
+                scales=scales,
                 norm=options.loss_norm,
                 weights=self.weights,
             )
@@ -332,15 +314,6 @@ class GraphNetwork(Baseline):
             steps.append(terms | dict(own))
             state = following
         return {name: torch.stack([terms[name] for terms in steps]).mean() for name in steps[0]}
-
-    def _forgetful(self, state: State, windows: int, generator: torch.Generator) -> State:
-        """Return a state in which some windows know their last velocities only; the first one repeats."""
-        count, device = self.options.velocities, generator.device
-        forgotten = torch.randint(1, count, (windows,), generator=generator, device=device)
-        forgotten *= torch.rand(windows, generator=generator, device=device) < self.options.forgetful
-        first = forgotten.to(state.sample.device)[state.sample]
-        index = torch.arange(count, device=first.device).expand(len(first), -1).clamp(min=first[:, None])
-        return replace(state, velocity=state.velocity.gather(1, index[..., None].expand(-1, -1, 2)))
 
     def start(self, given: Batch) -> State:
         """Return the state after the given frames; where they are few, the first velocity repeats."""
@@ -366,10 +339,9 @@ class GraphNetwork(Baseline):
         output, own = self.predict(state, self.edges(state), generator)
         if self.options.target is Target.VELOCITY:
             velocity = self.velocity.inverse(output)
-            position = state.position + velocity
         else:
             velocity = state.velocity[:, -1] + self.acceleration.inverse(output)
-            position = state.position + velocity
+        position = state.position + velocity
         inside = self._inside(position)
         return state.moved(inside, velocity + (inside - position).detach()), own
 
@@ -395,4 +367,4 @@ class GraphNetwork(Baseline):
         return position.detach().clamp(low, high) + (position - position.detach())
 
 
-_CLASSES: dict[tuple[type[GraphNetwork], type[Operator]], type[GraphNetwork]] = {}
+_CLASSES: dict[type[Operator], type[GraphNetwork]] = {}

@@ -39,11 +39,7 @@ class Start:
     record: Mapping[str, Any]  # what records say of them: recipe, sha256, and what they took
 
     def fill(self, model: Baseline) -> None:
-        """Copy the weights into a model.
-
-        Raises:
-            UsageError: they are of another network, or mean something else there.
-        """
+        """Copy the weights into a model; refuse those of another network or of another meaning there."""
         ours = model.options.model_dump(mode="json")
         adapted, options = model.adapted(self.weights, self.options)
         other = sorted(name for name, value in options.items() if ours[name] != value)
@@ -76,20 +72,7 @@ def warn_of_last_state(checkpoint: Checkpoint, path: Path) -> None:
 
 
 def start_from(path: str | Path, entry: Entry, size: Size, *, root: Path, registry: Registry) -> Start:
-    """Return the weights of a file for a training on the data at hand.
-
-    Args:
-        path: weights.pt or checkpoint.pt of a training, perhaps at another size of the split.
-        entry: baseline that is to be trained.
-        size: on which data.
-        root: folder of all data sets.
-        registry: where splits are described.
-
-    Raises:
-        UnreadableFileError: the file is damaged, unsafe, or changed while it was read.
-        UsageError: a baseline that is fitted as a whole; or weights of another baseline, split or size.
-        DataError: the data are missing, or of another version than those that the weights were trained on.
-    """
+    """Return the weights of a file, perhaps of another size, for a training on the data at hand."""
     if getattr(entry.model, "closed_form", False):
         message = f"{entry.model.method} is fitted as a whole, without steps"
         raise UsageError(message, where=WHERE, got=str(path), fix="leave the option out")
@@ -97,11 +80,7 @@ def start_from(path: str | Path, entry: Entry, size: Size, *, root: Path, regist
     found, before = load(file), file.stat()
     warn_of_last_state(found, file)
     sha256, after = file_sha256(file), file.stat()
-    if (before.st_ino, before.st_size, before.st_mtime_ns) != (
-        after.st_ino,
-        after.st_size,
-        after.st_mtime_ns,
-    ):
+    if any(getattr(before, name) != getattr(after, name) for name in ("st_ino", "st_size", "st_mtime_ns")):
         raise UnreadableFileError(
             "the file changed while it was read", where=str(file), fix="start from a copy"
         )
@@ -119,27 +98,18 @@ def start_from(path: str | Path, entry: Entry, size: Size, *, root: Path, regist
         raise UsageError(error.what, where=WHERE, expected=error.expected, got=error.got, fix=fix) from error
     facts = rescaled(found.facts, here)
     options = restore(replace(found, facts=facts), where=str(file)).options
+    name = str(found.training.get("recipe", {}).get("name", ""))
+    name = name if re.fullmatch(RECIPE_NAME, name) else "unnamed"
+    budget = found.budget or Budget()
+    hours = {each: getattr(budget, each) for each in ("cpu_hours", "validation_hours", "gpu_hours")}
+    if any(value is None or value > MOST_HOURS for value in hours.values()):
+        hours = dict.fromkeys(hours)  # where one is not known, their sum is not
+    made = found.training.get("step", 0) if budget.steps is None else budget.steps
+    steps = int(made) + (budget.start_steps or 0)
     return Start(
         path=file,
         facts=facts,
         weights=found.weights,
         options=options.model_dump(mode="json", exclude=set(options.in_training)),
-        record={"recipe": _recipe_of(found), "sha256": sha256, "took": _took(found)},
+        record={"recipe": name, "sha256": sha256, "took": {**hours, "steps": min(steps, MOST_STEPS)}},
     )
-
-
-def _recipe_of(found: Checkpoint) -> str:
-    """Return the name of the recipe that weights were trained by, if it is one."""
-    name = str(found.training.get("recipe", {}).get("name", ""))
-    return name if re.fullmatch(RECIPE_NAME, name) else "unnamed"
-
-
-def _took(found: Checkpoint) -> dict[str, float | None]:
-    """Return steps and hours behind weights; None for all hours where one is not known."""
-    budget = found.budget or Budget()
-    hours = {name: getattr(budget, name) for name in ("cpu_hours", "validation_hours", "gpu_hours")}
-    if any(value is None or value > MOST_HOURS for value in hours.values()):
-        hours = dict.fromkeys(hours)
-    made = found.training.get("step", 0) if budget.steps is None else budget.steps
-    steps = int(made) + (budget.start_steps or 0)
-    return {**hours, "steps": min(steps, MOST_STEPS)}

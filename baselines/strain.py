@@ -20,11 +20,8 @@ from lagbench.errors import UsageError
 from .baseline import Batch
 from .particle_grid import ParticleGrid, Stencil
 
-UNIT = 0.2
-"""Strain that looks like 1 [1]; far beyond it all strains look alike."""
-
-SLACK = 1e-3
-"""Share of a cell's square that is added to the spread of the nodes: it bounds F where they lie on a line."""
+UNIT = 0.2  # strain that looks like 1 [1]; far beyond it all strains look alike
+SLACK = 1e-3  # share of a cell's square on top of the nodes' spread: bounds F where they lie on a line
 
 
 @dataclass(frozen=True)
@@ -42,14 +39,9 @@ class Rest:
     def of(
         cls, grid: ParticleGrid, position: Tensor, layer: Tensor, layers: int, *, solid: Tensor | None = None
     ) -> Rest:
-        """Return what F needs.
+        """Return what F needs of X; bodies that do not mix have layers of their own.
 
-        Args:
-            grid: where displacements are averaged.
-            position: X [length], shape [particle, 2].
-            layer: layer of each particle, int64, shape [particle]; bodies that do not mix have their own.
-            layers: number of layers.
-            solid: who shows a strain, bool, shape [particle]; all by default.
+        ``solid`` says who shows a strain, bool, shape [particle]; all by default.
         """
         position = position.clamp(grid.low, grid.high)
         stencil = grid.stencil(position, layer)
@@ -64,11 +56,7 @@ class Rest:
         return cls(grid, position, stencil, count, lever)
 
     def strain(self, position: Tensor) -> Tensor:
-        """Return ``tanh(e / 0.2)`` as (xx, xy, yy) [1], shape [particle, 3].
-
-        Args:
-            position: x, positions of the same particles now [length], shape [particle, 2].
-        """
+        """Return ``tanh(e / 0.2)`` at positions x as (xx, xy, yy) [1], shape [particle, 3]."""
         moved = _around(self.grid, self.stencil, self.count, position - self.position)
         with torch.autocast(position.device.type, enabled=False):
             gradient = torch.einsum("pnd,pne->pde", moved, self.lever)  # F - 1
@@ -77,11 +65,7 @@ class Rest:
 
 
 def first_frame(given: Batch) -> Tensor:
-    """Return the positions in the scenario's first frame [length], shape [particle, 2].
-
-    Raises:
-        UsageError: the windows begin later and do not hold them.
-    """
+    """Return the positions in the scenario's first frame [length], shape [particle, 2]."""
     if given.origin is not None:
         return given.origin
     if bool((given.frame != 0).any()):

@@ -73,24 +73,19 @@ class Fields:
         return pad(along_x, (0, 0, 1, 1)), pad(along_y, (1, 1))
 
 
-def fields(
-    position: Tensor,
-    velocity: Tensor,
-    grid: Grid,
-    *,
-    full: float,
-    sample: Tensor | None = None,
-    windows: int | None = None,
-    counted: Tensor | None = None,
-) -> Fields:
+def fields(sums: Transfer, grid: Grid, full: float, counted: Tensor | None = None) -> Fields:
     """Return the grid fields of particles, at the nodes that count: by default their own.
 
-    ``full`` is the weight of a full interior node; a prediction is judged at the nodes of the truth.
+    ``full`` is the weight of a full interior node; a prediction is judged at the nodes of the truth. Velocity
+    is ``sum(w u) / sum(w)``, 0 where the weight is below EMPTY_SHARE of full.
     """
-    sums = transfer(position, velocity, grid, sample=sample, windows=windows)
     if counted is None:
-        counted = counted_nodes(sums.weight, full)
-    return Fields(grid, sums.weight, node_velocity(sums, full), counted, full)
+        counted = sums.weight.detach() >= COUNTED_SHARE * full
+    filled = (sums.weight >= EMPTY_SHARE * full) & (sums.weight > 0.0)
+    # Empty nodes divide by 1: a quotient that is thrown away must not have an infinite gradient.
+    weight = torch.where(filled, sums.weight, 1.0)
+    velocity = torch.where(filled[..., None], sums.momentum / weight[..., None], 0.0)
+    return Fields(grid, sums.weight, velocity, counted, full)
 
 
 def transfer(
@@ -162,16 +157,3 @@ def nine_nodes(layer: Tensor, column: Tensor, row: Tensor, shape: tuple[int, int
     three = torch.arange(3, device=row.device)
     corner = (layer * columns + column) * rows + row
     return corner[:, None, None] + (three[:, None] * rows + three)
-
-
-def counted_nodes(weight: Tensor, full: float) -> Tensor:
-    """Return the nodes with at least :data:`~lagbench.data.grid.COUNTED_SHARE` of a full node's weight."""
-    return weight.detach() >= COUNTED_SHARE * full
-
-
-def node_velocity(sums: Transfer, full: float) -> Tensor:
-    """Return ``sum(w u) / sum(w)``, 0 where the weight is below EMPTY_SHARE of full."""
-    filled = (sums.weight >= EMPTY_SHARE * full) & (sums.weight > 0.0)
-    # Empty nodes divide by 1: a quotient that is thrown away must not have an infinite gradient.
-    weight = torch.where(filled, sums.weight, 1.0)
-    return torch.where(filled[..., None], sums.momentum / weight[..., None], 0.0)

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from itertools import chain, count, islice, pairwise
 from pathlib import Path
 
@@ -22,16 +23,16 @@ from torch.utils.data import DataLoader, Sampler
 from lagbench.atomic import check_writable
 from lagbench.data.local import locate
 from lagbench.data.registry import Registry
-from lagbench.errors import DataError, UsageError
+from lagbench.errors import UsageError
 from lagbench.submission.budget import Track, track_of
 from lagbench.tensors import Window, collate
 from lagbench.torch import WindowDataset, WindowSampler
 from lagbench.work.progress import Meter, Progress
 
 from .augmentation import check_symmetry
-from .baseline import Baseline, Facts
+from .baseline import Baseline
 from .catalogue import find
-from .checkpoint import Checkpoint, load_weights, rounded_weights, save
+from .checkpoint import load_weights, rounded_weights, save
 from .facts import facts_of
 from .job import STOPPED_EARLY, RunFolder, TrainingJob, TrainingRecord, parameter_count, start_words
 from .machine import (
@@ -155,9 +156,7 @@ def train(
             fix="name another folder with --output",
         )
     shared = int(os.environ.get("WORLD_SIZE", processes))
-    earlier = folder.earlier(plan, resume=resume, fresh=fresh)
-    if earlier is not None:
-        _check_same_conditions(earlier, facts, processes=shared, where=str(folder.path))
+    earlier = folder.earlier(plan, facts, processes=shared, resume=resume, fresh=fresh)
     job = TrainingJob(
         recipe=plan,
         facts=facts,
@@ -175,12 +174,15 @@ def train(
     with generators_kept(), threads_used(threads, processes=here), memory_errors_told(SMALLER):
         reseed(seed_of(plan.training.seed))
         model = entry.model.build(plan.model, facts)
-        if initial is not None and earlier is None:
+        if earlier is not None:
+            load_weights(model, earlier.weights, where=str(folder.checkpoint))
+        elif initial is not None:
             initial.fill(model)
         if earlier is None and not is_helper():
             folder.clear()
         ledger, steps = (fit if getattr(model, "closed_form", False) else descend)(job, model)
-        budget = job.budget(ledger)
+        budget, done = job.budget(ledger), asdict(ledger)
+        del done["validation"]
         return TrainingResult(
             baseline=plan.baseline,
             split=facts.split,
@@ -194,40 +196,9 @@ def train(
             device=budget.device or "",
             threads=budget.threads or 0,
             track=track_of(facts.size, budget),
-            state=ledger.state,
             start=start_words(plan.start),
             first_step=int(earlier.training.get("step", 0)) if earlier else 0,
-            step=ledger.step,
-            loss=ledger.loss,
-            windows_seen=ledger.windows_seen,
-            epochs=ledger.epochs,
-            metric=ledger.metric,
-            best_value=ledger.best_value,
-            best_step=ledger.best_step,
-            cpu_seconds=ledger.cpu_seconds,
-            validation_cpu_seconds=ledger.validation_cpu_seconds,
-            gpu_seconds=ledger.gpu_seconds,
-            wall_seconds=ledger.wall_seconds,
-        )
-
-
-def _check_same_conditions(earlier: Checkpoint, facts: Facts, *, processes: int, where: str) -> None:
-    """Refuse to go on with other data, or with another number of processes, than a training began with."""
-    if earlier.facts.dataset_sha256 != facts.dataset_sha256:
-        raise DataError(
-            "the training began on another version of the data set",
-            where=where,
-            expected=earlier.facts.dataset_sha256,
-            got=facts.dataset_sha256,
-            fix="train anew with --fresh",
-        )
-    if earlier.training.get("processes") != processes:
-        raise UsageError(
-            "the training began with another number of processes",
-            where="--processes",
-            expected=earlier.training.get("processes"),
-            got=processes,
-            fix="the learning rate and the order of windows follow from it; or train anew with --fresh",
+            **done,
         )
 
 
@@ -280,9 +251,7 @@ def descend(job: TrainingJob, model: Baseline) -> tuple[TrainingRecord, int]:
         origin=model.origin,
     )
     steps = options.total_steps(len(data), processes=job.processes)
-    ledger, earlier = job.ledger(), job.earlier
-    if earlier is not None:
-        load_weights(model, earlier.weights, where=str(job.folder.checkpoint))
+    ledger = job.ledger()
     if ledger.state != STOPPED_EARLY:
         ledger.state = "finished" if ledger.step >= steps else "running"
     if ledger.state != "running":
@@ -310,10 +279,10 @@ def descend(job: TrainingJob, model: Baseline) -> tuple[TrainingRecord, int]:
         steps=steps,
         processes=job.processes,
         step=ledger.step,
-        optimizer=earlier.optimizer if earlier else None,
+        optimizer=job.earlier.optimizer if job.earlier else None,
     )
     validation = validation_of(options, facts, root=job.root, registry=job.registry)
-    keeper = TrainingCallback(job, ledger, validation=validation, steps=steps, windows=len(data))
+    keeper = TrainingCallback(job, ledger, validation=validation, windows=len(data))
     half = options.precision == "auto" and multiplies_bfloat16(job.device)
     with quiet():
         trainer = Trainer(
@@ -354,7 +323,6 @@ def fit(job: TrainingJob, model: Baseline) -> tuple[TrainingRecord, int]:
     """
     ledger = job.ledger()
     if job.earlier is not None:
-        load_weights(model, job.earlier.weights, where=str(job.folder.checkpoint))
         ledger.state = "finished"
         return ledger, STEPS
     if job.recipe.training.compile:
@@ -369,13 +337,9 @@ def fit(job: TrainingJob, model: Baseline) -> tuple[TrainingRecord, int]:
         )
 
     def scenarios() -> Iterator[NDArray[np.float32]]:
-        paths = [
-            path
-            for subset in job.recipe.training.windows
-            for path in scenario_paths(
-                job.facts.split, subset=subset, size=job.facts.size, root=job.root, registry=job.registry
-            ).values()
-        ]
+        find_in = partial(scenario_paths, job.facts.split, size=job.facts.size, root=job.root)
+        parts = (find_in(subset=one, registry=job.registry) for one in job.recipe.training.windows)
+        paths = [path for part in parts for path in part.values()]
         job.meter.begin("fitting", total=len(paths) + 1, scenarios=len(paths))
         for path in paths:
             yield scenario_batch(path).position.transpose(0, 1).numpy()

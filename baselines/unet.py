@@ -6,8 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import gelu
 
-COARSEST = 4
-"""Nodes of the finest level to one of the coarsest, along each axis."""
+COARSEST = 4  # nodes of the finest level to one of the coarsest, along each axis
 
 
 class Block(nn.Module):

@@ -21,7 +21,8 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from functools import partial
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -123,10 +124,7 @@ class VAR(Fitted):
     def fit(self, scenarios: Iterable[NDArray[np.float32]]) -> Mapping[str, float]:
         """Fit the coefficients; return condition number, floor and rows of :class:`LeastSquares`."""
         rows = LaggedRows([self.states(position) for position in scenarios], lags=self.options.lags)
-        return self.adopt(solve(rows))
-
-    def adopt(self, found: LeastSquares) -> Mapping[str, float]:
-        """Take over a solution."""
+        found = solve(rows)
         self.coefficients = torch.from_numpy(found.coefficients)
         return {"condition": found.condition, "floor": found.floor, "rows": found.rows}
 
@@ -151,6 +149,7 @@ class StableVAR(Fitted):
     """
 
     method = "var-stable"
+    inputs = 1
 
     class Options(baseline.Options):
         """Options of the stable VAR."""
@@ -171,19 +170,10 @@ class StableVAR(Fitted):
     def __init__(self, options: Options, facts: Facts) -> None:
         super().__init__(options, facts)
         rank = min(options.rank, self.features)
-        shapes = {
-            "mean": (self.features,),
-            "drift": (self.features,),
-            "directions": (self.features, rank),
-            "response": (rank, self.features),
-        }
-        for name, shape in shapes.items():
-            self.register_buffer(name, torch.zeros(shape))
-
-    @property
-    def inputs(self) -> int:
-        """One frame."""
-        return 1
+        self.register_buffer("mean", torch.zeros(self.features))
+        self.register_buffer("drift", torch.zeros(self.features))
+        self.register_buffer("directions", torch.zeros(self.features, rank))
+        self.register_buffer("response", torch.zeros(rank, self.features))
 
     def fit(self, scenarios: Iterable[NDArray[np.float32]]) -> Mapping[str, float]:
         """Fit mean, drift, directions and response; return the share of variance they hold."""
@@ -196,12 +186,10 @@ class StableVAR(Fitted):
             drift += (y - x[:, 1:]).sum(0) / rows.rows
             squares += float(np.square(x[:, 1:]).sum())
         spread = squares - rows.rows * float(mean @ mean)
-
-        def centred() -> Iterator[Matrix]:
-            return (x[:, 1:] - mean for x, _ in rows)
-
         kept = self.directions.shape[1]
-        directions, eigenvalues = principal_directions(centred, self.features, rank=kept)
+        directions, eigenvalues = principal_directions(
+            lambda: (x[:, 1:] - mean for x, _ in rows), self.features, rank=kept
+        )
         response = np.zeros((kept, self.features))
         for x, y in rows:
             response += ((x[:, 1:] - mean) @ directions).T @ (y - x[:, 1:] - drift)
@@ -221,16 +209,6 @@ class StableVAR(Fitted):
 TOLERANCE = 1e-3  # relative accuracy of the condition number's two eigenvalues
 
 
-class Blocks(Protocol):
-    """Rows of regressors and responses, block by block; may be read more than once."""
-
-    rows: int
-
-    def __iter__(self) -> Iterator[tuple[Matrix, Matrix]]:
-        """Yield regressors [row, regressor] and responses [row, response], C-ordered."""
-        ...
-
-
 @dataclass(frozen=True, kw_only=True)
 class LeastSquares:
     """The solution and how well it is determined."""
@@ -243,41 +221,23 @@ class LeastSquares:
     rows: int  # rows that went in
 
 
-@dataclass(frozen=True)
-class _Factor:
-    """Cholesky factor of a Gram matrix, upper triangle."""
-
-    upper: Matrix
-    condition: float
-    floor: float
-
-    def divide(self, right: Matrix) -> Matrix:
-        """Return G^-1 times a matrix, in its place when it is Fortran-ordered."""
-        solved: Matrix = cho_solve((self.upper, False), right, overwrite_b=True, check_finite=False)
-        return solved
-
-
-def solve(blocks: Blocks) -> LeastSquares:
+def solve(blocks: LaggedRows) -> LeastSquares:
     """Return the least-squares solution of X B = Y, that of least norm if there are many."""
     shape = next(((x.shape[1], y.shape[1]) for x, y in blocks), None)
     if shape is None:
         raise WorkFailedError("nothing to fit", expected="scenarios longer than the lags", got="no rows")
     if blocks.rows >= shape[0]:  # the Gram matrix of the regressors, by blocks of rows
-        factor = _factor(lambda: _gram((x for x, _ in blocks), shape[0]))
-        found = factor.divide(_products(blocks, shape))
-
-        def residual(x: Matrix, y: Matrix) -> Matrix:  # Y - X B of one block, C-ordered
-            transposed: Matrix = blas.dgemm(-1.0, found, x.T, trans_a=True, beta=1.0, c=y.T)
-            return transposed.T
-
-        found += factor.divide(_products(((x, residual(x, y)) for x, y in blocks), shape))
+        divided, condition, floor = _factor(lambda: _gram((x for x, _ in blocks), shape[0]))
+        found = divided(_products(blocks, shape))
+        residual = partial(blas.dgemm, -1.0, found, trans_a=True, beta=1.0)  # (Y - X B)' of a block
+        found += divided(_products(((x, residual(x.T, c=y.T).T) for x, y in blocks), shape))
     else:  # the Gram matrix of the rows, which all fit
         x, y = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
-        factor = _factor(lambda: _gram([np.ascontiguousarray(x.T)], len(x)))
-        dual = factor.divide(np.asfortranarray(y))
-        dual += factor.divide(np.asfortranarray(y - x @ (x.T @ dual)))
+        divided, condition, floor = _factor(lambda: _gram([np.ascontiguousarray(x.T)], len(x)))
+        dual = divided(np.asfortranarray(y))
+        dual += divided(np.asfortranarray(y - x @ (x.T @ dual)))
         found = x.T @ dual
-    return LeastSquares(coefficients=found, condition=factor.condition, floor=factor.floor, rows=blocks.rows)
+    return LeastSquares(coefficients=found, condition=condition, floor=floor, rows=blocks.rows)
 
 
 def _gram(blocks: Iterable[Matrix], size: int) -> Matrix:
@@ -296,8 +256,11 @@ def _products(blocks: Iterable[tuple[Matrix, Matrix]], shape: tuple[int, int]) -
     return total
 
 
-def _factor(gram: Callable[[], Matrix]) -> _Factor:
-    """Return the Cholesky factor, of the matrix with a floor under it if it is singular to rounding."""
+def _factor(gram: Callable[[], Matrix]) -> tuple[Callable[[Matrix], Matrix], float, float]:
+    """Return G^-1 times a matrix, in its place when that is Fortran-ordered, condition number and floor.
+
+    By Cholesky's factor of G, with the floor under it if it is singular to rounding.
+    """
     matrix = gram()
     size = len(matrix)
     if not np.isfinite(matrix.diagonal()).all():
@@ -311,12 +274,9 @@ def _factor(gram: Callable[[], Matrix]) -> _Factor:
             upper, _ = cho_factor(matrix, overwrite_a=True, check_finite=False)
         except LinAlgError:
             continue
-
-        def inverse(v: Matrix) -> Matrix:
-            return np.asarray(cho_solve((upper, False), v, check_finite=False))  # noqa: B023 (called here)
-
-        condition = float(np.sqrt(largest * _largest_eigenvalue(inverse, size)))
-        return _Factor(upper, condition, floor)
+        divided: Callable[..., Matrix] = partial(cho_solve, (upper, False), check_finite=False)
+        condition = float(np.sqrt(largest * _largest_eigenvalue(divided, size)))
+        return partial(divided, overwrite_b=True), condition, floor
     raise WorkFailedError("the Gram matrix has no Cholesky factor", where="rows to fit")
 
 
@@ -351,7 +311,4 @@ def principal_directions(
 
 def _squared(blocks: Iterable[Matrix], basis: Matrix) -> Matrix:
     """Return X'X times a basis."""
-    total = np.zeros_like(basis)
-    for x in blocks:
-        total += x.T @ (x @ basis)
-    return total
+    return sum((x.T @ (x @ basis) for x in blocks), np.zeros_like(basis))

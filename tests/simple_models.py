@@ -52,21 +52,16 @@ OPERATORS: tuple[type[Operator], ...] = (GNS, SuperGAT, SuperGATDot, GAT, GATv2,
 
 
 class Drift(Baseline):
-    """``x(f+1) = x(f) + a (x(f) - x(f-1))``; the best ``a`` is a quotient of two sums.
-
-    Options:
-        fail_at: call of `forward` whose loss is NaN; 0 is none.
-        explode_at: frame of a rollout that is infinite; 0 is none.
-    """
+    """``x(f+1) = x(f) + a (x(f) - x(f-1))``; the best ``a`` is a quotient of two sums."""
 
     method = "Drift"
 
     class Options(Base):
-        """See above."""
+        """Its start, and where it fails."""
 
         start: float = 0.0
-        fail_at: int = 0
-        explode_at: int = 0
+        fail_at: int = 0  # call of `forward` whose loss is NaN; 0 is none
+        explode_at: int = 0  # frame of a rollout that is infinite; 0 is none
 
     def __init__(self, options: Any, facts: Facts) -> None:
         super().__init__(options, facts)
@@ -117,11 +112,10 @@ def install(monkeypatch: pytest.MonkeyPatch, **models: type) -> None:
     """Let packages seem installed that add baselines, by name."""
     own = tuple(catalogue.installed(catalogue.GROUP))
     added = tuple(
-        EntryPoint(name.replace("_", "-"), f"{model.__module__}:{model.__name__}", catalogue.GROUP)
+        EntryPoint(name, f"{model.__module__}:{model.__name__}", catalogue.GROUP)
         for name, model in models.items()
     )
-    find: Callable[..., Any] = lambda group: own + added  # noqa: E731
-    monkeypatch.setattr(catalogue, "installed", find)
+    monkeypatch.setattr(catalogue, "installed", lambda group: own + added)
 
 
 def trainer(
@@ -139,10 +133,6 @@ def trainer(
         return run(baseline, size="tiny", settings=own, output=folder / to, threads=1, **options)
 
     return call
-
-
-TURN = 0.1
-"""Angle that :func:`rotations` turn by per frame [rad]."""
 
 
 def facts_of(scenarios: Sequence[Floats]) -> Facts:
@@ -188,7 +178,7 @@ def rotations(scenarios: int, *, frames: int = 40, particles: int = 12, seed: in
     """Return one lopsided cloud that turns about the centre of the box, from other angles."""
     rng = np.random.default_rng(seed)
     cloud = np.array([0.25, 0.0]) + rng.normal(0.0, 0.06, (particles, 2))
-    angle = rng.uniform(0.0, 2 * np.pi, scenarios)[:, None] + TURN * np.arange(frames)
+    angle = rng.uniform(0.0, 2 * np.pi, scenarios)[:, None] + 0.1 * np.arange(frames)
     c, s = np.cos(angle), np.sin(angle)
     turn = np.stack([np.stack([c, s], -1), np.stack([-s, c], -1)], -2)
     return list((0.5 + np.einsum("pi,sfij->sfpj", cloud, turn)).astype(np.float32))
@@ -201,10 +191,7 @@ def train(model: Baseline, scenarios: Sequence[Floats], *, steps: int, batch: in
     optimiser = torch.optim.Adam(model.parameters(), lr=3e-3)
     falling = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
     for _ in range(steps):
-        picks = [
-            (int(rng.integers(len(scenarios))), int(rng.integers(len(scenarios[0]) - length + 1)))
-            for _ in range(batch)
-        ]
+        picks = [rng.integers([len(scenarios), len(scenarios[0]) - length + 1]) for _ in range(batch)]
         terms = model(batch_of([scenarios[s][f : f + length] for s, f in picks]), generator)
         loss = sum((model.weights.get(name, 1.0) * term for name, term in terms.items()), torch.zeros(()))
         optimiser.zero_grad()
@@ -237,32 +224,21 @@ def counted(widths: Sequence[int]) -> int:
     return sum(before * after + after for before, after in pairwise(widths))
 
 
-RADIUS = 0.0625
-"""A power of two: distances over it round nowhere."""
-
-SMALL: dict[str, object] = {"latent": 16, "layers": 2, "noise_std": 0.0}
-"""Options of a network that runs in milliseconds."""
+RADIUS = 0.0625  # a power of two: distances over it round nowhere
+SMALL: dict[str, object] = {"latent": 16, "layers": 2, "noise_std": 0.0}  # runs in milliseconds
 
 
 def facts(**changes: object) -> Facts:
     """Return the figures of a box of 256 particles whose statistics have no mean."""
-    still = dict.fromkeys(("velocity_mean", "acceleration_mean"), (0.0, 0.0))
-    plain = replace(
-        FACTS,
-        split="cavity",
-        particles=256,
-        bounds=((0.0625, 0.9375), (0.0625, 0.9375)),
-        radius=RADIUS,
-        frame_interval=0.5,
-        statistics={
-            "position_mean": (0.5, 0.5),
-            "position_std": (0.25, 0.3),
-            "velocity_std": (0.004, 0.003),
-            "acceleration_std": (0.0002, 0.0001),
-            **still,
-        },
-    )
-    return replace(plain, **changes)  # type: ignore[arg-type]
+    statistics = {
+        "position_mean": (0.5, 0.5),
+        "position_std": (0.25, 0.3),
+        "velocity_std": (0.004, 0.003),
+        "acceleration_std": (0.0002, 0.0001),
+        **dict.fromkeys(("velocity_mean", "acceleration_mean"), (0.0, 0.0)),
+    }
+    plain: dict[str, Any] = {"split": "cavity", "particles": 256, "radius": RADIUS, "frame_interval": 0.5}
+    return replace(FACTS, **plain | {"bounds": ((0.0625, 0.9375),) * 2, "statistics": statistics} | changes)
 
 
 def jittered(seed: int, side: int = 16, low: float = 0.0625, high: float = 0.9375) -> NDArray[np.float64]:

@@ -84,15 +84,11 @@ def test_every_baseline_trains_and_predicts(lagbench: Command, baseline: str) ->
 
 def test_from_a_name_to_scores_in_words(lagbench: Command) -> None:
     """Without --json each command says what it did and which one comes next, down to the scores."""
-    trained = lagbench(
-        "train", "curl-noise", "--size", "tiny", "--baseline", "gns", "--set", "training.steps=1"
-    )
+    train = ("train", "curl-noise", "--size", "tiny", "--baseline", "gns", "--set", "training.steps=1")
+    trained = lagbench(*train)
     assert "next: lagbench predict runs/curl-noise/tiny/gns-0/weights.pt" in trained.stdout
     assert "hint: tiny is for tests" in trained.stdout
-    again = lagbench(
-        "train", "curl-noise", "--size", "tiny", "--baseline", "gns", "--set", "training.steps=1"
-    )
-    assert "it was over before" in again.stdout
+    assert "it was over before" in lagbench(*train).stdout
     assert "it was over before" not in trained.stdout
     predict = ("predict", "runs/curl-noise/tiny/gns-0/weights.pt", "--threads", "1", "--no-bench")
     assert lagbench(*predict, "--set", "model.latent=7").exit_code == 2
@@ -145,8 +141,7 @@ def test_mistakes_of_train(lagbench: Command, words: tuple[str, ...], code: int,
 def test_mistakes_of_predict(lagbench: Command, tmp_path: Path) -> None:
     """A pickle, a missing file and data of another version are refused with 3, 3 and 4."""
     (tmp_path / "bomb.pt").write_bytes(pickle.dumps(os.getcwd))
-    assert lagbench("predict", "bomb.pt").exit_code == 3
-    assert lagbench("predict", "none.pt").exit_code == 3
+    assert lagbench("predict", "bomb.pt").exit_code == lagbench("predict", "none.pt").exit_code == 3
     lagbench("train", "--baseline", "gns", *TINY, "--set", "training.steps=1")
     weights = tmp_path / "runs/curl-noise/tiny/gns-0/weights.pt"
     content = torch.load(weights, weights_only=True)
@@ -159,23 +154,22 @@ def test_mistakes_of_predict(lagbench: Command, tmp_path: Path) -> None:
 
 
 @pytest.mark.filterwarnings("default")
-def test_predicting_before_the_end_is_warned_of(lagbench: Command, tmp_path: Path) -> None:
-    """On stderr, in one line, and only while the training is not over."""
+def test_what_is_not_the_best_is_warned_of(lagbench: Command, tmp_path: Path) -> None:
+    """Predicting before the end, in one line on stderr; and predicting from and starting at checkpoint.pt.
+
+    The latter where weights.pt lies beside it.
+    """
     lagbench("train", "--baseline", "mlp", *TINY, "--set", "training.steps=2", "-o", "run")
-    predict = ("predict", "run/weights.pt", "--threads", "1", "--no-bench", "--json")
-    assert lagbench(*predict).stderr == ""
-    record = json.loads((tmp_path / "run/training.json").read_text())
-    (tmp_path / "run/training.json").write_text(json.dumps(record | {"state": "interrupted", "step": 1}))
-    done = lagbench(*predict)
+    early = ("predict", "run/weights.pt", "--threads", "1", "--no-bench", "--json")
+    assert lagbench(*early).stderr == ""
+    told = (tmp_path / "run/training.json").read_text()
+    unfinished = json.loads(told) | {"state": "interrupted", "step": 1}
+    (tmp_path / "run/training.json").write_text(json.dumps(unfinished))
+    done = lagbench(*early)
     assert done.stderr.startswith("warning: ")
     assert done.stderr.count("\n") == 1
     assert "step 1 of 2" in done.stderr
-
-
-@pytest.mark.filterwarnings("default")
-def test_the_last_state_is_not_the_best(lagbench: Command, tmp_path: Path) -> None:
-    """Where weights.pt lies beside checkpoint.pt, predicting from and starting at the latter is warned of."""
-    lagbench("train", "--baseline", "mlp", *TINY, "--set", "training.steps=2", "-o", "run")
+    (tmp_path / "run/training.json").write_text(told)
     predict = ("predict", "run/checkpoint.pt", "--threads", "1", "--no-bench", "--quiet")
     more = ("train", "--baseline", "mlp", *TINY, "--set", "training.steps=1", "--quiet")
     for words in (predict, (*more, "--start", "run/checkpoint.pt", "-o", "more")):
@@ -187,17 +181,18 @@ def test_the_last_state_is_not_the_best(lagbench: Command, tmp_path: Path) -> No
     assert lagbench(*predict).stderr == ""
 
 
-def command(*words: str, threads: int = 1) -> subprocess.CompletedProcess[str]:
-    """Run lagbench in a process of its own."""
-    environment = {**os.environ, "OMP_NUM_THREADS": str(threads)}
-    return subprocess.run(
-        [sys.executable, "-m", "lagbench", *words], capture_output=True, text=True, env=environment
-    )
+def command(*words: str) -> subprocess.CompletedProcess[str]:
+    """Run Python's module in a process of its own, on one thread."""
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    line = [sys.executable, "-m", *words]
+    return subprocess.run(line, capture_output=True, text=True, env=environment, timeout=300)
 
 
 def test_bench_of_the_solver(lagbench: Command, original: LocalSplit) -> None:
     """The solver is timed in a process of its own; nothing else can be timed, and no local split."""
-    done = command("bench", "solver", "--split", "curl-noise", "--size", "tiny", "--frames", "3", "--json")
+    done = command(
+        "lagbench", "bench", "solver", "--split", "curl-noise", "--size", "tiny", "--frames", "3", "--json"
+    )
     found = json.loads(done.stdout)
     assert (found["particles"], found["substeps"]) == (506, 12)
     assert found["frames"] >= 3
@@ -240,7 +235,7 @@ def test_two_processes_tell_an_error_once(lagbench: Command) -> None:
     """A loss that overflows ends both processes, and one of them says so."""
     settings = [word for key in SHARED for word in ("--set", key)]
     settings += ["--set", "training.steps=9", "--set", "training.learning_rate=1e30"]
-    ended = command("train", "--baseline", "mlp", *TINY, *settings, "--processes", "2")
+    ended = command("lagbench", "train", "--baseline", "mlp", *TINY, *settings, "--processes", "2")
     assert ended.returncode == 5
     assert ended.stderr.count("the loss is not finite") == 1
 
@@ -254,22 +249,10 @@ def launched(*words: str) -> list[subprocess.CompletedProcess[str]]:
     with socket.socket() as held:  # a port that nobody listens on
         held.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{held.getsockname()[1]}"
-    agent = ["-m", "torch.distributed.run", "--nnodes", "2", "--nproc-per-node", "1", "--rdzv-id", "lagbench"]
+    agent = ["torch.distributed.run", "--nnodes", "2", "--nproc-per-node", "1", "--rdzv-id", "lagbench"]
     agent += ["--rdzv-backend", "c10d", "--rdzv-endpoint", address, "-m", "lagbench", *words]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     with ThreadPoolExecutor() as both:
-        pair = [
-            both.submit(
-                subprocess.run,
-                [sys.executable, *agent],
-                env=environment,
-                capture_output=True,
-                text=True,
-                timeout=300,
-            )
-            for _ in range(2)
-        ]
-    return [one.result() for one in pair]
+        return list(both.map(lambda _: command(*agent), range(2)))
 
 
 @pytest.mark.slow
@@ -287,7 +270,7 @@ def test_two_processes_make_the_weights_of_one(lagbench: Command, tmp_path: Path
         return "train", "--baseline", "mlp", *TINY, "-o", folder, *settings
 
     together = options("shared", 3, 1e-3)
-    shared = launched(*together) if nodes == 2 else [command(*together, "--processes", "2")]
+    shared = launched(*together) if nodes == 2 else [command("lagbench", *together, "--processes", "2")]
     assert [one.returncode for one in shared] == [0] * nodes, [one.stderr for one in shared]
     assert "".join(one.stdout for one in shared).count("finished, step 8 of 8") == 1
     assert json.loads((tmp_path / "shared" / "training.json").read_text())["processes"] == 2

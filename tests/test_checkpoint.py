@@ -51,18 +51,8 @@ def test_round_trip(tmp_path: Path) -> None:
     assert (found.baseline, found.options, found.facts) == (stored.baseline, stored.options, FACTS)
     assert found.training == stored.training
     assert torch.equal(found.weights["a"], stored.weights["a"])
-    assert found.optimizer is not None
     # Adam's first moment after one step: (1 - 0.9) x gradient.
     assert found.optimizer["state"][0]["exp_avg"].tolist() == pytest.approx([0.05, 0.2])
-
-
-def test_restore(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A model comes back in float32 from weights in bfloat16."""
-    install(monkeypatch, drift=Drift)
-    save(tmp_path / "a.pt", example(weights={"a": torch.tensor([0.25]).bfloat16(), "calls": torch.tensor(0)}))
-    model = restore(load(tmp_path / "a.pt"))
-    assert model.state_dict()["a"].dtype is torch.float32
-    assert model.state_dict()["a"].item() == 0.25
 
 
 def test_rounding() -> None:
@@ -111,9 +101,8 @@ def test_a_pickle_is_refused_and_not_run(tmp_path: Path, writer: str) -> None:
 def test_text_is_no_pickle(tmp_path: Path) -> None:
     """Of any other file it is said that it is no checkpoint; of a folder, which file to name."""
     (tmp_path / "notes.md").write_text("# hello\n")
-    with pytest.raises(UnreadableFileError, match="lagbench train") as caught:
+    with pytest.raises(UnreadableFileError, match=r"not a checkpoint(.|\n)*lagbench train"):
         load(tmp_path / "notes.md")
-    assert "more than tensors" not in str(caught.value)
     with pytest.raises(UnreadableFileError) as caught:
         load(tmp_path)
     assert "weights.pt" not in str(caught.value)
@@ -124,11 +113,10 @@ def test_text_is_no_pickle(tmp_path: Path) -> None:
 
 def test_scripts_are_refused(tmp_path: Path) -> None:
     """A TorchScript archive, which holds code too, is refused."""
-    file = tmp_path / "script.pt"
     with pytest.warns(DeprecationWarning, match="torch.jit"):
-        torch.jit.save(torch.jit.script(torch.nn.ReLU()), file)
+        torch.jit.save(torch.jit.script(torch.nn.ReLU()), tmp_path / "script.pt")
     with pytest.raises(UnreadableFileError):
-        load(file)
+        load(tmp_path / "script.pt")
 
 
 @pytest.mark.parametrize(
@@ -156,16 +144,8 @@ def test_other_files_are_unreadable(tmp_path: Path, content: object) -> None:
         load(file)
 
 
-def _put(content: dict[str, Any], *place: object) -> None:
-    """Put the last value where the keys before it lead."""
-    *path, key, value = place
-    for step in path:
-        content = content[step]
-    content[key] = value
-
-
 @pytest.mark.parametrize(
-    "place",
+    "change",
     [
         ("training", "recipe", []),
         ("training", "recipe", "training", []),
@@ -179,23 +159,6 @@ def _put(content: dict[str, Any], *place: object) -> None:
         ("facts", "particles", -3),
         ("facts", "radius", float("inf")),
         ("facts", "statistics", "velocity_std", [float("nan"), 1.0]),
-    ],
-)
-def test_strange_words_are_refused(tmp_path: Path, place: tuple[object, ...]) -> None:
-    """Whatever a stranger writes about a model is read as what it should be, or not at all."""
-    file = tmp_path / "strange.pt"
-    save(file, example())
-    content = torch.load(file, weights_only=True)
-    about = json.loads(content["about"])
-    _put(about, *place)
-    torch.save({**content, "about": json.dumps(about)}, file)
-    with pytest.raises(UnreadableFileError, match=r"strange\.pt"):
-        load(file)
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [
         {"about": "[" * 10**5},
         {"lagbench_checkpoint": torch.ones(2)},
         {"lagbench_checkpoint": True},
@@ -205,24 +168,35 @@ def test_strange_words_are_refused(tmp_path: Path, place: tuple[object, ...]) ->
         {"weights": {"a": torch.zeros(1, device="meta")}},
     ],
 )
-def test_strange_tensors_are_refused(tmp_path: Path, changes: dict[str, Any]) -> None:
-    """Weights are plain numbers that the file really holds."""
+def test_strange_words_and_tensors_are_refused(
+    tmp_path: Path, change: tuple[Any, ...] | dict[str, Any]
+) -> None:
+    """A stranger's words are what they should be, or nothing; weights are numbers that the file holds."""
     file = tmp_path / "strange.pt"
     save(file, example())
-    torch.save({**torch.load(file, weights_only=True), **changes}, file)
+    content = torch.load(file, weights_only=True)
+    if isinstance(change, tuple):  # keys, and the value where they lead
+        about = place = json.loads(content["about"])
+        *path, key, value = change
+        for step in path:
+            place = place[step]
+        place[key] = value
+        change = {"about": json.dumps(about)}
+    torch.save({**content, **change}, file)
     with pytest.raises(UnreadableFileError, match=r"strange\.pt"):
         load(file)
 
 
-def test_missing_and_cut(tmp_path: Path) -> None:
-    """A missing file and one that was cut short are unreadable."""
-    with pytest.raises(UnreadableFileError, match="No such file"):
-        load(tmp_path / "none.pt")
-    save(tmp_path / "a.pt", example())
-    whole = (tmp_path / "a.pt").read_bytes()
-    (tmp_path / "a.pt").write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(UnreadableFileError):
-        load(tmp_path / "a.pt")
+def test_missing_cut_and_never_written(tmp_path: Path) -> None:
+    """A missing file, one that was cut short, and a pipe, which would be waited for, are unreadable."""
+    os.mkfifo(tmp_path / "pipe.pt")
+    save(tmp_path / "cut.pt", example())
+    whole = (tmp_path / "cut.pt").read_bytes()
+    (tmp_path / "cut.pt").write_bytes(whole[: len(whole) // 2])
+    for name, words in (("none.pt", "No such file"), ("cut.pt", None), ("pipe.pt", None)):
+        with pytest.raises(UnreadableFileError, match=words) as caught:
+            load(tmp_path / name)
+        assert caught.value.where == str(tmp_path / name)
 
 
 @pytest.mark.parametrize(
@@ -255,32 +229,25 @@ def test_unknown_baseline() -> None:
 
 def test_data_of_another_version(generated: GenerationResult, unmeasured: Registry) -> None:
     """The data at hand must have the hash of the data that the model was trained on."""
-    with pytest.raises(DataError, match="another version"):
-        check_data(example(), root=generated.root, registry=unmeasured, where="a.pt")
-    with pytest.raises(DataError, match="lagbench generate"):
-        check_data(example(), root=generated.root / "nowhere", registry=unmeasured, where="a.pt")
-    elsewhere = example(facts=replace(FACTS, split="my-river"))
-    with pytest.raises(DataError) as caught:  # a local split of another root
-        check_data(elsewhere, root=generated.root, registry=unmeasured, where="a.pt")
-    assert caught.value.where == "a.pt"
-
-
-def repacked(source: Path, target: Path, *, compression: int = zipfile.ZIP_STORED, **more: bytes) -> Path:
-    """Write an archive anew, with other compression and further members."""
-    with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w", compression) as new:
-        for member in old.infolist():
-            new.writestr(member.filename, old.read(member))
-        for name, data in more.items():
-            new.writestr(name, data)
-    return target
+    root = generated.root
+    for split, there, words in (
+        ("curl-noise", root, "another version"),
+        ("curl-noise", root / "nowhere", "lagbench generate"),
+        ("my-river", root, "where: a.pt"),  # a local split of another root
+    ):
+        found = example(facts=replace(FACTS, split=split))
+        with pytest.raises(DataError, match=words):
+            check_data(found, root=there, registry=unmeasured, where="a.pt")
 
 
 def test_an_archive_that_unpacks_to_more_is_refused(tmp_path: Path) -> None:
     """100 MB of zeros in 100 kB: refused by its directory, before they are unpacked."""
     save(tmp_path / "a.pt", example())
-    bomb = repacked(
-        tmp_path / "a.pt", tmp_path / "bomb.pt", compression=zipfile.ZIP_DEFLATED, big=bytes(10**8)
-    )
+    bomb = tmp_path / "bomb.pt"
+    with zipfile.ZipFile(tmp_path / "a.pt") as old, zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as new:
+        for member in old.infolist():
+            new.writestr(member.filename, old.read(member))
+        new.writestr("big", bytes(10**8))
     assert bomb.stat().st_size < 10**6
     tracemalloc.start()
     with pytest.raises(UnreadableFileError) as caught:
@@ -304,14 +271,6 @@ def test_overlapping_members_are_refused(tmp_path: Path) -> None:
         load(tmp_path / "a.pt")
 
 
-def test_a_fifo_is_refused_at_once(tmp_path: Path) -> None:
-    """Nobody writes to it; opening it would wait for ever."""
-    os.mkfifo(tmp_path / "a.pt")
-    with pytest.raises(UnreadableFileError) as caught:
-        load(tmp_path / "a.pt")
-    assert caught.value.where == str(tmp_path / "a.pt")
-
-
 def test_a_flipped_byte_is_seen(tmp_path: Path) -> None:
     """Any byte of any member: its checksum is another. Bytes between members are padding."""
     save(tmp_path / "a.pt", example())
@@ -328,40 +287,26 @@ def test_a_flipped_byte_is_seen(tmp_path: Path) -> None:
                 load(tmp_path / "b.pt")
 
 
-KNOWN = ("position_mean", "position_std", "velocity_mean", "velocity_std")
-WHOLE = replace(
-    FACTS, statistics=dict.fromkeys((*KNOWN, "acceleration_mean", "acceleration_std"), (0.5, 0.5))
-)
+KINDS = [f"{name}_{of}" for name in ("position", "velocity", "acceleration") for of in ("mean", "std")]
+WHOLE = replace(FACTS, statistics=dict.fromkeys(KINDS, (0.5, 0.5)))
 
-SMALL: dict[str, dict[str, Any]] = {
-    "neuralmpm": {"cells": 8, "width": 4, "materials": [0, 1, 2, 3]},
-    "mlp": {"widths": [4]},
-    "lstm": {"latent": 4, "decoder": [4]},
-    "lstm-mlp": {"latent": 4, "decoder": [4]},
-    "var": {"lags": 1},
-    "var-stable": {"rank": 2},
+SIZES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
+    "neuralmpm": ({"cells": 8, "width": 4, "materials": [0, 1, 2, 3]}, {"width": 4 * 10**5}),
+    "mlp": ({"widths": [4]}, {"widths": [10**7, 10**7]}),
+    **dict.fromkeys(("lstm", "lstm-mlp"), ({"latent": 4, "decoder": [4]}, {"latent": 10**7})),
+    "var": ({"lags": 1}, {"lags": 10**9}),
+    "var-stable": ({"rank": 2}, {}),
 }
-"""Options of small models; those of graph networks are below."""
+"""Options of small models, and of such as no machine holds."""
 
-LARGE: dict[str, dict[str, Any]] = {
-    "mlp": {"widths": [10**7, 10**7]},
-    "neuralmpm": {"width": 4 * 10**5},
-    "var": {"lags": 10**9},
-    "var-stable": {},
-}
-"""Options of models that no machine holds; by default a latent vector of 10^7 numbers."""
+GRAPHS = {"latent": 4, "layers": 2}, {"latent": 10**7}  # the same of graph networks
 
 
 def stored(baseline: str) -> Checkpoint:
     """Return the checkpoint of a small model."""
-    options = SMALL.get(baseline, {"latent": 4, "layers": 2})
+    options, _ = SIZES.get(baseline, GRAPHS)
     weights = find(baseline).model.build(options, WHOLE).state_dict()
     return Checkpoint(baseline=baseline, options=options, facts=WHOLE, weights=weights)
-
-
-def particles(count: int) -> Facts:
-    """Return the facts of a data set with as many particles."""
-    return replace(WHOLE, particles=count)
 
 
 @pytest.mark.parametrize("baseline", names())
@@ -382,21 +327,16 @@ def test_what_the_weights_fill_is_built(baseline: str) -> None:
 def test_larger_models_are_refused(baseline: str) -> None:
     """Options for 10^10 numbers and more are refused as those of an unreadable file, at once."""
     found = stored(baseline)
-    facts = particles(10**9) if baseline == "var-stable" else WHOLE
-    options = {**found.options, **LARGE.get(baseline, {"latent": 10**7})}
+    facts = replace(WHOLE, particles=10**9) if baseline == "var-stable" else WHOLE
+    options = {**found.options, **SIZES.get(baseline, GRAPHS)[1]}
     with pytest.raises(UnreadableFileError, match=r"larger model(.|\n)*weights of"):
         restore(replace(found, options=options, facts=facts), where="theirs.pt")
 
 
-def test_layers_without_number_are_refused() -> None:
-    """Ten million layers of one number each are not built either."""
-    found = stored("gns")
+def test_small_numbers_and_shared_bytes_are_seen_through() -> None:
+    """Ten million layers of one number each are not built; names for the same bytes make no large file."""
     with pytest.raises(UnreadableFileError, match=r"larger model(.|\n)*tensors"):
-        restore(replace(found, options={"latent": 1, "layers": 10**7}))
-
-
-def test_weights_that_share_their_bytes_count_once() -> None:
-    """A file cannot seem large by many names for the same bytes."""
+        restore(replace(stored("gns"), options={"latent": 1, "layers": 10**7}))
     found = stored("mlp")
     one = torch.zeros(10**6)
     weights = {f"w{i}": one.view(1000, 1000) for i in range(100)}
@@ -412,13 +352,14 @@ class Reading(Drift):
         self.half = float(torch.full((1,), 0.5))
 
 
-def test_a_baseline_that_reads_numbers_is_built(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A stranger's baseline that cannot be measured beforehand is built as it is."""
+def test_a_baseline_that_reads_numbers_is_built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stranger's baseline that cannot be measured is built as it is, in float32 from bfloat16."""
     install(monkeypatch, reading=Reading)
-    weights = {"a": torch.tensor([0.25]), "calls": torch.tensor(0)}
-    model = restore(Checkpoint(baseline="reading", options={}, facts=FACTS, weights=weights))
+    weights = {"a": torch.tensor([0.25]).bfloat16(), "calls": torch.tensor(0)}
+    save(tmp_path / "a.pt", example(baseline="reading", options={}, weights=weights))
+    model = restore(load(tmp_path / "a.pt"))
     assert isinstance(model, Reading)
-    assert (model.half, model.a.item()) == (0.5, 0.25)
+    assert (model.half, model.a.item(), model.a.dtype) == (0.5, 0.25, torch.float32)
 
 
 def test_weights_of_the_board_can_be_run() -> None:

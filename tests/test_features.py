@@ -7,7 +7,7 @@ import pytest
 import torch
 from simple_models import RADIUS, batch, facts, jittered, swirl
 
-from lagbench.baselines.augmentation import Symmetry, draw, image, noisy, random_walk
+from lagbench.baselines.augmentation import Symmetry, draw, image, noisy
 from lagbench.baselines.graph import NodeFeatures, Scale, edge_features, radius_graph, wall_distance
 from lagbench.errors import UsageError
 
@@ -23,10 +23,9 @@ def node_features(**options: bool) -> NodeFeatures:
     """Return the features of the test's box, the scales without noise."""
     statistics = facts().statistics
     torch.manual_seed(0)
-    velocity, acceleration = (
-        Scale(statistics[f"{name}_mean"], statistics[f"{name}_std"]) for name in ("velocity", "acceleration")
-    )
-    return NodeFeatures(BOUNDS, velocity, acceleration, RADIUS, **options)
+    kinds = ("velocity", "acceleration")
+    scales = (Scale(statistics[f"{kind}_mean"], statistics[f"{kind}_std"]) for kind in kinds)
+    return NodeFeatures(BOUNDS, *scales, RADIUS, **options)
 
 
 def test_noise_widens_the_deviation_of_the_data() -> None:
@@ -61,16 +60,12 @@ def test_edges_show_what_a_loop_over_pairs_shows() -> None:
     assert len(expected) > 500
     np.testing.assert_allclose(shown, expected, atol=1e-14)
     assert shown[:, 2].max() <= 1.0
-
-
-def test_coinciding_particles_have_a_finite_gradient() -> None:
-    """The distance of two particles in one place is 0, and so is its gradient."""
+    # the distance of two particles in one place is 0, and so is its gradient
     position = torch.tensor([[0.5, 0.5], [0.5, 0.5], [0.5, 0.53125]], requires_grad=True)
     edges = torch.tensor([[0, 2], [1, 1]])
-    shown = edge_features(position, edges, RADIUS)
-    assert shown[:, 2].tolist() == [0.0, 0.5]
-    shown[:, 2].sum().backward()
-    assert position.grad is not None
+    distance = edge_features(position, edges, RADIUS)[:, 2]
+    assert distance.tolist() == [0.0, 0.5]
+    distance.sum().backward()
     # d distance / d y of the third is 1 / radius, of the second its opposite.
     assert position.grad.tolist() == [[0.0, 0.0], [0.0, -16.0], [0.0, 16.0]]
 
@@ -81,8 +76,7 @@ def test_a_particle_shows_thirty_numbers() -> None:
     # deviations (0.004, 0.003) and (0.0002, 0.0001): changes of 1, 2, 3, 4 deviations end at 0.002 and 0.001
     velocity = torch.tensor([0.0, 1.0, 3.0, 6.0, 10.0])[None, :, None] * torch.tensor([0.0002, 0.0001])
     shown = features(torch.tensor([[0.5, 0.5]]), velocity, torch.tensor([2]))
-    assert shown.shape == (1, 30)
-    assert features.count == 30
+    assert shown.shape == (1, features.count) == (1, 30)
     expected = torch.tensor([0.5, 1 / 3, 1.0, 1.0, 2.0, 2.0, 3.0, 3.0, 4.0, 4.0])
     torch.testing.assert_close(shown[0, :10], expected)
     assert shown[0, 10:14].tolist() == [1.0] * 4
@@ -113,20 +107,17 @@ def test_features_do_not_see_where_particles_are() -> None:
     shifted = position + torch.tensor([0.125, -0.0625])
     edges = radius_graph(position, RADIUS)
     assert torch.equal(radius_graph(shifted, RADIUS), edges)
-    assert torch.equal(
-        features(position, velocity, material, walls), features(shifted, velocity, material, walls)
-    )
+    here, there = (features(x, velocity, material, walls) for x in (position, shifted))
+    assert torch.equal(here, there)
     assert torch.equal(edge_features(position, edges, RADIUS), edge_features(shifted, edges, RADIUS))
 
 
-@pytest.fixture(scope="module")
-def walks() -> torch.Tensor:
-    """Noise of deviation 0.3 on six frames of 40,000 particles."""
-    return random_walk(40_000, 6, 0.3, generator())
+def test_noise_has_the_stated_deviation_at_the_last_velocity() -> None:
+    """Velocity noise is a walk: covariance of steps j and k is std^2 min(j, k) / 5 (80,000 draws).
 
-
-def test_noise_has_the_stated_deviation_at_the_last_velocity(walks: torch.Tensor) -> None:
-    """Velocity noise is a walk: covariance of steps j and k is std^2 min(j, k) / 5 (80,000 draws)."""
+    That of x and y, and of neighbours in the row, is uncorrelated.
+    """
+    walks = noisy(torch.zeros(40_000, 6, 2), 6, 0.3, generator())
     velocity = walks.diff(dim=1)
     covariance = torch.einsum("pjc,pkc->jk", velocity, velocity) / velocity[:, 0].numel()
     step = torch.arange(1.0, 6.0)
@@ -135,11 +126,7 @@ def test_noise_has_the_stated_deviation_at_the_last_velocity(walks: torch.Tensor
     torch.testing.assert_close(covariance, expected, rtol=0.0, atol=0.025 * 0.09)
     assert abs(float(velocity[:, -1].std()) - 0.3) < 0.003
     assert not walks[:, 0].any()
-
-
-def test_components_and_particles_are_disturbed_on_their_own(walks: torch.Tensor) -> None:
-    """Noise of x and y, and of neighbours in the row, is uncorrelated."""
-    last = walks.diff(dim=1)[:, -1] / 0.3
+    last = velocity[:, -1] / 0.3
     for one, other in ((last[:, 0], last[:, 1]), (last[1:, 0], last[:-1, 0])):
         assert abs(float((one * other).mean())) < 5 / np.sqrt(len(one))
 
@@ -172,12 +159,10 @@ def test_walls_move_with_the_particles_on_them() -> None:
     """In every image a particle that rides on a wall still rides on the wall that it is at."""
     middle = np.array([[0.0625, 0.5], [0.9375, 0.5], [0.5, 0.0625], [0.5, 0.9375]])
     rider = batch(np.stack([middle, middle]), walls=True)
-    assert rider.wall_velocity is not None
     rider = batch(np.stack([middle, middle + rider.wall_velocity[0, 0].numpy()]), walls=True)
     seen = set()
     for matrix in draw(Symmetry.SQUARE, 200, generator()).unique(dim=0):
         turned = image(rider, matrix[None], BOUNDS)
-        assert turned.wall_velocity is not None
         place = (turned.position[:, None, 0] - torch.from_numpy(middle).float()).norm(dim=2).argmin(dim=1)
         velocity = turned.position[:, 1] - turned.position[:, 0]
         torch.testing.assert_close(turned.wall_velocity[0, 0][place], velocity, atol=1e-6, rtol=0)
@@ -186,7 +171,10 @@ def test_walls_move_with_the_particles_on_them() -> None:
 
 
 def test_images_are_per_window_and_leave_the_data_alone() -> None:
-    """The first window stays, the second is mirrored in x: x becomes 1 - x in this box."""
+    """The first window stays, the second is mirrored in x: x becomes 1 - x in this box.
+
+    Mixed precision does not round positions or wall velocities to bfloat16.
+    """
     windows = batch(swirl(0, 3), swirl(1, 3), walls=True)
     kept = windows.position.clone()
     matrix = torch.stack([torch.eye(2), torch.diag(torch.tensor([-1.0, 1.0]))])
@@ -195,18 +183,11 @@ def test_images_are_per_window_and_leave_the_data_alone() -> None:
     torch.testing.assert_close(turned.position[:256], kept[:256])
     torch.testing.assert_close(turned.position[256:, :, 0], 1.0 - kept[256:, :, 0])
     torch.testing.assert_close(turned.position[256:, :, 1], kept[256:, :, 1])
-
-
-def test_images_are_exact_under_autocast() -> None:
-    """Mixed precision does not round positions or wall velocities to bfloat16."""
-    windows = batch(swirl(0, 3), swirl(1, 3), walls=True)
     matrix = draw(Symmetry.SQUARE, 2, generator(3))
     plain = image(windows, matrix, BOUNDS)
     with torch.autocast("cpu", torch.bfloat16):
         mixed = image(windows, matrix, BOUNDS)
     assert torch.equal(mixed.position, plain.position)
-    assert mixed.wall_velocity is not None
-    assert plain.wall_velocity is not None
     assert torch.equal(mixed.wall_velocity, plain.wall_velocity)
 
 

@@ -29,21 +29,14 @@ SMALL = {"widths": [16, 8]}
 
 Array = NDArray[np.float64]
 
-ENDS: dict[str, Callable[[Study], object]] = {
-    "4.2": lambda study: study.activation,
-    "4.3": lambda study: study.widths[0],
-    "4.4": lambda study: len(study.widths),
-    "4.5": lambda study: study.row,
-}
-"""What tells a row's recipe from the others of its table."""
-
 
 @pytest.mark.parametrize("study", STUDIES, ids=lambda study: f"{study.table}-{study.row}")
 def test_parameters_of_the_thesis(study: Study) -> None:
     """The recipes of Tables 4.2 to 4.5 have as many parameters as the thesis prints."""
     split = "fluid" if study.table < "4.4" else "multimaterial"
-    variant = f"table-{study.table}-{ENDS[study.table](study)}"
-    recipe = recipe_for(find("mlp"), split, "full", variant=variant)
+    # what tells a row's recipe from the others of its table
+    ends = {"4.2": study.activation, "4.3": study.widths[0], "4.4": len(study.widths), "4.5": study.row}
+    recipe = recipe_for(find("mlp"), split, "full", variant=f"table-{study.table}-{ends[study.table]}")
     with torch.device("meta"):  # no memory for the weights
         model = MLP.build(recipe.model, replace(FACTS, particles=2500))
     assert sum(p.numel() for p in model.parameters()) == study.parameters
@@ -60,13 +53,9 @@ ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
 def transcribed(model: MLP, before: Array, last: Array, activation: str) -> Array:
     """Return the next positions by the equations, shape [particle, 2]."""
     known = {name: np.array(value) for name, value in FACTS.statistics.items()}
-    state = np.concatenate(
-        [
-            (last - known["position_mean"]) / known["position_std"],
-            (last - before - known["velocity_mean"]) / known["velocity_std"],
-        ],
-        axis=1,
-    ).ravel()
+    place = (last - known["position_mean"]) / known["position_std"]
+    speed = (last - before - known["velocity_mean"]) / known["velocity_std"]
+    state = np.concatenate([place, speed], axis=1).ravel()
     layers = [p.detach().numpy().astype(float) for p in model.parameters()]
     for index in range(0, len(layers), 2):
         state = layers[index] @ state + layers[index + 1]
@@ -96,19 +85,19 @@ def test_the_loss_is_equation_4_16() -> None:
     assert loss == pytest.approx(float((predicted - state[2]).square().mean().detach()), rel=1e-5)
 
 
-def test_windows_do_not_mix() -> None:
-    """A rollout of two scenarios side by side equals those of each alone."""
+def test_windows_do_not_mix_and_are_of_as_many_particles() -> None:
+    """A rollout of two scenarios side by side equals those of each alone, of their last two frames.
+
+    Scenarios of another size raise an error that says how many particles it takes.
+    """
     model = MLP.build(SMALL, FACTS)
     both = rolled(model, batch_of([SCENARIOS[0][:2], SCENARIOS[1][:2]]), 5)
     alone = [rolled(model, batch_of([x[:2]]), 5) for x in SCENARIOS[:2]]
     torch.testing.assert_close(both, torch.cat(alone), atol=1e-6, rtol=1e-5)
-
-
-def test_only_the_last_frame_and_its_velocity_count() -> None:
-    """Six given frames start the rollout that their last two do."""
-    model = MLP.build(SMALL, FACTS)
     long, short = (rolled(model, batch_of([SCENARIOS[0][first:6]]), 3) for first in (0, 4))
     assert torch.equal(long, short)
+    with pytest.raises(DataError, match="12 particles in each window\n  got: 11"):
+        model.start(batch_of([SCENARIOS[0][:2, :11]]))
 
 
 def test_a_change_of_nothing_is_persistence() -> None:
@@ -130,20 +119,13 @@ def test_noise_is_as_large_as_asked_and_only_in_training() -> None:
     assert torch.equal(model.disturbed(state, None), state)
 
 
-def test_other_particles_are_refused() -> None:
-    """Scenarios of another size raise an error that says how many particles it takes."""
-    model = MLP.build(SMALL, FACTS)
-    with pytest.raises(DataError, match="12 particles in each window\n  got: 11"):
-        model.start(batch_of([SCENARIOS[0][:2, :11]]))
-
-
 GATED: dict[str, Any] = {"latent": 8, "decoder": [6]}
 BOTH = pytest.mark.parametrize("kind", [LSTM, LSTMWithMLP])
 
 
-def window_of(frames: int = 2) -> FrameWindow:
-    """Return the states of the first scenario's first frames."""
-    state = FrameState(FACTS).of(torch.from_numpy(SCENARIOS[0][:frames]))
+def window_of() -> FrameWindow:
+    """Return the states of the first scenario's first two frames."""
+    state = FrameState(FACTS).of(torch.from_numpy(SCENARIOS[0][:2]))
     return FrameWindow(state[None], torch.zeros(1, 12, dtype=torch.int64))
 
 
@@ -159,19 +141,10 @@ def test_parameters_of_table_4_6(kind: type[LSTM], material: int) -> None:
     assert sum(p.numel() for p in model.parameters()) == expected
 
 
-def elu(a: Array) -> Array:
-    """Return x or exp(x) - 1."""
-    return np.where(a > 0, a, np.expm1(a))
-
-
-def sigmoid(a: Array) -> Array:
-    """Return 1 / (1 + exp(-x))."""
-    return 1 / (1 + np.exp(-a))
-
-
 def cells(layer: torch.nn.LSTM, inputs: Array) -> Array:
     """Return the outputs of an LSTM layer over time by its gates, shape [time, latent]."""
     (w, r, b, c) = (p.detach().numpy().astype(float) for p in layer.parameters())
+    sigmoid = ACTIVATIONS["sigmoid"]
     h = cell = np.zeros(layer.hidden_size)
     outputs = []
     for x in inputs:
@@ -192,8 +165,7 @@ def linear(layer: torch.nn.Module, x: Array) -> Array:
 @BOTH
 def test_a_step_is_the_equations(kind: type[LSTM]) -> None:
     """Encoder, pooling, gates, the MLP between, and decoder, written out, give the same state."""
-    model = kind.build(GATED, FACTS).eval()
-    window = window_of()
+    model, window, elu = kind.build(GATED, FACTS).eval(), window_of(), ACTIVATIONS["elu"]
     latent = elu(linear(model.encoder[0], window.state[0].numpy().astype(float))).mean(axis=1)
     latent = cells(model.first, latent)
     if model.between is not None:
@@ -202,22 +174,10 @@ def test_a_step_is_the_equations(kind: type[LSTM]) -> None:
     expected = linear(model.decoder[2], elu(linear(model.decoder[0], last))).reshape(12, 4)
     found = model.next_state(window)[0].detach().numpy()
     np.testing.assert_allclose(found, expected, atol=1e-5)
-
-
-@BOTH
-def test_pooling_forgets_the_order_of_particles(kind: type[LSTM]) -> None:
-    """Renumbered particles give the same prediction, one to each number."""
-    model = kind.build(GATED, FACTS).eval()
-    window = window_of()
+    # the order of particles is nothing, that of frames is not
     order = torch.randperm(12, generator=torch.Generator().manual_seed(0))
     shuffled = FrameWindow(window.state[:, :, order], window.material)
     torch.testing.assert_close(model.next_state(window), model.next_state(shuffled), atol=1e-6, rtol=1e-5)
-
-
-def test_both_frames_count() -> None:
-    """The earlier of the two states changes the prediction."""
-    model = LSTM.build(GATED, FACTS).eval()
-    window = window_of()
     doubled = FrameWindow(window.state[:, [1, 1]], window.material)
     assert not torch.allclose(model.next_state(window), model.next_state(doubled), atol=1e-6)
 
@@ -225,12 +185,10 @@ def test_both_frames_count() -> None:
 def test_a_rollout_starts_from_two_frames() -> None:
     """Two given frames are enough: the first takes the second's velocity, as its own is unknown."""
     model = LSTM.build(GATED, FACTS)
-    given = SCENARIOS[0][:2]
-    states = model.start(batch_of([given])).state[0]
-    assert torch.equal(states[0, :, 2:], states[1, :, 2:])
+    short, long = (model.start(batch_of([SCENARIOS[0][:frames]])).state[0] for frames in (2, 6))
+    assert torch.equal(short[0, :, 2:], short[1, :, 2:])
+    assert not torch.equal(long[0, :, 2:], long[1, :, 2:])
     assert model.history == 3
-    longer = model.start(batch_of([SCENARIOS[0][:6]])).state[0]
-    assert not torch.equal(longer[0, :, 2:], longer[1, :, 2:])
 
 
 def test_dropout_acts_in_training_only() -> None:
@@ -267,26 +225,19 @@ def test_the_material_is_a_fifth_input(kind: type[FrameNetwork], options: dict[s
 
 
 @pytest.mark.parametrize(
-    ("kind", "options", "steps", "share"),
-    [
-        (MLP, {"widths": [64, 64]}, 300, 0.1),
-        (LSTM, {"latent": 32, "decoder": [32], "dropout": [0.0, 0.0]}, 400, 0.2),
-        (LSTMWithMLP, {"latent": 32, "decoder": [32], "dropout": [0.0, 0.0]}, 400, 0.2),
-    ],
+    ("kind", "steps", "share"), [(MLP, 300, 0.1), (LSTM, 400, 0.2), (LSTMWithMLP, 400, 0.2)]
 )
-def test_it_learns_a_rotation(
-    kind: type[FrameNetwork], options: dict[str, Any], steps: int, share: float
-) -> None:
+def test_it_learns_a_rotation(kind: type[FrameNetwork], steps: int, share: float) -> None:
     """After some hundred steps a rollout from a new angle is far better than standing still."""
     torch.manual_seed(0)
-    model = kind.build(options, FACTS)
+    recurrent = {"latent": 32, "decoder": [32], "dropout": [0.0, 0.0]}
+    model = kind.build({"widths": [64, 64]} if kind is MLP else recurrent, FACTS)
     train(model, rotations(24), steps=steps)
     assert share_of_persistence(model, rotations(30)[-1], frames=20) < share
 
 
 NETWORKS = ("mlp", "lstm", "lstm-mlp")
 SPLITS = ("cavity", "curl-noise", "fluid", "multimaterial")
-FULL_BOXES = {("cavity", "full"), ("curl-noise", "full")}
 
 
 @pytest.mark.parametrize("size", ["tiny", "mini", "full"])
@@ -294,7 +245,7 @@ FULL_BOXES = {("cavity", "full"), ("curl-noise", "full")}
 @pytest.mark.parametrize("name", [*NETWORKS, "var", "var-stable"])
 def test_models_have_recipes_where_they_fit(name: str, split: str, size: str) -> None:
     """Plain VAR is not for full boxes; mini has at most 4 M numbers, a stable VAR 8 MB."""
-    if name == "var" and (split, size) in FULL_BOXES:
+    if name == "var" and size == "full" and split in ("cavity", "curl-noise"):
         with pytest.raises(UsageError, match="no recipe"):
             recipe_for(find(name), split, size)
         return

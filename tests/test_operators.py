@@ -22,7 +22,6 @@ from lagbench.baselines.operators.transformer import Transformer
 
 Array = NDArray[np.float64]
 LATENT, HIDDEN = 6, 5
-EVERY = pytest.mark.parametrize("operator", OPERATORS)
 
 
 def small(seed: int = 0) -> Graph:
@@ -112,16 +111,13 @@ def supergat_sd(w: dict[str, Array], x: Array, i: int, near: list[tuple[int, Arr
 
 def transformer(w: dict[str, Array], x: Array, i: int, near: list[tuple[int, Array]]) -> Array:
     """Return Shi et al. (2021), Eqs. 3 and 4, with a linear skip connection."""
-    product = {
-        name: x @ w[f"conv.lin_{name}.weight"].T + w[f"conv.lin_{name}.bias"]
+    key, query, value, skip = (
+        x @ w[f"conv.lin_{name}.weight"].T + w[f"conv.lin_{name}.bias"]
         for name in ("key", "query", "value", "skip")
-    }
-    edges = [w["conv.lin_edge.weight"] @ e for _, e in near]
-    keys = [product["key"][j] + e for e, (j, _) in zip(edges, near, strict=True)]
-    values = [product["value"][j] + e for e, (j, _) in zip(edges, near, strict=True)]
-    a = softmax([product["query"][i] @ key / np.sqrt(LATENT) for key in keys]) if near else np.zeros(0)
-    heard = np.sum([a_j * value for a_j, value in zip(a, values, strict=True)], axis=0)
-    return product["skip"][i] + heard
+    )
+    told = [(j, w["conv.lin_edge.weight"] @ e) for j, e in near]
+    a = softmax([query[i] @ (key[j] + e) / np.sqrt(LATENT) for j, e in told]) if near else []
+    return skip[i] + np.sum([a_j * (value[j] + e) for a_j, (j, e) in zip(a, told, strict=True)], axis=0)
 
 
 def gns(w: dict[str, Array], x: Array, i: int, near: list[tuple[int, Array]]) -> Array:
@@ -167,9 +163,12 @@ def test_pointnet_is_that_of_pyg() -> None:
     torch.testing.assert_close(ours, theirs(x, position, inputs.edge_index), rtol=1e-12, atol=1e-12)
 
 
-@EVERY
-def test_order_of_particles_and_edges(operator: type[Operator]) -> None:
-    """Particles in another order get the same updates in that order; the order of edges is nothing."""
+@pytest.mark.parametrize("operator", OPERATORS)
+def test_order_and_lack_of_edges(operator: type[Operator]) -> None:
+    """Particles in another order get the same updates in that order; the order of edges is nothing.
+
+    Without any edge updates and gradients are finite.
+    """
     inputs, layer = small(), built(operator).eval()
     order = torch.randperm(len(inputs.node), generator=torch.Generator().manual_seed(3))
     edges = torch.randperm(len(inputs.edge), generator=torch.Generator().manual_seed(4))
@@ -177,10 +176,6 @@ def test_order_of_particles_and_edges(operator: type[Operator]) -> None:
     mixed = Graph(inputs.node[order], place[inputs.edge_index][:, edges], inputs.edge[edges])
     np.testing.assert_allclose(updated(layer, mixed), updated(layer, inputs)[order], rtol=1e-9, atol=1e-9)
 
-
-@EVERY
-def test_without_edges(operator: type[Operator]) -> None:
-    """Particles without neighbours have finite updates and gradients."""
     layer = built(operator)
     alone = Graph(torch.randn(3, 2 * LATENT), torch.empty(2, 0, dtype=torch.int64), torch.empty(0, LATENT))
     alone.edge.requires_grad_()  # a plain sum has no weights
@@ -219,16 +214,12 @@ def test_link_loss() -> None:
     assert not layer.eval()(inputs.node.double(), inputs.edge_index, inputs.edge)[1]
 
 
-def test_link_loss_starts_low() -> None:
-    """At the widths of a recipe, inputs as a network has them start the link loss near 1, not 1000."""
+def test_link_loss_starts_low_and_decreases() -> None:
+    """At the widths of a recipe it starts near 1, not 1000; SuperGAT learns who are neighbours."""
     torch.manual_seed(0)
-    inputs = graph(300, 2400, node=256, edge=128)
-    inputs.node[:, 128:] *= 8.0  # sums of about 8 normalised messages
-    assert 0.3 < SuperGAT(256, 128, 128)(*inputs)[1]["link"].item() < 3.0
-
-
-def test_link_loss_decreases() -> None:
-    """Trained on one graph, SuperGAT learns which particles are neighbours."""
+    wide = graph(300, 2400, node=256, edge=128)
+    wide.node[:, 128:] *= 8.0  # sums of about 8 normalised messages
+    assert 0.3 < SuperGAT(256, 128, 128)(*wide)[1]["link"].item() < 3.0
     torch.manual_seed(0)
     inputs, layer = graph(40, 200, node=32, edge=16), SuperGAT(32, 16, 16)
     inputs.node.mul_(8.0)  # sums of about 8 normalised messages
@@ -245,27 +236,23 @@ def test_link_loss_decreases() -> None:
 
 
 def test_draws_leave_global_sources_alone() -> None:
-    """Training SuperGAT draws from the given generator only, the same for the same seed."""
-    inputs, layer = small(), built(SuperGAT, scale=0.4)
-    before = random.getstate(), torch.get_rng_state(), np.random.get_state()[1].tolist()  # noqa: NPY002
+    """Training SuperGAT draws from the given generator only, the same for the same seed.
+
+    The layer can be copied afterwards: no graph of gradients hangs on it.
+    """
+    (node, edge_index, edge), layer = small(), built(SuperGAT, scale=0.4)
+
+    def states() -> tuple[object, ...]:
+        return random.getstate(), torch.get_rng_state().tolist(), np.random.get_state()[1].tolist()  # noqa: NPY002
+
+    before = states()
     losses = [
-        layer(*map(_double, inputs), generator=torch.Generator().manual_seed(seed))[1]["link"].item()
+        layer(node.double(), edge_index, edge, generator=torch.Generator().manual_seed(seed))[1][
+            "link"
+        ].item()
         for seed in (0, 0, 1)
     ]
-    after = random.getstate(), torch.get_rng_state(), np.random.get_state()[1].tolist()  # noqa: NPY002
+    assert states() == before
     assert losses[0] == losses[1] != losses[2]
-    assert before[0] == after[0]
-    assert torch.equal(before[1], after[1])
-    assert before[2] == after[2]
-
-
-def _double(tensor: torch.Tensor) -> torch.Tensor:
-    return tensor.double() if tensor.is_floating_point() else tensor
-
-
-def test_nothing_stays_on_the_layer() -> None:
-    """A trained layer can be copied: no graph of gradients hangs on it."""
-    layer = built(SuperGAT)
-    layer(*map(_double, small()))
     copied = copy.deepcopy(layer)
     assert all(torch.equal(a, b) for a, b in zip(layer.parameters(), copied.parameters(), strict=True))

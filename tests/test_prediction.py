@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import netCDF4
 import numpy as np
@@ -37,12 +38,8 @@ from lagbench.submission import validate as examine
 Predict = Callable[..., PredictionResult]
 
 
-UNFINISHED = {
-    "state": "running",
-    "step": 9,
-    "steps": 70,
-    "recipe": {"name": "curl-noise/tiny", "training": {"seed": 3}},
-}
+RECIPE = {"name": "curl-noise/tiny", "training": {"seed": 3}}
+UNFINISHED = {"state": "running", "step": 9, "steps": 70, "recipe": RECIPE}
 """Record of a training whose weights the fixture has, and which goes on."""
 
 
@@ -87,11 +84,7 @@ def run(
             options=model.options.model_dump(),
             facts=facts,
             weights=model.state_dict(),
-            training={
-                "step": 9,
-                "recipe": {"name": "curl-noise/tiny", "training": {"seed": 3}},
-                **options.pop("training", {}),
-            },
+            training={"step": 9, "recipe": RECIPE, **options.pop("training", {})},
         )
         save(tmp_path / "weights.pt", stored)
         output = tmp_path / options.pop("name", "predictions.nc")
@@ -100,26 +93,28 @@ def run(
     return call
 
 
-def truth(root: Path) -> dict[int, np.ndarray]:
-    """Return the positions of the test scenarios by id, read without our code."""
-    found = {}
-    for file in sorted((root / "curl-noise/tiny/v2/test").glob("*.nc")):
-        with netCDF4.Dataset(file) as data:
-            found[int(file.stem)] = np.asarray(data["position"][:], np.float64)
-    return found
-
-
 def written(path: Path, name: str = "position") -> np.ndarray:
-    """Return a variable of a predictions.nc."""
+    """Return a variable of a file, read without our code."""
     with netCDF4.Dataset(path) as data:
         return np.asarray(data[name][:])
+
+
+def said(path: Path) -> dict[str, Any]:
+    """Return the attributes of a file."""
+    with netCDF4.Dataset(path) as data:
+        return {name: data.getncattr(name) for name in data.ncattrs()}
+
+
+def truth(folder: Path) -> dict[int, np.ndarray]:
+    """Return the positions of the test scenarios by id."""
+    return {int(file.stem): written(file).astype(float) for file in sorted(folder.glob("test/*.nc"))}
 
 
 def test_a_drift_in_closed_form(run: Predict, generated: GenerationResult) -> None:
     """With a = 1/2 the k-th position is x + (1 - 2^-k) u, u the last given velocity."""
     result = run(start=0.5)
     shares = 1 - 0.5 ** np.arange(1, 21)
-    for row, position in enumerate(truth(generated.root).values()):
+    for row, position in enumerate(truth(generated.folder).values()):
         last, velocity = position[5], position[5] - position[4]
         expected = last + shares[:, None, None] * velocity
         assert np.abs(written(result.path)[row] - expected).max() < 1e-6
@@ -129,11 +124,10 @@ def test_the_file_is_valid_and_says_what_made_it(
     run: Predict, generated: GenerationResult, unmeasured: Registry
 ) -> None:
     """The file passes every check, and holds cost, device, seed, parameters and training."""
-    result = run(method="my drift")
+    result = run(method="my drift", training={"best_step": 4})  # of a state that is not the best
     report = examine(result.path, root=generated.root, registry=unmeasured)
     assert report.valid, report.findings
-    with netCDF4.Dataset(result.path) as data:
-        found = {name: data.getncattr(name) for name in data.ncattrs()}
+    found = said(result.path)
     assert (found["method"], found["seed"], found["parameters"]) == ("my drift", 3, 1)
     assert "curl-noise/tiny, step 9" in found["training"]
     assert "1 thread" in found["device"]
@@ -144,7 +138,7 @@ def test_the_file_is_valid_and_says_what_made_it(
 
 def test_batches_do_not_matter(run: Predict) -> None:
     """Scenarios predicted side by side are those predicted one by one."""
-    alone, together = run(name="a.nc", batch=1), run(name="b.nc", batch=2)
+    alone, together = (run(name=f"{batch}.nc", batch=batch) for batch in (1, 2))
     assert (alone.batch, together.batch) == (1, 2)
     assert np.array_equal(written(alone.path), written(together.path))
 
@@ -152,12 +146,16 @@ def test_batches_do_not_matter(run: Predict) -> None:
 def test_a_rollout_is_frozen_where_it_diverges(run: Predict, generated: GenerationResult) -> None:
     """From frame 6 + 4 on, positions are those of frame 9, and the file says so."""
     result = run(model={"explode_at": 5})
-    position = written(result.path)
-    assert result.diverged == dict.fromkeys(truth(generated.root), 10)
+    position, given = written(result.path), truth(generated.folder)
+    assert result.diverged == dict.fromkeys(given, 10)
     assert written(result.path, "diverged_at").tolist() == [10, 10]
     assert np.isfinite(position).all()
     assert (position[:, 4:] == position[:, 3:4]).all()
     assert (position[:, 3] != position[:, 2]).any()
+    never = run(model={"explode_at": 1}, name="never.nc")  # stays at the last given frame
+    for row, position in enumerate(given.values()):
+        assert (written(never.path)[row] == position[5].astype(np.float32)).all()
+    assert set(never.diverged.values()) == {6}
 
 
 @pytest.mark.parametrize(("batch", "seconds"), [(1, 1.0), (2, 1.5)])
@@ -165,34 +163,13 @@ def test_frozen_frames_are_not_timed(
     run: Predict, monkeypatch: pytest.MonkeyPatch, batch: int, seconds: float
 ) -> None:
     """With a second per step, 4 of 20 frames before a burst cost 4 s, side by side 4 s in vain before."""
-    ticks = []
-    step = Drift.advance
-
-    def slow(self: Drift, state: Any) -> Any:
-        ticks.append(1)
-        return step(self, state)
-
-    monkeypatch.setattr(Drift, "advance", slow)
-    monkeypatch.setattr(prediction, "time", SimpleNamespace(process_time=lambda: float(len(ticks))))
+    slow = Mock(side_effect=Drift.advance)
+    monkeypatch.setattr(Drift, "advance", lambda self, state: slow(self, state))
+    monkeypatch.setattr(prediction, "time", SimpleNamespace(process_time=lambda: float(slow.call_count)))
     result = run(model={"explode_at": 4}, batch=batch)
     assert list(result.diverged.values()) == [9, 9]
     assert result.seconds_per_frame == seconds
     assert result.clock == "processor"  # one thread: what else runs here does not count
-
-
-def test_the_last_state_is_called_by_its_own_step(run: Predict) -> None:
-    """Of checkpoint.pt, which is not the best, the file says the step that it was stored at."""
-    result = run(training={"best_step": 4})
-    with netCDF4.Dataset(result.path) as data:
-        assert "step 9" in data.getncattr("training")
-
-
-def test_divergence_in_the_first_frame(run: Predict, generated: GenerationResult) -> None:
-    """A rollout that is never finite stays at the last given frame."""
-    result = run(model={"explode_at": 1})
-    for row, position in enumerate(truth(generated.root).values()):
-        assert (written(result.path)[row] == position[5].astype(np.float32)).all()
-    assert set(result.diverged.values()) == {6}
 
 
 def windows(firsts: list[float]) -> Batch:
@@ -221,23 +198,6 @@ def test_a_diverging_scenario_leaves_others_alone() -> None:
     assert good.position.shape == bad.position.shape == (8, 3, 2)
 
 
-class Fleeing(Drift):
-    """A Drift whose particles go a box farther to the right in every frame."""
-
-    def advance(self, state: State) -> tuple[State, Tensor]:
-        """Advance by one frame."""
-        state, position = super().advance(state)
-        return state, position + torch.tensor([float(state[2] - 1), 0.0])
-
-
-def test_a_rollout_is_frozen_before_it_is_too_far(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What the scorer would refuse is frozen within ten boxes, as what ceases to be finite is."""
-    found = roll_out(Fleeing.build({"start": 0.0}, FACTS), windows([0.9]), 30)[0]
-    assert found.diverged_at is not None
-    assert 8.0 < float(found.position.max()) < 10.6
-    assert torch.isfinite(found.position).all()
-
-
 class Wrong(Drift):
     """A Drift with another answer."""
 
@@ -247,6 +207,19 @@ class Wrong(Drift):
         """Give the answer."""
         state, position = super().advance(state)
         return self.answer(state, position)
+
+
+def test_a_rollout_is_frozen_before_it_is_too_far(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the scorer would refuse is frozen within ten boxes, as what ceases to be finite is."""
+
+    def fleeing(state: State, position: Tensor) -> Any:  # a box farther to the right in every frame
+        return state, position + torch.tensor([float(state[2] - 1), 0.0])
+
+    monkeypatch.setattr(Wrong, "answer", staticmethod(fleeing))
+    found = roll_out(Wrong.build({"start": 0.0}, FACTS), windows([0.9]), 30)[0]
+    assert found.diverged_at is not None
+    assert 8.0 < float(found.position.max()) < 10.6
+    assert torch.isfinite(found.position).all()
 
 
 @pytest.mark.parametrize(
@@ -267,15 +240,11 @@ def test_what_is_no_frame_is_not_broadcast(answer: Any, monkeypatch: pytest.Monk
     assert caught.value.where == "Wrong.advance"
 
 
-def test_rollouts_keep_the_mode() -> None:
-    """A model in training is rolled out without dropout, and is in training afterwards."""
-    model = Drift.build({}, FACTS).train()
-    roll_out(model, windows([0.9]), 1)
-    assert model.training
-
-
-def test_rounding_for_a_while() -> None:
-    """Weights are in bfloat16 inside and have all their bits again outside."""
+def test_rollouts_keep_mode_and_weights() -> None:
+    """In training it is in training afterwards; rounded to bfloat16 for a while it has all its bits again."""
+    drift = Drift.build({}, FACTS).train()
+    roll_out(drift, windows([0.9]), 1)
+    assert drift.training
     model = torch.nn.Linear(8, 8)
     before = {name: value.clone() for name, value in model.state_dict().items()}
     with as_published(model):
@@ -298,12 +267,11 @@ def test_only_the_given_frames_are_read(run: Predict, copied: Callable[[], Path]
 
 def test_mistakes(run: Predict, generated: GenerationResult, tmp_path: Path) -> None:
     """Missing data, a missing checkpoint and a missing device have errors of their own."""
-    result = run()
-    weights = tmp_path / "weights.pt"
+    made = run().path
     with pytest.raises(DataError, match="lagbench generate"):
-        predict(weights, result.path, root=tmp_path / "nowhere")
+        predict(tmp_path / "weights.pt", made, root=tmp_path / "nowhere")
     with pytest.raises(UnreadableFileError, match=r"none\.pt"):
-        predict(tmp_path / "none.pt", result.path, root=generated.root)
+        predict(tmp_path / "none.pt", made, root=generated.root)
     with pytest.raises(UsageError, match="no device 'tpu'"):
         run(device="tpu")
 
@@ -316,57 +284,43 @@ def test_another_size_than_that_of_the_training(
     ones = dict.fromkeys(here.statistics, (1.0, 1.0))
     trained = replace(here, size="mini", dataset_sha256="0" * 64, radius=0.5, horizon=3, statistics=ones)
     trained = replace(trained, particles=4 * here.particles)
-    budget = {
-        "cpu_hours": 0.1,
-        "steps": 9,
-        "metric": "vorticity_nrmse",
-        "best": 0.2,
-        "validations": [[9, 0.2]],
-    }
+    valid = {"metric": "vorticity_nrmse", "best": 0.2, "validations": [[9, 0.2]]}
+    budget = {"cpu_hours": 0.1, "steps": 9, **valid}
     result = run("scaled", start=0.5, facts=trained, size="tiny", training={"budget": budget})
     assert (result.size, result.trained_size) == ("tiny", "mini")
     assert Scaled.told == replace(here, radius=1.0, statistics=ones)
     assert np.array_equal(written(result.path), written(run(start=0.5, name="own.nc").path))
     report = examine(result.path, root=generated.root, registry=unmeasured)
     assert report.valid, report.findings
-    with netCDF4.Dataset(result.path) as data:
-        assert json.loads(data.getncattr("budget")) == {"cpu_hours": 0.1, "steps": 9}
-        assert data.getncattr("training").startswith("curl-noise mini train")
+    assert json.loads(said(result.path)["budget"]) == {"cpu_hours": 0.1, "steps": 9}
+    assert said(result.path)["training"].startswith("curl-noise mini train")
     other = replace(trained, frame_interval=2.0 * here.frame_interval)
-    for name, facts, size in (
-        ("drift", trained, "tiny"),
-        ("scaled", other, "tiny"),
-        ("scaled", trained, "small"),
-    ):
+    wrong = (("drift", trained, "tiny"), ("scaled", other, "tiny"), ("scaled", trained, "small"))
+    for name, facts, size in wrong:
         with pytest.raises(UsageError):
             run(name, size=size, facts=facts)
     with pytest.raises(DataError):
         run("scaled", size="tiny", facts=replace(trained, version="0.9.0"))
-
-
-def test_what_the_training_changed_is_told(run: Predict) -> None:
-    """The file says by which ``--set`` the recipe became another, apart from changes of the prediction."""
-    recipe = recipe_for(find("gns"), "curl-noise", "tiny", settings=["training.steps=77"]).as_json()
-    result = run(training={"recipe": recipe}, settings=["model.explode_at=3"])
-    with netCDF4.Dataset(result.path) as data:
-        told = data.getncattr("training")
-    before, _, after = told.partition("predicted with")
-    assert "training.steps=77" in before
-    assert "model.explode_at=3" not in before
-    assert "model.explode_at=3" in after
+    run("scaled", facts=replace(here, radius=0.5))
+    assert Scaled.told.radius == 0.5  # hashes do not hold it: at its own size that of the training counts
 
 
 def test_a_model_is_changed_where_that_needs_no_weights(
     run: Predict, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An option of the model is as if it had been trained with, and the file says so; others are refused."""
-    result = run(settings=["model.explode_at=3"])
-    assert np.array_equal(
-        written(result.path), written(run(model={"explode_at": 3}, name="trained.nc").path), equal_nan=True
-    )
+    """An option of the model is as if it had been trained with, and the file says so; others are refused.
+
+    By which ``--set`` the training's recipe became another is told apart from that.
+    """
+    recipe = recipe_for(find("gns"), "curl-noise", "tiny", settings=["training.steps=77"]).as_json()
+    result = run(training={"recipe": recipe}, settings=["model.explode_at=3"])
+    trained = run(model={"explode_at": 3}, name="trained.nc")
+    assert np.array_equal(written(result.path), written(trained.path), equal_nan=True)
     assert set(result.diverged.values()) == {8}
-    with netCDF4.Dataset(result.path) as data:
-        assert data.getncattr("training").endswith("model.explode_at=3")
+    before, _, after = said(result.path)["training"].partition("predicted with")
+    assert "training.steps=77" in before
+    assert "model.explode_at=3" not in before
+    assert after.endswith("model.explode_at=3")
     install(monkeypatch, several=Several)
     for setting in ("training.steps=3", "model.explode=1", "model.count=2"):
         with pytest.raises(UsageError):
@@ -387,21 +341,10 @@ def test_no_image_falls_sideways(tiny_split: Callable[..., GenerationResult], tm
     assert not (tmp_path / "p.nc").exists()
 
 
-def test_at_its_own_size_a_model_keeps_its_radius(run: Predict, generated: GenerationResult) -> None:
-    """Hashes do not hold the radius: that of the training counts."""
-    here = facts_of("curl-noise", "tiny", root=generated.root)
-    run("scaled", facts=replace(here, radius=0.5))
-    assert Scaled.told.radius == 0.5
-
-
 def test_models_of_any_size_have_the_same_weights_at_each() -> None:
     """No parameter of theirs depends on the number of particles; MLPs and the like are not among them."""
-    statistics = {
-        f"{name}_{of}": (0.5, 0.5)
-        for name in ("position", "velocity", "acceleration")
-        for of in ("mean", "std")
-    }
-    small = replace(FACTS, statistics=statistics)
+    kinds = [f"{name}_{of}" for name in ("position", "velocity", "acceleration") for of in ("mean", "std")]
+    small = replace(FACTS, statistics=dict.fromkeys(kinds, (0.5, 0.5)))
     large = replace(small, size="full", particles=12, radius=0.05)
     models = {name: entry.model for name, entry in every_entry().items() if entry.model.any_size}
     assert {"neuralmpm", "gns", "supergat"} <= set(models) <= set(every_entry()) - {"mlp", "lstm", "var"}
@@ -413,14 +356,18 @@ def test_models_of_any_size_have_the_same_weights_at_each() -> None:
         assert shapes[0] == shapes[1], model.method
 
 
-@pytest.mark.parametrize("name", ["weights.pt", "training.nc", ".", "predictions.json", "taken.nc"])
+@pytest.mark.parametrize(
+    "name", ["weights.pt", "training.nc", ".", "predictions.json", "taken.nc", "scenario.nc"]
+)
 def test_nothing_else_is_replaced(
-    run: Predict, tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
+    run: Predict, tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch, generated: GenerationResult
 ) -> None:
     """Not the weights, nor the record of their training, whose name that of the cost would be; no folder.
 
-    Predictions and their cost have two names.
+    No scenario, which is a file of the same format. Predictions and their cost have two names.
     """
+    scenario = next(generated.folder.glob("test/*.nc")).read_bytes()
+    (tmp_path / "scenario.nc").write_bytes(scenario)
     (tmp_path / "taken.json").mkdir()
     record = {**UNFINISHED, "state": "finished"}
     (tmp_path / "training.json").write_text(json.dumps(record))
@@ -429,6 +376,7 @@ def test_nothing_else_is_replaced(
     assert caught.value.where == "--output"
     assert json.loads((tmp_path / "training.json").read_text()) == record
     assert load(tmp_path / "weights.pt").baseline == "drift"
+    assert (tmp_path / "scenario.nc").read_bytes() == scenario
     monkeypatch.chdir(tmp_path)
     with pytest.raises(UsageError):
         check_replaceable(Path())
@@ -439,22 +387,9 @@ def test_nothing_else_is_replaced(
         run(name="predictions.nc")
 
 
-def test_no_scenario_is_replaced(run: Predict, tmp_path: Path, generated: GenerationResult) -> None:
-    """It is a file of the same format, and the truth."""
-    scenario = next(generated.folder.glob("test/*.nc")).read_bytes()
-    (tmp_path / "scenario.nc").write_bytes(scenario)
-    with pytest.raises(UsageError):
-        run(name="scenario.nc")
-    assert (tmp_path / "scenario.nc").read_bytes() == scenario
-
-
 def test_out_of_memory(run: Predict, monkeypatch: pytest.MonkeyPatch) -> None:
     """When memory is full, the message says what to lower, and no file appears."""
-
-    def full(self: Drift, state: object) -> object:
-        raise torch.OutOfMemoryError("no memory left")
-
-    monkeypatch.setattr(Drift, "advance", full)
+    monkeypatch.setattr(Drift, "advance", Mock(side_effect=torch.OutOfMemoryError("no memory left")))
     with pytest.raises(WorkFailedError, match="lower --batch"):
         run(name="none.nc")
 
@@ -496,25 +431,28 @@ def test_what_is_no_record_of_these_weights_is_passed_over(
     assert run(training={"state": "running"}).path.is_file()
 
 
+CORES = len(os.sched_getaffinity(0))
+
+
 @pytest.mark.parametrize(
-    ("count", "environment", "expected"),
-    [(3, "2", 3), (None, "2", 2), (None, "0", 1), (None, "", None), (None, "many", None)],
+    ("count", "environment", "processes", "expected"),
+    [
+        *(
+            (3, "2", 1, 3),
+            (None, "2", 1, 2),
+            (None, "0", 1, 1),
+            (None, "", 1, CORES),
+            (None, "many", 1, CORES),
+        ),
+        *((None, "", CORES, 1), (None, "", CORES + 1, 1)),
+    ],
 )
 def test_threads_are_those_asked_for(
-    monkeypatch: pytest.MonkeyPatch, count: int | None, environment: str, expected: int | None
+    monkeypatch: pytest.MonkeyPatch, count: int | None, environment: str, processes: int, expected: int
 ) -> None:
-    """The option wins over OMP_NUM_THREADS, that over one per core; afterwards all is as before."""
+    """The option wins over OMP_NUM_THREADS, that over a share of the cores; afterwards all is as before."""
     monkeypatch.setenv("OMP_NUM_THREADS", environment)
     before = torch.get_num_threads()
-    with threads_used(count):
-        assert torch.get_num_threads() == (expected or len(os.sched_getaffinity(0)))
+    with threads_used(count, processes=processes):
+        assert torch.get_num_threads() == expected
     assert torch.get_num_threads() == before
-
-
-def test_processes_share_the_cores(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As many processes as cores have one thread each."""
-    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
-    cores = len(os.sched_getaffinity(0))
-    for processes in (cores, cores + 1):
-        with threads_used(None, processes=processes):
-            assert torch.get_num_threads() == 1

@@ -17,13 +17,7 @@ from simple_models import Drift, batch, facts, install, rolled, swirl
 from lagbench.baselines.baseline import Baseline, Settings
 from lagbench.baselines.catalogue import Entry, every_entry, find, names
 from lagbench.baselines.job import settings_of
-from lagbench.baselines.recipe import (
-    Schedule,
-    TrainingOptions,
-    changed_options,
-    recipe_for,
-    recipe_names,
-)
+from lagbench.baselines.recipe import Schedule, TrainingOptions, changed_options, recipe_for, recipe_names
 from lagbench.data.registry import load
 from lagbench.errors import UnreadableFileError, UsageError
 
@@ -107,25 +101,26 @@ def test_options_of_the_training(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "setting"),
+    ("name", "option", "value"),
     [
-        *(("mlp", "model.target=change"), ("mlp", "model.activation=tanh")),
-        *(("lstm", "model.target=change"), ("gns", "model.target=velocity")),
-        ("gns", "model.sum_messages=false"),
+        *(("mlp", "target", "change"), ("mlp", "activation", "tanh"), ("lstm", "target", "change")),
+        *(("gns", "target", "velocity"), ("gns", "sum_messages", "false")),
     ],
 )
-def test_weights_keep_their_meaning(name: str, setting: str) -> None:
+def test_weights_keep_their_meaning(name: str, option: str, value: str) -> None:
     """A trained model refuses options that its weights were made for, though they would fit."""
-    baseline = find(name)
+    baseline, setting = find(name), f"model.{option}={value}"
     stored = baseline.model.Options().model_dump(mode="json")
     with pytest.raises(UsageError):
         changed_options(baseline, stored, [setting])
-    group, _, value = setting.partition("=")
-    assert changed_options(baseline, {**stored, group.partition(".")[2]: value}, [setting])
+    assert changed_options(baseline, {**stored, option: value}, [setting])
 
 
-def test_layers(entry: Entry) -> None:
-    """Settings win over the recipe, and the recipe over the defaults of the file."""
+def test_layers(entry: Entry, tmp_path: Path) -> None:
+    """Settings win over the recipe, and the recipe over the defaults of the file, which may be one's own.
+
+    A star stands for every split. Of baselines that share a recipe, one has what is said of it by name.
+    """
     plain = recipe_for(entry, "cavity", "tiny")
     assert (plain.training.steps, plain.training.epochs, plain.training.batch) == (7, None, 4)
     assert plain.model["start"] == 0.5
@@ -133,6 +128,14 @@ def test_layers(entry: Entry) -> None:
     assert long.model["start"] == 2.0
     assert (long.training.batch, long.training.seed) == (9, 5)
     assert (long.training.schedule.factor, long.training.schedule.every) == (0.5, 10)
+    starred = recipe_for(entry, "fluid", "mini")
+    assert (starred.name, starred.training.learning_rate) == ("fluid/mini", 0.01)
+    for name, steps in (("drift", 8), ("gns", 9)):
+        recipe = recipe_for(replace(entry, name=name), "fluid", "full")
+        assert (recipe.model["start"], recipe.training.steps, recipe.training.batch) == (1.0, steps, 4)
+    own = tmp_path / "own.yaml"
+    own.write_text("{format: 1, recipes: {fluid/tiny: {training: {steps: 3}}}}")
+    assert recipe_for(entry, "fluid", "tiny", variant=str(own)).training.steps == 3
 
 
 def test_trainings_of_before_an_option_go_on() -> None:
@@ -141,8 +144,10 @@ def test_trainings_of_before_an_option_go_on() -> None:
     before = recipe_for(entry, "fluid", "tiny").as_json()
     assert not {"strain", "mixture", "pushforward", "recovery", "average"} & set(before["model"])
     assert not {"ema", "compile"} & set(before["training"])
-    after = recipe_for(entry, "fluid", "tiny", settings=["model.strain=true", "training.ema=0.9"]).as_json()
+    changes = ["model.strain=true", "training.ema=0.9", "training.compile=true"]
+    after = recipe_for(entry, "fluid", "tiny", settings=changes).as_json()
     assert (after["model"].pop("strain"), after["training"].pop("ema")) == (True, 0.9)
+    assert after["training"].pop("compile") is True
     assert after == before
 
 
@@ -189,31 +194,14 @@ def test_nothing_is_told_of_a_recipe_that_is_not_ours(tmp_path: Path) -> None:
 
 
 def test_steps_and_epochs_replace_each_other(entry: Entry) -> None:
-    """A later layer that counts epochs drops the steps below it."""
-    changed = recipe_for(entry, "cavity", "tiny", settings=["training.epochs=2"]).training
-    assert (changed.steps, changed.epochs) == (None, 2)
+    """A later layer that counts epochs drops the steps below it; in one layer both are refused."""
+    for settings in (["training.epochs=2"], ["training.steps=5", "training.epochs=2"]):
+        changed = recipe_for(entry, "cavity", "tiny", settings=settings).training
+        assert (changed.steps, changed.epochs) == (None, 2)
     # 2 epochs x 41 windows / (4 windows x 2 processes) = 10.25
     assert changed.total_steps(41, processes=2) == 11
-
-
-def test_any_split(entry: Entry) -> None:
-    """A star stands for every split; the recipe is named after the split that was asked for."""
-    recipe = recipe_for(entry, "fluid", "mini")
-    assert (recipe.name, recipe.training.learning_rate) == ("fluid/mini", 0.01)
-
-
-def test_a_baseline_among_others(entry: Entry) -> None:
-    """Of baselines that share a recipe, one has what is said of it by name beside what all have."""
-    for name, steps in (("drift", 8), ("gns", 9)):
-        recipe = recipe_for(replace(entry, name=name), "fluid", "full")
-        assert (recipe.model["start"], recipe.training.steps, recipe.training.batch) == (1.0, steps, 4)
-
-
-def test_own_file(entry: Entry, tmp_path: Path) -> None:
-    """A file of recipes can be given in place of ours."""
-    own = tmp_path / "own.yaml"
-    own.write_text("{format: 1, recipes: {fluid/tiny: {training: {steps: 3}}}}")
-    assert recipe_for(entry, "fluid", "tiny", variant=str(own)).training.steps == 3
+    with pytest.raises(ValueError, match="steps or epochs"):
+        TrainingOptions(steps=1, epochs=1)
 
 
 @pytest.mark.parametrize(
@@ -236,34 +224,28 @@ def test_own_file(entry: Entry, tmp_path: Path) -> None:
         (["training.clip=no"], "training.clip"),
         (["training.precision=off"], "'bf16'"),
         (["model.start=true"], "model.start"),
-        (["training.steps=5", "training.epochs=5"], ""),
     ],
 )
 def test_mistakes_in_settings(entry: Entry, settings: list[str], message: str) -> None:
-    """A wrong setting is a usage error that names key and remedy; steps and epochs replace each other."""
-    if not message:
-        assert recipe_for(entry, "cavity", "tiny", settings=settings).training.epochs == 5
-        return
+    """A wrong setting is a usage error that names key and remedy."""
     with pytest.raises(UsageError, match=message):
         recipe_for(entry, "cavity", "tiny", settings=settings)
 
 
 def test_no_such_recipe(entry: Entry) -> None:
     """A split or variant without a recipe is a usage error that names the nearest."""
-    with pytest.raises(UsageError, match="did you mean 'long'"):
-        recipe_for(entry, "cavity", "tiny", variant="lon")
-    with pytest.raises(UsageError, match="cavity/tiny"):
-        recipe_for(entry, "curl-noise", "full")
-    with pytest.raises(UsageError, match="leave --recipe out"):
-        recipe_for(entry, "curl-noise", "mini", variant="long")  # of any split there is one without a variant
-    with pytest.raises(UsageError, match="cavity/tiny"):
-        recipe_for(entry, "cavity", "huge", variant="long")
-    with pytest.raises(UsageError, match="--size mini or full has it"):
-        recipe_for(find("neuralmpm"), "multimaterial", "tiny", variant="conserving")
     bare = replace(entry, recipes=None)
     assert recipe_for(bare, "cavity", "tiny").name == "cavity/tiny"
-    with pytest.raises(UsageError):
-        recipe_for(bare, "cavity", "tiny", variant="long")
+    for asked, split, size, variant, words in (
+        (entry, "cavity", "tiny", "lon", "did you mean 'long'"),
+        (entry, "curl-noise", "full", None, "cavity/tiny"),
+        (entry, "curl-noise", "mini", "long", "leave --recipe out"),  # of any split one has no variant
+        (entry, "cavity", "huge", "long", "cavity/tiny"),
+        (find("neuralmpm"), "multimaterial", "tiny", "conserving", "--size mini or full has it"),
+        (bare, "cavity", "tiny", "long", "no recipe"),
+    ):
+        with pytest.raises(UsageError, match=words):
+            recipe_for(asked, split, size, variant=variant)
 
 
 @pytest.mark.parametrize(
@@ -298,12 +280,8 @@ def test_schedules_equal_torch() -> None:
         assert math.isclose(decay.at(step, steps=50), 0.1 ** (step / 20), rel_tol=1e-12)
         optimizer.step()
         cosine.step()
-
-
-def test_warm_up() -> None:
-    """The rate rises in equal parts: with 3 warm-up steps 1/4, 2/4, 3/4, then 1."""
-    rates = [Schedule().at(step, steps=10, warmup=3) for step in range(5)]
-    assert rates == [0.25, 0.5, 0.75, 1.0, 1.0]
+    # it rises in equal parts: with 3 warm-up steps 1/4, 2/4, 3/4, then 1
+    assert [Schedule().at(step, steps=10, warmup=3) for step in range(5)] == [0.25, 0.5, 0.75, 1.0, 1.0]
 
 
 class Kinds(Settings):
@@ -318,89 +296,49 @@ class Kinds(Settings):
     anything: Any = None
 
 
-@pytest.mark.parametrize(
-    "given",
-    [
+def test_yes_and_no_where_they_are_meant() -> None:
+    """Options that may be yes or no, or anything, keep it; pydantic would make numbers of it elsewhere.
+
+    Inside of lists and mappings too.
+    """
+    for given in (
         {"number": 1.0, "either": True, "word": True, "flags": [True, False], "anything": [True]},
         {"either": 1, "several": [1, 2], "named": {"a": 1.0}, "anything": False},
-    ],
-)
-def test_yes_and_no_where_they_are_meant(given: dict[str, object]) -> None:
-    """Options that may be yes or no, or anything, take it and keep it."""
-    found = Kinds.model_validate(given).model_dump(mode="json", include=set(given))
-    assert json.dumps(found, sort_keys=True) == json.dumps(given, sort_keys=True)
+    ):
+        found = Kinds.model_validate(given).model_dump(mode="json", include=set(given))
+        assert json.dumps(found, sort_keys=True) == json.dumps(given, sort_keys=True)
+    for value in (True, False):
+        for name, wrong in (("number", value), ("several", [3, value]), ("named", {"a": value})):
+            with pytest.raises(ValidationError) as caught:
+                Kinds.model_validate({name: wrong})
+            assert [error["loc"] for error in caught.value.errors()] == [(name,)]
 
 
-@pytest.mark.parametrize("name", ["number", "several", "named"])
-@pytest.mark.parametrize("value", [True, False])
-def test_yes_and_no_are_no_numbers(name: str, value: bool) -> None:
-    """Which pydantic would make 1 and 0, inside of lists and mappings too."""
-    given = {"number": value, "several": [3, value], "named": {"a": value}}
-    with pytest.raises(ValidationError) as caught:
-        Kinds.model_validate({name: given[name]})
-    assert [error["loc"] for error in caught.value.errors()] == [(name,)]
-
-
-def test_budget_is_one() -> None:
-    """Steps and epochs together are refused."""
-    with pytest.raises(ValueError, match="steps or epochs"):
-        TrainingOptions(steps=1, epochs=1)
-
-
-def test_records_without_compile_are_of_plain_trainings() -> None:
-    """The record of a training that compiles nothing has no such key, so those without it go on."""
-    plain, compiled = (
-        recipe_for(find("gns"), "cavity", "tiny", settings=settings).as_json()["training"]
-        for settings in ([], ["training.compile=true"])
-    )
-    assert "compile" not in plain
-    assert compiled == plain | {"compile": True}
-
-
-def test_other_packages_add_baselines(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A class of another package is found by its name; ours cannot be replaced."""
+def test_other_packages_add_baselines(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A class of another package is found by its name, its recipes beside its module; ours stay."""
     install(monkeypatch, drift=Drift, gns=Drift)
+    monkeypatch.setattr(Drift, "recipes", "drift.yaml", raising=False)
+    monkeypatch.chdir(tmp_path)  # from whatever folder the command is given
     with pytest.warns(UserWarning, match="its name is taken"):
-        assert find("drift").model is Drift
+        found = find("drift")
+    assert found.model is Drift
+    assert found.recipes == Path(inspect.getfile(Drift)).with_name("drift.yaml")
     with pytest.warns(UserWarning, match="its name is taken"):
         assert find("gns").model.method == "GNS"
 
 
-class NoBaseline:
-    """Neither a baseline nor an operator."""
-
-
-class Half(Baseline):
-    """A baseline that defines too little."""
-
-
 def test_a_baseline_is_whole_and_has_a_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without its methods none is built; a name that no folder should have is passed over."""
-    install(monkeypatch, half=Half)
-    with pytest.raises(UsageError, match="history, forward, start, advance"):
-        find("half")
-    install(monkeypatch, **{"Bad Name/x": Drift})
-    with pytest.warns(UserWarning, match="Bad Name/x"):
-        assert "Bad Name/x" not in names()
-
-
-def test_recipes_lie_beside_their_module(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """From whatever folder the command is given."""
-    install(monkeypatch, drift=Drift)
-    monkeypatch.setattr(Drift, "recipes", "drift.yaml", raising=False)
-    monkeypatch.chdir(tmp_path)
-    assert find("drift").recipes == Path(inspect.getfile(Drift)).with_name("drift.yaml")
-
-
-def test_broken_packages_only_warn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A package whose baseline cannot be loaded is named in a warning; the others are there."""
-    install(monkeypatch, broken=NoBaseline)
-    with pytest.warns(UserWarning, match="broken"):
+    """What lacks methods or is no baseline cannot be loaded and only warns beside others, as odd names do."""
+    install(monkeypatch, half=Baseline, broken=Settings, **{"Bad Name/x": Drift})
+    with pytest.warns(UserWarning, match="adds no baseline") as told:
         found = every_entry()
-    assert "broken" not in found
+    words = " ".join(str(warning.message) for warning in told)
+    assert all(name in words for name in ("'half'", "'broken'", "'Bad Name/x'"))
     assert "mlp" in found
-    with pytest.raises(UsageError, match="cannot be loaded"):
-        find("broken")
+    assert not {"half", "broken", "Bad Name/x"} & found.keys()
+    for name, reason in (("half", "history, forward, start, advance"), ("broken", "cannot be loaded")):
+        with pytest.warns(UserWarning, match="Bad Name/x"), pytest.raises(UsageError, match=reason):
+            find(name)
 
 
 def test_the_page_of_the_baselines_is_complete() -> None:

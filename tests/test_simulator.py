@@ -84,7 +84,6 @@ def test_a_mirrored_model_in_a_mirrored_world(target: str, axis: int) -> None:
     rng = np.random.default_rng(0)
     windows = [jittered(seed) + rng.normal(0.0, 2e-3, (6, 256, 2)).cumsum(axis=0) for seed in (0, 1)]
     given = batch(*windows, walls=True)
-    assert given.wall_velocity is not None
     given.wall_velocity[1] *= -0.5
     matrix = torch.eye(2).repeat(2, 1, 1)
     matrix[:, axis, axis] = -1.0
@@ -101,10 +100,9 @@ def test_a_mirrored_model_in_a_mirrored_world(target: str, axis: int) -> None:
 
 def test_windows_side_by_side_do_not_see_each_other() -> None:
     """Two windows in one batch roll out as they do alone."""
-    model = network(awake=True)
-    both = rolled(model, batch(swirl(0, 6), swirl(1, 6)), 3)
-    alone = torch.cat([rolled(model, batch(swirl(seed, 6)), 3) for seed in (0, 1)])
-    torch.testing.assert_close(both, alone, rtol=0.0, atol=1e-6)
+    model, windows = network(awake=True), [swirl(seed, 6) for seed in (0, 1)]
+    alone = torch.cat([rolled(model, batch(window), 3) for window in windows])
+    torch.testing.assert_close(rolled(model, batch(*windows), 3), alone, rtol=0.0, atol=1e-6)
 
 
 def test_two_frames_are_enough_to_start_from() -> None:
@@ -123,6 +121,9 @@ def test_two_frames_are_enough_to_start_from() -> None:
     assert torch.equal(long.velocity, given.position[:, 2:].diff(dim=1))
     with pytest.raises(UsageError, match="2 or more"):
         model.start(given.part(slice(1)))
+    model = network(awake=True, velocities=1)  # sees two frames and starts from two
+    assert (model.history, model.features.count) == (2, 22)
+    assert torch.equal(rolled(model, given, 2), rolled(model, given.part(slice(6, 8)), 2))
 
 
 def test_a_state_moved_by_the_truth_is_the_next_start() -> None:
@@ -136,45 +137,35 @@ def test_a_state_moved_by_the_truth_is_the_next_start() -> None:
 
 
 def test_walls_move_per_frame() -> None:
-    """Wall velocities per second become per frame (half a second here), each particle its window's."""
+    """Wall velocities per second become per frame (half a second here), each particle its window's.
+
+    A predicted frame moves with its own wall velocity; after the last known one that stays.
+    """
     given = batch(swirl(0, 6), swirl(1, 6), walls=True)
-    assert given.wall_velocity is not None
     given.wall_velocity[1] *= 3.0
     state = network(wall_velocity=True).start(given)
-    assert state.wall_velocity is not None
     torch.testing.assert_close(state.wall_velocity[0, 0], torch.arange(1.0, 9.0).reshape(4, 2) / 200)
     torch.testing.assert_close(state.wall_velocity[1], 3.0 * state.wall_velocity[0])
     assert network().start(given).wall_velocity is None
-
-
-def test_a_step_sees_the_walls_of_the_next_frame() -> None:
-    """A predicted frame moves with its own wall velocity; after the last known one that stays."""
+    with pytest.raises(UsageError) as caught:
+        network(wall_velocity=True, changes={"moving_walls": False})
+    assert caught.value.where == "model.wall_velocity"
     whole = batch(swirl(0, 8), walls=True)
-    assert whole.wall_velocity is not None
     whole.wall_velocity.mul_(torch.arange(8.0)[:, None, None])
     state = network(wall_velocity=True).start(whole.part(slice(6)))
     seen = []
     for _ in range(3):
-        assert state.wall_velocity is not None
         seen.append(float(state.wall_velocity[0, 0, 0, 0]))
         state = state.moved(state.position, state.velocity[:, -1])
     assert seen == pytest.approx([6 * 0.005, 7 * 0.005, 7 * 0.005])
 
 
-def test_walls_that_rest_are_no_features() -> None:
-    """In a split without moving walls the option is refused."""
-    with pytest.raises(UsageError) as caught:
-        network(wall_velocity=True, changes={"moving_walls": False})
-    assert caught.value.where == "model.wall_velocity"
-
-
 def test_particles_stay_in_the_box_unless_told_otherwise() -> None:
     """A particle that flies out stops at the wall and its velocity says so; without clamp it flies on."""
-    flight = np.array([[[0.93 - 0.004 * (5 - f), 0.5 + 0.001 * f]] for f in range(6)])
-    free, kept = network(clamp=False), network()
-    assert float(rolled(free, batch(flight), 3)[0, -1, 0]) == pytest.approx(0.942, abs=1e-6)
-    state = kept.start(batch(flight))
-    places = []
+    flight = batch(np.array([[[0.93 - 0.004 * (5 - f), 0.5 + 0.001 * f]] for f in range(6)]))
+    assert float(rolled(network(clamp=False), flight, 3)[0, -1, 0]) == pytest.approx(0.942, abs=1e-6)
+    kept, places = network(), []
+    state = kept.start(flight)
     for _ in range(3):
         with torch.no_grad():
             state, position = kept.advance(state)
@@ -195,22 +186,24 @@ def test_no_rollout_leaves_the_box(target: str) -> None:
     assert bool(((found == low) | (found == high)).any())  # some did try
 
 
+class Watched(GraphNetwork):
+    """A graph network that keeps what it is shown, and says nothing."""
+
+    operator, method = GNS, "watched"
+
+    def predict(self, state: State, *_: object) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        """Keep the state."""
+        self.seen = [*getattr(self, "seen", []), state]
+        return torch.zeros_like(state.position), {}
+
+
 def test_noise_stays_in_the_box() -> None:
     """Particles that rest at a wall are disturbed to its inner side only."""
     resting = np.repeat([[[0.9375, 0.3 + 0.05 * i] for i in range(8)]], 7, axis=0)
-    starts: list[torch.Tensor] = []
-
-    class Watched(GraphNetwork):
-        operator, method = GNS, "watched"
-
-        def predict(self, state: State, *_: object) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-            starts.append(state.position[:, 0])
-            return torch.zeros_like(state.position), {}
-
     model = Watched.build(SMALL | {"noise_std": 1e-3}, facts())
     model(batch(resting), torch.Generator().manual_seed(0))
-    assert float(starts[0].max()) == 0.9375
-    assert float(starts[0].min()) < 0.9375
+    x = model.seen[0].position[:, 0]
+    assert float(x.min()) < float(x.max()) == 0.9375
 
 
 def test_a_wall_passes_gradients_on() -> None:
@@ -226,7 +219,6 @@ def test_a_wall_passes_gradients_on() -> None:
 def test_forcing_of_the_next_frame_moves_particles_near_walls() -> None:
     """Another wall velocity in the coming frame changes the step near walls, in an older frame nothing."""
     window = batch(np.repeat(jittered(0)[None], 7, axis=0), walls=True)
-    assert window.wall_velocity is not None
     model = network(awake=True, layers=1, wall_velocity=True, wall_reach=1.0)
     found = []
     for frame in (None, 5, 6):
@@ -245,37 +237,22 @@ def test_forcing_of_the_next_frame_moves_particles_near_walls() -> None:
     assert not bool(changed[near > 2.0 * RADIUS].any())  # one layer: a neighbour's wall at most
 
 
-def test_velocities_shown_are_the_last_ones() -> None:
-    """A model of one velocity sees two frames and starts from two, in training and in rollouts."""
-    model = network(awake=True, velocities=1)
-    assert (model.history, model.features.count) == (2, 22)
-    given = batch(swirl(0, 6))
-    assert torch.equal(rolled(model, given, 2), rolled(model, given.part(slice(4, 6)), 2))
-
-
 def test_forgetful_windows_know_what_a_rollout_knows_at_its_start() -> None:
     """A forgetful window starts as from its last few frames do; every number comes up, but all of them."""
     window = batch(*(swirl(seed, 7) for seed in range(24)))
-    seen: list[State] = []
-
-    class Watched(GraphNetwork):
-        operator, method = GNS, "watched"
-
-        def predict(self, state: State, *_: object) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-            seen.append(state)
-            return torch.zeros_like(state.position), {}
-
     model = Watched.build(SMALL | {"forgetful": 1.0}, facts())
     model(window, torch.Generator().manual_seed(0))
     starts = [model.start(window.part(slice(6 - known, 6))).velocity for known in range(2, 7)]
     numbers = set()
     for sample in range(24):
         mine = window.sample == sample
-        (number,) = (i for i, start in enumerate(starts) if torch.equal(seen[0].velocity[mine], start[mine]))
+        (number,) = (
+            i for i, start in enumerate(starts) if torch.equal(model.seen[0].velocity[mine], start[mine])
+        )
         numbers.add(number)
     assert numbers == set(range(4))
     model(window)  # without a generator, as in validation, nothing is forgotten
-    assert torch.equal(seen[1].velocity, starts[-1])
+    assert torch.equal(model.seen[1].velocity, starts[-1])
 
 
 def test_half_precision_moves_particles_in_full() -> None:

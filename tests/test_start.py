@@ -27,6 +27,7 @@ from lagbench.submission.budget import Budget, track_of
 from lagbench.work.progress import Progress
 
 Run = Callable[..., TrainingResult]
+Changes = dict[str, Any] | None
 STILL = ("steps=1", "learning_rate=1e-30")
 """One step that changes no weight by as much as its rounding."""
 
@@ -71,20 +72,19 @@ def stored(generated: GenerationResult, unmeasured: Registry, tmp_path: Path) ->
     def call(
         baseline: str = "any",
         *,
-        facts: dict[str, Any] | None = None,
-        model: dict[str, Any] | None = None,
-        weights: dict[str, torch.Tensor] | None = None,
-        **training: Any,
+        facts: Changes = None,
+        model: Changes = None,
+        weights: Changes = None,
+        **more: Any,
     ) -> Path:
         here = facts_of("curl-noise", "tiny", root=generated.root, registry=unmeasured)
         built = AnySize.build({"start": 0.5, **(model or {})}, here)
-        told = {"step": 9, "recipe": {"name": "curl-noise/mini-made-up"}, **training}
         checkpoint = Checkpoint(
             baseline=baseline,
             options=built.options.model_dump(),
             facts=replace(here, **(facts or {})),
-            weights=built.state_dict() if weights is None else weights,
-            training=told,
+            weights=weights or built.state_dict(),
+            training={"step": 9, "recipe": {"name": "curl-noise/mini-made-up"}, **more},
         )
         save(tmp_path / "start.pt", checkpoint)
         return tmp_path / "start.pt"
@@ -92,20 +92,9 @@ def stored(generated: GenerationResult, unmeasured: Registry, tmp_path: Path) ->
     return call
 
 
-def positions(path: Path) -> np.ndarray:
-    """Return what a predictions.nc predicts."""
-    with netCDF4.Dataset(path) as data:
-        return np.asarray(data["position"][:])
-
-
 @pytest.mark.parametrize("size", ["tiny", "mini"])
 def test_it_goes_on_where_the_weights_are(
-    run: Run,
-    stored: Callable[..., Path],
-    generated: GenerationResult,
-    unmeasured: Registry,
-    tmp_path: Path,
-    size: str,
+    run: Run, stored: Callable[..., Path], generated: GenerationResult, unmeasured: Registry, size: str
 ) -> None:
     """A step that changes nothing predicts what the weights do, also in units of another size."""
     units = dict.fromkeys(("velocity_std", "acceleration_std", "position_std"), (1e-3, 1e-3))
@@ -113,35 +102,37 @@ def test_it_goes_on_where_the_weights_are(
     start = stored(facts=other if size == "mini" else None, model={"share": 0.5})
     result = run("any", *STILL, start=start)  # the recipe's share is another
     options: dict[str, Any] = {"root": generated.root, "registry": unmeasured, "threads": 1, "size": "tiny"}
-    predict(result.weights, tmp_path / "went-on.nc", **options)
-    predict(start, tmp_path / "weights.nc", **options)
-    assert np.array_equal(positions(tmp_path / "went-on.nc"), positions(tmp_path / "weights.nc"))
+    found = []
+    for weights in (start, result.weights):
+        with netCDF4.Dataset(predict(weights, result.folder / "made.nc", **options).path) as data:
+            found.append(np.asarray(data["position"][:]))
+    assert np.array_equal(*found)
 
 
 def test_it_learns_from_there(run: Run) -> None:
     """A training from its own end begins at the loss that it ended with; random weights do not."""
     first = run("gns", "steps=30", "validate_every=0", to="first")
-    further = run("gns", "steps=1", "validate_every=0", start=first.weights, to="further")
-    anew = run("gns", "steps=1", "validate_every=0", to="anew")
+    further, anew = (
+        run("gns", "steps=1", "validate_every=0", start=start, to=to)
+        for start, to in ((first.weights, "further"), (None, "anew"))
+    )
     assert further.loss["total"] < 0.95 * anew.loss["total"]
 
 
 def test_nothing_worse_takes_their_place(run: Run, stored: Callable[..., Path]) -> None:
-    """Where every step leads away, the best weights are those that it started from."""
+    """Where every step leads away, the best weights are those that it started from.
+
+    What fails early can be tried again: a checkpoint lies beside the weights that were validated first.
+    """
     start = stored()
     result = run("any", "steps=4", "learning_rate=100.0", "validate_every=2", start=start)
     assert result.best_step == 0
     assert float(load(result.weights).weights["a"]) == 0.5
     record = json.loads((result.folder / "training.json").read_text())
     assert [entry["step"] for entry in record["validation"]] == [0, 2, 4]
-
-
-def test_what_fails_early_can_be_tried_again(run: Run, stored: Callable[..., Path]) -> None:
-    """The folder then holds a checkpoint beside the weights that were validated first."""
-    bad = ("steps=100", "learning_rate=1e38", "validate_every=50")
     for _ in range(2):
         with pytest.raises(WorkFailedError):
-            run("any", *bad, start=stored())
+            run("any", "steps=100", "learning_rate=1e38", "validate_every=50", start=start, to="bad")
 
 
 def test_what_came_before_is_told(run: Run, stored: Callable[..., Path], tmp_path: Path) -> None:
@@ -164,16 +155,13 @@ def test_what_came_before_is_told(run: Run, stored: Callable[..., Path], tmp_pat
     assert again["start_steps"] == 10
 
 
-@pytest.mark.parametrize(
-    "spent", [None, {"cpu_hours": 0.1, "validation_hours": 0.0}, {"cpu_hours": 9.9e11, "gpu_hours": 0.0}]
-)
-def test_hours_that_nobody_knows(
-    run: Run, stored: Callable[..., Path], spent: dict[str, float] | None
-) -> None:
+def test_hours_that_nobody_knows(run: Run, stored: Callable[..., Path]) -> None:
     """Weights without a budget that can be believed leave the sum unknown: it is of no equal compute."""
-    budget = load(run("any", *STILL, start=stored(budget=spent)).weights).training["budget"]
-    assert budget["cpu_hours"] is None
-    assert track_of("mini", Budget.model_validate(budget)) is None
+    doubtful = ({"cpu_hours": 0.1, "validation_hours": 0.0}, {"cpu_hours": 9.9e11, "gpu_hours": 0.0})
+    for number, spent in enumerate((None, *doubtful)):
+        result = run("any", *STILL, start=stored(budget=spent), to=f"run{number}")
+        budget = Budget.model_validate(load(result.weights).training["budget"])
+        assert budget.cpu_hours is track_of("mini", budget) is None
 
 
 def test_what_came_before_counts_for_convergence() -> None:
@@ -193,14 +181,12 @@ def test_nothing_is_lost(run: Run, stored: Callable[..., Path]) -> None:
     link = first.folder.with_name("link.pt")
     link.symlink_to(first.checkpoint)
     for baseline, start in (
-        ("any", first.weights),
-        ("any", link),
-        ("any", stored(weights=odd)),
-        ("drift", stored()),
-        ("any", stored(model={"unit": 2.0})),
+        *(("any", first.weights), ("any", link)),
+        *(("any", {"weights": odd}), ("drift", {}), ("any", {"model": {"unit": 2.0}})),
     ):
+        path = stored(**start) if isinstance(start, dict) else start
         with pytest.raises(LagbenchError):
-            run(baseline, "steps=2", "model.unit=1", start=start, fresh=True)
+            run(baseline, "steps=2", "model.unit=1", start=path, fresh=True)
         assert (first.weights.read_bytes(), first.checkpoint.read_bytes()) == held
 
 
@@ -243,11 +229,9 @@ def test_it_can_be_interrupted(run: Run, stored: Callable[..., Path]) -> None:
         ("any", {"facts": {"size": "mini", "frame_interval": 9.0}}, UsageError),
         ("drift", {"baseline": "drift", "facts": {"size": "mini"}}, UsageError),  # for one size only
         ("any", {"facts": {"statistics": {}}}, UnreadableFileError),
-        ("any", {"weights": {"a": torch.zeros(2), "calls": torch.zeros(())}}, UnreadableFileError),
-        (
-            "any",
-            {"weights": {"a": torch.full((1,), float("nan")), "calls": torch.zeros(())}},
-            UnreadableFileError,
+        *(
+            ("any", {"weights": {"a": a, "calls": torch.zeros(())}}, UnreadableFileError)
+            for a in (torch.zeros(2), torch.full((1,), float("nan")))
         ),
         ("var", {"baseline": "var"}, UsageError),  # fitted, not trained
         ("any", {"recipe": {"name": "x", "start": {"sha256": "../x", "recipe": "x"}}}, UnreadableFileError),

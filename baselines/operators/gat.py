@@ -5,14 +5,12 @@ GAT adds up what each of them says; in GATv2 the ranking of neighbours depends o
 
 from __future__ import annotations
 
-import torch
-from torch import Tensor
 from torch_geometric.nn import GATConv, GATv2Conv
 
-from .operator import Losses, Operator
+from .operator import Convolution
 
 
-class GAT(Operator):
+class GAT(Convolution):
     r"""Graph attention of Velickovic et al. (2018): PyG's GATConv.
 
     .. math::
@@ -25,19 +23,10 @@ class GAT(Operator):
     """
 
     method = "GNS + GATConv"
-
-    def __init__(self, inputs: int, latent: int, hidden: int) -> None:
-        super().__init__(inputs, latent, hidden)
-        self.conv = GATConv(inputs, latent, edge_dim=latent)
-
-    def forward(
-        self, node: Tensor, edge_index: Tensor, edge: Tensor, *, generator: torch.Generator | None = None
-    ) -> tuple[Tensor, Losses]:
-        """Return what each node gathers."""
-        return self.conv(node, edge_index, edge), {}
+    layer = GATConv
 
 
-class GATv2(Operator):
+class GATv2(Convolution):
     r"""Dynamic graph attention of Brody et al. (2022): PyG's GATv2Conv.
 
     .. math::
@@ -50,13 +39,4 @@ class GATv2(Operator):
     """
 
     method = "GNS + GATv2Conv"
-
-    def __init__(self, inputs: int, latent: int, hidden: int) -> None:
-        super().__init__(inputs, latent, hidden)
-        self.conv = GATv2Conv(inputs, latent, edge_dim=latent)
-
-    def forward(
-        self, node: Tensor, edge_index: Tensor, edge: Tensor, *, generator: torch.Generator | None = None
-    ) -> tuple[Tensor, Losses]:
-        """Return what each node gathers."""
-        return self.conv(node, edge_index, edge), {}
+    layer = GATv2Conv

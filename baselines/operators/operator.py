@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import ClassVar
 
 import torch
@@ -34,9 +34,7 @@ class Operator(nn.Module):
 
     def __init__(self, inputs: int, latent: int, hidden: int) -> None:
         super().__init__()
-        self.inputs = inputs
-        self.latent = latent
-        self.hidden = hidden
+        self.inputs, self.latent, self.hidden = inputs, latent, hidden
 
     @abstractmethod
     def forward(
@@ -54,6 +52,22 @@ class Operator(nn.Module):
         Returns:
             What is gathered, shape [particle, latent]; losses by name.
         """
+
+
+class Convolution(Operator):
+    """A convolution of PyTorch Geometric that takes edge features."""
+
+    layer: ClassVar[Callable[..., nn.Module]]
+
+    def __init__(self, inputs: int, latent: int, hidden: int) -> None:
+        super().__init__(inputs, latent, hidden)
+        self.conv = self.layer(inputs, latent, edge_dim=latent)
+
+    def forward(
+        self, node: Tensor, edge_index: Tensor, edge: Tensor, *, generator: torch.Generator | None = None
+    ) -> tuple[Tensor, Losses]:
+        """Return what each node gathers."""
+        return self.conv(node, edge_index, edge), {}
 
 
 def summed(edge_index: Tensor, edge: Tensor, nodes: int) -> Tensor:

@@ -28,8 +28,7 @@ def unlinked_pairs(
     None as generator draws the same pairs every time.
     """
     source = torch.Generator().manual_seed(0) if generator is None else generator
-    pairs = torch.randint(nodes, (2, count), generator=source, device=source.device)
-    pairs = pairs.to(edge_index.device)
+    pairs = torch.randint(nodes, (2, count), generator=source, device=source.device).to(edge_index.device)
     sender, receiver = pairs
     linked = torch.isin(receiver * nodes + sender, edge_index[1] * nodes + edge_index[0])
     return pairs[:, ~linked & (sender != receiver)]

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import torch
-from torch import Tensor
 from torch_geometric.nn import TransformerConv
 
-from .operator import Losses, Operator
+from .operator import Convolution
 
 
-class Transformer(Operator):
+class Transformer(Convolution):
     r"""The graph transformer of Shi et al. (2021): PyG's TransformerConv.
 
     .. math::
@@ -20,13 +18,4 @@ class Transformer(Operator):
     """
 
     method = "GNS + TransformerConv"
-
-    def __init__(self, inputs: int, latent: int, hidden: int) -> None:
-        super().__init__(inputs, latent, hidden)
-        self.conv = TransformerConv(inputs, latent, edge_dim=latent)
-
-    def forward(
-        self, node: Tensor, edge_index: Tensor, edge: Tensor, *, generator: torch.Generator | None = None
-    ) -> tuple[Tensor, Losses]:
-        """Return what each node gathers."""
-        return self.conv(node, edge_index, edge), {}
+    layer = TransformerConv
