@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from lagbench.data import WALLS
 from lagbench.errors import UsageError
 
-from .driver import Driver, stack
+from .driver import Driver
 from .nodal_stress import JACOBIAN_BOUND, NodalStress
 from .solver import Health
 from .split import ClosedBoxParameters, InitialState
@@ -32,22 +32,14 @@ class ClosedBox(Driver[ClosedBoxParameters]):
 
     def _start(self, states: Sequence[InitialState]) -> None:
         p, k = self.parameters, self._kernels
-        carried = np.ones((self.scenarios, p.particles, 4), np.float32)
-        carried[:, :, :2] = stack(states, "velocity")
-        k.carried.from_numpy(carried)
-        for axis, field in enumerate((k.slope_x, k.slope_y)):
-            slope = np.zeros_like(carried)
-            slope[:, :, :2] = stack(states, "affine")[:, :, :, axis]
-            field.from_numpy(slope)
         self._states = list(states)
         self._move_walls_towards(0)
-        cells = np.array([state.area / p.particles for state in states]) * p.grid**2
-        k.fill.from_numpy(cells.astype(np.float32))
         spread = np.array([state.viscosity for state in states]) * p.dt * p.grid**2
         k.spread.from_numpy(spread.astype(np.float32))
         for field in (k.node, k.moved, k.gain):
             field.fill(0.0)
-        self.restart_mean()
+        k.total.fill(0.0)
+        self._averaged = 0
 
     def move_walls(self, velocity: NDArray[np.float32]) -> None:
         """Let the walls slide with these velocities [length/s], shape [scenario, 4, 2].
@@ -73,10 +65,6 @@ class ClosedBox(Driver[ClosedBoxParameters]):
         self._averaged += substeps if average else 0
         super().advance(substeps)
 
-    def velocity(self) -> NDArray[np.float32]:
-        """Particle velocities v_p [length/s], shape [scenario, particle, 2]."""
-        return np.asarray(self._kernels.carried.to_numpy()[:, :, :2])
-
     def jacobian(self) -> NDArray[np.float32]:
         """Volume ratio J of the particles [1], shape [scenario, particle]."""
         return np.asarray(self._kernels.carried.to_numpy()[:, :, 3])
@@ -95,11 +83,6 @@ class ClosedBox(Driver[ClosedBoxParameters]):
     def _on_grid(self, values: NDArray[Any]) -> NDArray[Any]:
         width = self.parameters.grid + 1
         return values.reshape(self.scenarios, width, width, 2)
-
-    def restart_mean(self) -> None:
-        """Forget the substeps averaged so far."""
-        self._kernels.total.fill(0.0)
-        self._averaged = 0
 
     def health(self) -> list[Health]:
         """Return what each scenario went through during the last advance."""

@@ -77,10 +77,21 @@ LIMITS = {
 
 def check_constants(kind: ParametersType, given: Mapping[str, object], size: Size) -> None:
     """Refuse constants that a solver cannot use."""
+    where = f"{size.file}, splits.{size.split}, size {size.name}"
     for field in fields(kind):
         if field.name not in given:
             if field.default is MISSING:
-                raise _missing(field.name, kind, size)
+                known = {other.name for other in fields(kind)}
+                strange = [other for other in size.parameters if other not in known]
+                close = get_close_matches(field.name, strange, n=3)
+                declare = f"declare {field.name} under parameters of the split"
+                raise UnreadableFileError(
+                    "a parameter is missing",
+                    where=f"{where}, parameter {field.name}",
+                    expected=field.name,
+                    got=", ".join(close) or "no name like it",
+                    fix=f"did you mean {close[0]!r}?" if close else declare,
+                )
             continue
         limit, value = LIMITS.get(field.name, Limit()), given[field.name]
         if field.type == "bool":
@@ -95,28 +106,10 @@ def check_constants(kind: ParametersType, given: Mapping[str, object], size: Siz
         if not good:
             raise UnreadableFileError(
                 "a parameter has no possible value",
-                where=f"{size.file}, {_key(size, field.name)}",
+                where=f"{where}, parameter {field.name}",
                 expected=expected,
                 got=repr(value),
             )
-
-
-def _key(size: Size, name: str) -> str:
-    return f"splits.{size.split}, size {size.name}, parameter {name}"
-
-
-def _missing(name: str, kind: ParametersType, size: Size) -> UnreadableFileError:
-    """Return an error that names the parameter that may have been meant."""
-    known = {field.name for field in fields(kind)}
-    strange = [other for other in size.parameters if other not in known]
-    close = get_close_matches(name, strange, n=3)
-    return UnreadableFileError(
-        "a parameter is missing",
-        where=f"{size.file}, {_key(size, name)}",
-        expected=name,
-        got=", ".join(close) or "no name like it",
-        fix=f"did you mean {close[0]!r}?" if close else f"declare {name} under parameters of the split",
-    )
 
 
 @contextmanager

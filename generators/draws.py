@@ -134,34 +134,25 @@ def fill(rng: RandomSource, count: int, *, low: float, high: float, jitter: floa
     [length] are multiples of 2^-20, shape [particle, 2].
     """
     columns = math.isqrt(count)
-    ends = [count * column // columns for column in range(columns + 1)]
-    sizes = np.diff(ends)
-    column = np.repeat(np.arange(columns), sizes)
-    row = np.arange(count) - np.repeat(ends[:-1], sizes)
-    cell = np.stack([column, row], axis=-1)
-    cells = np.stack([np.full(count, columns), np.repeat(sizes, sizes)], axis=-1)
-    return _place(rng, cell, cells, low=low, high=high, jitter=jitter)
+    ends = np.array([count * column // columns for column in range(columns + 1)])
+    return _fill_columns(rng, ends, low, high, jitter)
 
 
 def fill_grid(
     rng: RandomSource, columns: int, rows: int, *, low: float, high: float, jitter: float
 ) -> NDArray[np.float64]:
     """Fill a square with columns x rows particles; arguments as in :func:`fill`."""
-    index = np.arange(columns * rows)
-    cell = np.stack([index // rows, index % rows], axis=-1)
-    cells = np.broadcast_to(np.array([columns, rows]), cell.shape)
-    return _place(rng, cell, cells, low=low, high=high, jitter=jitter)
+    return _fill_columns(rng, rows * np.arange(columns + 1), low, high, jitter)
 
 
-def _place(
-    rng: RandomSource,
-    cell: NDArray[np.integer],
-    cells: NDArray[np.integer],
-    *,
-    low: float,
-    high: float,
-    jitter: float,
+def _fill_columns(
+    rng: RandomSource, ends: NDArray[np.integer], low: float, high: float, jitter: float
 ) -> NDArray[np.float64]:
-    """Put a particle near the middle of its cell: base position + (r - 1/2) jitter spacing."""
+    """Put particles near the middles of their cells, column by column: (r - 1/2) jitter spacings off."""
+    sizes = np.diff(ends)
+    column = np.repeat(np.arange(len(sizes)), sizes)
+    row = np.arange(len(column)) - np.repeat(ends[:-1], sizes)
+    cell = np.stack([column, row], axis=-1)
+    cells = np.stack([np.full(len(column), len(sizes)), np.repeat(sizes, sizes)], axis=-1)
     displacement = (rng.random(cell.shape) - 0.5) * jitter
     return quantise(low + (high - low) * (cell + 0.5 + displacement) / cells)

@@ -113,14 +113,7 @@ def from_fixed(total: Value, inverse_scale: ti.f32) -> Value:
 
 @ti.func
 def accumulate(sums: Template, node: ti.math.ivec2, scaled: ti.math.vec4, atomic: Template) -> None:
-    """Add scaled contributions to one node's fixed-point sums.
-
-    Args:
-        sums: vector field of int64, shape [scenario, node].
-        node: its index.
-        scaled: contributions, already times their scales.
-        atomic: whether other threads may add to the same node.
-    """
+    """Add contributions, times their scales, to one node's sums; atomic where other threads may as well."""
     # Even in serial code `+=` is an atomic, which costs five times as much.
     if ti.static(atomic):
         ti.atomic_add(sums[node], to_fixed(scaled))

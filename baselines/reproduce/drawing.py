@@ -192,7 +192,7 @@ def _draw_arrows(axes: Axes, scene: Scene, limit: float) -> None:
 class Figure:
     """A figure, table or section of the thesis: one row of the catalogue."""
 
-    name: str  # as in fig_5_10 or table_5_4
+    name: str = ""  # as in fig_5_10 or table_5_4: its key in the catalogue
     title: str  # what it shows
     draw: Callable[[Plan, Figure], Sheet]
     # models whose scored runs it shows, by split

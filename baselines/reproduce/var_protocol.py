@@ -40,8 +40,6 @@ TRAIN, VALID = 0.70, 0.15
 
 FILE = "var_protocol.json"  # what ``--json`` prints, in a folder of runs or of committed studies
 
-GROWTH_FRAMES = 100
-
 States = NDArray[np.float32]
 
 
@@ -143,7 +141,7 @@ def forecast_errors(
             break
         errors[frame] = np.square(state - true).mean()
     grown = norms[np.isfinite(norms)]
-    span = min(GROWTH_FRAMES, len(grown) - 1)
+    span = min(100, len(grown) - 1)
     return errors, float((grown[-1] / grown[-1 - span]) ** (1 / span)) if span > 0 else float("nan")
 
 
@@ -168,11 +166,7 @@ def beside_thesis(held: Mapping[str, Any]) -> Sheet:
         ("share of its largest eigenvalue that was added to the Gram matrix", None, held["floor"]),
         (f"squared error of one step, over the frames fitted {unit}", None, held["fit_mse"]),
         (f"squared error of the forecast {unit}", thesis["mse"], held["forecast_mse"]),
-        (
-            f"squared error of standing still after those frames {unit}",
-            None,
-            held["persistence_mse"],
-        ),
+        (f"squared error of standing still after those frames {unit}", None, held["persistence_mse"]),
         ("factor by which the forecast grows per frame at its end", None, held["growth"]),
     ]
     at = sorted((int(frame), value) for frame, value in held["mse_at"].items())

@@ -63,19 +63,12 @@ def parser() -> argparse.ArgumentParser:
 
 def settings(given: argparse.Namespace) -> Experiment:
     """Return the experiment that the options ask for."""
-    default = 100_000 if given.case is Case.CAVITY else 30_000 * given.grid // 40
-    return plan(
-        given.case,
-        substeps=default if given.substeps is None else given.substeps,
-        reynolds=given.re,
-        grid=given.grid,
-        particles=given.particles,
-        dt=given.dt,
-        lid_speed=given.lid_speed,
-        lid_off_after=given.lid_off_after,
-        frequency=given.frequency,
-        seed=given.seed,
-    )
+    substeps = given.substeps
+    if substeps is None:
+        substeps = 100_000 if given.case is Case.CAVITY else 30_000 * given.grid // 40
+    same = ("grid", "particles", "dt", "lid_speed", "lid_off_after", "frequency", "seed")
+    others = {name: getattr(given, name) for name in same}
+    return plan(given.case, substeps=substeps, reynolds=given.re, **others)
 
 
 def check_outputs(given: argparse.Namespace) -> None:
@@ -121,11 +114,17 @@ def document(result: Result) -> JSON:
     parameters = solver_parameters(e)
     box = box_of(parameters)
     work = e.particles * e.substeps
-    apart = result.deviations()
-    against = None
-    if apart is not None:
+    against = lines = None
+    if (apart := result.deviations()) is not None:
         u, v = apart
         against = {"u_rmse": u.rmse, "v_rmse": v.rmse, "u_max": u.maximum, "v_max": v.maximum}
+    if result.profiles is not None:
+        ours, ghia = result.profiles.at_reference_points(), centre_lines(e.reynolds or 0.0)
+        lines = {
+            "averaged_substeps": [result.averaged_from, e.substeps],
+            "u": _points("y", Y, "u", ours.u, None if ghia is None else ghia.u),
+            "v": _points("x", X, "v", ours.v, None if ghia is None else ghia.v),
+        }
     found: JSON = {
         "format": 1,
         "case": e.case.value,
@@ -133,7 +132,7 @@ def document(result: Result) -> JSON:
         "parameters": asdict(parameters),
         "box": [box.low, box.high],
         "time": e.substeps * e.dt,
-        "centre_lines": _centre_lines(result),
+        "centre_lines": lines,
         "ghia": against,
         "jacobian": {
             "min": min(c.jacobian_min for c in checks),
@@ -154,18 +153,6 @@ def document(result: Result) -> JSON:
         },
     }
     return {key: rounded(value) for key, value in found.items()}
-
-
-def _centre_lines(result: Result) -> JSON | None:
-    if result.profiles is None:
-        return None
-    found = result.profiles.at_reference_points()
-    reference = centre_lines(result.experiment.reynolds or 0.0)
-    return {
-        "averaged_substeps": [result.averaged_from, result.experiment.substeps],
-        "u": _points("y", Y, "u", found.u, None if reference is None else reference.u),
-        "v": _points("x", X, "v", found.v, None if reference is None else reference.v),
-    }
 
 
 def _points(

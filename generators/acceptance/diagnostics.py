@@ -113,8 +113,6 @@ def grid_rates(velocity: Reals, spacing: float) -> Rates:
 
 Array = NDArray[np.float64]
 
-_DRAWN_POINTS = 201
-
 _MISPRINT = float("nan")
 
 Y = (
@@ -244,7 +242,7 @@ def draw(profiles: Profiles, reference: CentreLines | None, title: str, path: Pa
 
     figure = Figure(figsize=(9.0, 4.2), layout="constrained")
     left, right = figure.subplots(1, 2)
-    line = np.linspace(0.0, 1.0, _DRAWN_POINTS)
+    line = np.linspace(0.0, 1.0, 201)
     left.plot(profiles.u(line), line, label="lagbench")
     right.plot(line, profiles.v(line), label="lagbench")
     if reference is not None:

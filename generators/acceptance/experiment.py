@@ -139,11 +139,10 @@ def _check(holds: bool, what: str, where: str, expected: object, got: object) ->
 
 def _check_ranges(experiment: Experiment) -> None:
     """Refuse what the solver cannot resolve or is unstable at."""
-    parameters = solver_parameters(experiment)
+    parameters, e, speed = solver_parameters(experiment), experiment, experiment.lid_speed
     box = box_of(parameters)
     sound = math.sqrt(parameters.modulus / parameters.density)
     fastest = _ACOUSTIC_LIMIT / (sound * parameters.grid)
-    e, speed = experiment, experiment.lid_speed
     fewest = f"at least {box.cells**2} in {box.cells} x {box.cells} cells"
     enough = e.particles >= box.cells**2
     _check(enough, "fewer particles than cells", "--particles", fewest, e.particles)
@@ -163,7 +162,7 @@ def _check_ranges(experiment: Experiment) -> None:
     positive = math.isfinite(e.reynolds) and e.reynolds > 0.0
     _check(positive, "not a Reynolds number", "--re", "a positive number", e.reynolds)
     if e.case is Case.CURL_NOISE:
-        speed = _root_mean_square_speed(initial_state(dataclasses.replace(e, reynolds=None)))
+        speed = _root_mean_square(initial_state(dataclasses.replace(e, reynolds=None)).velocity)
     # Explicit diffusion is unstable beyond this viscosity.
     least = speed * box.width * e.dt / (_VISCOUS_LIMIT * box.spacing**2)
     stable, span = e.reynolds >= least, f"at least {least:.3g} at dt = {e.dt:.3g}"
@@ -201,27 +200,24 @@ def initial_state(experiment: Experiment) -> InitialState:
             high=box.high,
             scale=full.value("velocity_scale"),
         )
-        velocity = quantise(np.stack([psi.y, -psi.x], axis=-1))
-        affine = quantise(np.stack([psi.xy, psi.yy, -psi.xx, -psi.xy], axis=-1)).reshape(affine.shape)
+        velocity, affine = curl_noise.flow(psi)
     wall_velocity = np.zeros((len(WALLS), 2))
     wall_velocity[WALLS.index("top"), 0] = experiment.lid_speed
-    state = InitialState(
+    speed = experiment.lid_speed or _root_mean_square(velocity)
+    return InitialState(
         position=position,
         velocity=velocity,
         affine=affine,
         material=np.full(len(position), Material.LIQUID, dtype=np.int8),
         area=box.width**2,
+        # nu = U L / Re [length^2/s]
+        viscosity=0.0 if experiment.reynolds is None else speed * box.width / experiment.reynolds,
         wall_velocity=quantise(wall_velocity),
     )
-    if experiment.reynolds is None:
-        return state
-    speed = experiment.lid_speed or _root_mean_square_speed(state)
-    # nu = U L / Re [length^2/s]
-    return dataclasses.replace(state, viscosity=speed * box.width / experiment.reynolds)
 
 
-def _root_mean_square_speed(state: InitialState) -> float:
-    return float(np.sqrt(np.mean(np.sum(state.velocity**2, axis=-1))))
+def _root_mean_square(velocity: NDArray[np.float64]) -> float:
+    return float(np.sqrt(np.mean(np.sum(velocity**2, axis=-1))))
 
 
 CHECK_EVERY = 10_000  # substeps between two checks
@@ -293,65 +289,6 @@ class Result:
         return deviation(found.u, reference.u), deviation(found.v, reference.v)
 
 
-class _Run:
-    """A solver and the result that grows with it."""
-
-    def __init__(self, experiment: Experiment, device: Device) -> None:
-        self.result = Result(experiment=experiment, averaged_from=experiment.substeps - averaged(experiment))
-        self.parameters = solver_parameters(experiment)
-        self.box = box_of(self.parameters)
-        self.state = initial_state(experiment)
-        self.mass = self.parameters.density * self.state.area / experiment.particles
-        threads = 1 if device is Device.CPU else None
-        self.solver = cast("ClosedBox", build(self.parameters, device=device, threads=threads))
-        # The first substep compiles; loading again starts afresh, and no compilation is timed.
-        self.solver.load([self.state])
-        self.solver.advance(1)
-        self.solver.load([self.state])
-        self.before = self.solver.position()[0]
-
-    def advance(self, first: int, last: int) -> None:
-        start = time.perf_counter()
-        self.solver.advance(last - first, average=first >= self.result.averaged_from)
-        self.result.seconds += time.perf_counter() - start
-        if last == self.result.experiment.lid_off_after:
-            self.solver.move_walls(np.zeros((1, *self.state.wall_velocity.shape), np.float32))
-
-    def interior(self, nodal: NDArray[np.floating]) -> NDArray[np.floating]:
-        inside = slice(self.parameters.wall + 1, self.parameters.grid - self.parameters.wall)
-        return nodal[inside, inside]
-
-    def record_frame(self, substep: int) -> None:
-        self.result.frame_substeps.append(substep)
-        self.result.kinetic_energy.append(kinetic_energy(self.solver.velocity()[0], self.mass))
-        if substep > 0:
-            after = self.solver.position()[0]
-            self.result.displacement_energy.append(displacement_energy(after, self.before, self.mass))
-            self.before = after
-
-    def check(self, substep: int) -> None:
-        position, jacobian = self.solver.position()[0], self.solver.jacobian()[0]
-        driven = self.result.experiment.case is Case.CAVITY
-        outside = jacobian[~lid_corners(position, self.box)] if driven else jacobian
-        counts = occupancy(position, self.box)
-        rates = grid_rates(self.interior(self.solver.grid_velocity()[0]), self.box.spacing)
-        self.result.checks.append(
-            Check(
-                substep=substep,
-                jacobian_min=float(jacobian.min()),
-                jacobian_max=float(jacobian.max()),
-                jacobian_min_outside_lid_corners=float(outside.min()),
-                jacobian_max_outside_lid_corners=float(outside.max()),
-                empty_cells=int(np.sum(counts == 0)),
-                particles_per_cell_min=int(counts.min()),
-                particles_per_cell_max=int(counts.max()),
-                divergence_rms=rates.divergence,
-                vorticity_rms=rates.vorticity,
-                divergence_over_vorticity=rates.ratio,
-            )
-        )
-
-
 def stops(experiment: Experiment) -> Iterator[int]:
     """Yield the substeps at which the run pauses, ascending, the last one of the run included."""
     last = experiment.substeps
@@ -369,18 +306,54 @@ def averaged(experiment: Experiment) -> int:
 
 def run(experiment: Experiment, *, device: Device = Device.CPU, report: Report = lambda _: None) -> Result:
     """Simulate an experiment and measure it."""
-    running = _Run(experiment, device)
-    running.record_frame(0)
-    done = 0
-    for stop in stops(experiment):
-        running.advance(done, stop)
+    driven = experiment.case is Case.CAVITY
+    result = Result(experiment=experiment, averaged_from=experiment.substeps - averaged(experiment))
+    parameters, state = solver_parameters(experiment), initial_state(experiment)
+    box, mass = box_of(parameters), parameters.density * state.area / experiment.particles
+    inside = slice(parameters.wall + 1, parameters.grid - parameters.wall)  # nodes between the walls
+    threads = 1 if device is Device.CPU else None
+    solver = cast("ClosedBox", build(parameters, device=device, threads=threads))
+    # The first substep compiles; loading again starts afresh, and no compilation is timed.
+    solver.load([state])
+    solver.advance(1)
+    solver.load([state])
+    done, before = 0, solver.position()[0]
+    for stop in (0, *stops(experiment)):
+        start = time.perf_counter()
+        solver.advance(stop - done, average=done >= result.averaged_from)
+        result.seconds += time.perf_counter() - start
         done = stop
+        if done == experiment.lid_off_after:
+            solver.move_walls(np.zeros((1, *state.wall_velocity.shape), np.float32))
+        position = solver.position()[0]
         if done % experiment.frame_substeps == 0:
-            running.record_frame(done)
-        if done % CHECK_EVERY == 0 or done == experiment.substeps:
-            running.check(done)
+            result.frame_substeps.append(done)
+            result.kinetic_energy.append(kinetic_energy(solver.velocity()[0], mass))
+            if done > 0:
+                result.displacement_energy.append(displacement_energy(position, before, mass))
+            before = position
+        if done == experiment.substeps or (done > 0 and done % CHECK_EVERY == 0):
+            jacobian = solver.jacobian()[0]
+            outside = jacobian[~lid_corners(position, box)] if driven else jacobian
+            counts = occupancy(position, box)
+            rates = grid_rates(solver.grid_velocity()[0][inside, inside], box.spacing)
+            result.checks.append(
+                Check(
+                    substep=done,
+                    jacobian_min=float(jacobian.min()),
+                    jacobian_max=float(jacobian.max()),
+                    jacobian_min_outside_lid_corners=float(outside.min()),
+                    jacobian_max_outside_lid_corners=float(outside.max()),
+                    empty_cells=int(np.sum(counts == 0)),
+                    particles_per_cell_min=int(counts.min()),
+                    particles_per_cell_max=int(counts.max()),
+                    divergence_rms=rates.divergence,
+                    vorticity_rms=rates.vorticity,
+                    divergence_over_vorticity=rates.ratio,
+                )
+            )
         report(done)
-    if experiment.case is Case.CAVITY:
-        mean = running.interior(running.solver.mean_grid_velocity()[0])
-        running.result.profiles = extract(mean, running.box, experiment.lid_speed)
-    return running.result
+    if driven:
+        mean = solver.mean_grid_velocity()[0][inside, inside]
+        result.profiles = extract(mean, box, experiment.lid_speed)
+    return result
