@@ -102,10 +102,7 @@ class Batch:
                 yield index, frame
 
     def frame(self, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return position [length] and velocity [length/s] of a scenario, shape [particle, 2].
-
-        They are those of the last yield of :meth:`recordings`.
-        """
+        """Return position [length] and velocity [length/s], shape [particle, 2], at the last recording."""
         return self._position[index], self._velocity[index]
 
     def displace(self, offset: NDArray[np.float32]) -> None:

@@ -1,10 +1,7 @@
 """Weakly compressible flow in a full box: cavity and curl noise (design 4.3).
 
-The equations stand in :mod:`.nodal_stress`. The walls lie half-way between nodes, at
-``(wall + 1/2) / grid`` and its mirror image, and hold the fluid or let it slide.
-
-Valid while max abs(v) dt <= dx, which also bounds every fixed-point sum, and while J stays in
-(0, 8]. The settings of the split ``cavity`` reproduce Ghia, Ghia & Shin (1982) at Re 100 and 400.
+Equations, walls and the bounds within which they hold stand in :mod:`.nodal_stress`. The settings
+of the split ``cavity`` reproduce Ghia, Ghia & Shin (1982) at Re 100 and 400.
 """
 
 from collections.abc import Sequence
@@ -42,10 +39,7 @@ class ClosedBox(Driver[ClosedBoxParameters]):
         self._averaged = 0
 
     def move_walls(self, velocity: NDArray[np.float32]) -> None:
-        """Let the walls slide with these velocities [length/s], shape [scenario, 4, 2].
-
-        They do so from now on, or where a scenario has a program, up to its next frame.
-        """
+        """Let walls slide [length/s], shape [scenario, 4, 2]; with a program, up to its next frame."""
         self._kernels.walls.speed.from_numpy(velocity[:, (0, 1, 2, 3), (1, 1, 0, 0)])
 
     def _move_walls_towards(self, frame: int) -> None:
@@ -99,11 +93,7 @@ class ClosedBox(Driver[ClosedBoxParameters]):
         ]
 
     def close(self) -> None:
-        """Give the memory back; the solver cannot be used afterwards.
-
-        Kernels of other solvers in this process compile again: many solvers may share a process,
-        but there is no need to close one per scenario.
-        """
+        """Give the memory back, for good; kernels of other solvers in this process compile again."""
         self._kernels.release()
 
     def _broken(self, index: int, health: Health) -> dict[str, str]:

@@ -36,41 +36,26 @@ __all__ = [
 
 ParametersType = type[ClosedBoxParameters] | type[FreeSurfaceParameters]
 
-_POSITIVE = Limit(low=0.0, open_low=True)
-_NOT_NEGATIVE = Limit(low=0.0)
-_SHARE = Limit(low=0.0, high=1.0)
-_POISSON = Limit(low=0.0, high=0.5, open_high=True)
+_POSITIVE = (
+    *("dt", "density", "modulus", "liquid_modulus", "jelly_modulus", "rope_modulus", "snow_modulus"),
+    *("snow_hardening_min", "snow_hardening_max", "snow_jp_min", "snow_jp_max"),
+)
+_NOT_NEGATIVE = ("shift", "liquid_viscosity", "elastic_damping", "snow_stretch", "snow_hardening")
 
 LIMITS = {
     "particles": Limit(low=1, whole=True),
     "grid": Limit(low=4, whole=True),
     "wall": Limit(low=0, whole=True),
     "substeps_per_frame": Limit(low=1, whole=True),
-    "dt": _POSITIVE,
-    "density": _POSITIVE,
-    "modulus": _POSITIVE,
-    "liquid_modulus": _POSITIVE,
-    "jelly_modulus": _POSITIVE,
-    "rope_modulus": _POSITIVE,
-    "snow_modulus": _POSITIVE,
-    "jelly_poisson": _POISSON,
-    "rope_poisson": _POISSON,
-    "snow_poisson": _POISSON,
-    "velocity_relaxation": _SHARE,
-    "jacobian_relaxation": _SHARE,
-    "density_coupling": _SHARE,
-    "shift": _NOT_NEGATIVE,
-    "liquid_viscosity": _NOT_NEGATIVE,
-    "elastic_damping": _NOT_NEGATIVE,
+    **dict.fromkeys(_POSITIVE, Limit(low=0.0, open_low=True)),
+    **dict.fromkeys(_NOT_NEGATIVE, Limit(low=0.0)),
+    **{f"{solid}_poisson": Limit(low=0.0, high=0.5, open_high=True) for solid in ("jelly", "rope", "snow")},
+    "velocity_relaxation": Limit(low=0.0, high=1.0),
+    "jacobian_relaxation": Limit(low=0.0, high=1.0),
+    "density_coupling": Limit(low=0.0, high=1.0),
     "jacobian_min": Limit(low=0.0, high=1.0, open_low=True),
     "jacobian_max": Limit(low=1.0),
     "snow_compression": Limit(low=0.0, high=1.0, open_high=True),
-    "snow_stretch": _NOT_NEGATIVE,
-    "snow_hardening": _NOT_NEGATIVE,
-    "snow_hardening_min": _POSITIVE,
-    "snow_hardening_max": _POSITIVE,
-    "snow_jp_min": _POSITIVE,
-    "snow_jp_max": _POSITIVE,
 }
 """Limits of constants that both the solvers and their stability rest on; others are finite numbers."""
 

@@ -18,12 +18,8 @@ import taichi as ti
 
 from .transfer import Value, bounded
 
-EXPONENT_MAX = 4.0
-"""Largest magnitude of the argument for which the error bound of :func:`exponential` holds."""
-
-STRETCH_MIN = 0.1
-"""Smallest trial stretch that enters the plastic volume; an inverted particle counts as this."""
-
+EXPONENT_MAX = 4.0  # largest magnitude for which the error bound of :func:`exponential` holds
+STRETCH_MIN = 0.1  # smallest trial stretch that enters the plastic volume, an inverted particle's too
 _STRETCH_EPSILON = 1e-6
 _SHEAR_EPSILON = 1e-12
 

@@ -33,9 +33,7 @@ class RandomSource(Protocol):
 
 
 def entropy(split: str, size: str, major: int, scenario: int) -> tuple[int, int, int]:
-    """Return the three integers that seed a scenario.
-
-    The first is the first eight bytes of SHA-256("split/size"), big-endian.
+    """Return what seeds a scenario: the first eight bytes of SHA-256("split/size"), big-endian, and numbers.
 
     >>> entropy("cavity", "tiny", 1, 3)[1:]
     (1, 3)
@@ -83,10 +81,7 @@ def uniform(rng: RandomSource, low: float, high: float) -> float:
 
 
 def log_uniform(rng: RandomSource, low: float, high: float) -> float:
-    """Draw x with ln x uniform on [ln low, ln high).
-
-    x = low exp(u ln(high / low)), in 50 decimal digits, rounded once.
-    """
+    """Draw x = low exp(u ln(high / low)), uniform in its logarithm: in 50 decimal digits, rounded once."""
     if not 0.0 < low <= high:
         raise WorkFailedError("a log-uniform range is empty", expected="0 < low <= high", got=(low, high))
     span = _PRECISE.ln(_PRECISE.divide(Decimal(high), Decimal(low)))
@@ -112,12 +107,8 @@ def choice(rng: RandomSource, count: int) -> int:
 
 
 def direction(rng: RandomSource) -> tuple[float, float]:
-    """Draw a unit vector, uniform over the circle, without sine or cosine.
-
-    A point of the square is taken again until it lies in the unit disc (and not at its very
-    centre), then divided by its length.
-    """
-    while True:
+    """Draw a unit vector, uniform over the circle, without sine or cosine."""
+    while True:  # until a point of the square lies in the unit disc, and not at its very centre
         x, y = (float(2.0 * r - 1.0) for r in rng.random((2,)))
         square = x * x + y * y
         if 2.0**-20 <= square <= 1.0:

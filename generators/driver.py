@@ -170,8 +170,8 @@ class Driver(ABC, Generic[Parameters]):
 
     def _check_state(self, index: int, state: InitialState) -> None:
         count = self.parameters.particles
-        vectors = (count, 2)
-        shapes = {"position": vectors, "velocity": vectors, "affine": (*vectors, 2), "material": (count,)}
+        shapes: dict[str, tuple[int, ...]] = {"position": (count, 2), "velocity": (count, 2)}
+        shapes |= {"affine": (count, 2, 2), "material": (count,)}
         for name, shape in shapes.items():
             held = np.asarray(getattr(state, name))
             if held.shape != shape or held.dtype.kind not in ("iu" if name == "material" else "f"):

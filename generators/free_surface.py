@@ -22,8 +22,7 @@ from .split import FreeSurfaceParameters, InitialState, Material
 
 Array = NDArray[np.float64]
 
-_LARGEST = 1e30
-"""Extremes beyond this stand for what is not a number."""
+_LARGEST = 1e30  # extremes beyond this stand for what is not a number
 
 
 def courant(parameters: FreeSurfaceParameters) -> dict[Material, float]:

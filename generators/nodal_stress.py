@@ -41,12 +41,8 @@ from .transfer import (
 )
 from .walls import Walls
 
-JACOBIAN_BOUND = 8.0
-"""Largest J that the sums have room for [1]."""
-
-_INSET = 1e-3
-"""Distance that particles keep from a wall [cells]."""
-
+JACOBIAN_BOUND = 8.0  # largest J that the sums have room for [1]
+_INSET = 1e-3  # distance that particles keep from a wall [cells]
 _REACH = 16.0
 """Bound of abs(v_p + C (x_i - x_p)) over the speed bound dx/dt [1].
 

@@ -69,12 +69,6 @@ class Jet:
             result = (result * self).shift(coefficient)
         return result
 
-    def where(self, condition: NDArray[np.bool_], otherwise: float) -> Jet:
-        """Keep the function where the condition holds; a constant takes its place elsewhere."""
-        value, *derivatives = self._terms()
-        kept = (np.where(condition, term, 0.0) for term in derivatives)
-        return Jet(np.where(condition, value, otherwise), *kept)
-
     def _terms(self) -> tuple[Array, Array, Array, Array, Array, Array]:
         return self.value, self.x, self.y, self.xx, self.xy, self.yy
 
@@ -119,9 +113,7 @@ def noise(x: Jet, y: Jet, lattice: NDArray[np.float64]) -> Jet:
 
 
 def ramp(t: Jet) -> Jet:
-    """Return Bridson's ramp: (15 t - 10 t^3 + 3 t^5) / 8 up to t = 1, then 1.
-
-    It starts from 0 with a slope of 15/8 and arrives with slope and curvature 0.
-    """
-    rising = t.polynomial(0.0, 1.875, 0.0, -1.25, 0.0, 0.375)
-    return rising.where(t.value < 1.0, 1.0)
+    """Return Bridson's ramp: (15 t - 10 t^3 + 3 t^5) / 8 up to t = 1, with two derivatives, then 1."""
+    value, *derivatives = t.polynomial(0.0, 1.875, 0.0, -1.25, 0.0, 0.375)._terms()
+    below = t.value < 1.0
+    return Jet(np.where(below, value, 1.0), *(np.where(below, term, 0.0) for term in derivatives))

@@ -46,15 +46,9 @@ from .transfer import (
     stepped,
 )
 
-_INSET = 1e-3
-"""Distance that particles keep from a wall [cells]."""
-
-_REACH = 64.0
-"""Bound of abs(v_p + A o) over dx/dt, the largest speed [1]; a violent impact reaches 2."""
-
-_HUGE = 3e38
-"""Stands for what is not a number where extremes are kept."""
-
+_INSET = 1e-3  # distance that particles keep from a wall [cells]
+_REACH = 64.0  # bound of abs(v_p + A o) over dx/dt, the largest speed [1]; a violent impact reaches 2
+_HUGE = 3e38  # stands for what is not a number where extremes are kept
 _LIQUID, _SNOW, _ROPE = int(Material.LIQUID), int(Material.SNOW), int(Material.ROPE)
 
 
@@ -250,11 +244,8 @@ class ParticleStress:
     def flow(self, s: ti.i32, p: ti.i32, solid: Template) -> None:
         """Move a particle; update J of a liquid or F of a solid."""
         here, kind, old = self.here[s, p], self.matter[s, p][0], self.matter[s, p][1]
-        x = bounded(
-            ti.Vector([self.x[s, p][0], self.x[s, p][1]]) + self.dt * ti.Vector([here[0], here[1]]),
-            self.least,
-            self.most,
-        )
+        moved = ti.Vector([self.x[s, p][0], self.x[s, p][1]]) + self.dt * ti.Vector([here[0], here[1]])
+        x = bounded(moved, self.least, self.most)
         self.x[s, p] = ti.Vector([x[0], x[1], 0.0, 0.0])
         c = self.gradient(s, p)
         j = old + self.dt * (c[0, 0] + c[1, 1]) * old
@@ -276,14 +267,8 @@ class ParticleStress:
         self.matter[s, p] = ti.Vector([kind, ratio, 0.0, 0.0])
         self.carried[s, p] = ti.Vector([here[0], here[1], 1.0, spread])
         seen, speed = self.extremes[s, p], largest_of(ti.abs(here[0]), ti.abs(here[1]))
-        self.extremes[s, p] = ti.Vector(
-            [
-                larger(speed, seen[0]),
-                -larger(-jacobian, -seen[1]),
-                larger(jacobian, seen[2]),
-                seen[3],
-            ]
-        )
+        least, most = -larger(-jacobian, -seen[1]), larger(jacobian, seen[2])
+        self.extremes[s, p] = ti.Vector([larger(speed, seen[0]), least, most, seen[3]])
 
     # --- the drivers: the same phases in the same order --------------------------------------
 

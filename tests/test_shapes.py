@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scenario_draws import neighbours
 
 from lagbench.errors import WorkFailedError
@@ -30,27 +29,18 @@ def source(scenario: int = 0) -> np.random.Generator:
     return stream
 
 
-def cloud(half: float = 0.6, cells: int = 1501) -> NDArray[np.float64]:
-    """Return the middles of a fine grid about the origin."""
-    side = half * ((2 * np.arange(cells) + 1) / cells - 1)
-    return np.stack(np.meshgrid(side, side), -1).reshape(-1, 2)
-
-
 @pytest.mark.parametrize("name", SHAPES)
-def test_area_and_reach_agree_with_counting(name: str) -> None:
-    """The points inside a fine grid give the area to 0.5 % and the bounding box to a cell."""
-    shape, grid = SHAPES[name], cloud()
+def test_area_reach_and_distance_agree_with_counting(name: str) -> None:
+    """The points inside a fine grid give the area to 0.5 % and the bounding box to a cell.
+
+    Outside, the distance is that to the nearest of them.
+    """
+    shape, side = SHAPES[name], 0.6 * ((2 * np.arange(1501) + 1) / 1501 - 1)
+    grid = np.stack(np.meshgrid(side, side), -1).reshape(-1, 2)
     inside = grid[shape.distance(grid) <= 0.0]
     assert len(inside) * (1.2 / 1501) ** 2 == pytest.approx(shape.area, rel=5e-3)
     np.testing.assert_allclose(inside.max(axis=0), shape.reach, atol=1.2 / 1501)
     np.testing.assert_allclose(inside.min(axis=0), np.negative(shape.reach), atol=1.2 / 1501)
-
-
-@pytest.mark.parametrize("name", SHAPES)
-def test_distance_is_how_far_the_shape_is(name: str) -> None:
-    """Outside, the distance is that to the nearest inside point of a fine grid."""
-    shape, grid = SHAPES[name], cloud()
-    inside = grid[shape.distance(grid) <= 0.0]
     probes = np.random.Generator(np.random.PCG64(1)).random((300, 2)) * 1.6 - 0.8
     found = shape.distance(probes)
     nearest = neighbours(probes[found > 0.0], 1, among=inside)[0][:, 0]

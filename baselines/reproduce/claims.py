@@ -27,111 +27,75 @@ from .thesis import FRAME_MODELS, OPERATORS, ROSTER, interval, key_frame, label,
 class Claim:
     """A question about one model and its rivals, asked of every split by the ranking metric."""
 
-    question: str
     first: str  # model that the question is about; empty for the best floor
     rivals: tuple[str, ...] = ()  # models to compare it with; empty for all
+    question: str = ""
     metrics: tuple[str, ...] = ()  # judged beside the ranking one, over the horizon
     at_key_frame: tuple[str, ...] = ()  # judged at the frame at which the thesis compares models
 
 
-CLAIMS = (
-    Claim(
-        "Does SuperGAT come first among the operators (Table 5.4: on the cavity it does)?",
-        "supergat",
-        tuple(name for name in OPERATORS if name != "supergat"),
-        at_key_frame=("vorticity_mse",),
+_CLAIMS = {
+    "Does SuperGAT come first among the operators (Table 5.4: on the cavity it does)?": Claim(
+        "supergat", tuple(name for name in OPERATORS if name != "supergat"), at_key_frame=("vorticity_mse",)
     ),
-    Claim(
-        "Does SuperGAT's link loss help, at the same start and seeds?",
-        "supergat",
-        ("supergat-unlinked",),
-        at_key_frame=("vorticity_pearson",),
+    "Does SuperGAT's link loss help, at the same start and seeds?": Claim(
+        "supergat", ("supergat-unlinked",), at_key_frame=("vorticity_pearson",)
     ),
-    Claim(
-        "Does the vorticity loss help (Fig. 5.5: it does), at the same budget and seeds?",
+    "Does the vorticity loss help (Fig. 5.5: it does), at the same budget and seeds?": Claim(
         "gns",
         ("gns-novorticity",),
         metrics=("position_rmse", "energy_error"),
         at_key_frame=("vorticity_pearson",),
     ),
-    Claim(
-        "Do summed messages decide: is SuperGAT better with them than without?",
-        "supergat",
-        ("supergat-unsummed",),
+    "Do summed messages decide: is SuperGAT better with them than without?": Claim(
+        "supergat", ("supergat-unsummed",)
     ),
-    Claim("Is MX attention better than SD (Eq. 5.27 has both)?", "supergat", ("supergat-sd",)),
-    Claim(
-        "Is acceleration a better target than velocity (section 5.9.3)?",
-        "gns",
-        ("gns-velocity",),
-        at_key_frame=("vorticity_pearson",),
+    "Is MX attention better than SD (Eq. 5.27 has both)?": Claim("supergat", ("supergat-sd",)),
+    "Is acceleration a better target than velocity (section 5.9.3)?": Claim(
+        "gns", ("gns-velocity",), at_key_frame=("vorticity_pearson",)
     ),
-    Claim("Is L2 better than L1 as the norm of the loss (the thesis chooses L2)?", "gns", ("gns-l1",)),
-    Claim(
-        "Does a weight of the vorticity loss ten times as large help?",
-        "gns-tenfold",
-        ("gns",),
-        at_key_frame=("vorticity_pearson",),
+    "Is L2 better than L1 as the norm of the loss (the thesis chooses L2)?": Claim("gns", ("gns-l1",)),
+    "Does a weight of the vorticity loss ten times as large help?": Claim(
+        "gns-tenfold", ("gns",), at_key_frame=("vorticity_pearson",)
     ),
-    Claim(
-        "Does a loss over three own steps help (section 6.2), at the same processor time?",
-        "gns-unrolled",
-        ("gns",),
+    "Does a loss over three own steps help (section 6.2), at the same processor time?": Claim(
+        "gns-unrolled", ("gns",)
     ),
-    Claim("Graph or grid: is neuralmpm better than every operator?", "neuralmpm", OPERATORS),
-    Claim(
-        "Is it better for NeuralMPM to learn from its own rollouts than from more calls unrolled?",
-        "neuralmpm-long",
-        ("neuralmpm-unrolled",),
+    "Graph or grid: is neuralmpm better than every operator?": Claim("neuralmpm", OPERATORS),
+    "Is it better for NeuralMPM to learn from its own rollouts than from more calls unrolled?": Claim(
+        "neuralmpm-long", ("neuralmpm-unrolled",)
     ),
-    Claim(
-        "Does NeuralMPM gain by one grid of velocities for all materials, at no more steps?",
-        "neuralmpm",
-        ("neuralmpm-unmixed",),
+    "Does NeuralMPM gain by one grid of velocities for all materials, at no more steps?": Claim(
+        "neuralmpm", ("neuralmpm-unmixed",)
     ),
-    Claim(
-        "Does NeuralMPM gain by conserved momentum, shorter bundles and more of the first frames?",
-        "neuralmpm-conserving",
-        ("neuralmpm-long", "neuralmpm"),
+    "Does NeuralMPM gain by conserved momentum, shorter bundles and more of the first frames?": Claim(
+        "neuralmpm-conserving", ("neuralmpm-long", "neuralmpm")
     ),
-    Claim(
-        "Does NeuralMPM gain by holding bodies in shape and matter from being pressed together?",
-        "neuralmpm-projected",
-        ("neuralmpm-conserving",),
+    "Does NeuralMPM gain by holding bodies in shape and matter from being pressed together?": Claim(
+        "neuralmpm-projected", ("neuralmpm-conserving",)
     ),
-    Claim(
-        "Does NeuralMPM gain by the mean over the images of the box, with the same weights?",
-        "neuralmpm-averaged",
-        ("neuralmpm",),
+    "Does NeuralMPM gain by the mean over the images of the box, with the same weights?": Claim(
+        "neuralmpm-averaged", ("neuralmpm",)
     ),
-    Claim(
-        "Does NeuralMPM gain by starting from the weights of another size?",
-        "neuralmpm-started",
-        ("neuralmpm",),
+    "Does NeuralMPM gain by starting from the weights of another size?": Claim(
+        "neuralmpm-started", ("neuralmpm",)
     ),
-    Claim(
-        "Does NeuralMPM that is held in shape gain by starting from the weights of another size?",
-        "neuralmpm-projected-started",
-        ("neuralmpm-projected",),
+    "Does NeuralMPM that is held in shape gain by starting from the weights of another size?": Claim(
+        "neuralmpm-projected-started", ("neuralmpm-projected",)
     ),
-    Claim(
-        "Does it gain by grids of shape and density as fine as those of full at full?",
-        "neuralmpm-projected-finer",
-        ("neuralmpm-projected-started", "neuralmpm-projected"),
+    "Does it gain by grids of shape and density as fine as those of full at full?": Claim(
+        "neuralmpm-projected-finer", ("neuralmpm-projected-started", "neuralmpm-projected")
     ),
-    Claim(
-        "Does LSTM + MLP come first among the frame models (Table 4.8: it does)?",
-        "lstm-mlp",
-        tuple(name for name in FRAME_MODELS if name != "lstm-mlp"),
+    "Does LSTM + MLP come first among the frame models (Table 4.8: it does)?": Claim(
+        "lstm-mlp", tuple(name for name in FRAME_MODELS if name != "lstm-mlp")
     ),
-    Claim(
-        "Is standing still better than VAR(1) (section 4.8.3: its forecast diverges)?",
-        "persistence",
-        ("var",),
-        metrics=("mse_end",),
+    "Is standing still better than VAR(1) (section 4.8.3: its forecast diverges)?": Claim(
+        "persistence", ("var",), metrics=("mse_end",)
     ),
-    Claim("Is the best floor better than a model that learned?", ""),
-)
+    "Is the best floor better than a model that learned?": Claim(""),
+}
+
+CLAIMS = tuple(replace(claim, question=question) for question, claim in _CLAIMS.items())
 
 
 class Verdict(enum.StrEnum):

@@ -52,10 +52,7 @@ class Rollouts:
     _truth: dict[int, Snapshot] = field(default_factory=dict)
 
     def position(self, name: str | None, frame: int) -> Floats:
-        """Return positions of the truth (None) or of a prediction [length], shape [particle, 2].
-
-        Given frames are the truth's.
-        """
+        """Return positions [length], [particle, 2], of the truth (None, and given frames) or a prediction."""
         if name is None or frame < self.scenario.setting.predicted_frames[0]:
             return np.asarray(self.file.read("position", frame), np.float64)
         return np.asarray(self.predictions[name].frames(self.recording.scenario, frame, 1)[0], np.float64)

@@ -191,13 +191,12 @@ def case_curves(plan: Plan, figure: Figure) -> Sheet:
         return Sheet(notes=(figure.said, "No run of this model is there."))
     score = methods[name].scores[metric]
     cases = [f"T{row} (scenario {scenario})" for row, scenario in enumerate(score.scenarios)]
-    with charts(1, 1, width=5.6, height=3.4) as drawn:
-        (axes,) = drawn
+    with charts(1, 1, width=5.6, height=3.4) as (axes,):
         for case, values in zip(cases, score.per_frame, strict=True):
             axes.plot(score.frames, values, lw=1.1, label=case)
         axes.set_ylim(bottom=0.0)
         tidy(axes, label(name), "frame", f"{metric} [{score.metric.unit}]")
-        picture = png(drawn)
+        picture = png([axes])
     rows = [
         (case, *(number(float(np.nanmax(values[: end - score.frames[0] + 1]))) for end in BOUNDS))
         for case, values in zip(cases, score.per_frame, strict=True)

@@ -69,9 +69,24 @@ def measure(
 ) -> ProtocolResult:
     """Fit a VAR of so many lags and forecast by the thesis's protocol."""
     # torch is loaded here, so that pages of results are written without it
+    from lagbench.baselines.rollout import scenario_paths
     from lagbench.baselines.var import LaggedRows, solve
 
-    states = _all_states(split, size, root)
+    paths: dict[int, Path] = {}
+    for subset in ("train", "valid", "test"):
+        paths |= scenario_paths(split, subset=subset, size=size, root=root)
+    tier = load().size(split, size)
+    frames = np.empty((sum(map(tier.frame_count, paths)), tier.particles, 4), np.float32)
+    filled = 0
+    for _, path in sorted(paths.items()):
+        with read_scenario(path) as file:  # positions and the solver's velocities, block by block
+            for position, velocity in zip(file.blocks("position"), file.blocks("velocity"), strict=True):
+                frames[filled : filled + len(position)] = np.concatenate([position, velocity], axis=-1)
+                filled += len(position)
+    for feature in np.moveaxis(frames, -1, 0):
+        feature -= feature.mean(dtype=np.float64)
+        feature /= feature.std(dtype=np.float64)
+    states: States = frames.reshape(len(frames), -1)
     train = int(TRAIN * len(states))
     valid = states[train : train + int(VALID * len(states))]
     rows = LaggedRows([states[:train]], lags=lags)
@@ -98,27 +113,6 @@ def measure(
         growth=growth,
         persistence_mse=float(np.square(valid - states[train - 1], dtype=np.float64).mean()),
     )
-
-
-def _all_states(split: str, size: str, root: str | Path | None) -> States:
-    """Return the standardised states of all frames, shape [frame, feature]."""
-    from lagbench.baselines.rollout import scenario_paths
-
-    paths: dict[int, Path] = {}
-    for subset in ("train", "valid", "test"):
-        paths |= scenario_paths(split, subset=subset, size=size, root=root)
-    tier = load().size(split, size)
-    states = np.empty((sum(map(tier.frame_count, paths)), tier.particles, 4), np.float32)
-    filled = 0
-    for _, path in sorted(paths.items()):
-        with read_scenario(path) as file:  # positions and the solver's velocities, block by block
-            for position, velocity in zip(file.blocks("position"), file.blocks("velocity"), strict=True):
-                states[filled : filled + len(position)] = np.concatenate([position, velocity], axis=-1)
-                filled += len(position)
-    for feature in np.moveaxis(states, -1, 0):
-        feature -= feature.mean(dtype=np.float64)
-        feature /= feature.std(dtype=np.float64)
-    return states.reshape(len(states), -1)
 
 
 def forecast_errors(

@@ -59,10 +59,7 @@ def box_of(parameters: ClosedBoxParameters) -> Box:
 
 
 def occupancy(position: Reals, box: Box) -> NDArray[np.int64]:
-    """Count the particles in each cell, shape [cells, cells]; one outside the walls counts for the nearest.
-
-    Positions [length] are of shape [particle, 2]; the sum of the counts is their number.
-    """
+    """Count the particles in each cell, shape [cells, cells]; one outside counts for the nearest."""
     cell = np.floor((position - box.low) / box.spacing).astype(np.int64)
     column, row = np.clip(cell, 0, box.cells - 1).T
     counts = np.bincount(column * box.cells + row, minlength=box.cells**2)

@@ -3,10 +3,6 @@
 The splits in datasets.yaml come in three sizes; an experiment scales size ``full`` to any grid.
 The box stays where it is as nearly as nodes allow, dt shrinks with dx, the particles per cell
 and the constants per substep stay.
-
-Checks at every 10,000th substep and at the end: the range of J, the cells without a particle, and
-divergence against vorticity. Kinetic energy at every frame. In the cavity, the velocity on the
-centre lines, averaged over the last part of the run, against Ghia, Ghia & Shin.
 """
 
 from __future__ import annotations
@@ -16,7 +12,7 @@ import enum
 import itertools
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -30,32 +26,17 @@ from lagbench.generators.noise import gradients
 from lagbench.generators.solver import Device, build
 from lagbench.generators.split import ClosedBoxParameters, InitialState, Material
 
-from .diagnostics import (
-    Deviation,
-    Profiles,
-    box_of,
-    centre_lines,
-    deviation,
-    displacement_energy,
-    extract,
-    grid_rates,
-    kinetic_energy,
-    lid_corners,
-    occupancy,
-)
+from . import diagnostics
 
 if TYPE_CHECKING:
     from lagbench.generators.closed_box import ClosedBox
 
 
-_FULL_GRID = 40
 _LEAST_GRID = 16
 _VISCOUS_LIMIT = 0.2
 _ACOUSTIC_LIMIT = 0.5
 _MACH_LIMIT = 1.0 / 3.0
 _LARGEST_FREQUENCY = 14  # beyond it velocity gradients outgrow what :func:`.draws.quantise` holds
-_DEFAULT_LID_SPEED = 0.15
-_DEFAULT_FREQUENCY = 4
 
 
 class Case(enum.StrEnum):
@@ -96,7 +77,7 @@ def plan(
     *,
     substeps: int,
     reynolds: float | None = None,
-    grid: int = _FULL_GRID,
+    grid: int = 40,
     particles: int | None = None,
     dt: float | None = None,
     lid_speed: float | None = None,
@@ -123,9 +104,9 @@ def plan(
         particles=round(full.particles * (grid / full.grid) ** 2) if particles is None else particles,
         substeps=substeps,
         dt=full.dt * full.grid / grid if dt is None else dt,
-        lid_speed=(_DEFAULT_LID_SPEED if lid_speed is None else lid_speed) if driven else 0.0,
+        lid_speed=(0.15 if lid_speed is None else lid_speed) if driven else 0.0,
         lid_off_after=lid_off_after,
-        frequency=0 if driven else (_DEFAULT_FREQUENCY if frequency is None else frequency),
+        frequency=0 if driven else (4 if frequency is None else frequency),
         seed=seed,
     )
     _check_ranges(experiment)
@@ -140,7 +121,7 @@ def _check(holds: bool, what: str, where: str, expected: object, got: object) ->
 def _check_ranges(experiment: Experiment) -> None:
     """Refuse what the solver cannot resolve or is unstable at."""
     parameters, e, speed = solver_parameters(experiment), experiment, experiment.lid_speed
-    box = box_of(parameters)
+    box = diagnostics.box_of(parameters)
     sound = math.sqrt(parameters.modulus / parameters.density)
     fastest = _ACOUSTIC_LIMIT / (sound * parameters.grid)
     fewest = f"at least {box.cells**2} in {box.cells} x {box.cells} cells"
@@ -187,7 +168,7 @@ def solver_parameters(experiment: Experiment) -> ClosedBoxParameters:
 
 def initial_state(experiment: Experiment) -> InitialState:
     """Fill the box with particles: at rest under a moving lid, or stirred by curl noise."""
-    box = box_of(solver_parameters(experiment))
+    box = diagnostics.box_of(solver_parameters(experiment))
     full = _full(experiment.case)
     rng = np.random.Generator(np.random.PCG64(experiment.seed))
     position = fill(rng, experiment.particles, low=box.low, high=box.high, jitter=full.value("jitter"))
@@ -256,7 +237,7 @@ class Result:
     # sum m (x(f) - x(f-1))^2 / 2 of each whole frame from the first [mass length^2]
     displacement_energy: list[float] = dataclasses.field(default_factory=list)
     averaged_from: int  # first substep of the velocity average
-    profiles: Profiles | None = None  # centre lines; None in curl noise
+    profiles: diagnostics.Profiles | None = None  # centre lines; None in curl noise
     seconds: float = 0.0  # wall time spent in the solver [s]
 
     @property
@@ -269,47 +250,28 @@ class Result:
 
     @property
     def largest_rise_after_lid_off(self) -> float | None:
-        """Largest gain of kinetic energy from one frame to the next, relative [1].
-
-        Counts from the frame at which the lid stops; not above 0 where the energy falls
-        monotonically. None while the lid moves.
-        """
+        """Largest relative gain of kinetic energy by a frame since the lid stopped; None while it moves."""
         off = self.experiment.lid_off_after
         if off is None:
             return None
         after = [e for at, e in zip(self.frame_substeps, self.kinetic_energy, strict=True) if at >= off]
         return max((b / a - 1.0 for a, b in itertools.pairwise(after)), default=None)
 
-    def deviations(self) -> tuple[Deviation, Deviation] | None:
+    def deviations(self) -> tuple[diagnostics.Deviation, diagnostics.Deviation] | None:
         """Return the deviation of u and of v from Ghia, Ghia & Shin, where they tabulate."""
-        reference = centre_lines(self.experiment.reynolds or 0.0)
+        reference = diagnostics.centre_lines(self.experiment.reynolds or 0.0)
         if self.profiles is None or reference is None or self.experiment.lid_off_after is not None:
             return None
         found = self.profiles.at_reference_points()
-        return deviation(found.u, reference.u), deviation(found.v, reference.v)
-
-
-def stops(experiment: Experiment) -> Iterator[int]:
-    """Yield the substeps at which the run pauses, ascending, the last one of the run included."""
-    last = experiment.substeps
-    points = {last, last - averaged(experiment), *range(CHECK_EVERY, last, CHECK_EVERY)}
-    points.update(range(experiment.frame_substeps, last, experiment.frame_substeps))
-    if experiment.lid_off_after is not None:
-        points.add(experiment.lid_off_after)
-    yield from sorted(points - {0})
-
-
-def averaged(experiment: Experiment) -> int:
-    """Return the substeps at the end over which the nodal velocity is averaged."""
-    return max(1, min(AVERAGED, experiment.substeps // 4))
+        return diagnostics.deviation(found.u, reference.u), diagnostics.deviation(found.v, reference.v)
 
 
 def run(experiment: Experiment, *, device: Device = Device.CPU, report: Report = lambda _: None) -> Result:
     """Simulate an experiment and measure it."""
-    driven = experiment.case is Case.CAVITY
-    result = Result(experiment=experiment, averaged_from=experiment.substeps - averaged(experiment))
+    driven, end, frame = experiment.case is Case.CAVITY, experiment.substeps, experiment.frame_substeps
+    result = Result(experiment=experiment, averaged_from=end - max(1, min(AVERAGED, end // 4)))
     parameters, state = solver_parameters(experiment), initial_state(experiment)
-    box, mass = box_of(parameters), parameters.density * state.area / experiment.particles
+    box, mass = diagnostics.box_of(parameters), parameters.density * state.area / experiment.particles
     inside = slice(parameters.wall + 1, parameters.grid - parameters.wall)  # nodes between the walls
     threads = 1 if device is Device.CPU else None
     solver = cast("ClosedBox", build(parameters, device=device, threads=threads))
@@ -318,7 +280,9 @@ def run(experiment: Experiment, *, device: Device = Device.CPU, report: Report =
     solver.advance(1)
     solver.load([state])
     done, before = 0, solver.position()[0]
-    for stop in (0, *stops(experiment)):
+    stops = {0, end, result.averaged_from, experiment.lid_off_after or 0}
+    stops |= {*range(CHECK_EVERY, end, CHECK_EVERY), *range(frame, end, frame)}
+    for stop in sorted(stops):
         start = time.perf_counter()
         solver.advance(stop - done, average=done >= result.averaged_from)
         result.seconds += time.perf_counter() - start
@@ -326,17 +290,17 @@ def run(experiment: Experiment, *, device: Device = Device.CPU, report: Report =
         if done == experiment.lid_off_after:
             solver.move_walls(np.zeros((1, *state.wall_velocity.shape), np.float32))
         position = solver.position()[0]
-        if done % experiment.frame_substeps == 0:
+        if done % frame == 0:
             result.frame_substeps.append(done)
-            result.kinetic_energy.append(kinetic_energy(solver.velocity()[0], mass))
+            result.kinetic_energy.append(diagnostics.kinetic_energy(solver.velocity()[0], mass))
             if done > 0:
-                result.displacement_energy.append(displacement_energy(position, before, mass))
+                result.displacement_energy.append(diagnostics.displacement_energy(position, before, mass))
             before = position
-        if done == experiment.substeps or (done > 0 and done % CHECK_EVERY == 0):
+        if done == end or (done > 0 and done % CHECK_EVERY == 0):
             jacobian = solver.jacobian()[0]
-            outside = jacobian[~lid_corners(position, box)] if driven else jacobian
-            counts = occupancy(position, box)
-            rates = grid_rates(solver.grid_velocity()[0][inside, inside], box.spacing)
+            outside = jacobian[~diagnostics.lid_corners(position, box)] if driven else jacobian
+            counts = diagnostics.occupancy(position, box)
+            rates = diagnostics.grid_rates(solver.grid_velocity()[0][inside, inside], box.spacing)
             result.checks.append(
                 Check(
                     substep=done,
@@ -355,5 +319,5 @@ def run(experiment: Experiment, *, device: Device = Device.CPU, report: Report =
         report(done)
     if driven:
         mean = solver.mean_grid_velocity()[0][inside, inside]
-        result.profiles = extract(mean, box, experiment.lid_speed)
+        result.profiles = diagnostics.extract(mean, box, experiment.lid_speed)
     return result
