@@ -98,6 +98,8 @@ def test_numbers_are_floats_in_any_yaml(generated: GenerationResult) -> None:
     assert all(isinstance(number, float) for number in read["twin_floor"])
     assert all(isinstance(number, float) for row in read["statistics"].values() for number in row)
     assert max(map(len, text.splitlines())) <= 110
+    # Text above the marker stays, whatever stood below it.
+    assert replace_measured("a: 1\n\nmeasured:\n  old: {}\n", {}) == replace_measured("a: 1\n", {})
 
 
 def test_changed_bits_need_another_version(
@@ -113,17 +115,17 @@ def test_changed_bits_need_another_version(
     assert "--allow-change" in capsys.readouterr().err
     assert run(generated.root, registry, "--allow-change") == 0
     assert registry.read_text() == text
-
-
-def test_another_major_is_another_name(registry: Path) -> None:
-    """A new MAJOR has an entry of its own beside the old one."""
+    # A new MAJOR has an entry of its own beside the old one.
     size = load(registry).size(SPLIT, SIZE)
     assert released_name(size) == f"{SPLIT}/{SIZE}/v2"
     assert released_name(size.model_copy(update={"version": "3.0.0"})) == f"{SPLIT}/{SIZE}/v3"
 
 
 def test_incomplete_or_changed_data_are_not_recorded(
-    copied: Callable[[], Path], registry: Path, capsys: pytest.CaptureFixture[str]
+    copied: Callable[[], Path],
+    registry: Path,
+    generated: GenerationResult,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     """A file that is not the manifest's, no manifest, or a part of a data set: exit code 4."""
     root = copied()
@@ -134,20 +136,12 @@ def test_incomplete_or_changed_data_are_not_recorded(
     (folder / "manifest.json").unlink()
     assert run(root, registry) == 4
     assert "no manifest" in capsys.readouterr().err
-
-
-def test_a_part_has_no_measures(generated: GenerationResult) -> None:
-    """Statistics and floors need every scenario, and every test scenario its twin."""
+    # Statistics and floors need every scenario, and every test scenario its twin.
     manifest = manifest_of(generated.root)
     without_twin = [entry.model_copy(update={"twin_floor": ()}) for entry in manifest.files]
     for part in ({"complete": False}, {"files": tuple(without_twin)}):
         with pytest.raises(DataError, match="incomplete"):
             measured_values(manifest.model_copy(update=part))
-
-
-def test_measured_block_replaces_itself() -> None:
-    """Text above the marker stays, whatever stood below it."""
-    assert replace_measured("a: 1\n\nmeasured:\n  old: {}\n", {}) == replace_measured("a: 1\n", {})
 
 
 def test_no_released_hash_has_changed() -> None:

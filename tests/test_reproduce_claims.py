@@ -47,10 +47,7 @@ def test_a_comparison_can_be_counted_by_hand() -> None:
     assert row.verdict is Verdict.BETTER
     (turned,) = compared(evidence, "gat", ["gns"], ["position_rmse"])
     assert (turned.verdict, turned.won, turned.p) == (Verdict.WORSE, 0, row.p)
-
-
-def test_the_larger_correlation_wins() -> None:
-    """Directions come from the metrics table; at a frame the values of that frame are compared."""
+    # Directions come from the metrics table; at a frame the values of that frame are compared.
     evidence = known({"gns": [0.9] * 8, "gat": [0.5] * 8})
     (row,) = compared(evidence, "gns", ["gat"], ["vorticity_pearson"], frame=54)
     assert (row.verdict, row.won, row.frame) == (Verdict.BETTER, 8, 54)

@@ -47,15 +47,12 @@ def test_area_reach_and_distance_agree_with_counting(name: str) -> None:
     np.testing.assert_allclose(found[found > 0.0], nearest, atol=1.2 / 1501 * 1.5)
 
 
-def test_rectangle_distance_by_hand() -> None:
-    """A 4 x 2 rectangle: 1 deep at the middle, 1 beyond an edge, 5 from a corner (3-4-5)."""
+def test_shapes_by_hand() -> None:
+    """A 4 x 2 rectangle: 1 deep at the middle, 1 beyond an edge, 5 from a corner (3-4-5); one blob."""
     rectangle = shapes.Rectangle(4.0, 2.0)
     at = np.array([[0.0, 0.0], [3.0, 0.5], [5.0, 5.0], [1.5, 0.0]])
     assert rectangle.distance(at).tolist() == [-1.0, 1.0, 5.0, -0.5]
-
-
-def test_blobs_of_one_disc_are_a_disc() -> None:
-    """The counted area of a unit disc is pi to 1e-3, hence the radius sqrt(area / pi)."""
+    # The counted area of a unit disc is pi to 1e-3, hence the radius sqrt(area / pi).
     blob = shapes.Blobs.of_area(0.05, np.zeros((1, 2)), cells=512)
     assert blob.radius == pytest.approx(math.sqrt(0.05 / math.pi), rel=1e-3)
     assert blob.centres == ((0.0, 0.0),)
@@ -82,10 +79,7 @@ def test_seeds_have_the_centre_and_spread_of_the_body() -> None:
     assert moments == pytest.approx([0.05**2 / 12, 0.65**2 / 12], rel=0.03)
     np.testing.assert_allclose(np.abs(axes[:, 1]), [0.6, 0.8], atol=0.003)
     np.testing.assert_allclose(position.mean(axis=0), 0.5, atol=0.003)
-
-
-def test_seeds_shift_with_the_scenario() -> None:
-    """Two scenarios spread different points in the same body."""
+    # Two scenarios spread different points in the same body.
     body = shapes.body_at(SHAPES["disc"], 0.5, 0.5)
     first, second = (shapes.seeds(source(k), body, 50) for k in (0, 1))
     assert neighbours(second, 1, among=first)[0].min() > 0.0

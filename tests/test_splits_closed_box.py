@@ -105,10 +105,7 @@ def test_curl_noise_frequencies_follow_the_thesis() -> None:
     for size, count, least in (("full", 10, 4), ("mini", 3, 2), ("tiny", 2, 1)):
         found = [state.parameters["frequency"] for state in all_of("curl-noise", size)]
         assert found == [i % count + least for i in registry.load().size("curl-noise", size).scenarios]
-
-
-def test_curl_noise_mini_has_one_vorticity() -> None:
-    """There the scale falls as frequency squared: 0.08 to 0.12 per frame at each; full has one scale."""
+    # At mini the scale falls as frequency squared: one vorticity [1/frame]. Full has one scale.
     drawn = [state.parameters for state in all_of("curl-noise", "mini")]
     for frequency in (2, 3, 4):
         own = [float(one["initial_vorticity_rms"]) for one in drawn if one["frequency"] == frequency]
