@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.generators.closed_box import ClosedBox
-from lagbench.generators.draws import quantise
+from lagbench.generators.draws import fill, quantise
 from lagbench.generators.solver import Device, build
 from lagbench.generators.split import ClosedBoxParameters, InitialState
 
@@ -29,19 +29,6 @@ def box(constants: ClosedBoxParameters) -> tuple[float, float]:
     """Return the coordinates of the low and the high walls."""
     low = (constants.wall + 0.5) / constants.grid
     return low, 1.0 - low
-
-
-def lattice(constants: ClosedBoxParameters, seed: int, jitter: float = 0.25) -> NDArray[np.float64]:
-    """Return particles that fill the box: columns of nearly equal spacing, each moved at random."""
-    rng = np.random.default_rng(seed)
-    low, high = box(constants)
-    columns = int(np.sqrt(constants.particles))
-    ends = constants.particles * np.arange(columns + 1) // columns
-    parts = []
-    for column, count in enumerate(np.diff(ends)):
-        x, y = ((rng.random((count, 2)) - 0.5) * jitter + 0.5).T
-        parts.append(np.stack([(column + x) / columns, (np.arange(count) + y) / count], axis=1))
-    return quantise(low + (high - low) * np.concatenate(parts))
 
 
 def scenario(
@@ -65,7 +52,7 @@ def scenario(
     if frames:
         wall_velocity = quantise(wall_velocity * (2.0 * rng.random((frames, 4, 1)) - 1.0))
     return InitialState(
-        position=lattice(constants, seed, jitter),
+        position=fill(np.random.default_rng(seed), count, low=low, high=high, jitter=jitter),
         velocity=quantise((2.0 * rng.random((count, 2)) - 1.0) * speed),
         affine=quantise((2.0 * rng.random((count, 2, 2)) - 1.0) * speed * constants.grid / 4.0),
         material=np.zeros(count, np.int8),

@@ -96,26 +96,19 @@ class Stencil:
 
 
 class FreeSurfaceReference:
-    """One scenario of the free-surface solver.
-
-    Attributes:
-        position: [length], shape [particle, 2].
-        velocity: [length/s], shape [particle, 2].
-        affine: C [1/s], components (xx, xy, yx, yy) of shape [particle].
-        deformation: F [1], components like ``affine``.
-        ratio: J of liquid, Jp of snow, 1 elsewhere [1], shape [particle].
-    """
+    """One scenario of the free-surface solver."""
 
     def __init__(self, parameters: FreeSurfaceParameters, state: InitialState) -> None:
         """Start from an initial state; constants are computed in float64, then rounded once."""
         p = self.p = parameters
         count = len(state.position)
-        self.position = state.position.astype(Float)
-        self.velocity = state.velocity.astype(Float)
+        self.position = state.position.astype(Float)  # [length], shape [particle, 2]
+        self.velocity = state.velocity.astype(Float)  # [length/s], shape [particle, 2]
+        # C [1/s] and F [1], components (xx, xy, yx, yy) of shape [particle]
         self.affine: Components = tuple(state.affine.reshape(count, 4).T.astype(Float))
         ones, zeros = np.ones(count, Float), np.zeros(count, Float)
         self.deformation: Components = (ones, zeros, zeros, ones)
-        self.ratio = ones
+        self.ratio = ones  # J of liquid, Jp of snow, 1 elsewhere [1], shape [particle]
         self.liquid = state.material == Material.LIQUID
         self.snow = state.material == Material.SNOW
         moduli = {

@@ -63,10 +63,7 @@ def test_runs_are_read_with_their_costs(plan: Plan) -> None:
     assert held.cost is not None
     assert held.cost.seconds_per_frame == 0.5
     assert held.cost.speed_up is None
-
-
-def test_hours_are_the_mean_of_the_trainings_that_tell_theirs() -> None:
-    """1 h, 3 h and none are 2 h; of none known there is no mean."""
+    # 1 h, 3 h and none are 2 h; of none known there is no mean.
     told: list[dict[str, float]] = [{"cpu_seconds": 3600.0}, {"cpu_seconds": 10_800.0}, {}]
     seeds = [Seeded(seed=i, scores={}, record=one, path=Path()) for i, one in enumerate(told)]
     assert Method(name="gns", seeds=tuple(seeds)).hours_per_seed == 2.0
