@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import io
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from lagbench.errors import UsageError, require
@@ -21,7 +21,6 @@ from .solver import Device
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
 ti = require("taichi", extra="generate")
-
 
 HARMLESS = frozenset(
     {
@@ -55,8 +54,11 @@ def start(device: Device, *, scenarios: int = 1, threads: int | None = None) -> 
     on_gpu = device is Device.CUDA
     if not _started:
         size, greeting = max(2, available_cores(), threads or 0), io.StringIO()
+        # Others would change device, precision or optimisation behind our back.
+        names = [name for name in os.environ if name.startswith("TI_") and name not in HARMLESS]
+        hidden = {name: os.environ.pop(name) for name in names}
         try:
-            with contextlib.redirect_stdout(greeting), _only_harmless_variables():
+            with contextlib.redirect_stdout(greeting):
                 ti.init(
                     arch=ti.cuda if on_gpu else ti.cpu,
                     default_fp=ti.f32,
@@ -74,6 +76,8 @@ def start(device: Device, *, scenarios: int = 1, threads: int | None = None) -> 
                 got=error,
                 fix="use --device cpu: there is no NVIDIA GPU, or no driver of one" if on_gpu else None,
             ) from error
+        finally:
+            os.environ.update(hidden)
         _started.append((on_gpu, size))
     running_on_gpu, pool = _started[0]
     if running_on_gpu != on_gpu or (threads or 1) > pool:
@@ -84,17 +88,6 @@ def start(device: Device, *, scenarios: int = 1, threads: int | None = None) -> 
             fix="use another process",
         )
     return threads or min(pool, available_cores())
-
-
-@contextlib.contextmanager
-def _only_harmless_variables() -> Iterator[None]:
-    """Hide the variables that would change device, precision or optimisation behind our back."""
-    names = [name for name in os.environ if name.startswith("TI_") and name not in HARMLESS]
-    hidden = {name: os.environ.pop(name) for name in names}
-    try:
-        yield
-    finally:
-        os.environ.update(hidden)
 
 
 def place(*groups: tuple[tuple[int, ...], Sequence[Any]]) -> Any:  # noqa: ANN401 (Taichi is untyped)

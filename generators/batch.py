@@ -22,7 +22,7 @@ from lagbench.errors import UsageError, WorkFailedError
 
 from .constants import blamed_on_parameters, solver_constants, split_module
 from .draws import generator
-from .solver import Device, Solver, build
+from .solver import Device, Health, Solver, build
 from .split import ClosedBoxParameters, FreeSurfaceParameters, InitialState
 
 STRIDE = 4_000_000  # particle-substeps between two reports: about a tenth of a second on a core
@@ -66,15 +66,6 @@ def substeps_of(size: Size, scenario: int) -> int:
     return last * size.substeps_per_frame
 
 
-@dataclass
-class Extremes:
-    """The widest values that a scenario has shown at any substep."""
-
-    max_speed: float = 0.0  # largest velocity component [length/s]
-    jacobian_min: float = np.inf  # smallest J of any particle [1]
-    jacobian_max: float = -np.inf  # largest J of any particle [1]
-
-
 class Batch:
     """Scenarios in a solver, and the frames at which they are due."""
 
@@ -82,8 +73,10 @@ class Batch:
         self.job = job  # what to simulate
         # the scenarios before their first substep
         self.states = [draw(job.size, scenario) for scenario in job.scenarios]
-        self.extremes = [Extremes() for _ in job.scenarios]  # what each has gone through so far
-        # holds the scenarios in the order of the job
+        # what each has gone through so far
+        unseen = Health(finite=True, max_speed=0.0, jacobian_min=np.inf, jacobian_max=-np.inf)
+        self.extremes = [unseen] * len(self.states)
+        # in the order of the job
         self.solver = _solver(solver_constants(job.size), job.device, len(self.states))
         with self._naming():
             self.solver.load(self.states)
@@ -109,10 +102,7 @@ class Batch:
                 yield index, frame
 
     def frame(self, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return position [length] and velocity [length/s] of a scenario, shape [particle, 2].
-
-        They are those of the last yield of :meth:`recordings`.
-        """
+        """Return position [length] and velocity [length/s], shape [particle, 2], at the last recording."""
         return self._position[index], self._velocity[index]
 
     def displace(self, offset: NDArray[np.float32]) -> None:
@@ -137,9 +127,12 @@ class Batch:
                 if self._now <= last * interval:
                     running += 1
                     widest = self.extremes[index]
-                    widest.max_speed = max(widest.max_speed, health.max_speed)
-                    widest.jacobian_min = min(widest.jacobian_min, health.jacobian_min)
-                    widest.jacobian_max = max(widest.jacobian_max, health.jacobian_max)
+                    self.extremes[index] = Health(
+                        finite=health.finite,
+                        max_speed=max(widest.max_speed, health.max_speed),
+                        jacobian_min=min(widest.jacobian_min, health.jacobian_min),
+                        jacobian_max=max(widest.jacobian_max, health.jacobian_max),
+                    )
             self._report(count * running)
 
     def _replay(self, count: int) -> None:

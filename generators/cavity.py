@@ -68,23 +68,19 @@ def _program(rng: RandomSource, size: Size, frames: int) -> NDArray[np.float64]:
     return quantise(speed)
 
 
-def _classic(rng: RandomSource, size: Size, frames: int, start: int) -> NDArray[np.float64]:
-    """Return rest, then a speed of [U/2, U] to either side from frame ``start`` on; as :func:`_program`."""
-    fastest, sign = size.value("speed_max"), 2 * choice(rng, 2) - 1
-    return np.where(np.arange(frames) >= start, sign * uniform(rng, 0.5 * fastest, fastest), 0.0)
-
-
 def _motion(rng: RandomSource, size: Size, scenario: int, start: int) -> NDArray[np.float64]:
     """Draw the velocity of each wall towards each frame, ``start`` frames before frame 0 included."""
-    walls, frames = DRIVEN[scenario % len(DRIVEN)], start + size.frame_count(scenario)
+    frames, fastest, first = start + size.frame_count(scenario), size.value("speed_max"), 0
     velocity = np.zeros((frames, len(WALLS), 2))
     if is_classic(scenario):
         # In the last given frame at the latest: what is to be predicted is never at rest.
         first = _whole(rng, start - size.value("lid_lead"), start + size.task.input_frames - 1)
-        speeds = [_classic(rng, size, frames, first) for _ in walls]
-    else:
-        speeds = [_program(rng, size, frames) for _ in walls]
-    for wall, speed in zip(walls, speeds, strict=True):
+    for wall in DRIVEN[scenario % len(DRIVEN)]:
+        if is_classic(scenario):
+            sign = 2 * choice(rng, 2) - 1
+            speed = np.where(np.arange(frames) >= first, sign * uniform(rng, 0.5 * fastest, fastest), 0.0)
+        else:
+            speed = _program(rng, size, frames)
         velocity[:, WALLS.index(wall), _TANGENT[wall]] = speed
     return velocity
 

@@ -1,10 +1,7 @@
 """Weakly compressible flow in a full box: cavity and curl noise (design 4.3).
 
-The equations stand in :mod:`.nodal_stress`. The walls lie half-way between nodes, at
-``(wall + 1/2) / grid`` and its mirror image, and hold the fluid or let it slide.
-
-Valid while max abs(v) dt <= dx, which also bounds every fixed-point sum, and while J stays in
-(0, 8]. The settings of the split ``cavity`` reproduce Ghia, Ghia & Shin (1982) at Re 100 and 400.
+Equations, walls and the bounds within which they hold stand in :mod:`.nodal_stress`. The settings
+of the split ``cavity`` reproduce Ghia, Ghia & Shin (1982) at Re 100 and 400.
 """
 
 from collections.abc import Sequence
@@ -16,7 +13,7 @@ from numpy.typing import NDArray
 from lagbench.data import WALLS
 from lagbench.errors import UsageError
 
-from .driver import Driver, stack
+from .driver import Driver
 from .nodal_stress import JACOBIAN_BOUND, NodalStress
 from .solver import Health
 from .split import ClosedBoxParameters, InitialState
@@ -32,28 +29,17 @@ class ClosedBox(Driver[ClosedBoxParameters]):
 
     def _start(self, states: Sequence[InitialState]) -> None:
         p, k = self.parameters, self._kernels
-        carried = np.ones((self.scenarios, p.particles, 4), np.float32)
-        carried[:, :, :2] = stack(states, "velocity")
-        k.carried.from_numpy(carried)
-        for axis, field in enumerate((k.slope_x, k.slope_y)):
-            slope = np.zeros_like(carried)
-            slope[:, :, :2] = stack(states, "affine")[:, :, :, axis]
-            field.from_numpy(slope)
         self._states = list(states)
         self._move_walls_towards(0)
-        cells = np.array([state.area / p.particles for state in states]) * p.grid**2
-        k.fill.from_numpy(cells.astype(np.float32))
         spread = np.array([state.viscosity for state in states]) * p.dt * p.grid**2
         k.spread.from_numpy(spread.astype(np.float32))
         for field in (k.node, k.moved, k.gain):
             field.fill(0.0)
-        self.restart_mean()
+        k.total.fill(0.0)
+        self._averaged = 0
 
     def move_walls(self, velocity: NDArray[np.float32]) -> None:
-        """Let the walls slide with these velocities [length/s], shape [scenario, 4, 2].
-
-        They do so from now on, or where a scenario has a program, up to its next frame.
-        """
+        """Let walls slide [length/s], shape [scenario, 4, 2]; with a program, up to its next frame."""
         self._kernels.walls.speed.from_numpy(velocity[:, (0, 1, 2, 3), (1, 1, 0, 0)])
 
     def _move_walls_towards(self, frame: int) -> None:
@@ -72,10 +58,6 @@ class ClosedBox(Driver[ClosedBoxParameters]):
         self._kernels.averaging = average
         self._averaged += substeps if average else 0
         super().advance(substeps)
-
-    def velocity(self) -> NDArray[np.float32]:
-        """Particle velocities v_p [length/s], shape [scenario, particle, 2]."""
-        return np.asarray(self._kernels.carried.to_numpy()[:, :, :2])
 
     def jacobian(self) -> NDArray[np.float32]:
         """Volume ratio J of the particles [1], shape [scenario, particle]."""
@@ -96,11 +78,6 @@ class ClosedBox(Driver[ClosedBoxParameters]):
         width = self.parameters.grid + 1
         return values.reshape(self.scenarios, width, width, 2)
 
-    def restart_mean(self) -> None:
-        """Forget the substeps averaged so far."""
-        self._kernels.total.fill(0.0)
-        self._averaged = 0
-
     def health(self) -> list[Health]:
         """Return what each scenario went through during the last advance."""
         extremes = self._read(self._kernels.extremes).max(axis=1)
@@ -116,11 +93,7 @@ class ClosedBox(Driver[ClosedBoxParameters]):
         ]
 
     def close(self) -> None:
-        """Give the memory back; the solver cannot be used afterwards.
-
-        Kernels of other solvers in this process compile again: many solvers may share a process,
-        but there is no need to close one per scenario.
-        """
+        """Give the memory back, for good; kernels of other solvers in this process compile again."""
         self._kernels.release()
 
     def _broken(self, index: int, health: Health) -> dict[str, str]:

@@ -36,51 +36,47 @@ __all__ = [
 
 ParametersType = type[ClosedBoxParameters] | type[FreeSurfaceParameters]
 
-_POSITIVE = Limit(low=0.0, open_low=True)
-_NOT_NEGATIVE = Limit(low=0.0)
-_SHARE = Limit(low=0.0, high=1.0)
-_POISSON = Limit(low=0.0, high=0.5, open_high=True)
+_POSITIVE = (
+    *("dt", "density", "modulus", "liquid_modulus", "jelly_modulus", "rope_modulus", "snow_modulus"),
+    *("snow_hardening_min", "snow_hardening_max", "snow_jp_min", "snow_jp_max"),
+)
+_NOT_NEGATIVE = ("shift", "liquid_viscosity", "elastic_damping", "snow_stretch", "snow_hardening")
 
 LIMITS = {
     "particles": Limit(low=1, whole=True),
     "grid": Limit(low=4, whole=True),
     "wall": Limit(low=0, whole=True),
     "substeps_per_frame": Limit(low=1, whole=True),
-    "dt": _POSITIVE,
-    "density": _POSITIVE,
-    "modulus": _POSITIVE,
-    "liquid_modulus": _POSITIVE,
-    "jelly_modulus": _POSITIVE,
-    "rope_modulus": _POSITIVE,
-    "snow_modulus": _POSITIVE,
-    "jelly_poisson": _POISSON,
-    "rope_poisson": _POISSON,
-    "snow_poisson": _POISSON,
-    "velocity_relaxation": _SHARE,
-    "jacobian_relaxation": _SHARE,
-    "density_coupling": _SHARE,
-    "shift": _NOT_NEGATIVE,
-    "liquid_viscosity": _NOT_NEGATIVE,
-    "elastic_damping": _NOT_NEGATIVE,
+    **dict.fromkeys(_POSITIVE, Limit(low=0.0, open_low=True)),
+    **dict.fromkeys(_NOT_NEGATIVE, Limit(low=0.0)),
+    **{f"{solid}_poisson": Limit(low=0.0, high=0.5, open_high=True) for solid in ("jelly", "rope", "snow")},
+    "velocity_relaxation": Limit(low=0.0, high=1.0),
+    "jacobian_relaxation": Limit(low=0.0, high=1.0),
+    "density_coupling": Limit(low=0.0, high=1.0),
     "jacobian_min": Limit(low=0.0, high=1.0, open_low=True),
     "jacobian_max": Limit(low=1.0),
     "snow_compression": Limit(low=0.0, high=1.0, open_high=True),
-    "snow_stretch": _NOT_NEGATIVE,
-    "snow_hardening": _NOT_NEGATIVE,
-    "snow_hardening_min": _POSITIVE,
-    "snow_hardening_max": _POSITIVE,
-    "snow_jp_min": _POSITIVE,
-    "snow_jp_max": _POSITIVE,
 }
 """Limits of constants that both the solvers and their stability rest on; others are finite numbers."""
 
 
 def check_constants(kind: ParametersType, given: Mapping[str, object], size: Size) -> None:
     """Refuse constants that a solver cannot use."""
+    where = f"{size.file}, splits.{size.split}, size {size.name}"
     for field in fields(kind):
         if field.name not in given:
             if field.default is MISSING:
-                raise _missing(field.name, kind, size)
+                known = {other.name for other in fields(kind)}
+                strange = [other for other in size.parameters if other not in known]
+                close = get_close_matches(field.name, strange, n=3)
+                declare = f"declare {field.name} under parameters of the split"
+                raise UnreadableFileError(
+                    "a parameter is missing",
+                    where=f"{where}, parameter {field.name}",
+                    expected=field.name,
+                    got=", ".join(close) or "no name like it",
+                    fix=f"did you mean {close[0]!r}?" if close else declare,
+                )
             continue
         limit, value = LIMITS.get(field.name, Limit()), given[field.name]
         if field.type == "bool":
@@ -95,28 +91,10 @@ def check_constants(kind: ParametersType, given: Mapping[str, object], size: Siz
         if not good:
             raise UnreadableFileError(
                 "a parameter has no possible value",
-                where=f"{size.file}, {_key(size, field.name)}",
+                where=f"{where}, parameter {field.name}",
                 expected=expected,
                 got=repr(value),
             )
-
-
-def _key(size: Size, name: str) -> str:
-    return f"splits.{size.split}, size {size.name}, parameter {name}"
-
-
-def _missing(name: str, kind: ParametersType, size: Size) -> UnreadableFileError:
-    """Return an error that names the parameter that may have been meant."""
-    known = {field.name for field in fields(kind)}
-    strange = [other for other in size.parameters if other not in known]
-    close = get_close_matches(name, strange, n=3)
-    return UnreadableFileError(
-        "a parameter is missing",
-        where=f"{size.file}, {_key(size, name)}",
-        expected=name,
-        got=", ".join(close) or "no name like it",
-        fix=f"did you mean {close[0]!r}?" if close else f"declare {name} under parameters of the split",
-    )
 
 
 @contextmanager

@@ -18,24 +18,14 @@ import taichi as ti
 
 from .transfer import Value, bounded
 
-EXPONENT_MAX = 4.0
-"""Largest magnitude of the argument for which the error bound of :func:`exponential` holds."""
-
-STRETCH_MIN = 0.1
-"""Smallest trial stretch that enters the plastic volume; an inverted particle counts as this."""
-
+EXPONENT_MAX = 4.0  # largest magnitude for which the error bound of :func:`exponential` holds
+STRETCH_MIN = 0.1  # smallest trial stretch that enters the plastic volume, an inverted particle's too
 _STRETCH_EPSILON = 1e-6
 _SHEAR_EPSILON = 1e-12
 
 
 def lame(young: float, poisson: float) -> tuple[float, float]:
-    """Return Lame's constants (mu, lambda) of plane strain.
-
-    mu = E / (2 (1 + nu)), lambda = E nu / ((1 + nu) (1 - 2 nu)).
-
-    Args:
-        young: Young's modulus E [mass/s^2].
-        poisson: Poisson's ratio nu < 1/2 [1].
+    """Return Lame's constants of plane strain, mu = E / (2 (1 + nu)) and E nu / ((1 + nu) (1 - 2 nu)).
 
     >>> lame(40.0, 0.25)
     (16.0, 16.0)
@@ -82,12 +72,7 @@ def rotation(f: ti.math.mat2) -> ti.math.vec3:
 
 @ti.func
 def viscous_stress(c: ti.math.mat2, viscosity: ti.f32) -> ti.math.mat2:
-    """Return mu (C + C^T).
-
-    Args:
-        c: velocity gradient [1/s].
-        viscosity: dynamic viscosity mu, density times kinematic viscosity [mass/s].
-    """
+    """Return mu (C + C^T), of a velocity gradient C [1/s] and the dynamic viscosity mu [mass/s]."""
     shear = viscosity * (c[0, 1] + c[1, 0])
     return ti.Matrix([[2.0 * viscosity * c[0, 0], shear], [shear, 2.0 * viscosity * c[1, 1]]])
 
@@ -100,15 +85,10 @@ def liquid_stress(jacobian: ti.f32, modulus: ti.f32) -> ti.f32:
 
 @ti.func
 def corotated_stress(f: ti.math.mat2, mu: ti.f32, la: ti.f32) -> ti.math.mat2:
-    """Return the fixed corotated stress 2 mu (F - R) F^T + lambda (J - 1) J I.
+    """Return the fixed corotated stress 2 mu (F - R) F^T + lambda (J - 1) J I, mu and lambda in [mass/s^2].
 
     With W = R [[h, k], [k, -h]], a symmetric matrix without trace,
     (F - R) F^T = (q (q - 1) + r^2) I + (2 q - 1) W.
-
-    Args:
-        f: deformation gradient [1].
-        mu: shear modulus [mass/s^2].
-        la: Lame's first constant [mass/s^2].
     """
     turn = rotation(f)
     q = turn[2]
@@ -126,13 +106,9 @@ def corotated_stress(f: ti.math.mat2, mu: ti.f32, la: ti.f32) -> ti.math.mat2:
 
 @ti.func
 def hardening(plastic: ti.f32, exponent: ti.f32, low: ti.f32, high: ti.f32) -> ti.f32:
-    """Return exp(xi (1 - Jp)) within [low, high], the factor on the moduli of snow.
+    """Return exp(xi (1 - Jp)) within [low, high], caps within exp(-+EXPONENT_MAX): snow's factor on moduli.
 
-    Args:
-        plastic: plastic volume ratio Jp [1]; below 1 the snow is compacted and stiffer.
-        exponent: xi [1].
-        low: lower cap, at least exp(-EXPONENT_MAX) [1].
-        high: upper cap, at most exp(EXPONENT_MAX) [1].
+    Below Jp = 1 the snow is compacted and stiffer.
     """
     z = bounded(exponent * (1.0 - plastic), -EXPONENT_MAX, EXPONENT_MAX)
     return bounded(exponential(z), low, high)
@@ -145,11 +121,6 @@ def plastic_return(f: ti.math.mat2, low: ti.f32, high: ti.f32) -> Value:
     Clamping q + r and q - r gives new q and r, by which rotation and reflection are scaled.
     The second value is the factor on Jp: trial stretches (at least :data:`STRETCH_MIN`) over
     clamped ones.
-
-    Args:
-        f: trial deformation gradient [1].
-        low: smallest elastic stretch, 1 - theta_c [1].
-        high: largest elastic stretch, 1 + theta_s [1].
     """
     turn = rotation(f)
     q = turn[2]

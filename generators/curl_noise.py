@@ -39,17 +39,10 @@ def solver_parameters(size: Size) -> ClosedBoxParameters:
 
 
 def stream_function(position: Array, lattice: Array, *, low: float, high: float, scale: float) -> Jet:
-    """Return psi and its derivatives at points of the box.
+    """Return psi [length^2/s] and its derivatives at points between walls at low and high [length].
 
-    Args:
-        position: points [length], shape [point, 2].
-        lattice: Perlin gradients, shape [F + 1, F + 1, 2].
-        low: coordinate of the left and bottom walls [length].
-        high: coordinate of the right and top walls [length].
-        scale: s [length/s].
-
-    Returns:
-        psi [length^2/s]; u = psi.y and v = -psi.x.
+    Points are of shape [point, 2], Perlin gradients of shape [F + 1, F + 1, 2], the scale is s [length/s];
+    u = psi.y and v = -psi.x.
     """
     cells = float(len(lattice) - 1)
     per_length = cells / (high - low)
@@ -62,7 +55,7 @@ def stream_function(position: Array, lattice: Array, *, low: float, high: float,
     return psi.scale(scale * (high - low))
 
 
-def _flow(psi: Jet) -> tuple[Array, Array]:
+def flow(psi: Jet) -> tuple[Array, Array]:
     """Return velocity [point, 2] and its gradient C [point, 2, 2], multiples of 2^-20."""
     velocity = np.stack([psi.y, -psi.x], axis=-1)
     affine = np.stack([psi.xy, psi.yy, -psi.xx, -psi.xy], axis=-1).reshape(-1, 2, 2)
@@ -92,16 +85,9 @@ def _grid_rates(lattice: Array, size: Size, scale: float) -> tuple[float, float]
     return _root_mean_square(divergence), _root_mean_square(vorticity)
 
 
-def _scale(size: Size, frequency: int) -> float:
-    """Return s at a frequency F [length/s]: s0 (F0 / F)^k."""
-    scale = float(size.value("velocity_scale"))
-    for _ in range(size.value("scale_falloff")):
-        scale = scale * size.value("frequency_min") / frequency
-    return scale
-
-
-def _positions(rng: RandomSource, size: Size, low: float, high: float) -> Array:
-    """Draw the jittered lattice of Eq. 5.44."""
+def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
+    """Draw a lattice of particles and the stream function that sets them moving."""
+    low, high = closed_box_walls(size)
     columns, rows = size.value("lattice_x"), size.value("lattice_y")
     if columns * rows != size.particles:
         raise UsageError(
@@ -110,18 +96,14 @@ def _positions(rng: RandomSource, size: Size, low: float, high: float) -> Array:
             expected=f"lattice_x * lattice_y = particles = {size.particles}",
             got=f"{columns} * {rows} = {columns * rows}",
         )
-    return fill_grid(rng, columns, rows, low=low, high=high, jitter=size.value("jitter"))
-
-
-def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
-    """Draw a lattice of particles and the stream function that sets them moving."""
-    low, high = closed_box_walls(size)
+    position = fill_grid(rng, columns, rows, low=low, high=high, jitter=size.value("jitter"))
     frequency = scenario % size.value("frequency_count") + size.value("frequency_min")
-    position = _positions(rng, size, low, high)
     lattice = gradients(rng, frequency)
-    scale = _scale(size, frequency)
+    scale = float(size.value("velocity_scale"))
+    for _ in range(size.value("scale_falloff")):  # no power: its bits differ from machine to machine
+        scale = scale * size.value("frequency_min") / frequency
     psi = stream_function(position, lattice, low=low, high=high, scale=scale)
-    velocity, affine = _flow(psi)
+    velocity, affine = flow(psi)
     divergence, vorticity = _grid_rates(lattice, size, scale)
     energy = 0.5 * math.fsum(v * v for v in velocity.ravel().tolist()) / size.particles
     return InitialState(

@@ -33,9 +33,7 @@ class RandomSource(Protocol):
 
 
 def entropy(split: str, size: str, major: int, scenario: int) -> tuple[int, int, int]:
-    """Return the three integers that seed a scenario.
-
-    The first is the first eight bytes of SHA-256("split/size"), big-endian.
+    """Return what seeds a scenario: the first eight bytes of SHA-256("split/size"), big-endian, and numbers.
 
     >>> entropy("cavity", "tiny", 1, 3)[1:]
     (1, 3)
@@ -83,10 +81,7 @@ def uniform(rng: RandomSource, low: float, high: float) -> float:
 
 
 def log_uniform(rng: RandomSource, low: float, high: float) -> float:
-    """Draw x with ln x uniform on [ln low, ln high).
-
-    x = low exp(u ln(high / low)), in 50 decimal digits, rounded once.
-    """
+    """Draw x = low exp(u ln(high / low)), uniform in its logarithm: in 50 decimal digits, rounded once."""
     if not 0.0 < low <= high:
         raise WorkFailedError("a log-uniform range is empty", expected="0 < low <= high", got=(low, high))
     span = _PRECISE.ln(_PRECISE.divide(Decimal(high), Decimal(low)))
@@ -112,12 +107,8 @@ def choice(rng: RandomSource, count: int) -> int:
 
 
 def direction(rng: RandomSource) -> tuple[float, float]:
-    """Draw a unit vector, uniform over the circle, without sine or cosine.
-
-    A point of the square is taken again until it lies in the unit disc (and not at its very
-    centre), then divided by its length.
-    """
-    while True:
+    """Draw a unit vector, uniform over the circle, without sine or cosine."""
+    while True:  # until a point of the square lies in the unit disc, and not at its very centre
         x, y = (float(2.0 * r - 1.0) for r in rng.random((2,)))
         square = x * x + y * y
         if 2.0**-20 <= square <= 1.0:
@@ -134,34 +125,25 @@ def fill(rng: RandomSource, count: int, *, low: float, high: float, jitter: floa
     [length] are multiples of 2^-20, shape [particle, 2].
     """
     columns = math.isqrt(count)
-    ends = [count * column // columns for column in range(columns + 1)]
-    sizes = np.diff(ends)
-    column = np.repeat(np.arange(columns), sizes)
-    row = np.arange(count) - np.repeat(ends[:-1], sizes)
-    cell = np.stack([column, row], axis=-1)
-    cells = np.stack([np.full(count, columns), np.repeat(sizes, sizes)], axis=-1)
-    return _place(rng, cell, cells, low=low, high=high, jitter=jitter)
+    ends = np.array([count * column // columns for column in range(columns + 1)])
+    return _fill_columns(rng, ends, low, high, jitter)
 
 
 def fill_grid(
     rng: RandomSource, columns: int, rows: int, *, low: float, high: float, jitter: float
 ) -> NDArray[np.float64]:
     """Fill a square with columns x rows particles; arguments as in :func:`fill`."""
-    index = np.arange(columns * rows)
-    cell = np.stack([index // rows, index % rows], axis=-1)
-    cells = np.broadcast_to(np.array([columns, rows]), cell.shape)
-    return _place(rng, cell, cells, low=low, high=high, jitter=jitter)
+    return _fill_columns(rng, rows * np.arange(columns + 1), low, high, jitter)
 
 
-def _place(
-    rng: RandomSource,
-    cell: NDArray[np.integer],
-    cells: NDArray[np.integer],
-    *,
-    low: float,
-    high: float,
-    jitter: float,
+def _fill_columns(
+    rng: RandomSource, ends: NDArray[np.integer], low: float, high: float, jitter: float
 ) -> NDArray[np.float64]:
-    """Put a particle near the middle of its cell: base position + (r - 1/2) jitter spacing."""
+    """Put particles near the middles of their cells, column by column: (r - 1/2) jitter spacings off."""
+    sizes = np.diff(ends)
+    column = np.repeat(np.arange(len(sizes)), sizes)
+    row = np.arange(len(column)) - np.repeat(ends[:-1], sizes)
+    cell = np.stack([column, row], axis=-1)
+    cells = np.stack([np.full(len(column), len(sizes)), np.repeat(sizes, sizes)], axis=-1)
     displacement = (rng.random(cell.shape) - 0.5) * jitter
     return quantise(low + (high - low) * (cell + 0.5 + displacement) / cells)

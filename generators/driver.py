@@ -34,6 +34,10 @@ class Kernels(Protocol):
     """What a driver asks of the kernels of a formulation."""
 
     x: _Field  # particle positions [length], and two zeros
+    carried: _Field  # what particles spread: v_x, v_y and two numbers that are 1 at first
+    slope_x: _Field  # d/dx of the velocity, first, at the particles
+    slope_y: _Field  # d/dy of the same
+    fill: _Field  # m / (rho dx^2), shape [scenario]
     least: float  # smallest coordinate of a particle
     most: float  # largest coordinate of a particle
     speed_bound: float  # the CFL bound dx/dt [length/s]
@@ -73,7 +77,7 @@ class Driver(ABC, Generic[Parameters]):
 
     @abstractmethod
     def _start(self, states: Sequence[InitialState]) -> None:
-        """Fill all fields but the positions."""
+        """Fill the fields that only this formulation has."""
 
     @abstractmethod
     def health(self) -> list[Health]:
@@ -90,6 +94,15 @@ class Driver(ABC, Generic[Parameters]):
         for index, state in enumerate(states):
             self._check_state(index, state)
         self._place(stack(states, "position"))
+        carried = np.ones((self.scenarios, self.parameters.particles, 4), np.float32)
+        carried[..., :2] = stack(states, "velocity")
+        self._kernels.carried.from_numpy(carried)
+        for axis, field in enumerate((self._kernels.slope_x, self._kernels.slope_y)):
+            slope = np.zeros_like(carried)
+            slope[..., :2] = stack(states, "affine")[..., axis]
+            field.from_numpy(slope)
+        self._volume = np.array([state.area / self.parameters.particles for state in states])
+        self._kernels.fill.from_numpy((self._volume * self.parameters.grid**2).astype(np.float32))
         self._start(states)
         self._substeps = 0
         self._kernels.restart_extremes()
@@ -108,8 +121,24 @@ class Driver(ABC, Generic[Parameters]):
                 for _ in range(until - self._substeps):
                     self._kernels.run_in_parallel()
             self._substeps = until
+        fastest = self._kernels.speed_bound
         for index, health in enumerate(self.health()):
-            self._check_health(index, health, substeps)
+            broken: dict[str, str] = {}
+            if not health.finite:
+                broken["every number is finite"] = "NaN or an infinite number"
+            # NaN breaks no bound here: it is told above, and as a value it would say nothing.
+            if health.max_speed > fastest:
+                broken[f"CFL: abs(v) <= dx/dt = {fastest:.6g}"] = f"abs(v) = {health.max_speed:.6g}"
+            broken |= self._broken(index, health)
+            if broken:
+                span = f"substep {end}" if substeps == 1 else f"substeps {end - substeps} to {end}"
+                raise WorkFailedError(
+                    "the simulation blew up",
+                    where=f"scenario {index}, {span}",
+                    expected="; ".join(broken),
+                    got="; ".join(broken.values()),
+                    fix="a smaller dt (a larger substeps_per_frame), a softer material or smaller velocities",
+                )
 
     def _drive(self, end: int) -> int:
         """Set what acts from outside now; return the substep up to which it does, ``end`` at most."""
@@ -119,10 +148,14 @@ class Driver(ABC, Generic[Parameters]):
         """Particle positions [length], shape [scenario, particle, 2]."""
         return self._read(self._kernels.x)[..., :2]
 
+    def velocity(self) -> NDArray[np.float32]:
+        """Particle velocities v_p [length/s], shape [scenario, particle, 2]."""
+        return self._kernels.carried.to_numpy()[..., :2]
+
     def _read(self, field: _Field) -> NDArray[np.float32]:
         """Return a field of the particles, shape [scenario, particle, 4]."""
         if self.device is not Device.CPU:
-            return np.asarray(field.to_numpy())
+            return field.to_numpy()
         values = np.empty((1, self.parameters.particles, 4), np.float32)
         _copy(field, values)
         return values
@@ -137,12 +170,8 @@ class Driver(ABC, Generic[Parameters]):
 
     def _check_state(self, index: int, state: InitialState) -> None:
         count = self.parameters.particles
-        shapes = {
-            "position": (count, 2),
-            "velocity": (count, 2),
-            "affine": (count, 2, 2),
-            "material": (count,),
-        }
+        shapes: dict[str, tuple[int, ...]] = {"position": (count, 2), "velocity": (count, 2)}
+        shapes |= {"affine": (count, 2, 2), "material": (count,)}
         for name, shape in shapes.items():
             held = np.asarray(getattr(state, name))
             if held.shape != shape or held.dtype.kind not in ("iu" if name == "material" else "f"):
@@ -172,26 +201,6 @@ class Driver(ABC, Generic[Parameters]):
                 expected=f"finite positions, abs(v) <= dx/dt = {fastest:.6g}, abs(C) dt <= 2",
                 got=f"abs(v) = {speed:.6g}, abs(C) dt = {stretch:.6g}, "
                 f"{np.count_nonzero(~np.isfinite(state.position))} coordinates that are not finite",
-            )
-
-    def _check_health(self, index: int, health: Health, substeps: int) -> None:
-        fastest = self._kernels.speed_bound
-        broken: dict[str, str] = {}
-        if not health.finite:
-            broken["every number is finite"] = "NaN or an infinite number"
-        # NaN breaks no bound here: it is told above, and as a value it would say nothing.
-        if health.max_speed > fastest:
-            broken[f"CFL: abs(v) <= dx/dt = {fastest:.6g}"] = f"abs(v) = {health.max_speed:.6g}"
-        broken |= self._broken(index, health)
-        if broken:
-            last = self._substeps
-            span = f"substep {last}" if substeps == 1 else f"substeps {last - substeps} to {last}"
-            raise WorkFailedError(
-                "the simulation blew up",
-                where=f"scenario {index}, {span}",
-                expected="; ".join(broken),
-                got="; ".join(broken.values()),
-                fix="a smaller dt (a larger substeps_per_frame), a softer material or smaller velocities",
             )
 
 

@@ -7,7 +7,6 @@ before it falls). Expected behaviour: a jet along the walls after the impact, sl
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 
 from .constants import constants, free_surface_walls, interval, ranges
 from .draws import RandomSource, choice, direction, normal, quantise, uniform
-from .shapes import Blobs, Body, Disc, Rectangle, Region, Shape, place, seeds
+from .shapes import Blobs, Body, Disc, Rectangle, Shape, place, seeds
 from .split import FreeSurfaceParameters, InitialState, Material
 
 if TYPE_CHECKING:
@@ -27,12 +26,7 @@ FAMILIES = ("falling-rectangle", "thrown", "falling-circle", "splash")
 """Family of a scenario, by id % 4."""
 
 # Families whose bodies start in one region with one range of velocities share its parameters.
-_START = {
-    "falling-rectangle": "falling",
-    "falling-circle": "falling",
-    "thrown": "thrown",
-    "splash": "splash",
-}
+_START = dict(zip(FAMILIES, ("falling", "thrown", "falling", "splash"), strict=True))
 
 
 def solver_parameters(size: Size) -> FreeSurfaceParameters:
@@ -40,33 +34,16 @@ def solver_parameters(size: Size) -> FreeSurfaceParameters:
     return constants(FreeSurfaceParameters, size)
 
 
-def _rectangle(rng: RandomSource, area: float, size: Size) -> Rectangle:
-    width = math.sqrt(area * uniform(rng, *interval(size, "aspect")))
-    return Rectangle(width, area / width)
-
-
-def _blobs(rng: RandomSource, area: float, size: Size) -> Blobs:
-    """Draw discs that all reach a common point, so that the body is one piece."""
-    reach = interval(size, "blob_offset")
-    offsets = [(uniform(rng, *reach), direction(rng)) for _ in range(size.value("blob_count"))]
-    arrangement = np.array([(r * x, r * y) for r, (x, y) in offsets])
-    return Blobs.of_area(area, arrangement, cells=size.value("blob_cells"))
-
-
 def _shape(rng: RandomSource, family: str, area: float, size: Size) -> Shape:
     if family == "splash":
-        return _blobs(rng, area, size)
+        # All discs reach a common point, so that the body is one piece.
+        reach = interval(size, "blob_offset")
+        offsets = [(uniform(rng, *reach), direction(rng)) for _ in range(size.value("blob_count"))]
+        arrangement = np.array([(r * x, r * y) for r, (x, y) in offsets])
+        return Blobs.of_area(area, arrangement, cells=size.value("blob_cells"))
     if family == "falling-circle" or (family == "thrown" and choice(rng, 2) == 1):
         return Disc.of_area(area)
-    return _rectangle(rng, area, size)
-
-
-def _within_walls(region: Region, size: Size) -> Region:
-    """Return the part of a region that keeps its margin from the walls."""
-    low, high = free_surface_walls(size)
-    (left, right), (bottom, top) = region
-    least, most = low + size.value("margin"), high - size.value("margin")
-    return (max(left, least), min(right, most)), (max(bottom, least), min(top, most))
+    return Rectangle.of_area(area, uniform(rng, *interval(size, "aspect")))
 
 
 def _splash(rng: RandomSource, body: Body, position: Array, size: Size) -> Array:
@@ -92,7 +69,12 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     family = FAMILIES[scenario % len(FAMILIES)]
     start = _START[family]
     area = uniform(rng, *interval(size, "area"))
-    body = place(rng, _shape(rng, family, area, size), _within_walls(ranges(size, start), size))
+    shape = _shape(rng, family, area, size)
+    (left, right), (bottom, top) = ranges(size, start)
+    low, high = free_surface_walls(size)
+    least, most = low + size.value("margin"), high - size.value("margin")
+    region = (max(left, least), min(right, most)), (max(bottom, least), min(top, most))
+    body = place(rng, shape, region)
     drift = [uniform(rng, *component) for component in ranges(size, f"{start}_velocity")]
     position = seeds(rng, body, size.particles)
     return InitialState(

@@ -22,8 +22,7 @@ from .split import FreeSurfaceParameters, InitialState, Material
 
 Array = NDArray[np.float64]
 
-_LARGEST = 1e30
-"""Extremes beyond this stand for what is not a number."""
+_LARGEST = 1e30  # extremes beyond this stand for what is not a number
 
 
 def courant(parameters: FreeSurfaceParameters) -> dict[Material, float]:
@@ -70,27 +69,14 @@ class FreeSurface(Driver[FreeSurfaceParameters]):
 
     def _start(self, states: Sequence[InitialState]) -> None:
         p, k = self.parameters, self._kernels
-        carried = np.ones((self.scenarios, p.particles, 4), np.float32)
-        carried[:, :, :2] = stack(states, "velocity")
-        k.carried.from_numpy(carried)
-        for axis, field in enumerate((k.slope_x, k.slope_y)):
-            slope = np.zeros_like(carried)
-            slope[:, :, :2] = stack(states, "affine")[:, :, :, axis]
-            field.from_numpy(slope)
         self._material = stack(states, "material").astype(np.int32)
         k.solid = bool((self._material != Material.LIQUID).any())
-        matter = np.zeros_like(carried)
+        matter = np.zeros((self.scenarios, p.particles, 4), np.float32)
         matter[:, :, 0], matter[:, :, 1] = self._material, 1.0
         k.matter.from_numpy(matter)
         shape = (self.scenarios, p.particles, 2, 2)
         k.f.from_numpy(np.broadcast_to(np.eye(2, dtype=np.float32), shape).copy())
-        self._volume = np.array([state.area / p.particles for state in states])
-        k.fill.from_numpy((self._volume * p.grid**2).astype(np.float32))
         k.friction.from_numpy(np.array([state.friction for state in states], np.float32))
-
-    def velocity(self) -> NDArray[np.float32]:
-        """Particle velocities v_p [length/s], shape [scenario, particle, 2]."""
-        return np.asarray(self._kernels.carried.to_numpy()[..., :2])
 
     def affine(self) -> NDArray[np.float32]:
         """APIC matrices C = grad v [1/s], shape [scenario, particle, 2, 2]."""
@@ -113,20 +99,8 @@ class FreeSurface(Driver[FreeSurfaceParameters]):
 
     def energy(self) -> Energy:
         """Return the energy of each scenario, in float64 from the particles."""
-        p = self.parameters
-        height = self.position()[..., 1].astype(np.float64) - self._kernels.least
-        square = (self.velocity().astype(np.float64) ** 2).sum(axis=-1)
-        spin = (self.affine().astype(np.float64) ** 2).sum(axis=(-2, -1)) / (4.0 * p.grid**2)
-        mass = p.density * self._volume
-        return Energy(
-            kinetic=0.5 * mass * (square + spin).sum(axis=-1),
-            gravitational=p.gravity * mass * height.sum(axis=-1),
-            elastic=self._volume * self._elastic_density().sum(axis=-1),
-        )
-
-    def _elastic_density(self) -> Array:
-        """Return psi [mass/s^2], shape [scenario, particle]."""
         p, k = self.parameters, self._kernels
+        # psi [mass/s^2], shape [scenario, particle]
         f, ratio = self.deformation().astype(np.float64), self.volume_ratio().astype(np.float64)
         a, b, c, d = f[..., 0, 0], f[..., 0, 1], f[..., 1, 0], f[..., 1, 1]
         # abs(F - R)^2 = abs(F)^2 - 2 tr(R^T F) + 2, and tr(R^T F) is twice the mean stretch.
@@ -134,14 +108,19 @@ class FreeSurface(Driver[FreeSurfaceParameters]):
         bulk = 0.5 * (a * d - b * c - 1.0) ** 2
         factor = np.clip(np.exp(p.snow_hardening * (1.0 - ratio)), p.snow_hardening_min, p.snow_hardening_max)
         density = p.liquid_modulus * (ratio - 1.0 - np.log(ratio))
-        for material, (mu, la) in (
-            (Material.JELLY, k.jelly),
-            (Material.ROPE, k.rope),
-            (Material.SNOW, k.snow),
-        ):
+        moduli = {Material.JELLY: k.jelly, Material.ROPE: k.rope, Material.SNOW: k.snow}
+        for material, (mu, la) in moduli.items():
             psi = (mu * shear + la * bulk) * (factor if material is Material.SNOW else 1.0)
             density = np.where(self._material == material, psi, density)
-        return np.asarray(density)
+        height = self.position()[..., 1].astype(np.float64) - k.least
+        square = (self.velocity().astype(np.float64) ** 2).sum(axis=-1)
+        spin = (self.affine().astype(np.float64) ** 2).sum(axis=(-2, -1)) / (4.0 * p.grid**2)
+        mass = p.density * self._volume
+        return Energy(
+            kinetic=0.5 * mass * (square + spin).sum(axis=-1),
+            gravitational=p.gravity * mass * height.sum(axis=-1),
+            elastic=self._volume * density.sum(axis=-1),
+        )
 
     def health(self) -> list[Health]:
         """Return what each scenario went through during the last advance."""

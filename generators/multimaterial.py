@@ -13,7 +13,6 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lagbench.errors import WorkFailedError
 
@@ -24,8 +23,6 @@ from .split import FreeSurfaceParameters, InitialState, Material
 
 if TYPE_CHECKING:
     from lagbench.data.registry import Size
-
-Array = NDArray[np.float64]
 
 PAIRS = (
     (Material.LIQUID, Material.SNOW),
@@ -46,39 +43,33 @@ def solver_parameters(size: Size) -> FreeSurfaceParameters:
     return constants(FreeSurfaceParameters, size)
 
 
-def _rope(rng: RandomSource, size: Size) -> Rectangle:
-    length = uniform(rng, *interval(size, "rope_length"))
-    return Rectangle(length, size.value("rope_width"), direction(rng))
-
-
 def _shape(rng: RandomSource, material: Material, size: Size) -> Shape:
     """Draw a rope, a ball of jelly, or a rectangle or disc of anything else."""
     if material is Material.ROPE:
-        return _rope(rng, size)
+        length = uniform(rng, *interval(size, "rope_length"))
+        return Rectangle(length, size.value("rope_width"), direction(rng))
     area = uniform(rng, *interval(size, "area"))
     if material is Material.JELLY or choice(rng, 2) == 1:
         return Disc.of_area(area)
-    width = math.sqrt(area * uniform(rng, *interval(size, "aspect")))
-    return Rectangle(width, area / width)
-
-
-def _shares(count: int, first: Shape, second: Shape) -> tuple[int, int]:
-    """Divide the particles by area, to the nearest particle."""
-    own = math.floor(count * first.area / (first.area + second.area) + 0.5)
-    return own, count - own
+    return Rectangle.of_area(area, uniform(rng, *interval(size, "aspect")))
 
 
 def _apart(rng: RandomSource, size: Size, shapes: tuple[Shape, Shape]) -> tuple[Body, Body]:
     """Place two shapes between the walls until they keep their gap.
 
-    The second's outline is probed where it matters: at evenly spread points inside it.
+    The second is probed at those nodes of a grid of ``gap_cells`` cells over its bounding box, each way,
+    that lie inside it.
     """
     low, high = free_surface_walls(size)
     inner = (low + size.value("margin"), high - size.value("margin"))
     gap, cells = float(size.value("gap")), int(size.value("gap_cells"))
+    side = (2.0 * np.arange(cells + 1) - cells) / cells
+    x, y = np.meshgrid(side * shapes[1].reach[0], side * shapes[1].reach[1])
+    offsets = np.stack([x.ravel(), y.ravel()], axis=-1)
     for _ in range(_ATTEMPTS):
         first, second = (place(rng, shape, (inner, inner)) for shape in shapes)
-        if float(np.min(first.distance(_probe(second, cells)))) >= gap:
+        grid = second.centre + offsets
+        if float(np.min(first.distance(grid[second.distance(grid) <= 0.0]))) >= gap:
             return first, second
     raise WorkFailedError(
         "two bodies found no room side by side",
@@ -87,32 +78,17 @@ def _apart(rng: RandomSource, size: Size, shapes: tuple[Shape, Shape]) -> tuple[
     )
 
 
-def _probe(body: Body, cells: int) -> Array:
-    """Return nodes of a grid over a body that lie inside it [length], shape [point, 2].
-
-    The grid has ``cells`` cells across the bounding box, each way.
-    """
-    side = (2.0 * np.arange(cells + 1) - cells) / cells
-    x, y = np.meshgrid(side * body.shape.reach[0], side * body.shape.reach[1])
-    grid = body.centre + np.stack([x.ravel(), y.ravel()], axis=-1)
-    return np.asarray(grid[body.distance(grid) <= 0.0])
-
-
-def _pull(rng: RandomSource, bodies: tuple[Body, Body], size: Size) -> tuple[Array, Array, float]:
-    """Draw the attractor: velocity of each body = rate (point - centre) [length/s]."""
-    point = np.array([uniform(rng, *component) for component in ranges(size, "attractor")])
-    rate = uniform(rng, *interval(size, "attraction"))
-    first, second = (quantise(rate * (point - body.centre)) for body in bodies)
-    return first, second, rate
-
-
 def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     """Draw two bodies, their places and their velocities."""
     materials = PAIRS[scenario % len(PAIRS)]
     first, second = (_shape(rng, material, size) for material in materials)
     bodies = _apart(rng, size, (first, second))
-    counts = _shares(size.particles, first, second)
-    *velocities, rate = _pull(rng, bodies, size)
+    own = math.floor(size.particles * first.area / (first.area + second.area) + 0.5)
+    counts = own, size.particles - own
+    # the attractor: velocity of each body = rate (point - centre) [length/s]
+    point = np.array([uniform(rng, *component) for component in ranges(size, "attractor")])
+    rate = uniform(rng, *interval(size, "attraction"))
+    velocities = [quantise(rate * (point - body.centre)) for body in bodies]
     friction = 0.0 if Material.LIQUID in materials else float(size.value("friction"))
     drawn: dict[str, int | float | str] = {
         "pair": "-".join(material.name.lower() for material in materials),
@@ -120,7 +96,9 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
         "friction": friction,
     }
     for name, body, velocity in zip(("first", "second"), bodies, velocities, strict=True):
-        drawn |= _describe(name, body, velocity)
+        drawn |= {f"{name}_shape": type(body.shape).__name__.lower(), f"{name}_area": body.shape.area}
+        for what, (x, y) in (("centre", body.centre.tolist()), ("velocity", velocity.tolist())):
+            drawn |= {f"{name}_{what}_x": x, f"{name}_{what}_y": y}
     return InitialState(
         position=np.concatenate([seeds(rng, b, n) for b, n in zip(bodies, counts, strict=True)]),
         velocity=np.repeat(np.stack(velocities), counts, axis=0),
@@ -130,15 +108,3 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
         friction=friction,
         parameters=drawn,
     )
-
-
-def _describe(name: str, body: Body, velocity: Array) -> dict[str, int | float | str]:
-    """Return what the file says about a body."""
-    return {
-        f"{name}_shape": type(body.shape).__name__.lower(),
-        f"{name}_area": body.shape.area,
-        f"{name}_centre_x": float(body.centre[0]),
-        f"{name}_centre_y": float(body.centre[1]),
-        f"{name}_velocity_x": float(velocity[0]),
-        f"{name}_velocity_y": float(velocity[1]),
-    }

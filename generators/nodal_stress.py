@@ -41,12 +41,8 @@ from .transfer import (
 )
 from .walls import Walls
 
-JACOBIAN_BOUND = 8.0
-"""Largest J that the sums have room for [1]."""
-
-_INSET = 1e-3
-"""Distance that particles keep from a wall [cells]."""
-
+JACOBIAN_BOUND = 8.0  # largest J that the sums have room for [1]
+_INSET = 1e-3  # distance that particles keep from a wall [cells]
 _REACH = 16.0
 """Bound of abs(v_p + C (x_i - x_p)) over the speed bound dx/dt [1].
 
@@ -57,90 +53,59 @@ max abs(v) sum w abs(x_i - x_p) <= 4/dt, and a node lies within 1.5 dx per axis:
 
 @ti.data_oriented
 class NodalStress:
-    """Fields of a batch of scenarios and the kernels that advance them.
-
-    Attributes:
-        x: particle positions [length], and two zeros.
-        carried: what P2G spreads: v_x, v_y, 1, J.
-        slope_x: d/dx of the nodal (v_x, v_y, r, Jbar) at the particles.
-        slope_y: d/dy of the same.
-        extremes: largest abs(v_x), abs(v_y), J and -J of each particle since the advance began.
-        peak: largest absolute velocity component of each node since then.
-        moved: nodal v_x, v_y, r, Jbar after the forces of the last substep.
-        total: sum over time of the nodal velocities.
-        averaging: whether the substeps to come count for it.
-        spread: nu dt / dx^2, shape [scenario].
-        fill: m / (rho dx^2), shape [scenario].
-        speed_bound: the CFL bound dx/dt [length/s].
-        least: smallest coordinate of a particle.
-        most: largest coordinate of a particle.
-    """
+    """Fields of a batch of scenarios and the kernels that advance them."""
 
     def __init__(
         self, parameters: ClosedBoxParameters, *, scenarios: int, atomic: bool, threads: int
     ) -> None:
         """Round the constants and take the memory."""
-        self.parameters = parameters  # constants that the scenarios share
+        self.parameters = p = parameters  # constants that the scenarios share
         self.scenarios = scenarios  # scenarios advanced together
         self.atomic = atomic  # whether several threads run the phases
         self.threads = threads  # threads of the parallel loops on a CPU
-        self.averaging = False
-        self.walls = Walls(grid=parameters.grid, wall=parameters.wall, no_slip=parameters.no_slip)
-        self._set_constants()
-        self._make_fields()
-
-    def release(self) -> None:
-        """Give the memory back; the fields cannot be used afterwards."""
-        self._tree.destroy()
-
-    def _set_constants(self) -> None:
-        p = self.parameters
+        self.averaging = False  # whether the substeps to come count for the total
+        self.walls = Walls(grid=p.grid, wall=p.wall, no_slip=p.no_slip)
         dx = 1.0 / p.grid
-        self.inv_dx, self.width = float(p.grid), p.grid + 1
-        self.dt = p.dt
-        self.least = (p.wall + 0.5 + _INSET) * dx
-        self.most = (p.grid - p.wall - 0.5 - _INSET) * dx
-        self.speed_bound = dx / p.dt
+        self.inv_dx, self.width, self.dt = float(p.grid), p.grid + 1, p.dt
+        self.least = (p.wall + 0.5 + _INSET) * dx  # smallest coordinate of a particle
+        self.most = (p.grid - p.wall - 0.5 - _INSET) * dx  # largest coordinate of a particle
+        self.speed_bound = dx / p.dt  # the CFL bound dx/dt [length/s]
         self.velocity_scale = fixed_point_scale(p.particles, _REACH * self.speed_bound)
         self.count_scale = fixed_point_scale(p.particles, JACOBIAN_BOUND)
         self.velocity_unit, self.count_unit = 1.0 / self.velocity_scale, 1.0 / self.count_scale
         self.cell_scale = self.velocity_scale * dx
         self.pressure = p.dt * p.modulus / (p.density * 2.0 * dx)
         self.gradient = 4.0 * self.inv_dx
-        self.shift = -p.shift * dx * dx
-        self.shift_bound = 0.1 * dx
-
-    def _make_fields(self) -> None:
-        p = self.parameters
-        self.x = ti.Vector.field(4, ti.f32)
-        self.carried = ti.Vector.field(4, ti.f32)
-        self.slope_x = ti.Vector.field(4, ti.f32)
-        self.slope_y = ti.Vector.field(4, ti.f32)
+        self.shift, self.shift_bound = -p.shift * dx * dx, 0.1 * dx
+        self.x = ti.Vector.field(4, ti.f32)  # particle positions [length], and two zeros
+        self.carried = ti.Vector.field(4, ti.f32)  # what P2G spreads: v_x, v_y, 1, J
+        self.slope_x = ti.Vector.field(4, ti.f32)  # d/dx of the nodal (v_x, v_y, r, Jbar) at the particles
+        self.slope_y = ti.Vector.field(4, ti.f32)  # d/dy of the same
+        # largest abs(v_x), abs(v_y), J and -J of each particle since the advance began
         self.extremes = ti.Vector.field(4, ti.f32)
         self.rows = [ti.Vector.field(4, ti.f32) for _ in range(3)]  # of the stencil
         self.here = ti.Vector.field(4, ti.f32)  # nodal v_x, v_y, r, Jbar at the particles
         self.push = ti.Vector.field(4, ti.f32)  # nodal dt a at the particles, and two zeros
         self.sums = ti.Vector.field(4, ti.i64)  # n v_x, n v_y, n, n J
-        self.node = ti.Vector.field(4, ti.f32)
-        self.moved = ti.Vector.field(4, ti.f32)
-        self.gain = ti.Vector.field(2, ti.f32)
-        self.peak = ti.field(ti.f32)
-        self.total = ti.Vector.field(2, ti.f64)
-        self.spread = ti.field(ti.f32)
-        self.fill = ti.field(ti.f32)
-        particles = (self.scenarios, p.particles)
-        nodes = (self.scenarios, self.width**2)
+        self.node = ti.Vector.field(4, ti.f32)  # v_x, v_y, r, Jbar
+        self.moved = ti.Vector.field(4, ti.f32)  # the same after the forces of the last substep
+        self.gain = ti.Vector.field(2, ti.f32)  # dt a
+        self.peak = ti.field(ti.f32)  # largest absolute velocity component since the advance began
+        self.total = ti.Vector.field(2, ti.f64)  # sum over time of the nodal velocities
+        self.spread = ti.field(ti.f32)  # nu dt / dx^2, shape [scenario]
+        self.fill = ti.field(ti.f32)  # m / (rho dx^2), shape [scenario]
+        of_particles = (self.x, self.carried, self.slope_x, self.slope_y)
+        of_particles += (*self.rows, self.here, self.push, self.extremes)
+        of_nodes = (self.sums, self.node, self.moved, self.gain, self.peak, self.total)
         self._tree = backend.place(
-            *((particles, [field]) for field in (self.x, self.carried, self.slope_x, self.slope_y)),
-            *((particles, [field]) for field in (*self.rows, self.here, self.push, self.extremes)),
-            (nodes, [self.sums]),
-            (nodes, [self.node]),
-            (nodes, [self.moved]),
-            (nodes, [self.gain]),
-            (nodes, [self.peak]),
-            (nodes, [self.total]),
-            ((self.scenarios,), [self.walls.speed, self.spread, self.fill]),
+            *(((scenarios, p.particles), [field]) for field in of_particles),
+            *(((scenarios, self.width**2), [field]) for field in of_nodes),
+            ((scenarios,), [self.walls.speed, self.spread, self.fill]),
         )
+
+    def release(self) -> None:
+        """Give the memory back; the fields cannot be used afterwards."""
+        self._tree.destroy()
 
     @ti.func
     def at(self, i: ti.i32, j: ti.i32) -> ti.i32:

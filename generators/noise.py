@@ -3,10 +3,8 @@
 Both are polynomials within a lattice cell, so that a stream function made of them has
 continuous second derivatives, and every operation is + - * or floor.
 
-Functions of the plane carried together with their first and second derivatives.
-
-A :class:`Jet` obeys the product rule to second order, so a field written once in + - * has
-exact derivatives (to rounding) and no step width to choose:
+A :class:`Jet` carries a function with its first and second derivatives by the product rule, so a
+field written once in + - * has exact derivatives (to rounding) and no step width to choose:
 
     (f g)_x = f_x g + f g_x,    (f g)_xy = f_xy g + f_x g_y + f_y g_x + f g_xy.
 """
@@ -21,7 +19,6 @@ from numpy.typing import NDArray
 from .draws import RandomSource, direction
 
 __all__ = ["Jet", "coordinates", "gradients", "noise", "ramp"]
-
 
 Array = NDArray[np.float64]
 
@@ -72,30 +69,21 @@ class Jet:
             result = (result * self).shift(coefficient)
         return result
 
-    def where(self, condition: NDArray[np.bool_], otherwise: float) -> Jet:
-        """Keep the function where the condition holds; a constant takes its place elsewhere."""
-        value, *derivatives = self._terms()
-        kept = (np.where(condition, term, 0.0) for term in derivatives)
-        return Jet(np.where(condition, value, otherwise), *kept)
-
     def _terms(self) -> tuple[Array, Array, Array, Array, Array, Array]:
         return self.value, self.x, self.y, self.xx, self.xy, self.yy
 
 
 def coordinates(position: Array) -> tuple[Jet, Jet]:
     """Return x and y as jets at the given points, shape [point, 2]."""
-    zero = np.zeros(len(position))
-    one = np.ones(len(position))
-    x = Jet(position[:, 0], one, zero, zero, zero, zero)
-    y = Jet(position[:, 1], zero, one, zero, zero, zero)
-    return x, y
+    zero, one = np.zeros(len(position)), np.ones(len(position))
+    x, y = position.T
+    return Jet(x, one, zero, zero, zero, zero), Jet(y, zero, one, zero, zero, zero)
 
 
 def gradients(rng: RandomSource, frequency: int) -> NDArray[np.float64]:
     """Draw the unit gradients of a lattice, shape [frequency + 1, frequency + 1, 2]."""
-    nodes = frequency + 1
-    drawn = [direction(rng) for _ in range(nodes * nodes)]
-    return np.array(drawn, dtype=np.float64).reshape(nodes, nodes, 2)
+    nodes = range(frequency + 1)
+    return np.array([[direction(rng) for _ in nodes] for _ in nodes])
 
 
 def fade(t: Jet) -> Jet:
@@ -103,19 +91,10 @@ def fade(t: Jet) -> Jet:
     return t.polynomial(0.0, 0.0, 0.0, 10.0, -15.0, 6.0)
 
 
-def _lerp(share: Jet, start: Jet, end: Jet) -> Jet:
-    return start + share * (end - start)
-
-
 def noise(x: Jet, y: Jet, lattice: NDArray[np.float64]) -> Jet:
-    """Return gradient noise with lattice nodes at whole numbers (Eqs. 5.40, 5.41).
+    """Return gradient noise of a lattice [node, node, 2] at points given in its cells (Eqs. 5.40, 5.41).
 
     It is 0 at every node and its slope there is the node's gradient.
-
-    Args:
-        x: first coordinate in lattice cells, between 0 and the lattice's cells.
-        y: second coordinate, alike.
-        lattice: gradients, shape [node, node, 2].
     """
     last = len(lattice) - 2
     # A point on the far wall belongs to the last cell, not to one beyond the lattice.
@@ -128,13 +107,13 @@ def noise(x: Jet, y: Jet, lattice: NDArray[np.float64]) -> Jet:
         return p.shift(-float(k)).scale(slope[:, 0]) + q.shift(-float(m)).scale(slope[:, 1])
 
     u, w = fade(p), fade(q)
-    return _lerp(w, _lerp(u, corner(0, 0), corner(1, 0)), _lerp(u, corner(0, 1), corner(1, 1)))
+    low = corner(0, 0) + u * (corner(1, 0) - corner(0, 0))
+    high = corner(0, 1) + u * (corner(1, 1) - corner(0, 1))
+    return low + w * (high - low)
 
 
 def ramp(t: Jet) -> Jet:
-    """Return Bridson's ramp: (15 t - 10 t^3 + 3 t^5) / 8 up to t = 1, then 1.
-
-    It starts from 0 with a slope of 15/8 and arrives with slope and curvature 0.
-    """
-    rising = t.polynomial(0.0, 1.875, 0.0, -1.25, 0.0, 0.375)
-    return rising.where(t.value < 1.0, 1.0)
+    """Return Bridson's ramp: (15 t - 10 t^3 + 3 t^5) / 8 up to t = 1, with two derivatives, then 1."""
+    value, *derivatives = t.polynomial(0.0, 1.875, 0.0, -1.25, 0.0, 0.375)._terms()
+    below = t.value < 1.0
+    return Jet(np.where(below, value, 1.0), *(np.where(below, term, 0.0) for term in derivatives))

@@ -46,60 +46,32 @@ from .transfer import (
     stepped,
 )
 
-_INSET = 1e-3
-"""Distance that particles keep from a wall [cells]."""
-
-_REACH = 64.0
-"""Bound of abs(v_p + A o) over dx/dt, the largest speed [1]; a violent impact reaches 2."""
-
-_HUGE = 3e38
-"""Stands for what is not a number where extremes are kept."""
-
+_INSET = 1e-3  # distance that particles keep from a wall [cells]
+_REACH = 64.0  # bound of abs(v_p + A o) over dx/dt, the largest speed [1]; a violent impact reaches 2
+_HUGE = 3e38  # stands for what is not a number where extremes are kept
 _LIQUID, _SNOW, _ROPE = int(Material.LIQUID), int(Material.SNOW), int(Material.ROPE)
 
 
 @ti.data_oriented
 class ParticleStress:
-    """Fields of a batch of scenarios and the kernels that advance them.
-
-    Attributes:
-        x: particle positions [length], and two zeros.
-        carried: what P2G spreads: v_x, v_y, 1, and J of liquid or 1.
-        slope_x: d/dx of the nodal v_x, v_y, r and Jbar at the particles, the first column of C.
-        slope_y: d/dy of the same.
-        f: deformation gradients of the solids [1].
-        matter: :class:`.Material`, J of liquid or plastic Jp of snow (1 in other solids), and two zeros.
-        extremes: largest speed, smallest and largest J, and largest abs(v) + abs(A o) of each
-            particle since the advance began.
-        fill: m / (rho dx^2), shape [scenario].
-        friction: Coulomb friction of the walls, shape [scenario].
-        least: smallest coordinate of a particle.
-        most: largest coordinate of a particle.
-        speed_bound: the CFL bound dx/dt [length/s].
-        reach_bound: largest abs(v) + abs(A o) that the sums have room for [length/s].
-    """
+    """Fields of a batch of scenarios and the kernels that advance them."""
 
     def __init__(
         self, parameters: FreeSurfaceParameters, *, scenarios: int, atomic: bool, threads: int
     ) -> None:
         """Round the constants and take the memory."""
-        self.parameters = parameters  # constants that the scenarios share
+        self.parameters = p = parameters  # constants that the scenarios share
         self.scenarios = scenarios  # scenarios advanced together
         self.atomic = atomic  # whether several threads run the phases
         self.threads = threads  # threads of the parallel loops on a CPU
         self.solid = True  # whether some particles are no liquid
-        self._set_constants()
-        self._make_fields()
-
-    def _set_constants(self) -> None:
-        p = self.parameters
-        dx = 1.0 / p.grid
-        self.inv_dx, self.dx, self.dt = float(p.grid), dx, p.dt
+        self.inv_dx, self.dx, self.dt = float(p.grid), 1.0 / p.grid, p.dt
         self.width = p.grid + 1
         self.low, self.high = p.wall, p.grid - p.wall
-        self.least, self.most = (self.low + _INSET) * dx, (self.high - _INSET) * dx
-        self.speed_bound = dx / p.dt
-        self.reach_bound = _REACH * self.speed_bound
+        # smallest and largest coordinate of a particle
+        self.least, self.most = (self.low + _INSET) * self.dx, (self.high - _INSET) * self.dx
+        self.speed_bound = self.dx / p.dt  # the CFL bound dx/dt [length/s]
+        self.reach_bound = _REACH * self.speed_bound  # of abs(v) + abs(A o), what sums have room for
         self.velocity_scale = fixed_point_scale(p.particles, self.reach_bound)
         self.count_scale = fixed_point_scale(p.particles, max(1.0, p.jacobian_max))
         self.velocity_unit, self.count_unit = 1.0 / self.velocity_scale, 1.0 / self.count_scale
@@ -111,14 +83,15 @@ class ParticleStress:
         self.rope = lame(p.rope_modulus, p.rope_poisson)
         self.snow = lame(p.snow_modulus, p.snow_poisson)
         self.yield_low, self.yield_high = 1.0 - p.snow_compression, 1.0 + p.snow_stretch
-
-    def _make_fields(self) -> None:
-        self.x = ti.Vector.field(4, ti.f32)
-        self.carried = ti.Vector.field(4, ti.f32)
+        self.x = ti.Vector.field(4, ti.f32)  # particle positions [length], and two zeros
+        self.carried = ti.Vector.field(4, ti.f32)  # what P2G spreads: v_x, v_y, 1, and J of liquid or 1
+        # d/dx of the nodal v_x, v_y, r and Jbar at the particles, the first column of C
         self.slope_x = ti.Vector.field(4, ti.f32)
-        self.slope_y = ti.Vector.field(4, ti.f32)
-        self.f = ti.Matrix.field(2, 2, ti.f32)
+        self.slope_y = ti.Vector.field(4, ti.f32)  # d/dy of the same
+        self.f = ti.Matrix.field(2, 2, ti.f32)  # deformation gradients of the solids [1]
+        # Material, J of liquid or plastic Jp of snow (1 in other solids), and two zeros
         self.matter = ti.Vector.field(4, ti.f32)
+        # largest speed, smallest and largest J, largest abs(v) + abs(A o) since the advance began
         self.extremes = ti.Vector.field(4, ti.f32)
         self.rows = [ti.Vector.field(4, ti.f32) for _ in range(3)]  # of the stencil
         self.a_x = ti.Vector.field(4, ti.f32)  # first column of A, scaled, and two zeros
@@ -126,16 +99,14 @@ class ParticleStress:
         self.here = ti.Vector.field(4, ti.f32)  # v_x, v_y, r, Jbar at the particle
         self.sums = ti.Vector.field(4, ti.i64)  # n v_x, n v_y, n, n J
         self.node = ti.Vector.field(4, ti.f32)  # v_x, v_y, r, Jbar
-        self.fill = ti.field(ti.f32)
-        self.friction = ti.field(ti.f32)
-        particles = (self.scenarios, self.parameters.particles)
-        nodes = (self.scenarios, self.width**2)
+        self.fill = ti.field(ti.f32)  # m / (rho dx^2), shape [scenario]
+        self.friction = ti.field(ti.f32)  # Coulomb friction of the walls, shape [scenario]
         carried = (self.x, self.carried, self.slope_x, self.slope_y, self.f, self.matter, self.extremes)
         derived = (*self.rows, self.a_x, self.a_y, self.here)
-        self._tree = backend.place(
-            *((particles, [field]) for field in carried + derived),
-            *((nodes, [field]) for field in (self.sums, self.node)),
-            ((self.scenarios,), [self.fill, self.friction]),
+        backend.place(
+            *(((scenarios, p.particles), [field]) for field in carried + derived),
+            *(((scenarios, self.width**2), [field]) for field in (self.sums, self.node)),
+            ((scenarios,), [self.fill, self.friction]),
         )
 
     # --- one substep: each function is one phase at one particle or node ---------------------
@@ -273,11 +244,8 @@ class ParticleStress:
     def flow(self, s: ti.i32, p: ti.i32, solid: Template) -> None:
         """Move a particle; update J of a liquid or F of a solid."""
         here, kind, old = self.here[s, p], self.matter[s, p][0], self.matter[s, p][1]
-        x = bounded(
-            ti.Vector([self.x[s, p][0], self.x[s, p][1]]) + self.dt * ti.Vector([here[0], here[1]]),
-            self.least,
-            self.most,
-        )
+        moved = ti.Vector([self.x[s, p][0], self.x[s, p][1]]) + self.dt * ti.Vector([here[0], here[1]])
+        x = bounded(moved, self.least, self.most)
         self.x[s, p] = ti.Vector([x[0], x[1], 0.0, 0.0])
         c = self.gradient(s, p)
         j = old + self.dt * (c[0, 0] + c[1, 1]) * old
@@ -299,14 +267,8 @@ class ParticleStress:
         self.matter[s, p] = ti.Vector([kind, ratio, 0.0, 0.0])
         self.carried[s, p] = ti.Vector([here[0], here[1], 1.0, spread])
         seen, speed = self.extremes[s, p], largest_of(ti.abs(here[0]), ti.abs(here[1]))
-        self.extremes[s, p] = ti.Vector(
-            [
-                larger(speed, seen[0]),
-                -larger(-jacobian, -seen[1]),
-                larger(jacobian, seen[2]),
-                seen[3],
-            ]
-        )
+        least, most = -larger(-jacobian, -seen[1]), larger(jacobian, seen[2])
+        self.extremes[s, p] = ti.Vector([larger(speed, seen[0]), least, most, seen[3]])
 
     # --- the drivers: the same phases in the same order --------------------------------------
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from lagbench.atomic import write_atomically
@@ -30,19 +30,7 @@ from lagbench.errors import DataError, LagbenchError
 MARKER = "\nmeasured:"  # where the generated part of datasets.yaml begins
 _NOTICE = "# Written by `python -m lagbench.generators.record`; do not edit below this line."
 _SHORT = 16
-_WIDTH = 110
-
-
-def check_files(folder: Path, manifest: Manifest) -> None:
-    """Compare every file of a data set with its manifest, byte by byte."""
-    for entry in manifest.files:
-        path = folder / entry.path
-        if not path.is_file() or file_sha256(path) != entry.file_sha256:
-            raise DataError(
-                "a file is not the one that the manifest describes",
-                where=str(path),
-                fix=f"lagbench generate --split {manifest.split} --size {manifest.size}",
-            )
+_PER_LINE = (110 - 10) // len("-1.00000000e-05, ")  # numbers of a list in a line of at most 110 characters
 
 
 def measured_values(manifest: Manifest) -> Measured:
@@ -64,41 +52,24 @@ def measured_values(manifest: Manifest) -> Measured:
     )
 
 
-def with_statistics(folder: Path, manifest: Manifest) -> Manifest:
-    """Return a manifest whose statistics follow from the files of train."""
-    train = [folder / entry.path for entry in manifest.files if entry.subset == "train"]
-    return manifest.model_copy(update={"statistics": file_statistics(train)})
-
-
 def render(measured: Mapping[str, Mapping[str, Measured]]) -> str:
     """Return the measured block as YAML 1.1 text, the same text for the same values."""
     lines = [_NOTICE, "measured:"]
     for split, sizes in sorted(measured.items()):
         lines.append(f"  {split}:")
         for size, values in sorted(sizes.items()):
-            lines.append(f"    {size}:")
-            lines += [f"      {line}" for line in _block(values)]
+            lines += [f"    {size}:", f'      dataset_sha256: "{values.dataset_sha256}"']
+            lines.append("      subset_sha256:")
+            lines += [f'        {subset}: "{digest}"' for subset, digest in values.subset_sha256.items()]
+            lines.append("      scenario_sha256:")
+            lines += [f'        {i}: "{digest}"' for i, digest in sorted(values.scenario_sha256.items())]
+            lines.append("      statistics:")
+            for name, row in values.statistics.items():
+                lines.append(f"        {name}: [{', '.join(map(_number, row))}]")
+            numbers = [_number(value) for value in values.twin_floor]
+            rows = [", ".join(numbers[k : k + _PER_LINE]) for k in range(0, len(numbers), _PER_LINE)]
+            lines += ["      twin_floor:", "        [" + ",\n         ".join(rows) + "]"]
     return "\n".join(lines) + "\n"
-
-
-def _block(values: Measured) -> Iterator[str]:
-    yield f'dataset_sha256: "{values.dataset_sha256}"'
-    yield "subset_sha256:"
-    for subset, digest in values.subset_sha256.items():
-        yield f'  {subset}: "{digest}"'
-    yield "scenario_sha256:"
-    for scenario, digest in sorted(values.scenario_sha256.items()):
-        yield f'  {scenario}: "{digest}"'
-    yield "statistics:"
-    for name, row in values.statistics.items():
-        yield f"  {name}: [{', '.join(map(_number, row))}]"
-    yield "twin_floor:"
-    # A flow sequence in lines of equal counts.
-    numbers = [_number(value) for value in values.twin_floor]
-    per_line = (_WIDTH - 10) // (len("-1.00000000e-05, "))
-    lines = [", ".join(numbers[k : k + per_line]) for k in range(0, len(numbers), per_line)]
-    for k, line in enumerate(lines):
-        yield ("  [" if k == 0 else "   ") + line + ("]" if k == len(lines) - 1 else ",")
 
 
 def _number(value: float) -> str:
@@ -159,11 +130,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
         manifest = read_manifest(root, size.split, size.name, size.major)
         if manifest is None:
             raise DataError("the data set has no manifest", where=str(folder))
-        check_files(folder, manifest)
+        for entry in manifest.files:
+            path = folder / entry.path
+            if not path.is_file() or file_sha256(path) != entry.file_sha256:
+                raise DataError(
+                    "a file is not the one that the manifest describes",
+                    where=str(path),
+                    fix=f"lagbench generate --split {manifest.split} --size {manifest.size}",
+                )
         released, checkout = options.released, options.registry.parent / "tests"
         if released is None and checkout.is_dir():
             released = checkout / "data" / "released_hashes.json"
-        manifest = with_statistics(folder, manifest)
+        # what the manifest says of train is not taken on trust
+        train = [folder / entry.path for entry in manifest.files if entry.subset == "train"]
+        manifest = manifest.model_copy(update={"statistics": file_statistics(train)})
         allow = options.allow_change
         values = record(size, manifest, registry=options.registry, released=released, allow=allow)
     except LagbenchError as error:

@@ -26,9 +26,6 @@ Region = tuple[tuple[float, float], tuple[float, float]]
 # Roberts' R2 sequence: 1/g and 1/g^2 for the real root g of g^3 = g + 1.
 _R2 = np.array([0.7548776662466927, 0.5698402909980532])
 
-SEED_BLOCK = 1 << 16
-"""Points of the sequence drawn at once: a million particles take no memory beside their own."""
-
 
 class Shape(Protocol):
     """A body's outline about the origin."""
@@ -53,6 +50,12 @@ class Rectangle:
     width: float  # extent across it [length]
     axis: tuple[float, float] = (1.0, 0.0)  # unit vector
 
+    @classmethod
+    def of_area(cls, area: float, aspect: float) -> Rectangle:
+        """Return the level rectangle of this area [length^2] and length over width [1]."""
+        length = math.sqrt(area * aspect)
+        return cls(length, area / length)
+
     @property
     def area(self) -> float:
         """Length times width."""
@@ -62,10 +65,7 @@ class Rectangle:
     def reach(self) -> tuple[float, float]:
         """Half the bounding box of the turned rectangle."""
         c, s = abs(self.axis[0]), abs(self.axis[1])
-        return (
-            0.5 * (c * self.length + s * self.width),
-            0.5 * (s * self.length + c * self.width),
-        )
+        return 0.5 * (c * self.length + s * self.width), 0.5 * (s * self.length + c * self.width)
 
     def distance(self, position: Array) -> Array:
         """Return the exact signed distance."""
@@ -114,19 +114,21 @@ class Blobs:
 
     @classmethod
     def of_area(cls, area: float, offsets: Array, *, cells: int) -> Blobs:
-        """Scale an arrangement of unit discs until their union covers an area.
+        """Scale an arrangement of unit discs, centres in radii [disc, 2], until their union covers an area.
 
-        The union of unit discs is measured once, by counting the cells of a grid; a similar
-        arrangement of any other area follows by its scale.
-
-        Args:
-            area: wanted area of the union [length^2].
-            offsets: centres in radii, shape [disc, 2].
-            cells: cells of that grid across the bounding box; at 512 the error is about 1e-3.
+        The union of unit discs is measured once, by counting cells of a grid, so many across the bounding
+        box; at 512 the error is about 1e-3. Any other area follows by its scale.
         """
         low, high = offsets.min(axis=0) - 1.0, offsets.max(axis=0) + 1.0
-        centres = offsets - 0.5 * (low + high)
-        scale = math.sqrt(area / _union_area(centres, high - low, cells))
+        centres, extent = offsets - 0.5 * (low + high), high - low
+        middle = (np.arange(cells) + 0.5) / cells - 0.5
+        x, y = (side.ravel() for side in np.meshgrid(middle * extent[0], middle * extent[1]))
+        covered = np.zeros(cells * cells, dtype=np.bool_)
+        for centre in centres:
+            dx, dy = x - centre[0], y - centre[1]
+            covered |= dx * dx + dy * dy <= 1.0
+        counted = float(np.count_nonzero(covered) * (extent[0] * extent[1])) / (cells * cells)
+        scale = math.sqrt(area / counted)
         placed = tuple((float(x) * scale, float(y) * scale) for x, y in centres)
         return cls(placed, scale, area)
 
@@ -140,17 +142,6 @@ class Blobs:
         """Return the signed distance, exact outside and on the outline."""
         discs = [Disc(self.radius).distance(position - np.array(c)) for c in self.centres]
         return np.asarray(np.minimum.reduce(discs))
-
-
-def _union_area(centres: Array, extent: Array, cells: int) -> float:
-    """Return the area that unit discs cover within a box about the origin."""
-    middle = (np.arange(cells) + 0.5) / cells - 0.5
-    x, y = (side.ravel() for side in np.meshgrid(middle * extent[0], middle * extent[1]))
-    covered = np.zeros(cells * cells, dtype=np.bool_)
-    for centre in centres:
-        dx, dy = x - centre[0], y - centre[1]
-        covered |= dx * dx + dy * dy <= 1.0
-    return float(np.count_nonzero(covered) * (extent[0] * extent[1])) / (cells * cells)
 
 
 @dataclass(frozen=True)
@@ -186,18 +177,15 @@ def place(rng: RandomSource, shape: Shape, region: Region) -> Body:
 
 
 def seeds(rng: RandomSource, body: Body, count: int) -> Array:
-    """Spread particles evenly inside a body.
+    """Spread particles evenly inside a body: multiples of 2^-20 [length], shape [count, 2].
 
     The first ``count`` points inside it of Roberts' R2 low-discrepancy sequence, laid by a
     random shift over the smallest square about the bounding box, so that spacings are alike
     in both directions however slender the body is.
-
-    Returns:
-        Positions, multiples of 2^-20 [length], shape [count, 2].
     """
     shift = rng.random((2,))
     side = 2.0 * max(body.shape.reach)
-    block = min(4 * count, SEED_BLOCK)
+    block = min(4 * count, 1 << 16)  # at once: a million particles take no memory beside their own
     found, missing, start = [np.empty((0, 2))], count, 1
     while missing > 0:
         index = np.arange(start, start + block, dtype=np.float64)[:, None]

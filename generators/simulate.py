@@ -20,7 +20,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -123,38 +123,6 @@ def active_frames(energies: Sequence[float], task: Task) -> int:
     return max(0, last + 1 - task.input_frames)
 
 
-@dataclass
-class _Recording:
-    """One scenario's open file and its kinetic energy, frame by frame."""
-
-    writer: ScenarioWriter
-    mass: float
-    energies: list[float] = field(default_factory=list)
-
-    def append(self, position: NDArray[np.float32], velocity: NDArray[np.float32]) -> None:
-        self.writer.append(position, velocity)
-        speed = velocity.astype(np.float64).ravel()
-        # An exact sum: which frames are active enters the content hash.
-        self.energies.append(0.5 * self.mass * math.fsum((speed * speed).tolist()))
-
-
-def _facts(batch: Batch, index: int, energies: list[float]) -> Facts:
-    extremes, size = batch.extremes[index], batch.job.size
-    largest = max(energies)
-    return Facts(
-        start_frame=batch.states[index].start_frame,
-        kinetic_energy_first=energies[0],
-        kinetic_energy_last=energies[-1],
-        kinetic_energy_max=largest,
-        kinetic_energy_mean=math.fsum(energies) / len(energies),
-        energy_last_over_max=energies[-1] / largest if largest > 0.0 else 0.0,
-        max_speed=extremes.max_speed,
-        cfl=extremes.max_speed * size.dt * size.grid,
-        jacobian_min=extremes.jacobian_min,
-        jacobian_max=extremes.jacobian_max,
-    )
-
-
 def simulate(
     job: SimulationJob, report: Report, *, clock: Callable[[], float] = time.process_time
 ) -> list[Simulated]:
@@ -163,24 +131,37 @@ def simulate(
     Kernels compile on the way to the first two frames, so time is taken from there on.
     """
     batch, size = Batch(job, report), job.size
+    masses = [_particle_mass(size, state) for state in batch.states]
+    kinetic: list[list[float]] = [[] for _ in masses]  # energies by scenario, frame by frame
     begun = clock()
     with ExitStack() as stack:
-        recordings = [
-            _Recording(
-                stack.enter_context(scenario_writer(job, scenario, state)), _particle_mass(job.size, state)
-            )
-            for scenario, state in zip(job.scenarios, batch.states, strict=True)
-        ]
+        pairs = zip(job.scenarios, batch.states, strict=True)
+        writers = [stack.enter_context(scenario_writer(job, scenario, state)) for scenario, state in pairs]
         for index, frame in batch.recordings():
-            recordings[index].append(*batch.frame(index))
+            position, velocity = batch.frame(index)
+            writers[index].append(position, velocity)
+            speed = velocity.astype(np.float64).ravel()
+            # An exact sum: which frames are active enters the content hash.
+            kinetic[index].append(0.5 * masses[index] * math.fsum((speed * speed).tolist()))
             if frame == COMPILING - 1:
                 begun = clock()
-        if isinstance(batch.solver.parameters, FreeSurfaceParameters):
-            for recording in recordings:
-                active = active_frames(recording.energies, job.size.task)
-                recording.writer.state(active_frames=active)
-        for index, recording in enumerate(recordings):
-            recording.writer.state_facts(asdict(_facts(batch, index, recording.energies)))
+        for writer, energies, state, seen in zip(writers, kinetic, batch.states, batch.extremes, strict=True):
+            if isinstance(batch.solver.parameters, FreeSurfaceParameters):
+                writer.state(active_frames=active_frames(energies, size.task))
+            largest = max(energies)
+            facts = Facts(
+                start_frame=state.start_frame,
+                kinetic_energy_first=energies[0],
+                kinetic_energy_last=energies[-1],
+                kinetic_energy_max=largest,
+                kinetic_energy_mean=math.fsum(energies) / len(energies),
+                energy_last_over_max=energies[-1] / largest if largest > 0.0 else 0.0,
+                max_speed=seen.max_speed,
+                cfl=seen.max_speed * size.dt * size.grid,
+                jacobian_min=seen.jacobian_min,
+                jacobian_max=seen.jacobian_max,
+            )
+            writer.state_facts(asdict(facts))
     timed = size.frame_count(job.scenarios[0]) - COMPILING
     pace = Pace(
         seconds=clock() - begun,
@@ -190,19 +171,17 @@ def simulate(
     return [
         Simulated(
             scenario=scenario,
-            content_sha256=recording.writer.content_sha256,
+            content_sha256=writer.content_sha256,
             pace=pace if timed > 0 and len(job.scenarios) == 1 else None,
         )
-        for scenario, recording in zip(job.scenarios, recordings, strict=True)
+        for scenario, writer in zip(job.scenarios, writers, strict=True)
     ]
-
-
-_STREAM = 1  # appended to a scenario's seed: the nudge has a random stream of its own
 
 
 def nudge(size: Size, scenario: int) -> NDArray[np.float32]:
     """Return the displacement of a scenario's twin [length], shape [particle, 2]."""
-    seed = (*entropy(size.split, size.name, size.major, scenario), _STREAM)
+    # a random stream of its own: the scenario's seed and a 1
+    seed = (*entropy(size.split, size.name, size.major, scenario), 1)
     rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed)))
     signs = np.where(rng.random((size.particles, 2)) < 0.5, -1.0, 1.0)
     return (QUANTUM * signs).astype(np.float32)

@@ -18,6 +18,7 @@ kernel that returns ``Nothing``.
 """
 
 import inspect
+import math
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import taichi as ti
@@ -31,11 +32,9 @@ else:
     Value = inspect.Parameter.empty
     Nothing = tuple[()]
 
+# 1.5 x 2^52: added to a float64 below 2^51, it leaves the rounded integer in the low bits.
 _ROUNDING_SHIFT = 6755399441055744.0
-"""1.5 x 2^52: added to a float64 below 2^51, it leaves the rounded integer in the low bits."""
-
-_SHIFT_BITS = 0x4338000000000000
-"""The bits of that float64."""
+_SHIFT_BITS = 0x4338000000000000  # of that float64
 
 
 def fixed_point_scale(particles: int, bound: float) -> float:
@@ -48,21 +47,8 @@ def fixed_point_scale(particles: int, bound: float) -> float:
     True
     """
     bits = min(50, 62 - (particles - 1).bit_length())
-    return 2.0**bits / power_of_two_above(bound)
-
-
-def power_of_two_above(value: float) -> float:
-    """Return the smallest power of two that is not below a positive value.
-
-    >>> power_of_two_above(12.5)
-    16.0
-    """
-    power = 1.0
-    while power < value:
-        power *= 2.0
-    while power / 2.0 >= value:
-        power /= 2.0
-    return power
+    mantissa, exponent = math.frexp(bound)  # the mantissa of a power of two is a half
+    return math.ldexp(1.0, bits - (exponent - (mantissa == 0.5)))
 
 
 @ti.func
@@ -113,14 +99,7 @@ def from_fixed(total: Value, inverse_scale: ti.f32) -> Value:
 
 @ti.func
 def accumulate(sums: Template, node: ti.math.ivec2, scaled: ti.math.vec4, atomic: Template) -> None:
-    """Add scaled contributions to one node's fixed-point sums.
-
-    Args:
-        sums: vector field of int64, shape [scenario, node].
-        node: its index.
-        scaled: contributions, already times their scales.
-        atomic: whether other threads may add to the same node.
-    """
+    """Add contributions, times their scales, to one node's sums; atomic where other threads may as well."""
     # Even in serial code `+=` is an atomic, which costs five times as much.
     if ti.static(atomic):
         ti.atomic_add(sums[node], to_fixed(scaled))

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.generators.closed_box import ClosedBox
+from lagbench.generators.draws import fill, quantise
 from lagbench.generators.solver import Device, build
 from lagbench.generators.split import ClosedBoxParameters, InitialState
 
@@ -18,19 +19,9 @@ ALL_LIDS = (0.3, -0.2, 0.25, -0.35)
 
 def parameters(**changes: float | bool) -> ClosedBoxParameters:
     """Return the cavity's constants on a box of 11 x 11 cells with 700 particles, or changes of them."""
-    values: dict[str, float | bool] = {
-        "particles": 700,
-        "grid": 16,
-        "dt": 4e-3,
-        "wall": 2,
-        "no_slip": True,
-        "density": 1e-4,
-        "modulus": 5e-4,
-        "velocity_relaxation": 0.01,
-        "jacobian_relaxation": 0.1,
-        "density_coupling": 0.01,
-        "shift": 0.01,
-    }
+    values: dict[str, float | bool] = {"particles": 700, "grid": 16, "dt": 4e-3, "wall": 2, "no_slip": True}
+    values |= {"density": 1e-4, "modulus": 5e-4, "velocity_relaxation": 0.01, "jacobian_relaxation": 0.1}
+    values |= {"density_coupling": 0.01, "shift": 0.01}
     return ClosedBoxParameters(**(values | changes))
 
 
@@ -38,26 +29,6 @@ def box(constants: ClosedBoxParameters) -> tuple[float, float]:
     """Return the coordinates of the low and the high walls."""
     low = (constants.wall + 0.5) / constants.grid
     return low, 1.0 - low
-
-
-def lattice(constants: ClosedBoxParameters, seed: int, jitter: float = 0.25) -> NDArray[np.float64]:
-    """Return particles that fill the box: columns of nearly equal spacing, each moved at random."""
-    rng = np.random.default_rng(seed)
-    low, high = box(constants)
-    columns = int(np.sqrt(constants.particles))
-    ends = constants.particles * np.arange(columns + 1) // columns
-    parts = []
-    for column, count in enumerate(np.diff(ends)):
-        moved = (rng.random((count, 2)) - 0.5) * jitter + 0.5
-        x = (column + moved[:, 0]) / columns
-        y = (np.arange(count) + moved[:, 1]) / count
-        parts.append(np.stack([x, y], axis=1))
-    return quantise(low + (high - low) * np.concatenate(parts))
-
-
-def quantise(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Round to multiples of 2^-20."""
-    return np.round(values * 2.0**20) / 2.0**20
 
 
 def scenario(
@@ -75,14 +46,13 @@ def scenario(
     With ``frames`` they slide up to that fast, as a random program of so many frames says.
     """
     rng = np.random.default_rng([seed, 1])
-    low, high = box(constants)
-    count = constants.particles
+    (low, high), count = box(constants), constants.particles
     wall_velocity = np.zeros((4, 2))
     wall_velocity[(0, 1, 2, 3), (1, 1, 0, 0)] = walls
     if frames:
         wall_velocity = quantise(wall_velocity * (2.0 * rng.random((frames, 4, 1)) - 1.0))
     return InitialState(
-        position=lattice(constants, seed, jitter),
+        position=fill(np.random.default_rng(seed), count, low=low, high=high, jitter=jitter),
         velocity=quantise((2.0 * rng.random((count, 2)) - 1.0) * speed),
         affine=quantise((2.0 * rng.random((count, 2, 2)) - 1.0) * speed * constants.grid / 4.0),
         material=np.zeros(count, np.int8),
@@ -92,47 +62,29 @@ def scenario(
     )
 
 
-@functools.cache
-def _built(
-    constants: ClosedBoxParameters, device: Device, scenarios: int, threads: int | None, copy: int
-) -> ClosedBox:
-    assert copy >= 0
-    return cast("ClosedBox", build(constants, device=device, scenarios=scenarios, threads=threads))
+compiled = functools.cache(build)
 
 
 def loaded(
-    constants: ClosedBoxParameters,
-    states: Sequence[InitialState],
-    *,
-    device: Device = Device.CPU,
-    threads: int | None = None,
-    copy: int = 0,
+    constants: ClosedBoxParameters, states: Sequence[InitialState], **options: Device | int
 ) -> ClosedBox:
-    """Return a solver with fresh scenarios; solvers of other ``copy`` are other objects."""
-    solver = _built(constants, device, len(states), threads, copy)
+    """Return a solver with fresh scenarios; the next call with its arguments takes it over."""
+    solver = cast("ClosedBox", compiled(constants, scenarios=len(states), **options))
     solver.load(states)
     return solver
 
 
 def snapshot(solver: ClosedBox) -> dict[str, NDArray[Any]]:
     """Return every array that a caller can read, as it is now."""
-    return {
-        "position": solver.position(),
-        "velocity": solver.velocity(),
-        "jacobian": solver.jacobian(),
-        "grid_velocity": solver.grid_velocity(),
-    }
+    names = ("position", "velocity", "jacobian", "grid_velocity")
+    return {name: getattr(solver, name)() for name in names}
 
 
 def after(
-    constants: ClosedBoxParameters,
-    states: Sequence[InitialState],
-    substeps: int,
-    *,
-    device: Device = Device.CPU,
-    threads: int | None = None,
+    constants: ClosedBoxParameters, states: Sequence[InitialState], *substeps: int, **options: Device | int
 ) -> dict[str, NDArray[Any]]:
-    """Return the arrays of fresh scenarios after some substeps."""
-    solver = loaded(constants, states, device=device, threads=threads)
-    solver.advance(substeps)
+    """Return the arrays of fresh scenarios after some advances."""
+    solver = loaded(constants, states, **options)
+    for count in substeps:
+        solver.advance(count)
     return snapshot(solver)

@@ -29,20 +29,9 @@ class Part:
 
 def parameters(**changes: float) -> FreeSurfaceParameters:
     """Return the constants of multimaterial with 500 particles on a coarse grid, or changes of them."""
-    values: dict[str, float] = {
-        "particles": 500,
-        "grid": 32,
-        "dt": 1 / 600,
-        "wall": 2,
-        "gravity": 2.5,
-        "density": 1.0,
-        "liquid_modulus": 60.0,
-        "liquid_viscosity": 1e-3,
-        "jacobian_relaxation": 0.2,
-        "density_coupling": 0.01,
-        "jacobian_min": 0.5,
-        "jacobian_max": 1.0,
-    }
+    values: dict[str, float] = {"particles": 500, "grid": 32, "dt": 1 / 600, "wall": 2, "gravity": 2.5}
+    values |= {"density": 1.0, "liquid_modulus": 60.0, "liquid_viscosity": 1e-3, "density_coupling": 0.01}
+    values |= {"jacobian_relaxation": 0.2, "jacobian_min": 0.5, "jacobian_max": 1.0}
     return FreeSurfaceParameters(**(values | changes))
 
 
@@ -65,36 +54,23 @@ def scenario(
     )
 
 
-@functools.cache
-def _solver(
-    constants: FreeSurfaceParameters, device: Device, scenarios: int, threads: int | None
-) -> FreeSurface:
-    """Build a solver once: building compiles."""
-    built = build(constants, device=device, scenarios=scenarios, threads=threads)
-    return cast("FreeSurface", built)
+compiled = functools.cache(build)
 
 
 def start(
-    constants: FreeSurfaceParameters,
-    states: Sequence[InitialState],
-    device: Device = Device.CPU,
-    threads: int | None = None,
+    constants: FreeSurfaceParameters, states: Sequence[InitialState], **options: Device | int
 ) -> FreeSurface:
     """Return a solver that holds some scenarios; the next call with its arguments takes it over."""
-    solver = _solver(constants, device, len(states), threads)
+    solver = cast("FreeSurface", compiled(constants, scenarios=len(states), **options))
     solver.load(states)
     return solver
 
 
 def run(
-    constants: FreeSurfaceParameters,
-    states: Sequence[InitialState],
-    *substeps: int,
-    device: Device = Device.CPU,
-    threads: int | None = None,
+    constants: FreeSurfaceParameters, states: Sequence[InitialState], *substeps: int, **options: Device | int
 ) -> list[NDArray[np.float32]]:
     """Return every array of the state of some scenarios after some advances."""
-    solver = start(constants, states, device, threads)
+    solver = start(constants, states, **options)
     for count in substeps:
         solver.advance(count)
     return snapshot(solver)
@@ -102,10 +78,5 @@ def run(
 
 def snapshot(solver: FreeSurface) -> list[NDArray[np.float32]]:
     """Return every array that the state consists of."""
-    return [
-        solver.position(),
-        solver.velocity(),
-        solver.affine(),
-        solver.deformation(),
-        solver.volume_ratio(),
-    ]
+    names = ("position", "velocity", "affine", "deformation", "volume_ratio")
+    return [getattr(solver, name)() for name in names]

@@ -49,8 +49,10 @@ class ReferenceClosedBox:
             self.done += 1
             sums = self.to_grid()
             v, r, jbar = self.fold(sums)
-            self.fill_ghosts(r, even=True)
-            self.fill_ghosts(jbar, even=True)
+            low, high = self.low, self.high
+            for q in (r, jbar):  # scalars are even: columns first, then whole rows with the corners
+                q[low], q[high] = q[low + 1], q[high - 1]
+                q[:, low], q[:, high] = q[:, low + 1], q[:, high - 1]
             self.mirror(v, moving=True)
             a = self.acceleration(v, jbar)
             v = v + a
@@ -74,13 +76,12 @@ class ReferenceClosedBox:
         east, north = self.cell_scale * self.c[:, :, 0], self.cell_scale * self.c[:, :, 1]
         centred = offset - f(1.0)
         middle = mv * self.v - centred[:, :1] * east - centred[:, 1:] * north
-        for i in range(3):
-            for k in range(3):
-                w = (weight[i][:, 0] * weight[k][:, 1])[:, None]
-                momentum = (middle + f(i - 1) * east) + f(k - 1) * north
-                parts = np.concatenate([w * momentum, w * m, w * (m * self.j[:, None])], axis=1)
-                node = (base[:, 0] + i, base[:, 1] + k)
-                np.add.at(sums, node, np.rint(parts.astype(np.float64)).astype(np.int64))
+        for i, k in np.ndindex(3, 3):
+            w = (weight[i][:, 0] * weight[k][:, 1])[:, None]
+            momentum = (middle + f(i - 1) * east) + f(k - 1) * north
+            parts = np.concatenate([w * momentum, w * m, w * (m * self.j[:, None])], axis=1)
+            node = (base[:, 0] + i, base[:, 1] + k)
+            np.add.at(sums, node, np.rint(parts.astype(np.float64)).astype(np.int64))
         return sums
 
     def fold(self, sums: NDArray[np.int64]) -> tuple[Single, Single, Single]:
@@ -111,12 +112,6 @@ class ReferenceClosedBox:
         v = np.where(filled[:, :, None], momentum / mass[:, :, None], f(0.0))
         r = np.where(filled, mass * self.fill, f(0.0))
         return v, r, np.where(filled, total[:, :, 3].astype(f) * unit / mass, f(1.0))
-
-    def fill_ghosts(self, q: Single, *, even: bool) -> None:
-        """Mirror a scalar, evenly or oddly: columns first, then whole rows with the corners."""
-        low, high, sign = self.low, self.high, f(1.0 if even else -1.0)
-        q[low], q[high] = sign * q[low + 1], sign * q[high - 1]
-        q[:, low], q[:, high] = sign * q[:, low + 1], sign * q[:, high - 1]
 
     def mirror(self, v: Single, *, moving: bool) -> None:
         """Mirror a vector: normal odd, tangential odd about the wall's velocity (even: free slip)."""
@@ -156,15 +151,14 @@ class ReferenceClosedBox:
         nodal = np.concatenate([v, r[:, :, None], jbar[:, :, None]], axis=2)
         here, slope_x, slope_y = (np.zeros((p.particles, 4), f) for _ in range(3))
         gain = np.zeros((p.particles, 2), f)
-        for i in range(3):
-            for k in range(3):
-                node = (base[:, 0] + i, base[:, 1] + k)
-                w = (weight[i][:, 0] * weight[k][:, 1])[:, None]
-                share = w * nodal[node]
-                gain += w * a[node]
-                here += share
-                slope_x += f(i - 1) * share
-                slope_y += f(k - 1) * share
+        for i, k in np.ndindex(3, 3):
+            node = (base[:, 0] + i, base[:, 1] + k)
+            w = (weight[i][:, 0] * weight[k][:, 1])[:, None]
+            share = w * nodal[node]
+            gain += w * a[node]
+            here += share
+            slope_x += f(i - 1) * share
+            slope_y += f(k - 1) * share
         slope_x = self.gradient * (slope_x - (offset[:, :1] - f(1.0)) * here)
         slope_y = self.gradient * (slope_y - (offset[:, 1:] - f(1.0)) * here)
         volume = f(1.0) / np.maximum(here[:, 2], f(0.5))

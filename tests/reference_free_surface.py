@@ -28,11 +28,6 @@ def lame(young: float, poisson: float) -> tuple[float, float]:
     return young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
 
 
-def clamp(value: Floats, low: Float, high: Float) -> Floats:
-    """Limit to [low, high]."""
-    return np.minimum(np.maximum(value, low), high)
-
-
 def fixed(value: Floats, scale: float) -> NDArray[np.int64]:
     """Round to the nearest multiple of 1/scale, ties to even, as an integer."""
     return np.rint(value.astype(np.float64) * scale).astype(np.int64)
@@ -94,34 +89,26 @@ class Stencil:
 
     def nodes(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.int32], Floats, Floats, Floats]]:
         """Yield (node i, node k, weight, offset x [cells], offset y [cells]) for the nine nodes."""
-        for i in range(3):
-            for k in range(3):
-                weight = self.weights[i][:, 0] * self.weights[k][:, 1]
-                offset = Float(i) - self.distance[:, 0], Float(k) - self.distance[:, 1]
-                yield self.base[:, 0] + i, self.base[:, 1] + k, weight, *offset
+        for i, k in np.ndindex(3, 3):
+            weight = self.weights[i][:, 0] * self.weights[k][:, 1]
+            offset = Float(i) - self.distance[:, 0], Float(k) - self.distance[:, 1]
+            yield self.base[:, 0] + i, self.base[:, 1] + k, weight, *offset
 
 
 class FreeSurfaceReference:
-    """One scenario of the free-surface solver.
-
-    Attributes:
-        position: [length], shape [particle, 2].
-        velocity: [length/s], shape [particle, 2].
-        affine: C [1/s], components (xx, xy, yx, yy) of shape [particle].
-        deformation: F [1], components like ``affine``.
-        ratio: J of liquid, Jp of snow, 1 elsewhere [1], shape [particle].
-    """
+    """One scenario of the free-surface solver."""
 
     def __init__(self, parameters: FreeSurfaceParameters, state: InitialState) -> None:
         """Start from an initial state; constants are computed in float64, then rounded once."""
         p = self.p = parameters
         count = len(state.position)
-        self.position = state.position.astype(Float)
-        self.velocity = state.velocity.astype(Float)
+        self.position = state.position.astype(Float)  # [length], shape [particle, 2]
+        self.velocity = state.velocity.astype(Float)  # [length/s], shape [particle, 2]
+        # C [1/s] and F [1], components (xx, xy, yx, yy) of shape [particle]
         self.affine: Components = tuple(state.affine.reshape(count, 4).T.astype(Float))
         ones, zeros = np.ones(count, Float), np.zeros(count, Float)
         self.deformation: Components = (ones, zeros, zeros, ones)
-        self.ratio = ones
+        self.ratio = ones  # J of liquid, Jp of snow, 1 elsewhere [1], shape [particle]
         self.liquid = state.material == Material.LIQUID
         self.snow = state.material == Material.SNOW
         moduli = {
@@ -148,8 +135,8 @@ class FreeSurfaceReference:
     def stress(self) -> tuple[Floats, Floats, Floats]:
         """Kirchhoff stress (xx, xy, yy)."""
         p, f = self.p, Split.of(self.deformation)
-        exponent = clamp(Float(p.snow_hardening) * (ONE - self.ratio), Float(-4), Float(4))
-        stiff = clamp(exp(exponent), Float(p.snow_hardening_min), Float(p.snow_hardening_max))
+        exponent = np.clip(Float(p.snow_hardening) * (ONE - self.ratio), Float(-4), Float(4))
+        stiff = np.clip(exp(exponent), Float(p.snow_hardening_min), Float(p.snow_hardening_max))
         factor = np.where(self.snow, stiff, ONE)
         mu, la = self.mu * factor, self.la * factor
         square = f.h * f.h + f.k * f.k
@@ -237,17 +224,14 @@ class FreeSurfaceReference:
         self.velocity = np.stack([vx, vy], 1)
         dx = 1 / self.p.grid
         low, high = Float((self.p.wall + 1e-3) * dx), Float((self.p.grid - self.p.wall - 1e-3) * dx)
-        self.position = clamp(self.position + Float(self.p.dt) * self.velocity, low, high)
-        self.relax_liquid(r, smooth)
-        self.deform()
-
-    def relax_liquid(self, density: Floats, smooth: Floats) -> None:
-        """J <- J (1 + dt tr C) + kappa (Jbar - J); J <- J + theta (1 / max(r, 1) - J); limits."""
+        self.position = np.clip(self.position + Float(self.p.dt) * self.velocity, low, high)
+        # J <- J (1 + dt tr C) + kappa (Jbar - J); J <- J + theta (1 / max(r, 1) - J); limits.
         p, old = self.p, self.ratio
         j = old + Float(p.dt) * (self.affine[0] + self.affine[3]) * old
         j = j + Float(p.jacobian_relaxation) * (smooth - old)
-        j = j + Float(p.density_coupling) * (ONE / np.maximum(density, ONE) - j)
-        self.ratio = np.where(self.liquid, clamp(j, Float(p.jacobian_min), Float(p.jacobian_max)), old)
+        j = j + Float(p.density_coupling) * (ONE / np.maximum(r, ONE) - j)
+        self.ratio = np.where(self.liquid, np.clip(j, Float(p.jacobian_min), Float(p.jacobian_max)), old)
+        self.deform()
 
     def deform(self) -> None:
         """F <- (I + dt C) F for solids; snow then yields."""
@@ -258,24 +242,21 @@ class FreeSurfaceReference:
             c + dt * (cyx * a + cyy * c),
             d + dt * (cyx * b + cyy * d),
         )
-        elastic, factor = self.yielded(trial)  # type: ignore[arg-type]
-        plastic = clamp(self.ratio * factor, Float(self.p.snow_jp_min), Float(self.p.snow_jp_max))
-        self.ratio = np.where(self.snow, plastic, self.ratio)
-        self.deformation = tuple(  # type: ignore[assignment]
-            np.where(self.liquid, old, np.where(self.snow, kept, new))
-            for old, kept, new in zip(self.deformation, elastic, trial, strict=True)
-        )
-
-    def yielded(self, trial: Components) -> tuple[Components, Floats]:
-        """Clamp the principal stretches; return the elastic gradient and the factor on Jp."""
+        # Snow: the principal stretches are clamped; Jp takes the rest.
         low, high = Float(1 - self.p.snow_compression), Float(1 + self.p.snow_stretch)
-        f = Split.of(trial)
+        f = Split.of(trial)  # type: ignore[arg-type]
         r = np.sqrt(f.h * f.h + f.k * f.k)
-        first, second = clamp(f.q + r, low, high), clamp(f.q - r, low, high)
+        first, second = np.clip(f.q + r, low, high), np.clip(f.q - r, low, high)
         sheared = r > Float(1e-12)
         shrink = np.where(sheared, HALF * (first - second) / np.where(sheared, r, ONE), Float(0))
         mean = HALF * (first + second)
         e, g, h, k = mean * f.cos, mean * f.sin, shrink * f.h, shrink * f.k
         floor = Float(0.1)
         factor = np.maximum(f.q + r, floor) * np.maximum(f.q - r, floor) / (first * second)
-        return (e + h, k - g, k + g, e - h), factor
+        elastic = e + h, k - g, k + g, e - h
+        plastic = np.clip(self.ratio * factor, Float(self.p.snow_jp_min), Float(self.p.snow_jp_max))
+        self.ratio = np.where(self.snow, plastic, self.ratio)
+        self.deformation = tuple(  # type: ignore[assignment]
+            np.where(self.liquid, old, np.where(self.snow, kept, new))
+            for old, kept, new in zip(self.deformation, elastic, trial, strict=True)
+        )

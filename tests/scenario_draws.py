@@ -10,6 +10,7 @@ import os
 import subprocess
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TypeVar
 
 import numpy as np
@@ -50,18 +51,6 @@ def of_this_turn(cases: Sequence[Case], *, turns: int, shift: int = 0) -> list[C
     return [case for place, case in enumerate(cases) if (place + turn() + shift) % turns == 0]
 
 
-class OnlyRandom:
-    """A generator of which nothing but ``random`` can be used."""
-
-    def __init__(self, inner: np.random.Generator) -> None:
-        """Wrap a real generator."""
-        self._inner = inner
-
-    def random(self, size: tuple[int, ...]) -> NDArray[np.float64]:
-        """Pass on to the real one."""
-        return self._inner.random(size)
-
-
 def changed(size: registry.Size, **values: float) -> registry.Size:
     """Return a size with other parameter values."""
     new = {k: size.parameters[k].model_copy(update={"value": v}) for k, v in values.items()}
@@ -70,7 +59,8 @@ def changed(size: registry.Size, **values: float) -> registry.Size:
 
 def draw(size: registry.Size, scenario: int) -> InitialState:
     """Draw a scenario of a size from its own seed."""
-    rng = OnlyRandom(draws.generator(size.split, size.name, size.major, scenario))
+    # nothing but ``random`` can be used of the generator
+    rng = SimpleNamespace(random=draws.generator(size.split, size.name, size.major, scenario).random)
     module = importlib.import_module(size.generator)
     state: InitialState = module.initial_state(size, scenario, rng)
     return state

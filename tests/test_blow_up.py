@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import SIZE, SPLIT
-from numpy.typing import NDArray
 
 from lagbench.data.manifest import read_manifest
 from lagbench.data.registry import Registry, Size, load
@@ -18,9 +17,10 @@ from lagbench.errors import WorkFailedError
 from lagbench.generators import batch
 from lagbench.generators import simulate as twin
 from lagbench.generators.batch import Batch, SimulationJob
+from lagbench.generators.closed_box import ClosedBox
 from lagbench.generators.constants import split_module
 from lagbench.generators.simulate import simulate
-from lagbench.generators.solver import Device, Solver, build
+from lagbench.generators.solver import Device, build
 from lagbench.generators.split import InitialState
 from lagbench.make.generate import generate
 
@@ -109,16 +109,13 @@ def test_a_good_run_loads_its_states_once(
     """Nothing is replayed where nothing fails."""
     size = unmeasured.size(SPLIT, SIZE)
     loads: list[int] = []
-    kind = type(
-        compiled(split_module(size).solver_parameters(size), device=Device.CPU, scenarios=1, threads=1)
-    )
-    load_states = kind.load
+    load_states = ClosedBox.load
 
-    def counted(solver: Solver, states: Sequence[InitialState]) -> None:
+    def counted(solver: ClosedBox, states: Sequence[InitialState]) -> None:
         loads.append(len(states))
         load_states(solver, states)
 
-    monkeypatch.setattr(kind, "load", counted)
+    monkeypatch.setattr(ClosedBox, "load", counted)
     simulate(SimulationJob(size=size, scenarios=(2,), root=tmp_path), lambda units: None)
     assert loads == [1]
 
@@ -129,10 +126,7 @@ def test_a_twin_is_replayed_with_its_nudge(
     """A nudge that is not a number breaks the twin, in the replay as well, one substep later."""
     size = unmeasured.size(SPLIT, SIZE)
 
-    def shove(entry: Size, scenario: int) -> NDArray[np.float32]:
-        return np.full((entry.particles, 2), np.nan, dtype=np.float32)
-
-    monkeypatch.setattr(twin, "nudge", shove)
+    monkeypatch.setattr(twin, "nudge", lambda size, _: np.full((size.particles, 2), np.nan, np.float32))
     job = SimulationJob(size=size, scenarios=(3,), root=copied())
     with pytest.raises(WorkFailedError, match="blew up") as caught:
         twin.twin_floors(job, lambda units: None)
@@ -141,48 +135,34 @@ def test_a_twin_is_replayed_with_its_nudge(
     assert caught.value.expected == "every number is finite"
 
 
-def test_a_failure_that_does_not_repeat_keeps_its_range(stiff: Size, tmp_path: Path) -> None:
+def test_a_failure_that_does_not_repeat_keeps_its_range(
+    stiff: Size, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Where the replay passes (a bit that flipped), the range of the first report is all there is."""
     running = Batch(SimulationJob(size=stiff, scenarios=(2,), root=tmp_path), lambda units: None)
-    solver = running.solver
+    failed: list[int] = []
 
-    class Flaky:
-        """Fails on its first advance only."""
+    def flaky(substeps: int) -> None:
+        if not failed:
+            failed.append(substeps)
+            raise WorkFailedError("the simulation blew up", where=f"scenario 0, substeps 0 to {substeps}")
 
-        failed = False
-
-        def __getattr__(self, name: str) -> object:
-            return getattr(solver, name)
-
-        def advance(self, substeps: int) -> None:
-            if not self.failed:
-                self.failed = True
-                where = f"scenario 0, substeps 0 to {substeps}"
-                raise WorkFailedError("the simulation blew up", where=where)
-
-    running.solver = Flaky()
+    monkeypatch.setattr(running.solver, "advance", flaky)
     with pytest.raises(WorkFailedError, match="scenario 2, substeps 0 to 12"):
         list(running.recordings())
 
 
-def test_no_manifest_where_no_scenario_succeeded(stiff_registry: Registry, tmp_path: Path) -> None:
-    """A failed scenario leaves neither file nor manifest; one that is there already stays."""
-    root = tmp_path / "data"
-    with pytest.raises(WorkFailedError, match="blew up"):
-        generate(SPLIT, SIZE, scenarios="2", root=root, workers=1, registry=stiff_registry)
-    assert [p.name for p in root.rglob("*") if p.is_file() and not p.name.startswith(".lock")] == []
-
-
-def test_a_failure_keeps_the_manifest_of_the_others(
-    copied: Callable[[], Path], stiff_registry: Registry
+def test_a_failed_scenario_leaves_what_was_there(
+    copied: Callable[[], Path], stiff_registry: Registry, tmp_path: Path
 ) -> None:
-    """Files of an earlier generation and their manifest stay as they were."""
-    root = copied()
-    manifest = read_manifest(root, SPLIT, SIZE, 2)
-    assert manifest is not None
-    (root / SPLIT / SIZE / "v2" / "valid" / "0002.nc").unlink()
-    with pytest.raises(WorkFailedError, match="blew up"):
-        generate(SPLIT, SIZE, scenarios="2", root=root, workers=1, registry=stiff_registry)
-    after = read_manifest(root, SPLIT, SIZE, 2)
+    """Neither file nor manifest of it; files of an earlier generation and their manifest stay."""
+    before = copied()
+    (before / SPLIT / SIZE / "v2" / "valid" / "0002.nc").unlink()
+    for root in (tmp_path / "data", before):
+        with pytest.raises(WorkFailedError, match="blew up"):
+            generate(SPLIT, SIZE, scenarios="2", root=root, workers=1, registry=stiff_registry)
+    found = [p.name for p in (tmp_path / "data").rglob("*") if p.is_file()]
+    assert all(name.startswith(".lock") for name in found)
+    after = read_manifest(before, SPLIT, SIZE, 2)
     assert after is not None
     assert [e.scenario for e in after.files] == [0, 1, 3, 4]

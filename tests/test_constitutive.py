@@ -31,50 +31,41 @@ def taichi_runtime() -> None:
 
 
 @ti.kernel
-def evaluate_exponential(z: Array, out: Array) -> Nothing:
-    """Evaluate the function of this name for every entry."""
+def evaluate_scalars(z: Array, exponential: Array, hardening: Array) -> Nothing:
+    """Evaluate the functions of these names for every entry."""
     for i in range(z.shape[0]):
-        out[i] = constitutive.exponential(z[i])
+        exponential[i] = constitutive.exponential(z[i])
+        hardening[i] = constitutive.hardening(z[i], 10.0, 0.05, 5.0)
 
 
 @ti.kernel
-def evaluate_hardening(jp: Array, out: Array) -> Nothing:
-    """Evaluate the function of this name for every entry."""
-    for i in range(jp.shape[0]):
-        out[i] = constitutive.hardening(jp[i], 10.0, 0.05, 5.0)
-
-
-@ti.kernel
-def evaluate_rotation(f: Array, out: Array) -> Nothing:
-    """Evaluate the function of this name for every entry."""
+def evaluate(f: Array, turn: Array, stress: Array, elastic: Array, ratio: Array) -> Nothing:
+    """Evaluate rotation, corotated stress and plastic return for every gradient."""
     for i in range(f.shape[0]):
         m = ti.Matrix([[f[i, 0, 0], f[i, 0, 1]], [f[i, 1, 0], f[i, 1, 1]]])
-        r = constitutive.rotation(m)
-        out[i, 0] = r[0]
-        out[i, 1] = r[1]
-
-
-@ti.kernel
-def evaluate_corotated(f: Array, out: Array) -> Nothing:
-    """Evaluate the function of this name for every entry."""
-    for i in range(f.shape[0]):
-        m = ti.Matrix([[f[i, 0, 0], f[i, 0, 1]], [f[i, 1, 0], f[i, 1, 1]]])
-        tau = constitutive.corotated_stress(m, MU, LAMBDA)
-        for a in ti.static(range(2)):
-            for b in ti.static(range(2)):
-                out[i, a, b] = tau[a, b]
-
-
-@ti.kernel
-def evaluate_plastic(f: Array, out: Array, ratio: Array) -> Nothing:
-    """Evaluate the function of this name for every entry."""
-    for i in range(f.shape[0]):
-        m = ti.Matrix([[f[i, 0, 0], f[i, 0, 1]], [f[i, 1, 0], f[i, 1, 1]]])
-        elastic, factor = constitutive.plastic_return(m, LOW, HIGH)
+        rotation, tau = constitutive.rotation(m), constitutive.corotated_stress(m, MU, LAMBDA)
+        kept, factor = constitutive.plastic_return(m, LOW, HIGH)
         ratio[i] = factor
         for a in ti.static(range(2)):
+            turn[i, a] = rotation[a]
             for b in ti.static(range(2)):
-                out[i, a, b] = elastic[a, b]
+                stress[i, a, b], elastic[i, a, b] = tau[a, b], kept[a, b]
+
+
+def scalars(values: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return exponential and hardening of numbers."""
+    found = np.empty_like(values), np.empty_like(values)
+    evaluate_scalars(values, *found)
+    return found
+
+
+def models(gradients: Any) -> tuple[NDArray[np.float32], ...]:
+    """Return (cosine, sine), corotated stress, elastic part and volume ratio of gradients [n, 2, 2]."""
+    f = np.ascontiguousarray(gradients, np.float32)
+    turn, stress, elastic = np.empty(f.shape[:2], np.float32), np.empty_like(f), np.empty_like(f)
+    ratio = np.empty(len(f), np.float32)
+    evaluate(f, turn, stress, elastic, ratio)
+    return turn, stress, elastic, ratio
 
 
 def deformations(spread: float) -> NDArray[np.float32]:
@@ -91,26 +82,16 @@ def energy(f: NDArray[np.float64]) -> float:
     return float(MU * ((f - polar(f)[0]) ** 2).sum() + 0.5 * LAMBDA * (np.linalg.det(f) - 1.0) ** 2)
 
 
-def corotated(f: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Run the Taichi stress on gradients of shape [n, 2, 2]."""
-    out = np.empty_like(f)
-    evaluate_corotated(f, out)
-    return out
-
-
 def test_exponential_holds_its_stated_error() -> None:
     """The polynomial is exp to 3e-6 over its domain."""
     z = np.linspace(-4.0, 4.0, 200_001, dtype=np.float32)
-    out = np.empty_like(z)
-    evaluate_exponential(z, out)
-    assert np.abs(out / np.exp(z.astype(np.float64)) - 1.0).max() <= 3e-6
+    assert np.abs(scalars(z)[0] / np.exp(z.astype(np.float64)) - 1.0).max() <= 3e-6
 
 
 def test_hardening_is_capped_and_monotone() -> None:
     """Compacted snow is never stiffer than the cap, stretched snow never softer than the floor."""
     jp = np.linspace(0.3, 4.0, 10_001, dtype=np.float32)
-    out = np.empty_like(jp)
-    evaluate_hardening(jp, out)
+    _, out = scalars(jp)
     assert out.max() == np.float32(5.0)
     assert out.min() == np.float32(0.05)
     assert (np.diff(out) <= 0.0).all()
@@ -121,25 +102,16 @@ def test_rotation_is_the_polar_factor() -> None:
     """R equals SciPy's polar factor for gradients of positive determinant."""
     f = deformations(0.4)
     f = f[np.linalg.det(f) > 0.05]
-    out = np.empty((len(f), 2), np.float32)
-    evaluate_rotation(f, out)
     expected = np.array([polar(m.astype(np.float64))[0][:, 0] for m in f])
-    np.testing.assert_allclose(out, expected, atol=2e-6)
-
-
-def test_rotation_of_nothing_is_the_identity() -> None:
-    """A gradient without a direction (all zero, or a pure reflection) gives R = I."""
-    f = np.array([np.zeros((2, 2)), [[1.0, 0.0], [0.0, -1.0]]], np.float32)
-    out = np.empty((2, 2), np.float32)
-    evaluate_rotation(f, out)
-    assert out.tolist() == [[1.0, 0.0], [1.0, 0.0]]
+    np.testing.assert_allclose(models(f)[0], expected, atol=2e-6)
+    # A gradient without a direction (all zero, or a pure reflection) gives R = I.
+    assert models([np.zeros((2, 2)), np.diag([1.0, -1.0])])[0].tolist() == [[1.0, 0.0], [1.0, 0.0]]
 
 
 def test_corotated_stress_is_the_derivative_of_its_energy() -> None:
     """Tau = (d psi / dF) F^T, with psi differentiated by central differences."""
     f = deformations(0.3)[:64]
-    stress = corotated(f)
-    step = 1e-6
+    stress, step = models(f)[1], 1e-6
     for m, tau in zip(f.astype(np.float64), stress, strict=True):
         gradient = np.empty((2, 2))
         for entry in np.ndindex(2, 2):
@@ -153,24 +125,22 @@ def test_corotated_stress_ignores_rotation_before_and_follows_rotation_after() -
     """tau(Q F) = Q tau(F) Q^T and tau(F Q) = tau(F): objective and isotropic."""
     f = deformations(0.2)
     q = np.array([[0.6, -0.8], [0.8, 0.6]], np.float32)
-    stress = corotated(f)
-    np.testing.assert_allclose(corotated(q @ f), q @ stress @ q.T, atol=3e-4)
-    np.testing.assert_allclose(corotated(f @ q), stress, atol=3e-4)
+    stress = models(f)[1]
+    np.testing.assert_allclose(models(q @ f)[1], q @ stress @ q.T, atol=3e-4)
+    np.testing.assert_allclose(models(f @ q)[1], stress, atol=3e-4)
 
 
 def test_small_strain_is_hookes_law() -> None:
     """For F = I + eps e the stress is 2 mu e + lambda tr(e) I to first order."""
     strain = np.array([[2.0, 0.5], [0.5, -1.0]]) * 1e-3
-    stress = corotated((np.eye(2) + strain)[None].astype(np.float32))[0]
     hooke = 2.0 * MU * strain + LAMBDA * np.trace(strain) * np.eye(2)
-    np.testing.assert_allclose(stress, hooke, rtol=5e-3, atol=2e-4)
+    np.testing.assert_allclose(models([np.eye(2) + strain])[1][0], hooke, rtol=5e-3, atol=2e-4)
 
 
 def test_plastic_return_clamps_numpys_singular_values() -> None:
     """The elastic part is U clamp(Sigma) V^T of NumPy's SVD, and Jp takes the rest."""
     f = deformations(0.15)
-    elastic, ratio = np.empty_like(f), np.empty(COUNT, np.float32)
-    evaluate_plastic(f, elastic, ratio)
+    *_, elastic, ratio = models(f)
     u, sigma, vt = np.linalg.svd(f.astype(np.float64))
     kept = np.clip(sigma, LOW, HIGH)
     np.testing.assert_allclose(elastic, u @ (kept[:, :, None] * vt), atol=2e-5)
@@ -182,37 +152,22 @@ def test_plastic_return_leaves_elastic_states_alone() -> None:
     """Stretches inside the yield limits change nothing but rounding."""
     rng = np.random.default_rng(3)
     f = (np.eye(2) + 1e-3 * (2.0 * rng.random((COUNT, 2, 2)) - 1.0)).astype(np.float32)
-    elastic, ratio = np.empty_like(f), np.empty(COUNT, np.float32)
-    evaluate_plastic(f, elastic, ratio)
+    *_, elastic, ratio = models(f)
     np.testing.assert_allclose(elastic, f, atol=3e-7)
     np.testing.assert_allclose(ratio, 1.0, atol=5e-7)
 
 
 def test_inverted_snow_stays_finite() -> None:
     """Even a collapsed or inverted gradient gives a positive, finite volume ratio."""
-    f = np.array(
-        [np.zeros((2, 2)), -np.eye(2), [[1.0, 0.0], [0.0, -1.0]], [[0.0, 1.0], [1.0, 0.0]]], np.float32
-    )
-    elastic, ratio = np.empty_like(f), np.empty(4, np.float32)
-    evaluate_plastic(f, elastic, ratio)
+    *_, elastic, ratio = models([np.zeros((2, 2)), -np.eye(2), np.diag([1.0, -1.0]), np.eye(2)[::-1]])
     assert np.isfinite(elastic).all()
     assert (ratio > 0.0).all()
     assert np.isfinite(ratio).all()
 
 
-@pytest.mark.parametrize(
-    ("young", "poisson", "expected"),
-    [
-        (40.0, 0.25, (16.0, 16.0)),  # 40 / 2.5; 40 * 0.25 / (1.25 * 0.5)
-        (30.0, 0.0, (15.0, 0.0)),
-    ],
-)
-def test_lame_constants(young: float, poisson: float, expected: tuple[float, float]) -> None:
-    """Lame's constants by hand."""
-    assert constitutive.lame(young, poisson) == expected
-
-
-def test_wave_speed_from_lame_constants() -> None:
-    """Lambda + 2 mu equals E (1 - nu) / ((1 + nu)(1 - 2 nu)), the P-wave modulus."""
+def test_lame_constants() -> None:
+    """By hand; lambda + 2 mu equals E (1 - nu) / ((1 + nu)(1 - 2 nu)), the P-wave modulus."""
+    assert constitutive.lame(40.0, 0.25) == (16.0, 16.0)  # 40 / 2.5; 40 * 0.25 / (1.25 * 0.5)
+    assert constitutive.lame(30.0, 0.0) == (15.0, 0.0)
     mu, la = constitutive.lame(100.0, 0.3)
     assert math.isclose(la + 2.0 * mu, 100.0 * 0.7 / (1.3 * 0.4))

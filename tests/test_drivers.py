@@ -1,19 +1,25 @@
-"""Drivers, threads, calls and orders of particles give one and the same result, bit by bit."""
+"""Drivers, threads, calls, orders of particles and the environment change no bit of a result."""
 
 from __future__ import annotations
 
 import dataclasses
+import os
 import subprocess
 import sys
+from pathlib import Path
 from typing import cast
 
 import numpy as np
 import pytest
 from box_scenarios import ALL_LIDS, after, loaded, parameters, scenario, snapshot
+from conftest import SIZE, SPLIT
 
+from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
 from lagbench.generators.closed_box import ClosedBox
 from lagbench.generators.solver import Device, build
+from lagbench.make.generate import GenerationResult
+from lagbench.make.verify import verify
 
 NO_SLIP = parameters()
 FREE_SLIP = parameters(no_slip=False, wall=1, velocity_relaxation=0.002, density_coupling=0.002, shift=0.002)
@@ -28,34 +34,24 @@ def test_drivers_give_the_same_bits(threads: int) -> None:
     ]
     together = after(NO_SLIP, states, 450, device=Device.PARALLEL, threads=threads)
     for index, state in enumerate(states):
-        for name, values in after(NO_SLIP, [state], 450).items():
-            np.testing.assert_array_equal(values[0], together[name][index], err_msg=name)
+        own = {name: values[index : index + 1] for name, values in together.items()}
+        np.testing.assert_equal(own, after(NO_SLIP, [state], 450))
 
 
 def test_threads_lose_no_contribution() -> None:
     """Two threads that add 20,000 particles to the same nine nodes, 100 times, lose none of them."""
     constants = parameters(particles=20_000, modulus=1e-30)
     state = scenario(constants)
-    crowd = dataclasses.replace(
-        state,
-        position=np.full_like(state.position, 0.5),
-        velocity=np.full_like(state.velocity, 0.25),
-    )
-    serial = after(constants, [crowd], 100)
-    threaded = after(constants, [crowd], 100, device=Device.PARALLEL, threads=2)
-    for name, values in serial.items():
-        np.testing.assert_array_equal(values, threaded[name], err_msg=name)
+    everywhere = np.ones_like(state.position)
+    crowd = [dataclasses.replace(state, position=0.5 * everywhere, velocity=0.25 * everywhere)]
+    threaded = after(constants, crowd, 100, device=Device.PARALLEL, threads=2)
+    np.testing.assert_equal(threaded, after(constants, crowd, 100))
 
 
 def test_frames_do_not_matter() -> None:
     """450 substeps in one call and in calls of 50 give the same bits."""
-    state = scenario(NO_SLIP, seed=6, speed=0.4, walls=ALL_LIDS)
-    at_once = after(NO_SLIP, [state], 450)
-    frames = loaded(NO_SLIP, [state])
-    for _ in range(9):
-        frames.advance(50)
-    for name, values in snapshot(frames).items():
-        np.testing.assert_array_equal(values, at_once[name], err_msg=name)
+    states = [scenario(NO_SLIP, seed=6, speed=0.4, walls=ALL_LIDS)]
+    np.testing.assert_equal(after(NO_SLIP, states, *[50] * 9), after(NO_SLIP, states, 450))
 
 
 @pytest.mark.parametrize("device", [Device.CPU, Device.PARALLEL])
@@ -63,24 +59,19 @@ def test_the_order_of_particles_does_not_matter(device: Device) -> None:
     """Particles in another order move in the same way, bit by bit, over 450 substeps."""
     state = scenario(FREE_SLIP, seed=7, speed=0.4, viscosity=0.0)
     order = np.random.default_rng(8).permutation(FREE_SLIP.particles)
-    shuffled = dataclasses.replace(
-        state, position=state.position[order], velocity=state.velocity[order], affine=state.affine[order]
-    )
+    arrays = {name: getattr(state, name)[order] for name in ("position", "velocity", "affine")}
+    shuffled = dataclasses.replace(state, **arrays)
     straight, mixed = after(FREE_SLIP, [state], 450), after(FREE_SLIP, [shuffled], 450, device=device)
     np.testing.assert_array_equal(straight.pop("grid_velocity"), mixed["grid_velocity"])
     for name, values in straight.items():
         np.testing.assert_array_equal(values[0][order], mixed[name][0], err_msg=name)
 
 
-def test_the_serial_driver_takes_one_scenario() -> None:
-    """More scenarios than the serial driver can hold are refused, with the way out."""
+def test_what_the_runtime_cannot_do_is_refused() -> None:
+    """The serial driver takes one scenario; the first solver of a process fixes the pool of threads."""
+    loaded(NO_SLIP, [scenario(NO_SLIP)])
     with pytest.raises(UsageError, match="one worker per scenario"):
         build(NO_SLIP, device=Device.CPU, scenarios=2)
-
-
-def test_more_threads_than_the_pool_are_refused() -> None:
-    """Taichi's pool is fixed by the first solver of a process."""
-    loaded(NO_SLIP, [scenario(NO_SLIP)])
     with pytest.raises(UsageError, match="another process"):
         build(NO_SLIP, device=Device.PARALLEL, threads=10_000)
 
@@ -93,8 +84,7 @@ def test_a_closed_solver_leaves_the_others_alone() -> None:
     solver.advance(30)
     cast("ClosedBox", other).close()
     solver.advance(30)
-    for name, values in snapshot(solver).items():
-        np.testing.assert_array_equal(values, expected[name], err_msg=name)
+    np.testing.assert_equal(snapshot(solver), expected)
 
 
 def test_taichi_is_imported_late_and_quietly() -> None:
@@ -114,10 +104,8 @@ def test_taichi_is_imported_late_and_quietly() -> None:
 def test_a_wall_program_is_a_wall_moved_by_hand(device: Device) -> None:
     """Two programs, one shorter than the run, in calls that end within frames, act frame by frame."""
     constants = parameters(substeps_per_frame=10)
-    states = [
-        scenario(constants, seed=seed, walls=ALL_LIDS, frames=count) for seed, count in ((1, 9), (2, 5))
-    ]
-    states = states[: 1 if device is Device.CPU else 2]
+    lengths = {1: 9} if device is Device.CPU else {1: 9, 2: 5}
+    states = [scenario(constants, seed=k, walls=ALL_LIDS, frames=n) for k, n in lengths.items()]
     solver = loaded(constants, states, device=device)
     for substeps in (3, 17, 25, 20, 5):
         solver.advance(substeps)
@@ -129,19 +117,16 @@ def test_a_wall_program_is_a_wall_moved_by_hand(device: Device) -> None:
         rows = [state.wall_velocity[min(frame, len(state.wall_velocity) - 1)] for state in states]
         by_hand.move_walls(np.stack(rows).astype(np.float32))
         by_hand.advance(10)
-    for name, values in snapshot(by_hand).items():
-        np.testing.assert_array_equal(values, programmed[name], err_msg=name)
+    np.testing.assert_equal(snapshot(by_hand), programmed)
     assert np.abs(programmed["velocity"]).max() > 0.01
     assert health[0].max_speed > 0.0
 
 
 def test_extremes_of_an_advance_span_its_frames() -> None:
     """A wall that is fast in the first of three frames only shows in the health of the whole advance."""
-    constants = parameters(substeps_per_frame=10)
-    state = scenario(constants, seed=3, viscosity=1e-2)
-    program = np.zeros((4, 4, 2))
+    constants, program = parameters(substeps_per_frame=10), np.zeros((4, 4, 2))
     program[1, 3, 0] = 0.5
-    state = dataclasses.replace(state, wall_velocity=program)
+    state = dataclasses.replace(scenario(constants, seed=3, viscosity=1e-2), wall_velocity=program)
     solver = loaded(constants, [state])
     solver.advance(30)
     fastest = solver.health()[0].max_speed
@@ -150,3 +135,44 @@ def test_extremes_of_an_advance_span_its_frames() -> None:
     first = solver.health()[0].max_speed
     solver.advance(20)
     assert solver.health()[0].max_speed < first == fastest
+
+
+START = """
+from lagbench.generators import backend
+from lagbench.generators.solver import Device
+backend.start(Device.CPU)
+config = backend.ti.lang.impl.current_cfg()
+print(config.arch, config.opt_level, config.advanced_optimization, config.debug)
+import os
+print(sorted(name for name in os.environ if name.startswith("TI_") and "VERSION" not in name))
+"""
+
+HOSTILE = {"TI_ARCH": "vulkan", "TI_OPT_LEVEL": "0", "TI_ADVANCED_OPTIMIZATION": "0"}
+HOSTILE |= {"TI_DEBUG": "1", "TI_DEFAULT_FP": "64"}
+
+
+def started(**variables: str) -> list[str]:
+    """Return what a fresh process prints about the runtime that it started."""
+    own = {name: value for name, value in os.environ.items() if not name.startswith("TI_")} | variables
+    command = [sys.executable, "-c", START]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True, env=own)
+    return done.stdout.splitlines()
+
+
+def test_the_environment_does_not_choose_the_arithmetic() -> None:
+    """Device, optimisation and checks are the same with hostile variables, which stay as they were."""
+    clean, hostile = started(), started(**HOSTILE)
+    assert clean[0].startswith(("Arch.x64", "Arch.arm64"))
+    assert hostile[0] == clean[0]
+    assert hostile[1] == str(sorted(HOSTILE))
+
+
+def test_simulating_anew_without_taichi_names_the_remedy(
+    generated: GenerationResult, unmeasured: Registry, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A worker that finds no Taichi is a usage error with the extra to install, not a crash."""
+    (tmp_path / "taichi.py").write_text("raise ModuleNotFoundError('no taichi', name='taichi')\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(UsageError, match="taichi is not installed") as caught:
+        verify(SPLIT, SIZE, root=generated.root, regenerate=1, workers=1, registry=unmeasured)
+    assert caught.value.fix == "pip install 'lagbench[generate]'"

@@ -72,10 +72,9 @@ def test_energy_of_a_moving_body_by_hand() -> None:
     """Kinetic m v^2/2, gravitational m g h, elastic 0 at the start."""
     state = ball(Material.JELLY, (0.5, -1.0))
     energy = start(CONSTANTS, [state]).energy()
-    mass = state.area
     height = state.position[:, 1].mean() - LOW
-    assert energy.kinetic[0] == pytest.approx(0.5 * mass * 1.25)
-    assert energy.gravitational[0] == pytest.approx(mass * 2.5 * height, rel=1e-3)
+    assert energy.kinetic[0] == pytest.approx(0.5 * state.area * 1.25)
+    assert energy.gravitational[0] == pytest.approx(state.area * 2.5 * height, rel=1e-3)
     assert energy.elastic[0] == pytest.approx(0.0, abs=1e-12)
     assert energy.total[0] == pytest.approx(energy.kinetic[0] + energy.gravitational[0])
 
@@ -95,16 +94,12 @@ def test_friction_decelerates_by_mu_g() -> None:
     """A block that slides on the floor loses mu g of speed per second, and keeps it without friction."""
     speeds = {}
     for friction in (0.0, 0.3):
-        block = Part(Material.ROPE, Rectangle(0.3, 0.1), (0.3, LOW + 0.065), (0.0, 0.0))
+        block = Part(Material.ROPE, Rectangle(0.3, 0.1), (0.3, LOW + 0.065))
         state = scenario(CONSTANTS, block, friction=friction)
         solver = start(CONSTANTS, [state])
         solver.advance(600)
-        pushed = dataclasses.replace(
-            state,
-            position=solver.position()[0].astype(np.float64),
-            velocity=state.velocity + np.array([0.6, 0.0]),
-        )
-        solver.load([pushed])
+        resting, pushed = solver.position()[0].astype(np.float64), state.velocity + np.array([0.6, 0.0])
+        solver.load([dataclasses.replace(state, position=resting, velocity=pushed)])
         solver.advance(60)
         early = solver.velocity()[0, :, 0].mean()
         solver.advance(180)
@@ -146,7 +141,7 @@ def test_displace_moves_and_keeps_in_the_box() -> None:
 def test_runaway_particle_is_reported() -> None:
     """Speeds beyond one cell per substep name the scenario, the substeps and the bound."""
     heavy = parameters(gravity=2000.0)
-    solver = start(heavy, [ball(Material.LIQUID), ball(Material.SNOW)], Device.PARALLEL)
+    solver = start(heavy, [ball(Material.LIQUID), ball(Material.SNOW)], device=Device.PARALLEL)
     with pytest.raises(WorkFailedError, match=r"scenario 0, substeps 0 to 60(?s:.*)CFL"):
         solver.advance(60)
 
@@ -155,7 +150,7 @@ def test_runaway_particle_is_reported() -> None:
 @pytest.mark.parametrize("device", [Device.CPU, Device.PARALLEL])
 def test_what_is_not_a_number_is_reported(poison: float, device: Device) -> None:
     """A corrupt velocity neither crashes the process nor passes unseen."""
-    solver = start(CONSTANTS, [ball(Material.JELLY)], device)
+    solver = start(CONSTANTS, [ball(Material.JELLY)], device=device)
     carried = solver._kernels.carried.to_numpy()
     carried[0, 7, :2] = poison
     solver._kernels.carried.from_numpy(carried)
@@ -175,10 +170,9 @@ def test_states_that_do_not_fit_are_refused() -> None:
         solver.load([good, good])
     with pytest.raises(UsageError, match="shape of position"):
         solver.load([dataclasses.replace(good, position=good.position[:-1])])
-    with pytest.raises(WorkFailedError, match="bounds"):
-        solver.load([dataclasses.replace(good, position=good.position * np.nan)])
-    with pytest.raises(WorkFailedError, match="bounds"):
-        solver.load([dataclasses.replace(good, velocity=good.velocity + 100.0)])
+    for wild in ({"position": good.position * np.nan}, {"velocity": good.velocity + 100.0}):
+        with pytest.raises(WorkFailedError, match="bounds"):
+            solver.load([dataclasses.replace(good, **wild)])
 
 
 def test_courant_numbers_by_hand() -> None:
@@ -192,11 +186,8 @@ def test_courant_numbers_by_hand() -> None:
 
 def test_jacobian_of_liquid_and_of_solids() -> None:
     """Liquid reports its J within its bounds, solids the determinant of F."""
-    state = scenario(
-        CONSTANTS,
-        Part(Material.LIQUID, DISC, (0.25, 0.2), (0.0, -2.0)),
-        Part(Material.ROPE, DISC, (0.75, 0.2), (0.0, -2.0)),
-    )
+    places = {Material.LIQUID: (0.25, 0.2), Material.ROPE: (0.75, 0.2)}
+    state = scenario(CONSTANTS, *(Part(kind, DISC, at, (0.0, -2.0)) for kind, at in places.items()))
     solver = start(CONSTANTS, [state])
     solver.advance(60)
     liquid = state.material == Material.LIQUID
@@ -208,11 +199,9 @@ def test_jacobian_of_liquid_and_of_solids() -> None:
 
 def test_two_bodies_in_touch_share_the_grid() -> None:
     """A liquid that falls on jelly stops above it: the bodies do not pass through each other."""
-    state = scenario(
-        CONSTANTS,
-        Part(Material.JELLY, Rectangle(0.86, 0.2), (0.5, LOW + 0.11)),
-        Part(Material.LIQUID, Rectangle(0.5, 0.1), (0.5, LOW + 0.32)),
-    )
+    below = Part(Material.JELLY, Rectangle(0.86, 0.2), (0.5, LOW + 0.11))
+    above = Part(Material.LIQUID, Rectangle(0.5, 0.1), (0.5, LOW + 0.32))
+    state = scenario(CONSTANTS, below, above)
     position = run(CONSTANTS, [state], 600)[0][0]
     jelly = state.material == Material.JELLY
     assert position[jelly, 1].mean() < position[~jelly, 1].mean() - 0.1

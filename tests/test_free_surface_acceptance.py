@@ -7,7 +7,6 @@ commits.
 from __future__ import annotations
 
 import functools
-import importlib
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import cast
@@ -22,7 +21,8 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 from scipy.spatial import Delaunay, cKDTree
 
 from lagbench.data import registry
-from lagbench.generators.free_surface import FreeSurface, courant
+from lagbench.generators.constants import solver_constants
+from lagbench.generators.free_surface import courant
 from lagbench.generators.shapes import Disc, Rectangle
 from lagbench.generators.split import FreeSurfaceParameters, InitialState, Material
 
@@ -55,16 +55,7 @@ class History:
 
 def constants(split: str, size: str) -> FreeSurfaceParameters:
     """Return the solver's constants at a size of the registry."""
-    entry = registry.load().size(split, size)
-    found = importlib.import_module(entry.generator).solver_parameters(entry)
-    return cast("FreeSurfaceParameters", found)
-
-
-def advance_frames(solver: FreeSurface, frames: int, substeps: int) -> tuple[float, bool]:
-    """Advance, and return the largest speed and whether all stayed finite."""
-    solver.advance(frames * substeps)
-    health = solver.health()[0]
-    return health.max_speed, health.finite
+    return cast("FreeSurfaceParameters", solver_constants(registry.load().size(split, size)))
 
 
 def spacing(state: InitialState) -> float:
@@ -79,17 +70,18 @@ def history(split: str, size: str, scenario_id: int, frames: int) -> History:
     solver = start(chosen, [state])
     substeps = registry.load().size(split, size).substeps_per_frame
     kinetic, total, fastest, gap = [], [], 0.0, 0.0
+    energy = solver.energy()
     for _ in range(frames // 4):
-        energy = solver.energy()
         kinetic.append(energy.kinetic[0])
         total.append(energy.total[0])
-        speed, finite = advance_frames(solver, 4, substeps)
-        assert finite
-        fastest = max(fastest, speed)
+        solver.advance(4 * substeps)
+        (health,) = solver.health()
+        assert health.finite
+        fastest = max(fastest, health.max_speed)
         rope = solver.position()[0, state.material == Material.ROPE].astype(np.float64)
         if len(rope) and len(kinetic) % 15 == 0:
             gap = max(gap, longest_edge(rope))
-    energy = solver.energy()
+        energy = solver.energy()
     return History(
         parameters=chosen,
         state=state,
@@ -105,9 +97,9 @@ def history(split: str, size: str, scenario_id: int, frames: int) -> History:
 def longest_edge(position: Array) -> float:
     """Return the largest gap that holds a body together: the longest edge of its spanning tree."""
     triangles = Delaunay(position).simplices
-    edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [0, 2]]])
-    length = np.linalg.norm(position[edges[:, 0]] - position[edges[:, 1]], axis=1)
-    graph = coo_matrix((length, (edges[:, 0], edges[:, 1])), shape=(len(position), len(position)))
+    first, second = np.concatenate([triangles[:, pair] for pair in ([0, 1], [1, 2], [0, 2])]).T
+    length = np.linalg.norm(position[first] - position[second], axis=1)
+    graph = coo_matrix((length, (first, second)), shape=(len(position), len(position)))
     return float(minimum_spanning_tree(graph.tocsr()).data.max())
 
 
@@ -128,14 +120,6 @@ def relative_density(position: Array, area: float, p: FreeSurfaceParameters) -> 
             n[wall + outside] = n[wall + inside]
     gathered = np.sum([w * count[base[:, 0] + i, base[:, 1] + j] for i, j, w in stencil], axis=0)
     return np.asarray(gathered * area / p.particles * p.grid**2)
-
-
-def misfit(before: Array, after: Array) -> float:
-    """Root mean square distance after the best rigid motion (Kabsch)."""
-    a, b = before - before.mean(axis=0), after - after.mean(axis=0)
-    u, _, vt = np.linalg.svd(a.T @ b)
-    turn = u @ np.diag([1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
-    return float(np.sqrt(((a @ turn - b) ** 2).sum(axis=1).mean()))
 
 
 @pytest.mark.parametrize("size", ["full", "mini", "tiny"])
@@ -199,8 +183,7 @@ def test_settled_liquid(split: str, scenario_id: int) -> None:
     assert density.std() <= 0.05
     pressure = p.liquid_modulus * (1.0 - run.ratio)
     floor = p.density * p.gravity * top.mean()
-    edges = np.linspace(2.0 * cell, top.mean(), 6)
-    for start_of_bin, end in pairwise(edges):
+    for start_of_bin, end in pairwise(np.linspace(2.0 * cell, top.mean(), 6)):
         here = (below >= start_of_bin) & (below < end)
         excess = pressure[here].mean() - p.density * p.gravity * below[here].mean()
         assert abs(excess) <= 0.1 * floor
@@ -227,17 +210,20 @@ def test_snow_compacts_and_breaks(shape: Rectangle | Disc, seed: int) -> None:
 def test_jelly_rebounds_and_keeps_its_shape(seed: int) -> None:
     """Dropped by 0.45, a ball rises to 0.6-0.9 of that and is round again at frame 600."""
     radius, drop = 0.126, 0.45
-    ball = Part(Material.JELLY, Disc(radius), (0.5, 3 / 64 + drop + radius))
-    state = scenario(FULL, ball, seed=seed)
+    state = scenario(FULL, Part(Material.JELLY, Disc(radius), (0.5, 3 / 64 + drop + radius)), seed=seed)
     solver, heights = start(FULL, [state]), []
     for _ in range(120):
         heights.append(float(solver.position()[0, :, 1].mean()))
         solver.advance(FRAME)
-    lowest = int(np.argmin(heights[:60]))
-    rest = heights[0] - drop
+    lowest, rest = int(np.argmin(heights[:60])), heights[0] - drop
     assert 0.6 <= (max(heights[lowest:]) - rest) / drop <= 0.9
     solver.advance(480 * FRAME)
-    assert misfit(state.position, solver.position()[0].astype(np.float64)) <= 0.03 * radius
+    # root mean square distance after the best rigid motion (Kabsch)
+    after = solver.position()[0].astype(np.float64)
+    a, b = state.position - state.position.mean(axis=0), after - after.mean(axis=0)
+    u, _, vt = np.linalg.svd(a.T @ b)
+    turn = u @ np.diag([1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    assert np.sqrt(((a @ turn - b) ** 2).sum(axis=1).mean()) <= 0.03 * radius
 
 
 @pytest.mark.slow

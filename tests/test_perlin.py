@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from lagbench.generators import curl_noise, draws, noise
 
 LOW, HIGH = 0.0375, 0.9625
+NUMBERS = st.floats(-2, 2, allow_subnormal=False)
 
 
 def points(count: int, low: float = 0.0, high: float = 1.0) -> NDArray[np.float64]:
@@ -54,20 +55,20 @@ def lattice_of(frequency: int) -> NDArray[np.float64]:
     return np.asarray(noise.gradients(rng, frequency))
 
 
-@given(
-    st.lists(st.floats(-2, 2, allow_subnormal=False), min_size=1, max_size=6),
-    st.floats(-2, 2, allow_subnormal=False),
-    st.floats(-2, 2, allow_subnormal=False),
-)
+def stream(position: NDArray[np.float64], lattice: NDArray[np.float64]) -> noise.Jet:
+    """Return the stream function of scale 0.01 and its derivatives."""
+    return curl_noise.stream_function(position, lattice, low=LOW, high=HIGH, scale=0.01)
+
+
+@given(st.lists(NUMBERS, min_size=1, max_size=6), NUMBERS, NUMBERS)
 def test_jets_differentiate_polynomials(coefficients: list[float], x: float, y: float) -> None:
     """The Hessian of p(x y) follows from p' and p'' by hand (chain rule)."""
     jet_x, jet_y = noise.coordinates(np.array([[x, y]]))
     p = (jet_x * jet_y).polynomial(*coefficients)
     exact = Polynomial(coefficients)
     first, second = exact.deriv(1)(x * y), exact.deriv(2)(x * y)
-    expected = [
-        exact(x * y), y * first, x * first, y * y * second, first + x * y * second, x * x * second,
-    ]  # fmt: skip
+    expected = [exact(x * y), y * first, x * first]
+    expected += [y * y * second, first + x * y * second, x * x * second]
     found = [term[0] for term in (p.value, p.x, p.y, p.xx, p.xy, p.yy)]
     assert found == pytest.approx(expected, rel=1e-9, abs=1e-9)
 
@@ -79,13 +80,9 @@ def test_noise_is_zero_with_the_drawn_slope_at_every_node() -> None:
     found = noise.noise(*noise.coordinates(node), lattice)
     np.testing.assert_allclose(found.value, 0.0, atol=1e-15)
     np.testing.assert_allclose(np.stack([found.x, found.y], -1), lattice.reshape(-1, 2), atol=1e-14)
-
-
-def test_gradients_are_unit_vectors() -> None:
-    """Every lattice gradient has length 1 and no two are alike."""
-    lattice = lattice_of(13).reshape(-1, 2)
-    np.testing.assert_allclose(np.hypot(*lattice.T), 1.0, rtol=3e-16)
-    assert len(np.unique(lattice, axis=0)) == 14 * 14
+    large = lattice_of(13).reshape(-1, 2)  # unit vectors, no two alike
+    np.testing.assert_allclose(np.hypot(*large.T), 1.0, rtol=3e-16)
+    assert len(np.unique(large, axis=0)) == 14 * 14
 
 
 @given(st.floats(0.0, 5.0), st.floats(0.0, 5.0))
@@ -108,16 +105,14 @@ def test_ramp_joins_one_with_two_derivatives() -> None:
 @pytest.mark.parametrize("frequency", [1, 2, 4, 13])
 def test_flow_is_the_rotated_gradient_by_numerical_differentiation(frequency: int) -> None:
     """Velocity: u = dpsi/dy and v = -dpsi/dx of the formula, differenced over 2e-6."""
-    lattice, scale, step = lattice_of(frequency), 0.01, 1e-6
+    lattice, step = lattice_of(frequency), 1e-6
     position = points(60, LOW + 0.001, HIGH - 0.001)
-    psi = curl_noise.stream_function(position, lattice, low=LOW, high=HIGH, scale=scale)
-    for k, term in enumerate((psi.x, psi.y)):
-        offset = np.eye(2)[k] * step
-        numeric = [
-            (psi_by_hand(p + offset, lattice, scale) - psi_by_hand(p - offset, lattice, scale)) / (2 * step)
-            for p in position
-        ]
-        np.testing.assert_allclose(term, numeric, atol=2e-7 * frequency * scale)
+    psi = stream(position, lattice)
+    for term, offset in zip((psi.x, psi.y), np.eye(2) * step, strict=True):
+        above, below = (
+            np.array([psi_by_hand(p + sign * offset, lattice, 0.01) for p in position]) for sign in (1, -1)
+        )
+        np.testing.assert_allclose(term, (above - below) / (2 * step), atol=2e-9 * frequency)
 
 
 @pytest.mark.parametrize("frequency", [1, 4, 13])
@@ -125,20 +120,13 @@ def test_hessian_by_numerical_differentiation(frequency: int) -> None:
     """The second derivatives are the differences of the first."""
     lattice, step = lattice_of(frequency), 1e-6
     position = points(200, LOW + 0.001, HIGH - 0.001)
-
-    def flow(at: NDArray[np.float64]) -> noise.Jet:
-        return curl_noise.stream_function(at, lattice, low=LOW, high=HIGH, scale=0.01)
-
-    here = flow(position)
-    across, up = np.array([step, 0.0]), np.array([0.0, step])
-    right, left = flow(position + across), flow(position - across)
-    above, below = flow(position + up), flow(position - up)
-    pairs = [
-        (here.xx, right.x - left.x), (here.xy, right.y - left.y), (here.xy, above.x - below.x),
-        (here.yy, above.y - below.y),
-    ]  # fmt: skip
-    for exact, difference in pairs:
-        np.testing.assert_allclose(exact, difference / (2 * step), atol=2e-5 * frequency**2)
+    here = stream(position, lattice)
+    for (along_x, along_y), offset in zip(
+        ((here.xx, here.xy), (here.xy, here.yy)), np.eye(2) * step, strict=True
+    ):
+        after, before = stream(position + offset, lattice), stream(position - offset, lattice)
+        for exact, difference in ((along_x, after.x - before.x), (along_y, after.y - before.y)):
+            np.testing.assert_allclose(exact, difference / (2 * step), atol=2e-5 * frequency**2)
 
 
 @pytest.mark.parametrize("frequency", [1, 4, 13])
@@ -148,9 +136,7 @@ def test_no_flow_crosses_the_walls(frequency: int) -> None:
     lattice = lattice_of(frequency)
     for wall in (LOW, HIGH):
         upright = np.stack([np.full(101, wall), along], -1)
-        level = np.stack([along, np.full(101, wall)], -1)
-        side = curl_noise.stream_function(upright, lattice, low=LOW, high=HIGH, scale=0.01)
-        floor = curl_noise.stream_function(level, lattice, low=LOW, high=HIGH, scale=0.01)
+        side, floor = stream(upright, lattice), stream(upright[:, ::-1], lattice)
         assert not side.y.any()
         assert not floor.x.any()
         assert np.abs(side.x).max() > 1e-4

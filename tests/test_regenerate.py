@@ -7,23 +7,17 @@ import pytest
 from scenario_draws import turn
 
 from lagbench.data.manifest import read_manifest
-from lagbench.data.registry import Size, load
+from lagbench.data.registry import load
 from lagbench.make.generate import GenerationResult, generate
 from lagbench.make.verify import verify
 
 SPLITS = tuple(load().splits)
 
 
-def _size(split: str, name: str) -> Size:
-    size = load().size(split, name)
-    assert size.measured is not None, f"{split} {name} has no hashes in datasets.yaml"
-    return size
-
-
 @pytest.mark.parametrize("split", SPLITS)
 def test_tiny_is_made_to_the_bit(split: str, tiny_split: Callable[..., GenerationResult]) -> None:
     """All of tiny: scenario, subset and data set hashes, statistics and twin floor."""
-    size = _size(split, "tiny")
+    size = load().size(split, "tiny")
     measured = size.measured
     assert measured is not None
     result = tiny_split(split)
@@ -44,7 +38,7 @@ def test_tiny_is_made_to_the_bit(split: str, tiny_split: Callable[..., Generatio
 def test_one_scenario_is_made_to_the_bit(split: str, tmp_path: Path) -> None:
     """One scenario, of mini or of full, another one after every commit."""
     name = ("mini", "full")[(turn() + SPLITS.index(split)) % 2]
-    size = _size(split, name)
+    size = load().size(split, name)
     scenario = size.scenarios[turn() // 2 % len(size.scenarios)]
     result = generate(split, name, scenarios=(scenario,), root=tmp_path)
     assert result.simulated == (scenario,)

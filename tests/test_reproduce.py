@@ -63,10 +63,7 @@ def test_runs_are_read_with_their_costs(plan: Plan) -> None:
     assert held.cost is not None
     assert held.cost.seconds_per_frame == 0.5
     assert held.cost.speed_up is None
-
-
-def test_hours_are_the_mean_of_the_trainings_that_tell_theirs() -> None:
-    """1 h, 3 h and none are 2 h; of none known there is no mean."""
+    # 1 h, 3 h and none are 2 h; of none known there is no mean.
     told: list[dict[str, float]] = [{"cpu_seconds": 3600.0}, {"cpu_seconds": 10_800.0}, {}]
     seeds = [Seeded(seed=i, scores={}, record=one, path=Path()) for i, one in enumerate(told)]
     assert Method(name="gns", seeds=tuple(seeds)).hours_per_seed == 2.0
@@ -78,12 +75,13 @@ def test_the_board_comes_first(plan: Plan, tmp_path: Path) -> None:
     board, weights = tmp_path / "board", tmp_path / "weights"
     entry = board / "submissions" / SPLIT / SIZE / "gns.yaml"
     scores = board / "scores" / SPLIT / SIZE / "gns.nc"
-    for path in (entry, scores, weights / SPLIT / SIZE / "gns_0.json"):
-        path.parent.mkdir(parents=True, exist_ok=True)
+    record = weights / SPLIT / SIZE / "gns_0.json"
+    for path in (entry, scores, record):
+        path.parent.mkdir(parents=True)
     shutil.copy(plan.home(SPLIT) / "gat-0" / "scores.nc", scores)
     cost = "{seconds_per_frame: 0.1, device: here, solver_seconds_per_frame: 0.05}"
     entry.write_text(f"predictions: [{{seed: 0}}]\nparameters: 7\ncost: {cost}\n")
-    (weights / SPLIT / SIZE / "gns_0.json").write_text(json.dumps({"cpu_seconds": 3600.0}))
+    record.write_text(json.dumps({"cpu_seconds": 3600.0}))
     sources = Sources(board=board, weights=weights, runs=plan.runs, registry=plan.described)
     held = Evidence(sources, SPLIT, SIZE).methods
     assert held["gns"].seeds[0].path == scores
@@ -143,9 +141,8 @@ def test_runs_of_another_recipe_are_a_variant(runs: Path, cavity: ScoreBench, tm
 @pytest.fixture
 def sources(plan: Plan, tmp_path: Path) -> Sources:
     """Runs alone, nothing committed."""
-    return Sources(
-        board=tmp_path / "none", weights=tmp_path / "none", runs=plan.runs, registry=plan.described
-    )
+    none = tmp_path / "none"
+    return Sources(board=none, weights=none, runs=plan.runs, registry=plan.described)
 
 
 def test_the_page_tells_what_there_is(sources: Sources) -> None:
@@ -157,9 +154,8 @@ def test_the_page_tells_what_there_is(sources: Sources) -> None:
     assert "0.007715" in page  # SuperGAT's MAE in Table 5.4
     (learned,) = (row for row in markdown_rows(page, "last doubling") if row["model"] == "GNS")
     assert learned["epochs"] == "0.8"  # 40 steps of 2 of 100 windows
-    assert [learned[head] for head in ("validation at 1/4", "1/2", "1", "last doubling")] == [
-        *("4", "2", "0.5", "75 %")
-    ]
+    heads = ("validation at 1/4", "1/2", "1", "last doubling")
+    assert [learned[head] for head in heads] == ["4", "2", "0.5", "75 %"]
     assert {row["the first is"] for row in markdown_rows(page, "the first is")} == {"too few scenarios"}
     assert page == results.render(sources, (SIZE,))
 
@@ -173,9 +169,8 @@ def test_studies_stand_beside_the_thesis(sources: Sources, tmp_path: Path) -> No
     home = tmp_path / "studies" / "fluid" / SIZE
     home.mkdir(parents=True)
     (home / "mlp_studies.json").write_text(json.dumps({"mlp-4-3-2": held}))
-    rows = markdown_rows(
-        results.render(replace(sources, studies=tmp_path / "studies"), (SIZE,)), "train, thesis"
-    )
+    page = results.render(replace(sources, studies=tmp_path / "studies"), (SIZE,))
+    rows = markdown_rows(page, "train, thesis")
     (ours,) = (row for row in rows if row["train, ours"] != "-")
     heads = ("hidden layers", "parameters, ours", "steps x batch, ours")
     assert [ours[head] for head in heads] == ["200 x 200 x 200", "1,234", "7 x 32"]
@@ -184,12 +179,12 @@ def test_studies_stand_beside_the_thesis(sources: Sources, tmp_path: Path) -> No
     assert len(rows) == 6  # the widths of Table 4.3
 
 
-def test_what_is_missing_is_listed_with_its_command(plan: Plan, tmp_path: Path) -> None:
+def test_what_is_missing_is_listed_with_its_command(sources: Sources, tmp_path: Path) -> None:
     """Where entries are missing stands the command; a training whose predictions were refused is no gap."""
     (tmp_path / SPLIT / SIZE).mkdir(parents=True)
     (tmp_path / SPLIT / SIZE / "mlp_0.json").write_text("{}")
-    sources = Sources(board=None, weights=tmp_path, runs=plan.runs, registry=plan.described)
-    missing = results.render(sources, (SIZE,)).split("## Missing")[1].splitlines()
+    page = results.render(replace(sources, weights=tmp_path), (SIZE,))
+    missing = page.split("## Missing")[1].splitlines()
     refused, absent = (
         line for line in missing if line.startswith(f"- {SPLIT} {SIZE}: ") and "floors" not in line
     )
@@ -201,13 +196,11 @@ def test_what_is_missing_is_listed_with_its_command(plan: Plan, tmp_path: Path) 
 
 
 @pytest.mark.parametrize("floor", [False, True])
-def test_the_page_works_without_entries(plan: Plan, tmp_path: Path, floor: bool) -> None:
+def test_the_page_works_without_entries(plan: Plan, sources: Sources, tmp_path: Path, floor: bool) -> None:
     """Nothing on the board, or floors alone: a page without claims that names the command for every size."""
     if floor:
-        home = tmp_path / SPLIT / SIZE / "persistence-0"
-        shutil.copytree(plan.folder(SPLIT, "gns", 0), home)
-    sources = Sources(board=tmp_path / "board", weights=tmp_path, runs=tmp_path, registry=plan.described)
-    page = results.render(sources, (SIZE,))
+        shutil.copytree(plan.folder(SPLIT, "gns", 0), tmp_path / SPLIT / SIZE / "persistence-0")
+    page = results.render(replace(sources, runs=tmp_path), (SIZE,))
     for split in EXPECTED:
         assert f"--size {SIZE} --split {split}" in page
     assert "the first is" not in page
@@ -259,15 +252,10 @@ def test_rollouts_show_truth_and_prediction(plan: Plan, cavity: ScoreBench) -> N
 
 def test_every_figure_of_the_contract_is_there() -> None:
     """Design section 10 lists the tables and figures; each needs models that the roster knows."""
-    figures = {"4": (4, 5, 6, 8, 11, 12, 13), "5": (5, *range(10, 20), *range(21, 29))}
-    wanted = {f"fig_{chapter}_{number}" for chapter, numbers in figures.items() for number in numbers}
-    wanted |= {f"table_4_{number}" for number in (2, 3, 4, 5, 7, 8)} | {
-        "table_3_1",
-        "section_3_2_2",
-        "section_4_8_3",
-    }
-    wanted |= {f"table_5_{number}" for number in (1, 3, 4, 5)}
-    assert set(FIGURES) == wanted
+    numbers = {"fig_4": (4, 5, 6, 8, 11, 12, 13), "fig_5": (5, *range(10, 20), *range(21, 29))}
+    numbers |= {"table_3": (1,), "table_4": (2, 3, 4, 5, 7, 8), "table_5": (1, 3, 4, 5)}
+    wanted = {f"{chapter}_{number}" for chapter, held in numbers.items() for number in held}
+    assert set(FIGURES) == wanted | {"section_3_2_2", "section_4_8_3"}
     for figure in FIGURES.values():
         for split, names in figure.needs.items():
             assert set(names) <= set(EXPECTED[split])
@@ -309,16 +297,17 @@ def test_tables_and_figures_are_written(plan: Plan, cavity: ScoreBench) -> None:
     assert float(rows["SuperGAT"]["MAE ours mean"]) == 0.0
 
 
-def test_unknown_names_are_answered_with_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:
-    """A misspelt item, split, size or seed ends with exit code 2."""
-    for arguments, word in (
-        (["--only", "table_54"], "table_5_4"),
-        (["--split", "cavty"], "cavity"),
-        (["--size", "midi"], "mini"),
-        (["--seeds", "a"], "0,1"),
-    ):
-        assert main(arguments) == 2
-        assert word in capsys.readouterr().err
+def test_unknown_names_are_answered_with_the_nearest(
+    plan: Plan, cavity: ScoreBench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A misspelt item, split, size or seed, or no worker, ends with exit code 2."""
+    right = {"--only": "table_5_4", "--split": "cavity", "--size": "mini", "--seeds": "0,1"}
+    for option, wrong in zip(right, ("table_54", "cavty", "midi", "a"), strict=True):
+        assert main([option, wrong]) == 2
+        assert right[option] in capsys.readouterr().err
+    for more in ((), ("--dry-run",), ("--no-training",)):
+        assert main(options(plan, "--workers", "0", *more), registry=cavity.registry) == 2
+    capsys.readouterr()
     assert main(["--list", "--split", "fluid"]) == 0
     assert "table_4_8" in capsys.readouterr().out
 
@@ -373,12 +362,6 @@ def test_an_interrupt_says_how_to_go_on(
     monkeypatch.setattr("lagbench.baselines.reproduce.__main__.make_runs", stop)
     assert main(options(plan, "--only", "table_5_4"), registry=cavity.registry) == 130
     assert "goes on" in capsys.readouterr().err
-
-
-def test_workers_are_counted_from_one(plan: Plan, cavity: ScoreBench) -> None:
-    """None is a mistake, whatever else was asked for."""
-    for more in ((), ("--dry-run",), ("--no-training",)):
-        assert main(options(plan, "--workers", "0", *more), registry=cavity.registry) == 2
 
 
 @pytest.mark.slow

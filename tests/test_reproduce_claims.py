@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -46,13 +47,9 @@ def test_a_comparison_can_be_counted_by_hand() -> None:
     assert row.verdict is Verdict.BETTER
     (turned,) = compared(evidence, "gat", ["gns"], ["position_rmse"])
     assert (turned.verdict, turned.won, turned.p) == (Verdict.WORSE, 0, row.p)
-
-
-def test_the_larger_correlation_wins() -> None:
-    """Directions come from the metrics table; at a frame the values of that frame are compared."""
-    (row,) = compared(
-        known({"gns": [0.9] * 8, "gat": [0.5] * 8}), "gns", ["gat"], ["vorticity_pearson"], frame=54
-    )
+    # Directions come from the metrics table; at a frame the values of that frame are compared.
+    evidence = known({"gns": [0.9] * 8, "gat": [0.5] * 8})
+    (row,) = compared(evidence, "gns", ["gat"], ["vorticity_pearson"], frame=54)
     assert (row.verdict, row.won, row.frame) == (Verdict.BETTER, 8, 54)
 
 
@@ -95,21 +92,16 @@ def test_seeds_that_only_one_has_do_not_count() -> None:
     evidence.methods["gat"] = a_method("gat", [0.9] * 8)
     (row,) = compared(evidence, "gns", ["gat"], ["position_rmse"])
     assert row.means == pytest.approx((0.5, 0.9))
-    evidence.methods["gat"] = Method(
-        name="gat",
-        seeds=tuple(
-            Seeded(seed=7, scores=s.scores, record={}, path=Path()) for s in evidence.methods["gat"].seeds
-        ),
-    )
+    (only,) = evidence.methods["gat"].seeds
+    evidence.methods["gat"] = Method(name="gat", seeds=(replace(only, seed=7),))
     (row,) = compared(evidence, "gns", ["gat"], ["position_rmse"])
     assert row.seeds == (2, 1)
 
 
 def test_models_stand_beside_the_best_floor() -> None:
     """The floor of least error is the one that counts; skill is 1 - score / its score."""
-    evidence = known(
-        {"gns": [0.1] * 8, "gat": [0.9] * 8, "persistence": [0.5] * 8, "constant-velocity": [2.0] * 8}
-    )
+    scores = {"gns": 0.1, "gat": 0.9, "persistence": 0.5, "constant-velocity": 2.0}
+    evidence = known({name: [score] * 8 for name, score in scores.items()})
     assert evidence.best_floor == "persistence"
     assert evidence.skill("gns") == pytest.approx(0.8)
     assert evidence.skill("gat") == pytest.approx(-0.8)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import netCDF4
@@ -95,41 +96,29 @@ def test_studies_are_what_was_asked_for(
 
     What a row came to lies in one file, which suffices for its table, unless it is of other data.
     """
-    for module in (runs, tables):
-        monkeypatch.setattr(module, "TABLES", {"table_4_2": ("4.2", SPLIT)})
-        monkeypatch.setattr(module, "study_rows", lambda _: STUDIES[:1])
-    for steps in (1, 2):
-        plan = Plan(
-            size="tiny",
-            root=generated.root,
-            runs=tmp_path / "runs",
-            output=tmp_path / "out",
-            settings=(f"training.steps={steps}", "model.widths=[4]"),
-            device="cpu",
-            threads=1,
-            registry=unmeasured,
-        )
-        if steps == 1:
-            runs.make_studies(plan, "table_4_2")
-            home = plan.home(SPLIT)
-            first = {path: path.stat().st_mtime_ns for path in home.rglob("*.*")}
-            runs.make_studies(plan, "table_4_2")
-            assert {path: path.stat().st_mtime_ns for path in home.rglob("*.*")} == first
-            known = known_studies([home], plan.hash(SPLIT))
-            assert known["mlp-4-2-1"]["train"] > 0.0
-            assert known["mlp-4-2-1"]["training"]["step"] == 1
-            (row,) = tables.studies_beside_thesis("table_4_2", "tiny", known).tables[0].rows
-            assert f"{known['mlp-4-2-1']['valid']:.3g}" in row
-            assert known_studies([home], "f" * 64) == {}
-            stale = {"mlp-4-2-1": {**known["mlp-4-2-1"], "training": {"dataset_sha256": "f" * 64}}}
-            (tmp_path / "mlp_studies.json").write_text(json.dumps(stale))
-            assert known_studies([home, tmp_path], plan.hash(SPLIT)) == known
-            later = {"mlp-4-2-1": {**known["mlp-4-2-1"], "train": 9.0}}
-            (tmp_path / "mlp_studies.json").write_text(json.dumps(later))
-            assert known_studies([home, tmp_path], plan.hash(SPLIT)) == later
-        else:
-            with pytest.raises(UsageError):
-                runs.make_studies(plan, "table_4_2")
+    monkeypatch.setattr(tables, "TABLES", {"table_4_2": ("4.2", SPLIT)})
+    monkeypatch.setattr(tables, "study_rows", lambda _: STUDIES[:1])
+    places = {"root": generated.root, "runs": tmp_path / "runs", "output": tmp_path / "out"}
+    small = ("training.steps=1", "model.widths=[4]")
+    plan = Plan(size="tiny", settings=small, device="cpu", threads=1, registry=unmeasured, **places)
+    tables.make_studies(plan, "table_4_2")
+    home = plan.home(SPLIT)
+    first = {path: path.stat().st_mtime_ns for path in home.rglob("*.*")}
+    tables.make_studies(plan, "table_4_2")
+    assert {path: path.stat().st_mtime_ns for path in home.rglob("*.*")} == first
+    known = tables.known_studies([home], plan.hash(SPLIT))
+    held = known["mlp-4-2-1"]
+    assert held["train"] > 0.0
+    assert held["training"]["step"] == 1
+    (row,) = tables.studies_beside_thesis("table_4_2", "tiny", known).tables[0].rows
+    assert f"{held['valid']:.3g}" in row
+    assert tables.known_studies([home], "f" * 64) == {}
+    stale, later = {**held, "training": {"dataset_sha256": "f" * 64}}, {**held, "train": 9.0}
+    for other, expected in ((stale, held), (later, later)):
+        (tmp_path / "mlp_studies.json").write_text(json.dumps({"mlp-4-2-1": other}))
+        assert tables.known_studies([home, tmp_path], plan.hash(SPLIT)) == {"mlp-4-2-1": expected}
+    with pytest.raises(UsageError):
+        tables.make_studies(replace(plan, settings=("training.steps=2", *small[1:])), "table_4_2")
 
 
 @pytest.fixture
@@ -138,9 +127,8 @@ def short(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "recipes"
     folder.mkdir()
     for name, recipe in (("gns", "tiny-short"), ("mlp", "tiny")):
-        (folder / f"{name}.yaml").write_text(
-            f"{{format: 1, recipes: {{'*/{recipe}': {{training: {{steps: 1}}}}}}}}"
-        )
+        held = {"format": 1, "recipes": {f"*/{recipe}": {"training": {"steps": 1}}}}
+        (folder / f"{name}.yaml").write_text(json.dumps(held))  # JSON is YAML
     monkeypatch.setattr(catalogue, "RECIPES", folder)
     monkeypatch.setattr(command, "EXPECTED", {SPLIT: ("supergat", "mlp")})
 
@@ -224,14 +212,10 @@ def test_committed_weights_are_shown_without_training(
     assert list((tmp_path / "runs" / "reproduce" / "tiny").glob("fig_5_22*.png"))
 
 
-def test_nothing_is_made_without_training_and_weights(reproduce: Reproduce, tmp_path: Path) -> None:
-    """Without runs and committed weights a figure says so, and no run appears."""
+def test_unusable_committed_weights_leave_nothing(reproduce: Reproduce, tmp_path: Path) -> None:
+    """No weights leave a figure that says so; damaged ones end with exit code 3, and no run appears."""
     assert reproduce(*ONLY, "--no-training", "--weights", str(tmp_path / "none")) == 0
     assert [path.name for path in (tmp_path / "runs").iterdir()] == ["reproduce"]
-
-
-def test_unusable_committed_weights_leave_nothing(reproduce: Reproduce, tmp_path: Path) -> None:
-    """Damaged weights end with exit code 3, and no run that a later training would take for its own."""
     weights = tmp_path / "weights" / SPLIT / "tiny" / "supergat_0.pt"
     weights.parent.mkdir(parents=True)
     weights.write_bytes(b"no weights")

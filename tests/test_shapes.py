@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scenario_draws import neighbours
 
 from lagbench.errors import WorkFailedError
@@ -30,42 +29,30 @@ def source(scenario: int = 0) -> np.random.Generator:
     return stream
 
 
-def cloud(half: float = 0.6, cells: int = 1501) -> NDArray[np.float64]:
-    """Return the middles of a fine grid about the origin."""
-    side = half * ((2 * np.arange(cells) + 1) / cells - 1)
-    return np.stack(np.meshgrid(side, side), -1).reshape(-1, 2)
-
-
 @pytest.mark.parametrize("name", SHAPES)
-def test_area_and_reach_agree_with_counting(name: str) -> None:
-    """The points inside a fine grid give the area to 0.5 % and the bounding box to a cell."""
-    shape, grid = SHAPES[name], cloud()
+def test_area_reach_and_distance_agree_with_counting(name: str) -> None:
+    """The points inside a fine grid give the area to 0.5 % and the bounding box to a cell.
+
+    Outside, the distance is that to the nearest of them.
+    """
+    shape, side = SHAPES[name], 0.6 * ((2 * np.arange(1501) + 1) / 1501 - 1)
+    grid = np.stack(np.meshgrid(side, side), -1).reshape(-1, 2)
     inside = grid[shape.distance(grid) <= 0.0]
     assert len(inside) * (1.2 / 1501) ** 2 == pytest.approx(shape.area, rel=5e-3)
     np.testing.assert_allclose(inside.max(axis=0), shape.reach, atol=1.2 / 1501)
     np.testing.assert_allclose(inside.min(axis=0), np.negative(shape.reach), atol=1.2 / 1501)
-
-
-@pytest.mark.parametrize("name", SHAPES)
-def test_distance_is_how_far_the_shape_is(name: str) -> None:
-    """Outside, the distance is that to the nearest inside point of a fine grid."""
-    shape, grid = SHAPES[name], cloud()
-    inside = grid[shape.distance(grid) <= 0.0]
     probes = np.random.Generator(np.random.PCG64(1)).random((300, 2)) * 1.6 - 0.8
     found = shape.distance(probes)
     nearest = neighbours(probes[found > 0.0], 1, among=inside)[0][:, 0]
     np.testing.assert_allclose(found[found > 0.0], nearest, atol=1.2 / 1501 * 1.5)
 
 
-def test_rectangle_distance_by_hand() -> None:
-    """A 4 x 2 rectangle: 1 deep at the middle, 1 beyond an edge, 5 from a corner (3-4-5)."""
+def test_shapes_by_hand() -> None:
+    """A 4 x 2 rectangle: 1 deep at the middle, 1 beyond an edge, 5 from a corner (3-4-5); one blob."""
     rectangle = shapes.Rectangle(4.0, 2.0)
     at = np.array([[0.0, 0.0], [3.0, 0.5], [5.0, 5.0], [1.5, 0.0]])
     assert rectangle.distance(at).tolist() == [-1.0, 1.0, 5.0, -0.5]
-
-
-def test_blobs_of_one_disc_are_a_disc() -> None:
-    """The counted area of a unit disc is pi to 1e-3, hence the radius sqrt(area / pi)."""
+    # The counted area of a unit disc is pi to 1e-3, hence the radius sqrt(area / pi).
     blob = shapes.Blobs.of_area(0.05, np.zeros((1, 2)), cells=512)
     assert blob.radius == pytest.approx(math.sqrt(0.05 / math.pi), rel=1e-3)
     assert blob.centres == ((0.0, 0.0),)
@@ -92,10 +79,7 @@ def test_seeds_have_the_centre_and_spread_of_the_body() -> None:
     assert moments == pytest.approx([0.05**2 / 12, 0.65**2 / 12], rel=0.03)
     np.testing.assert_allclose(np.abs(axes[:, 1]), [0.6, 0.8], atol=0.003)
     np.testing.assert_allclose(position.mean(axis=0), 0.5, atol=0.003)
-
-
-def test_seeds_shift_with_the_scenario() -> None:
-    """Two scenarios spread different points in the same body."""
+    # Two scenarios spread different points in the same body.
     body = shapes.body_at(SHAPES["disc"], 0.5, 0.5)
     first, second = (shapes.seeds(source(k), body, 50) for k in (0, 1))
     assert neighbours(second, 1, among=first)[0].min() > 0.0

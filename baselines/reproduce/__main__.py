@@ -33,7 +33,30 @@ from .thesis import EXPECTED, ROSTER, Model, label, number
 
 def main(arguments: Sequence[str] | None = None, *, registry: Registry | None = None) -> int:
     """Make what the arguments name; return the exit code."""
-    given = _parser().parse_args(arguments)
+    parser = argparse.ArgumentParser(
+        prog="python -m lagbench.baselines.reproduce",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("--size", default="mini", help="tiny, mini or full")
+    add("--only", metavar="NAMES", help="tables and figures, as in table_5_4,fig_5_5; all by default")
+    add("--split", help="only what is about this split, and all models that are meant for it")
+    add("--root", type=Path, help="folder of all data sets")
+    add("--runs", type=Path, default=Path("runs"), help="folder of runs")
+    add("--output", "-o", type=Path, help="RUNS/reproduce/<size> by default")
+    add("--weights", type=Path, default=WEIGHTS, help="folder of committed weights")
+    add("--studies", type=Path, default=STUDIES, help="folder of committed results that are no entries")
+    add("--seeds", default="0", help="seeds of every training, as in 0,1")
+    add("--recipe", metavar="NAME", help="variant of the recipes, as in short")
+    add("--set", action="append", default=[], metavar="KEY=VALUE", help="change every recipe; repeatable")
+    add("--device", default="auto", help="cpu, cuda or auto")
+    add("--threads", type=int, help="CPU threads of a training; one per core by default, one with --workers")
+    add("--workers", type=int, help="trainings side by side, on one GPU or many cores; 1 by default")
+    add("--no-training", action="store_true", help="train nothing: runs that are there, what is committed")
+    add("--dry-run", action="store_true", help="make nothing, say what would be trained")
+    add("--list", action="store_true", help="list tables and figures, and what they need")
+    given = parser.parse_args(arguments)
     try:
         figures = _chosen(given.only, given.split)
         if given.list:
@@ -211,33 +234,6 @@ def _say(text: str) -> None:
         sys.stdout.flush()
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m lagbench.baselines.reproduce",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    add = parser.add_argument
-    add("--size", default="mini", help="tiny, mini or full")
-    add("--only", metavar="NAMES", help="tables and figures, as in table_5_4,fig_5_5; all by default")
-    add("--split", help="only what is about this split, and all models that are meant for it")
-    add("--root", type=Path, help="folder of all data sets")
-    add("--runs", type=Path, default=Path("runs"), help="folder of runs")
-    add("--output", "-o", type=Path, help="RUNS/reproduce/<size> by default")
-    add("--weights", type=Path, default=WEIGHTS, help="folder of committed weights")
-    add("--studies", type=Path, default=STUDIES, help="folder of committed results that are no entries")
-    add("--seeds", default="0", help="seeds of every training, as in 0,1")
-    add("--recipe", metavar="NAME", help="variant of the recipes, as in short")
-    add("--set", action="append", default=[], metavar="KEY=VALUE", help="change every recipe; repeatable")
-    add("--device", default="auto", help="cpu, cuda or auto")
-    add("--threads", type=int, help="CPU threads of a training; one per core by default, one with --workers")
-    add("--workers", type=int, help="trainings side by side, on one GPU or many cores; 1 by default")
-    add("--no-training", action="store_true", help="train nothing: runs that are there, what is committed")
-    add("--dry-run", action="store_true", help="make nothing, say what would be trained")
-    add("--list", action="store_true", help="list tables and figures, and what they need")
-    return parser
 
 
 if __name__ == "__main__":

@@ -23,127 +23,79 @@ from .evidence import Evidence, ordered
 from .thesis import FRAME_MODELS, OPERATORS, ROSTER, interval, key_frame, label, number
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Claim:
     """A question about one model and its rivals, asked of every split by the ranking metric."""
 
-    question: str
     first: str  # model that the question is about; empty for the best floor
     rivals: tuple[str, ...] = ()  # models to compare it with; empty for all
+    question: str = ""
     metrics: tuple[str, ...] = ()  # judged beside the ranking one, over the horizon
     at_key_frame: tuple[str, ...] = ()  # judged at the frame at which the thesis compares models
 
 
-CLAIMS = (
-    Claim(
-        question="Does SuperGAT come first among the operators (Table 5.4: on the cavity it does)?",
-        first="supergat",
-        rivals=tuple(name for name in OPERATORS if name != "supergat"),
-        at_key_frame=("vorticity_mse",),
+_CLAIMS = {
+    "Does SuperGAT come first among the operators (Table 5.4: on the cavity it does)?": Claim(
+        "supergat", tuple(name for name in OPERATORS if name != "supergat"), at_key_frame=("vorticity_mse",)
     ),
-    Claim(
-        question="Does SuperGAT's link loss help, at the same start and seeds?",
-        first="supergat",
-        rivals=("supergat-unlinked",),
-        at_key_frame=("vorticity_pearson",),
+    "Does SuperGAT's link loss help, at the same start and seeds?": Claim(
+        "supergat", ("supergat-unlinked",), at_key_frame=("vorticity_pearson",)
     ),
-    Claim(
-        question="Does the vorticity loss help (Fig. 5.5: it does), at the same budget and seeds?",
-        first="gns",
-        rivals=("gns-novorticity",),
+    "Does the vorticity loss help (Fig. 5.5: it does), at the same budget and seeds?": Claim(
+        "gns",
+        ("gns-novorticity",),
         metrics=("position_rmse", "energy_error"),
         at_key_frame=("vorticity_pearson",),
     ),
-    Claim(
-        question="Do summed messages decide: is SuperGAT better with them than without?",
-        first="supergat",
-        rivals=("supergat-unsummed",),
+    "Do summed messages decide: is SuperGAT better with them than without?": Claim(
+        "supergat", ("supergat-unsummed",)
     ),
-    Claim(
-        question="Is MX attention better than SD (Eq. 5.27 has both)?",
-        first="supergat",
-        rivals=("supergat-sd",),
+    "Is MX attention better than SD (Eq. 5.27 has both)?": Claim("supergat", ("supergat-sd",)),
+    "Is acceleration a better target than velocity (section 5.9.3)?": Claim(
+        "gns", ("gns-velocity",), at_key_frame=("vorticity_pearson",)
     ),
-    Claim(
-        question="Is acceleration a better target than velocity (section 5.9.3)?",
-        first="gns",
-        rivals=("gns-velocity",),
-        at_key_frame=("vorticity_pearson",),
+    "Is L2 better than L1 as the norm of the loss (the thesis chooses L2)?": Claim("gns", ("gns-l1",)),
+    "Does a weight of the vorticity loss ten times as large help?": Claim(
+        "gns-tenfold", ("gns",), at_key_frame=("vorticity_pearson",)
     ),
-    Claim(
-        question="Is L2 better than L1 as the norm of the loss (the thesis chooses L2)?",
-        first="gns",
-        rivals=("gns-l1",),
+    "Does a loss over three own steps help (section 6.2), at the same processor time?": Claim(
+        "gns-unrolled", ("gns",)
     ),
-    Claim(
-        question="Does a weight of the vorticity loss ten times as large help?",
-        first="gns-tenfold",
-        rivals=("gns",),
-        at_key_frame=("vorticity_pearson",),
+    "Graph or grid: is neuralmpm better than every operator?": Claim("neuralmpm", OPERATORS),
+    "Is it better for NeuralMPM to learn from its own rollouts than from more calls unrolled?": Claim(
+        "neuralmpm-long", ("neuralmpm-unrolled",)
     ),
-    Claim(
-        question="Does a loss over three own steps help (section 6.2), at the same processor time?",
-        first="gns-unrolled",
-        rivals=("gns",),
+    "Does NeuralMPM gain by one grid of velocities for all materials, at no more steps?": Claim(
+        "neuralmpm", ("neuralmpm-unmixed",)
     ),
-    Claim(
-        question="Graph or grid: is neuralmpm better than every operator?",
-        first="neuralmpm",
-        rivals=OPERATORS,
+    "Does NeuralMPM gain by conserved momentum, shorter bundles and more of the first frames?": Claim(
+        "neuralmpm-conserving", ("neuralmpm-long", "neuralmpm")
     ),
-    Claim(
-        question="Is it better for NeuralMPM to learn from its own rollouts than from more calls unrolled?",
-        first="neuralmpm-long",
-        rivals=("neuralmpm-unrolled",),
+    "Does NeuralMPM gain by holding bodies in shape and matter from being pressed together?": Claim(
+        "neuralmpm-projected", ("neuralmpm-conserving",)
     ),
-    Claim(
-        question="Does NeuralMPM gain by one grid of velocities for all materials, at no more steps?",
-        first="neuralmpm",
-        rivals=("neuralmpm-unmixed",),
+    "Does NeuralMPM gain by the mean over the images of the box, with the same weights?": Claim(
+        "neuralmpm-averaged", ("neuralmpm",)
     ),
-    Claim(
-        question="Does NeuralMPM gain by conserved momentum, shorter bundles and more of the first frames?",
-        first="neuralmpm-conserving",
-        rivals=("neuralmpm-long", "neuralmpm"),
+    "Does NeuralMPM gain by starting from the weights of another size?": Claim(
+        "neuralmpm-started", ("neuralmpm",)
     ),
-    Claim(
-        question="Does NeuralMPM gain by holding bodies in shape and matter from being pressed together?",
-        first="neuralmpm-projected",
-        rivals=("neuralmpm-conserving",),
+    "Does NeuralMPM that is held in shape gain by starting from the weights of another size?": Claim(
+        "neuralmpm-projected-started", ("neuralmpm-projected",)
     ),
-    Claim(
-        question="Does NeuralMPM gain by the mean over the images of the box, with the same weights?",
-        first="neuralmpm-averaged",
-        rivals=("neuralmpm",),
+    "Does it gain by grids of shape and density as fine as those of full at full?": Claim(
+        "neuralmpm-projected-finer", ("neuralmpm-projected-started", "neuralmpm-projected")
     ),
-    Claim(
-        question="Does NeuralMPM gain by starting from the weights of another size?",
-        first="neuralmpm-started",
-        rivals=("neuralmpm",),
+    "Does LSTM + MLP come first among the frame models (Table 4.8: it does)?": Claim(
+        "lstm-mlp", tuple(name for name in FRAME_MODELS if name != "lstm-mlp")
     ),
-    Claim(
-        question="Does NeuralMPM that is held in shape gain by starting from the weights of another size?",
-        first="neuralmpm-projected-started",
-        rivals=("neuralmpm-projected",),
+    "Is standing still better than VAR(1) (section 4.8.3: its forecast diverges)?": Claim(
+        "persistence", ("var",), metrics=("mse_end",)
     ),
-    Claim(
-        question="Does it gain by grids of shape and density as fine as those of full at full?",
-        first="neuralmpm-projected-finer",
-        rivals=("neuralmpm-projected-started", "neuralmpm-projected"),
-    ),
-    Claim(
-        question="Does LSTM + MLP come first among the frame models (Table 4.8: it does)?",
-        first="lstm-mlp",
-        rivals=tuple(name for name in FRAME_MODELS if name != "lstm-mlp"),
-    ),
-    Claim(
-        question="Is standing still better than VAR(1) (section 4.8.3: its forecast diverges)?",
-        first="persistence",
-        rivals=("var",),
-        metrics=("mse_end",),
-    ),
-    Claim(question="Is the best floor better than a model that learned?", first=""),
-)
+    "Is the best floor better than a model that learned?": Claim(""),
+}
+
+CLAIMS = tuple(replace(claim, question=question) for question, claim in _CLAIMS.items())
 
 
 class Verdict(enum.StrEnum):
@@ -254,10 +206,8 @@ def answer(rows: Sequence[Compared]) -> str:
 
 def comparison_table(rows: Sequence[Compared]) -> Table:
     """Return comparisons as a table; the lead is second minus first in loss: positive favours the first."""
-    heads = (
-        *("where", "metric", "first", "second", "means", "seeds"),
-        *("lead (95 %)", "won", "p (Holm)", "the first is"),
-    )
+    sides = ("where", "metric", "first", "second", "means", "seeds")
+    heads = (*sides, "lead (95 %)", "won", "p (Holm)", "the first is")
     cells = []
     for row in rows:
         low, high = row.test.interval

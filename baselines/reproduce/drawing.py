@@ -52,10 +52,7 @@ class Rollouts:
     _truth: dict[int, Snapshot] = field(default_factory=dict)
 
     def position(self, name: str | None, frame: int) -> Floats:
-        """Return positions of the truth (None) or of a prediction [length], shape [particle, 2].
-
-        Given frames are the truth's.
-        """
+        """Return positions [length], [particle, 2], of the truth (None, and given frames) or a prediction."""
         if name is None or frame < self.scenario.setting.predicted_frames[0]:
             return np.asarray(self.file.read("position", frame), np.float64)
         return np.asarray(self.predictions[name].frames(self.recording.scenario, frame, 1)[0], np.float64)
@@ -192,7 +189,7 @@ def _draw_arrows(axes: Axes, scene: Scene, limit: float) -> None:
 class Figure:
     """A figure, table or section of the thesis: one row of the catalogue."""
 
-    name: str  # as in fig_5_10 or table_5_4
+    name: str = ""  # as in fig_5_10 or table_5_4: its key in the catalogue
     title: str  # what it shows
     draw: Callable[[Plan, Figure], Sheet]
     # models whose scored runs it shows, by split

@@ -59,9 +59,7 @@ def panels(plan: Plan, figure: Figure) -> Sheet:
             for panel in figure.panels
             if rows
         }
-    notes = (
-        [figure.said] if cases else [figure.said, "No scenario of this kind is in this size's test subset."]
-    )
+    notes = [figure.said] + ([] if cases else ["No scenario of this kind is in this size's test subset."])
     tables = [_errors(plan, figure, frames, cases)]
     if len(figure.models) == 2:  # a model with and without something
         second, first = figure.models
@@ -102,12 +100,8 @@ def histograms(plan: Plan, figure: Figure) -> Sheet:
     """Return histograms of T0's vorticity at the frames of a figure, and their divergences."""
     size = plan.tier(figure.split)
     frames, case = _frames(size, figure), min(size.subsets["test"])
-    columns = min(len(frames), 2)
-    width = 6.0 if columns == 1 else 4.2
-    with (
-        opened(plan, figure.split, case, figure.models) as rollouts,
-        charts(len(frames), columns, width=width, height=2.8) as drawn,
-    ):
+    show = charts(len(frames), min(len(frames), 2), width=6.0 if len(frames) == 1 else 4.2, height=2.8)
+    with opened(plan, figure.split, case, figure.models) as rollouts, show as drawn:
         for axes, frame in zip(drawn, frames, strict=True):
             truth = rollouts.snapshot(None, frame).fields
             true = truth.vorticity[truth.differentiable]
@@ -118,9 +112,8 @@ def histograms(plan: Plan, figure: Figure) -> Sheet:
             for name in rollouts.predictions:
                 # what the truth never reaches is counted in the outermost bins
                 held = np.clip(rollouts.pair(name, frame).predicted_vorticity, edges[0], edges[-1])
-                axes.stairs(
-                    np.histogram(held, edges)[0], edges, color=colour(name), lw=1.0, label=label(name)
-                )
+                counts = np.histogram(held, edges)[0]
+                axes.stairs(counts, edges, color=colour(name), lw=1.0, label=label(name))
             tidy(axes, f"frame {frame}, T0", "vorticity [1/frame]", "nodes", legend=frame == frames[0])
         picture = png(drawn)
     table = _errors(plan, figure, frames, {0: case})
@@ -132,10 +125,8 @@ def residuals(plan: Plan, figure: Figure) -> Sheet:
     size = plan.tier(figure.split)
     (frame,), case = _frames(size, figure), min(size.subsets["test"])
     by_node = "nodes" in figure.panels
-    with (
-        opened(plan, figure.split, case, figure.models) as rollouts,
-        charts(6, 3, width=2.9, height=2.4) as drawn,
-    ):
+    show = charts(6, 3, width=2.9, height=2.4)
+    with opened(plan, figure.split, case, figure.models) as rollouts, show as drawn:
         pairs = {name: rollouts.pair(name, frame) for name in rollouts.predictions}
         # all but the extreme residuals of all models but the worst are in range
         spread = sorted(np.quantile(np.abs(pair.vorticity_residual), 0.995) for pair in pairs.values())
@@ -154,10 +145,7 @@ def residuals(plan: Plan, figure: Figure) -> Sheet:
     return Sheet(notes=(figure.said,), tables=(table,), pictures={"": picture})
 
 
-Floats = NDArray[np.float64]
-
-BOUNDS = {40: 0.0002, 80: 0.0004}
-"""What the thesis says that SuperGAT's vorticity MSE stays below up to a frame [1/frame^2]."""
+BOUNDS = {40: 0.0002, 80: 0.0004}  # below which SuperGAT's vorticity MSE stays up to a frame [1/frame^2]
 
 
 def model_curves(plan: Plan, figure: Figure) -> Sheet:
@@ -203,13 +191,12 @@ def case_curves(plan: Plan, figure: Figure) -> Sheet:
         return Sheet(notes=(figure.said, "No run of this model is there."))
     score = methods[name].scores[metric]
     cases = [f"T{row} (scenario {scenario})" for row, scenario in enumerate(score.scenarios)]
-    with charts(1, 1, width=5.6, height=3.4) as drawn:
-        (axes,) = drawn
+    with charts(1, 1, width=5.6, height=3.4) as (axes,):
         for case, values in zip(cases, score.per_frame, strict=True):
             axes.plot(score.frames, values, lw=1.1, label=case)
         axes.set_ylim(bottom=0.0)
         tidy(axes, label(name), "frame", f"{metric} [{score.metric.unit}]")
-        picture = png(drawn)
+        picture = png([axes])
     rows = [
         (case, *(number(float(np.nanmax(values[: end - score.frames[0] + 1]))) for end in BOUNDS))
         for case, values in zip(cases, score.per_frame, strict=True)
@@ -233,11 +220,10 @@ def losses(plan: Plan, figure: Figure) -> Sheet:
     with charts(1, 1, width=5.6, height=3.2) as drawn:
         plot_losses(drawn[0], curves)
         picture = png(drawn)
-    heads: tuple[str, ...]
+    heads: tuple[str, ...] = ("split", "loss at the end, ours", "train / valid, thesis (Table 4.5, row 3)")
     rows: list[tuple[str, ...]] = []
     if several:
-        heads = ("split", "loss at the end, ours", "train / valid, thesis (Table 4.5, row 3)")
-        rows = [(called, _end(loss), "0.0091 / 0.0152") for called, (_, _, loss) in curves.items()]
+        rows += [(called, _end(loss), "0.0091 / 0.0152") for called, (_, _, loss) in curves.items()]
     else:
         terms = tuple(LOSS_SNAPSHOTS["end"])
         heads = ("raw term", *terms)
@@ -252,5 +238,5 @@ def losses(plan: Plan, figure: Figure) -> Sheet:
     )
 
 
-def _end(loss: Floats) -> str:
+def _end(loss: NDArray[np.float64]) -> str:
     return number(float(loss[-SMOOTHED:].mean()) if loss.size else None)

@@ -35,7 +35,6 @@ from .thesis import (
     SIZES,
     TABLE_4_8,
     TABLE_5_4,
-    Model,
     interval,
     key_frame,
     label,
@@ -85,11 +84,26 @@ def render(sources: Sources, sizes: Sequence[str] = SIZES) -> str:
     known = [evidence for evidence in found if evidence.methods]
     learned = [evidence for evidence in known if evidence.models]
     parts = [HEAD, *_claims(learned), *(part for evidence in known for part in _chapter(evidence))]
-    protocols = [part for size in sizes for part in _protocol(sources, size)]
+    homes = [home for home in (sources.studies, sources.runs) if home]
+    protocols, studies = [], []
+    for size in sizes:
+        measured = next((p for home in homes if (p := home / "fluid" / size / FILE).is_file()), None)
+        protocols += [beside_thesis(read_json(measured)).text] if measured else []
+        for name, (_, split) in TABLES.items():
+            data = sources.size(split, size).measured
+            trained = known_studies([h / split / size for h in homes], data.dataset_sha256 if data else None)
+            if any(study_name(study) in trained for study in study_rows(name)):
+                studies.append(studies_beside_thesis(name, size, trained).text)
     parts += ["## VAR by the thesis's protocol (section 4.8.3)", *protocols] if protocols else []
-    studies = [part for size in sizes for part in _studies(sources, size)]
     parts += ["## MLPs from frame to frame", *studies] if studies else []
-    variants = (f"- `{model.name}`: {_how(model)}" for model in ROSTER.values() if model.varied)
+    variants = []
+    for model in (model for model in ROSTER.values() if model.varied):
+        settings = "".join(f" --set {setting}" for setting in model.settings)
+        recipe = f" --recipe {model.recipe}" if model.recipe else ""
+        how = f"`--baseline {model.baseline}{recipe}{settings}`"
+        if model.weights:
+            how = f"`lagbench predict{settings}` with weights of `{model.weights}`"
+        variants.append(f"- `{model.name}`: {how}")
     parts += [COMMANDS, "\n".join(variants), "## Missing", "\n".join(_missing(found)) or "Nothing."]
     return "\n\n".join(parts) + "\n"
 
@@ -142,9 +156,9 @@ def _training_rows(evidence: Evidence) -> Iterator[list[str]]:
         method = evidence.models[name]
         record = method.seeds[0].record
         # beside the step an entry holds one number, the metric that was validated
-        held = [(e["step"], v) for e in record.get("validation", ()) for n, v in e.items() if n != "step"]
+        held = [(e["step"], n, v) for e in record.get("validation", ()) for n, v in e.items() if n != "step"]
         best = [
-            min((value for step, value in held if step <= share * record["step"]), default=None)
+            min((value for step, _, value in held if step <= share * record["step"]), default=None)
             for share in (0.25, 0.5, 1.0)
         ]
         seen = record["step"] * record["recipe"]["training"]["batch"] if "windows" in record else None
@@ -156,7 +170,7 @@ def _training_rows(evidence: Evidence) -> Iterator[list[str]]:
             number(seen / record["windows"] if seen else None),
             number(method.hours_per_seed),
             number(evidence.skill(name)),
-            next((name for entry in record.get("validation", ()) for name in entry if name != "step"), "-"),
+            held[0][1] if held else "-",
             *map(number, best),
             "-" if gain is None else f"{100.0 * gain:.2g} %",
         ]
@@ -187,16 +201,7 @@ def _chapter(evidence: Evidence) -> Iterator[str]:
         " our solver's time for a frame on one core over the model's, same machine. Hours are without"
         " validations."
     )
-    heads = (
-        "recipe",
-        "changed",
-        "parameters",
-        "seeds",
-        "CPU hours per seed",
-        "hardware",
-        "s/frame",
-        "solver s/frame",
-    )
+    heads = ("model", "recipe", "changed", "parameters", "seeds", "CPU hours per seed", "hardware")
     rows = []
     for name, method in evidence.models.items():
         record, cost = method.seeds[0].record, method.cost
@@ -218,7 +223,7 @@ def _chapter(evidence: Evidence) -> Iterator[str]:
                 *map(number, paid),
             ]
         )
-    yield markdown(("model", *heads, "speed-up"), rows)
+    yield markdown((*heads, "s/frame", "solver s/frame", "speed-up"), rows)
 
 
 def _horizon(evidence: Evidence) -> str:
@@ -286,25 +291,6 @@ def agreement(first: Sequence[float], second: Sequence[float]) -> float:
     return 1.0 - 2.0 * turned / len(pairs)
 
 
-def _protocol(sources: Sources, size: str) -> Iterator[str]:
-    """Yield what the thesis's own protocol gave for VAR, where it was measured."""
-    for home in (sources.studies, sources.runs):
-        path = home / "fluid" / size / FILE if home else None
-        if path and path.is_file():
-            yield beside_thesis(read_json(path)).text
-            return
-
-
-def _studies(sources: Sources, size: str) -> Iterator[str]:
-    """Yield Tables 4.2 to 4.5, those of which a row was trained."""
-    for name, (_, split) in TABLES.items():
-        homes = [home / split / size for home in (sources.studies, sources.runs) if home]
-        measured = sources.size(split, size).measured
-        known = known_studies(homes, measured.dataset_sha256 if measured else None)
-        if any(study_name(study) in known for study in study_rows(name)):
-            yield studies_beside_thesis(name, size, known).text
-
-
 def _missing(found: Sequence[Evidence]) -> Iterator[str]:
     """Yield what has no entry on each split and size, and the command that makes it."""
     for evidence in found:
@@ -320,15 +306,6 @@ def _missing(found: Sequence[Evidence]) -> Iterator[str]:
             yield f"- {evidence.where}: {what}: `{command}`, then `lagbench submit`."
         if evidence.stale:
             yield f"- {evidence.where}: {len(evidence.stale)} score files of other data, left out."
-
-
-def _how(model: Model) -> str:
-    """Return what makes a variant, as it is typed."""
-    settings = "".join(f" --set {setting}" for setting in model.settings)
-    if model.weights:
-        return f"`lagbench predict{settings}` with weights of `{model.weights}`"
-    recipe = f" --recipe {model.recipe}" if model.recipe else ""
-    return f"`--baseline {model.baseline}{recipe}{settings}`"
 
 
 def _markdown(held: Table) -> str:

@@ -203,12 +203,7 @@ _MODELS = (
         varied="neuralmpm",
         settings=("model.mixture=false",),
     ),
-    Model(
-        "neuralmpm-unrolled",
-        "NeuralMPM, 16 frames unrolled",
-        varied="neuralmpm",
-        recipe="unrolled",
-    ),
+    Model("neuralmpm-unrolled", "NeuralMPM, 16 frames unrolled", varied="neuralmpm", recipe="unrolled"),
     Model(
         "neuralmpm-averaged",
         "NeuralMPM, mean over images",
@@ -224,20 +219,10 @@ _MODELS = (
         recipe="long",
         weights="neuralmpm-long",
     ),
-    Model(
-        "neuralmpm-conserving",
-        "NeuralMPM, momentum conserved",
-        varied="neuralmpm",
-        recipe="conserving",
-    ),
+    Model("neuralmpm-conserving", "NeuralMPM, momentum conserved", varied="neuralmpm", recipe="conserving"),
     Model("neuralmpm-conserving-averaged", "NeuralMPM, momentum conserved, mean over images"),
     Model("neuralmpm-conserving-of-mini", "NeuralMPM, momentum conserved, trained at mini"),
-    Model(
-        "neuralmpm-projected",
-        "NeuralMPM, held in shape",
-        varied="neuralmpm",
-        recipe="projected",
-    ),
+    Model("neuralmpm-projected", "NeuralMPM, held in shape", varied="neuralmpm", recipe="projected"),
     Model("neuralmpm-projected-averaged", "NeuralMPM, held in shape, mean over images"),
     Model("neuralmpm-projected-of-mini", "NeuralMPM, held in shape, trained at mini"),
     Model("neuralmpm-projected-started", "NeuralMPM, held in shape, started from another size"),
@@ -298,8 +283,7 @@ def colour(name: str) -> str:
     return ROSTER[name].colour if name in ROSTER else MUTED
 
 
-_FAMILIES = {"fluid": 4, "multimaterial": 6}
-"""Scenes repeat with the id, on the free surface: four families, six pairs of materials."""
+_FAMILIES = {"fluid": 4, "multimaterial": 6}  # scenes repeat with the id: four families, six pairs
 
 _KEY_FRAMES = {"cavity": 54, "curl-noise": 40}
 """Frames at which the thesis compares models: 54; and 35 after the last of six given ones."""

@@ -40,8 +40,6 @@ TRAIN, VALID = 0.70, 0.15
 
 FILE = "var_protocol.json"  # what ``--json`` prints, in a folder of runs or of committed studies
 
-GROWTH_FRAMES = 100
-
 States = NDArray[np.float32]
 
 
@@ -71,9 +69,24 @@ def measure(
 ) -> ProtocolResult:
     """Fit a VAR of so many lags and forecast by the thesis's protocol."""
     # torch is loaded here, so that pages of results are written without it
+    from lagbench.baselines.rollout import scenario_paths
     from lagbench.baselines.var import LaggedRows, solve
 
-    states = _all_states(split, size, root)
+    paths: dict[int, Path] = {}
+    for subset in ("train", "valid", "test"):
+        paths |= scenario_paths(split, subset=subset, size=size, root=root)
+    tier = load().size(split, size)
+    frames = np.empty((sum(map(tier.frame_count, paths)), tier.particles, 4), np.float32)
+    filled = 0
+    for _, path in sorted(paths.items()):
+        with read_scenario(path) as file:  # positions and the solver's velocities, block by block
+            for position, velocity in zip(file.blocks("position"), file.blocks("velocity"), strict=True):
+                frames[filled : filled + len(position)] = np.concatenate([position, velocity], axis=-1)
+                filled += len(position)
+    for feature in np.moveaxis(frames, -1, 0):
+        feature -= feature.mean(dtype=np.float64)
+        feature /= feature.std(dtype=np.float64)
+    states: States = frames.reshape(len(frames), -1)
     train = int(TRAIN * len(states))
     valid = states[train : train + int(VALID * len(states))]
     rows = LaggedRows([states[:train]], lags=lags)
@@ -102,27 +115,6 @@ def measure(
     )
 
 
-def _all_states(split: str, size: str, root: str | Path | None) -> States:
-    """Return the standardised states of all frames, shape [frame, feature]."""
-    from lagbench.baselines.rollout import scenario_paths
-
-    paths: dict[int, Path] = {}
-    for subset in ("train", "valid", "test"):
-        paths |= scenario_paths(split, subset=subset, size=size, root=root)
-    tier = load().size(split, size)
-    states = np.empty((sum(map(tier.frame_count, paths)), tier.particles, 4), np.float32)
-    filled = 0
-    for _, path in sorted(paths.items()):
-        with read_scenario(path) as file:  # positions and the solver's velocities, block by block
-            for position, velocity in zip(file.blocks("position"), file.blocks("velocity"), strict=True):
-                states[filled : filled + len(position)] = np.concatenate([position, velocity], axis=-1)
-                filled += len(position)
-    for feature in np.moveaxis(states, -1, 0):
-        feature -= feature.mean(dtype=np.float64)
-        feature /= feature.std(dtype=np.float64)
-    return states.reshape(len(states), -1)
-
-
 def forecast_errors(
     coefficients: NDArray[np.float64], last: States, truth: States
 ) -> tuple[NDArray[np.float64], float]:
@@ -143,7 +135,7 @@ def forecast_errors(
             break
         errors[frame] = np.square(state - true).mean()
     grown = norms[np.isfinite(norms)]
-    span = min(GROWTH_FRAMES, len(grown) - 1)
+    span = min(100, len(grown) - 1)
     return errors, float((grown[-1] / grown[-1 - span]) ** (1 / span)) if span > 0 else float("nan")
 
 
@@ -168,11 +160,7 @@ def beside_thesis(held: Mapping[str, Any]) -> Sheet:
         ("share of its largest eigenvalue that was added to the Gram matrix", None, held["floor"]),
         (f"squared error of one step, over the frames fitted {unit}", None, held["fit_mse"]),
         (f"squared error of the forecast {unit}", thesis["mse"], held["forecast_mse"]),
-        (
-            f"squared error of standing still after those frames {unit}",
-            None,
-            held["persistence_mse"],
-        ),
+        (f"squared error of standing still after those frames {unit}", None, held["persistence_mse"]),
         ("factor by which the forecast grows per frame at its end", None, held["growth"]),
     ]
     at = sorted((int(frame), value) for frame, value in held["mse_at"].items())

@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import Progress
 
@@ -31,20 +30,20 @@ from lagbench.errors import LagbenchError, UsageError, WorkFailedError
 from lagbench.generators.solver import Device
 
 from .diagnostics import X, Y, box_of, centre_lines, draw
-from .experiment import Case, Experiment, Result, plan, run, solver_parameters
+from .experiment import Case, Result, plan, run, solver_parameters
 
 DIGITS = 9  # significant digits of the numbers in the JSON file: fewer than libraries differ in
 JSON = dict[str, Any]
 
 
-def parser() -> argparse.ArgumentParser:
-    """Return the parser of the options."""
-    made = argparse.ArgumentParser(
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command and return its exit code."""
+    parser = argparse.ArgumentParser(
         prog="python -m lagbench.generators.acceptance",
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    add = made.add_argument
+    add = parser.add_argument
     add("--case", type=Case, choices=list(Case), required=True, help="which closed box")
     add("--json", type=Path, metavar="FILE", help="results")
     add("--re", type=float, metavar="R", help="Reynolds number; curl-noise is inviscid without it")
@@ -58,37 +57,35 @@ def parser() -> argparse.ArgumentParser:
     add("--seed", type=int, default=0, help="seed of the particle lattice and the stirring")
     add("--device", type=Device, choices=list(Device), default=Device.CPU, help="where to run")
     add("--profiles", type=Path, metavar="PNG", help="draw the centre lines (cavity)")
-    return made
+    given = parser.parse_args(arguments)
+    try:
+        sys.stdout.write(summary(perform(given)) + "\n")
+    except (LagbenchError, OSError) as error:
+        sys.stderr.write(f"error: {error}\n")
+        return getattr(error, "exit_code", WorkFailedError.exit_code)
+    except KeyboardInterrupt:
+        sys.stderr.write("interrupted\n")
+        return 130
+    return 0
 
 
-def settings(given: argparse.Namespace) -> Experiment:
-    """Return the experiment that the options ask for."""
-    default = 100_000 if given.case is Case.CAVITY else 30_000 * given.grid // 40
-    return plan(
-        given.case,
-        substeps=default if given.substeps is None else given.substeps,
-        reynolds=given.re,
-        grid=given.grid,
-        particles=given.particles,
-        dt=given.dt,
-        lid_speed=given.lid_speed,
-        lid_off_after=given.lid_off_after,
-        frequency=given.frequency,
-        seed=given.seed,
-    )
-
-
-def check_outputs(given: argparse.Namespace) -> None:
-    """Make sure that the files can be written, before the long run."""
+def perform(given: argparse.Namespace) -> JSON:
+    """Run what the options ask for, write the files and return the results."""
+    substeps = given.substeps
+    if substeps is None:
+        substeps = 100_000 if given.case is Case.CAVITY else 30_000 * given.grid // 40
+    same = ("grid", "particles", "dt", "lid_speed", "lid_off_after", "frequency", "seed")
+    others = {name: getattr(given, name) for name in same}
+    experiment = plan(given.case, substeps=substeps, reynolds=given.re, **others)
+    # Make sure that the files can be written, before the long run.
     if given.profiles is not None and given.case is not Case.CAVITY:
         raise UsageError("curl noise has no centre-line profiles", where="--profiles", fix="leave it out")
     if given.profiles is not None and given.profiles.suffix.lower() not in {".png", ".pdf", ".svg"}:
         raise UsageError(
             "not a picture format", where="--profiles", expected=".png, .pdf or .svg", got=given.profiles
         )
-    for flag, path in (("--json", given.json), ("--profiles", given.profiles)):
-        if path is None:
-            continue
+    files = {"--json": given.json, "--profiles": given.profiles}
+    for flag, path in ((flag, path) for flag, path in files.items() if path is not None):
         fresh = not path.exists()
         try:
             path.absolute().parent.mkdir(parents=True, exist_ok=True)
@@ -102,6 +99,20 @@ def check_outputs(given: argparse.Namespace) -> None:
             ) from error
         if fresh:
             path.unlink()
+    console = Console(stderr=True)
+    with Progress(console=console, disable=not console.is_terminal) as progress:
+        task = progress.add_task(experiment.case.value, total=experiment.substeps)
+        result = run(
+            experiment, device=given.device, report=lambda done: progress.update(task, completed=done)
+        )
+    found = document(result)
+    if given.json is not None:
+        given.json.write_text(json.dumps(found, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    if given.profiles is not None and result.profiles is not None:
+        e = experiment
+        title = f"Re {e.reynolds:g}, {e.grid} x {e.grid}, {e.substeps} substeps"
+        draw(result.profiles, centre_lines(e.reynolds or 0.0), title, given.profiles)
+    return found
 
 
 def rounded(value: object) -> object:
@@ -121,11 +132,18 @@ def document(result: Result) -> JSON:
     parameters = solver_parameters(e)
     box = box_of(parameters)
     work = e.particles * e.substeps
-    apart = result.deviations()
-    against = None
-    if apart is not None:
+    against: JSON | None = None
+    lines: JSON | None = None
+    if (apart := result.deviations()) is not None:
         u, v = apart
         against = {"u_rmse": u.rmse, "v_rmse": v.rmse, "u_max": u.maximum, "v_max": v.maximum}
+    if result.profiles is not None:
+        ours, ghia = result.profiles.at_reference_points(), centre_lines(e.reynolds or 0.0)
+        lines = {"averaged_substeps": [result.averaged_from, e.substeps]}
+        for name, along, abscissae in (("u", "y", Y), ("v", "x", X)):
+            known = np.full(len(abscissae), np.nan) if ghia is None else getattr(ghia, name)
+            points = zip(abscissae, getattr(ours, name), known, strict=True)
+            lines[name] = [{along: x, name: float(v), "ghia": float(theirs)} for x, v, theirs in points]
     found: JSON = {
         "format": 1,
         "case": e.case.value,
@@ -133,7 +151,7 @@ def document(result: Result) -> JSON:
         "parameters": asdict(parameters),
         "box": [box.low, box.high],
         "time": e.substeps * e.dt,
-        "centre_lines": _centre_lines(result),
+        "centre_lines": lines,
         "ghia": against,
         "jacobian": {
             "min": min(c.jacobian_min for c in checks),
@@ -156,32 +174,6 @@ def document(result: Result) -> JSON:
     return {key: rounded(value) for key, value in found.items()}
 
 
-def _centre_lines(result: Result) -> JSON | None:
-    if result.profiles is None:
-        return None
-    found = result.profiles.at_reference_points()
-    reference = centre_lines(result.experiment.reynolds or 0.0)
-    return {
-        "averaged_substeps": [result.averaged_from, result.experiment.substeps],
-        "u": _points("y", Y, "u", found.u, None if reference is None else reference.u),
-        "v": _points("x", X, "v", found.v, None if reference is None else reference.v),
-    }
-
-
-def _points(
-    along: str,
-    abscissae: Sequence[float],
-    name: str,
-    values: NDArray[np.float64],
-    reference: NDArray[np.float64] | None,
-) -> list[JSON]:
-    tabulated = np.full(len(abscissae), np.nan) if reference is None else reference
-    return [
-        {along: x, name: float(value), "ghia": float(known)}
-        for x, value, known in zip(abscissae, values, tabulated, strict=True)
-    ]
-
-
 def summary(found: JSON) -> str:
     """Return the results in a few lines."""
     j, ghia_error = found["jacobian"], found["ghia"]
@@ -193,51 +185,11 @@ def summary(found: JSON) -> str:
     if ghia_error is not None:
         lines.insert(0, "against Ghia: " + ", ".join(f"{k} {v:.4f}" for k, v in ghia_error.items()))
     if found["case"] == Case.CURL_NOISE and found["energy_retention"] is not None:
-        lines.insert(
-            0,
-            f"energy left {found['energy_retention']:.3f}, divergence over vorticity "
-            f"{found['divergence_over_vorticity']:.4f}",
-        )
+        ratio = f"divergence over vorticity {found['divergence_over_vorticity']:.4f}"
+        lines.insert(0, f"energy left {found['energy_retention']:.3f}, {ratio}")
     if found["largest_rise_after_lid_off"] is not None:
         lines.insert(0, f"largest rise of energy with the lid off {found['largest_rise_after_lid_off']:.2e}")
     return "\n".join(lines)
-
-
-def perform(given: argparse.Namespace) -> JSON:
-    """Run what the options ask for, write the files and return the results."""
-    experiment = settings(given)
-    check_outputs(given)
-    console = Console(stderr=True)
-    with Progress(console=console, disable=not console.is_terminal) as progress:
-        task = progress.add_task(experiment.case.value, total=experiment.substeps)
-        result = run(
-            experiment, device=given.device, report=lambda done: progress.update(task, completed=done)
-        )
-    found = document(result)
-    if given.json is not None:
-        given.json.write_text(json.dumps(found, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    if given.profiles is not None and result.profiles is not None:
-        e = experiment
-        title = f"Re {e.reynolds:g}, {e.grid} x {e.grid}, {e.substeps} substeps"
-        draw(result.profiles, centre_lines(experiment.reynolds or 0.0), title, given.profiles)
-    return found
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command and return its exit code."""
-    given = parser().parse_args(arguments)
-    try:
-        sys.stdout.write(summary(perform(given)) + "\n")
-    except LagbenchError as error:
-        sys.stderr.write(f"error: {error}\n")
-        return error.exit_code
-    except OSError as error:
-        sys.stderr.write(f"error: {error}\n")
-        return WorkFailedError.exit_code
-    except KeyboardInterrupt:
-        sys.stderr.write("interrupted\n")
-        return 130
-    return 0
 
 
 if __name__ == "__main__":

@@ -59,10 +59,7 @@ def box_of(parameters: ClosedBoxParameters) -> Box:
 
 
 def occupancy(position: Reals, box: Box) -> NDArray[np.int64]:
-    """Count the particles in each cell, shape [cells, cells]; one outside the walls counts for the nearest.
-
-    Positions [length] are of shape [particle, 2]; the sum of the counts is their number.
-    """
+    """Count the particles in each cell, shape [cells, cells]; one outside counts for the nearest."""
     cell = np.floor((position - box.low) / box.spacing).astype(np.int64)
     column, row = np.clip(cell, 0, box.cells - 1).T
     counts = np.bincount(column * box.cells + row, minlength=box.cells**2)
@@ -112,8 +109,6 @@ def grid_rates(velocity: Reals, spacing: float) -> Rates:
 
 
 Array = NDArray[np.float64]
-
-_DRAWN_POINTS = 201
 
 _MISPRINT = float("nan")
 
@@ -244,7 +239,7 @@ def draw(profiles: Profiles, reference: CentreLines | None, title: str, path: Pa
 
     figure = Figure(figsize=(9.0, 4.2), layout="constrained")
     left, right = figure.subplots(1, 2)
-    line = np.linspace(0.0, 1.0, _DRAWN_POINTS)
+    line = np.linspace(0.0, 1.0, 201)
     left.plot(profiles.u(line), line, label="lagbench")
     right.plot(line, profiles.v(line), label="lagbench")
     if reference is not None:

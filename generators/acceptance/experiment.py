@@ -3,10 +3,6 @@
 The splits in datasets.yaml come in three sizes; an experiment scales size ``full`` to any grid.
 The box stays where it is as nearly as nodes allow, dt shrinks with dx, the particles per cell
 and the constants per substep stay.
-
-Checks at every 10,000th substep and at the end: the range of J, the cells without a particle, and
-divergence against vorticity. Kinetic energy at every frame. In the cavity, the velocity on the
-centre lines, averaged over the last part of the run, against Ghia, Ghia & Shin.
 """
 
 from __future__ import annotations
@@ -16,7 +12,7 @@ import enum
 import itertools
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -30,32 +26,17 @@ from lagbench.generators.noise import gradients
 from lagbench.generators.solver import Device, build
 from lagbench.generators.split import ClosedBoxParameters, InitialState, Material
 
-from .diagnostics import (
-    Deviation,
-    Profiles,
-    box_of,
-    centre_lines,
-    deviation,
-    displacement_energy,
-    extract,
-    grid_rates,
-    kinetic_energy,
-    lid_corners,
-    occupancy,
-)
+from . import diagnostics
 
 if TYPE_CHECKING:
     from lagbench.generators.closed_box import ClosedBox
 
 
-_FULL_GRID = 40
 _LEAST_GRID = 16
 _VISCOUS_LIMIT = 0.2
 _ACOUSTIC_LIMIT = 0.5
 _MACH_LIMIT = 1.0 / 3.0
 _LARGEST_FREQUENCY = 14  # beyond it velocity gradients outgrow what :func:`.draws.quantise` holds
-_DEFAULT_LID_SPEED = 0.15
-_DEFAULT_FREQUENCY = 4
 
 
 class Case(enum.StrEnum):
@@ -96,7 +77,7 @@ def plan(
     *,
     substeps: int,
     reynolds: float | None = None,
-    grid: int = _FULL_GRID,
+    grid: int = 40,
     particles: int | None = None,
     dt: float | None = None,
     lid_speed: float | None = None,
@@ -123,9 +104,9 @@ def plan(
         particles=round(full.particles * (grid / full.grid) ** 2) if particles is None else particles,
         substeps=substeps,
         dt=full.dt * full.grid / grid if dt is None else dt,
-        lid_speed=(_DEFAULT_LID_SPEED if lid_speed is None else lid_speed) if driven else 0.0,
+        lid_speed=(0.15 if lid_speed is None else lid_speed) if driven else 0.0,
         lid_off_after=lid_off_after,
-        frequency=0 if driven else (_DEFAULT_FREQUENCY if frequency is None else frequency),
+        frequency=0 if driven else (4 if frequency is None else frequency),
         seed=seed,
     )
     _check_ranges(experiment)
@@ -139,11 +120,10 @@ def _check(holds: bool, what: str, where: str, expected: object, got: object) ->
 
 def _check_ranges(experiment: Experiment) -> None:
     """Refuse what the solver cannot resolve or is unstable at."""
-    parameters = solver_parameters(experiment)
-    box = box_of(parameters)
+    parameters, e, speed = solver_parameters(experiment), experiment, experiment.lid_speed
+    box = diagnostics.box_of(parameters)
     sound = math.sqrt(parameters.modulus / parameters.density)
     fastest = _ACOUSTIC_LIMIT / (sound * parameters.grid)
-    e, speed = experiment, experiment.lid_speed
     fewest = f"at least {box.cells**2} in {box.cells} x {box.cells} cells"
     enough = e.particles >= box.cells**2
     _check(enough, "fewer particles than cells", "--particles", fewest, e.particles)
@@ -163,7 +143,7 @@ def _check_ranges(experiment: Experiment) -> None:
     positive = math.isfinite(e.reynolds) and e.reynolds > 0.0
     _check(positive, "not a Reynolds number", "--re", "a positive number", e.reynolds)
     if e.case is Case.CURL_NOISE:
-        speed = _root_mean_square_speed(initial_state(dataclasses.replace(e, reynolds=None)))
+        speed = _root_mean_square(initial_state(dataclasses.replace(e, reynolds=None)).velocity)
     # Explicit diffusion is unstable beyond this viscosity.
     least = speed * box.width * e.dt / (_VISCOUS_LIMIT * box.spacing**2)
     stable, span = e.reynolds >= least, f"at least {least:.3g} at dt = {e.dt:.3g}"
@@ -188,7 +168,7 @@ def solver_parameters(experiment: Experiment) -> ClosedBoxParameters:
 
 def initial_state(experiment: Experiment) -> InitialState:
     """Fill the box with particles: at rest under a moving lid, or stirred by curl noise."""
-    box = box_of(solver_parameters(experiment))
+    box = diagnostics.box_of(solver_parameters(experiment))
     full = _full(experiment.case)
     rng = np.random.Generator(np.random.PCG64(experiment.seed))
     position = fill(rng, experiment.particles, low=box.low, high=box.high, jitter=full.value("jitter"))
@@ -201,27 +181,24 @@ def initial_state(experiment: Experiment) -> InitialState:
             high=box.high,
             scale=full.value("velocity_scale"),
         )
-        velocity = quantise(np.stack([psi.y, -psi.x], axis=-1))
-        affine = quantise(np.stack([psi.xy, psi.yy, -psi.xx, -psi.xy], axis=-1)).reshape(affine.shape)
+        velocity, affine = curl_noise.flow(psi)
     wall_velocity = np.zeros((len(WALLS), 2))
     wall_velocity[WALLS.index("top"), 0] = experiment.lid_speed
-    state = InitialState(
+    speed = experiment.lid_speed or _root_mean_square(velocity)
+    return InitialState(
         position=position,
         velocity=velocity,
         affine=affine,
         material=np.full(len(position), Material.LIQUID, dtype=np.int8),
         area=box.width**2,
+        # nu = U L / Re [length^2/s]
+        viscosity=0.0 if experiment.reynolds is None else speed * box.width / experiment.reynolds,
         wall_velocity=quantise(wall_velocity),
     )
-    if experiment.reynolds is None:
-        return state
-    speed = experiment.lid_speed or _root_mean_square_speed(state)
-    # nu = U L / Re [length^2/s]
-    return dataclasses.replace(state, viscosity=speed * box.width / experiment.reynolds)
 
 
-def _root_mean_square_speed(state: InitialState) -> float:
-    return float(np.sqrt(np.mean(np.sum(state.velocity**2, axis=-1))))
+def _root_mean_square(velocity: NDArray[np.float64]) -> float:
+    return float(np.sqrt(np.mean(np.sum(velocity**2, axis=-1))))
 
 
 CHECK_EVERY = 10_000  # substeps between two checks
@@ -260,7 +237,7 @@ class Result:
     # sum m (x(f) - x(f-1))^2 / 2 of each whole frame from the first [mass length^2]
     displacement_energy: list[float] = dataclasses.field(default_factory=list)
     averaged_from: int  # first substep of the velocity average
-    profiles: Profiles | None = None  # centre lines; None in curl noise
+    profiles: diagnostics.Profiles | None = None  # centre lines; None in curl noise
     seconds: float = 0.0  # wall time spent in the solver [s]
 
     @property
@@ -273,114 +250,74 @@ class Result:
 
     @property
     def largest_rise_after_lid_off(self) -> float | None:
-        """Largest gain of kinetic energy from one frame to the next, relative [1].
-
-        Counts from the frame at which the lid stops; not above 0 where the energy falls
-        monotonically. None while the lid moves.
-        """
+        """Largest relative gain of kinetic energy by a frame since the lid stopped; None while it moves."""
         off = self.experiment.lid_off_after
         if off is None:
             return None
         after = [e for at, e in zip(self.frame_substeps, self.kinetic_energy, strict=True) if at >= off]
         return max((b / a - 1.0 for a, b in itertools.pairwise(after)), default=None)
 
-    def deviations(self) -> tuple[Deviation, Deviation] | None:
+    def deviations(self) -> tuple[diagnostics.Deviation, diagnostics.Deviation] | None:
         """Return the deviation of u and of v from Ghia, Ghia & Shin, where they tabulate."""
-        reference = centre_lines(self.experiment.reynolds or 0.0)
+        reference = diagnostics.centre_lines(self.experiment.reynolds or 0.0)
         if self.profiles is None or reference is None or self.experiment.lid_off_after is not None:
             return None
         found = self.profiles.at_reference_points()
-        return deviation(found.u, reference.u), deviation(found.v, reference.v)
-
-
-class _Run:
-    """A solver and the result that grows with it."""
-
-    def __init__(self, experiment: Experiment, device: Device) -> None:
-        self.result = Result(experiment=experiment, averaged_from=experiment.substeps - averaged(experiment))
-        self.parameters = solver_parameters(experiment)
-        self.box = box_of(self.parameters)
-        self.state = initial_state(experiment)
-        self.mass = self.parameters.density * self.state.area / experiment.particles
-        threads = 1 if device is Device.CPU else None
-        self.solver = cast("ClosedBox", build(self.parameters, device=device, threads=threads))
-        # The first substep compiles; loading again starts afresh, and no compilation is timed.
-        self.solver.load([self.state])
-        self.solver.advance(1)
-        self.solver.load([self.state])
-        self.before = self.solver.position()[0]
-
-    def advance(self, first: int, last: int) -> None:
-        start = time.perf_counter()
-        self.solver.advance(last - first, average=first >= self.result.averaged_from)
-        self.result.seconds += time.perf_counter() - start
-        if last == self.result.experiment.lid_off_after:
-            self.solver.move_walls(np.zeros((1, *self.state.wall_velocity.shape), np.float32))
-
-    def interior(self, nodal: NDArray[np.floating]) -> NDArray[np.floating]:
-        inside = slice(self.parameters.wall + 1, self.parameters.grid - self.parameters.wall)
-        return nodal[inside, inside]
-
-    def record_frame(self, substep: int) -> None:
-        self.result.frame_substeps.append(substep)
-        self.result.kinetic_energy.append(kinetic_energy(self.solver.velocity()[0], self.mass))
-        if substep > 0:
-            after = self.solver.position()[0]
-            self.result.displacement_energy.append(displacement_energy(after, self.before, self.mass))
-            self.before = after
-
-    def check(self, substep: int) -> None:
-        position, jacobian = self.solver.position()[0], self.solver.jacobian()[0]
-        driven = self.result.experiment.case is Case.CAVITY
-        outside = jacobian[~lid_corners(position, self.box)] if driven else jacobian
-        counts = occupancy(position, self.box)
-        rates = grid_rates(self.interior(self.solver.grid_velocity()[0]), self.box.spacing)
-        self.result.checks.append(
-            Check(
-                substep=substep,
-                jacobian_min=float(jacobian.min()),
-                jacobian_max=float(jacobian.max()),
-                jacobian_min_outside_lid_corners=float(outside.min()),
-                jacobian_max_outside_lid_corners=float(outside.max()),
-                empty_cells=int(np.sum(counts == 0)),
-                particles_per_cell_min=int(counts.min()),
-                particles_per_cell_max=int(counts.max()),
-                divergence_rms=rates.divergence,
-                vorticity_rms=rates.vorticity,
-                divergence_over_vorticity=rates.ratio,
-            )
-        )
-
-
-def stops(experiment: Experiment) -> Iterator[int]:
-    """Yield the substeps at which the run pauses, ascending, the last one of the run included."""
-    last = experiment.substeps
-    points = {last, last - averaged(experiment), *range(CHECK_EVERY, last, CHECK_EVERY)}
-    points.update(range(experiment.frame_substeps, last, experiment.frame_substeps))
-    if experiment.lid_off_after is not None:
-        points.add(experiment.lid_off_after)
-    yield from sorted(points - {0})
-
-
-def averaged(experiment: Experiment) -> int:
-    """Return the substeps at the end over which the nodal velocity is averaged."""
-    return max(1, min(AVERAGED, experiment.substeps // 4))
+        return diagnostics.deviation(found.u, reference.u), diagnostics.deviation(found.v, reference.v)
 
 
 def run(experiment: Experiment, *, device: Device = Device.CPU, report: Report = lambda _: None) -> Result:
     """Simulate an experiment and measure it."""
-    running = _Run(experiment, device)
-    running.record_frame(0)
-    done = 0
-    for stop in stops(experiment):
-        running.advance(done, stop)
+    driven, end, frame = experiment.case is Case.CAVITY, experiment.substeps, experiment.frame_substeps
+    result = Result(experiment=experiment, averaged_from=end - max(1, min(AVERAGED, end // 4)))
+    parameters, state = solver_parameters(experiment), initial_state(experiment)
+    box, mass = diagnostics.box_of(parameters), parameters.density * state.area / experiment.particles
+    inside = slice(parameters.wall + 1, parameters.grid - parameters.wall)  # nodes between the walls
+    threads = 1 if device is Device.CPU else None
+    solver = cast("ClosedBox", build(parameters, device=device, threads=threads))
+    # The first substep compiles; loading again starts afresh, and no compilation is timed.
+    solver.load([state])
+    solver.advance(1)
+    solver.load([state])
+    done, before = 0, solver.position()[0]
+    stops = {0, end, result.averaged_from, experiment.lid_off_after or 0}
+    stops |= {*range(CHECK_EVERY, end, CHECK_EVERY), *range(frame, end, frame)}
+    for stop in sorted(stops):
+        start = time.perf_counter()
+        solver.advance(stop - done, average=done >= result.averaged_from)
+        result.seconds += time.perf_counter() - start
         done = stop
-        if done % experiment.frame_substeps == 0:
-            running.record_frame(done)
-        if done % CHECK_EVERY == 0 or done == experiment.substeps:
-            running.check(done)
+        if done == experiment.lid_off_after:
+            solver.move_walls(np.zeros((1, *state.wall_velocity.shape), np.float32))
+        position = solver.position()[0]
+        if done % frame == 0:
+            result.frame_substeps.append(done)
+            result.kinetic_energy.append(diagnostics.kinetic_energy(solver.velocity()[0], mass))
+            if done > 0:
+                result.displacement_energy.append(diagnostics.displacement_energy(position, before, mass))
+            before = position
+        if done == end or (done > 0 and done % CHECK_EVERY == 0):
+            jacobian = solver.jacobian()[0]
+            outside = jacobian[~diagnostics.lid_corners(position, box)] if driven else jacobian
+            counts = diagnostics.occupancy(position, box)
+            rates = diagnostics.grid_rates(solver.grid_velocity()[0][inside, inside], box.spacing)
+            result.checks.append(
+                Check(
+                    substep=done,
+                    jacobian_min=float(jacobian.min()),
+                    jacobian_max=float(jacobian.max()),
+                    jacobian_min_outside_lid_corners=float(outside.min()),
+                    jacobian_max_outside_lid_corners=float(outside.max()),
+                    empty_cells=int(np.sum(counts == 0)),
+                    particles_per_cell_min=int(counts.min()),
+                    particles_per_cell_max=int(counts.max()),
+                    divergence_rms=rates.divergence,
+                    vorticity_rms=rates.vorticity,
+                    divergence_over_vorticity=rates.ratio,
+                )
+            )
         report(done)
-    if experiment.case is Case.CAVITY:
-        mean = running.interior(running.solver.mean_grid_velocity()[0])
-        running.result.profiles = extract(mean, running.box, experiment.lid_speed)
-    return running.result
+    if driven:
+        mean = solver.mean_grid_velocity()[0][inside, inside]
+        result.profiles = diagnostics.extract(mean, box, experiment.lid_speed)
+    return result
