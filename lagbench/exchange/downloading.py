@@ -36,9 +36,7 @@ from lagbench.store.publication import publication
 from lagbench.work.progress import Meter, Progress
 
 REMEDY = "try again; if it stays so, name another store: --from"
-
-Reason = DataError | WorkFailedError | UsageError
-"""Why something could not be downloaded."""
+Reason = DataError | WorkFailedError | UsageError  # why something could not be downloaded
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -180,10 +178,7 @@ class _Download:
         self.missing = [f.scenario for f in findings if f.state is not State.GOOD]
 
     def run(self, urls: Iterable[str]) -> Reason:
-        """Fetch what is missing from stores in turn; return why something still is.
-
-        A store that lies, or a connection that keeps breaking, ends it.
-        """
+        """Fetch what is missing from stores in turn, unless one lies; return why something still is."""
         place = f"{self.size.split} {self.size.name}"
         reason: Reason = UsageError(
             "no store is known to download from",
@@ -196,12 +191,11 @@ class _Download:
             what = "datasets.yaml has no hash to check downloads against"
             return DataError(what, where=f"{place}, scenarios {spell_ids(unknown)}")
         for url in urls:
-            if not self.missing:
-                break
-            try:
-                reason = self._fetch_from(url.rstrip("/")) or reason
-            except StoreUnreachableError as error:
-                reason = error
+            if self.missing:
+                try:
+                    reason = self._fetch_from(url.rstrip("/")) or reason
+                except StoreUnreachableError as error:
+                    reason = error
         return reason
 
     def _fetch_from(self, url: str) -> NotInStoreError | None:
@@ -272,9 +266,8 @@ class _Download:
     def record(self) -> Manifest:
         """Write the manifest of what is there now; return it."""
         note_entries(self.size.folder(self.root), self._entries)
-        there = {entry.scenario for entry in self._entries}
-        kept = [e for e in self._old.files if e.scenario not in self.missing or e.scenario in there]
-        manifest = merged(self.size, self._old.model_copy(update={"files": tuple(kept)}), self._entries)
+        kept = tuple(entry for entry in self._old.files if entry.scenario not in self.missing)
+        manifest = merged(self.size, self._old.model_copy(update={"files": kept}), self._entries)
         if self.size.measured and "train" in manifest.subset_sha256:
             rows = {name: tuple(row) for name, row in self.size.measured.statistics.items()}
             manifest = manifest.model_copy(update={"statistics": rows})

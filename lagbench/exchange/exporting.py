@@ -39,7 +39,6 @@ from .metadata import (
 from .trajectory import Box, Run
 
 FORCE = "force.py"  # name of the program beside the data that LagrangeBench would run
-
 LAYERS = 3  # layers of particles of a wall, as LagrangeBench's own lid-driven cavity has them
 ALONG = (1, 1, 0, 0)  # axis along each wall: left, right, bottom, top
 
@@ -162,11 +161,7 @@ def export(
 
 
 class WallParticles:
-    """Layers of particles beside each wall of a box, at the spacing of the fluid's.
-
-    They go along with the wall's tangential velocity and come in again at its other end, so that they
-    stay beside it. The normal component, which closed boxes do not have, is left out.
-    """
+    """Layers of particles beside each wall of a box: they go along and come in again at its other end."""
 
     def __init__(self, bounds: Box, spacing: float) -> None:
         self.thickness = LAYERS * spacing
@@ -184,16 +179,12 @@ class WallParticles:
 
     def numbers(self, form: Format, velocity: NDArray[np.floating]) -> NDArray[np.int64]:
         """Return the number of each particle: of a wall that ever moves, or of one at rest."""
+        still, moving = WALL_NUMBERS[form]
         moves = (velocity != 0.0).any(axis=(0, 2))
-        table = np.array([WALL_NUMBERS[form][moving] for moving in moves.astype(int)], np.int64)
-        numbers: NDArray[np.int64] = table[self._wall]
-        return numbers
+        return np.where(moves[self._wall], moving, still)
 
     def travel(self, velocity: NDArray[np.floating], interval: float) -> NDArray[np.float64]:
-        """Return how far each wall has gone along itself since frame 0, shape [frame, wall].
-
-        ``velocity[f]`` acts from frame f-1 to f, shape [frame, wall, space].
-        """
+        """Return how far each wall has gone along itself; ``velocity[f]`` acts from frame f-1 to f."""
         steps = interval * velocity[:, range(len(ALONG)), ALONG].astype(np.float64)
         steps[0] = 0.0
         return np.cumsum(steps, axis=0)
@@ -203,10 +194,8 @@ class WallParticles:
         axis = np.array(ALONG)[self._wall]
         low, high = self._bounds[axis].T
         along = low + (self._along - low + travel[self._wall]) % (high - low)
-        places = np.stack(
-            [np.where(axis == 0, along, self._across), np.where(axis == 0, self._across, along)]
-        )
-        return places.T.astype(np.float32)
+        is_along = axis[:, None] == [0, 1]
+        return np.where(is_along, along[:, None], self._across[:, None]).astype(np.float32)
 
 
 def _origin(
@@ -241,19 +230,15 @@ def _with_walls(
 def _write_h5(
     path: Path, runs: Iterable[Run], *, length: int, origin: Sequence[float]
 ) -> list[tuple[int, int]]:
-    """Write one subset for LagrangeBench, whole or not at all; return frames and particles by trajectory.
-
-    That reader takes the length of the first trajectory for all: every one has ``length`` frames, longer
-    runs become several, and what is left over at their end is not written. ``origin`` is taken off every
-    position [length]. Chunks of one frame, with gzip and shuffle, are read there 5 to 10 times faster than
-    those that HDF5 chooses.
-    """
+    """Write one subset for LagrangeBench, whole or not at all; return frames and particles by trajectory."""
     shapes: list[tuple[int, int]] = []
     with (
         atomic_path(path, option="--output") as temporary,
         h5py.File(temporary, "w", libver="earliest") as out,
     ):
         for frames, position, kinds in runs:
+            # That reader takes the length of the first trajectory for all: longer runs become several, and
+            # what is left over is not written. It reads chunks of one frame 5 to 10 times faster.
             for start in range(0, frames - length + 1, length):
                 group = out.create_group(f"{len(shapes):05d}")
                 stored = group.create_dataset(
@@ -310,9 +295,8 @@ def _frames(size: Size, scenario: int, path: Path) -> int:
     with read_scenario(path) as file:
         found = file.header
     known = size.measured.scenario_sha256.get(scenario) if size.measured else None
-    if (found.key.major, found.key.scenario) != (size.major, scenario) or not (
-        found.content_sha256.startswith(known or "")
-    ):
+    same = (found.key.major, found.key.scenario) == (size.major, scenario)
+    if not (same and found.content_sha256.startswith(known or "")):
         raise DataError(
             "a scenario is not that of the registry",
             where=str(path),

@@ -29,13 +29,8 @@ from .metadata import Format, materials_of
 from .trajectory import Run, Trajectory, check_array, check_inflation, read_header
 
 JOINT = "gns_data"  # key under which some files hold all trajectories together
-_EPOCH = (1980, 1, 1, 0, 0, 0)
-"""Time of every member: the earliest that zip knows, so that equal data give equal bytes."""
-
 _NUMBERS = re.compile("[iu][1248]|f[248]|b1")  # codes of the types of numbers that may be in a file
-_MOST_STEPS = 1 << 18
-"""Steps of a pickle at the most; NumPy takes about fifty for a trajectory, each makes one object."""
-
+_MOST_STEPS = 1 << 18  # steps of a pickle, each makes one object; NumPy takes about fifty for a trajectory
 _PARTS = 3  # parts of a trajectory at the most: positions, kinds, a material property
 _DEPTH = 3  # how deep arrays may lie in each other: trajectories in a joint array, parts, and a spare
 
@@ -53,7 +48,8 @@ def write(path: Path, runs: Iterable[Run]) -> list[tuple[int, int]]:
             pair[0], pair[1] = np.empty((frames, len(kinds), 2), np.float32), kinds
             for number in range(frames):
                 pair[0][number] = position(number)
-            member = zipfile.ZipInfo(f"simulation_{len(shapes)}.npy", date_time=_EPOCH)
+            # A zip member's earliest time, which is the default: equal data give equal bytes.
+            member = zipfile.ZipInfo(f"simulation_{len(shapes)}.npy")
             member.external_attr = 0o644 << 16
             with archive.open(member, "w", force_zip64=True) as stream:
                 np.lib.format.write_array_header_1_0(
@@ -65,11 +61,7 @@ def write(path: Path, runs: Iterable[Run]) -> list[tuple[int, int]]:
 
 
 def trajectories(path: Path, kinds: Mapping[int, str]) -> Iterator[Trajectory]:
-    """Yield the trajectories of a file, one in memory at a time; its pickles are rebuilt.
-
-    Kinds say what numbers of particles stand for, see :func:`.metadata.materials_of`. Damage is refused
-    by an UnreadableFileError, positions that are not of two components by a DataError.
-    """
+    """Yield the trajectories of a file, one in memory at a time; its pickles are rebuilt."""
     try:
         archive = zipfile.ZipFile(path)
     except (OSError, zipfile.BadZipFile) as error:

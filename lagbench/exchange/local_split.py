@@ -38,10 +38,7 @@ SIZE = "full"  # size of every local split
 VERSION = "1.0.0"
 DEVICE = "cpu"
 HEAD = '# A local split of lagbench, written by `lagbench {}`; its hashes stand under "measured".\n'
-
-PER_CELL = 2.5
-"""Spacings of particles across a cell of the score grid where the user gives none; the splits of
-lagbench have 1.8 to 2.6."""
+PER_CELL = 2.5  # spacings of particles across a cell of the score grid; our own splits have 1.8 to 2.6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,11 +73,7 @@ def make_local_split(
     counts: Mapping[str, int] | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> LocalSplit:
-    """Write a local split of the trajectories of train, valid and test; it appears whole or not at all.
-
-    The last part of ``output`` is the name of the split, ``command`` stands in the head of its description;
-    ``counts`` are the trajectories of each subset, where they are known before.
-    """
+    """Write a local split of trajectories, of so many in each subset where ``counts`` tells, and load it."""
     folder = Path(os.path.abspath(expanded(output, "--output")))
     if about.name in load().splits:
         raise UsageError(
@@ -182,7 +175,7 @@ class _Building:
         with ScenarioWriter(
             scenario_path(self.root, key),
             key,
-            particles=trajectory.particles,
+            particles=len(trajectory.material),
             frames=trajectory.frames,
             frame_interval=1.0 / about.rate,
             material=trajectory.material,
@@ -204,10 +197,7 @@ class _Building:
         )
 
     def _frames(self, trajectory: Trajectory) -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
-        """Yield positions and velocities in the unit box; without own velocities, differences.
-
-        Then ``v(f) = (x(f) - x(f-1)) / interval``, and v(0) = v(1).
-        """
+        """Yield positions and velocities in the unit box; without own velocities, differences."""
         before: NDArray[np.float32] | None = None
         for number, (raw, own) in enumerate(trajectory.read()):
             position = self.about.measure.place(raw)
@@ -220,7 +210,7 @@ class _Building:
                 yield position, velocity
             elif before is not None:
                 velocity = ((position.astype(np.float64) - before) * self.about.rate).astype(np.float32)
-                if number == 1:
+                if number == 1:  # v(f) = (x(f) - x(f-1)) / interval, and v(0) = v(1)
                     yield before, velocity
                 yield position, velocity
             before = position
@@ -279,20 +269,16 @@ class _Building:
             "statistics": {name: list(row) for name, row in manifest.statistics.items()},
             "twin_floor": [],
         }
-        described = {
-            "format": 1,
-            "splits": {about.name: self._split(ids)},
-            "measured": {about.name: {SIZE: measured}},
-        }
-        text = spell_yaml(described)
-        (self.root / about.name / DESCRIPTION).write_text(HEAD.format(command) + text, encoding="utf-8")
+        splits = {about.name: self._split(ids)}
+        described = {"format": 1, "splits": splits, "measured": {about.name: {SIZE: measured}}}
+        text = HEAD.format(command) + spell_yaml(described)
+        (self.root / about.name / DESCRIPTION).write_text(text, encoding="utf-8")
         return manifest
 
     def _split(self, ids: Mapping[str, Sequence[int]]) -> dict[str, object]:
         """Return the description of the split as plain values."""
         about = self.about
-        box = ((self.low[0], self.high[0]), (self.low[1], self.high[1]))
-        bounds = box if about.bounds is None else about.measure.box(about.bounds)
+        bounds = about.measure.box(about.bounds) if about.bounds else zip(self.low, self.high, strict=True)
         frames: dict[int, list[int]] = {}
         for entry in self.entries:
             frames.setdefault(entry.frames, []).append(entry.scenario)
@@ -358,14 +344,12 @@ class _Building:
                 got=spell_ids(interest) if interest[0] >= 0 else interest,
             )
         placement = Placement.CELL_CENTRES if about.full_box else Placement.NODES
+        cells = about.cells or self._suitable_cells(placement, (about.input_frames, last))
         return {
             "input_frames": about.input_frames,
             "horizon": horizon,
             "frames_of_interest": interest,
-            "score_grid": {
-                "cells": about.cells or self._suitable_cells(placement, (about.input_frames, last)),
-                "placement": placement.value,
-            },
+            "score_grid": {"cells": cells, "placement": placement.value},
             "radius": about.radius / about.measure.scale,
         }
 

@@ -34,10 +34,7 @@ MAX_BYTES = 1 << 20
 
 Pair = tuple[FiniteFloat, FiniteFloat]
 Length = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Shapes = Mapping[str, Sequence[tuple[int, int]]]
-"""Frames and particles of every trajectory, by subset."""
-
-_GRANULES = 2**20
+Shapes = Mapping[str, Sequence[tuple[int, int]]]  # frames and particles of every trajectory, by subset
 
 
 class Format(enum.StrEnum):
@@ -80,18 +77,13 @@ def parse_format(name: str) -> Format:
 def numbers_of(form: Format, material: NDArray[np.integer]) -> NDArray[np.int64]:
     """Return the number of each particle's material, shape [particle]."""
     table = np.array([NUMBERS[form][name] for name in MATERIALS], dtype=np.int64)
-    numbers: NDArray[np.int64] = table[material]
-    return numbers
+    return np.asarray(table[material])
 
 
 def materials_of(
     form: Format, numbers: NDArray[np.integer], *, given: Mapping[int, str], where: str
 ) -> tuple[NDArray[np.int8], NDArray[np.bool_]]:
-    """Return the material of each particle that is kept, and a mask over all particles.
-
-    ``given`` is what the user said of numbers: a material, or "drop". A number that no material has
-    and the user did not map, or no particle left, is an UnreadableFileError that names ``where``.
-    """
+    """Return the material of each particle kept, and a mask over all; ``given`` is what the user said."""
     known = {number: name for name, number in NUMBERS[form].items()} | {PADDING: DROP} | dict(given)
     codes = {number: _DROPPED if name == DROP else _code(name) for number, name in known.items()}
     found = np.unique(numbers).tolist()
@@ -161,16 +153,16 @@ class Source(BaseModel):
     model_config = ConfigDict(frozen=True)
 
     bounds: tuple[Pair, Pair]  # box of the source [its length]
-    radius: Length  # connectivity radius [its length]
-    frame_interval: Length | None  # time between frames [s]; None where none is stated
-    spacing: Length | None  # distance of neighbouring particles at first [its length]
-    periodic: tuple[bool, bool]  # whether the box is periodic, along x and y
-    hints: Hints  # what our own exports add
+    radius: Length = Field(alias="default_connectivity_radius")  # [its length]
+    frame_interval: Length | None = Field(alias="dt")  # time between frames [s]; None where none is stated
+    spacing: Length | None = Field(alias="dx")  # distance of neighbouring particles at first [its length]
+    periodic: tuple[bool, bool] = Field(alias="periodic_boundary_conditions")  # along x and y
+    hints: Hints = Field(alias=OWN_KEY)  # what our own exports add
 
 
 def floor_of(value: float) -> float:
     """Return the largest multiple of 2^-20 below: taken off a float32 beyond it, nothing is lost."""
-    return math.floor(value * _GRANULES) / _GRANULES
+    return math.floor(value * 2**20) / 2**20
 
 
 def describe(
@@ -187,13 +179,7 @@ def describe(
     free_slip: bool,
     wall: float | None = None,
 ) -> dict[str, object]:
-    """Return the metadata of an export.
-
-    Statistics are mean and std over train per frame, see ``lagbench.data.statistics``. ``spacing`` is the
-    distance of neighbouring particles at first, ``origin`` what was taken off every position,
-    ``from_walls`` whether the bounds are those of the box, ``wall`` the thickness of wall particles where
-    there are some [length].
-    """
+    """Return the metadata of an export whose walls, where they are particles, are ``wall`` thick [length]."""
     task, grid = size.task, size.task.score_grid
     short = {"vel": "velocity", "acc": "acceleration"}
     common = {
@@ -253,9 +239,7 @@ def describe(
         # Its cell lists start at 0 and are as long as the bounds are apart: particles beyond the
         # difference would lose their neighbours.
         if wall is not None:
-            special["bounds"] = [
-                [0.0, high + wall - o] for (_, high), o in zip(size.bounds, origin, strict=True)
-            ]
+            special["bounds"] = [[0.0, h + wall - o] for (_, h), o in zip(size.bounds, origin, strict=True)]
         elif not from_walls:
             special["bounds"] = [[0.0, 1.0], [0.0, 1.0]]
     return {**common, **special, OWN_KEY: own}
@@ -301,29 +285,18 @@ def read_source(folder: Path, form: Format) -> Source:
         return Source.model_validate(
             {
                 "bounds": values.get("bounds"),
-                "radius": values.get("default_connectivity_radius"),
-                "frame_interval": step * steps or None,
-                "spacing": values.get("dx") if form is Format.LAGRANGEBENCH_H5 else None,
-                "periodic": values.get("periodic_boundary_conditions") or (False, False),
-                "hints": values.get(OWN_KEY) or {},
+                "default_connectivity_radius": values.get("default_connectivity_radius"),
+                "dt": step * steps or None,
+                "dx": values.get("dx") if form is Format.LAGRANGEBENCH_H5 else None,
+                "periodic_boundary_conditions": values.get("periodic_boundary_conditions") or (False, False),
+                OWN_KEY: values.get(OWN_KEY) or {},
             }
         )
     except ValidationError as error:
         first = error.errors()[0]
-        name, *inner = map(str, first["loc"] or ("frame_interval",))
         raise UnreadableFileError(
             "the metadata lack what a split needs, or state it otherwise",
-            where=f"{path}, key {'.'.join((_KEYS.get(name, name), *inner))}",
+            where=f"{path}, key {'.'.join(map(str, first['loc'] or ('dt',)))}",
             expected=first["msg"],
             got=first["input"],
         ) from None
-
-
-_KEYS = {
-    "radius": "default_connectivity_radius",
-    "frame_interval": "dt",
-    "spacing": "dx",
-    "periodic": "periodic_boundary_conditions",
-    "hints": OWN_KEY,
-}
-"""Key of what :class:`Source` holds, where it has another name."""

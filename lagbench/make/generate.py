@@ -13,6 +13,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -45,7 +46,7 @@ from lagbench.work.progress import Meter, Progress
 from lagbench.work.run import ONE_THREAD, read_many
 
 from .cards import card_texts, write_cards
-from .inventory import Look, compare, look
+from .inventory import compare, examine, look
 from .plan import Estimate, Scenarios, Selection, check_disk, estimate, free_bytes, note_pace, select
 
 Job = TypeVar("Job")
@@ -88,11 +89,7 @@ class Generation:
     def survey(
         self, wanted: Sequence[int], *, force: bool = False, gathered: Collection[int] | None = None
     ) -> None:
-        """Find out what is there and what is to do; writes nothing.
-
-        With ``gathered``, what a real call would take from other root folders, it only tells: that counts
-        as there, and the manifest's word is taken for files.
-        """
+        """Find out what is there and what is to do; with ``gathered``, what would be there, it only tells."""
         old = read_or_empty(self.size, self.root)
         held = self.store.held if self.store else {}
         local = [i for i in self.size.scenarios if i not in held]
@@ -101,23 +98,14 @@ class Generation:
         stated = {entry.scenario: entry.bytes for entry in old.files}
         suspects = [i for i in local if i in wanted or lengths.get(i) != stated.get(i)]
         self._meter.begin("checking", total=len(suspects), scenarios=len(suspects))
-        looks = {
-            f"scenario {i}": Look(
-                root=self.root,
-                size=self.size,
-                scenario=i,
-                manifest=old.only(i),
-                trusting=gathered is not None,
-            )
-            for i in suspects
-        }
+        quick = partial(examine, self.root, self.size, quick=True, trusting=gathered is not None)
+        looks = {f"scenario {i}": partial(quick, i, manifest=old.only(i)) for i in suspects}
         findings = self._read(look, looks, map(self._path, suspects))
-        good = [finding.entry for finding in findings if finding.entry]
-        self._hashed = [*good]
-        bad = set(suspects) - {entry.scenario for entry in good}
-        good += held.values()
+        self._hashed = [finding.entry for finding in findings if finding.entry]
+        bad = set(suspects) - {entry.scenario for entry in self._hashed}
         kept = tuple(e for e in old.files if e.scenario not in bad)
-        self.manifest = merged(self.size, old.model_copy(update={"files": kept}), good)
+        there = [*self._hashed, *held.values()]
+        self.manifest = merged(self.size, old.model_copy(update={"files": kept}), there)
         self.kept = [i for i in wanted if (i not in bad or i in (gathered or ())) and not force]
         on_cores = self.device is Device.CPU and self.scheduler is None
         self.to_do = estimate(self.size, [i for i in wanted if i not in self.kept], on_cores=on_cores)
@@ -157,22 +145,15 @@ class Generation:
         if self.store:
             self.store.finish(self.manifest, cards)
 
-    def missing(self) -> tuple[int, ...]:
-        """Return the ids of the size that the manifest does not hold."""
-        return tuple(i for i in self.size.scenarios if self.manifest.entry(i) is None)
-
     def _read(
         self, function: Callable[[Job, Report], Result], jobs: Mapping[str, Job], files: Iterable[Path]
     ) -> list[Result]:
         """Run a function that reads files, here or by the workers; the meter counts files."""
-        return read_many(
-            function,
-            jobs,
-            files,
-            lambda count: self._meter.count(count, scenarios=count),
-            workers=self.workers,
-            scheduler=self.scheduler,
-        )
+
+        def count(files: int) -> None:
+            self._meter.count(files, scenarios=files)
+
+        return read_many(function, jobs, files, count, workers=self.workers, scheduler=self.scheduler)
 
     def _path(self, scenario: int) -> Path:
         return self.size.path(self.root, scenario)
@@ -188,8 +169,8 @@ class Generation:
         width = 1 if self.device is Device.CPU else max(1, BATCH_PARTICLES // self.size.particles)
         batches = [tuple(longest_first[k : k + width]) for k in range(0, len(longest_first), width)]
         tasks = [
-            self._task(f"scenario {spell_ids(batch)}", simulate, batch, sum(costs[i] for i in batch))
-            for batch in batches
+            self._task(f"scenario {spell_ids(ids)}", simulate, ids, sum(costs[i] for i in ids))
+            for ids in batches
         ]
         tasks += map(self._twin, twins)
         if not tasks:
@@ -211,12 +192,9 @@ class Generation:
                     self._take(event.value, team, event.machine or environment_of(self.device))
                 else:
                     floors = {i: tuple(map(round_digits, floor)) for i, floor in event.value.items()}
-                    entries = [
-                        entry.model_copy(update={"twin_floor": floors[entry.scenario]})
-                        for entry in self.manifest.files
-                        if entry.scenario in floors
-                    ]
-                    self._keep(merged(self.size, self.manifest, entries))
+                    files = [entry for entry in self.manifest.files if entry.scenario in floors]
+                    files = [e.model_copy(update={"twin_floor": floors[e.scenario]}) for e in files]
+                    self._keep(merged(self.size, self.manifest, files))
 
     def _task(self, what: str, function: Callable[..., Any], scenarios: tuple[int, ...], cost: float) -> Task:
         job = SimulationJob(size=self.size, scenarios=scenarios, root=self.root, device=self.device)
@@ -362,6 +340,7 @@ def generate(
             publication(tier, folder) as generation.store,
         ):
             generation.run(wanted, force=force)
+    manifest = generation.manifest
     return GenerationResult(
         split=tier.split,
         size=tier.name,
@@ -372,14 +351,14 @@ def generate(
         workers=cores,
         simulated=generation.to_do.scenarios,
         kept=tuple(generation.kept),
-        missing=tuple(i for i in generation.missing() if i not in generation.kept),
+        missing=tuple(i for i in tier.scenarios if not manifest.entry(i) and i not in generation.kept),
         bytes_needed=generation.to_do.bytes,
         bytes_free=free,
         seconds_expected=generation.to_do.seconds(cores),
         measured=generation.to_do.measured,
         seconds=time.monotonic() - started,
-        complete=generation.manifest.complete,
-        dataset_sha256=generation.manifest.dataset_sha256,
+        complete=manifest.complete,
+        dataset_sha256=manifest.dataset_sha256,
         verdict=generation.verdict,
         dry_run=dry_run,
     )

@@ -123,11 +123,7 @@ def examine(
     quick: bool = False,
     trusting: bool = False,
 ) -> Finding:
-    """Look at the file of one scenario.
-
-    ``quick`` does not hash values that this machine has hashed before, and asks for an entry; ``trusting``
-    takes the manifest's word for the others too.
-    """
+    """Look at a file; ``quick`` believes what was hashed here and asks for an entry, ``trusting`` the manifest."""
     key = size.key(scenario)
     path = scenario_path(root, key)
     if not path.exists():
@@ -183,27 +179,9 @@ def examine(
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Look:
-    """The arguments of a quick :func:`examine`, for a worker."""
-
-    root: Path  # folder that holds all data sets
-    size: Size  # tier of a split
-    scenario: int  # id
-    manifest: Manifest  # what the folder's manifest says of this scenario
-    trusting: bool = False  # whether that is believed
-
-
-def look(order: Look, report: Callable[[int], None]) -> Finding:
-    """Examine the file of one scenario quickly and report it as one unit of work."""
-    finding = examine(
-        order.root,
-        order.size,
-        order.scenario,
-        manifest=order.manifest,
-        quick=True,
-        trusting=order.trusting,
-    )
+def look(examined: Callable[[], Finding], report: Callable[[int], None]) -> Finding:
+    """Examine a file, as a worker does, and report it as one unit of work."""
+    finding = examined()
     report(1)
     return finding
 
@@ -228,8 +206,7 @@ def _check_header(path: Path, header: ScenarioHeader, size: Size, scenario: int)
         raise DataError("a file holds another scenario", where=str(path), expected=wanted, got=found)
     if not size.simulated:  # then the recorded content hash covers the parameters
         return
-    drawn = file_parameters(size, draw(size, scenario))
-    parameters = {name: plain(value) for name, value in drawn.items()}
+    parameters = {name: plain(value) for name, value in file_parameters(size, draw(size, scenario)).items()}
     # What only the simulation tells is covered by the content hash.
     stated = {name: value for name, value in header.parameters.items() if name not in OUTCOMES}
     if parameters != stated:
@@ -256,20 +233,24 @@ def compare(size: Size, manifest: Manifest, *, promised: Collection[int] = ()) -
     tolerated = {e.scenario for e in manifest.files if may_differ(e.device, manifest.environments)}
     tolerated -= set(promised)
     broken = [i for i in differing if i not in tolerated]
-    if broken:
-        what = f"{len(broken)} of {len(manifest.files)} scenarios have another hash"
-        raise _broken(what, f"{size.split} {size.name}, scenarios {spell_ids(broken)}", record)
-    if differing:
-        return f"scenarios {spell_ids(differing)} have {other_bits(size)}"
     found = {**manifest.subset_sha256, "the data set": manifest.dataset_sha256}
     wanted = {**measured.subset_sha256, "the data set": measured.dataset_sha256}
     others = [name for name, digest in found.items() if digest is not None and digest != wanted.get(name)]
-    if others:
-        where = f"{size.split} {size.name}, {', '.join(others)}"
-        raise _broken(
-            "subsets or the data set have another hash though every scenario has its own", where, record
-        )
-    return f"equal to {record}" if manifest.complete else f"what is there is equal to {record}"
+    if broken:
+        what = f"{len(broken)} of {len(manifest.files)} scenarios have another hash"
+        others = [f"scenarios {spell_ids(broken)}"]
+    elif differing:
+        return f"scenarios {spell_ids(differing)} have {other_bits(size)}"
+    elif others:
+        what = "subsets or the data set have another hash though every scenario has its own"
+    else:
+        return f"equal to {record}" if manifest.complete else f"what is there is equal to {record}"
+    raise DataError(
+        what,
+        where=f"{size.split} {size.name}, {', '.join(others)}",
+        expected=f"the hashes in {record}",
+        fix="see docs/determinism.md; `lagbench doctor` prints what a report needs",
+    )
 
 
 def unlike(size: Size) -> str:
@@ -291,25 +272,3 @@ def hash_verdict(size: Size, computed: str | None, recorded: str | None, *, tole
     if computed == recorded:
         return f"equal to {record_of(size)}"
     return other_bits(size) if tolerated else unlike(size)
-
-
-def unlike_measures(size: Size, manifest: Manifest) -> list[str]:
-    """Return the statistics, and the twin floor, of a manifest that datasets.yaml has otherwise.
-
-    They follow from the bits, so a manifest that is complete and bitwise must have them.
-    """
-    measured = size.measured
-    if measured is None or not manifest.complete or manifest.identity != "bitwise":
-        return []
-    names = sorted(measured.statistics.keys() | manifest.statistics.keys())
-    found = [n for n in names if measured.statistics.get(n) != manifest.statistics.get(n)]
-    return found + (["twin floor"] if manifest.mean_twin_floor() != measured.twin_floor else [])
-
-
-def _broken(what: str, where: str, record: str) -> DataError:
-    return DataError(
-        what,
-        where=where,
-        expected=f"the hashes in {record}",
-        fix="see docs/determinism.md; `lagbench doctor` prints what a report needs",
-    )

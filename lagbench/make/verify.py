@@ -35,7 +35,6 @@ from .inventory import (
     record_of,
     recorded_hash,
     unlike,
-    unlike_measures,
 )
 from .plan import Scenarios, Selection, estimate, select
 
@@ -188,9 +187,7 @@ def verify(
     )
 
 
-IDENTICAL = "identical"
 DIFFERENT = "different"
-INCOMPARABLE = "nothing to compare with"
 
 
 def evenly_spaced(ids: Sequence[int], count: int) -> tuple[int, ...]:
@@ -233,8 +230,8 @@ def _likeness(size: Size, finding: Finding, content: str) -> str:
     if finding.tolerated or not known:
         known += filter(None, [recorded_hash(size, finding.scenario)])
     if not known:
-        return INCOMPARABLE
-    return IDENTICAL if any(map(content.startswith, known)) else DIFFERENT
+        return "nothing to compare with"
+    return "identical" if any(map(content.startswith, known)) else DIFFERENT
 
 
 def _reports(
@@ -278,5 +275,11 @@ def _notes(size: Size, manifest: Manifest | None, findings: Mapping[int, Finding
     entries = {entry.scenario: entry.content_sha256 for entry in manifest.files}
     others = [i for i, f in findings.items() if i in entries and f.content_sha256 not in (None, entries[i])]
     notes = [f"the manifest has other hashes of {spell_ids(others)}"] if others else []
-    names = unlike_measures(size, manifest)
-    return notes + ([f"the manifest has another {', '.join(names)} than {record_of(size)}"] if names else [])
+    # What follows from the bits must be as recorded where all of them are.
+    if size.measured and manifest.complete and manifest.identity == "bitwise":
+        found = {**manifest.statistics, "twin floor": manifest.mean_twin_floor()}
+        known = {**size.measured.statistics, "twin floor": size.measured.twin_floor}
+        names = [*sorted((known.keys() | found.keys()) - {"twin floor"}), "twin floor"]
+        names = [name for name in names if found.get(name) != known.get(name)]
+        notes += [f"the manifest has another {', '.join(names)} than {record_of(size)}"] if names else []
+    return notes
