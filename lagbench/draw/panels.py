@@ -53,10 +53,8 @@ UNITS = {
 DOT = 1.25  # diameter of a drawn particle in particle spacings: neighbours overlap a little
 MOST_DOTS = 1 << 16  # particles drawn at the most; more would take memory and no eye would tell
 
-FEW_NODES = 4
-_ALONG = np.array(
-    [[0.0, 1.0], [0.0, 1.0], [1.0, 0.0], [1.0, 0.0]]
-)  # along the walls left, right, bottom, top
+FEW_NODES = 4  # of which too few fields are differentiable for a streamline
+_ALONG = np.array([(0.0, 1.0), (0.0, 1.0), (1.0, 0.0), (1.0, 0.0)])  # along walls left, right, bottom, top
 
 
 def limit_of(panel: Panel, scene: Scene) -> float:
@@ -82,8 +80,8 @@ def draw(axes: Axes, panel: Panel, scene: Scene, *, limit: float, detail: float 
     elif panel is Panel.VORTICITY:
         _draw_field(axes, scene, scene.vorticity, scale)
     else:
-        _draw_field(axes, scene, np.where(scene.fields.counted, _grid_speed(scene), np.nan), scale)
         fields = scene.fields
+        _draw_field(axes, scene, np.where(fields.counted, _grid_speed(scene), np.nan), scale)
         if fields.differentiable.sum() < FEW_NODES:
             return
         u, v = (np.ma.masked_array(fields.velocity[..., axis], ~fields.counted).T for axis in (0, 1))

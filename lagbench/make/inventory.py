@@ -123,7 +123,7 @@ def examine(
     quick: bool = False,
     trusting: bool = False,
 ) -> Finding:
-    """Look at a file; ``quick`` believes what was hashed here and asks for an entry, ``trusting`` the manifest."""
+    """Look at a file; ``quick`` asks for an entry and takes hashes of before, ``trusting`` the manifest's."""
     key = size.key(scenario)
     path = scenario_path(root, key)
     if not path.exists():

@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     Row = tuple[float, int, int]  # seconds, particle substeps and frames, as in Pace
 
 
-RATES = "rates.json"  # file of the measured rates, in the user's cache
 MOST_BYTES = 1 << 16  # a longer file of rates is not ours [bytes]
 MOST_ROWS = 32  # numbers of particles per kind of solver that are kept, the latest ones
 SECONDS = Limit(low=0, high=1e9, open_low=True)  # processor time of the generations behind a rate [s]
@@ -191,7 +190,7 @@ def note_pace(size: Size, paces: Sequence[Pace]) -> None:
 
 
 def _path() -> Path:
-    return cache_folder("rates") / RATES
+    return cache_folder("rates") / "rates.json"
 
 
 def _kind(size: Size) -> str:
