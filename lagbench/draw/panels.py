@@ -35,20 +35,17 @@ class Panel(enum.StrEnum):
     STREAMLINES = "streamlines"
 
 
-TITLES = {
+TITLES = {  # heading of each panel
     Panel.SPEED: "Particles by speed",
     Panel.MATERIAL: "Particles by material",
     Panel.VORTICITY: "Vorticity",
     Panel.STREAMLINES: "Streamlines",
 }
-"""Heading of each panel."""
-
-UNITS = {
+UNITS = {  # what colour bars say: physical time throughout, as velocity in the files
     Panel.SPEED: "speed  [length/s]",
     Panel.VORTICITY: "vorticity  [1/s]",
     Panel.STREAMLINES: "speed on the grid  [length/s]",
 }
-"""What colour bars say: physical time throughout, as velocity in the files."""
 
 DOT = 1.25  # diameter of a drawn particle in particle spacings: neighbours overlap a little
 MOST_DOTS = 1 << 16  # particles drawn at the most; more would take memory and no eye would tell

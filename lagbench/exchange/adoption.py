@@ -211,16 +211,8 @@ def _h5_trajectory(
     position, kinds = group["position"], group["particle_type"]
     shape = position.shape
     check_array(name, shape, position.dtype)
-    numbers = np.asarray(kinds)
-    if numbers.shape != shape[1:2] or numbers.dtype.kind not in "iu":
-        raise UnreadableFileError(
-            "these are no kinds of particles",
-            where=name,
-            expected=f"{shape[1]} integers",
-            got=f"{numbers.dtype} of shape {numbers.shape}",
-        )
-    material, kept = materials_of(Format.LAGRANGEBENCH_H5, numbers, given=given, where=name)
-
+    form, numbers = Format.LAGRANGEBENCH_H5, np.asarray(kinds)
+    material, kept = materials_of(form, numbers, shape[1], given=given, where=name)
     origin = np.asarray(stated.hints.origin, np.float32)
     sides = np.array([high - low for low, high in stated.bounds])
     half = np.where(stated.periodic, sides / 2.0, np.inf)

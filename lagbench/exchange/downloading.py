@@ -201,7 +201,16 @@ class _Download:
     def _fetch_from(self, url: str) -> NotInStoreError | None:
         """Fetch what one store has; return the error of the last file that it has not."""
         check_disk(self.root, sum(map(self.size.file_bytes, self.missing)))
-        claims, last = self._claims(url), None
+        # What its manifest says of the files that datasets.yaml means; None without one.
+        claims: dict[int, FileEntry] | None = None
+        last: NotInStoreError | None = None
+        place = address_of(self.size, url, MANIFEST_NAME)
+        with suppress(NotInStoreError):
+            text = fetch_text(place, limit=MANIFEST_LIMIT, remedy=REMEDY)
+            manifest = parse_manifest(self.size, text, where=place, remedy=REMEDY)
+            claims = {entry.scenario: entry for entry in manifest.files}
+            other = [i for i in self.missing if i in claims and not claims[i].has_hash(self._recorded[i])]
+            refuse_strangers(manifest, other, where=place, remedy=REMEDY)
         wanted = {}
         for i in self.missing:
             key, claim = self.size.key(i), (claims or {}).get(i)
@@ -234,19 +243,6 @@ class _Download:
         finally:
             self.missing = [i for i in self.missing if i not in self.downloaded]
         return last
-
-    def _claims(self, url: str) -> dict[int, FileEntry] | None:
-        """Return what the store's manifest says of the files that datasets.yaml means; None without one."""
-        place = address_of(self.size, url, MANIFEST_NAME)
-        try:
-            text = fetch_text(place, limit=MANIFEST_LIMIT, remedy=REMEDY)
-        except NotInStoreError:
-            return None
-        manifest = parse_manifest(self.size, text, where=place, remedy=REMEDY)
-        found = {entry.scenario: entry for entry in manifest.files}
-        other = [i for i in self.missing if i in found and not found[i].has_hash(self._recorded[i])]
-        refuse_strangers(manifest, other, where=place, remedy=REMEDY)
-        return found
 
     def _take(self, url: str, scenario: int, claim: FileEntry | None) -> None:
         """Note a new file; what cannot be told from it is the store's word."""

@@ -103,9 +103,7 @@ def export(
     tier, home, splits = locate(split, size, root=root, registry=registry)
     folder, ending = Path(output), ENDINGS[form]
     _check_target(folder, [f"{subset}{ending}" for subset in HASHED_SUBSETS], force=force)
-    frames_of: dict[str, dict[Path, int]] = {subset: {} for subset in HASHED_SUBSETS}
-    for scenario, path in sorted(scenario_files(tier, home, HASHED_SUBSETS).items()):
-        frames_of[tier.subset_of(scenario)][path] = _frames(tier, scenario, path)
+    frames_of = _frames_of(tier, home)
     statistics, digest = _recorded(tier, home)
     with read_scenario(next(iter(frames_of["train"]))) as file:
         spacing = math.sqrt(float(file.read("particle_mass")) / float(tier.value("density")))
@@ -119,7 +117,10 @@ def export(
             raise UsageError(what, where="--wall-particles and --unit-box", fix="leave out --unit-box")
         walls = WallParticles(tier.bounds, spacing)
     measured = closed if from_walls is None else from_walls
-    origin = _origin(tier, form, walls, from_walls=measured)
+    # What is taken off every position, so that none is below 0 where bounds start there.
+    shifted = form is Format.LAGRANGEBENCH_H5 and (measured or wall_particles)
+    beyond = walls.thickness if walls else 0.0
+    left, bottom = (floor_of(low - beyond) if shifted else 0.0 for low, _ in tier.bounds)
     with contextlib.suppress(OSError):  # written last, it says that an export is whole
         (folder / NAME).unlink()
     meter = Meter(progress)
@@ -130,7 +131,7 @@ def export(
         if form is Format.GNS_NPZ:
             shapes[subset] = gns_npz.write(target, runs)
         else:
-            shapes[subset] = _write_h5(target, runs, length=min(files.values()), origin=origin)
+            shapes[subset] = _write_h5(target, runs, length=min(files.values()), origin=(left, bottom))
         meter.count(1, scenarios=len(files))
     metadata = describe(
         tier,
@@ -140,7 +141,7 @@ def export(
         title=splits.split(tier.split).title,
         dataset_sha256=digest,
         spacing=spacing,
-        origin=origin,
+        origin=(left, bottom),
         from_walls=measured,
         free_slip=not (tier.simulated and getattr(solver_constants(tier), "no_slip", False)),
         wall=walls.thickness if walls else None,
@@ -196,17 +197,6 @@ class WallParticles:
         along = low + (self._along - low + travel[self._wall]) % (high - low)
         is_along = axis[:, None] == [0, 1]
         return np.where(is_along, along[:, None], self._across[:, None]).astype(np.float32)
-
-
-def _origin(
-    size: Size, form: Format, walls: WallParticles | None, *, from_walls: bool
-) -> tuple[float, float]:
-    """Return what is taken off every position, so that none is below 0 where bounds start there."""
-    if form is not Format.LAGRANGEBENCH_H5 or not (from_walls or walls):
-        return 0.0, 0.0
-    beyond = walls.thickness if walls else 0.0
-    (x, _), (y, _) = size.bounds
-    return floor_of(x - beyond), floor_of(y - beyond)
 
 
 def _runs(files: Iterable[Path], form: Format, interval: float, walls: WallParticles | None) -> Iterator[Run]:
@@ -290,18 +280,21 @@ def _recorded(size: Size, root: Path) -> tuple[dict[str, tuple[float, ...]], str
     return dict(manifest.statistics), manifest.dataset_sha256
 
 
-def _frames(size: Size, scenario: int, path: Path) -> int:
-    """Return the frames of a scenario after a look at its header."""
-    with read_scenario(path) as file:
-        found = file.header
-    known = size.measured.scenario_sha256.get(scenario) if size.measured else None
-    same = (found.key.major, found.key.scenario) == (size.major, scenario)
-    if not (same and found.content_sha256.startswith(known or "")):
-        raise DataError(
-            "a scenario is not that of the registry",
-            where=str(path),
-            expected=f"scenario {scenario}, content hash {known or 'any'}",
-            got=f"scenario {found.key.scenario}, content hash {found.content_sha256[:16]}",
-            fix=f"lagbench verify --split {size.split} --size {size.name}",
-        )
-    return found.frames
+def _frames_of(size: Size, root: Path) -> dict[str, dict[Path, int]]:
+    """Return files and their frames by subset, in order of their ids, after a look at each header."""
+    frames: dict[str, dict[Path, int]] = {subset: {} for subset in HASHED_SUBSETS}
+    for scenario, path in sorted(scenario_files(size, root, HASHED_SUBSETS).items()):
+        with read_scenario(path) as file:
+            found = file.header
+        known = size.measured.scenario_sha256.get(scenario) if size.measured else None
+        same = (found.key.major, found.key.scenario) == (size.major, scenario)
+        if not (same and found.content_sha256.startswith(known or "")):
+            raise DataError(
+                "a scenario is not that of the registry",
+                where=str(path),
+                expected=f"scenario {scenario}, content hash {known or 'any'}",
+                got=f"scenario {found.key.scenario}, content hash {found.content_sha256[:16]}",
+                fix=f"lagbench verify --split {size.split} --size {size.name}",
+            )
+        frames[size.subset_of(scenario)][path] = found.frames
+    return frames

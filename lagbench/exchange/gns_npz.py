@@ -92,7 +92,6 @@ def _trajectory(name: str, item: object, given: Mapping[int, str]) -> Trajectory
         )
     position = parts[0]
     check_array(name, position.shape, position.dtype)
-    particles = position.shape[1]
     try:
         numbers = np.asarray(parts[1])
         values = np.unique(np.asarray(parts[2:], dtype=np.float64))
@@ -100,15 +99,7 @@ def _trajectory(name: str, item: object, given: Mapping[int, str]) -> Trajectory
         raise UnreadableFileError(
             "these are no kinds and no material property", where=name, expected="numbers", got=error
         ) from error
-    if numbers.dtype.kind not in "iu" or numbers.shape not in ((), (1,), (particles,)):
-        raise UnreadableFileError(
-            "these are no kinds of particles",
-            where=name,
-            expected=f"an integer, or {particles} of them",
-            got=f"{numbers.dtype} of shape {numbers.shape}",
-        )
-    numbers = np.broadcast_to(numbers, (particles,))
-    material, kept = materials_of(Format.GNS_NPZ, numbers, given=given, where=name)
+    material, kept = materials_of(Format.GNS_NPZ, numbers, position.shape[1], given=given, where=name)
     if len(values) == 1 and not np.isfinite(values[0]):
         raise UnreadableFileError("the material property is not finite", where=name, got=values[0])
     chosen = position if kept.all() else position[:, kept]

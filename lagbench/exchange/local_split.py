@@ -76,13 +76,11 @@ def make_local_split(
     """Write a local split of trajectories, of so many in each subset where ``counts`` tells, and load it."""
     folder = Path(os.path.abspath(expanded(output, "--output")))
     if about.name in load().splits:
-        raise UsageError(
-            f"{about.name!r} is one of the splits of lagbench", where="--output", fix="use another name"
-        )
+        what = f"{about.name!r} is one of the splits of lagbench"
+        raise UsageError(what, where="--output", fix="use another name")
     if folder.exists():
-        raise UsageError(
-            "the folder is there already", where=str(folder), fix="remove it, or use another name"
-        )
+        fix = "remove it, or use another name"
+        raise UsageError("the folder is there already", where=str(folder), fix=fix)
     meter = Meter(progress)
     with _scratch(folder) as root:
         building = _Building(about, root)
@@ -192,9 +190,8 @@ class _Building:
         self.entries.append(describe_file(self.root, key))
 
     def _key(self, scenario: int, subset: str) -> ScenarioKey:
-        return ScenarioKey(
-            split=self.about.name, size=SIZE, version=VERSION, scenario=scenario, subset=subset
-        )
+        name = self.about.name
+        return ScenarioKey(split=name, size=SIZE, version=VERSION, scenario=scenario, subset=subset)
 
     def _frames(self, trajectory: Trajectory) -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
         """Yield positions and velocities in the unit box; without own velocities, differences."""
@@ -279,9 +276,7 @@ class _Building:
         """Return the description of the split as plain values."""
         about = self.about
         bounds = about.measure.box(about.bounds) if about.bounds else zip(self.low, self.high, strict=True)
-        frames: dict[int, list[int]] = {}
-        for entry in self.entries:
-            frames.setdefault(entry.frames, []).append(entry.scenario)
+        lengths = sorted({entry.frames for entry in self.entries})
         tested = [entry for entry in self.entries if entry.subset == "test"]
         task = self._task(shortest=min(entry.frames for entry in tested))
         cells = task["score_grid"]["cells"]  # type: ignore[index]
@@ -300,10 +295,10 @@ class _Building:
             "source_x": (about.measure.corner[0], origin, "x in the source of the lower left corner"),
             "source_y": (about.measure.corner[1], origin, "y in the source of the lower left corner"),
         }
-        spelled = {count: spell_ids(frames[count]) for count in sorted(frames)}
+        frames = {n: spell_ids([e.scenario for e in self.entries if e.frames == n]) for n in lengths}
         size = {
             "subsets": {name: spell_ids(scenarios) for name, scenarios in ids.items()},
-            "frames": next(iter(frames)) if len(frames) == 1 else spelled,
+            "frames": lengths[0] if len(lengths) == 1 else frames,
             "bounds": [[float(low), float(high)] for low, high in bounds],
             "parameters": {},
             "task": task,

@@ -17,7 +17,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,20 +46,18 @@ class Format(enum.StrEnum):
 
 ENDINGS = {Format.GNS_NPZ: ".npz", Format.LAGRANGEBENCH_H5: ".h5"}  # of the files of subsets
 
-NUMBERS: Mapping[Format, Mapping[str, int]] = {
+NUMBERS: Mapping[Format, Mapping[str, int]] = {  # of each material
     Format.GNS_NPZ: {"liquid": 5, "snow": 6, "jelly": 7, "rope": 8},
     Format.LAGRANGEBENCH_H5: {"liquid": 0, "jelly": 4, "snow": 5, "rope": 6},
 }
-"""Number of each material."""
 
+# of particles of a wall at rest, and of one that moves
 WALL_NUMBERS: Mapping[Format, tuple[int, int]] = {Format.GNS_NPZ: (3, 3), Format.LAGRANGEBENCH_H5: (1, 2)}
-"""Number of particles of a wall at rest, and of one that moves."""
 
-MEANINGS: Mapping[Format, Mapping[int, str]] = {
+MEANINGS: Mapping[Format, Mapping[int, str]] = {  # of numbers without a material
     Format.GNS_NPZ: {0: "rigid", 3: "kinematic: a boundary that moves as prescribed"},
     Format.LAGRANGEBENCH_H5: {1: "solid wall", 2: "moving wall", 3: "rigid body"},
 }
-"""What numbers without a material mean."""
 
 PADDING = -1  # number of particles that are not there (lagrangebench-h5)
 DROP = "drop"  # what a number is mapped to whose particles are left out
@@ -81,9 +79,18 @@ def numbers_of(form: Format, material: NDArray[np.integer]) -> NDArray[np.int64]
 
 
 def materials_of(
-    form: Format, numbers: NDArray[np.integer], *, given: Mapping[int, str], where: str
+    form: Format, numbers: NDArray[Any], particles: int, *, given: Mapping[int, str], where: str
 ) -> tuple[NDArray[np.int8], NDArray[np.bool_]]:
     """Return the material of each particle kept, and a mask over all; ``given`` is what the user said."""
+    gns = form is Format.GNS_NPZ
+    if numbers.dtype.kind not in "iu" or numbers.shape not in [(particles,), *([(), (1,)] if gns else [])]:
+        raise UnreadableFileError(
+            "these are no kinds of particles",
+            where=where,
+            expected=f"an integer, or {particles} of them" if gns else f"{particles} integers",
+            got=f"{numbers.dtype} of shape {numbers.shape}",
+        )
+    numbers = np.broadcast_to(numbers, (particles,))
     known = {number: name for name, number in NUMBERS[form].items()} | {PADDING: DROP} | dict(given)
     codes = {number: _DROPPED if name == DROP else _code(name) for number, name in known.items()}
     found = np.unique(numbers).tolist()
@@ -157,7 +164,7 @@ class Source(BaseModel):
     frame_interval: Length | None = Field(alias="dt")  # time between frames [s]; None where none is stated
     spacing: Length | None = Field(alias="dx")  # distance of neighbouring particles at first [its length]
     periodic: tuple[bool, bool] = Field(alias="periodic_boundary_conditions")  # along x and y
-    hints: Hints = Field(alias=OWN_KEY)  # what our own exports add
+    hints: Hints = Field(alias="lagbench")  # what our own exports add
 
 
 def floor_of(value: float) -> float:

@@ -163,12 +163,12 @@ def examine(
             if claim is not None and claim.content_sha256 == content:  # packed anew, or by an earlier version
                 facts = entry.facts or claim.facts
                 entry = entry.model_copy(update={"facts": facts, "twin_floor": claim.twin_floor})
-    except (DataError, OSError) as error:
-        if isinstance(error, DataError):
-            # How to mend it depends on the split, and is said once for all files.
-            problem = str(DataError(error.what, where=error.where, expected=error.expected, got=error.got))
-        else:
-            problem = f"cannot read {path}: {error.strerror}"
+    except DataError as error:
+        # How to mend it depends on the split, and is said once for all files.
+        problem = str(DataError(error.what, where=error.where, expected=error.expected, got=error.got))
+        return Finding(scenario=scenario, state=State.WRONG, problem=problem)
+    except OSError as error:
+        problem = f"cannot read {path}: {error.strerror}"
         return Finding(scenario=scenario, state=State.WRONG, problem=problem)
     return Finding(
         scenario=scenario,
@@ -263,8 +263,10 @@ def other_bits(size: Size) -> str:
     return f"other bits than {record_of(size)} (identity: tolerance)"
 
 
-def hash_verdict(size: Size, computed: str | None, recorded: str | None, *, tolerated: bool = False) -> str:
-    """Return how one subset or data set hash compares with the recorded one, in words."""
+def hash_verdict(size: Size, computed: str | None, subset: str | None = None, *, tolerated: bool) -> str:
+    """Return how the hash of a subset, else of the data set, compares with the recorded one, in words."""
+    known = size.measured
+    recorded = known and (known.subset_sha256.get(subset) if subset else known.dataset_sha256)
     if recorded is None:
         return f"no hash in {record_of(size)} yet"
     if computed is None:

@@ -211,19 +211,15 @@ def _read() -> dict[str, dict[int, Row]]:
         held = json.loads(data)
         if held["machine"] != platform.node():
             return {}
-        kinds = ("closed_box", "free_surface")
-        return {k: dict(_checked(int(n), *row) for n, row in held.get(k, {}).items()) for k in kinds}
+        rates: dict[str, dict[int, Row]] = {"closed_box": {}, "free_surface": {}}
+        for kind, rows in rates.items():
+            for particles, (seconds, substeps, frames) in held.get(kind, {}).items():
+                counts = NEEDED["particles"].holds(int(particles)) and COUNT.holds(substeps)
+                if not (counts and COUNT.holds(frames) and SECONDS.holds(seconds)):
+                    return {}
+                if not RATIO.holds(seconds / reference_seconds(substeps, frames)):
+                    return {}
+                rows[int(particles)] = (seconds, substeps, frames)
+        return rates
     except (OSError, ValueError, TypeError, KeyError, AttributeError, RuntimeError):
         return {}
-
-
-def _checked(particles: int, seconds: float, particle_substeps: int, frames: int) -> tuple[int, Row]:
-    if not (
-        NEEDED["particles"].holds(particles)
-        and SECONDS.holds(seconds)
-        and COUNT.holds(particle_substeps)
-        and COUNT.holds(frames)
-        and RATIO.holds(seconds / reference_seconds(particle_substeps, frames))
-    ):
-        raise ValueError(f"no machine takes {seconds} s for that")
-    return particles, (seconds, particle_substeps, frames)
