@@ -101,21 +101,17 @@ class Painter:
 
     def paint(self, scene: Scene) -> Packed:
         """Return the panel of one frame, shape [row, column], first row at the top."""
-        return halve(self._field(scene) if self.panel is Panel.VORTICITY else self._dots(scene))
-
-    def _walls(self, scene: Scene) -> Packed:
-        """Return the empty box; it changes only where a wall turns."""
-        signs = np.sign(scene.recording.wall_velocity[scene.frame]).tobytes()
-        if signs not in self._drawn_walls:
-            with figure(self._side / DPI, self._side / DPI) as drawn:
-                draw_walls(drawn.add_axes((0, 0, 1, 1)), scene.recording, scene.frame)
-                self._drawn_walls[signs] = pack(pixels_of(drawn))
-        return self._drawn_walls[signs]
-
-    def _dots(self, scene: Scene) -> Packed:
-        """Draw a dot for every particle, cut off at the walls; later particles lie on earlier ones."""
-        margin, walls = self._margin, self._walls(scene)
-        image = np.pad(walls, margin)
+        walls = self._walls(scene)
+        if self.panel is Panel.VORTICITY:  # a square around every node that has one; paper elsewhere
+            grid = scene.fields.grid
+            index = np.floor(self._middle * grid.cells - grid.origin + 0.5).astype(np.intp)
+            index = np.clip(index, 0, grid.nodes - 1)
+            omega = scene.vorticity.T[::-1][np.ix_(grid.nodes - 1 - index[::-1], index)]
+            defined = np.isfinite(omega) & self._inside
+            level = _level(0.5 + 0.5 * np.where(defined, omega, 0.0) / self.limit, len(self._colours))
+            return halve(np.where(defined, self._colours[level], walls))
+        # A dot for every particle, cut off at the walls; later particles lie on earlier ones.
+        margin, image = self._margin, np.pad(walls, self._margin)
         shown = ((scene.position >= 0.0) & (scene.position <= 1.0)).all(axis=-1)
         x, y = scene.position[shown].T
         column = np.minimum((x * self._side).astype(np.intp), self._side - 1) + margin
@@ -127,17 +123,16 @@ class Painter:
             colours = self._colours[_level(scene.speed / self.limit, len(self._colours))]
         places = (row * width + column)[:, None] + stamp
         image.reshape(-1)[places] = colours[shown][:, None]
-        return np.where(self._inside, image[margin:-margin, margin:-margin], walls)
+        return halve(np.where(self._inside, image[margin:-margin, margin:-margin], walls))
 
-    def _field(self, scene: Scene) -> Packed:
-        """Draw a square around every node that has a vorticity; paper elsewhere."""
-        fields = scene.fields
-        index = np.floor(self._middle * fields.grid.cells - fields.grid.origin + 0.5).astype(np.intp)
-        index = np.clip(index, 0, fields.grid.nodes - 1)
-        omega = scene.vorticity.T[::-1][np.ix_(fields.grid.nodes - 1 - index[::-1], index)]
-        defined = np.isfinite(omega) & self._inside
-        level = _level(0.5 + 0.5 * np.where(defined, omega, 0.0) / self.limit, len(self._colours))
-        return np.where(defined, self._colours[level], self._walls(scene))
+    def _walls(self, scene: Scene) -> Packed:
+        """Return the empty box; it changes only where a wall turns."""
+        signs = np.sign(scene.recording.wall_velocity[scene.frame]).tobytes()
+        if signs not in self._drawn_walls:
+            with figure(self._side / DPI, self._side / DPI) as drawn:
+                draw_walls(drawn.add_axes((0, 0, 1, 1)), scene.recording, scene.frame)
+                self._drawn_walls[signs] = pack(pixels_of(drawn))
+        return self._drawn_walls[signs]
 
 
 def _level(share: NDArray[np.float64], levels: int) -> NDArray[np.intp]:

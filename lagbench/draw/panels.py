@@ -50,7 +50,7 @@ UNITS = {  # what colour bars say: physical time throughout, as velocity in the 
 DOT = 1.25  # diameter of a drawn particle in particle spacings: neighbours overlap a little
 MOST_DOTS = 1 << 16  # particles drawn at the most; more would take memory and no eye would tell
 
-FEW_NODES = 4  # of which too few fields are differentiable for a streamline
+FEW_NODES = 4  # with neighbours to differentiate over, below which no streamline is drawn
 _ALONG = np.array([(0.0, 1.0), (0.0, 1.0), (1.0, 0.0), (1.0, 0.0)])  # along walls left, right, bottom, top
 
 

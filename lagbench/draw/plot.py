@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lagbench.data import WALLS
 from lagbench.data.local import locate, remedy
 from lagbench.data.registry import Registry, Size
 from lagbench.errors import DataError, UsageError, nearest
@@ -155,7 +156,10 @@ def _table(files: Sequence[Path], panel: Panel | None, frame: int | None, splits
     scaled = driven and panel in (Panel.STREAMLINES, Panel.SPEED)
     common = float(np.median([limit_of(panel, scene) for scene in scenes]))
     limits = [WALL_SHARE * np.abs(s.recording.wall_velocity).max() if scaled else common for s in scenes]
-    labels = [f"frame {s.frame}" if i % len(frames) else _name(s) for i, s in enumerate(scenes)]
+    labels = [f"frame {scene.frame}" for scene in scenes]
+    for i in range(0, len(scenes), len(frames)):  # the first of each scenario
+        recording = scenes[i].recording
+        labels[i] = "   ".join([str(recording.scenario), *_marks(recording, ("frequency",))[:1]])
     cells = list(zip(scenes, labels, limits, strict=True))
     shown = ", ".join(str(scene.frame) for scene in scenes[: len(frames)])
     columns = COLUMNS if len(frames) == 1 else 3 * len(frames)
@@ -168,22 +172,11 @@ def _table(files: Sequence[Path], panel: Panel | None, frame: int | None, splits
     )
 
 
-def _name(scene: Scene) -> str:
-    recording = scene.recording
-    if recording.reynolds is not None:
-        return f"{recording.scenario}   Re {recording.reynolds:.0f}"
-    if "frequency" in recording.parameters:
-        return f"{recording.scenario}   frequency {recording.parameters['frequency']}"
-    return str(recording.scenario)
-
-
 ALL = "all"
 KINDS = (ALL, *(str(panel) for panel in Panel))
 """What :func:`plot_frame` can draw."""
 
 SIDE, GAP, MARGIN, TOP, BAR = 3.25, 0.25, 0.25, 0.96, 0.66  # of a frame [inch]
-WALLS = ("left", "right", "bottom", "top")
-MARKS = ("family", "pair", "frequency")
 SEPARATOR = "  ·  "
 DIRECTIONS = {(1, 0): "right", (-1, 0): "left", (0, 1): "up", (0, -1): "down"}
 
@@ -253,7 +246,9 @@ def plot_frame(
 def describe(recording: Recording) -> str:
     """Return split, size, scenario and what sets it apart, as in "cavity full · scenario 3 · Re 120"."""
     parts = [f"{recording.size.split} {recording.size.name}", f"scenario {recording.scenario}"]
-    if recording.reynolds is not None:
-        parts.append(f"Re {recording.reynolds:.0f}")
-    parts += [f"{name} {recording.parameters[name]}" for name in MARKS if name in recording.parameters]
-    return SEPARATOR.join(parts)
+    return SEPARATOR.join([*parts, *_marks(recording, ("family", "pair", "frequency"))])
+
+
+def _marks(recording: Recording, names: Sequence[str]) -> list[str]:
+    marks = [] if recording.reynolds is None else [f"Re {recording.reynolds:.0f}"]
+    return marks + [f"{name} {recording.parameters[name]}" for name in names if name in recording.parameters]

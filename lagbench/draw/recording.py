@@ -79,7 +79,6 @@ class Recording:
         registry: Registry,
     ) -> None:
         """Read what holds for all frames."""
-        # tier of the split, from the registry
         self.size: Size = registry.size(str(identity["split"]), str(identity["size"]))
         self.title = registry.split(self.size.split).title  # title of the split
         self.scenario = int(identity["scenario"])  # id
@@ -87,10 +86,8 @@ class Recording:
         self.frames = frames  # recorded frames
         self._read = read
         self._present = np.isfinite(read("position", 0)).all(axis=-1)
-        # material of each particle, shape [particle]
-        self.material = read("material", slice(None))[self._present].astype(np.int8)
-        # [length/s], shape [frame, wall, 2]; zeros where the file has none
-        self.wall_velocity = np.zeros((frames, 4, 2))
+        self.material = read("material", slice(None))[self._present].astype(np.int8)  # [particle]
+        self.wall_velocity = np.zeros((frames, 4, 2))  # [length/s], [frame, wall, 2]; zeros without walls
         if "wall_velocity" in variables:
             self.wall_velocity[:] = read("wall_velocity", slice(frames))
         self._mass = float(read("particle_mass", slice(None)))
@@ -166,11 +163,8 @@ def _beside(file: str | Path, registry: Registry | None) -> Registry:
 def _of_dataset(data: xr.Dataset, registry: Registry | None) -> Recording:
     """Return the recording that a data set of one scenario holds."""
     if "scenario" in data.dims:
-        raise UsageError(
-            "a picture shows one scenario",
-            got=f"a data set of {data.sizes['scenario']}",
-            fix="choose one: data.sel(scenario=3)",
-        )
+        got, fix = f"a data set of {data.sizes['scenario']}", "choose one: data.sel(scenario=3)"
+        raise UsageError("a picture shows one scenario", got=got, fix=fix)
     attributes: dict[str, Any] = {str(k): v for k, v in data.attrs.items()}
     names = ("split", "size", "scenario")
     identity = {n: data.coords[n].item() if n in data.coords else attributes[n] for n in names}

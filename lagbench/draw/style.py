@@ -33,8 +33,8 @@ PAPER = "#ffffff"  # background
 WALL = "#d5d9e0"  # walls at rest
 MOVING = "#d55e00"  # moving walls: vermilion, which jelly has too; no split has both
 
+# liquid, jelly, snow, rope: blue, vermilion, sky blue, orange
 MATERIAL_COLOURS = ("#0072b2", "#d55e00", "#56b4e9", "#e69f00")
-"""Colours of liquid, jelly, snow, rope: blue, vermilion, sky blue, orange."""
 
 
 def speed_map() -> ListedColormap:
@@ -100,14 +100,11 @@ _STYLE = {
     "font.family": "DejaVu Sans",  # ships with matplotlib, so that text has the same pixels everywhere
     "font.size": 9.0,
     "text.color": INK,
-    "axes.labelcolor": MUTED,
+    **dict.fromkeys(("axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color"), MUTED),
     "axes.titlecolor": INK,
     "axes.titlesize": 10.0,
     "axes.titlelocation": "left",
     "axes.titlepad": 5.0,
-    "axes.edgecolor": MUTED,
-    "xtick.color": MUTED,
-    "ytick.color": MUTED,
     "xtick.labelsize": 8.0,
     "ytick.labelsize": 8.0,
     "figure.facecolor": PAPER,
@@ -163,12 +160,8 @@ def save(drawn: Figure, output: str | Path) -> Path:
     path = Path(output)
     ending = path.suffix.lower()
     if ending not in ENDINGS:
-        raise UsageError(
-            "pictures are PNG, PDF or SVG files",
-            where="output",
-            expected=f"a name ending in {', '.join(ENDINGS)}",
-            got=path,
-        )
+        expected = f"a name ending in {', '.join(ENDINGS)}"
+        raise UsageError("pictures are PNG, PDF or SVG files", where="output", expected=expected, got=path)
     if ending == ".png":
         data = png_bytes(drawn)
     else:

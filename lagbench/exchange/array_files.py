@@ -29,11 +29,9 @@ READABLE = (".npy", ".npz", ".nc")  # files that are adopted: an array, named ar
 ARRAYS = POSITION, VELOCITY, MATERIAL, WALLS = "position", "velocity", "material", "wall_velocity"
 CLASSIC = b"CDF"  # first bytes of the older netCDF formats, which cannot point to other files
 
+# What may be in a netCDF-4 file; chunks by default span many frames, so that more of them stay unpacked.
 NETCDF = Structure(groups=None, texts=True, cache=1 << 30)
-"""What may be in a netCDF-4 file; chunks by default span many frames, so that more of them stay unpacked."""
-
-Row = tuple[Path, int | None]
-"""A file and, where it holds several, the number of the trajectory in it."""
+Row = tuple[Path, int | None]  # a file and, where it holds several, the number of the trajectory in it
 
 
 def natural(paths: Sequence[Path]) -> list[Path]:
@@ -64,17 +62,13 @@ def rows_of(path: Path) -> list[Row]:
     if path.suffix != ".npy" or len(shape := _array(path).shape) != 4:
         return [(path, None)]
     if shape[0] > MAX_ID + 1:
-        raise DataError(
-            "too many trajectories", where=str(path), expected=f"at most {MAX_ID + 1}", got=shape[0]
-        )
+        expected = f"at most {MAX_ID + 1}"
+        raise DataError("too many trajectories", where=str(path), expected=expected, got=shape[0])
     return [(path, row) for row in range(shape[0])]
 
 
 def open_row(which: Row, interval: float | None) -> Trajectory:
-    """Return a trajectory whose arrays are read frame by frame where the file allows it.
-
-    What they mean is looked at where the time between frames is given [s].
-    """
+    """Return a trajectory; what its arrays mean is looked at where the time between frames is given [s]."""
     path, row = which
     name = str(path) if row is None else f"{path}, trajectory {row}"
     with _reading(path):

@@ -176,27 +176,16 @@ class WallParticles:
                 across = low[1 - axis] - depth if wall in (0, 2) else high[1 - axis] + depth
                 rows += [(wall, low[axis] + pitch * (n + 0.5), across) for n in range(count)]
         walls, along, across = np.array(rows).T
-        self._wall, self._along, self._across = walls.astype(int), along, across
+        self.wall = walls.astype(int)  # which each particle lies beside
+        self._along, self._across = along, across
 
-    def numbers(self, form: Format, velocity: NDArray[np.floating]) -> NDArray[np.int64]:
-        """Return the number of each particle: of a wall that ever moves, or of one at rest."""
-        still, moving = WALL_NUMBERS[form]
-        moves = (velocity != 0.0).any(axis=(0, 2))
-        return np.where(moves[self._wall], moving, still)
-
-    def travel(self, velocity: NDArray[np.floating], interval: float) -> NDArray[np.float64]:
-        """Return how far each wall has gone along itself; ``velocity[f]`` acts from frame f-1 to f."""
-        steps = interval * velocity[:, range(len(ALONG)), ALONG].astype(np.float64)
-        steps[0] = 0.0
-        return np.cumsum(steps, axis=0)
-
-    def place(self, travel: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Return the positions where walls have gone so far, shape [particle, 2]."""
-        axis = np.array(ALONG)[self._wall]
+    def join(self, file: ScenarioFile, travel: NDArray[np.float64], frame: int) -> NDArray[np.float32]:
+        """Return the positions of a frame and, behind them, of walls that have gone so far [frame, wall]."""
+        axis = np.array(ALONG)[self.wall]
         low, high = self._bounds[axis].T
-        along = low + (self._along - low + travel[self._wall]) % (high - low)
-        is_along = axis[:, None] == [0, 1]
-        return np.where(is_along, along[:, None], self._across[:, None]).astype(np.float32)
+        along = low + (self._along - low + travel[frame, self.wall]) % (high - low)
+        places = np.where(axis[:, None] == [0, 1], along[:, None], self._across[:, None])
+        return np.concatenate([file.read("position", frame), places.astype(np.float32)])
 
 
 def _runs(files: Iterable[Path], form: Format, interval: float, walls: WallParticles | None) -> Iterator[Run]:
@@ -206,15 +195,13 @@ def _runs(files: Iterable[Path], form: Format, interval: float, walls: WallParti
             kinds, position = numbers_of(form, file.read("material")), partial(file.read, "position")
             if walls is not None:
                 velocity = file.read("wall_velocity")
-                kinds = np.concatenate([kinds, walls.numbers(form, velocity)])
-                position = partial(_with_walls, file, walls, walls.travel(velocity, interval))
+                still, moving = WALL_NUMBERS[form]
+                ever = (velocity != 0.0).any(axis=(0, 2))
+                kinds = np.concatenate([kinds, np.where(ever[walls.wall], moving, still)])
+                steps = interval * velocity[:, range(len(ALONG)), ALONG].astype(np.float64)
+                steps[0] = 0.0  # velocity[f] acts from frame f-1 to f
+                position = partial(walls.join, file, np.cumsum(steps, axis=0))
             yield file.header.frames, position, kinds
-
-
-def _with_walls(
-    file: ScenarioFile, walls: WallParticles, travel: NDArray[np.float64], frame: int
-) -> NDArray[np.float32]:
-    return np.concatenate([file.read("position", frame), walls.place(travel[frame])])
 
 
 def _write_h5(

@@ -36,11 +36,7 @@ _DEPTH = 3  # how deep arrays may lie in each other: trajectories in a joint arr
 
 
 def write(path: Path, runs: Iterable[Run]) -> list[tuple[int, int]]:
-    """Write one subset, whole or not at all; return frames and particles of each trajectory.
-
-    Members are stored uncompressed, as ``numpy.savez`` stores them: compressed bytes would
-    change with the version of zlib. One trajectory is in memory at a time.
-    """
+    """Write one subset, whole or not at all; return frames and particles of each trajectory."""
     shapes: list[tuple[int, int]] = []
     with atomic_path(path, option="--output") as temporary, zipfile.ZipFile(temporary, "w") as archive:
         for frames, position, kinds in runs:
@@ -48,7 +44,8 @@ def write(path: Path, runs: Iterable[Run]) -> list[tuple[int, int]]:
             pair[0], pair[1] = np.empty((frames, len(kinds), 2), np.float32), kinds
             for number in range(frames):
                 pair[0][number] = position(number)
-            # A zip member's earliest time, which is the default: equal data give equal bytes.
+            # Equal data give equal bytes: the time is zip's earliest, as by default, and members are stored
+            # as numpy.savez stores them, since compressed bytes would change with the version of zlib.
             member = zipfile.ZipInfo(f"simulation_{len(shapes)}.npy")
             member.external_attr = 0o644 << 16
             with archive.open(member, "w", force_zip64=True) as stream:
@@ -65,9 +62,8 @@ def trajectories(path: Path, kinds: Mapping[int, str]) -> Iterator[Trajectory]:
     try:
         archive = zipfile.ZipFile(path)
     except (OSError, zipfile.BadZipFile) as error:
-        raise UnreadableFileError(
-            "cannot read an npz file", where=str(path), got=f"{type(error).__name__}: {error}"
-        ) from error
+        got = f"{type(error).__name__}: {error}"
+        raise UnreadableFileError("cannot read an npz file", where=str(path), got=got) from error
     with archive:
         for member in archive.namelist():
             key = member.removesuffix(".npy")

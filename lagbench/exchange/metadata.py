@@ -31,7 +31,6 @@ from lagbench.errors import UnreadableFileError, UsageError, nearest
 NAME = "metadata.json"
 OWN_KEY = "lagbench"
 MAX_BYTES = 1 << 20
-
 Pair = tuple[FiniteFloat, FiniteFloat]
 Length = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Shapes = Mapping[str, Sequence[tuple[int, int]]]  # frames and particles of every trajectory, by subset
@@ -74,8 +73,7 @@ def parse_format(name: str) -> Format:
 
 def numbers_of(form: Format, material: NDArray[np.integer]) -> NDArray[np.int64]:
     """Return the number of each particle's material, shape [particle]."""
-    table = np.array([NUMBERS[form][name] for name in MATERIALS], dtype=np.int64)
-    return np.asarray(table[material])
+    return np.array([NUMBERS[form][name] for name in MATERIALS], dtype=np.int64).take(material)
 
 
 def materials_of(
@@ -236,10 +234,8 @@ def describe(
             "free_slip": free_slip,
             "is_bc_trick": False,
             # One less than frames: the last one is a target only, as in the data sets of that code base.
-            "sequence_length_train": frames_of["train"] - 1,
-            "sequence_length_test": frames_of["test"] - 1,
-            "num_trajs_train": len(shapes["train"]),
-            "num_trajs_test": len(shapes["test"]),
+            **{f"sequence_length_{subset}": frames_of[subset] - 1 for subset in ("train", "test")},
+            **{f"num_trajs_{subset}": len(shapes[subset]) for subset in ("train", "test")},
             "num_particles_max": max(n for rows in shapes.values() for _, n in rows),
             "periodic_boundary_conditions": [False, False],
         }
@@ -262,22 +258,19 @@ def write_metadata(folder: Path, metadata: Mapping[str, object]) -> Path:
 def read_source(folder: Path, form: Format) -> Source:
     """Return what a metadata.json says; what is missing, no JSON or incomplete is an UnreadableFileError."""
     path = folder / NAME
+    where = str(path)
     try:
         with path.open("rb") as stream:
             text = stream.read(MAX_BYTES + 1)
         if len(text) > MAX_BYTES:
-            raise UnreadableFileError(
-                "the file is too large", where=str(path), expected=f"<= {MAX_BYTES} bytes"
-            )
+            raise UnreadableFileError("the file is too large", where=where, expected=f"<= {MAX_BYTES} bytes")
         values = json.loads(text)
     except (OSError, ValueError, RecursionError) as error:
         raise UnreadableFileError(
-            "cannot read the metadata", where=str(path), expected="a JSON object", got=error
+            "cannot read the metadata", where=where, expected="a JSON object", got=error
         ) from error
     if not isinstance(values, dict):
-        raise UnreadableFileError(
-            "the metadata are no JSON object", where=str(path), got=type(values).__name__
-        )
+        raise UnreadableFileError("the metadata are no JSON object", where=where, got=type(values).__name__)
     # Newer GNS programs keep one block for training and one for rollouts.
     block = values.get("train")
     values = block if isinstance(block, dict) else values

@@ -26,8 +26,7 @@ FACTOR = 1.5  # from which on velocities have another unit than the motion; our 
 SHIFTED = 0.4  # share of the misfit that a shift by a frame must leave: a solver may lag by a tenth
 FEWEST = 8  # steps below which chance may look like anything
 
-Block = NDArray[np.float64]
-"""Some values of a trajectory, of shape [stretch of frames, frame, stretch of particles, particle, 2]."""
+Block = NDArray[np.float64]  # of shape [stretch of frames, frame, stretch of particles, particle, 2]
 
 
 def misplaced_axes(shape: tuple[int, ...]) -> Mistake | None:

@@ -25,10 +25,8 @@ from .mistakes import misplaced_axes
 
 Array = NDArray[np.floating]
 Frame = tuple[Array, Array | None]  # positions [length of the source], velocities [its length/s] if any
-
+# Frames of a trajectory, what returns the positions of one of them, and the kind of each particle.
 Run = tuple[int, Callable[[int], NDArray[np.float32]], NDArray[np.int64]]
-"""Frames of a trajectory, what returns the positions of one of them, and the kind of each particle."""
-
 Box = tuple[tuple[float, float], tuple[float, float]]  # low and high walls along x and y
 
 HARMLESS = 1 << 28  # bytes that may come of anything
@@ -53,10 +51,7 @@ class Trajectory:
 
 @dataclass(frozen=True, kw_only=True)
 class Measure:
-    """How lengths of the source become lengths of the unit box: ``(x - corner) / scale``.
-
-    A scale that is a power of two, with the corner 0, loses no bit.
-    """
+    """How lengths of the source become the unit box's, ``(x - corner) / scale``: powers of 2 lose no bit."""
 
     scale: float = 1.0
     corner: tuple[float, float] = (0.0, 0.0)
@@ -91,8 +86,7 @@ def _power(length: float) -> float:
     return 2.0 ** max(0, math.ceil(math.log2(length))) if length > 1.0 else 1.0
 
 
-Count = Annotated[int, Field(gt=-(1 << 31), lt=1 << 31)]
-"""A number of frames or cells, or of a frame: one that a message can spell out."""
+Count = Annotated[int, Field(gt=-(1 << 31), lt=1 << 31)]  # one that a message can spell out
 
 
 @with_config(ConfigDict(extra="forbid"))

@@ -106,13 +106,11 @@ def croissant_json(size: Size, split: Split, manifest: Manifest) -> str:
 
 CARD_NAME, CROISSANT_NAME = "README.md", "croissant.json"
 
-PICTURES: Mapping[str, str] = {
+PICTURES: Mapping[str, str] = {  # path relative to the card, and what it shows
     "pictures/scenarios.png": "scenarios of this data set",
     "pictures/frame.png": "one frame of a test scenario",
 }
-"""Pictures of a card, relative to it, and what they show."""
-
-NOTES: Mapping[str, str] = {
+NOTES: Mapping[str, str] = {  # what a reader of one split's card must know beside its description
     "cavity": (
         "The wall velocities of all frames, those to be predicted included, are part of what is given: they "
         "are the forcing. `wall_velocity` at frame f is what acts from frame f-1 to f."
@@ -131,8 +129,6 @@ NOTES: Mapping[str, str] = {
         "has: benchmarks/effective_viscosity.py fits it to the decay of each size."
     ),
 }
-"""What a reader of one split's card must know beside its description."""
-
 _WALLS = "closed box: what acts towards each frame; walls left, right, bottom, top"
 VARIABLES = (
     ("`position`", "frame, particle, space", "float32", "length", "particle positions in the unit box"),
@@ -142,10 +138,6 @@ VARIABLES = (
     ("`wall_velocity`", "frame, wall, space", "float32", "length/s", _WALLS),
     ("`time`", "frame", "float64", "s", "time since frame 0"),
 )
-
-
-BITWISE = "The files hold the same bits on every x86-64 Linux machine, with any number of workers."
-TOLERANCE = "Some files come from a device that does not promise equal bits: they agree to a tolerance."
 
 
 def write_cards(root: Path, size: Size, split: Split, manifest: Manifest) -> list[Path]:
@@ -206,6 +198,12 @@ def dataset_card(size: Size, split: Split, manifest: Manifest, *, pictures: list
         (f"`{name}`", f"{p.value:g}" if isinstance(p.value, float) else p.value, p.unit, p.description)
         for name, p in size.parameters.items()
     ]
+    subsets = []
+    for name, ids in size.subsets.items():
+        there = [entry for entry in manifest.files if entry.subset == name]
+        sums = sum(entry.frames for entry in there), sum(entry.bytes for entry in there)
+        digest = f"`{manifest.subset_sha256[name]}`" if name in manifest.subset_sha256 else "incomplete"
+        subsets.append((name, spell_ids(ids), f"{len(there)} of {len(ids)}", *sums, digest))
     options = f"--split {size.split} --size {size.name}"
     parts = [
         "\n".join(["---", *(f"{k}: {json.dumps(v, ensure_ascii=False)}" for k, v in head.items()), "---"]),
@@ -216,7 +214,7 @@ def dataset_card(size: Size, split: Split, manifest: Manifest, *, pictures: list
         "## In short",
         _facts(size, manifest),
         "## Subsets",
-        _subsets(size, manifest),
+        markdown(("subset", "ids", "scenarios", "frames", "bytes", "hash"), subsets),
         "## Reading",
         "One netCDF4 file per scenario, which `xarray.open_dataset` reads without lagbench. "
         "Lengths are in units of the unit box, time in seconds. Frame 0 is the state when recording starts.",
@@ -232,7 +230,9 @@ def dataset_card(size: Size, split: Split, manifest: Manifest, *, pictures: list
         "## Parameters",
         markdown(("parameter", "value", "unit", "meaning"), parameters),
         "## Regenerate and verify",
-        BITWISE if manifest.identity == "bitwise" else TOLERANCE,
+        "The files hold the same bits on every x86-64 Linux machine, with any number of workers."
+        if manifest.identity == "bitwise"
+        else "Some files come from a device that does not promise equal bits: they agree to a tolerance.",
         "```sh\n"
         "pip install 'lagbench[generate]'\n"
         f"lagbench generate {options}\n"
@@ -265,16 +265,6 @@ def _facts(size: Size, manifest: Manifest) -> str:
         ("bytes", sum(entry.bytes for entry in manifest.files)),
     ]
     return markdown(("", ""), rows)
-
-
-def _subsets(size: Size, manifest: Manifest) -> str:
-    rows = []
-    for subset, ids in size.subsets.items():
-        there = [entry for entry in manifest.files if entry.subset == subset]
-        sums = sum(entry.frames for entry in there), sum(entry.bytes for entry in there)
-        digest = f"`{manifest.subset_sha256[subset]}`" if subset in manifest.subset_sha256 else "incomplete"
-        rows.append((subset, spell_ids(ids), f"{len(there)} of {len(ids)}", *sums, digest))
-    return markdown(("subset", "ids", "scenarios", "frames", "bytes", "hash"), rows)
 
 
 def _task(size: Size, manifest: Manifest) -> str:

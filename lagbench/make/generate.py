@@ -74,8 +74,7 @@ class Generation:
         self.folder = size.folder(root)
         self.workers, self.scheduler = workers, scheduler  # processes here, or a Dask scheduler's workers
         self.sources = sources  # other root folders to take finished scenarios from
-        # the store that the root folder is a working copy of; None for a plain folder
-        self.store: Publication | None = None
+        self.store: Publication | None = None  # which the root folder is a working copy of; None if plain
         self.manifest = merged(self.size, None)  # what the folder holds, as far as is known
         self._hashed: list[FileEntry] = []  # files that were there and right, just hashed
         self.kept: list[int] = []  # ids whose files were there and right
@@ -161,7 +160,8 @@ class Generation:
     def _simulate(self) -> None:
         """Run everything that is to do in workers, and the twins of test scenarios."""
         with_twin = {entry.scenario for entry in self.manifest.files if entry.twin_floor}
-        twins = [i for i in self.kept if self._is_test(i) and i not in with_twin]
+        tested = self.size.subsets["test"]
+        twins = [i for i in self.kept if i in tested and i not in with_twin]
         self._bring(twins)
         costs = dict(zip(self.to_do.scenarios, self.to_do.substeps, strict=True))
         # Scenarios of similar length share a batch.
@@ -176,7 +176,7 @@ class Generation:
         if not tasks:
             return
         total = round(sum(task.cost for task in tasks))
-        total += sum(twin_substeps(self.size, i) for i in self.to_do.scenarios if self._is_test(i))
+        total += sum(twin_substeps(self.size, i) for i in self.to_do.scenarios if i in tested)
         self._meter.begin("simulating", total=total, scenarios=len(self.to_do.scenarios))
         environment = ONE_THREAD if self.device is Device.CPU else {}
         here = Pool(min(self.workers, len(tasks)), environment)
@@ -184,10 +184,8 @@ class Generation:
             for task in tasks:
                 team.submit(task)
             for event in team.events():
-                if event.kind == "progress":
-                    self._meter.count(event.value)
-                elif event.kind == "lost":
-                    self._meter.count(-event.value)
+                if event.kind != "done":  # it went on, or is lost
+                    self._meter.count(event.value if event.kind == "progress" else -event.value)
                 elif event.task.function is simulate:
                     self._take(event.value, team, event.machine or environment_of(self.device))
                 else:
@@ -205,9 +203,6 @@ class Generation:
         what, cost = f"twin of scenario {scenario}", twin_substeps(self.size, scenario)
         return self._task(what, twin_floors, (scenario,), cost)
 
-    def _is_test(self, scenario: int) -> bool:
-        return self.size.subset_of(scenario) == "test"
-
     def _take(self, outcomes: Sequence[Simulated], team: Pool | Cluster, machine: Mapping[str, str]) -> None:
         """Note simulated scenarios whose files are there, and send the twins of those of test after them."""
         environment = {**machine, "device": self.device.value}
@@ -218,12 +213,12 @@ class Generation:
         for outcome in outcomes:
             await_file(self._path(outcome.scenario))
         entries = [describe_file(self.root, self.size.key(outcome.scenario)) for outcome in outcomes]
-        tested = [outcome for outcome in outcomes if self._is_test(outcome.scenario)]
         note_entries(self.folder, entries)
         self._keep(merged(self.size, self.manifest, entries, environment))
         self._meter.count(scenarios=len(entries))
-        for outcome in tested:
-            team.submit(self._twin(outcome.scenario))
+        for entry in entries:
+            if entry.subset == "test":
+                team.submit(self._twin(entry.scenario))
 
     def _keep(self, manifest: Manifest) -> None:
         self.manifest = manifest

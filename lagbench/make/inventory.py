@@ -27,8 +27,6 @@ from lagbench.work.machine import available_cores, may_differ
 from .cards import PICTURES
 from .plan import estimate
 
-DRAWN = 2  # scenarios of a size that are drawn to estimate the time: all of them would take seconds
-
 
 class State(enum.StrEnum):
     """What became of a scenario's file."""
@@ -72,7 +70,7 @@ def overview(size: Size, root: Path) -> Overview:
     """Return what a size is, costs, and has below a root folder or in its store, read from names alone."""
     folder = size.folder(root)
     ids, url = size.scenarios, url_of(root)
-    expected = estimate(size, ids, drawn=DRAWN) if size.simulated else None
+    expected = estimate(size, ids, drawn=2) if size.simulated else None  # to draw all would take seconds
     if url is None:
         there = {i for i in ids if size.path(root, i).is_file()}
     else:

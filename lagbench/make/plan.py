@@ -53,11 +53,8 @@ def select(size: Size, *, subset: Selection = None, scenarios: Scenarios = None)
     names = tuple(names or size.subsets)
     for name in names:
         if name not in size.subsets:
-            raise UsageError(
-                f"{size.split} {size.name} has no subset {name!r}",
-                where="--subset",
-                fix=nearest(name, size.subsets),
-            )
+            what = f"{size.split} {size.name} has no subset {name!r}"
+            raise UsageError(what, where="--subset", fix=nearest(name, size.subsets))
     held = {i for name in names for i in size.subsets[name]}
     if scenarios is None:
         return tuple(sorted(held))

@@ -77,16 +77,15 @@ class VerificationResult:
 
     def check(self) -> None:
         """Raise unless everything that has to hold does."""
+        where = str(self.folder)
         if self.problems:
-            listing = "\n  ".join(self.problems)
-            raise DataError(
-                f"{len(self.problems)} problems\n  {listing}", where=str(self.folder), fix=self.fix
-            )
+            what = "\n  ".join([f"{len(self.problems)} problems", *self.problems])
+            raise DataError(what, where=where, fix=self.fix)
         if not any(report.present for report in self.subsets):
-            raise DataError("nothing is generated", where=str(self.folder), fix=self.fix)
+            raise DataError("nothing is generated", where=where, fix=self.fix)
         if self.must_be_complete and not self.complete:
             missing = ", ".join(f"{r.name} {spell_ids(r.missing)}" for r in self.subsets if r.missing)
-            where, got = str(self.folder), f"missing: {missing}"
+            got = f"missing: {missing}"
             raise DataError("the data set is incomplete", where=where, got=got, fix=self.fix)
 
 
@@ -155,7 +154,7 @@ def verify(
     anew = _regenerate(tier, evenly_spaced(ids, regenerate), cores, meter)
     regenerated = {i: _likeness(tier, findings[i], content) for i, content in anew.items()}
     problems = [f.problem for f in findings.values() if f.problem]
-    problems += [f"scenario {i} differs when simulated anew" for i in anew if regenerated[i] == DIFFERENT]
+    problems += [f"scenario {i} differs when simulated anew" for i in anew if regenerated[i] == "different"]
     # A killed writer leaves files here that the store never got.
     alone = unstored(tier, folder, [*right])
     problems += [f"scenario {i} is in the working copy alone, not in the store" for i in alone]
@@ -187,9 +186,6 @@ def verify(
         verdict=verdict,
         fix=remedy(tier, root=folder),
     )
-
-
-DIFFERENT = "different"
 
 
 def evenly_spaced(ids: Sequence[int], count: int) -> tuple[int, ...]:
@@ -233,7 +229,7 @@ def _likeness(size: Size, finding: Finding, content: str) -> str:
         known += filter(None, [recorded_hash(size, finding.scenario)])
     if not known:
         return "nothing to compare with"
-    return "identical" if any(map(content.startswith, known)) else DIFFERENT
+    return "identical" if any(map(content.startswith, known)) else "different"
 
 
 def _reports(
