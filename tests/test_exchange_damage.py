@@ -115,24 +115,17 @@ def test_a_malicious_pickle_is_never_run(gns: Path, tmp_path: Path, allow: bool)
 
 
 ADDRESSES = b"A" * 16
-OBJECTS_WITHOUT_FLAGS = _Reduced(
-    np.dtype, ("O8", False, True), (3, "|", None, None, None, -1, -1, 0)
-)  # NumPy takes the values of such a type for addresses of objects
+# NumPy takes the values of a type of objects without flags for addresses of objects.
+OBJECTS = _Reduced(np.dtype, ("O8", False, True), (3, "|", None, None, None, -1, -1, 0))
+STATE = (1, (2,), OBJECTS, False, ADDRESSES)
 MANY = [np.zeros(1)] * 4
 
 
 @pytest.mark.parametrize(
     ("item", "words"),
     [
-        (
-            _Reduced(
-                np.zeros(0).__reduce__()[0],
-                (np.ndarray, (0,), b"b"),
-                (1, (2,), OBJECTS_WITHOUT_FLAGS, False, ADDRESSES),
-            ),
-            "bytes for the objects",
-        ),
-        (_Reduced(np.float64(0).__reduce__()[0], (OBJECTS_WITHOUT_FLAGS, ADDRESSES[:8])), "wants to call"),
+        (_Reduced(np.zeros(0).__reduce__()[0], (np.ndarray, (0,), b"b"), STATE), "bytes for the objects"),
+        (_Reduced(np.float64(0).__reduce__()[0], (OBJECTS, ADDRESSES[:8])), "wants to call"),
         (_Reduced(np.ndarray, ((1 << 45,), np.dtype("f8"))), "make an array by itself"),
         (_Reduced(codecs.encode, ("x", "punycode")), "wants to call"),
         ("text", "holds a str"),
@@ -295,47 +288,36 @@ def test_a_damaged_npz_is_told(gns: Path, tmp_path: Path, arrays: dict[str, Any]
         imported(gns)
 
 
-@pytest.mark.parametrize("way", ["soft", "external", "virtual"])
-def test_a_file_that_leads_elsewhere_is_refused(h5: Path, tmp_path: Path, way: str) -> None:
-    """Links, virtual data sets and external storage would let a stranger's file read others."""
-    other = tmp_path / "other.h5"
-    (h5 / "train.h5").rename(other)
-    with h5py.File(h5 / "train.h5", "w") as file:
-        if way == "soft":
-            file["there"] = straight_runs(1)[0]
-            file["00000/position"] = h5py.SoftLink("/there")
-        elif way == "external":
-            file["00000"] = h5py.ExternalLink(str(other), "00000")
-        else:
-            layout = h5py.VirtualLayout(shape=(12, 40, 2), dtype="f4")
-            layout[:] = h5py.VirtualSource(str(other), "00000/position", shape=(12, 40, 2))
-            file.create_virtual_dataset("00000/position", layout)
-            file["00000/particle_type"] = np.zeros(40, int)
-    with refused(tmp_path, "00000"):
-        imported(h5)
-
-
-@pytest.mark.parametrize("way", ["link", "group", "virtual", "raw"])
-def test_adopted_netcdf_reads_no_other_file(tmp_path: Path, way: str) -> None:
-    """NetCDF's own reader would take positions from wherever a stranger's file points to."""
-    bad, other, run = tmp_path / "bad.nc", tmp_path / "other", straight_runs(1)[0]
+@pytest.mark.parametrize("name", ["00000/position", "position"])
+@pytest.mark.parametrize("way", ["soft", "external", "beside", "virtual", "raw"])
+def test_a_file_that_leads_elsewhere_is_refused(h5: Path, tmp_path: Path, name: str, way: str) -> None:
+    """HDF5 and netCDF would take positions from wherever a stranger's file points to, imported or adopted."""
+    bad, other, run = h5 / "train.h5", tmp_path / "other", straight_runs(1)[0]
     with h5py.File(other, "w") as file:
-        file["position"] = run
+        file["there"] = run
+    if name == "position":
+        bad = tmp_path / "bad.nc"
     with h5py.File(bad, "w") as file:
-        if way == "link":
-            file["position"] = h5py.ExternalLink(str(other), "position")
-        elif way == "group":
-            file["position"] = run
-            file["a/wall_velocity"] = h5py.ExternalLink(str(other), "position")
-        elif way == "virtual":
-            layout = h5py.VirtualLayout(shape=run.shape, dtype="f4")
-            layout[:] = h5py.VirtualSource(str(other), "position", shape=run.shape)
-            file.create_virtual_dataset("position", layout)
-        else:
-            other.write_bytes(run.tobytes())
-            file.create_dataset("position", run.shape, "f4", external=[(str(other), 0, run.nbytes)])
+        if name != "position":
+            file["00000/particle_type"] = np.zeros(40, int)
+        match way:
+            case "soft":
+                file["there"] = run
+                file[name] = h5py.SoftLink("/there")
+            case "external":
+                file[name] = h5py.ExternalLink(str(other), "there")
+            case "beside":
+                file[name] = run
+                file["a/wall_velocity"] = h5py.ExternalLink(str(other), "there")
+            case "virtual":
+                layout = h5py.VirtualLayout(shape=run.shape, dtype="f4")
+                layout[:] = h5py.VirtualSource(str(other), "there", shape=run.shape)
+                file.create_virtual_dataset(name, layout)
+            case _:
+                other.write_bytes(run.tobytes())
+                file.create_dataset(name, run.shape, "f4", external=[(str(other), 0, run.nbytes)])
     with refused(tmp_path, bad.name):
-        adopted(bad)
+        adopted(bad) if name == "position" else imported(h5)
 
 
 @pytest.mark.parametrize("kind", ["empty chunks", "a hole", "classic", "npy", "rows"])

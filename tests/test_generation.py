@@ -52,10 +52,7 @@ def test_everything_is_there_and_hashed(generated: GenerationResult) -> None:
     assert generated.simulated == (0, 1, 2, 3, 4)
     assert (generated.kept, generated.missing, generated.complete) == ((), (), True)
     assert "nothing to compare with" in generated.verdict
-
-
-def test_nothing_else_is_left(generated: GenerationResult) -> None:
-    """Beside the scenarios stand manifest, cards, pictures, the lock and the notes; no temporary file."""
+    # Beside the scenarios stand manifest, cards, pictures, the lock and the notes; no temporary file.
     files = [path for path in generated.folder.rglob("*") if path.is_file()]
     names = {str(path.relative_to(generated.folder)) for path in files}
     scenarios = {"train/0000.nc", "train/0001.nc", "valid/0002.nc", "test/0003.nc", "test/0004.nc"}
@@ -304,14 +301,6 @@ def test_a_root_that_is_a_file_is_refused_dry_or_not(
         with pytest.raises(WorkFailedError, match="is a file") as caught:
             generate(SPLIT, SIZE, root=root, dry_run=dry_run, registry=unmeasured)
         assert str(tmp_path / "file") in str(caught.value)
-
-
-@pytest.mark.parametrize("workers", [0, -1])
-def test_fewer_than_one_worker_is_refused(workers: int, tmp_path: Path, unmeasured: Registry) -> None:
-    """Neither an endless loop nor silently all cores, and no folder is made."""
-    with pytest.raises(UsageError, match="without a worker"):
-        generate(SPLIT, SIZE, root=tmp_path / "new", workers=workers, registry=unmeasured)
-    assert not (tmp_path / "new").exists()
 
 
 def test_a_registry_of_ones_own_is_all_that_counts(

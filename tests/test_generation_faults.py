@@ -64,15 +64,13 @@ def manifest_of(root: Path) -> Manifest:
         ({"scenarios": "one"}, "'one' is no id and no range"),
         ({"device": "gpu"}, "no device 'gpu'"),
         ({"device": "cuba"}, "did you mean 'cuda'?"),
+        *(({"workers": count}, "without a worker") for count in (0, -1)),
     ],
 )
-def test_unknown_names_and_ids(
-    options: dict[str, str], message: str, tmp_path: Path, unmeasured: Registry
-) -> None:
-    """Wrong names and ids are usage errors that say what is known, before anything is written."""
-    given: dict[str, Any] = {"split": SPLIT, "size": SIZE, **options}
+def test_bad_input(options: dict[str, Any], message: str, tmp_path: Path, unmeasured: Registry) -> None:
+    """Wrong names, ids and numbers are usage errors that say what is known, before anything is written."""
     with pytest.raises(UsageError, match=re.escape(message)) as caught:
-        generate(**given, root=tmp_path / "new", registry=unmeasured)
+        generate(**{"split": SPLIT, "size": SIZE, **options}, root=tmp_path / "new", registry=unmeasured)
     assert caught.value.exit_code == 2
     assert not (tmp_path / "new").exists()
 
