@@ -247,13 +247,7 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callabl
 @pytest.fixture
 def copied(generated: GenerationResult, tmp_path: Path) -> Callable[[], Path]:
     """A function that copies the generated data set to a root folder that a test may damage."""
-
-    def copy() -> Path:
-        root = tmp_path / "root"
-        shutil.copytree(generated.root, root)
-        return root
-
-    return copy
+    return lambda: shutil.copytree(generated.root, tmp_path / "root")
 
 
 @pytest.fixture(scope="module")

@@ -168,17 +168,14 @@ def _registry(size: Size, hashes: Mapping[int, str]) -> str:
     """Return our registry with what would be measured of this data set."""
     file = read_yaml(default_path())
     subsets = {"train": "0" * 64, "valid": "1" * 64, "test": subset_hash(hashes)}
-    file["measured"] = {
-        size.split: {
-            size.name: {
-                "dataset_sha256": dataset_hash(size.split, size.name, size.major, subsets),
-                "subset_sha256": subsets,
-                "scenario_sha256": {i: content[:16] for i, content in hashes.items()},
-                "statistics": {"position_std": [0.25, 0.25], "velocity_std": [0.002, 0.002]},
-                "twin_floor": [1e-6 * (k + 1) for k in range(size.task.horizon)],
-            }
-        }
+    measured = {
+        "dataset_sha256": dataset_hash(size.split, size.name, size.major, subsets),
+        "subset_sha256": subsets,
+        "scenario_sha256": {i: content[:16] for i, content in hashes.items()},
+        "statistics": {"position_std": [0.25, 0.25], "velocity_std": [0.002, 0.002]},
+        "twin_floor": [1e-6 * (k + 1) for k in range(size.task.horizon)],
     }
+    file["measured"] = {size.split: {size.name: measured}}
     return spell_yaml(file)
 
 

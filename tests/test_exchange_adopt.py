@@ -64,15 +64,14 @@ def own(tmp_path_factory: pytest.TempPathFactory, runs: Runs) -> LocalSplit:
 
 
 def test_positions_come_out_as_they_went_in(own: LocalSplit, runs: Runs) -> None:
-    """Every subset of the opened split holds the arrays bit for bit, the last ones in test."""
+    """Every subset of the opened split holds the arrays bit for bit, the last ones in test.
+
+    v(f) = (x(f) - x(f-1)) / interval, and v(0) = v(1).
+    """
     for subset, wanted in {"train": runs[:4], "valid": runs[4:5], "test": runs[5:]}.items():
         with lagbench.open_split(str(own.folder), subset=subset) as data:
             np.testing.assert_array_equal(data["position"].values, np.stack(wanted))
             assert data["time"].values[-1] == 11 * 0.25
-
-
-def test_velocities_are_differences(own: LocalSplit, runs: Runs) -> None:
-    """v(f) = (x(f) - x(f-1)) / interval, and v(0) = v(1)."""
     velocity = stored(own, 0, "velocity")
     wanted = (np.diff(runs[0].astype(np.float64), axis=0) / 0.25).astype(np.float32)
     np.testing.assert_array_equal(velocity[1:], wanted)
@@ -290,8 +289,7 @@ def test_what_is_no_trajectory_leaves_nothing(tmp_path: Path, kind: str) -> None
         ({"radius": None}, "the radius is not known"),
         ({"radius": -1.0}, "not a number above 0"),
         ({"horizon": 7}, "too short for the task"),
-        ({"horizon": 0}, "where: --horizon"),
-        ({"horizon": -1}, "where: --horizon"),
+        *(({"horizon": count}, "where: --horizon") for count in (0, -1)),
         ({"input_frames": 1}, "where: --input-frames"),
         ({"input_frames": 12}, "too short for the task"),
         ({"test": 3, "valid": 3}, "each subset needs a trajectory"),

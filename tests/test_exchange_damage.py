@@ -78,9 +78,9 @@ def array_file(path: Path, shape: tuple[int, ...], kind: str = "<f4") -> Iterato
 
 
 @contextlib.contextmanager
-def refused(folder: Path, where: str) -> Iterator[None]:
-    """Expect an error that names a file or what is in it, and that nothing is left."""
-    with pytest.raises((UnreadableFileError, DataError)) as caught:
+def refused(folder: Path, where: str, *others: type[LagbenchError]) -> Iterator[None]:
+    """Expect an unreadable file, or another error, named by the file or what is in it, and nothing left."""
+    with pytest.raises((UnreadableFileError, *others)) as caught:
         yield
     assert where in str(caught.value.where)
     assert not (folder / "own").exists()
@@ -260,17 +260,17 @@ def test_damaged_sources_leave_nothing(h5: Path, fault: str, error: type[Lagbenc
         case "half a file":
             target.write_bytes(target.read_bytes()[:1000])
         case _:
+            kinds, run = np.zeros(40, int), straight_runs(1)[0]
+            held: dict[str, dict[str, Any]] = {
+                "array for a group": {"00000": np.zeros(3)},
+                "nothing in an array": {"00000/position": h5py.Empty("f4"), "00000/particle_type": kinds},
+                "no positions": {"00000/particle_type": kinds},
+                "too few kinds": {"00000/position": run, "00000/particle_type": kinds[:39]},
+                "empty": {},
+            }
             with h5py.File(target, "w") as file:
-                if fault == "array for a group":
-                    file["00000"] = np.zeros(3)
-                elif fault == "nothing in an array":
-                    file["00000/position"] = h5py.Empty("f4")
-                    file["00000/particle_type"] = np.zeros(40, int)
-                elif fault == "no positions":
-                    file["00000/particle_type"] = np.zeros(40, int)
-                elif fault == "too few kinds":
-                    file["00000/position"] = straight_runs(1)[0]
-                    file["00000/particle_type"] = np.zeros(39, int)
+                for name, values in held[fault].items():
+                    file[name] = values
     with pytest.raises(error, match=words):
         imported(h5)
     assert [path.name for path in h5.parent.iterdir()] == ["in"]
@@ -316,7 +316,8 @@ def test_a_file_that_leads_elsewhere_is_refused(h5: Path, tmp_path: Path, name: 
             case _:
                 other.write_bytes(run.tobytes())
                 file.create_dataset(name, run.shape, "f4", external=[(str(other), 0, run.nbytes)])
-    with refused(tmp_path, bad.name):
+    led = "a/wall_velocity" if way == "beside" else name
+    with refused(tmp_path, f"{bad.name}, {led!r}"):
         adopted(bad) if name == "position" else imported(h5)
 
 
@@ -345,7 +346,7 @@ def test_a_sparse_file_fills_no_memory(tmp_path: Path, kind: str) -> None:
             else:
                 file.create_dataset("position", shape, "f4", chunks=(1, 10**6, 2))
     assert bad.stat().st_blocks * 512 < 1 << 20
-    with refused(tmp_path, bad.name):
+    with refused(tmp_path, bad.name, DataError):
         adopted(bad)
 
 
@@ -395,7 +396,7 @@ def test_arrays_that_are_no_numbers_are_refused(
         with h5py.File(bad, "w") as file:
             for key, array in arrays.items():
                 file[key] = array.astype(object) if array.dtype.kind == "U" else array
-    with refused(tmp_path, bad.name):
+    with refused(tmp_path, bad.name, DataError):
         adopted(bad, as_is=True)
 
 
@@ -469,7 +470,7 @@ def test_no_file_reaches_the_terminal(tmp_path: Path, place: str) -> None:
 def test_odd_parts_of_a_pickled_trajectory(gns: Path, tmp_path: Path, parts: tuple[Any, Any]) -> None:
     """Kinds and a material property that are no numbers are told by the key they stand at."""
     save_parts(gns, *parts)
-    with refused(tmp_path, "simulation_0"):
+    with refused(tmp_path, "simulation_0", DataError):
         imported(gns)
 
 

@@ -7,6 +7,7 @@ import pickle
 import tracemalloc
 import zipfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -38,14 +39,17 @@ FORMS = pytest.mark.parametrize("form", ["gns-npz", "lagrangebench-h5"])
 
 
 @pytest.fixture(scope="module")
-def flows(
-    generated: GenerationResult, unmeasured: Registry, tmp_path_factory: pytest.TempPathFactory
-) -> dict[str, Path]:
-    """The generated tiny curl-noise data set in both formats."""
-    folder = tmp_path_factory.mktemp("flows")
-    made = {form: folder / form for form in ("gns-npz", "lagrangebench-h5")}
+def flow(generated: GenerationResult, unmeasured: Registry) -> Callable[..., object]:
+    """A function that exports the generated tiny curl-noise data set."""
+    return partial(export, "curl-noise", "tiny", root=generated.root, registry=unmeasured)
+
+
+@pytest.fixture(scope="module")
+def flows(flow: Callable[..., object], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """That data set in both formats."""
+    made = {form: tmp_path_factory.mktemp(form) for form in ("gns-npz", "lagrangebench-h5")}
     for form, output in made.items():
-        export("curl-noise", "tiny", format=form, output=output, root=generated.root, registry=unmeasured)
+        flow(format=form, output=output)
     return made
 
 
@@ -118,11 +122,10 @@ def test_lagrangebench_metadata(flows: dict[str, Path]) -> None:
 
 @pytest.mark.parametrize("from_walls", [None, True, False])
 def test_lagrangebench_bounds(
-    generated: GenerationResult, unmeasured: Registry, tmp_path: Path, from_walls: bool | None
+    flow: Callable[..., object], generated: GenerationResult, tmp_path: Path, from_walls: bool | None
 ) -> None:
     """Cells counted from 0 hold every particle, no bit is lost; a closed box has its walls as bounds."""
-    options: dict[str, Any] = {"root": generated.root, "registry": unmeasured, "from_walls": from_walls}
-    export("curl-noise", "tiny", format="lagrangebench-h5", output=tmp_path, **options)
+    flow(format="lagrangebench-h5", output=tmp_path, from_walls=from_walls)
     metadata = read_metadata(tmp_path)
     bounds = np.array(metadata["bounds"])
     np.testing.assert_allclose(bounds, [[0.0, 1.0 if from_walls is False else 0.9]] * 2, atol=1e-6)
@@ -136,8 +139,8 @@ def test_lagrangebench_bounds(
 
 def test_walls_at_0_are_the_bounds_too(mixed: LocalSplit, tmp_path: Path) -> None:
     """Measured from walls that lie at 0 nothing is taken off, and the bounds are still the walls."""
-    paths = sorted(mixed.folder.parent.glob("[0-9].npz"))
     bounds = ((0.0, 0.95), (0.0, 0.95))
+    paths = sorted(mixed.folder.parent.glob("[0-9].npz"))
     own = adopt(paths, output=tmp_path / "corner", radius=0.1, frame_interval=0.1, bounds=bounds)
     for from_walls, high in ((True, 0.95), (False, 1.0)):
         folder = tmp_path / f"{from_walls}"
@@ -295,10 +298,9 @@ def test_readers_see_the_lid_move(
     np.testing.assert_allclose(came["train"][0], truth["train"][0], atol=1e-7)
 
 
-def test_walls_at_rest_are_solid(generated: GenerationResult, unmeasured: Registry, tmp_path: Path) -> None:
+def test_walls_at_rest_are_solid(flow: Callable[..., object], tmp_path: Path) -> None:
     """A simulated box with slip walls gets particles of the kind that does not move."""
-    options: dict[str, Any] = {"root": generated.root, "registry": unmeasured, "wall_particles": True}
-    export("curl-noise", "tiny", format="lagrangebench-h5", output=tmp_path, **options)
+    flow(format="lagrangebench-h5", output=tmp_path, wall_particles=True)
     position, kinds = read_h5(tmp_path / "test.h5")[0]
     assert {*kinds[506:].tolist()} == {1}
     assert (position[:, 506:] == position[0, 506:]).all()

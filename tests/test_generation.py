@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-import json
+import os
 import shutil
 import subprocess
 import sys
@@ -17,7 +17,7 @@ from conftest import DRAW, SIZE, SPLIT
 from independent_hash import content_hash, dumps
 
 from lagbench.data import WALLS
-from lagbench.data.manifest import read_manifest
+from lagbench.data.manifest import Manifest, read_manifest
 from lagbench.data.registry import Registry, load
 from lagbench.data.scenario import check_scenario, read_scenario
 from lagbench.errors import DataError, UsageError, WorkFailedError
@@ -33,6 +33,13 @@ from lagbench.work.progress import Progress
 def folder_of(root: Path) -> Path:
     """Return the folder of the tiny data set."""
     return root / SPLIT / SIZE / "v2"
+
+
+def manifest_of(root: Path, split: str = SPLIT) -> Manifest:
+    """Return the manifest of a tiny data set."""
+    manifest = read_manifest(root, split, SIZE, 2)
+    assert manifest is not None
+    return manifest
 
 
 def contents(root: Path) -> dict[str, bytes]:
@@ -124,10 +131,8 @@ def test_facts_of_the_manifest_follow_from_the_files(
 
     A twin's RMSE is known for each predicted frame; after one frame it is still near 2^-20.
     """
-    manifest = read_manifest(generated.root, SPLIT, SIZE, 2)
-    assert manifest is not None
     horizon = unmeasured.size(SPLIT, SIZE).task.horizon
-    for entry in manifest.files:
+    for entry in manifest_of(generated.root).files:
         with read_scenario(generated.folder / entry.path) as file:
             velocity, mass = file.read("velocity").astype(np.float64), float(file.read("particle_mass"))
         energy = 0.5 * mass * (velocity**2).sum(axis=(1, 2))
@@ -160,11 +165,11 @@ def test_resuming_makes_what_is_missing_or_wrong(
 ) -> None:
     """A removed and a damaged scenario are made anew by one worker; then all bytes are as before."""
     root = copied()
-    before = contents(root)
-    (folder_of(root) / "test" / "0003.nc").unlink()
-    damaged = folder_of(root) / "train" / "0001.nc"
-    damaged.write_bytes(damaged.read_bytes()[:-1000])
-    leftover = folder_of(root) / "test" / ".0003.nc.99999.partial"
+    before, folder = contents(root), folder_of(root)
+    (folder / "test" / "0003.nc").unlink()
+    damaged = folder / "train" / "0001.nc"
+    os.truncate(damaged, damaged.stat().st_size - 1000)
+    leftover = folder / "test" / ".0003.nc.99999.partial"
     leftover.write_bytes(b"half a file")
     result = generate(SPLIT, SIZE, root=root, workers=1, registry=unmeasured)
     assert (result.simulated, result.kept) == ((1, 3), (0, 2, 4))
@@ -178,9 +183,8 @@ def test_parts_complete_each_other(tmp_path: Path, unmeasured: Registry, generat
     part = generate(SPLIT, SIZE, subset="test", root=tmp_path, workers=1, registry=unmeasured)
     assert (part.simulated, part.missing) == ((3, 4), (0, 1, 2))
     assert (part.complete, part.dataset_sha256) == (False, None)
-    manifest = json.loads((folder_of(tmp_path) / "manifest.json").read_text())
-    assert manifest["complete"] is False
-    assert manifest["statistics"] == {}
+    manifest = manifest_of(tmp_path)
+    assert (manifest.complete, manifest.statistics) == (False, {})
     rest = generate(SPLIT, SIZE, root=tmp_path, workers=1, registry=unmeasured)
     assert (rest.simulated, rest.kept) == ((0, 1, 2), (3, 4))
     assert rest.dataset_sha256 == generated.dataset_sha256
@@ -239,9 +243,8 @@ def test_batches_start_each_scenario_at_its_own_frame(
     size = load().size("cavity", "tiny")
     assert len({draw(size, i).start_frame for i in range(3)}) == 3
     batch = generate("cavity", "tiny", root=tmp_path, device="parallel", scenarios="0-2")
-    manifests = [read_manifest(made.root, "cavity", "tiny", 2) for made in (tiny_split("cavity"), batch)]
-    hashes = [[manifest.entry(i) for i in range(3)] for manifest in manifests if manifest]
-    single, together = ([entry.content_sha256 for entry in row if entry] for row in hashes)
+    manifests = [manifest_of(made.root, "cavity") for made in (tiny_split("cavity"), batch)]
+    single, together = ([e.content_sha256 for e in m.files if e.scenario < 3] for m in manifests)
     assert single == together
     assert len(single) == 3
 

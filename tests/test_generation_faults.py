@@ -49,9 +49,6 @@ def manifest_of(root: Path) -> Manifest:
     return manifest
 
 
-# --- bad input -------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -73,9 +70,6 @@ def test_bad_input(options: dict[str, Any], message: str, tmp_path: Path, unmeas
         generate(**{"split": SPLIT, "size": SIZE, **options}, root=tmp_path / "new", registry=unmeasured)
     assert caught.value.exit_code == 2
     assert not (tmp_path / "new").exists()
-
-
-# --- disks -----------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -126,9 +120,6 @@ def test_a_worker_on_a_full_disk_names_the_file(tmp_path: Path, unmeasured: Regi
     assert files(tmp_path) == []
 
 
-# --- locks -----------------------------------------------------------------------------------
-
-
 def test_two_generations_at_once(tmp_path: Path, unmeasured: Registry, generated: GenerationResult) -> None:
     """The second waits, is told for whom, and then finds everything there."""
     told: list[str] = []
@@ -143,9 +134,6 @@ def test_two_generations_at_once(tmp_path: Path, unmeasured: Registry, generated
     assert f"process {os.getpid()} on" in told[0]
     assert result.simulated == ()
     assert result.dataset_sha256 == generated.dataset_sha256
-
-
-# --- interruptions ---------------------------------------------------------------------------
 
 
 CALL = "from lagbench.cli import main; main()"
@@ -244,9 +232,6 @@ def test_a_killed_parent_is_resumed(
     assert found is not None
     assert whole is not None
     assert found.files == whole.files  # with what each simulation went through
-
-
-# --- blow-ups and other bits -----------------------------------------------------------------
 
 
 def test_a_draw_out_of_range_names_its_scenario(tmp_path: Path, unmeasured_path: Path) -> None:
