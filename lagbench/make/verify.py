@@ -161,10 +161,8 @@ def verify(
     full = {name: members for name, members in tier.subsets.items() if right.keys() >= {*members}}
     digests = {name: subset_hash({i: right[i] for i in members}) for name, members in full.items()}
     reports = _reports(folder, tier, findings, digests)
-    whole = None
-    if digests.keys() >= {*HASHED_SUBSETS}:
-        hashed = {name: digests[name] for name in HASHED_SUBSETS}
-        whole = dataset_hash(tier.split, tier.name, tier.major, hashed)
+    hashed = {name: digests.get(name, "") for name in HASHED_SUBSETS}
+    whole = dataset_hash(tier.split, tier.name, tier.major, hashed) if all(hashed.values()) else None
     tolerated = [i for i, finding in findings.items() if finding.tolerated]
     verdict, wrong = hash_verdict(tier, whole, tolerated=bool(tolerated)), unlike(tier)
     problems += [f"{r.name}: its hash is {wrong}" for r in reports if r.verdict == wrong]
