@@ -54,6 +54,7 @@ if os.environ.pop("PYTHONDONTWRITEBYTECODE", None) and "PYTHONPYCACHEPREFIX" not
     atexit.register(shutil.rmtree, bytecode, ignore_errors=True)
 
 OUTCOMES, DRAW = scored._outcomes, cards._draw
+Names = tuple[str, ...]
 
 SPLIT, SIZE = "curl-noise", "tiny"
 """The quickest data set to generate: five scenarios of 312 substeps."""
@@ -63,14 +64,6 @@ def pytest_collection_finish() -> None:
     """Leave what the imports made out of every search for garbage: some 700,000 objects."""
     gc.collect()
     gc.freeze()
-
-
-@pytest.fixture(scope="session", autouse=True)
-def own_cache(home: Path) -> Iterator[None]:
-    """Keep out of the user's cache."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("LAGBENCH_CACHE", str(home / "cache"))
-        yield
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -109,16 +102,28 @@ def running() -> Iterator[Browser]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def validation_here() -> Iterator[None]:
-    """Score and submit without the child that looks at predictions first, which has tests of its own."""
+def quick(home: Path) -> Iterator[None]:
+    """Keep out of the user's cache, and do without what takes long and has tests of its own."""
 
-    def here(path: str | Path, *, isolated: bool = True, **options: Any) -> ValidationResult:
+    def validated(path: str | Path, *, isolated: bool = True, **options: Any) -> ValidationResult:
+        """Validate without the child that looks at predictions first."""
         assert isolated
         return validate(path, isolated=False, **options)
 
+    def draw(root: Path, size: Size, *_: object) -> None:
+        """Leave the pictures of cards blank: to draw them takes longer than to generate tiny data."""
+        for name in cards.PICTURES:
+            path = dataset_folder(root, size.split, size.name, size.major) / name
+            path.parent.mkdir(exist_ok=True)
+            path.write_bytes(b"")
+
     with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("LAGBENCH_CACHE", str(home / "cache"))
         for module in ("scoring.score", "board.submit"):
-            patch.setattr(f"lagbench.{module}.validate", here)
+            patch.setattr(f"lagbench.{module}.validate", validated)
+        patch.setattr(cards, "_draw", draw)
+        # Commands are built from their signatures once, not at every call, which may take less.
+        patch.setattr("typer.testing._get_command", functools.cache(get_command))
         yield
 
 
@@ -128,12 +133,7 @@ def floors_once() -> Iterator[None]:
     known: dict[Hashable, dict[int, dict[str, Tally]]] = {}
 
     def outcomes(
-        task: ScoredTask,
-        path: Path,
-        anatomy: Anatomy,
-        metrics: tuple[str, ...],
-        floors: tuple[str, ...],
-        *others: Any,
+        task: ScoredTask, path: Path, anatomy: Anatomy, metrics: Names, floors: Names, *others: Any
     ) -> list[ScenarioScores]:
         workers, scheduler, _ = others
         if not floors or scheduler is not None or (workers or 1) > 1:
@@ -147,29 +147,6 @@ def floors_once() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("lagbench.scoring.score._outcomes", outcomes)
-        yield
-
-
-@pytest.fixture(scope="session", autouse=True)
-def blank_pictures() -> Iterator[None]:
-    """Leave the pictures of cards blank: to draw them takes longer than to generate tiny data."""
-
-    def draw(root: Path, size: Size, *_: object) -> None:
-        for name in cards.PICTURES:
-            path = dataset_folder(root, size.split, size.name, size.major) / name
-            path.parent.mkdir(exist_ok=True)
-            path.write_bytes(b"")
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cards, "_draw", draw)
-        yield
-
-
-@pytest.fixture(scope="session", autouse=True)
-def commands_once() -> Iterator[None]:
-    """Build the commands from their signatures once, not at every call, which may take less."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("typer.testing._get_command", functools.cache(get_command))
         yield
 
 
@@ -270,13 +247,7 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callabl
 @pytest.fixture
 def copied(generated: GenerationResult, tmp_path: Path) -> Callable[[], Path]:
     """A function that copies the generated data set to a root folder that a test may damage."""
-
-    def copy() -> Path:
-        root = tmp_path / "root"
-        shutil.copytree(generated.root, root)
-        return root
-
-    return copy
+    return lambda: shutil.copytree(generated.root, tmp_path / "root")
 
 
 @pytest.fixture(scope="module")

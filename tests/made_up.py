@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import hashlib
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,7 +21,7 @@ from lagbench.board.ranking import combine, summarise
 from lagbench.board.submit import SubmitResult, submit
 from lagbench.data.checksums import dataset_hash, file_sha256, subset_hash
 from lagbench.data.registry import Registry, Size, default_path, load
-from lagbench.data.writer import ScenarioKey, ScenarioWriter, scenario_path
+from lagbench.data.writer import ScenarioWriter, scenario_path
 from lagbench.data.yamlfile import read_yaml, spell_yaml
 from lagbench.report.report import write_report
 from lagbench.scoring.card import ScoreCard
@@ -120,16 +119,10 @@ def _falling(size: Size, scenario: int, frames: int) -> Floats:
     half = size.particles // 2
     body = 0.1 * (rng.random((size.particles, 2)) - 0.5)
     angle = 0.03 * np.arange(frames)[:, None]
-    turned = np.stack(
-        [
-            np.cos(angle) * body[:, 0] - np.sin(angle) * body[:, 1],
-            np.sin(angle) * body[:, 0] + np.cos(angle) * body[:, 1],
-        ],
-        axis=-1,
-    )
+    (x, y), cos, sin = body.T, np.cos(angle), np.sin(angle)
+    turned = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
     middle = np.where(np.arange(size.particles)[:, None] < half, [0.3, 0.7], [0.7, 0.75])
-    fall = -0.0004 * np.arange(frames)[:, None] ** 2
-    turned[..., 1] += fall
+    turned[..., 1] -= 0.0004 * np.arange(frames)[:, None] ** 2
     return np.asarray(turned + middle)
 
 
@@ -142,9 +135,7 @@ def _material(size: Size, scenario: int) -> NDArray[np.int64]:
 
 
 def _write(root: Path, size: Size, scenario: int) -> str:
-    key = ScenarioKey(
-        split=size.split, size=size.name, version=size.version, scenario=scenario, subset="test"
-    )
+    key = size.key(scenario)
     positions = motion(size, scenario).astype(np.float32)
     cavity = size.split == "cavity"
     marks = {"cavity": {"reynolds_number": 80.0}, "curl-noise": {"frequency": 2}}
@@ -177,17 +168,14 @@ def _registry(size: Size, hashes: Mapping[int, str]) -> str:
     """Return our registry with what would be measured of this data set."""
     file = read_yaml(default_path())
     subsets = {"train": "0" * 64, "valid": "1" * 64, "test": subset_hash(hashes)}
-    file["measured"] = {
-        size.split: {
-            size.name: {
-                "dataset_sha256": dataset_hash(size.split, size.name, size.major, subsets),
-                "subset_sha256": subsets,
-                "scenario_sha256": {i: content[:16] for i, content in hashes.items()},
-                "statistics": {"position_std": [0.25, 0.25], "velocity_std": [0.002, 0.002]},
-                "twin_floor": [1e-6 * (k + 1) for k in range(size.task.horizon)],
-            }
-        }
+    measured = {
+        "dataset_sha256": dataset_hash(size.split, size.name, size.major, subsets),
+        "subset_sha256": subsets,
+        "scenario_sha256": {i: content[:16] for i, content in hashes.items()},
+        "statistics": {"position_std": [0.25, 0.25], "velocity_std": [0.002, 0.002]},
+        "twin_floor": [1e-6 * (k + 1) for k in range(size.task.horizon)],
     }
+    file["measured"] = {size.split: {size.name: measured}}
     return spell_yaml(file)
 
 
@@ -282,10 +270,7 @@ class BoardBench:
     def state(self) -> dict[str, str]:
         """Return path to hash of every file in the folder."""
         files = sorted(path for path in self.folder.rglob("*") if path.is_file())
-        return {
-            path.relative_to(self.folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
-            for path in files
-        }
+        return {path.relative_to(self.folder).as_posix(): file_sha256(path) for path in files}
 
 
 def master(home: Path) -> BoardBench:
@@ -339,10 +324,7 @@ def reform(bench: BoardBench, change: Callable[[Any], object], *, whole: bool = 
     with netCDF4.Dataset(bench.folder / SCORES / "noisy.nc", "r+") as file:
         file.set_auto_maskandscale(False)
         change(file)
-    if whole:
-        bench.forge("noisy")
-    else:
-        bench.rehash("noisy")
+    (bench.forge if whole else bench.rehash)("noisy")
 
 
 def scale(statistic: str, factor: float) -> Callable[[Any], object]:

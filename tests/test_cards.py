@@ -62,6 +62,12 @@ def write(root: Path, size: Size, manifest: Manifest) -> list[Path]:
     return cards.write_cards(root, size, registry.load().split(size.split), manifest)
 
 
+def card(size: Size, manifest: Manifest, **update: object) -> str:
+    """Return the card without pictures of a data set whose manifest has something else."""
+    manifest = manifest.model_copy(update=update)
+    return cards.dataset_card(size, registry.load().split(size.split), manifest, pictures=[])
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Write cards of a complete made-up cavity tiny."""
@@ -72,16 +78,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         patch.setattr(cards, "_draw", DRAW)
         written = write(root, size, manifest)
     folder = dataset_folder(root, "cavity", "tiny", 2)
-    assert {p.relative_to(folder).as_posix() for p in written} == {
-        "README.md",
-        "croissant.json",
-        *cards.PICTURES,
-    }
+    names = {p.relative_to(folder).as_posix() for p in written}
+    assert names == {"README.md", "croissant.json", *cards.PICTURES}
     return folder
 
 
-def test_mlcroissant_accepts_the_document(folder: Path) -> None:
-    """The reference validator finds no error; the missing date is its only remark."""
+def test_mlcroissant_accepts_and_reads_the_document(folder: Path) -> None:
+    """The reference validator only remarks on the missing date; records are what the manifest says."""
     tool = Path(sys.executable).parent / "mlcroissant"
     command = [str(tool), "validate", "--jsonld", str(folder / "croissant.json")]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -89,10 +92,6 @@ def test_mlcroissant_accepts_the_document(folder: Path) -> None:
     remarks = re.findall(r"^ +-  .*$", done.stderr, re.MULTILINE)
     assert all("datePublished" in remark for remark in remarks), remarks
     assert "Done" in done.stderr
-
-
-def test_mlcroissant_reads_the_scenarios(folder: Path) -> None:
-    """The records hold what the manifest says about each file."""
     command = [sys.executable, "-c", LOADER, str(folder / "croissant.json")]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     rows = json.loads(done.stdout)
@@ -127,13 +126,9 @@ def test_the_card_says_all_that_it_must(folder: Path) -> None:
         row = next(line for line in body.splitlines() if line.startswith(f"| `{name}` |"))
         assert escape(parameter.unit) in row
         assert escape(parameter.description) in row
-    for part in (
-        "velocity std | 0.00125 | 0.0025",
-        "CC-BY-4.0",
-        "lagbench generate --split cavity --size tiny",
-    ):
+    command = "lagbench generate --split cavity --size tiny"
+    for part in ("velocity std | 0.00125 | 0.0025", "CC-BY-4.0", command, "--regenerate 2"):
         assert part in body
-    assert "--regenerate 2" in body
     assert escape(" ".join(split.citation.split())) in body
 
 
@@ -167,48 +162,40 @@ def test_tables_have_as_many_cells_as_their_heads(folder: Path) -> None:
         assert len({len(re.findall(r"(?<!\\)\|", line)) for line in lines}) <= 1, block
 
 
-def test_without_matplotlib_there_are_no_pictures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The card is written all the same and links no picture."""
-    size, manifest = make(tmp_path)
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+@pytest.mark.parametrize("scenarios", [(0, 1, 2, 3, 4), ()])
+def test_without_matplotlib_or_files_there_are_no_pictures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, scenarios: tuple[int, ...]
+) -> None:
+    """The card is written all the same, names the files that are there and links no picture."""
+    size, manifest = make(tmp_path, scenarios=scenarios)
+    if scenarios:
+        monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     written = write(tmp_path, size, manifest)
     assert [path.name for path in written] == ["README.md", "croissant.json"]
     assert "![" not in written[0].read_text()
+    assert len(json.loads(written[1].read_text())["distribution"]) == len(scenarios)
 
 
 def test_a_partial_data_set_says_so(tmp_path: Path) -> None:
     """Before it is complete there is no data set hash, and subsets count what is there."""
-    size, manifest = make(tmp_path, scenarios=(0, 3))
-    text = cards.dataset_card(size, registry.load().split("cavity"), manifest, pictures=[])
+    text = card(*make(tmp_path, scenarios=(0, 3)))
     assert "none before it is complete" in text
     assert "| train | 0-1 | 1 of 2 |" in text
     assert "Statistics of train" not in text
 
 
-def test_an_empty_data_set_has_cards(tmp_path: Path) -> None:
-    """Nothing generated yet: cards without pictures, files or records."""
-    size, manifest = make(tmp_path, scenarios=())
-    written = write(tmp_path, size, manifest)
-    assert [path.name for path in written] == ["README.md", "croissant.json"]
-    assert json.loads(written[1].read_text())["distribution"] == []
-
-
 def test_a_copy_of_tolerant_identity_does_not_promise_equal_bits(tmp_path: Path) -> None:
     """The sentence about equal bits depends on the manifest."""
     size, manifest = make(tmp_path, scenarios=(0,))
-    split = registry.load().split("cavity")
-    loose = manifest.model_copy(update={"identity": "tolerance"})
-    assert "same bits on every" in cards.dataset_card(size, split, manifest, pictures=[])
-    assert "same bits on every" not in cards.dataset_card(size, split, loose, pictures=[])
+    assert "same bits on every" in card(size, manifest)
+    assert "same bits on every" not in card(size, manifest, identity="tolerance")
 
 
 def test_snow_snow_comes_to_rest_and_its_card_says_so() -> None:
     """The note of multimaterial is on its card and on no other."""
-    for name, split in registry.load().splits.items():
+    for name in registry.load().splits:
         size = registry.load().size(name, "tiny")
-        text = cards.dataset_card(
-            size, split, Manifest(split=name, size="tiny", version=size.version), pictures=[]
-        )
+        text = card(size, Manifest(split=name, size="tiny", version=size.version))
         assert ("Pairs with snow come to rest first" in text) == (name == "multimaterial")
 
 
@@ -217,9 +204,7 @@ def test_the_twin_floor_is_the_mean_over_test(tmp_path: Path) -> None:
     size, manifest = make(tmp_path, scenarios=(3, 4))
     floors = ((1e-6, 2e-3), (3e-6, 4e-3))
     files = tuple(e.model_copy(update={"twin_floor": f}) for e, f in zip(manifest.files, floors, strict=True))
-    manifest = manifest.model_copy(update={"files": files})
-    text = cards.dataset_card(size, registry.load().split("cavity"), manifest, pictures=[])
-    assert "2e-06 at the first predicted frame, 0.003 at the last" in text
+    assert "2e-06 at the first predicted frame, 0.003 at the last" in card(size, manifest, files=files)
 
 
 def test_hostile_text_of_a_registry_stays_text() -> None:

@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 from exchange_readers import straight_runs
 from numpy.typing import NDArray
-from typer.testing import CliRunner
+from typer.testing import Result
 
 import lagbench
-from lagbench.__main__ import app
 from lagbench.data.checksums import dataset_hash, subset_hash
 from lagbench.data.local import locate
 from lagbench.data.scenario import check_scenario, read_scenario
@@ -27,9 +26,11 @@ from lagbench.exchange.trajectory import Measure, estimate_spacing
 from lagbench.work.progress import Progress
 
 BASIC: dict[str, Any] = {"radius": 0.1, "frame_interval": 0.25}
+Runs = list[NDArray[np.float32]]
+Run = Callable[..., Result]
 
 
-def save_runs(folder: Path, runs: list[NDArray[np.float32]]) -> list[Path]:
+def save_runs(folder: Path, runs: Runs) -> list[Path]:
     """Write each trajectory to a .npy file."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / f"run{number}.npy" for number in range(len(runs))]
@@ -38,37 +39,40 @@ def save_runs(folder: Path, runs: list[NDArray[np.float32]]) -> list[Path]:
     return paths
 
 
-def scenario(made: LocalSplit, number: int) -> Path:
-    """Return the file of a scenario."""
+def adopted(folder: Path, runs: Runs, **wishes: Any) -> LocalSplit:
+    """Adopt each trajectory from a file of its own."""
+    return adopt(save_runs(folder / "in", runs), output=folder / "mine", **{**BASIC, **wishes})
+
+
+def stored(made: LocalSplit, number: int, name: str) -> NDArray[Any]:
+    """Return an array of a scenario."""
     size, root, _ = locate(str(made.folder))
-    return size.path(root, number)
+    with read_scenario(size.path(root, number)) as file:
+        return file.read(name)
 
 
 @pytest.fixture(scope="module")
-def runs() -> list[NDArray[np.float32]]:
+def runs() -> Runs:
     """Six trajectories of 12 frames and 40 particles."""
     return straight_runs(6)
 
 
 @pytest.fixture(scope="module")
-def own(tmp_path_factory: pytest.TempPathFactory, runs: list[NDArray[np.float32]]) -> LocalSplit:
+def own(tmp_path_factory: pytest.TempPathFactory, runs: Runs) -> LocalSplit:
     """A local split of these trajectories, four to train on."""
-    folder = tmp_path_factory.mktemp("own")
-    return adopt(save_runs(folder / "in", runs), output=folder / "mine", **BASIC)
+    return adopted(tmp_path_factory.mktemp("own"), runs)
 
 
-def test_positions_come_out_as_they_went_in(own: LocalSplit, runs: list[NDArray[np.float32]]) -> None:
-    """Every subset of the opened split holds the arrays bit for bit, the last ones in test."""
+def test_positions_come_out_as_they_went_in(own: LocalSplit, runs: Runs) -> None:
+    """Every subset of the opened split holds the arrays bit for bit, the last ones in test.
+
+    v(f) = (x(f) - x(f-1)) / interval, and v(0) = v(1).
+    """
     for subset, wanted in {"train": runs[:4], "valid": runs[4:5], "test": runs[5:]}.items():
         with lagbench.open_split(str(own.folder), subset=subset) as data:
             np.testing.assert_array_equal(data["position"].values, np.stack(wanted))
             assert data["time"].values[-1] == 11 * 0.25
-
-
-def test_velocities_are_differences(own: LocalSplit, runs: list[NDArray[np.float32]]) -> None:
-    """v(f) = (x(f) - x(f-1)) / interval, and v(0) = v(1)."""
-    with read_scenario(scenario(own, 0)) as file:
-        velocity = file.read("velocity")
+    velocity = stored(own, 0, "velocity")
     wanted = (np.diff(runs[0].astype(np.float64), axis=0) / 0.25).astype(np.float32)
     np.testing.assert_array_equal(velocity[1:], wanted)
     np.testing.assert_array_equal(velocity[0], wanted[0])
@@ -76,24 +80,22 @@ def test_velocities_are_differences(own: LocalSplit, runs: list[NDArray[np.float
 
 def test_hashes_follow_from_the_files(own: LocalSplit) -> None:
     """The data set hash is that of the files' own content hashes, and what split.yaml records."""
-    content = {i: check_scenario(scenario(own, i)) for i in range(6)}
+    size, root, _ = locate(str(own.folder))
+    content = {i: check_scenario(size.path(root, i)) for i in range(6)}
     parts = {"train": range(4), "valid": [4], "test": [5]}
     subsets = {name: subset_hash({i: content[i] for i in ids}) for name, ids in parts.items()}
-    size = locate(str(own.folder)).size
     assert own.dataset_sha256 == dataset_hash("mine", "full", 1, subsets)
     assert size.measured is not None
     assert size.measured.dataset_sha256 == own.dataset_sha256
     assert size.measured.scenario_sha256 == {i: digest[:16] for i, digest in content.items()}
 
 
-def test_the_same_arrays_give_the_same_hash(tmp_path: Path, runs: list[NDArray[np.float32]]) -> None:
+def test_the_same_arrays_give_the_same_split(own: LocalSplit, tmp_path: Path, runs: Runs) -> None:
     """Once in files of their own, once as one array of four dimensions."""
-    one = adopt(save_runs(tmp_path / "in", runs), output=tmp_path / "a" / "mine", **BASIC)
     np.save(tmp_path / "all.npy", np.stack(runs))
-    two = adopt(tmp_path / "all.npy", output=tmp_path / "b" / "mine", **BASIC)
-    assert one.dataset_sha256 == two.dataset_sha256
-    texts = [(made.folder / "split.yaml").read_bytes() for made in (one, two)]
-    assert texts[0] == texts[1]
+    made = adopt(tmp_path / "all.npy", output=tmp_path / "mine", **BASIC)
+    assert made.dataset_sha256 == own.dataset_sha256
+    assert (made.folder / "split.yaml").read_bytes() == (own.folder / "split.yaml").read_bytes()
 
 
 def test_a_local_split_is_verified_templated_and_scored(own: LocalSplit, tmp_path: Path) -> None:
@@ -112,13 +114,7 @@ def test_a_local_split_is_verified_templated_and_scored(own: LocalSplit, tmp_pat
 def test_progress_counts_towards_the_number_of_trajectories(tmp_path: Path) -> None:
     """Each subset ends with all of its trajectories written, of as many."""
     told: dict[str, Progress] = {}
-    adopt(
-        save_runs(tmp_path / "in", straight_runs(6)),
-        output=tmp_path / "mine",
-        test=2,
-        progress=lambda news: told.update({news.stage: news}),
-        **BASIC,
-    )
+    adopted(tmp_path, straight_runs(6), test=2, progress=lambda news: told.update({news.stage: news}))
     counts = {stage: (news.scenarios_done, news.scenarios, news.total) for stage, news in told.items()}
     assert counts == {"writing train": (3, 3, 3), "writing valid": (1, 1, 1), "writing test": (2, 2, 2)}
 
@@ -141,26 +137,21 @@ def test_ten_comes_after_two(tmp_path: Path) -> None:
 def test_an_empty_file_is_no_trajectory(tmp_path: Path, ending: str) -> None:
     """It is told as such, and not counted among too few."""
     save_runs(tmp_path, straight_runs(2))
-    (tmp_path / f"run2.{ending}").touch(exist_ok=True)
-    (tmp_path / f"run2.{ending}").write_bytes(b"")
+    (tmp_path / f"run2.{ending}").touch()
     with pytest.raises(UnreadableFileError) as caught:
         adopt(tmp_path, output=tmp_path / "mine", **BASIC)
     assert caught.value.where == str(tmp_path / f"run2.{ending}")
 
 
-def test_named_arrays(tmp_path: Path, runs: list[NDArray[np.float32]]) -> None:
+def test_named_arrays(tmp_path: Path, runs: Runs) -> None:
     """An .npz file may hold velocities, materials and walls; all of them are stored."""
-    walls = np.array([[0, 0], [0, 0], [0, 0], [0.5, 0]])
-    material = np.arange(40) % 4
+    named = {"material": np.arange(40) % 4, "wall_velocity": np.array([[0, 0], [0, 0], [0, 0], [0.5, 0]])}
     for number, run in enumerate(runs[:3]):
-        np.savez(
-            tmp_path / f"{number}.npz", position=run, velocity=-run, material=material, wall_velocity=walls
-        )
+        np.savez(tmp_path / f"{number}.npz", position=run, velocity=-run, **named)
     made = adopt([tmp_path / f"{n}.npz" for n in range(3)], output=tmp_path / "mine", **BASIC)
-    with read_scenario(scenario(made, 2)) as file:
-        np.testing.assert_array_equal(file.read("velocity"), -runs[2])
-        np.testing.assert_array_equal(file.read("material"), material)
-        np.testing.assert_array_equal(file.read("wall_velocity")[5], walls)
+    np.testing.assert_array_equal(stored(made, 2, "velocity"), -runs[2])
+    np.testing.assert_array_equal(stored(made, 2, "material"), named["material"])
+    np.testing.assert_array_equal(stored(made, 2, "wall_velocity")[5], named["wall_velocity"])
 
 
 def variable(file: netCDF4.Dataset, shape: tuple[int, ...], kind: str) -> netCDF4.Variable:
@@ -171,7 +162,7 @@ def variable(file: netCDF4.Dataset, shape: tuple[int, ...], kind: str) -> netCDF
     return file.createVariable("position", kind, names)
 
 
-def test_netcdf(tmp_path: Path, runs: list[NDArray[np.float32]]) -> None:
+def test_netcdf(tmp_path: Path, runs: Runs) -> None:
     """NetCDF files of double precision in subset folders are read frame by frame, rounded once."""
     for number, subset in enumerate(("train", "valid", "test")):
         (tmp_path / "in" / subset).mkdir(parents=True)
@@ -179,31 +170,30 @@ def test_netcdf(tmp_path: Path, runs: list[NDArray[np.float32]]) -> None:
             variable(file, runs[0].shape, "f8")[:] = runs[number] + 1e-9
     made = adopt(tmp_path / "in", output=tmp_path / "mine", **BASIC)
     assert made.scenarios == {"train": 1, "valid": 1, "test": 1}
-    with read_scenario(scenario(made, 2)) as file:
-        wanted = (runs[2].astype(np.float64) + 1e-9).astype(np.float32)
-        np.testing.assert_array_equal(file.read("position"), wanted)
+    wanted = (runs[2].astype(np.float64) + 1e-9).astype(np.float32)
+    np.testing.assert_array_equal(stored(made, 2, "position"), wanted)
 
 
-def test_packed_netcdf_is_refused(tmp_path: Path, runs: list[NDArray[np.float32]]) -> None:
+def test_packed_netcdf_is_refused(tmp_path: Path, runs: Runs) -> None:
     """Values that stand for others by scale_factor would be taken for positions: the file is named."""
-    for number, run in enumerate(runs[:3]):
-        with netCDF4.Dataset(tmp_path / f"{number}.nc", "w") as file:
-            position = variable(file, run.shape, "f4")
-            position.scale_factor = 2.0
-            position[:] = run
+    paths = save_runs(tmp_path, runs[:2])
+    with netCDF4.Dataset(tmp_path / "packed.nc", "w") as file:
+        position = variable(file, runs[2].shape, "f4")
+        position.scale_factor = 2.0
+        position[:] = runs[2]
     with pytest.raises(UnreadableFileError, match="packed"):
-        adopt([tmp_path / f"{n}.nc" for n in range(3)], output=tmp_path / "mine", **BASIC)
+        adopt([*paths, tmp_path / "packed.nc"], output=tmp_path / "mine", **BASIC)
 
 
 def test_the_folder_of_another_writer_is_left_alone(
-    tmp_path: Path, runs: list[NDArray[np.float32]], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, runs: Runs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A temporary folder of the same name, as of another machine, is neither used nor removed."""
     theirs = tmp_path / ".mine.partial"
     theirs.mkdir()
     monkeypatch.setattr(local_split, "temporary_name", lambda _: theirs)
     with pytest.raises(WorkFailedError, match="cannot write there"):
-        adopt(save_runs(tmp_path / "in", runs), output=tmp_path / "mine", **BASIC)
+        adopted(tmp_path, runs)
     assert theirs.is_dir()
 
 
@@ -211,7 +201,7 @@ def test_scenarios_may_differ_in_length_and_particles(tmp_path: Path) -> None:
     """Ragged trajectories are padded when opened; the task follows the shortest test scenario."""
     shapes = [(12, 40), (20, 30), (15, 25), (30, 40), (18, 40)]
     ragged = [straight_runs(1, frames=f, particles=p, seed=f)[0] for f, p in shapes]
-    made = adopt(save_runs(tmp_path / "in", ragged), output=tmp_path / "mine", test=2, **BASIC)
+    made = adopted(tmp_path, ragged, test=2)
     assert (made.horizon, made.particles) == (12, (25, 40))
     with lagbench.open_split(str(made.folder), subset="train") as data:
         assert data["frame_count"].values.tolist() == [12, 20]
@@ -224,7 +214,7 @@ def test_scenarios_may_differ_in_length_and_particles(tmp_path: Path) -> None:
 def test_unequal_test_scenarios_are_told(tmp_path: Path) -> None:
     """Test scenarios of different particle numbers can be opened, and a note says what cannot be."""
     ragged = [straight_runs(1, particles=p)[0] for p in (40, 40, 30, 20)]
-    made = adopt(save_runs(tmp_path / "in", ragged), output=tmp_path / "mine", test=2, valid=1, **BASIC)
+    made = adopted(tmp_path, ragged, test=2, valid=1)
     assert "20 to 30 particles" in made.notes[0]
     with pytest.raises(DataError, match="other frames or particles"):
         lagbench.template(str(made.folder), output=tmp_path / "p.nc")
@@ -233,18 +223,10 @@ def test_unequal_test_scenarios_are_told(tmp_path: Path) -> None:
 def test_a_wide_box_is_fitted_without_losing_a_bit(tmp_path: Path) -> None:
     """A box of 3 is divided by 4: times 4, every position is the source's."""
     wide = straight_runs(3, box=3.0)
-    made = adopt(
-        save_runs(tmp_path / "in", wide),
-        output=tmp_path / "mine",
-        radius=0.3,
-        frame_interval=0.25,
-        bounds=((0.0, 3.0), (0.0, 3.0)),
-        rescale=True,
-    )
+    made = adopted(tmp_path, wide, radius=0.3, bounds=((0.0, 3.0), (0.0, 3.0)), rescale=True)
     size = locate(str(made.folder)).size
     assert (size.task.radius, size.bounds[0], size.value("source_scale")) == (0.075, (0.0, 0.75), 4.0)
-    with read_scenario(scenario(made, 0)) as file:
-        np.testing.assert_array_equal(file.read("position") * 4, wide[0])
+    np.testing.assert_array_equal(stored(made, 0, "position") * 4, wide[0])
 
 
 @pytest.mark.parametrize(
@@ -307,8 +289,7 @@ def test_what_is_no_trajectory_leaves_nothing(tmp_path: Path, kind: str) -> None
         ({"radius": None}, "the radius is not known"),
         ({"radius": -1.0}, "not a number above 0"),
         ({"horizon": 7}, "too short for the task"),
-        ({"horizon": 0}, "where: --horizon"),
-        ({"horizon": -1}, "where: --horizon"),
+        *(({"horizon": count}, "where: --horizon") for count in (0, -1)),
         ({"input_frames": 1}, "where: --input-frames"),
         ({"input_frames": 12}, "too short for the task"),
         ({"test": 3, "valid": 3}, "each subset needs a trajectory"),
@@ -329,22 +310,18 @@ def test_what_a_user_says_is_checked(tmp_path: Path, changes: dict[str, Any], wo
     assert [path.name for path in tmp_path.iterdir()] == ["in"]
 
 
-def test_command(tmp_path: Path) -> None:
+def test_command(tmp_path: Path, run: Run) -> None:
     """`lagbench adopt` says what it made, and other commands take the folder it names."""
-    paths = save_runs(tmp_path / "in", straight_runs(4))
+    paths, target = save_runs(tmp_path / "in", straight_runs(4)), tmp_path / "mine"
     options = ["--radius", "0.1", "--frame-interval", "0.25", "--frames-of-interest", "8,10"]
-    target = tmp_path / "mine"
-    done = CliRunner().invoke(
-        app, ["adopt", *map(str, paths), "-o", str(target), *options, "--bounds", "0,1,0.25,1"]
-    )
+    done = run("adopt", *paths, "-o", target, *options, "--bounds", "0,1,0.25,1")
     assert done.exit_code == 0, done.output
     assert "2 train, 1 valid, 1 test, 48 frames, 40 particles" in done.stdout
     size = locate(str(target)).size
     assert size.task.frames_of_interest == (8, 10)
     assert size.bounds == ((0.0, 1.0), (0.25, 1.0))
-    shown = CliRunner().invoke(app, ["info", f"{target}/"])
-    assert "mine" in shown.stdout
-    refused = CliRunner().invoke(app, ["generate", "--split", str(target)])
+    assert "mine" in run("info", f"{target}/").stdout
+    refused = run("generate", "--split", target)
     assert refused.exit_code == 2
     assert "cannot be simulated" in refused.output
 
@@ -440,38 +417,37 @@ def test_a_trajectory_named_twice_is_refused(tmp_path: Path, way: str) -> None:
 
 
 @pytest.mark.parametrize("text", ["x", "8-", "9-8", "8,8"])
-def test_bad_frames_of_interest_name_their_option(tmp_path: Path, text: str) -> None:
+def test_bad_frames_of_interest_name_their_option(tmp_path: Path, run: Run, text: str) -> None:
     """The list is read as one of scenarios is, and the message speaks of frames."""
     paths = save_runs(tmp_path / "in", straight_runs(3))
-    options = ["-o", str(tmp_path / "mine"), "--radius", "0.1", "--frame-interval", "0.25"]
-    done = CliRunner().invoke(app, ["adopt", *map(str, paths), *options, "--frames-of-interest", text])
+    options = ["-o", tmp_path / "mine", "--radius", "0.1", "--frame-interval", "0.25"]
+    done = run("adopt", *paths, *options, "--frames-of-interest", text)
     assert done.exit_code == 2
     assert "where: --frames-of-interest" in done.output
     assert "--scenarios" not in done.output
 
 
-def test_a_file_describes_the_data_and_options_win(tmp_path: Path) -> None:
+def test_a_file_describes_the_data_and_options_win(tmp_path: Path, run: Run) -> None:
     """Keys of `--describe` count where no option says otherwise; unknown keys and wrong types are refused."""
     paths = save_runs(tmp_path / "in", straight_runs(4))
     told = tmp_path / "data.yaml"
-    options = ["-o", str(tmp_path / "mine"), "--describe", str(told), "--free-surface", "--horizon", "3"]
-    words = ["adopt", *map(str, paths), *options]
+    options = ["-o", tmp_path / "mine", "--describe", told, "--free-surface", "--horizon", "3"]
+    words = ["adopt", *paths, *options]
     endless = f"0x{'f' * 5000}"  # an integer whose digits Python does not spell
     wrong = ["colour: red", "radius: far", "- radius", f"title: {endless}", f"horizon: {endless}"]
     for line in (*wrong, f"density: [{endless}]", f"? {endless}\n: 1"):
         told.write_text(line)
-        assert CliRunner().invoke(app, words).exit_code == 2
+        assert run(*words).exit_code == 2
     assert not (tmp_path / "mine").exists()
     told.write_text(
         "radius: 0.1\nframe_interval: 0.25\nbounds: [[0, 1], [0.25, 1]]\nhorizon: 4\n"
         "frames_of_interest: [8]\nlicence: CC0-1.0\ndensity: 2\nspacing: 0.05\nfull_box: true\n"
     )
-    done = CliRunner().invoke(app, words)
+    done = run(*words)
     assert done.exit_code == 0, done.output
-    found = locate(str(tmp_path / "mine"))
-    size = found.size
+    size, _, splits = locate(str(tmp_path / "mine"))
     assert (size.task.radius, size.task.horizon, size.task.frames_of_interest) == (0.1, 3, (8,))
     assert size.bounds == ((0.0, 1.0), (0.25, 1.0))
     assert size.value("density") == 2.0
-    assert found.registry.split("mine").licence == "CC0-1.0"
+    assert splits.split("mine").licence == "CC0-1.0"
     assert size.task.score_grid.placement == "nodes"

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import pickle
 import tracemalloc
 import zipfile
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -14,10 +15,9 @@ import h5py
 import numpy as np
 import pytest
 from exchange_readers import Trajectory, frame_statistics, read_gns, read_h5, read_metadata, straight_runs
-from typer.testing import CliRunner
+from typer.testing import Result
 
 import lagbench
-from lagbench.__main__ import app
 from lagbench.data.registry import Registry
 from lagbench.errors import DataError, UsageError, WorkFailedError
 from lagbench.exchange import adopt, export, import_split
@@ -35,17 +35,21 @@ H5_KEYS = GNS_KEYS - {"sequence_length"} | {
     "periodic_boundary_conditions",
 }
 SUBSETS = ("train", "valid", "test")
+FORMS = pytest.mark.parametrize("form", ["gns-npz", "lagrangebench-h5"])
 
 
 @pytest.fixture(scope="module")
-def flows(
-    generated: GenerationResult, unmeasured: Registry, tmp_path_factory: pytest.TempPathFactory
-) -> dict[str, Path]:
-    """The generated tiny curl-noise data set in both formats."""
-    folder = tmp_path_factory.mktemp("flows")
-    made = {form: folder / form for form in ("gns-npz", "lagrangebench-h5")}
+def flow(generated: GenerationResult, unmeasured: Registry) -> Callable[..., object]:
+    """A function that exports the generated tiny curl-noise data set."""
+    return partial(export, "curl-noise", "tiny", root=generated.root, registry=unmeasured)
+
+
+@pytest.fixture(scope="module")
+def flows(flow: Callable[..., object], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """That data set in both formats."""
+    made = {form: tmp_path_factory.mktemp(form) for form in ("gns-npz", "lagrangebench-h5")}
     for form, output in made.items():
-        export("curl-noise", "tiny", format=form, output=output, root=generated.root, registry=unmeasured)
+        flow(format=form, output=output)
     return made
 
 
@@ -56,10 +60,8 @@ def mixed(tmp_path_factory: pytest.TempPathFactory) -> LocalSplit:
     for number, frames in enumerate((12, 30, 12, 25)):
         run = straight_runs(1, frames=frames, seed=number)[0]
         np.savez(folder / f"{number}.npz", position=run, material=np.arange(40) % 4)
-    files = [folder / f"{number}.npz" for number in range(4)]
-    return adopt(
-        files, output=folder / "mixed", radius=0.1, frame_interval=0.1, bounds=((0.1, 0.9), (0.1, 0.9))
-    )
+    box = ((0.1, 0.9), (0.1, 0.9))
+    return adopt(folder, output=folder / "mixed", radius=0.1, frame_interval=0.1, bounds=box)
 
 
 def stored(split: str, root: Path, size: str) -> dict[str, list[np.ndarray]]:
@@ -72,32 +74,26 @@ def stored(split: str, root: Path, size: str) -> dict[str, list[np.ndarray]]:
     return found
 
 
-def files_of(folder: Path, ending: str) -> dict[str, list[Trajectory]]:
+def files_of(folder: Path) -> dict[str, list[Trajectory]]:
     """Read an export with the reader of its format."""
-    read = read_gns if ending == ".npz" else read_h5
-    return {subset: read(folder / f"{subset}{ending}") for subset in SUBSETS}
+    paths = [next(folder.glob(f"{subset}.*")) for subset in SUBSETS]
+    return {path.stem: (read_gns if path.suffix == ".npz" else read_h5)(path) for path in paths}
 
 
-@pytest.mark.parametrize(("form", "ending"), [("gns-npz", ".npz"), ("lagrangebench-h5", ".h5")])
-def test_positions_are_those_stored(
-    flows: dict[str, Path], generated: GenerationResult, form: str, ending: str
-) -> None:
+@FORMS
+def test_positions_are_those_stored(flows: dict[str, Path], generated: GenerationResult, form: str) -> None:
     """Every trajectory has the stored bits, as float32, in the order of ids, once the origin is added."""
     wanted = stored(generated.split, generated.root, "tiny")
-    origin = np.array(read_metadata(flows[form])["lagbench"]["origin"], np.float32)
-    for subset, trajectories in files_of(flows[form], ending).items():
+    metadata, files = read_metadata(flows[form]), files_of(flows[form])
+    origin = np.array(metadata["lagbench"]["origin"], np.float32)
+    for subset, trajectories in files.items():
         assert len(trajectories) == len(wanted[subset])
         for (position, kinds), truth in zip(trajectories, wanted[subset], strict=True):
             assert position.dtype == np.float32
             np.testing.assert_array_equal(position + origin, truth)
             assert kinds.shape == (position.shape[1],)
-
-
-@pytest.mark.parametrize(("form", "ending"), [("gns-npz", ".npz"), ("lagrangebench-h5", ".h5")])
-def test_statistics_are_those_of_train_per_frame(flows: dict[str, Path], form: str, ending: str) -> None:
-    """Means and deviations equal those computed in one go from the exported train file."""
-    metadata = read_metadata(flows[form])
-    for name, value in frame_statistics(files_of(flows[form], ending)["train"]).items():
+    # Means and deviations are those computed in one go from the exported train file.
+    for name, value in frame_statistics(files["train"]).items():
         np.testing.assert_allclose(metadata[name], value, rtol=2e-8, atol=1e-14, err_msg=name)
 
 
@@ -126,11 +122,10 @@ def test_lagrangebench_metadata(flows: dict[str, Path]) -> None:
 
 @pytest.mark.parametrize("from_walls", [None, True, False])
 def test_lagrangebench_bounds(
-    generated: GenerationResult, unmeasured: Registry, tmp_path: Path, from_walls: bool | None
+    flow: Callable[..., object], generated: GenerationResult, tmp_path: Path, from_walls: bool | None
 ) -> None:
     """Cells counted from 0 hold every particle, no bit is lost; a closed box has its walls as bounds."""
-    options: dict[str, Any] = {"root": generated.root, "registry": unmeasured, "from_walls": from_walls}
-    export("curl-noise", "tiny", format="lagrangebench-h5", output=tmp_path, **options)
+    flow(format="lagrangebench-h5", output=tmp_path, from_walls=from_walls)
     metadata = read_metadata(tmp_path)
     bounds = np.array(metadata["bounds"])
     np.testing.assert_allclose(bounds, [[0.0, 1.0 if from_walls is False else 0.9]] * 2, atol=1e-6)
@@ -144,8 +139,8 @@ def test_lagrangebench_bounds(
 
 def test_walls_at_0_are_the_bounds_too(mixed: LocalSplit, tmp_path: Path) -> None:
     """Measured from walls that lie at 0 nothing is taken off, and the bounds are still the walls."""
-    paths = sorted(mixed.folder.parent.glob("[0-9].npz"))
     bounds = ((0.0, 0.95), (0.0, 0.95))
+    paths = sorted(mixed.folder.parent.glob("[0-9].npz"))
     own = adopt(paths, output=tmp_path / "corner", radius=0.1, frame_interval=0.1, bounds=bounds)
     for from_walls, high in ((True, 0.95), (False, 1.0)):
         folder = tmp_path / f"{from_walls}"
@@ -170,9 +165,7 @@ def test_each_material_has_its_number(
 ) -> None:
     """Liquid, jelly, snow, rope: four numbers below 9, none of which means padding or a boundary."""
     export(str(mixed.folder), format=form, output=tmp_path)
-    ending = ".npz" if form == "gns-npz" else ".h5"
-    _, kinds = files_of(tmp_path, ending)["train"][0]
-    assert kinds.tolist() == numbers * 10
+    assert files_of(tmp_path)["train"][0][1].tolist() == numbers * 10
 
 
 def test_unequal_lengths(mixed: LocalSplit, tmp_path: Path) -> None:
@@ -200,14 +193,11 @@ def test_an_export_that_breaks_off_is_not_whole(
     assert not list(tmp_path.glob(".*"))
 
 
-@pytest.mark.parametrize("form", ["gns-npz", "lagrangebench-h5"])
+@FORMS
 def test_the_same_data_give_the_same_bytes(mixed: LocalSplit, tmp_path: Path, form: str) -> None:
     """Two exports are equal byte for byte; a second one needs --force where the first is."""
-    hashes = []
-    for folder in ("a", "b"):
-        made = export(str(mixed.folder), format=form, output=tmp_path / folder)
-        hashes.append([hashlib.sha256(path.read_bytes()).hexdigest() for path in made.files])
-    assert hashes[0] == hashes[1]
+    one, two = (export(str(mixed.folder), format=form, output=tmp_path / name) for name in "ab")
+    assert [path.read_bytes() for path in one.files] == [path.read_bytes() for path in two.files]
     with pytest.raises(UsageError, match="files of that name"):
         export(str(mixed.folder), format=form, output=tmp_path / "a")
     export(str(mixed.folder), format=form, output=tmp_path / "a", force=True)
@@ -266,32 +256,23 @@ def lid(tmp_path_factory: pytest.TempPathFactory) -> LocalSplit:
     walls[:10, 3, 0], walls[10:, 3, 0] = 0.7, -0.35
     for number, run in enumerate(straight_runs(3, frames=20)):
         np.savez(folder / f"{number}.npz", position=run, wall_velocity=walls)
-    return adopt(
-        [folder / f"{number}.npz" for number in range(3)],
-        output=folder / "lid",
-        radius=0.1,
-        frame_interval=0.1,
-        spacing=0.04,
-        bounds=((0.1, 0.9), (0.1, 0.9)),
-        full_box=True,
-    )
+    options: dict[str, Any] = {"radius": 0.1, "frame_interval": 0.1, "spacing": 0.04, "full_box": True}
+    return adopt(folder, output=folder / "lid", bounds=((0.1, 0.9), (0.1, 0.9)), **options)
 
 
-@pytest.mark.parametrize(
-    ("form", "ending", "still", "moving"), [("gns-npz", ".npz", 3, 3), ("lagrangebench-h5", ".h5", 1, 2)]
-)
+@pytest.mark.parametrize(("form", "still", "moving"), [("gns-npz", 3, 3), ("lagrangebench-h5", 1, 2)])
 def test_readers_see_the_lid_move(
-    lid: LocalSplit, tmp_path: Path, form: str, ending: str, still: int, moving: int
+    lid: LocalSplit, tmp_path: Path, form: str, still: int, moving: int
 ) -> None:
     """Differences of lid particles are the wall's velocity, but for the one that comes in again."""
-    export(str(lid.folder), format=form, output=tmp_path, wall_particles=True)
-    metadata = read_metadata(tmp_path)
-    truth = stored("lid", lid.folder.parent, "full")["test"][0]
-    position, kinds = files_of(tmp_path, ending)["test"][0]
-    position = position + np.array(metadata["lagbench"]["origin"], np.float32)
+    export(str(lid.folder), format=form, output=tmp_path / "out", wall_particles=True)
+    metadata = read_metadata(tmp_path / "out")
+    truth = stored("lid", lid.folder.parent, "full")
+    raw, kinds = files_of(tmp_path / "out")["test"][0]
+    position = raw + np.array(metadata["lagbench"]["origin"], np.float32)
     # 0.8 / 0.04 = 20 particles to a layer, three layers to a wall, four walls.
     assert kinds[40:].tolist() == [still] * 180 + [moving] * 60
-    np.testing.assert_allclose(position[:, :40], truth, atol=1e-7)
+    np.testing.assert_allclose(position[:, :40], truth["test"][0], atol=1e-7)
     walls, top = position[:, 40:220], position[:, 220:]
     assert (walls == walls[0]).all()
     np.testing.assert_allclose(np.unique(top[..., 1].round(5)), [0.92, 0.96, 1.0])
@@ -309,28 +290,17 @@ def test_readers_see_the_lid_move(
         )
     assert again.any()
     if form == "lagrangebench-h5":
-        bounds = np.array(metadata["bounds"])
-        raw = files_of(tmp_path, ending)["test"][0][0]
-        assert ((raw >= 0) & (raw < bounds[:, 1])).all()
-
-
-@pytest.mark.parametrize("form", ["gns-npz", "lagrangebench-h5"])
-def test_wall_particles_do_not_come_back(lid: LocalSplit, tmp_path: Path, form: str) -> None:
-    """An import of our own export leaves them out: they are no material."""
-    export(str(lid.folder), format=form, output=tmp_path / "out", wall_particles=True)
+        assert ((raw >= 0) & (raw < np.array(metadata["bounds"])[:, 1])).all()
+    # An import of our own export leaves them out: they are no material.
     back = import_split(tmp_path / "out", format=form, output=tmp_path / "back", allow_pickle=True)
     assert back.particles == (40, 40)
-    np.testing.assert_allclose(
-        stored("back", tmp_path, "full")["train"][0],
-        stored("lid", lid.folder.parent, "full")["train"][0],
-        atol=1e-7,
-    )
+    came = stored("back", tmp_path, "full")
+    np.testing.assert_allclose(came["train"][0], truth["train"][0], atol=1e-7)
 
 
-def test_walls_at_rest_are_solid(generated: GenerationResult, unmeasured: Registry, tmp_path: Path) -> None:
+def test_walls_at_rest_are_solid(flow: Callable[..., object], tmp_path: Path) -> None:
     """A simulated box with slip walls gets particles of the kind that does not move."""
-    options: dict[str, Any] = {"root": generated.root, "registry": unmeasured, "wall_particles": True}
-    export("curl-noise", "tiny", format="lagrangebench-h5", output=tmp_path, **options)
+    flow(format="lagrangebench-h5", output=tmp_path, wall_particles=True)
     position, kinds = read_h5(tmp_path / "test.h5")[0]
     assert {*kinds[506:].tolist()} == {1}
     assert (position[:, 506:] == position[0, 506:]).all()
@@ -371,12 +341,11 @@ def test_missing_and_foreign_scenarios_are_told(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_command(mixed: LocalSplit, tmp_path: Path) -> None:
+def test_command(mixed: LocalSplit, tmp_path: Path, run: Callable[..., Result]) -> None:
     """`lagbench export` writes where it is told and says what; an unknown format names the nearest."""
-    arguments = ["export", str(mixed.folder), "--format", "lagrangebench-h5", "-o", str(tmp_path / "out")]
-    done = CliRunner().invoke(app, [*arguments, "--json"])
+    done = run("export", mixed.folder, "--format", "lagrangebench-h5", "-o", tmp_path / "out", "--json")
     assert done.exit_code == 0, done.output
     assert json.loads(done.stdout)["trajectories"] == {"train": 3, "valid": 1, "test": 1}
-    wrong = CliRunner().invoke(app, ["export", str(mixed.folder), "--format", "gns-npy"])
+    wrong = run("export", mixed.folder, "--format", "gns-npy")
     assert wrong.exit_code == 2
     assert "did you mean 'gns-npz'" in wrong.output

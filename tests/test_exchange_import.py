@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,9 @@ import numpy as np
 import pytest
 from exchange_readers import read_gns, read_h5, straight_runs
 from exchange_writers import SUBSETS, write_gns, write_h5
-from typer.testing import CliRunner
+from typer.testing import Result
 
 import lagbench
-from lagbench.__main__ import app
 from lagbench.data.local import locate
 from lagbench.data.registry import Registry
 from lagbench.errors import DataError, UnreadableFileError
@@ -42,8 +42,7 @@ def test_an_export_comes_back(
             np.testing.assert_array_equal(positions(made.folder, subset), data["position"].values)
             mass = data["particle_mass"].values[0]
     here, there = locate(str(made.folder)).size, unmeasured.size("curl-noise", "tiny")
-    assert here.task == there.task
-    assert here.bounds == there.bounds
+    assert (here.task, here.bounds) == (there.task, there.bounds)
     assert here.frame_interval == there.frame_interval
     with lagbench.open_split(str(made.folder)) as data:
         assert data["particle_mass"].values[0] == pytest.approx(mass, rel=1e-12)
@@ -51,10 +50,12 @@ def test_an_export_comes_back(
 
 @pytest.mark.parametrize("form", ["gns-npz", "lagrangebench-h5"])
 def test_imported_data_equal_the_source(tmp_path: Path, form: str) -> None:
-    """Positions of the local split are those that a reader of the source takes."""
+    """Positions of the local split are those that a reader takes, and a force.py beside them is not run."""
     gns = form == "gns-npz"
     source = (write_gns if gns else write_h5)(tmp_path / "in", straight_runs(3))
+    (source / "force.py").write_text(f"open({str(tmp_path / 'trace')!r}, 'w')")
     made = import_split(source, format=form, output=tmp_path / "own", allow_pickle=gns)
+    assert not (tmp_path / "trace").exists()
     read = (read_gns if gns else read_h5)(source / ("train.npz" if gns else "train.h5"))
     np.testing.assert_array_equal(positions(made.folder), [run for run, _ in read])
     interval = 0.01 if gns else 0.05
@@ -66,25 +67,10 @@ def test_another_horizon_drops_the_frames_of_the_exported_task(tmp_path: Path) -
     hints = {"lagbench": {"horizon": 6, "frames_of_interest": [10]}}
     source = write_gns(tmp_path / "in", straight_runs(3), **hints)
     kept = import_split(source, format="gns-npz", output=tmp_path / "a", allow_pickle=True)
-    own = import_split(
-        source,
-        format="gns-npz",
-        output=tmp_path / "b",
-        allow_pickle=True,
-        horizon=3,
-        radius=None,
-        bounds=None,
-    )  # None says nothing: the metadata do
+    options: dict[str, Any] = {"horizon": 3, "radius": None, "bounds": None}  # None says nothing: metadata do
+    own = import_split(source, format="gns-npz", output=tmp_path / "b", allow_pickle=True, **options)
     interest = [locate(str(made.folder)).size.task.frames_of_interest for made in (kept, own)]
     assert interest == [(10,), (8,)]
-
-
-def test_a_force_program_is_not_run(tmp_path: Path) -> None:
-    """A force.py beside the data is left alone."""
-    source = write_h5(tmp_path / "in", straight_runs(3))
-    (source / "force.py").write_text(f"open({str(tmp_path / 'trace')!r}, 'w')")
-    import_split(source, format="lagrangebench-h5", output=tmp_path / "own")
-    assert not (tmp_path / "trace").exists()
 
 
 @pytest.mark.parametrize("protocol", [3, 4])
@@ -130,15 +116,15 @@ def test_periodic_boxes(tmp_path: Path) -> None:
         import_split(source, format="lagrangebench-h5", output=tmp_path / "other")
 
 
-def test_what_the_user_says_goes_before_the_metadata(tmp_path: Path) -> None:
+def test_what_the_user_says_goes_before_the_metadata(tmp_path: Path, run: Callable[..., Result]) -> None:
     """`lagbench import` takes radius, task and box from its options where they are given."""
     source = write_h5(tmp_path / "in", straight_runs(3, box=3.0), bounds=[[0, 3], [0, 3]], dx=0.2)
-    arguments = ["import", str(source), "--format", "lagrangebench-h5", "-o", str(tmp_path / "own")]
-    refused = CliRunner().invoke(app, arguments)
+    arguments = ["import", source, "--format", "lagrangebench-h5", "-o", tmp_path / "own"]
+    refused = run(*arguments)
     assert refused.exit_code == 4
     assert "--rescale" in refused.output
     options = ["--rescale", "--radius", "0.4", "--horizon", "4", "--input-frames", "2", "--full-box"]
-    done = CliRunner().invoke(app, [*arguments, *options])
+    done = run(*arguments, *options)
     assert done.exit_code == 0, done.output
     size = locate(str(tmp_path / "own")).size
     assert (size.task.radius, size.task.input_frames, size.task.horizon) == (0.1, 2, 4)

@@ -9,10 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from typer.testing import CliRunner
+from typer.testing import Result
 
-from lagbench.__main__ import app
-from lagbench.data.layout import dataset_folder
 from lagbench.data.scenario import read_scenario
 from lagbench.errors import DataError
 from lagbench.exchange import adopt
@@ -26,10 +24,13 @@ SPLITS = ("cavity", "curl-noise", "fluid", "multimaterial")
 @pytest.fixture(scope="module", params=SPLITS)
 def ours(request: pytest.FixtureRequest, tiny_split: Callable[..., GenerationResult]) -> list[Any]:
     """The scenarios of a split: positions, the solver's velocities, the time between frames."""
-    made = tiny_split(request.param)
-    files = sorted(dataset_folder(made.root, made.split, made.size, 2).rglob("*.nc"))
+    return scenarios(tiny_split(request.param))
+
+
+def scenarios(made: GenerationResult) -> list[Any]:
+    """Return positions, velocities and the time between frames of each scenario."""
     found = []
-    for path in files:
+    for path in sorted(made.folder.rglob("*.nc")):
         with read_scenario(path) as file:
             time = file.read("time")
             found.append((file.read("position"), file.read("velocity"), float(time[1] - time[0])))
@@ -83,31 +84,14 @@ def test_swapped_components_are_named(ours: list[Any]) -> None:
 
 
 def test_other_units_are_named(ours: list[Any]) -> None:
-    """Displacements per frame, and a constant factor, of differences: the fix names the interval."""
+    """Displacements per frame, a constant factor, of which the fix names the interval, or turned round."""
     for position, _, interval in ours[:2]:
         assert "per frame" in said(position, differences(position, 1.0), interval)
-        with pytest.raises(DataError, match=f"--frame-interval {interval / 3:.3g}") as caught:
-            check_meaning("runs.npy", position, 3 * differences(position, interval), interval)
-        assert "3 times" in caught.value.what
-
-
-def test_backward_velocities_are_named(ours: list[Any]) -> None:
-    """Turned round, of any size; no frame interval mends them."""
-    for position, _, interval in ours[:2]:
-        for factor in (-1, -3):
-            with pytest.raises(DataError) as caught:
+        for factor, word in ((3, "3 times"), (-1, "backwards"), (-3, "backwards")):
+            with pytest.raises(DataError, match=word) as caught:
                 check_meaning("runs.npy", position, factor * differences(position, interval), interval)
-            assert "backwards" in caught.value.what
-            assert "--frame-interval" not in str(caught.value.fix)
-
-
-@pytest.mark.parametrize("shape", [(2, 40, 3), (50, 2, 3)])
-def test_data_in_space_are_not_called_transposed(tmp_path: Path, shape: tuple[int, ...]) -> None:
-    """Three components are refused as such, whatever else has length two."""
-    np.save(tmp_path / "runs.npy", np.zeros((3, *shape)))
-    with pytest.raises(DataError) as caught:
-        adopt(tmp_path / "runs.npy", output=tmp_path / "own", radius=0.1, frame_interval=0.1)
-    assert "moveaxis" not in str(caught.value)
+            named = f"--frame-interval {interval / 3:.3g}" if factor > 0 else "--frame-interval"
+            assert (named in str(caught.value.fix)) == (factor > 0)
 
 
 @pytest.mark.parametrize("split", ["fluid", "multimaterial"])
@@ -116,30 +100,20 @@ def test_shifted_velocities_are_named(split: str, tiny_split: Callable[..., Gene
 
     In our closed boxes the particles' own velocities lag behind their motion by some of a frame.
     """
-    made = tiny_split(split)
-    files = sorted(dataset_folder(made.root, split, made.size, 2).rglob("*.nc"))
-    named = {"late": 0, "early": 0}
-    for path in files:
-        with read_scenario(path) as file:
-            position, velocity = file.read("position"), file.read("velocity")
-            time = file.read("time")
-        interval = float(time[1] - time[0])
+    found, named = scenarios(tiny_split(split)), {"late": 0, "early": 0}
+    for position, velocity, interval in found:
         for shift, word in ((1, "late"), (-1, "early")):
             what = said(position, np.roll(velocity, shift, axis=0), interval)
             assert what in ("", f"velocities are one frame {word}")
             named[word] += bool(what)
-    assert min(named.values()) >= 0.8 * len(files)
+    assert min(named.values()) >= 0.8 * len(found)
 
 
 def test_shifted_differences_are_named(ours: list[Any]) -> None:
-    """Differences to the frame before that came one frame late fit nothing: each is another's."""
+    """Differences that came one frame late fit nothing; swapped and per frame too, all is named."""
     for position, _, interval in ours:
         late = np.roll(differences(position, interval), 1, axis=0)
         assert said(position, late, interval) == "velocities are one frame late"
-
-
-def test_two_mistakes_are_both_named(ours: list[Any]) -> None:
-    """Velocities that are swapped, per frame and late."""
     position, _, interval = ours[0]
     what = said(position, np.roll(differences(position, 1.0), 1, axis=0)[..., ::-1], interval)
     assert [word in what for word in ("swapped", "per frame", "late")] == [True] * 3
@@ -203,30 +177,39 @@ def test_odd_data_pass(kind: str) -> None:
         assert said(position, None, 0.1) == ""
 
 
-def test_adopting_says_so_and_can_be_told_otherwise(tmp_path: Path) -> None:
+def test_adopting_says_so_and_can_be_told_otherwise(tmp_path: Path, run: Callable[..., Result]) -> None:
     """`adopt` refuses swapped velocities, leaves nothing, and takes them with --as-is."""
     interval = 0.1
     position = 0.5 + 0.5 * _wheel(np.random.default_rng(0).random(60), 0.2)[0]
     for number in range(3):
         swapped = differences(position, interval)[..., ::-1]
         np.savez(tmp_path / f"{number}.npz", position=position, velocity=swapped)
-    words = ["adopt", *(str(tmp_path / f"{n}.npz") for n in range(3)), "-o", str(tmp_path / "own")]
-    options = ["--radius", "0.1", "--frame-interval", str(interval)]
-    refused = CliRunner().invoke(app, words + options)
+    words = ["adopt", tmp_path, "-o", tmp_path / "own", "--radius", "0.1", "--frame-interval", interval]
+    refused = run(*words)
     assert refused.exit_code == DataError.exit_code
     assert "0.npz" in refused.stderr
     assert not (tmp_path / "own").exists()
-    taken = CliRunner().invoke(app, [*words, *options, "--as-is"])
+    taken = run(*words, "--as-is")
     assert taken.exit_code == 0, taken.output
 
 
-@pytest.mark.parametrize(("turn", "axes"), [((0, 2, 1), "(frames, 2, particles)"), ((2, 0, 1), "(2, frames")])
-def test_components_that_do_not_come_last(tmp_path: Path, turn: tuple[int, ...], axes: str) -> None:
-    """The shape alone gives them away; what is said mends it."""
-    array = np.random.default_rng(0).random((12, 40, 2)).transpose(turn)
+@pytest.mark.parametrize(
+    ("shape", "words"),
+    [
+        ((12, 2, 40), "(frames, 2, particles)"),
+        ((2, 12, 40), "(2, frames"),
+        ((2, 40, 3), "3 components"),
+        ((50, 2, 3), "3 components"),
+    ],
+)
+def test_components_that_do_not_come_last(tmp_path: Path, shape: tuple[int, ...], words: str) -> None:
+    """The shape alone gives them away, and what is said mends it; three components are data in space."""
+    array = np.zeros(shape)
     np.save(tmp_path / "runs.npy", np.stack([array] * 3))
     with pytest.raises(DataError) as caught:
         adopt(tmp_path / "runs.npy", output=tmp_path / "own", radius=0.1, frame_interval=0.1)
-    assert axes in str(caught.value)
-    mended = eval(str(caught.value.fix), {"np": np, "array": array})
-    assert mended.shape == (12, 40, 2)
+    assert words in str(caught.value)
+    if shape[2] == 3:
+        assert "moveaxis" not in str(caught.value)
+    else:
+        assert eval(str(caught.value.fix), {"np": np, "array": array}).shape == (12, 40, 2)

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import pytest
 from conftest import SIZE, SPLIT
 
 from lagbench.atomic import temporary_name
 from lagbench.data.lock import dataset_lock
-from lagbench.data.manifest import read_manifest
+from lagbench.data.manifest import Manifest, read_manifest
 from lagbench.data.registry import Registry, load
 from lagbench.errors import UsageError, WorkFailedError
 from lagbench.generators.batch import SimulationJob
@@ -35,7 +37,16 @@ def partial_files(root: Path) -> list[Path]:
     return list(root.rglob(".*.nc.*.partial"))
 
 
-# --- bad input -------------------------------------------------------------------------------
+def scenario_files(root: Path) -> list[str]:
+    """Return the names of the finished scenario files."""
+    return sorted(path.name for path in root.rglob("[!.]*.nc"))
+
+
+def manifest_of(root: Path) -> Manifest:
+    """Return the manifest of the tiny data set."""
+    manifest = read_manifest(root, SPLIT, SIZE, 2)
+    assert manifest is not None
+    return manifest
 
 
 @pytest.mark.parametrize(
@@ -50,21 +61,15 @@ def partial_files(root: Path) -> list[Path]:
         ({"scenarios": "one"}, "'one' is no id and no range"),
         ({"device": "gpu"}, "no device 'gpu'"),
         ({"device": "cuba"}, "did you mean 'cuda'?"),
+        *(({"workers": count}, "without a worker") for count in (0, -1)),
     ],
 )
-def test_unknown_names_and_ids(
-    options: dict[str, str], message: str, tmp_path: Path, unmeasured: Registry
-) -> None:
-    """Wrong names and ids are usage errors that say what is known, before anything is written."""
-    given = {"split": SPLIT, "size": SIZE, **options}
-    with pytest.raises(UsageError) as caught:
-        generate(**given, root=tmp_path / "new", registry=unmeasured)  # type: ignore[arg-type]
-    assert message in str(caught.value)
+def test_bad_input(options: dict[str, Any], message: str, tmp_path: Path, unmeasured: Registry) -> None:
+    """Wrong names, ids and numbers are usage errors that say what is known, before anything is written."""
+    with pytest.raises(UsageError, match=re.escape(message)) as caught:
+        generate(**{"split": SPLIT, "size": SIZE, **options}, root=tmp_path / "new", registry=unmeasured)
     assert caught.value.exit_code == 2
     assert not (tmp_path / "new").exists()
-
-
-# --- disks -----------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -81,11 +86,8 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 def test_a_disk_too_small_is_refused_at_once(small_disk: Path, unmeasured: Registry) -> None:
     """The message tells bytes needed and free; nothing is written."""
-    with pytest.raises(WorkFailedError) as caught:
+    with pytest.raises(WorkFailedError, match=r"(?s)not enough disk space.*bytes free") as caught:
         generate(SPLIT, SIZE, root=small_disk, registry=unmeasured)
-    text = str(caught.value)
-    assert "not enough disk space" in text
-    assert "bytes free" in text
     assert caught.value.exit_code == 5
     assert files(small_disk) == []
 
@@ -95,17 +97,13 @@ def test_a_disk_that_fills_up_leaves_whole_files_only(
 ) -> None:
     """Somebody else takes the space in the midst: what was finished stays, the rest leaves no trace."""
     monkeypatch.setattr("lagbench.make.generate.check_disk", lambda root, needed: None)
-    with pytest.raises(WorkFailedError) as caught:
+    with pytest.raises(WorkFailedError, match="free disk space") as caught:
         generate(SPLIT, SIZE, root=small_disk, workers=1, registry=unmeasured)
-    assert "free disk space" in str(caught.value)
     assert caught.value.exit_code == 5
     assert partial_files(small_disk) == []
-    manifest = read_manifest(small_disk, SPLIT, SIZE, 2)
-    assert manifest is not None
+    manifest = manifest_of(small_disk)
     assert not manifest.complete
-    assert [name for name in files(small_disk) if name.endswith(".nc")] == [
-        Path(entry.path).name for entry in manifest.files
-    ]
+    assert scenario_files(small_disk) == [Path(entry.path).name for entry in manifest.files]
 
 
 def test_a_worker_on_a_full_disk_names_the_file(tmp_path: Path, unmeasured: Registry) -> None:
@@ -122,32 +120,20 @@ def test_a_worker_on_a_full_disk_names_the_file(tmp_path: Path, unmeasured: Regi
     assert files(tmp_path) == []
 
 
-# --- locks -----------------------------------------------------------------------------------
-
-
 def test_two_generations_at_once(tmp_path: Path, unmeasured: Registry, generated: GenerationResult) -> None:
     """The second waits, is told for whom, and then finds everything there."""
     told: list[str] = []
-    results: dict[str, GenerationResult] = {}
-
-    def second() -> None:
-        results["second"] = generate(
-            SPLIT, SIZE, root=tmp_path, workers=1, registry=unmeasured, on_wait=told.append
-        )
-
-    with dataset_lock(tmp_path, SPLIT, SIZE, 2):
-        waiting = threading.Thread(target=second)
-        waiting.start()
-        while not told:
-            time.sleep(0.01)
-        shutil.copytree(generated.folder, tmp_path / SPLIT / SIZE / "v2", dirs_exist_ok=True)
-    waiting.join(timeout=60)
+    options: dict[str, Any] = {"root": tmp_path, "workers": 1, "registry": unmeasured, "on_wait": told.append}
+    with ThreadPoolExecutor() as threads:
+        with dataset_lock(tmp_path, SPLIT, SIZE, 2):
+            second = threads.submit(generate, SPLIT, SIZE, **options)
+            while not told:
+                time.sleep(0.01)
+            shutil.copytree(generated.folder, tmp_path / SPLIT / SIZE / "v2", dirs_exist_ok=True)
+        result = second.result(timeout=60)
     assert f"process {os.getpid()} on" in told[0]
-    assert results["second"].simulated == ()
-    assert results["second"].dataset_sha256 == generated.dataset_sha256
-
-
-# --- interruptions ---------------------------------------------------------------------------
+    assert result.simulated == ()
+    assert result.dataset_sha256 == generated.dataset_sha256
 
 
 CALL = "from lagbench.__main__ import app; app()"
@@ -188,11 +174,6 @@ def wait_for(condition: Callable[[], object], process: subprocess.Popen[str]) ->
         time.sleep(0.005)
 
 
-def scenario_files(root: Path) -> list[str]:
-    """Return the names of the finished scenario files."""
-    return sorted(path.name for path in root.rglob("*.nc") if not path.name.startswith("."))
-
-
 def children(process: int) -> list[int]:
     """Return the process ids of the living children."""
     listing = Path(f"/proc/{process}/task/{process}/children")
@@ -209,9 +190,7 @@ def test_control_c_is_resumable(
     assert "interrupted" in errors
     assert "Traceback" not in errors
     assert partial_files(tmp_path) == []
-    manifest = read_manifest(tmp_path, SPLIT, SIZE, 2)
-    assert manifest is not None
-    assert manifest.complete is False
+    assert manifest_of(tmp_path).complete is False
     rest = generate(SPLIT, SIZE, root=tmp_path, workers=2, registry=unmeasured)
     assert rest.kept != ()
     assert rest.simulated != ()
@@ -253,9 +232,6 @@ def test_a_killed_parent_is_resumed(
     assert found is not None
     assert whole is not None
     assert found.files == whole.files  # with what each simulation went through
-
-
-# --- blow-ups and other bits -----------------------------------------------------------------
 
 
 def test_a_draw_out_of_range_names_its_scenario(tmp_path: Path, unmeasured_path: Path) -> None:

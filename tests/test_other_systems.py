@@ -81,9 +81,8 @@ def test_validating_and_scoring(commands: Run, bench: ScoreBench, tmp_path: Path
     bench.submit(tmp_path / "predictions.nc", straight)
     commands("list", "info curl-noise", "validate predictions.nc", "score predictions.nc -o less-scores")
     bench.score(tmp_path / "predictions.nc")
-    found, expected = (
-        json.loads((tmp_path / name).read_bytes()) for name in ("less-scores/scores.json", "scores.json")
-    )
+    paths = tmp_path / "less-scores/scores.json", tmp_path / "scores.json"
+    found, expected = (json.loads(path.read_bytes()) for path in paths)
     assert found == expected
 
 
@@ -98,38 +97,30 @@ def test_training_and_predicting(commands: Run, tmp_path: Path) -> None:
     assert (tmp_path / "scores.json").is_file()
 
 
-def test_a_system_without_limits(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No limit is asked for where there are none."""
-    monkeypatch.setattr(machine, "LIMITS", False)
-    monkeypatch.setattr(machine.resource, "setrlimit", lambda *_: pytest.fail("a limit"))
-    machine.limit_process(memory=1, seconds=1)
-
-
-def test_macos_refuses_a_limit_of_the_address_space(monkeypatch: pytest.MonkeyPatch) -> None:
-    """There only the others are set."""
+def test_systems_without_some_limits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where there are no limits none is asked for; macOS refuses that of the address space."""
     wanted: list[int] = []
     monkeypatch.setattr(machine.sys, "platform", "darwin")
     monkeypatch.setattr(machine.resource, "setrlimit", lambda what, _: wanted.append(what))
     machine.limit_process(memory=1, seconds=1)
     assert wanted == [machine.resource.RLIMIT_CORE, machine.resource.RLIMIT_CPU]
+    monkeypatch.setattr(machine, "LIMITS", False)
+    machine.limit_process(memory=1, seconds=1)
+    assert len(wanted) == 2
 
 
 def test_a_crash_on_windows_is_the_files_fault(monkeypatch: pytest.MonkeyPatch) -> None:
     """There a process that reads where it may not ends with the code 0xC0000005, not with a signal."""
     ended = subprocess.CompletedProcess([], 0xC0000005, stdout=b"1\n2", stderr=b"")
     monkeypatch.setattr(machine.subprocess, "run", lambda *_, **__: ended)
-    assert machine.in_child("any.function", [0, 0], seconds=1.0, wall=1.0) == (
-        [1],
-        "it ended with exit code 0xc0000005",
-    )
+    found = machine.in_child("any.function", [0, 0], seconds=1.0, wall=1.0)
+    assert found == ([1], "it ended with exit code 0xc0000005")
 
 
 def test_where_no_workers_start_jobs_run_here(monkeypatch: pytest.MonkeyPatch) -> None:
     """Scores come all the same; who asks for workers by name is told."""
     monkeypatch.setattr(pool, "AVAILABLE", False)
-    assert run_all(lambda job, _: (job, os.getpid()), {"a": 1, "b": 2}, workers=2) == [
-        (1, os.getpid()),
-        (2, os.getpid()),
-    ]
+    found = run_all(lambda job, _: (job, os.getpid()), {"a": 1, "b": 2}, workers=2)
+    assert found == [(job, os.getpid()) for job in (1, 2)]
     with pytest.raises(WorkFailedError):
         pool.Pool(2)

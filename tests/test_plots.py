@@ -28,24 +28,11 @@ from lagbench.errors import DataError, UsageError, WorkFailedError
 from lagbench.exchange import adopt
 from lagbench.store.dataset import open_split
 
-PNG_HEAD = b"\x89PNG\r\n\x1a\n"
-
 
 @pytest.fixture(scope="module")
 def swirl(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Write one cavity scenario whose top wall moves to the right."""
+    """One cavity scenario whose top wall moves to the right."""
     return write_swirl(tmp_path_factory.mktemp("root"))
-
-
-def chunks(data: bytes) -> list[bytes]:
-    """Return the types of a PNG's chunks."""
-    assert data.startswith(PNG_HEAD)
-    found, at = [], len(PNG_HEAD)
-    while at < len(data):
-        length, kind = struct.unpack_from(">I4s", data, at)
-        found.append(kind)
-        at += 12 + length
-    return found
 
 
 def pixels(path: Path) -> NDArray[np.uint8]:
@@ -61,17 +48,25 @@ def test_every_kind_of_picture_is_small_and_has_the_same_bytes_twice(swirl: Path
         data, again = (plot_frame(swirl, 2, tmp_path / n, kind=kind).read_bytes() for n in ("a.png", "b.png"))
         assert data == again
         assert len(data) < 300_000
-        assert set(chunks(data)) == {b"IHDR", b"PLTE", b"IDAT", b"IEND"}
+        at, chunks = 8, set()  # behind the head: length, type, content and sum of each chunk
+        while at < len(data):
+            length, chunk = struct.unpack_from(">I4s", data, at)
+            chunks.add(chunk)
+            at += 12 + length
+        assert chunks == {b"IHDR", b"PLTE", b"IDAT", b"IEND"}
         drawn.add(data)
     assert len(drawn) == len(KINDS)
 
 
 def test_a_data_set_draws_what_its_file_draws(swirl: Path, tmp_path: Path) -> None:
-    """A path and the xarray.Dataset opened from it give one picture."""
+    """A path and the xarray.Dataset opened from it give one picture; one of several scenarios is chosen."""
     from_file = plot_frame(swirl, -1, tmp_path / "file.png")
     with xr.open_dataset(swirl) as data:
         from_data = plot_frame(data, 5, tmp_path / "data.png")
+        with pytest.raises(UsageError, match="one scenario") as caught:
+            plot_frame(data.expand_dims(scenario=[0]), 0, tmp_path / "x.png")
     assert from_file.read_bytes() == from_data.read_bytes()
+    assert "sel(scenario" in str(caught.value)
 
 
 def test_a_scenario_of_an_opened_split_draws_what_its_file_draws(tmp_path: Path) -> None:
@@ -84,21 +79,14 @@ def test_a_scenario_of_an_opened_split_draws_what_its_file_draws(tmp_path: Path)
     assert from_split.read_bytes() == from_file.read_bytes()
 
 
-def test_a_data_set_of_several_scenarios_is_refused(swirl: Path, tmp_path: Path) -> None:
-    """The message says how to choose one scenario."""
-    with xr.open_dataset(swirl) as data, pytest.raises(UsageError, match="one scenario") as caught:
-        plot_frame(data.expand_dims(scenario=[0]), 0, tmp_path / "x.png")
-    assert "sel(scenario" in str(caught.value)
-
-
 CUTS = {"late": slice(1, None), "strided": slice(None, None, 2), "short": slice(0, 3), "one": 2}
 
 
 @pytest.mark.parametrize("cut", CUTS)
 def test_a_data_set_cut_in_frames_is_refused(tmp_path: Path, cut: str) -> None:
     """Whether frames are missing before, between or behind those that are left: they are called by place."""
-    write_swirl(tmp_path, "fluid", walls=None, parameters={"family": "disc"})
-    write_swirl(tmp_path, "fluid", 1, walls=None, parameters={"family": "disc"})
+    for scenario in (0, 1):
+        write_swirl(tmp_path, "fluid", scenario, walls=None, parameters={"family": "disc"})
     with open_split("fluid", subset="train", size="tiny", root=tmp_path) as data:
         less = data.isel(scenario=0, frame=CUTS[cut])
         with pytest.raises(UsageError) as caught:
@@ -108,25 +96,30 @@ def test_a_data_set_cut_in_frames_is_refused(tmp_path: Path, cut: str) -> None:
 
 def test_a_scenario_of_a_local_split_is_drawn_with_its_own_grid(tmp_path: Path) -> None:
     """An opened split, and a data set of one of its files, know the split that stands beside them."""
-    runs = [tmp_path / f"run{number}.npy" for number in range(3)]
-    for number, path in enumerate(runs):
-        np.save(path, straight_runs(3)[number])
-    made = adopt(runs, output=tmp_path / "mine", radius=0.1, frame_interval=0.25)
-    from_file = plot_frame(made.folder / "full/v1/test/0002.nc", 3, tmp_path / "file.png").read_bytes()
-    with open_split(str(made.folder)) as data:
-        assert plot_frame(data.isel(scenario=0), 3, tmp_path / "split.png").read_bytes() == from_file
-    with xr.open_dataset(made.folder / "full/v1/test/0002.nc") as data:
-        assert plot_frame(data, 3, tmp_path / "data.png").read_bytes() == from_file
+    np.save(tmp_path / "runs.npy", np.stack(straight_runs(3)))
+    made = adopt(tmp_path / "runs.npy", output=tmp_path / "mine", radius=0.1, frame_interval=0.25)
+    file = made.folder / "full/v1/test/0002.nc"
+    from_file = plot_frame(file, 3, tmp_path / "file.png").read_bytes()
+    with open_split(str(made.folder)) as split, xr.open_dataset(file) as data:
+        for source in (split.isel(scenario=0), data):
+            assert plot_frame(source, 3, tmp_path / "data.png").read_bytes() == from_file
 
 
 def test_fields_of_solid_body_rotation(swirl: Path) -> None:
-    """Vorticity on the grid is twice the angular velocity, per frame, at frame 0 and later."""
+    """Vorticity is twice the angular velocity, per frame on the grid, else per second, at frame 0 and later.
+
+    The scale of its colours is in that unit too.
+    """
     with open_recording(swirl) as recording:
         assert recording.area == pytest.approx(np.pi * 0.4**2)
         for frame in (0, 3):
-            fields = recording.scene(frame).fields
-            middle = fields.vorticity[3:5, 3:5]  # clear of the rim on the 8 x 8 grid
+            scene = recording.scene(frame)
+            middle = scene.fields.vorticity[3:5, 3:5]  # clear of the rim on the 8 x 8 grid
             np.testing.assert_allclose(middle, 2.0 * OMEGA, rtol=0.02)
+            per_second = 2.0 * OMEGA / recording.size.frame_interval
+            np.testing.assert_allclose(scene.vorticity[3:5, 3:5], per_second, rtol=0.02)
+            held = np.abs(scene.vorticity[scene.fields.differentiable])
+            assert limit_of(Panel.VORTICITY, scene) == pytest.approx(np.percentile(held, 99.0))
 
 
 @pytest.mark.parametrize("split", ["cavity", "multimaterial"])
@@ -149,16 +142,6 @@ def test_a_figure_has_one_unit_of_time(
     assert not any("/frame" in text for text in said)
 
 
-def test_the_scale_of_vorticity_is_in_its_unit(swirl: Path) -> None:
-    """A disc that turns by OMEGA a frame has twice that vorticity, over the seconds of a frame."""
-    with open_recording(swirl) as recording:
-        scene = recording.scene(3)
-        per_second = 2.0 * OMEGA / recording.size.frame_interval
-        np.testing.assert_allclose(scene.vorticity[3:5, 3:5], per_second, rtol=0.02)
-        held = np.abs(scene.vorticity[scene.fields.differentiable])
-        assert limit_of(Panel.VORTICITY, scene) == pytest.approx(np.percentile(held, 99.0))
-
-
 def test_the_scale_of_speeds_leaves_out_the_extreme_per_cent(swirl: Path) -> None:
     """Speeds of a disc are OMEGA r: 99 of 100 particles are within r = 0.4 sqrt(0.99)."""
     with open_recording(swirl) as recording:
@@ -177,13 +160,11 @@ def test_dpi_scales_a_picture(swirl: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("dpi", [0, -1, math.nan, 1e6, "128"])
 def test_pixels_per_inch_out_of_range_are_refused(swirl: Path, tmp_path: Path, dpi: Any) -> None:
     """The error names the option, and nothing is written, of a frame or of a sheet."""
-    for draw in (
-        lambda: plot_frame(swirl, 0, tmp_path / "x.png", dpi=dpi),
-        lambda: contact_sheet("cavity", "tiny", tmp_path / "x.png", root=swirl.parents[4], dpi=dpi),
-    ):
-        with pytest.raises(UsageError) as caught:
-            draw()
-        assert caught.value.where == "--dpi"
+    with pytest.raises(UsageError) as one:
+        plot_frame(swirl, 0, tmp_path / "x.png", dpi=dpi)
+    with pytest.raises(UsageError) as many:
+        contact_sheet("cavity", "tiny", tmp_path / "x.png", root=swirl.parents[4], dpi=dpi)
+    assert one.value.where == many.value.where == "--dpi"
     assert not list(tmp_path.iterdir())
 
 
@@ -197,21 +178,13 @@ def test_captions_say_what_sets_a_scenario_apart(swirl: Path, tmp_path: Path) ->
 
 
 def test_a_frame_counts_from_the_end_or_is_refused(swirl: Path, tmp_path: Path) -> None:
-    """Frame -1 is the last; beyond the ends the message names the range."""
+    """Frame -1 is the last; for floats, not NumPy's integers, and beyond the ends the range is named."""
     with open_recording(swirl) as recording:
-        assert recording.scene(-1).frame == 5
-    for frame in (6, -7):
-        with pytest.raises(UsageError, match=f"no frame {frame}") as caught:
-            plot_frame(swirl, frame, tmp_path / "x.png")
-        assert "0 to 5" in str(caught.value)
-
-
-def test_a_frame_is_a_whole_number(swirl: Path, tmp_path: Path) -> None:
-    """One of NumPy's is; a float is a mistake of the caller's, not of the file."""
-    plot_frame(swirl, np.int64(1), tmp_path / "one.png")  # type: ignore[arg-type]
-    with pytest.raises(UsageError) as caught:
-        plot_frame(swirl, 1.0, tmp_path / "x.png")  # type: ignore[arg-type]
-    assert caught.value.where == "scenario 0"
+        assert [recording.scene(frame).frame for frame in (-1, np.int64(1))] == [5, 1]
+    for frame, words in ((6, "no frame 6"), (-7, "no frame -7"), (1.0, "a whole number")):
+        with pytest.raises(UsageError, match=words) as caught:
+            plot_frame(swirl, frame, tmp_path / "x.png")  # type: ignore[arg-type]
+        assert (caught.value.where, caught.value.expected) == ("scenario 0", "0 to 5")
     assert not (tmp_path / "x.png").exists()
 
 
@@ -223,34 +196,29 @@ def test_moving_walls_are_marked_and_point_where_they_slide(tmp_path: Path) -> N
         with open_recording(path) as recording, figure(2.0, 2.0) as page:
             draw_walls(page.add_axes((0, 0, 1, 1)), recording, 0)
             drawn[name] = pixels_of(page)
-    side = drawn["right"].shape[0]
+    right, left, side = drawn["right"].astype(int), drawn["left"], len(drawn["right"])
     band = int(0.025 * side)  # middle of the wall of tiny, which is 0.05 wide
-    assert tuple(drawn["right"][band, int(0.2 * side)]) == tuple(style.rgb(style.MOVING))
-    assert tuple(drawn["right"][-band, side // 2]) == tuple(style.rgb(style.WALL))
-    assert tuple(drawn["right"][side // 2, side // 2]) == tuple(style.rgb(style.PAPER))
-    mirrored = np.abs(drawn["right"][:, ::-1].astype(int) - drawn["left"]).mean()
-    assert mirrored < 0.2 * np.abs(drawn["right"].astype(int) - drawn["left"]).mean()
+    assert tuple(right[band, int(0.2 * side)]) == tuple(style.rgb(style.MOVING))
+    assert tuple(right[-band, side // 2]) == tuple(style.rgb(style.WALL))
+    assert tuple(right[side // 2, side // 2]) == tuple(style.rgb(style.PAPER))
+    assert np.abs(right[:, ::-1] - left).mean() < 0.2 * np.abs(right - left).mean()
 
 
-@pytest.mark.parametrize(("name", "head"), [("x.pdf", b"%PDF"), ("x.svg", b"<?xml")])
+@pytest.mark.parametrize(("ending", "head"), [("pdf", b"%PDF"), ("svg", b"<?xml")])
 def test_vector_pictures_have_the_same_bytes_twice(
-    swirl: Path, tmp_path: Path, name: str, head: bytes
+    swirl: Path, tmp_path: Path, ending: str, head: bytes
 ) -> None:
     """PDF and SVG hold no date."""
-    first = plot_frame(swirl, 0, tmp_path / name).read_bytes()
+    first, second = (plot_frame(swirl, 0, tmp_path / f"{n}.{ending}").read_bytes() for n in "ab")
+    assert first == second
     assert first.startswith(head)
-    assert plot_frame(swirl, 0, tmp_path / name).read_bytes() == first
 
 
-def test_only_known_endings_are_taken(swirl: Path, tmp_path: Path) -> None:
-    """Another ending is refused before anything is written."""
+def test_a_picture_that_cannot_be_written_names_its_option(swirl: Path, tmp_path: Path) -> None:
+    """Another ending is refused; where a file is in the way, the remedy is the option that names it."""
     with pytest.raises(UsageError):
         plot_frame(swirl, 0, tmp_path / "x.jpg")
     assert not list(tmp_path.iterdir())
-
-
-def test_a_picture_that_cannot_be_written_names_its_option(swirl: Path) -> None:
-    """Where a file is in the way, the remedy is the option that names the picture."""
     with pytest.raises(WorkFailedError) as told:
         plot_frame(swirl, 0, swirl / "x.png")
     assert "--output" in str(told.value.fix)

@@ -46,7 +46,6 @@ __all__ = ["KINDS", "SUFFIXES", "animate", "check_ending"]
 Packed = NDArray[np.uint32]
 
 OVERSAMPLING = 2
-_EVEN = np.uint32(0xFEFEFE)
 
 
 def pack(pixels: NDArray[np.uint8]) -> Packed:
@@ -73,7 +72,7 @@ def halve(packed: Packed) -> Packed:
 
 def _mean(a: Packed, b: Packed) -> Packed:
     """Return the mean of packed pixels: the shared bits and half of the others, colour by colour."""
-    return (a & b) + (((a ^ b) & _EVEN) >> np.uint32(1))
+    return (a & b) + (((a ^ b) & np.uint32(0xFEFEFE)) >> np.uint32(1))
 
 
 class Painter:
@@ -95,27 +94,24 @@ class Painter:
         colours = vorticity_map() if panel is Panel.VORTICITY else speed_map()
         self._colours = pack((np.asarray(colours.colors)[:, :3] * 255.0).round().astype(np.uint8))
         left, right, bottom, top = box_of(recording)
-        middle = (np.arange(self._side) + 0.5) / self._side
-        rows = (1.0 - middle >= bottom) & (1.0 - middle <= top)
-        self._inside: NDArray[np.bool_] = rows[:, None] & (middle >= left) & (middle <= right)
+        self._middle = (np.arange(self._side) + 0.5) / self._side
+        rows = (1.0 - self._middle >= bottom) & (1.0 - self._middle <= top)
+        columns = (self._middle >= left) & (self._middle <= right)
+        self._inside: NDArray[np.bool_] = rows[:, None] & columns
 
     def paint(self, scene: Scene) -> Packed:
         """Return the panel of one frame, shape [row, column], first row at the top."""
-        return halve(self._field(scene) if self.panel is Panel.VORTICITY else self._dots(scene))
-
-    def _walls(self, scene: Scene) -> Packed:
-        """Return the empty box; it changes only where a wall turns."""
-        signs = np.sign(scene.recording.wall_velocity[scene.frame]).tobytes()
-        if signs not in self._drawn_walls:
-            with figure(self._side / DPI, self._side / DPI) as drawn:
-                draw_walls(drawn.add_axes((0, 0, 1, 1)), scene.recording, scene.frame)
-                self._drawn_walls[signs] = pack(pixels_of(drawn))
-        return self._drawn_walls[signs]
-
-    def _dots(self, scene: Scene) -> Packed:
-        """Draw a dot for every particle, cut off at the walls; later particles lie on earlier ones."""
-        margin, walls = self._margin, self._walls(scene)
-        image = np.pad(walls, margin)
+        walls = self._walls(scene)
+        if self.panel is Panel.VORTICITY:  # a square around every node that has one; paper elsewhere
+            grid = scene.fields.grid
+            index = np.floor(self._middle * grid.cells - grid.origin + 0.5).astype(np.intp)
+            index = np.clip(index, 0, grid.nodes - 1)
+            omega = scene.vorticity.T[::-1][np.ix_(grid.nodes - 1 - index[::-1], index)]
+            defined = np.isfinite(omega) & self._inside
+            level = _level(0.5 + 0.5 * np.where(defined, omega, 0.0) / self.limit, len(self._colours))
+            return halve(np.where(defined, self._colours[level], walls))
+        # A dot for every particle, cut off at the walls; later particles lie on earlier ones.
+        margin, image = self._margin, np.pad(walls, self._margin)
         shown = ((scene.position >= 0.0) & (scene.position <= 1.0)).all(axis=-1)
         x, y = scene.position[shown].T
         column = np.minimum((x * self._side).astype(np.intp), self._side - 1) + margin
@@ -127,18 +123,16 @@ class Painter:
             colours = self._colours[_level(scene.speed / self.limit, len(self._colours))]
         places = (row * width + column)[:, None] + stamp
         image.reshape(-1)[places] = colours[shown][:, None]
-        return np.where(self._inside, image[margin:-margin, margin:-margin], walls)
+        return halve(np.where(self._inside, image[margin:-margin, margin:-margin], walls))
 
-    def _field(self, scene: Scene) -> Packed:
-        """Draw a square around every node that has a vorticity; paper elsewhere."""
-        fields = scene.fields
-        middle = (np.arange(self._side) + 0.5) / self._side
-        index = np.floor(middle * fields.grid.cells - fields.grid.origin + 0.5).astype(np.intp)
-        index = np.clip(index, 0, fields.grid.nodes - 1)
-        omega = scene.vorticity.T[::-1][np.ix_(fields.grid.nodes - 1 - index[::-1], index)]
-        defined = np.isfinite(omega) & self._inside
-        level = _level(0.5 + 0.5 * np.where(defined, omega, 0.0) / self.limit, len(self._colours))
-        return np.where(defined, self._colours[level], self._walls(scene))
+    def _walls(self, scene: Scene) -> Packed:
+        """Return the empty box; it changes only where a wall turns."""
+        signs = np.sign(scene.recording.wall_velocity[scene.frame]).tobytes()
+        if signs not in self._drawn_walls:
+            with figure(self._side / DPI, self._side / DPI) as drawn:
+                draw_walls(drawn.add_axes((0, 0, 1, 1)), scene.recording, scene.frame)
+                self._drawn_walls[signs] = pack(pixels_of(drawn))
+        return self._drawn_walls[signs]
 
 
 def _level(share: NDArray[np.float64], levels: int) -> NDArray[np.intp]:
@@ -147,21 +141,11 @@ def _level(share: NDArray[np.float64], levels: int) -> NDArray[np.intp]:
 
 
 SUFFIXES = (".mp4", ".gif")  # endings of the files that can be written
-Write = Callable[[NDArray[np.uint8]], None]  # appends one frame: RGB bytes, shape [row, column, 3]
+Write = Callable[[NDArray[np.uint8]], object]  # appends one frame: RGB bytes, shape [row, column, 3]
 
 _CODING = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "20", "-preset", "veryfast"]
 _CONTAINER = ["-f", "mp4", "-movflags", "+faststart", "-map_metadata", "-1"]
 _NO_DATES = ["-fflags", "+bitexact", "-flags:v", "+bitexact"]
-
-
-@contextmanager
-def open_video(path: Path, size: tuple[int, int], frames_per_second: float) -> Iterator[Write]:
-    """Yield a function that appends a frame; the file appears when the body ends well."""
-    with atomic_path(path, option="--output") as temporary:
-        gif = path.suffix.lower() == ".gif"
-        coder = _gif(temporary, frames_per_second) if gif else _mp4(temporary, size, frames_per_second)
-        with coder as write:
-            yield write
 
 
 @contextmanager
@@ -180,12 +164,8 @@ def _mp4(path: Path, size: tuple[int, int], rate: float) -> Iterator[Write]:
         process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=log, start_new_session=True)
         pipe = cast("IO[bytes]", process.stdin)
         finished = False
-
-        def write(frame: NDArray[np.uint8]) -> None:
-            pipe.write(frame.tobytes())
-
         try:
-            yield write
+            yield lambda frame: pipe.write(frame.tobytes())
             pipe.close()
             finished = process.wait() == 0
         except BrokenPipeError:
@@ -197,10 +177,8 @@ def _mp4(path: Path, size: tuple[int, int], rate: float) -> Iterator[Write]:
                 pipe.close()
         if not finished:
             log.seek(0)
-            said = log.read().decode(errors="replace").strip()
-            raise WorkFailedError(
-                "ffmpeg cannot encode the video", where=str(path.parent), got=said or "nothing said"
-            )
+            said = log.read().decode(errors="replace").strip() or "nothing said"
+            raise WorkFailedError("ffmpeg cannot encode the video", where=str(path.parent), got=said)
 
 
 @contextmanager
@@ -282,7 +260,9 @@ def animate(
         mixed = any(np.unique(recording.material).size > 1 for recording in recordings)
         film = _Film(recordings, Panel(kind or (Panel.MATERIAL if mixed else Panel.SPEED)))
         numbers: Iterable[int] = range(0, min(recording.frames for recording in recordings), every)
-        write = stack.enter_context(open_video(path, film.size, frames_per_second))
+        temporary, rate = stack.enter_context(atomic_path(path, option="--output")), frames_per_second
+        gif = path.suffix.lower() == ".gif"
+        write = stack.enter_context(_gif(temporary, rate) if gif else _mp4(temporary, film.size, rate))
         if not quiet and watched():
             from rich.console import Console
             from rich.progress import track
@@ -296,19 +276,15 @@ def animate(
 def check_ending(path: Path) -> None:
     """Refuse a name that is none of a film."""
     if path.suffix.lower() not in SUFFIXES:
-        raise UsageError(
-            "no such kind of video",
-            where="output",
-            expected=f"a name ending in {' or '.join(SUFFIXES)}",
-            got=path,
-        )
+        expected = f"a name ending in {' or '.join(SUFFIXES)}"
+        raise UsageError("no such kind of video", where="output", expected=expected, got=path)
 
 
 class _Film:
     """Composes the frames: a still background, one painted panel per recording, a counter."""
 
     def __init__(self, recordings: Sequence[Recording], panel: Panel) -> None:
-        """Draw all that does not move: titles, names of the scenarios, colour bar or key."""
+        """Draw all that does not move: titles, names of the scenarios, colour bar or key, and the digits."""
         limit = 1.0
         if panel is not Panel.MATERIAL:  # one scale that suits whole recordings
             tops = []
@@ -322,7 +298,6 @@ class _Film:
         self._painters = [Painter(recording, panel, side=SIDE, limit=limit) for recording in recordings]
         self._lefts = [MARGIN + column * (SIDE + GAP) for column in range(len(recordings))]
         width, height = self.size = (self._lefts[-1] + SIDE + MARGIN, TOP + SIDE + BOTTOM)
-        self._counter = _Counter(recordings[0], right=width - MARGIN)
         with figure(width / DPI, height / DPI) as drawn:
             title = " | ".join(dict.fromkeys(recording.title for recording in recordings))
             drawn.text(MARGIN / width, 1 - 14 / height, title, fontsize=12, fontweight="bold", va="top")
@@ -335,36 +310,22 @@ class _Film:
             else:
                 colour_bar(below, panel, limit)
             self._still = pixels_of(drawn)
-
-    def frame(self, number: int) -> NDArray[np.uint8]:
-        """Return one frame as RGB bytes, shape [row, column, 3]."""
-        image = self._still.copy()
-        for recording, painter, left in zip(self._recordings, self._painters, self._lefts, strict=True):
-            image[TOP : TOP + SIDE, left : left + SIDE] = unpack(painter.paint(recording.scene(number)))
-        self._counter.draw(image, number)
-        return image
-
-
-class _Counter:
-    """Frame number and time at the bottom right, put together from digits drawn once."""
-
-    def __init__(self, recording: Recording, *, right: int) -> None:
-        """Draw the digits; the counter ends at a pixel."""
-        self._right = right
-        self._interval = recording.size.frame_interval
-        last = recording.frames - 1
-        self._places = (len(str(last)), len(f"{last * self._interval:.2f}"))
         self._digits = {}
         for letter in "0123456789.frames t=":
             with figure(DIGIT / DPI, LINE / DPI) as drawn:
                 drawn.text(0.5, 0.25, letter, fontsize=8.5, family="DejaVu Sans Mono", ha="center", color=INK)
                 self._digits[letter] = pixels_of(drawn)
 
-    def draw(self, image: NDArray[np.uint8], number: int) -> None:
-        """Write the frame number and its time into an image."""
-        text = f"frame {number:>{self._places[0]}}  {number * self._interval:>{self._places[1]}.2f} s"
-        left = self._right - DIGIT * len(text)
-        top = TOP + SIDE + 12
-        for letter in text:
-            image[top : top + LINE, left : left + DIGIT] = self._digits[letter]
-            left += DIGIT
+    def frame(self, number: int) -> NDArray[np.uint8]:
+        """Return one frame as RGB bytes, shape [row, column, 3]."""
+        image = self._still.copy()
+        for recording, painter, left in zip(self._recordings, self._painters, self._lefts, strict=True):
+            image[TOP : TOP + SIDE, left : left + SIDE] = unpack(painter.paint(recording.scene(number)))
+        # Frame number and time at the bottom right, as wide as the last.
+        interval, last = self._recordings[0].size.frame_interval, self._recordings[0].frames - 1
+        places, digits = len(str(last)), len(f"{last * interval:.2f}")
+        text = f"frame {number:>{places}}  {number * interval:>{digits}.2f} s"
+        left, top = self.size[0] - MARGIN - DIGIT * len(text), TOP + SIDE + 12
+        drawn = np.concatenate([self._digits[letter] for letter in text], axis=1)
+        image[top : top + LINE, left : self.size[0] - MARGIN] = drawn
+        return image

@@ -35,28 +35,23 @@ class Panel(enum.StrEnum):
     STREAMLINES = "streamlines"
 
 
-TITLES = {
+TITLES = {  # heading of each panel
     Panel.SPEED: "Particles by speed",
     Panel.MATERIAL: "Particles by material",
     Panel.VORTICITY: "Vorticity",
     Panel.STREAMLINES: "Streamlines",
 }
-"""Heading of each panel."""
-
-UNITS = {
+UNITS = {  # what colour bars say: physical time throughout, as velocity in the files
     Panel.SPEED: "speed  [length/s]",
     Panel.VORTICITY: "vorticity  [1/s]",
     Panel.STREAMLINES: "speed on the grid  [length/s]",
 }
-"""What colour bars say: physical time throughout, as velocity in the files."""
 
 DOT = 1.25  # diameter of a drawn particle in particle spacings: neighbours overlap a little
 MOST_DOTS = 1 << 16  # particles drawn at the most; more would take memory and no eye would tell
 
-FEW_NODES = 4
-_ALONG = np.array(
-    [[0.0, 1.0], [0.0, 1.0], [1.0, 0.0], [1.0, 0.0]]
-)  # along the walls left, right, bottom, top
+FEW_NODES = 4  # with neighbours to differentiate over, below which no streamline is drawn
+_ALONG = np.array([(0.0, 1.0), (0.0, 1.0), (1.0, 0.0), (1.0, 0.0)])  # along walls left, right, bottom, top
 
 
 def limit_of(panel: Panel, scene: Scene) -> float:
@@ -82,8 +77,8 @@ def draw(axes: Axes, panel: Panel, scene: Scene, *, limit: float, detail: float 
     elif panel is Panel.VORTICITY:
         _draw_field(axes, scene, scene.vorticity, scale)
     else:
-        _draw_field(axes, scene, np.where(scene.fields.counted, _grid_speed(scene), np.nan), scale)
         fields = scene.fields
+        _draw_field(axes, scene, np.where(fields.counted, _grid_speed(scene), np.nan), scale)
         if fields.differentiable.sum() < FEW_NODES:
             return
         u, v = (np.ma.masked_array(fields.velocity[..., axis], ~fields.counted).T for axis in (0, 1))

@@ -8,12 +8,13 @@ scenarios at one frame.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lagbench.data import WALLS
 from lagbench.data.local import locate, remedy
 from lagbench.data.registry import Registry, Size
 from lagbench.errors import DataError, UsageError, nearest
@@ -30,34 +31,22 @@ __all__ = ["KINDS", "Panel", "check_kind", "contact_sheet", "describe", "plot_fr
 
 
 COLUMNS = 6
-TIMES = (0.0, 0.05, 0.1, 0.2, 0.5, 1.0)
-"""Moments of a row over time, as shares of the last frame."""
-
-MOMENTS = (1 / 9, 1 / 2, 1.0)
-"""Shares of the last frame of interest at which flows that walls drive are shown."""
-
-DRIVEN, DECAYING = 30, 36
-"""Scenarios on a sheet of flows that walls drive, and of those that only decay (Figs. 5.7, 5.20)."""
-
+TIMES = (0.0, 0.05, 0.1, 0.2, 0.5, 1.0)  # moments of a row over time, as shares of the last frame
+MOMENTS = (1 / 9, 1 / 2, 1.0)  # the same of the last frame of interest, for flows that walls drive
+DRIVEN, DECAYING = 30, 36  # scenarios on a sheet of flows that walls drive, that only decay (Figs. 5.7, 5.20)
 CELL, CELL_GAP, LABEL, RIM, HEAD, FOOT = 1.3, 0.08, 0.18, 0.22, 0.7, 0.58  # of a sheet [inch]
 KIND_PARAMETERS = ("family", "pair")
 WALL_SHARE = 0.6  # the fluid itself seldom moves faster than this share of the wall's speed
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Cell:
-    """One small panel: a scene, its label, and the top of its colour scale."""
-
-    scene: Scene
-    label: str
-    limit: float
+_Cell = tuple[Scene, str, float]  # a small panel: scene, label, top of the colour scale
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Sheet:
     """What is on a page."""
 
-    rows: Sequence[Sequence[_Cell]]  # the small panels
+    rows: Sequence[Sequence[_Cell]]
     panel: Panel  # what they show
     subtitle: str  # second line of the title
     limit: float  # top of the colour bar
@@ -96,11 +85,8 @@ def contact_sheet(
     bring(tier, folder, tier.scenarios)
     files = scenario_files(tier, folder)
     if not files:
-        raise DataError(
-            "nothing to draw",
-            where=f"{tier.split} {size} under {folder}",
-            fix=remedy(tier, root=folder),
-        )
+        where = f"{tier.split} {size} under {folder}"
+        raise DataError("nothing to draw", where=where, fix=remedy(tier, root=folder))
     panel = None if kind is None else Panel(kind)
     found: dict[str, Path] = {}  # the first scenario of every family or pair
     for path in files:
@@ -116,15 +102,15 @@ def contact_sheet(
     with figure(width, height, dpi=dpi) as drawn:
         header(drawn, f"{splits.split(tier.split).title} · {tier.split} {size}", sheet.subtitle, left=RIM)
         for row, cells in enumerate(sheet.rows):
-            for column, cell in enumerate(cells):
+            for column, (scene, label, limit) in enumerate(cells):
                 left = RIM + column * (CELL + CELL_GAP)
                 bottom = height - HEAD - (row + 1) * (CELL + LABEL + CELL_GAP) + CELL_GAP
                 axes = drawn.add_axes((left / width, bottom / height, CELL / width, CELL / height))
-                axes.set_title(cell.label, fontsize=7.5, color=MUTED, pad=2.5)
-                draw(axes, sheet.panel, cell.scene, limit=cell.limit, detail=0.0)
+                axes.set_title(label, fontsize=7.5, color=MUTED, pad=2.5)
+                draw(axes, sheet.panel, scene, limit=limit, detail=0.0)
         below = drawn.add_axes((RIM / width, 0.42 / height, 2.6 / width, 0.09 / height))
         if sheet.panel is Panel.MATERIAL:
-            shown = [cell.scene.recording.material for row in sheet.rows for cell in row]
+            shown = [scene.recording.material for row in sheet.rows for scene, *_ in row]
             material_key(below, np.concatenate(shown))
         else:
             colour_bar(below, sheet.panel, sheet.limit, label=sheet.unit)
@@ -147,9 +133,10 @@ def _over_time(kinds: dict[str, Path], panel: Panel | None, splits: Registry) ->
         mixed = any(np.unique(row[0].recording.material).size > 1 for row in rows)
         panel = Panel.MATERIAL if mixed else Panel.SPEED
     limit = max(limit_of(panel, scene) for row in rows for scene in row)
-    cells = [[_Cell(scene=s, label=f"frame {s.frame}", limit=limit) for s in row] for row in rows]
-    for kind, row in zip(kinds, cells, strict=True):
-        row[0] = replace(row[0], label=f"{row[0].scene.recording.scenario}  {kind}")
+    cells = []
+    for kind, row in zip(kinds, rows, strict=True):
+        labels = [f"{row[0].recording.scenario}  {kind}", *(f"frame {scene.frame}" for scene in row[1:])]
+        cells.append([(scene, label, limit) for scene, label in zip(row, labels, strict=True)])
     return _Sheet(rows=cells, panel=panel, subtitle="the first scenario of each kind over time", limit=limit)
 
 
@@ -158,13 +145,10 @@ def _table(files: Sequence[Path], panel: Panel | None, frame: int | None, splits
     with open_recording(files[0], registry=splits) as recording:
         driven = bool(recording.wall_velocity.any())
         panel = panel or (Panel.STREAMLINES if driven else Panel.VORTICITY)
-        if frame is None:
-            starts_at_rest = driven or not recording.scene(0).speed.any()
-            latest = recording.size.task.frames_of_interest[-1] if starts_at_rest else 0
-            frame = min(latest, recording.frames - 1)
-            frames = [round(share * frame) for share in MOMENTS] if driven else [frame]
-        else:
-            frames = [frame]
+        frames = [frame] if frame is not None else [0]
+        if frame is None and (driven or not recording.scene(0).speed.any()):
+            latest = min(recording.size.task.frames_of_interest[-1], recording.frames - 1)
+            frames = [round(share * latest) for share in MOMENTS] if driven else [latest]
     scenes = []
     for path in files[: DRIVEN if driven else DECAYING]:
         with open_recording(path, registry=splits) as recording:
@@ -172,10 +156,11 @@ def _table(files: Sequence[Path], panel: Panel | None, frame: int | None, splits
     scaled = driven and panel in (Panel.STREAMLINES, Panel.SPEED)
     common = float(np.median([limit_of(panel, scene) for scene in scenes]))
     limits = [WALL_SHARE * np.abs(s.recording.wall_velocity).max() if scaled else common for s in scenes]
-    cells = [
-        _Cell(scene=s, label=f"frame {s.frame}" if i % len(frames) else _name(s), limit=m)
-        for i, (s, m) in enumerate(zip(scenes, limits, strict=True))
-    ]
+    labels = [f"frame {scene.frame}" for scene in scenes]
+    for i in range(0, len(scenes), len(frames)):  # the first of each scenario
+        recording = scenes[i].recording
+        labels[i] = "   ".join([str(recording.scenario), *_marks(recording, ("frequency",))[:1]])
+    cells = list(zip(scenes, labels, limits, strict=True))
     shown = ", ".join(str(scene.frame) for scene in scenes[: len(frames)])
     columns = COLUMNS if len(frames) == 1 else 3 * len(frames)
     return _Sheet(
@@ -187,22 +172,11 @@ def _table(files: Sequence[Path], panel: Panel | None, frame: int | None, splits
     )
 
 
-def _name(scene: Scene) -> str:
-    recording = scene.recording
-    if recording.reynolds is not None:
-        return f"{recording.scenario}   Re {recording.reynolds:.0f}"
-    if "frequency" in recording.parameters:
-        return f"{recording.scenario}   frequency {recording.parameters['frequency']}"
-    return str(recording.scenario)
-
-
 ALL = "all"
 KINDS = (ALL, *(str(panel) for panel in Panel))
 """What :func:`plot_frame` can draw."""
 
 SIDE, GAP, MARGIN, TOP, BAR = 3.25, 0.25, 0.25, 0.96, 0.66  # of a frame [inch]
-WALLS = ("left", "right", "bottom", "top")
-MARKS = ("family", "pair", "frequency")
 SEPARATOR = "  ·  "
 DIRECTIONS = {(1, 0): "right", (-1, 0): "left", (0, 1): "up", (0, -1): "down"}
 
@@ -272,7 +246,9 @@ def plot_frame(
 def describe(recording: Recording) -> str:
     """Return split, size, scenario and what sets it apart, as in "cavity full · scenario 3 · Re 120"."""
     parts = [f"{recording.size.split} {recording.size.name}", f"scenario {recording.scenario}"]
-    if recording.reynolds is not None:
-        parts.append(f"Re {recording.reynolds:.0f}")
-    parts += [f"{name} {recording.parameters[name]}" for name in MARKS if name in recording.parameters]
-    return SEPARATOR.join(parts)
+    return SEPARATOR.join([*parts, *_marks(recording, ("family", "pair", "frequency"))])
+
+
+def _marks(recording: Recording, names: Sequence[str]) -> list[str]:
+    marks = [] if recording.reynolds is None else [f"Re {recording.reynolds:.0f}"]
+    return marks + [f"{name} {recording.parameters[name]}" for name in names if name in recording.parameters]

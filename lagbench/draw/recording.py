@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 Read = Callable[[str, slice | int], NDArray[Any]]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Scene:
     """One frame of a scenario."""
 
@@ -79,7 +79,6 @@ class Recording:
         registry: Registry,
     ) -> None:
         """Read what holds for all frames."""
-        # tier of the split, from the registry
         self.size: Size = registry.size(str(identity["split"]), str(identity["size"]))
         self.title = registry.split(self.size.split).title  # title of the split
         self.scenario = int(identity["scenario"])  # id
@@ -87,10 +86,8 @@ class Recording:
         self.frames = frames  # recorded frames
         self._read = read
         self._present = np.isfinite(read("position", 0)).all(axis=-1)
-        # material of each particle, shape [particle]
-        self.material = read("material", slice(None))[self._present].astype(np.int8)
-        # [length/s], shape [frame, wall, 2]; zeros where the file has none
-        self.wall_velocity = np.zeros((frames, 4, 2))
+        self.material = read("material", slice(None))[self._present].astype(np.int8)  # [particle]
+        self.wall_velocity = np.zeros((frames, 4, 2))  # [length/s], [frame, wall, 2]; zeros without walls
         if "wall_velocity" in variables:
             self.wall_velocity[:] = read("wall_velocity", slice(frames))
         self._mass = float(read("particle_mass", slice(None)))
@@ -118,35 +115,25 @@ class Recording:
 
     def frame_number(self, frame: int) -> int:
         """Return an absolute frame number; negative ones count from the end."""
+        got: object = frame
         try:
             frame = operator.index(frame)
         except TypeError:
-            raise UsageError(
-                "a frame is named by a whole number",
-                where=f"scenario {self.scenario}",
-                expected=f"0 to {self.frames - 1}",
-                got=repr(frame),
-            ) from None
-        if not -self.frames <= frame < self.frames:
-            raise UsageError(
-                f"no frame {frame}",
-                where=f"scenario {self.scenario}",
-                expected=f"0 to {self.frames - 1}",
-                got=frame,
-            )
-        return frame % self.frames
+            what, got = "a frame is named by a whole number", repr(frame)
+        else:
+            if -self.frames <= frame < self.frames:
+                return frame % self.frames
+            what, got = f"no frame {frame}", frame
+        expected = f"0 to {self.frames - 1}"
+        raise UsageError(what, where=f"scenario {self.scenario}", expected=expected, got=got)
 
     def scene(self, frame: int) -> Scene:
         """Return one frame; negative numbers count from the end."""
         number = self.frame_number(frame)
         position, velocity = self._particles("position", number), self._particles("velocity", number)
-        if number:
-            displacement = position - self._particles("position", number - 1)
-        else:
-            displacement = velocity * self.size.frame_interval
-        return Scene(
-            recording=self, frame=number, position=position, velocity=velocity, displacement=displacement
-        )
+        before = self._particles("position", number - 1) if number else None
+        displacement = velocity * self.size.frame_interval if before is None else position - before
+        return Scene(self, number, position, velocity, displacement)
 
     def _particles(self, name: str, frame: int) -> NDArray[np.float64]:
         return self._read(name, frame)[self._present].astype(np.float64)
@@ -162,11 +149,9 @@ def open_recording(
         return
     with read_scenario(Path(source)) as file:
         head = file.header
-        key = head.key
-        identity = {"split": key.split, "size": key.size, "scenario": key.scenario}
-        variables = set(file.variables)
+        identity = {"split": head.key.split, "size": head.key.size, "scenario": head.key.scenario}
         splits = _beside(source, registry)
-        yield Recording(identity, head.parameters, head.frames, variables, file.read, splits)
+        yield Recording(identity, head.parameters, head.frames, {*file.variables}, file.read, splits)
 
 
 def _beside(file: str | Path, registry: Registry | None) -> Registry:
@@ -178,15 +163,11 @@ def _beside(file: str | Path, registry: Registry | None) -> Registry:
 def _of_dataset(data: xr.Dataset, registry: Registry | None) -> Recording:
     """Return the recording that a data set of one scenario holds."""
     if "scenario" in data.dims:
-        raise UsageError(
-            "a picture shows one scenario",
-            got=f"a data set of {data.sizes['scenario']}",
-            fix="choose one: data.sel(scenario=3)",
-        )
+        got, fix = f"a data set of {data.sizes['scenario']}", "choose one: data.sel(scenario=3)"
+        raise UsageError("a picture shows one scenario", got=got, fix=fix)
     attributes: dict[str, Any] = {str(k): v for k, v in data.attrs.items()}
-    identity = {
-        name: data.coords[name].item() if name in data.coords else attributes[name] for name in _IDENTITY
-    }
+    names = ("split", "size", "scenario")
+    identity = {n: data.coords[n].item() if n in data.coords else attributes[n] for n in names}
     held = data["frame"].values.tolist() if "frame" in data.dims else []
     frames = int(data["frame_count"]) if "frame_count" in data else len(held)
     if not held or held != list(range(max(frames, len(held)))):
@@ -205,6 +186,3 @@ def _of_dataset(data: xr.Dataset, registry: Registry | None) -> Recording:
     file = data.encoding.get("source")  # as xarray and open_split note where the data are from
     splits = _beside(file, registry) if isinstance(file, str | Path) else registry or load()
     return Recording(identity, attributes, frames, {str(name) for name in data.variables}, read, splits)
-
-
-_IDENTITY = ("split", "size", "scenario", "subset")

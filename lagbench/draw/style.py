@@ -33,20 +33,18 @@ PAPER = "#ffffff"  # background
 WALL = "#d5d9e0"  # walls at rest
 MOVING = "#d55e00"  # moving walls: vermilion, which jelly has too; no split has both
 
+# liquid, jelly, snow, rope: blue, vermilion, sky blue, orange
 MATERIAL_COLOURS = ("#0072b2", "#d55e00", "#56b4e9", "#e69f00")
-"""Colours of liquid, jelly, snow, rope: blue, vermilion, sky blue, orange."""
-
-SPEED_LEVELS, VORTICITY_LEVELS = 80, 81  # the middle of the odd one is no vorticity
 
 
 def speed_map() -> ListedColormap:
     """Return the map of speeds: dark when slow, never so light that paper swallows it."""
-    return _cut("plasma", 0.0, 0.9, SPEED_LEVELS)
+    return _cut("plasma", 0.0, 0.9, 80)
 
 
 def vorticity_map() -> ListedColormap:
     """Return the diverging map of vorticities: blue clockwise, red counter-clockwise, white none."""
-    return _cut("RdBu_r", 0.04, 0.96, VORTICITY_LEVELS)
+    return _cut("RdBu_r", 0.04, 0.96, 81)  # the middle of an odd number is no vorticity
 
 
 def rgb(colour: str) -> NDArray[np.uint8]:
@@ -102,14 +100,11 @@ _STYLE = {
     "font.family": "DejaVu Sans",  # ships with matplotlib, so that text has the same pixels everywhere
     "font.size": 9.0,
     "text.color": INK,
-    "axes.labelcolor": MUTED,
+    **dict.fromkeys(("axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color"), MUTED),
     "axes.titlecolor": INK,
     "axes.titlesize": 10.0,
     "axes.titlelocation": "left",
     "axes.titlepad": 5.0,
-    "axes.edgecolor": MUTED,
-    "xtick.color": MUTED,
-    "ytick.color": MUTED,
     "xtick.labelsize": 8.0,
     "ytick.labelsize": 8.0,
     "figure.facecolor": PAPER,
@@ -119,10 +114,7 @@ _STYLE = {
 
 @contextmanager
 def figure(width: float, height: float, *, dpi: int = DPI) -> Iterator[Figure]:
-    """Yield an empty figure in lagbench's style, whatever the user's matplotlibrc says.
-
-    Draw and save it inside the context.
-    """
+    """Yield an empty figure in lagbench's style, whatever the user's matplotlibrc says; save it inside."""
     if not (isinstance(dpi, int | float | np.number) and COARSEST <= dpi <= FINEST):
         raise UsageError(
             "no such number of pixels per inch", where="--dpi", expected=f"{COARSEST} to {FINEST}", got=dpi
@@ -153,18 +145,6 @@ def pixels_of(drawn: Figure) -> NDArray[np.uint8]:
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()  # type: ignore[no-untyped-call]
 
 
-def file_bytes(drawn: Figure, ending: str) -> bytes:
-    """Return the figure as a file of a kind in :data:`ENDINGS`, with the same bytes every time."""
-    if ending == ".png":
-        return png_bytes(drawn)
-    import matplotlib as mpl
-
-    nothing = dict.fromkeys(("Date",) if ending == ".svg" else ("CreationDate", "Producer", "Creator"))
-    with mpl.rc_context({"svg.hashsalt": "lagbench"}), io.BytesIO() as buffer:
-        drawn.savefig(buffer, format=ending[1:], metadata=nothing)
-        return buffer.getvalue()
-
-
 def png_bytes(drawn: Figure) -> bytes:
     """Return the figure as PNG without date or software, in lagbench's 256 colours."""
     from PIL import Image
@@ -176,15 +156,20 @@ def png_bytes(drawn: Figure) -> bytes:
 
 
 def save(drawn: Figure, output: str | Path) -> Path:
-    """Write the figure to a file that appears whole or not at all; return its path."""
+    """Write the figure to a file, with the same bytes every time and whole or not at all; return its path."""
     path = Path(output)
     ending = path.suffix.lower()
     if ending not in ENDINGS:
-        raise UsageError(
-            "pictures are PNG, PDF or SVG files",
-            where="output",
-            expected=f"a name ending in {', '.join(ENDINGS)}",
-            got=path,
-        )
-    write_atomically(path, file_bytes(drawn, ending), option="--output")
+        expected = f"a name ending in {', '.join(ENDINGS)}"
+        raise UsageError("pictures are PNG, PDF or SVG files", where="output", expected=expected, got=path)
+    if ending == ".png":
+        data = png_bytes(drawn)
+    else:
+        import matplotlib as mpl
+
+        nothing = dict.fromkeys(("Date",) if ending == ".svg" else ("CreationDate", "Producer", "Creator"))
+        with mpl.rc_context({"svg.hashsalt": "lagbench"}), io.BytesIO() as buffer:
+            drawn.savefig(buffer, format=ending[1:], metadata=nothing)
+            data = buffer.getvalue()
+    write_atomically(path, data, option="--output")
     return path

@@ -34,9 +34,9 @@ def markdown(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     Cells that start and end with a backtick are code and stay as they are.
     """
     numeric = [all(isinstance(row[i], int | float) for row in rows) and bool(rows) for i in range(len(head))]
-    lines = [_line([escape(cell) for cell in head]), _line(["---:" if right else "---" for right in numeric])]
-    lines += [_line([_cell(cell) for cell in row]) for row in rows]
-    return "\n".join(lines)
+    lines = [map(escape, head), ("---:" if right else "---" for right in numeric)]
+    lines += [map(_cell, row) for row in rows]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 
 def _cell(value: object) -> str:
@@ -49,7 +49,3 @@ def _cell(value: object) -> str:
     text = str(value)
     is_code = len(text) > 2 and text.startswith("`") and text.endswith("`") and "`" not in text[1:-1]
     return text.replace("|", "\\|") if is_code else escape(text)
-
-
-def _line(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(cells)} |"

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from itertools import chain
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Unpack
 
 import h5py
 import numpy as np
@@ -67,7 +69,14 @@ def adopt(
             raise UsageError(f"the {name.replace('_', ' ')} is not known", fix=f"--{name.replace('_', '-')}")
     given = [Path(sources)] if isinstance(sources, str | Path) else [Path(source) for source in sources]
     files = _by_subset(given, valid=valid, test=test)
-    _check_once(row for rows in files.values() for row in rows)
+    known: dict[Row, Path] = {}
+    for path, row in chain(*files.values()):
+        place = path.resolve(), row  # by links too: it could be trained on and tested
+        if place in known:
+            raise UsageError(
+                "a file is named twice", where=str(path), expected="each once", got=f"{known[place]} before"
+            )
+        known[place] = path
     counts = {subset: len(rows) for subset, rows in files.items()}
     source = f"{sum(counts.values())} trajectories of the user's own"
     about = Description(name=output_name(output), source=source, **wishes)
@@ -140,35 +149,22 @@ def import_split(
     if wishes.keys() & {"input_frames", "horizon"}:  # the frames belong to the exported task
         hints = hints.model_copy(update={"frames_of_interest": None})
     # What the metadata say, over it what our own exports add, over both what the user says.
-    facts: dict[str, Any] = {
-        "radius": stated.radius,
-        "frame_interval": stated.frame_interval,
-        "bounds": hints.bounds or stated.bounds,
-        "spacing": hints.spacing or stated.spacing,
-        "density": hints.density,
-        "input_frames": hints.input_frames,
-        "horizon": hints.horizon,
-        "frames_of_interest": hints.frames_of_interest,
-        "cells": hints.cells,
+    facts = {
+        **stated.model_dump(exclude={"periodic", "hints"}, exclude_none=True),
+        **hints.model_dump(exclude={"origin", "placement", "wall_particle_type"}, exclude_none=True),
         "full_box": hints.placement == "cell_centres",
         **said,
     }
-    if facts["frame_interval"] is None:
+    if "frame_interval" not in facts:
         raise UsageError("the metadata state no time between frames", fix="say it: --frame-interval SECONDS")
     about = Description(
         name=output_name(output),
         source=f"{form.value}: " + ", ".join(f"{p.name} {file_sha256(p)[:16]}" for p in files.values()),
-        **{name: value for name, value in facts.items() if value is not None},
+        **facts,
     )
-    walls = dict.fromkeys(stated.hints.wall_particle_type, DROP)
-    given = {**walls, **(kinds or {})}
-
-    def read(path: Path) -> Iterator[Trajectory]:
-        if form is Format.GNS_NPZ:
-            return gns_npz.trajectories(path, given)
-        return _h5_trajectories(path, given, stated)
-
-    subsets = {subset: read(path) for subset, path in files.items()}
+    given = {**dict.fromkeys(hints.wall_particle_type, DROP), **(kinds or {})}
+    read = gns_npz.trajectories if form is Format.GNS_NPZ else partial(_h5_trajectories, stated=stated)
+    subsets = {subset: read(path, given) for subset, path in files.items()}
     return make_local_split(about, subsets, output, command="import", progress=progress)
 
 
@@ -191,32 +187,12 @@ def _by_subset(given: Sequence[Path], *, valid: int | None, test: int | None) ->
             expected="at least one each, and one left for train",
             got=f"{len(rows)} trajectories, {for_valid} for valid, {for_test} for test",
         )
-    return {
-        "train": rows[:for_train],
-        "valid": rows[for_train : for_train + for_valid],
-        "test": rows[for_train + for_valid :],
-    }
-
-
-def _check_once(rows: Iterable[Row]) -> None:
-    """Refuse a trajectory that is named twice, by links too: it could be trained on and tested."""
-    known: dict[Row, Path] = {}
-    for path, row in rows:
-        place = path.resolve(), row
-        if place in known:
-            raise UsageError(
-                "a file is named twice", where=str(path), expected="each once", got=f"{known[place]} before"
-            )
-        known[place] = path
+    end = for_train + for_valid
+    return {"train": rows[:for_train], "valid": rows[for_train:end], "test": rows[end:]}
 
 
 def _h5_trajectories(path: Path, kinds: Mapping[int, str], stated: Source) -> Iterator[Trajectory]:
-    """Yield the trajectories of a file of LagrangeBench; frames are read when asked for.
-
-    Groups ``00000``, ``00001``, ... hold ``position`` float32 [frame, particle, space] and ``particle_type``
-    [particle]; a ``force.py`` beside the data, which that program executes, is left alone. A group that is
-    no trajectory is an UnreadableFileError, positions that are not of two components are a DataError.
-    """
+    """Yield a file's trajectories; a ``force.py`` beside it, which LagrangeBench would run, is left alone."""
     with opened(path) as file:
         # A stranger's file shall read none of ours, and hold no more than it shows.
         check_structure(file, path, Structure(members=MOST_TRAJECTORIES, groups=None))
@@ -235,16 +211,8 @@ def _h5_trajectory(
     position, kinds = group["position"], group["particle_type"]
     shape = position.shape
     check_array(name, shape, position.dtype)
-    numbers = np.asarray(kinds)
-    if numbers.shape != shape[1:2] or numbers.dtype.kind not in "iu":
-        raise UnreadableFileError(
-            "these are no kinds of particles",
-            where=name,
-            expected=f"{shape[1]} integers",
-            got=f"{numbers.dtype} of shape {numbers.shape}",
-        )
-    material, kept = materials_of(Format.LAGRANGEBENCH_H5, numbers, given=given, where=name)
-
+    form, numbers = Format.LAGRANGEBENCH_H5, np.asarray(kinds)
+    material, kept = materials_of(form, numbers, shape[1], given=given, where=name)
     origin = np.asarray(stated.hints.origin, np.float32)
     sides = np.array([high - low for low, high in stated.bounds])
     half = np.where(stated.periodic, sides / 2.0, np.inf)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 import zipfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
@@ -27,14 +27,11 @@ from .trajectory import Frame, Trajectory, check_array, check_inflation, read_he
 
 READABLE = (".npy", ".npz", ".nc")  # files that are adopted: an array, named arrays, netCDF
 ARRAYS = POSITION, VELOCITY, MATERIAL, WALLS = "position", "velocity", "material", "wall_velocity"
-CLASSIC = b"CDF"
-"""First bytes of the older netCDF formats, which cannot point to other files."""
+CLASSIC = b"CDF"  # first bytes of the older netCDF formats, which cannot point to other files
 
+# What may be in a netCDF-4 file; chunks by default span many frames, so that more of them stay unpacked.
 NETCDF = Structure(groups=None, texts=True, cache=1 << 30)
-"""What may be in a netCDF-4 file; chunks by default span many frames, so that more of them stay unpacked."""
-
-Row = tuple[Path, int | None]
-"""A file and, where it holds several, the number of the trajectory in it."""
+Row = tuple[Path, int | None]  # a file and, where it holds several, the number of the trajectory in it
 
 
 def natural(paths: Sequence[Path]) -> list[Path]:
@@ -62,55 +59,28 @@ def rows_of(path: Path) -> list[Row]:
         )
     if path.stat().st_size == 0:
         raise UnreadableFileError("the file is empty", where=str(path), expected="a trajectory")
-    if path.suffix != ".npy":
-        return [(path, None)]
-    shape = _array(path).shape
-    if len(shape) != 4:
+    if path.suffix != ".npy" or len(shape := _array(path).shape) != 4:
         return [(path, None)]
     if shape[0] > MAX_ID + 1:
-        raise DataError(
-            "too many trajectories", where=str(path), expected=f"at most {MAX_ID + 1}", got=shape[0]
-        )
+        expected = f"at most {MAX_ID + 1}"
+        raise DataError("too many trajectories", where=str(path), expected=expected, got=shape[0])
     return [(path, row) for row in range(shape[0])]
 
 
 def open_row(which: Row, interval: float | None) -> Trajectory:
-    """Return a trajectory whose arrays are read frame by frame where the file allows it.
-
-    What they mean is looked at where the time between frames is given [s].
-    """
+    """Return a trajectory; what its arrays mean is looked at where the time between frames is given [s]."""
     path, row = which
-    if path.suffix == ".npy":
-        array = _array(path)
-        name = str(path) if row is None else f"{path}, trajectory {row}"
-        held = {POSITION: array if row is None else array[row]}
-        return _trajectory(name, held, lambda: _frames(held), interval)
-    if path.suffix == ".npz":
-        with _reading(path):
-            with zipfile.ZipFile(path) as archive:
-                for member in archive.infolist():
-                    name = f"{path}, {member.filename}"
-                    check_inflation(name, packed=member.compress_size, unpacked=member.file_size)
-                    if member.filename.removesuffix(".npy") in ARRAYS:
-                        with archive.open(member) as stream:
-                            _check_header(name, stream, member.file_size)
-            with np.load(path, allow_pickle=False) as file:
-                arrays = {name: file[name] for name in ARRAYS if name in file}
-        return _trajectory(str(path), arrays, lambda: _frames(arrays), interval)
-    return _netcdf(path, interval)
+    name = str(path) if row is None else f"{path}, trajectory {row}"
+    with _reading(path):
+        if path.suffix == ".npy":
+            array = _array(path)
+            arrays = {POSITION: array if row is None else array[row]}
+        else:
+            arrays = _npz(path) if path.suffix == ".npz" else _netcdf(path)
+        return _trajectory(path, name, arrays, interval)
 
 
-def _frames(arrays: Mapping[str, Any]) -> Iterator[Frame]:
-    """Yield the frames of arrays, in memory or mapped or in a file, of shape [frame, particle, 2]."""
-    velocity = arrays.get(VELOCITY)
-    for number in range(arrays[POSITION].shape[0]):
-        frame = np.asarray(arrays[POSITION][number])
-        yield frame, None if velocity is None else np.asarray(velocity[number])
-
-
-def _trajectory(
-    name: str, arrays: Mapping[str, Any], read: Callable[[], Iterator[Frame]], interval: float | None
-) -> Trajectory:
+def _trajectory(path: Path, name: str, arrays: Mapping[str, Any], interval: float | None) -> Trajectory:
     """Return the trajectory of named arrays after a look at their shapes and, given an interval, meaning."""
     if POSITION not in arrays:
         raise UnreadableFileError(
@@ -141,6 +111,14 @@ def _trajectory(
                 raise DataError("a velocity of a wall is not finite", where=where)
     if interval is not None:
         check_meaning(name, arrays[POSITION], arrays.get(VELOCITY), interval)
+
+    def read() -> Iterator[Frame]:
+        velocity = arrays.get(VELOCITY)
+        with _reading(path):
+            for number in range(frames):
+                frame = np.asarray(arrays[POSITION][number])
+                yield frame, None if velocity is None else np.asarray(velocity[number])
+
     return Trajectory(
         name=name, frames=frames, material=material.astype(np.int8), read=read, wall_velocity=walls
     )
@@ -171,7 +149,6 @@ def _dtype(array: Any) -> np.dtype[Any]:  # noqa: ANN401
 
 
 def _array(path: Path) -> NDArray[Any]:
-    """Return the mapped array of a .npy file."""
     with _reading(path):
         with path.open("rb") as stream:
             _check_header(str(path), stream, path.stat().st_size)
@@ -180,10 +157,7 @@ def _array(path: Path) -> NDArray[Any]:
 
 
 def _check_header(name: str, stream: IO[bytes], length: int) -> None:
-    """Refuse objects, and more values than a .npy stream of some length [bytes] can hold.
-
-    NumPy reserves memory for what the header claims before it reads.
-    """
+    """Refuse objects, and more values than a .npy stream of some length [bytes] can hold."""
     shape, _, dtype = read_header(stream)
     if dtype.hasobject:
         raise UnreadableFileError(
@@ -193,6 +167,7 @@ def _check_header(name: str, stream: IO[bytes], length: int) -> None:
             fix="lagbench import --format gns-npz reads trajectories of GNS code bases",
         )
     held = length - stream.tell()
+    # NumPy reserves memory for what the header claims before it reads.
     if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize > held:
         raise UnreadableFileError(
             "the array claims more than the file holds",
@@ -202,35 +177,40 @@ def _check_header(name: str, stream: IO[bytes], length: int) -> None:
         )
 
 
-def _netcdf(path: Path, interval: float | None) -> Trajectory:
+def _npz(path: Path) -> dict[str, NDArray[Any]]:
+    with zipfile.ZipFile(path) as archive:
+        for member in archive.infolist():
+            name = f"{path}, {member.filename}"
+            check_inflation(name, packed=member.compress_size, unpacked=member.file_size)
+            if member.filename.removesuffix(".npy") in ARRAYS:
+                with archive.open(member) as stream:
+                    _check_header(name, stream, member.file_size)
+    with np.load(path, allow_pickle=False) as file:
+        return {name: file[name] for name in ARRAYS if name in file}
+
+
+def _netcdf(path: Path) -> dict[str, Any]:
     import netCDF4
 
-    with _reading(path):
-        with path.open("rb") as stream:
-            classic = stream.read(len(CLASSIC)) == CLASSIC
-        if not classic:  # netCDF would follow links and read other files
-            with opened(path) as held:
-                check_structure(held, path, NETCDF)
-        file = netCDF4.Dataset(path, "r")
-        file.set_auto_maskandscale(False)
-        arrays = {name: file.variables[name] for name in ARRAYS if name in file.variables}
-        # Values that stand for others are refused: they are read as they are stored.
-        for name, stored in arrays.items():
-            packed = {"scale_factor", "add_offset"} & set(stored.ncattrs())
-            if packed and name != MATERIAL:
-                raise UnreadableFileError(
-                    "the values are packed",
-                    where=f"{path}, {name}, {', '.join(sorted(packed))}",
-                    expected="positions as they are, float32 or float64",
-                    fix="write them again without scale_factor and add_offset",
-                )
-
-    def read() -> Iterator[Frame]:
-        with _reading(path):
-            yield from _frames(arrays)
-
-    with _reading(path):
-        return _trajectory(str(path), arrays, read, interval)
+    with path.open("rb") as stream:
+        classic = stream.read(len(CLASSIC)) == CLASSIC
+    if not classic:  # netCDF would follow links and read other files
+        with opened(path) as held:
+            check_structure(held, path, NETCDF)
+    file = netCDF4.Dataset(path, "r")
+    file.set_auto_maskandscale(False)
+    arrays = {name: file.variables[name] for name in ARRAYS if name in file.variables}
+    # Values that stand for others are refused: they are read as they are stored.
+    for name, stored in arrays.items():
+        packed = {"scale_factor", "add_offset"} & set(stored.ncattrs())
+        if packed and name != MATERIAL:
+            raise UnreadableFileError(
+                "the values are packed",
+                where=f"{path}, {name}, {', '.join(sorted(packed))}",
+                expected="positions as they are, float32 or float64",
+                fix="write them again without scale_factor and add_offset",
+            )
+    return arrays
 
 
 @contextmanager

@@ -36,9 +36,7 @@ from lagbench.store.publication import publication
 from lagbench.work.progress import Meter, Progress
 
 REMEDY = "try again; if it stays so, name another store: --from"
-
-Reason = DataError | WorkFailedError | UsageError
-"""Why something could not be downloaded."""
+Reason = DataError | WorkFailedError | UsageError  # why something could not be downloaded
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -180,10 +178,7 @@ class _Download:
         self.missing = [f.scenario for f in findings if f.state is not State.GOOD]
 
     def run(self, urls: Iterable[str]) -> Reason:
-        """Fetch what is missing from stores in turn; return why something still is.
-
-        A store that lies, or a connection that keeps breaking, ends it.
-        """
+        """Fetch what is missing from stores in turn, unless one lies; return why something still is."""
         place = f"{self.size.split} {self.size.name}"
         reason: Reason = UsageError(
             "no store is known to download from",
@@ -196,18 +191,26 @@ class _Download:
             what = "datasets.yaml has no hash to check downloads against"
             return DataError(what, where=f"{place}, scenarios {spell_ids(unknown)}")
         for url in urls:
-            if not self.missing:
-                break
-            try:
-                reason = self._fetch_from(url.rstrip("/")) or reason
-            except StoreUnreachableError as error:
-                reason = error
+            if self.missing:
+                try:
+                    reason = self._fetch_from(url.rstrip("/")) or reason
+                except StoreUnreachableError as error:
+                    reason = error
         return reason
 
     def _fetch_from(self, url: str) -> NotInStoreError | None:
         """Fetch what one store has; return the error of the last file that it has not."""
         check_disk(self.root, sum(map(self.size.file_bytes, self.missing)))
-        claims, last = self._claims(url), None
+        # What its manifest says of the files that datasets.yaml means; None without one.
+        claims: dict[int, FileEntry] | None = None
+        last: NotInStoreError | None = None
+        place = address_of(self.size, url, MANIFEST_NAME)
+        with suppress(NotInStoreError):
+            text = fetch_text(place, limit=MANIFEST_LIMIT, remedy=REMEDY)
+            manifest = parse_manifest(self.size, text, where=place, remedy=REMEDY)
+            claims = {entry.scenario: entry for entry in manifest.files}
+            other = [i for i in self.missing if i in claims and not claims[i].has_hash(self._recorded[i])]
+            refuse_strangers(manifest, other, where=place, remedy=REMEDY)
         wanted = {}
         for i in self.missing:
             key, claim = self.size.key(i), (claims or {}).get(i)
@@ -241,19 +244,6 @@ class _Download:
             self.missing = [i for i in self.missing if i not in self.downloaded]
         return last
 
-    def _claims(self, url: str) -> dict[int, FileEntry] | None:
-        """Return what the store's manifest says of the files that datasets.yaml means; None without one."""
-        place = address_of(self.size, url, MANIFEST_NAME)
-        try:
-            text = fetch_text(place, limit=MANIFEST_LIMIT, remedy=REMEDY)
-        except NotInStoreError:
-            return None
-        manifest = parse_manifest(self.size, text, where=place, remedy=REMEDY)
-        found = {entry.scenario: entry for entry in manifest.files}
-        other = [i for i in self.missing if i in found and not found[i].has_hash(self._recorded[i])]
-        refuse_strangers(manifest, other, where=place, remedy=REMEDY)
-        return found
-
     def _take(self, url: str, scenario: int, claim: FileEntry | None) -> None:
         """Note a new file; what cannot be told from it is the store's word."""
         entry = describe_file(self.root, self.size.key(scenario))
@@ -272,9 +262,8 @@ class _Download:
     def record(self) -> Manifest:
         """Write the manifest of what is there now; return it."""
         note_entries(self.size.folder(self.root), self._entries)
-        there = {entry.scenario for entry in self._entries}
-        kept = [e for e in self._old.files if e.scenario not in self.missing or e.scenario in there]
-        manifest = merged(self.size, self._old.model_copy(update={"files": tuple(kept)}), self._entries)
+        kept = tuple(entry for entry in self._old.files if entry.scenario not in self.missing)
+        manifest = merged(self.size, self._old.model_copy(update={"files": kept}), self._entries)
         if self.size.measured and "train" in manifest.subset_sha256:
             rows = {name: tuple(row) for name, row in self.size.measured.statistics.items()}
             manifest = manifest.model_copy(update={"statistics": rows})

@@ -39,7 +39,6 @@ from .metadata import (
 from .trajectory import Box, Run
 
 FORCE = "force.py"  # name of the program beside the data that LagrangeBench would run
-
 LAYERS = 3  # layers of particles of a wall, as LagrangeBench's own lid-driven cavity has them
 ALONG = (1, 1, 0, 0)  # axis along each wall: left, right, bottom, top
 
@@ -104,9 +103,7 @@ def export(
     tier, home, splits = locate(split, size, root=root, registry=registry)
     folder, ending = Path(output), ENDINGS[form]
     _check_target(folder, [f"{subset}{ending}" for subset in HASHED_SUBSETS], force=force)
-    frames_of: dict[str, dict[Path, int]] = {subset: {} for subset in HASHED_SUBSETS}
-    for scenario, path in sorted(scenario_files(tier, home, HASHED_SUBSETS).items()):
-        frames_of[tier.subset_of(scenario)][path] = _frames(tier, scenario, path)
+    frames_of = _frames_of(tier, home)
     statistics, digest = _recorded(tier, home)
     with read_scenario(next(iter(frames_of["train"]))) as file:
         spacing = math.sqrt(float(file.read("particle_mass")) / float(tier.value("density")))
@@ -120,7 +117,10 @@ def export(
             raise UsageError(what, where="--wall-particles and --unit-box", fix="leave out --unit-box")
         walls = WallParticles(tier.bounds, spacing)
     measured = closed if from_walls is None else from_walls
-    origin = _origin(tier, form, walls, from_walls=measured)
+    # What is taken off every position, so that none is below 0 where bounds start there.
+    shifted = form is Format.LAGRANGEBENCH_H5 and (measured or wall_particles)
+    beyond = walls.thickness if walls else 0.0
+    left, bottom = (floor_of(low - beyond) if shifted else 0.0 for low, _ in tier.bounds)
     with contextlib.suppress(OSError):  # written last, it says that an export is whole
         (folder / NAME).unlink()
     meter = Meter(progress)
@@ -131,7 +131,7 @@ def export(
         if form is Format.GNS_NPZ:
             shapes[subset] = gns_npz.write(target, runs)
         else:
-            shapes[subset] = _write_h5(target, runs, length=min(files.values()), origin=origin)
+            shapes[subset] = _write_h5(target, runs, length=min(files.values()), origin=(left, bottom))
         meter.count(1, scenarios=len(files))
     metadata = describe(
         tier,
@@ -141,7 +141,7 @@ def export(
         title=splits.split(tier.split).title,
         dataset_sha256=digest,
         spacing=spacing,
-        origin=origin,
+        origin=(left, bottom),
         from_walls=measured,
         free_slip=not (tier.simulated and getattr(solver_constants(tier), "no_slip", False)),
         wall=walls.thickness if walls else None,
@@ -162,11 +162,7 @@ def export(
 
 
 class WallParticles:
-    """Layers of particles beside each wall of a box, at the spacing of the fluid's.
-
-    They go along with the wall's tangential velocity and come in again at its other end, so that they
-    stay beside it. The normal component, which closed boxes do not have, is left out.
-    """
+    """Layers of particles beside each wall of a box: they go along and come in again at its other end."""
 
     def __init__(self, bounds: Box, spacing: float) -> None:
         self.thickness = LAYERS * spacing
@@ -180,44 +176,16 @@ class WallParticles:
                 across = low[1 - axis] - depth if wall in (0, 2) else high[1 - axis] + depth
                 rows += [(wall, low[axis] + pitch * (n + 0.5), across) for n in range(count)]
         walls, along, across = np.array(rows).T
-        self._wall, self._along, self._across = walls.astype(int), along, across
+        self.wall = walls.astype(int)  # which each particle lies beside
+        self._along, self._across = along, across
 
-    def numbers(self, form: Format, velocity: NDArray[np.floating]) -> NDArray[np.int64]:
-        """Return the number of each particle: of a wall that ever moves, or of one at rest."""
-        moves = (velocity != 0.0).any(axis=(0, 2))
-        table = np.array([WALL_NUMBERS[form][moving] for moving in moves.astype(int)], np.int64)
-        numbers: NDArray[np.int64] = table[self._wall]
-        return numbers
-
-    def travel(self, velocity: NDArray[np.floating], interval: float) -> NDArray[np.float64]:
-        """Return how far each wall has gone along itself since frame 0, shape [frame, wall].
-
-        ``velocity[f]`` acts from frame f-1 to f, shape [frame, wall, space].
-        """
-        steps = interval * velocity[:, range(len(ALONG)), ALONG].astype(np.float64)
-        steps[0] = 0.0
-        return np.cumsum(steps, axis=0)
-
-    def place(self, travel: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Return the positions where walls have gone so far, shape [particle, 2]."""
-        axis = np.array(ALONG)[self._wall]
+    def join(self, file: ScenarioFile, travel: NDArray[np.float64], frame: int) -> NDArray[np.float32]:
+        """Return the positions of a frame and, behind them, of walls that have gone so far [frame, wall]."""
+        axis = np.array(ALONG)[self.wall]
         low, high = self._bounds[axis].T
-        along = low + (self._along - low + travel[self._wall]) % (high - low)
-        places = np.stack(
-            [np.where(axis == 0, along, self._across), np.where(axis == 0, self._across, along)]
-        )
-        return places.T.astype(np.float32)
-
-
-def _origin(
-    size: Size, form: Format, walls: WallParticles | None, *, from_walls: bool
-) -> tuple[float, float]:
-    """Return what is taken off every position, so that none is below 0 where bounds start there."""
-    if form is not Format.LAGRANGEBENCH_H5 or not (from_walls or walls):
-        return 0.0, 0.0
-    beyond = walls.thickness if walls else 0.0
-    (x, _), (y, _) = size.bounds
-    return floor_of(x - beyond), floor_of(y - beyond)
+        along = low + (self._along - low + travel[frame, self.wall]) % (high - low)
+        places = np.where(axis[:, None] == [0, 1], along[:, None], self._across[:, None])
+        return np.concatenate([file.read("position", frame), places.astype(np.float32)])
 
 
 def _runs(files: Iterable[Path], form: Format, interval: float, walls: WallParticles | None) -> Iterator[Run]:
@@ -227,33 +195,27 @@ def _runs(files: Iterable[Path], form: Format, interval: float, walls: WallParti
             kinds, position = numbers_of(form, file.read("material")), partial(file.read, "position")
             if walls is not None:
                 velocity = file.read("wall_velocity")
-                kinds = np.concatenate([kinds, walls.numbers(form, velocity)])
-                position = partial(_with_walls, file, walls, walls.travel(velocity, interval))
+                still, moving = WALL_NUMBERS[form]
+                ever = (velocity != 0.0).any(axis=(0, 2))
+                kinds = np.concatenate([kinds, np.where(ever[walls.wall], moving, still)])
+                steps = interval * velocity[:, range(len(ALONG)), ALONG].astype(np.float64)
+                steps[0] = 0.0  # velocity[f] acts from frame f-1 to f
+                position = partial(walls.join, file, np.cumsum(steps, axis=0))
             yield file.header.frames, position, kinds
-
-
-def _with_walls(
-    file: ScenarioFile, walls: WallParticles, travel: NDArray[np.float64], frame: int
-) -> NDArray[np.float32]:
-    return np.concatenate([file.read("position", frame), walls.place(travel[frame])])
 
 
 def _write_h5(
     path: Path, runs: Iterable[Run], *, length: int, origin: Sequence[float]
 ) -> list[tuple[int, int]]:
-    """Write one subset for LagrangeBench, whole or not at all; return frames and particles by trajectory.
-
-    That reader takes the length of the first trajectory for all: every one has ``length`` frames, longer
-    runs become several, and what is left over at their end is not written. ``origin`` is taken off every
-    position [length]. Chunks of one frame, with gzip and shuffle, are read there 5 to 10 times faster than
-    those that HDF5 chooses.
-    """
+    """Write one subset for LagrangeBench, whole or not at all; return frames and particles by trajectory."""
     shapes: list[tuple[int, int]] = []
     with (
         atomic_path(path, option="--output") as temporary,
         h5py.File(temporary, "w", libver="earliest") as out,
     ):
         for frames, position, kinds in runs:
+            # That reader takes the length of the first trajectory for all: longer runs become several, and
+            # what is left over is not written. It reads chunks of one frame 5 to 10 times faster.
             for start in range(0, frames - length + 1, length):
                 group = out.create_group(f"{len(shapes):05d}")
                 stored = group.create_dataset(
@@ -305,19 +267,21 @@ def _recorded(size: Size, root: Path) -> tuple[dict[str, tuple[float, ...]], str
     return dict(manifest.statistics), manifest.dataset_sha256
 
 
-def _frames(size: Size, scenario: int, path: Path) -> int:
-    """Return the frames of a scenario after a look at its header."""
-    with read_scenario(path) as file:
-        found = file.header
-    known = size.measured.scenario_sha256.get(scenario) if size.measured else None
-    if (found.key.major, found.key.scenario) != (size.major, scenario) or not (
-        found.content_sha256.startswith(known or "")
-    ):
-        raise DataError(
-            "a scenario is not that of the registry",
-            where=str(path),
-            expected=f"scenario {scenario}, content hash {known or 'any'}",
-            got=f"scenario {found.key.scenario}, content hash {found.content_sha256[:16]}",
-            fix=f"lagbench verify --split {size.split} --size {size.name}",
-        )
-    return found.frames
+def _frames_of(size: Size, root: Path) -> dict[str, dict[Path, int]]:
+    """Return files and their frames by subset, in order of their ids, after a look at each header."""
+    frames: dict[str, dict[Path, int]] = {subset: {} for subset in HASHED_SUBSETS}
+    for scenario, path in sorted(scenario_files(size, root, HASHED_SUBSETS).items()):
+        with read_scenario(path) as file:
+            found = file.header
+        known = size.measured.scenario_sha256.get(scenario) if size.measured else None
+        same = (found.key.major, found.key.scenario) == (size.major, scenario)
+        if not (same and found.content_sha256.startswith(known or "")):
+            raise DataError(
+                "a scenario is not that of the registry",
+                where=str(path),
+                expected=f"scenario {scenario}, content hash {known or 'any'}",
+                got=f"scenario {found.key.scenario}, content hash {found.content_sha256[:16]}",
+                fix=f"lagbench verify --split {size.split} --size {size.name}",
+            )
+        frames[size.subset_of(scenario)][path] = found.frames
+    return frames

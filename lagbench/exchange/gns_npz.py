@@ -29,23 +29,14 @@ from .metadata import Format, materials_of
 from .trajectory import Run, Trajectory, check_array, check_inflation, read_header
 
 JOINT = "gns_data"  # key under which some files hold all trajectories together
-_EPOCH = (1980, 1, 1, 0, 0, 0)
-"""Time of every member: the earliest that zip knows, so that equal data give equal bytes."""
-
 _NUMBERS = re.compile("[iu][1248]|f[248]|b1")  # codes of the types of numbers that may be in a file
-_MOST_STEPS = 1 << 18
-"""Steps of a pickle at the most; NumPy takes about fifty for a trajectory, each makes one object."""
-
+_MOST_STEPS = 1 << 18  # steps of a pickle, each makes one object; NumPy takes about fifty for a trajectory
 _PARTS = 3  # parts of a trajectory at the most: positions, kinds, a material property
 _DEPTH = 3  # how deep arrays may lie in each other: trajectories in a joint array, parts, and a spare
 
 
 def write(path: Path, runs: Iterable[Run]) -> list[tuple[int, int]]:
-    """Write one subset, whole or not at all; return frames and particles of each trajectory.
-
-    Members are stored uncompressed, as ``numpy.savez`` stores them: compressed bytes would
-    change with the version of zlib. One trajectory is in memory at a time.
-    """
+    """Write one subset, whole or not at all; return frames and particles of each trajectory."""
     shapes: list[tuple[int, int]] = []
     with atomic_path(path, option="--output") as temporary, zipfile.ZipFile(temporary, "w") as archive:
         for frames, position, kinds in runs:
@@ -53,7 +44,9 @@ def write(path: Path, runs: Iterable[Run]) -> list[tuple[int, int]]:
             pair[0], pair[1] = np.empty((frames, len(kinds), 2), np.float32), kinds
             for number in range(frames):
                 pair[0][number] = position(number)
-            member = zipfile.ZipInfo(f"simulation_{len(shapes)}.npy", date_time=_EPOCH)
+            # Equal data give equal bytes: the time is zip's earliest, as by default, and members are stored
+            # as numpy.savez stores them, since compressed bytes would change with the version of zlib.
+            member = zipfile.ZipInfo(f"simulation_{len(shapes)}.npy")
             member.external_attr = 0o644 << 16
             with archive.open(member, "w", force_zip64=True) as stream:
                 np.lib.format.write_array_header_1_0(
@@ -65,17 +58,12 @@ def write(path: Path, runs: Iterable[Run]) -> list[tuple[int, int]]:
 
 
 def trajectories(path: Path, kinds: Mapping[int, str]) -> Iterator[Trajectory]:
-    """Yield the trajectories of a file, one in memory at a time; its pickles are rebuilt.
-
-    Kinds say what numbers of particles stand for, see :func:`.metadata.materials_of`. Damage is refused
-    by an UnreadableFileError, positions that are not of two components by a DataError.
-    """
+    """Yield the trajectories of a file, one in memory at a time; its pickles are rebuilt."""
     try:
         archive = zipfile.ZipFile(path)
     except (OSError, zipfile.BadZipFile) as error:
-        raise UnreadableFileError(
-            "cannot read an npz file", where=str(path), got=f"{type(error).__name__}: {error}"
-        ) from error
+        got = f"{type(error).__name__}: {error}"
+        raise UnreadableFileError("cannot read an npz file", where=str(path), got=got) from error
     with archive:
         for member in archive.namelist():
             key = member.removesuffix(".npy")
@@ -100,7 +88,6 @@ def _trajectory(name: str, item: object, given: Mapping[int, str]) -> Trajectory
         )
     position = parts[0]
     check_array(name, position.shape, position.dtype)
-    particles = position.shape[1]
     try:
         numbers = np.asarray(parts[1])
         values = np.unique(np.asarray(parts[2:], dtype=np.float64))
@@ -108,15 +95,7 @@ def _trajectory(name: str, item: object, given: Mapping[int, str]) -> Trajectory
         raise UnreadableFileError(
             "these are no kinds and no material property", where=name, expected="numbers", got=error
         ) from error
-    if numbers.dtype.kind not in "iu" or numbers.shape not in ((), (1,), (particles,)):
-        raise UnreadableFileError(
-            "these are no kinds of particles",
-            where=name,
-            expected=f"an integer, or {particles} of them",
-            got=f"{numbers.dtype} of shape {numbers.shape}",
-        )
-    numbers = np.broadcast_to(numbers, (particles,))
-    material, kept = materials_of(Format.GNS_NPZ, numbers, given=given, where=name)
+    material, kept = materials_of(Format.GNS_NPZ, numbers, position.shape[1], given=given, where=name)
     if len(values) == 1 and not np.isfinite(values[0]):
         raise UnreadableFileError("the material property is not finite", where=name, got=values[0])
     chosen = position if kept.all() else position[:, kept]

@@ -38,10 +38,7 @@ SIZE = "full"  # size of every local split
 VERSION = "1.0.0"
 DEVICE = "cpu"
 HEAD = '# A local split of lagbench, written by `lagbench {}`; its hashes stand under "measured".\n'
-
-PER_CELL = 2.5
-"""Spacings of particles across a cell of the score grid where the user gives none; the splits of
-lagbench have 1.8 to 2.6."""
+PER_CELL = 2.5  # spacings of particles across a cell of the score grid; our own splits have 1.8 to 2.6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,20 +73,14 @@ def make_local_split(
     counts: Mapping[str, int] | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> LocalSplit:
-    """Write a local split of the trajectories of train, valid and test; it appears whole or not at all.
-
-    The last part of ``output`` is the name of the split, ``command`` stands in the head of its description;
-    ``counts`` are the trajectories of each subset, where they are known before.
-    """
+    """Write a local split of trajectories, of so many in each subset where ``counts`` tells, and load it."""
     folder = Path(os.path.abspath(expanded(output, "--output")))
     if about.name in load().splits:
-        raise UsageError(
-            f"{about.name!r} is one of the splits of lagbench", where="--output", fix="use another name"
-        )
+        what = f"{about.name!r} is one of the splits of lagbench"
+        raise UsageError(what, where="--output", fix="use another name")
     if folder.exists():
-        raise UsageError(
-            "the folder is there already", where=str(folder), fix="remove it, or use another name"
-        )
+        fix = "remove it, or use another name"
+        raise UsageError("the folder is there already", where=str(folder), fix=fix)
     meter = Meter(progress)
     with _scratch(folder) as root:
         building = _Building(about, root)
@@ -182,7 +173,7 @@ class _Building:
         with ScenarioWriter(
             scenario_path(self.root, key),
             key,
-            particles=trajectory.particles,
+            particles=len(trajectory.material),
             frames=trajectory.frames,
             frame_interval=1.0 / about.rate,
             material=trajectory.material,
@@ -199,15 +190,11 @@ class _Building:
         self.entries.append(describe_file(self.root, key))
 
     def _key(self, scenario: int, subset: str) -> ScenarioKey:
-        return ScenarioKey(
-            split=self.about.name, size=SIZE, version=VERSION, scenario=scenario, subset=subset
-        )
+        name = self.about.name
+        return ScenarioKey(split=name, size=SIZE, version=VERSION, scenario=scenario, subset=subset)
 
     def _frames(self, trajectory: Trajectory) -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
-        """Yield positions and velocities in the unit box; without own velocities, differences.
-
-        Then ``v(f) = (x(f) - x(f-1)) / interval``, and v(0) = v(1).
-        """
+        """Yield positions and velocities in the unit box; without own velocities, differences."""
         before: NDArray[np.float32] | None = None
         for number, (raw, own) in enumerate(trajectory.read()):
             position = self.about.measure.place(raw)
@@ -220,7 +207,7 @@ class _Building:
                 yield position, velocity
             elif before is not None:
                 velocity = ((position.astype(np.float64) - before) * self.about.rate).astype(np.float32)
-                if number == 1:
+                if number == 1:  # v(f) = (x(f) - x(f-1)) / interval, and v(0) = v(1)
                     yield before, velocity
                 yield position, velocity
             before = position
@@ -279,23 +266,17 @@ class _Building:
             "statistics": {name: list(row) for name, row in manifest.statistics.items()},
             "twin_floor": [],
         }
-        described = {
-            "format": 1,
-            "splits": {about.name: self._split(ids)},
-            "measured": {about.name: {SIZE: measured}},
-        }
-        text = spell_yaml(described)
-        (self.root / about.name / DESCRIPTION).write_text(HEAD.format(command) + text, encoding="utf-8")
+        splits = {about.name: self._split(ids)}
+        described = {"format": 1, "splits": splits, "measured": {about.name: {SIZE: measured}}}
+        text = HEAD.format(command) + spell_yaml(described)
+        (self.root / about.name / DESCRIPTION).write_text(text, encoding="utf-8")
         return manifest
 
     def _split(self, ids: Mapping[str, Sequence[int]]) -> dict[str, object]:
         """Return the description of the split as plain values."""
         about = self.about
-        box = ((self.low[0], self.high[0]), (self.low[1], self.high[1]))
-        bounds = box if about.bounds is None else about.measure.box(about.bounds)
-        frames: dict[int, list[int]] = {}
-        for entry in self.entries:
-            frames.setdefault(entry.frames, []).append(entry.scenario)
+        bounds = about.measure.box(about.bounds) if about.bounds else zip(self.low, self.high, strict=True)
+        lengths = sorted({entry.frames for entry in self.entries})
         tested = [entry for entry in self.entries if entry.subset == "test"]
         task = self._task(shortest=min(entry.frames for entry in tested))
         cells = task["score_grid"]["cells"]  # type: ignore[index]
@@ -314,10 +295,10 @@ class _Building:
             "source_x": (about.measure.corner[0], origin, "x in the source of the lower left corner"),
             "source_y": (about.measure.corner[1], origin, "y in the source of the lower left corner"),
         }
-        spelled = {count: spell_ids(frames[count]) for count in sorted(frames)}
+        frames = {n: spell_ids([e.scenario for e in self.entries if e.frames == n]) for n in lengths}
         size = {
             "subsets": {name: spell_ids(scenarios) for name, scenarios in ids.items()},
-            "frames": next(iter(frames)) if len(frames) == 1 else spelled,
+            "frames": lengths[0] if len(lengths) == 1 else frames,
             "bounds": [[float(low), float(high)] for low, high in bounds],
             "parameters": {},
             "task": task,
@@ -358,14 +339,12 @@ class _Building:
                 got=spell_ids(interest) if interest[0] >= 0 else interest,
             )
         placement = Placement.CELL_CENTRES if about.full_box else Placement.NODES
+        cells = about.cells or self._suitable_cells(placement, (about.input_frames, last))
         return {
             "input_frames": about.input_frames,
             "horizon": horizon,
             "frames_of_interest": interest,
-            "score_grid": {
-                "cells": about.cells or self._suitable_cells(placement, (about.input_frames, last)),
-                "placement": placement.value,
-            },
+            "score_grid": {"cells": cells, "placement": placement.value},
             "radius": about.radius / about.measure.scale,
         }
 

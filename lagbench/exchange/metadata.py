@@ -17,7 +17,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,13 +31,9 @@ from lagbench.errors import UnreadableFileError, UsageError, nearest
 NAME = "metadata.json"
 OWN_KEY = "lagbench"
 MAX_BYTES = 1 << 20
-
 Pair = tuple[FiniteFloat, FiniteFloat]
 Length = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Shapes = Mapping[str, Sequence[tuple[int, int]]]
-"""Frames and particles of every trajectory, by subset."""
-
-_GRANULES = 2**20
+Shapes = Mapping[str, Sequence[tuple[int, int]]]  # frames and particles of every trajectory, by subset
 
 
 class Format(enum.StrEnum):
@@ -49,20 +45,18 @@ class Format(enum.StrEnum):
 
 ENDINGS = {Format.GNS_NPZ: ".npz", Format.LAGRANGEBENCH_H5: ".h5"}  # of the files of subsets
 
-NUMBERS: Mapping[Format, Mapping[str, int]] = {
+NUMBERS: Mapping[Format, Mapping[str, int]] = {  # of each material
     Format.GNS_NPZ: {"liquid": 5, "snow": 6, "jelly": 7, "rope": 8},
     Format.LAGRANGEBENCH_H5: {"liquid": 0, "jelly": 4, "snow": 5, "rope": 6},
 }
-"""Number of each material."""
 
+# of particles of a wall at rest, and of one that moves
 WALL_NUMBERS: Mapping[Format, tuple[int, int]] = {Format.GNS_NPZ: (3, 3), Format.LAGRANGEBENCH_H5: (1, 2)}
-"""Number of particles of a wall at rest, and of one that moves."""
 
-MEANINGS: Mapping[Format, Mapping[int, str]] = {
+MEANINGS: Mapping[Format, Mapping[int, str]] = {  # of numbers without a material
     Format.GNS_NPZ: {0: "rigid", 3: "kinematic: a boundary that moves as prescribed"},
     Format.LAGRANGEBENCH_H5: {1: "solid wall", 2: "moving wall", 3: "rigid body"},
 }
-"""What numbers without a material mean."""
 
 PADDING = -1  # number of particles that are not there (lagrangebench-h5)
 DROP = "drop"  # what a number is mapped to whose particles are left out
@@ -79,19 +73,22 @@ def parse_format(name: str) -> Format:
 
 def numbers_of(form: Format, material: NDArray[np.integer]) -> NDArray[np.int64]:
     """Return the number of each particle's material, shape [particle]."""
-    table = np.array([NUMBERS[form][name] for name in MATERIALS], dtype=np.int64)
-    numbers: NDArray[np.int64] = table[material]
-    return numbers
+    return np.array([NUMBERS[form][name] for name in MATERIALS], dtype=np.int64).take(material)
 
 
 def materials_of(
-    form: Format, numbers: NDArray[np.integer], *, given: Mapping[int, str], where: str
+    form: Format, numbers: NDArray[Any], particles: int, *, given: Mapping[int, str], where: str
 ) -> tuple[NDArray[np.int8], NDArray[np.bool_]]:
-    """Return the material of each particle that is kept, and a mask over all particles.
-
-    ``given`` is what the user said of numbers: a material, or "drop". A number that no material has
-    and the user did not map, or no particle left, is an UnreadableFileError that names ``where``.
-    """
+    """Return the material of each particle kept, and a mask over all; ``given`` is what the user said."""
+    gns = form is Format.GNS_NPZ
+    if numbers.dtype.kind not in "iu" or numbers.shape not in [(particles,), *([(), (1,)] if gns else [])]:
+        raise UnreadableFileError(
+            "these are no kinds of particles",
+            where=where,
+            expected=f"an integer, or {particles} of them" if gns else f"{particles} integers",
+            got=f"{numbers.dtype} of shape {numbers.shape}",
+        )
+    numbers = np.broadcast_to(numbers, (particles,))
     known = {number: name for name, number in NUMBERS[form].items()} | {PADDING: DROP} | dict(given)
     codes = {number: _DROPPED if name == DROP else _code(name) for number, name in known.items()}
     found = np.unique(numbers).tolist()
@@ -161,16 +158,16 @@ class Source(BaseModel):
     model_config = ConfigDict(frozen=True)
 
     bounds: tuple[Pair, Pair]  # box of the source [its length]
-    radius: Length  # connectivity radius [its length]
-    frame_interval: Length | None  # time between frames [s]; None where none is stated
-    spacing: Length | None  # distance of neighbouring particles at first [its length]
-    periodic: tuple[bool, bool]  # whether the box is periodic, along x and y
-    hints: Hints  # what our own exports add
+    radius: Length = Field(alias="default_connectivity_radius")  # [its length]
+    frame_interval: Length | None = Field(alias="dt")  # time between frames [s]; None where none is stated
+    spacing: Length | None = Field(alias="dx")  # distance of neighbouring particles at first [its length]
+    periodic: tuple[bool, bool] = Field(alias="periodic_boundary_conditions")  # along x and y
+    hints: Hints = Field(alias="lagbench")  # what our own exports add
 
 
 def floor_of(value: float) -> float:
     """Return the largest multiple of 2^-20 below: taken off a float32 beyond it, nothing is lost."""
-    return math.floor(value * _GRANULES) / _GRANULES
+    return math.floor(value * 2**20) / 2**20
 
 
 def describe(
@@ -187,13 +184,7 @@ def describe(
     free_slip: bool,
     wall: float | None = None,
 ) -> dict[str, object]:
-    """Return the metadata of an export.
-
-    Statistics are mean and std over train per frame, see ``lagbench.data.statistics``. ``spacing`` is the
-    distance of neighbouring particles at first, ``origin`` what was taken off every position,
-    ``from_walls`` whether the bounds are those of the box, ``wall`` the thickness of wall particles where
-    there are some [length].
-    """
+    """Return the metadata of an export whose walls, where they are particles, are ``wall`` thick [length]."""
     task, grid = size.task, size.task.score_grid
     short = {"vel": "velocity", "acc": "acceleration"}
     common = {
@@ -243,19 +234,15 @@ def describe(
             "free_slip": free_slip,
             "is_bc_trick": False,
             # One less than frames: the last one is a target only, as in the data sets of that code base.
-            "sequence_length_train": frames_of["train"] - 1,
-            "sequence_length_test": frames_of["test"] - 1,
-            "num_trajs_train": len(shapes["train"]),
-            "num_trajs_test": len(shapes["test"]),
+            **{f"sequence_length_{subset}": frames_of[subset] - 1 for subset in ("train", "test")},
+            **{f"num_trajs_{subset}": len(shapes[subset]) for subset in ("train", "test")},
             "num_particles_max": max(n for rows in shapes.values() for _, n in rows),
             "periodic_boundary_conditions": [False, False],
         }
         # Its cell lists start at 0 and are as long as the bounds are apart: particles beyond the
         # difference would lose their neighbours.
         if wall is not None:
-            special["bounds"] = [
-                [0.0, high + wall - o] for (_, high), o in zip(size.bounds, origin, strict=True)
-            ]
+            special["bounds"] = [[0.0, h + wall - o] for (_, h), o in zip(size.bounds, origin, strict=True)]
         elif not from_walls:
             special["bounds"] = [[0.0, 1.0], [0.0, 1.0]]
     return {**common, **special, OWN_KEY: own}
@@ -271,22 +258,19 @@ def write_metadata(folder: Path, metadata: Mapping[str, object]) -> Path:
 def read_source(folder: Path, form: Format) -> Source:
     """Return what a metadata.json says; what is missing, no JSON or incomplete is an UnreadableFileError."""
     path = folder / NAME
+    where = str(path)
     try:
         with path.open("rb") as stream:
             text = stream.read(MAX_BYTES + 1)
         if len(text) > MAX_BYTES:
-            raise UnreadableFileError(
-                "the file is too large", where=str(path), expected=f"<= {MAX_BYTES} bytes"
-            )
+            raise UnreadableFileError("the file is too large", where=where, expected=f"<= {MAX_BYTES} bytes")
         values = json.loads(text)
     except (OSError, ValueError, RecursionError) as error:
         raise UnreadableFileError(
-            "cannot read the metadata", where=str(path), expected="a JSON object", got=error
+            "cannot read the metadata", where=where, expected="a JSON object", got=error
         ) from error
     if not isinstance(values, dict):
-        raise UnreadableFileError(
-            "the metadata are no JSON object", where=str(path), got=type(values).__name__
-        )
+        raise UnreadableFileError("the metadata are no JSON object", where=where, got=type(values).__name__)
     # Newer GNS programs keep one block for training and one for rollouts.
     block = values.get("train")
     values = block if isinstance(block, dict) else values
@@ -301,29 +285,18 @@ def read_source(folder: Path, form: Format) -> Source:
         return Source.model_validate(
             {
                 "bounds": values.get("bounds"),
-                "radius": values.get("default_connectivity_radius"),
-                "frame_interval": step * steps or None,
-                "spacing": values.get("dx") if form is Format.LAGRANGEBENCH_H5 else None,
-                "periodic": values.get("periodic_boundary_conditions") or (False, False),
-                "hints": values.get(OWN_KEY) or {},
+                "default_connectivity_radius": values.get("default_connectivity_radius"),
+                "dt": step * steps or None,
+                "dx": values.get("dx") if form is Format.LAGRANGEBENCH_H5 else None,
+                "periodic_boundary_conditions": values.get("periodic_boundary_conditions") or (False, False),
+                OWN_KEY: values.get(OWN_KEY) or {},
             }
         )
     except ValidationError as error:
         first = error.errors()[0]
-        name, *inner = map(str, first["loc"] or ("frame_interval",))
         raise UnreadableFileError(
             "the metadata lack what a split needs, or state it otherwise",
-            where=f"{path}, key {'.'.join((_KEYS.get(name, name), *inner))}",
+            where=f"{path}, key {'.'.join(map(str, first['loc'] or ('dt',)))}",
             expected=first["msg"],
             got=first["input"],
         ) from None
-
-
-_KEYS = {
-    "radius": "default_connectivity_radius",
-    "frame_interval": "dt",
-    "spacing": "dx",
-    "periodic": "periodic_boundary_conditions",
-    "hints": OWN_KEY,
-}
-"""Key of what :class:`Source` holds, where it has another name."""

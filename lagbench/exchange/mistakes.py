@@ -15,29 +15,18 @@ from numpy.typing import NDArray
 from lagbench.errors import DataError
 from lagbench.submission.start import Mistake
 
-STRETCH = 4
-"""Neighbours along an axis that are looked at together: two second differences, a step and its neighbours."""
-
+STRETCH = 4  # neighbours along an axis looked at together: two second differences, a step and its neighbours
 STRETCHES = 64, 200  # stretches of frames and of particles that are looked at, evenly spaced over each axis
 ROUGH = 0.5  # change of a step, as a share of the step, from which on frames do not resolve the motion
-JUMPS = 1.0
-"""The same share for what jumps: places drawn at random have 1.7, what turns by a radian per frame 0.96."""
-
+JUMPS = 1.0  # the same for what jumps: random places have 1.7, what turns by a radian per frame 0.96
 SMOOTHER = 0.25  # share of the jumps that the other axis may have to be the smooth one
 ROUNDED = 1e-6  # share of a variance that rounding may leave
-EXPLAINED = 0.5
-"""Share of the velocities' variance that motion must leave, or another reading take away, to count."""
-
-FACTOR = 1.5
-"""Velocities that differ by more from the motion have another unit; those of our coarsest data do by 1.3."""
-
-SHIFTED = 0.4
-"""Share of the misfit that a shift by a frame must leave: velocities of a solver may lag by a tenth."""
-
+EXPLAINED = 0.5  # share of the velocities' variance that motion must leave, or another reading take away
+FACTOR = 1.5  # from which on velocities have another unit than the motion; our coarsest data have 1.3
+SHIFTED = 0.4  # share of the misfit that a shift by a frame must leave: a solver may lag by a tenth
 FEWEST = 8  # steps below which chance may look like anything
 
-Block = NDArray[np.float64]
-"""Some values of a trajectory, of shape [stretch of frames, frame, stretch of particles, particle, 2]."""
+Block = NDArray[np.float64]  # of shape [stretch of frames, frame, stretch of particles, particle, 2]
 
 
 def misplaced_axes(shape: tuple[int, ...]) -> Mistake | None:
@@ -53,21 +42,16 @@ def _axes(found: str) -> str:
 
 
 def check_meaning(name: str, position: Any, velocity: Any, interval: float) -> None:  # noqa: ANN401 (arrays, also netCDF's)
-    """Refuse a trajectory that another reading of its axes or velocities explains far better.
-
-    Positions [length] and velocities [length/s], or None, are [frame, particle, 2], in memory or in a file;
-    ``interval`` is the time between frames [s]. The DataError names the mistakes and how to mend them.
-    """
+    """Refuse positions [length] and velocities [length/s] that another reading explains far better."""
     if position.shape[0] < STRETCH:
         return
+    found: list[Mistake] = []
     with np.errstate(all="ignore"):  # what is not finite is no mistake of meaning, and found elsewhere
         moved = _block(position)
         if _is_transposed(moved):
             found = [Mistake(_axes("(particles, frames, 2)"), "array.swapaxes(0, 1)")]
         elif velocity is not None:
             found = list(_of_velocities(moved, _block(velocity), interval))
-        else:
-            return
     if found:
         raise DataError(
             "; ".join(mistake.what for mistake in found),
@@ -90,10 +74,7 @@ def _block(array: Any) -> Block:  # noqa: ANN401
 
 
 def _is_transposed(moved: Block) -> bool:
-    """Tell whether positions jump from row to row but not from column to column.
-
-    Particles are distinct places in any order, moments of one particle a smooth curve.
-    """
+    """Tell whether positions jump from row to row, as particles do, but not from column to column."""
     if moved.shape[3] < STRETCH:
         return False
     (step, change), (other_step, other_change) = (
@@ -131,7 +112,20 @@ def _of_velocities(moved: Block, velocity: Block, interval: float) -> Iterator[M
             what = f"velocities are {factor:.3g} times what the positions move per second"
             yield Mistake(what, f"divide them by it, or --frame-interval {interval / factor:.3g}")
         interval = 1.0 if per_frame else interval / factor
-    yield from _shifted(step, velocity * interval)
+    velocity = velocity * interval  # [length/frame]
+
+    def apart(*readings: Block) -> float:
+        return min(_length(step - reading) for reading in readings)
+
+    # A velocity may be that of its moment, or the difference to the frame before or after.
+    own = min(apart(*_own(velocity)), _length(step))
+    before, start, end, after = (velocity[:, frame] for frame in range(STRETCH))
+    late, early = apart(after, (after + end) / 2.0), apart(before, (before + start) / 2.0)
+    if own > 0.0 and min(late, early) <= SHIFTED * own:
+        if late <= early:
+            yield Mistake("velocities are one frame late", "velocity[1:] belongs to position[:-1]")
+        else:
+            yield Mistake("velocities are one frame early", "velocity[:-1] belongs to position[1:]")
 
 
 def _own(velocity: Block) -> tuple[Block, Block, Block]:
@@ -140,37 +134,13 @@ def _own(velocity: Block) -> tuple[Block, Block, Block]:
 
 
 def _multiple(step: Block, velocity: Block) -> tuple[float, float]:
-    """Return which share of the velocities' variance no multiple of the steps explains, and the multiple.
-
-    The share is 1 where nothing moves.
-    """
+    """Return which share of the velocities' variance no multiple of the steps explains, and the multiple."""
     found = []
     for mean in _own(velocity):
         squares, both = np.sum(step * step), np.sum(step * mean)
         share = 1.0 - both**2 / (squares * np.sum(mean * mean))
         found.append((float(share), float(both / squares)) if np.isfinite(share) else (1.0, 0.0))
     return min(found)
-
-
-def _shifted(step: Block, velocity: Block) -> Iterator[Mistake]:
-    """Yield whether velocities [length/frame] explain the step before or after better than their own.
-
-    A velocity may be that of its moment, or the difference to the frame before or after.
-    """
-
-    def apart(*readings: Block) -> float:
-        return min(_length(step - reading) for reading in readings)
-
-    own = min(apart(*_own(velocity)), _length(step))
-    before, start, end, after = (velocity[:, frame] for frame in range(STRETCH))
-    late, early = apart(after, (after + end) / 2.0), apart(before, (before + start) / 2.0)
-    if own > 0.0 and min(late, early) <= SHIFTED * own:
-        what, fix = (
-            ("late", "velocity[1:] belongs to position[:-1]")
-            if late <= early
-            else ("early", "velocity[:-1] belongs to position[1:]")
-        )
-        yield Mistake(f"velocities are one frame {what}", fix)
 
 
 def _length(vectors: Block) -> float:

@@ -24,25 +24,16 @@ from lagbench.submission.findings import quoted
 from .mistakes import misplaced_axes
 
 Array = NDArray[np.floating]
-Frame = tuple[Array, Array | None]
-"""Positions [length of the source] and, where the source has them, velocities [its length/s]."""
-
+Frame = tuple[Array, Array | None]  # positions [length of the source], velocities [its length/s] if any
+# Frames of a trajectory, what returns the positions of one of them, and the kind of each particle.
 Run = tuple[int, Callable[[int], NDArray[np.float32]], NDArray[np.int64]]
-"""Frames of a trajectory, what returns the positions of one of them, and the kind of each particle."""
+Box = tuple[tuple[float, float], tuple[float, float]]  # low and high walls along x and y
 
-Box = tuple[tuple[float, float], tuple[float, float]]
-"""Low and high walls along x and y."""
-
-PLANE = 2  # components of a position
 HARMLESS = 1 << 28  # bytes that may come of anything
 MOST_INFLATION = 200  # times its own length that a larger array may unpack to
 
-LEAST, MOST = 1e-30, 1e30
-"""Least and greatest number that a length, a time or a density may be: squares of them are floats."""
-
-FEWEST_CELLS, MOST_CELLS = 4, 4096
-"""Cells across of a score grid."""
-
+LEAST, MOST = 1e-30, 1e30  # what a length, a time or a density may be: squares of them are floats
+FEWEST_CELLS, MOST_CELLS = 4, 4096  # across of a score grid
 WIDE = 3.0  # radii within which neighbours are counted to estimate the spacing
 
 
@@ -57,28 +48,17 @@ class Trajectory:
     wall_velocity: Array | None = None  # [length/s], [wall, 2] or [frame, wall, 2]; None without walls
     parameters: Mapping[str, object] = field(default_factory=dict)  # facts that the file states and hashes
 
-    @property
-    def particles(self) -> int:
-        """Particles in every frame."""
-        return len(self.material)
-
 
 @dataclass(frozen=True, kw_only=True)
 class Measure:
-    """How lengths of the source become lengths of the unit box: ``(x - corner) / scale``.
-
-    A scale that is a power of two, with the corner 0, loses no bit.
-    """
+    """How lengths of the source become the unit box's, ``(x - corner) / scale``: powers of 2 lose no bit."""
 
     scale: float = 1.0
     corner: tuple[float, float] = (0.0, 0.0)
 
     @classmethod
     def fitting(cls, bounds: Box) -> Measure:
-        """Return the measure by which a box fits into the unit box.
-
-        The scale is the least power of two that holds it; the corner stays 0 where that is enough.
-        """
+        """Return the measure of the least scale by which a box fits, the corner 0 where that is enough."""
         low, high = np.array(bounds, dtype=np.float64).T
         corner = low
         if (low >= 0.0).all() and (high <= _power(float(high.max()))).all():
@@ -106,8 +86,7 @@ def _power(length: float) -> float:
     return 2.0 ** max(0, math.ceil(math.log2(length))) if length > 1.0 else 1.0
 
 
-Count = Annotated[int, Field(gt=-(1 << 31), lt=1 << 31)]
-"""A number of frames or cells, or of a frame: one that a message can spell out."""
+Count = Annotated[int, Field(gt=-(1 << 31), lt=1 << 31)]  # one that a message can spell out
 
 
 @with_config(ConfigDict(extra="forbid"))
@@ -132,20 +111,12 @@ class Wishes(TypedDict, total=False):
 
 
 def read_wishes(path: Path) -> Wishes:
-    """Return what a YAML file says of the data.
-
-    Raises:
-        UnreadableFileError: no plain YAML.
-        UsageError: an unknown key, or a value that does not fit.
-    """
+    """Return what a YAML file says of the data."""
     return _checked(read_yaml(path), where=f"{path}, key ")
 
 
 def check_wishes(wishes: Wishes) -> Wishes:
-    """Return what a caller says of the data as plain values, NumPy's converted; None says nothing.
-
-    An unknown name, or a value that does not fit, is a UsageError.
-    """
+    """Return what a caller says of the data as plain values, NumPy's converted; None says nothing."""
     said = {name: value for name, value in wishes.items() if value is not None}
     plain = {n: v.tolist() if isinstance(v, np.ndarray | np.generic) else v for n, v in said.items()}
     return _checked(plain, where="")
@@ -214,10 +185,8 @@ class Description:
         for option, value in positive.items():
             if not (LEAST <= value <= MOST):
                 raise UsageError("not a number above 0 that computes", where=option, got=value)
-        for option, count, least in (
-            ("--input-frames", self.input_frames, 2),
-            ("--horizon", self.horizon, 1),
-        ):
+        counts = ("--input-frames", self.input_frames, 2), ("--horizon", self.horizon, 1)
+        for option, count, least in counts:
             if count is not None and count < least:
                 expected = f"at least {least}"
                 raise UsageError("too few frames for a task", where=option, expected=expected, got=count)
@@ -238,17 +207,13 @@ class Description:
 
 
 def estimate_spacing(position: Array, radius: float) -> float:
-    """Return the distance of neighbouring particles in one frame, ``sqrt(area / particles)``.
-
-    The density deep inside the material is that within three radii of a particle, where the
-    upper quartile over particles leaves surfaces out.
-    """
+    """Return the distance of neighbouring particles in one frame, ``sqrt(area / particles)``."""
     from scipy.spatial import cKDTree
 
     points = position.astype(np.float64)
     reach = WIDE * radius
     counts = cKDTree(points).query_ball_point(points, reach, return_length=True)
-    inside = float(np.quantile(counts, 0.75))
+    inside = float(np.quantile(counts, 0.75))  # deep inside the material: this leaves surfaces out
     if inside < 2.0 and len(points) > 1:  # a particle counts itself
         raise UsageError(
             "particles have no neighbours: their spacing cannot be estimated",
@@ -269,7 +234,7 @@ def check_array(name: str, shape: tuple[int, ...], dtype: np.dtype[np.generic]) 
             expected="floats of shape (frame, particle, 2)",
             got=f"{dtype} of shape {shape}",
         )
-    if shape[2] != PLANE:
+    if shape[2] != 2:
         turned = misplaced_axes(shape)
         raise DataError(
             turned.what if turned else f"positions have {shape[2]} components",
@@ -280,19 +245,14 @@ def check_array(name: str, shape: tuple[int, ...], dtype: np.dtype[np.generic]) 
         )
     if shape[0] < 2 or shape[1] < 1:
         raise DataError("too little for a trajectory", where=name, expected="2 frames, 1 particle", got=shape)
-    for what, limit, count in zip(
-        ("frames", "particles"), (FRAMES, NEEDED["particles"]), shape, strict=False
-    ):
+    for what, limit, count in ("frames", FRAMES, shape[0]), ("particles", NEEDED["particles"], shape[1]):
         if not limit.holds(count):
             raise DataError(f"too many {what} for a trajectory", where=name, expected=limit, got=count)
 
 
 def check_inflation(where: str, *, packed: int, unpacked: int) -> None:
-    """Refuse an array [bytes] that is far larger than what a file holds of it.
-
-    Positions of particles that move compress by a factor of two or so, of particles at rest by a
-    hundred: what promises more, and much of it, was made to fill the memory, or is damaged.
-    """
+    """Refuse an array [bytes] that is far larger than what a file holds of it."""
+    # Particles that move compress by two or so, at rest by a hundred: more was made to fill the memory.
     if unpacked > max(HARMLESS, MOST_INFLATION * packed):
         raise UnreadableFileError(
             "the file would unpack to far more than it holds",

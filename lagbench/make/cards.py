@@ -18,9 +18,7 @@ from lagbench.data.manifest import Manifest
 from lagbench.data.registry import Registry, Size, Split, spell_ids
 from lagbench.draw.tables import escape, markdown
 
-CONFORMS_TO = "http://mlcommons.org/croissant/1.1"
 LICENCES = {"CC-BY-4.0": "https://creativecommons.org/licenses/by/4.0/"}
-NETCDF = "application/x-netcdf"
 KEYWORDS = ("particle simulation", "material point method", "surrogate model", "computational fluid dynamics")
 
 _TERMS = (
@@ -58,11 +56,6 @@ _FIELDS: Mapping[str, tuple[str, str]] = {
 
 def croissant_json(size: Size, split: Split, manifest: Manifest) -> str:
     """Return the Croissant document of a data set folder."""
-    return json.dumps(describe_dataset(size, split, manifest), indent=1, ensure_ascii=False) + "\n"
-
-
-def describe_dataset(size: Size, split: Split, manifest: Manifest) -> dict[str, object]:
-    """Return the Croissant document as plain values."""
     scenarios = {  # a table that holds its own data
         "@type": "cr:RecordSet",
         "@id": "scenarios",
@@ -81,12 +74,12 @@ def describe_dataset(size: Size, split: Split, manifest: Manifest) -> dict[str, 
         ],
         "data": [{f"scenarios/{name}": getattr(entry, name) for name in _FIELDS} for entry in manifest.files],
     }
-    return {
+    document = {
         "@context": dict(_CONTEXT),
         "@type": "sc:Dataset",
         "name": f"lagbench-{size.split}-{size.name}",
         "description": f"{split.title}, size {size.name}. {split.description}",
-        "conformsTo": CONFORMS_TO,
+        "conformsTo": "http://mlcommons.org/croissant/1.1",
         "citeAs": split.citation,
         "creator": {"@type": "sc:Organization", "name": "The lagbench authors"},
         "isLiveDataset": False,
@@ -101,24 +94,23 @@ def describe_dataset(size: Size, split: Split, manifest: Manifest) -> dict[str, 
                 "description": f"scenario {entry.scenario} of {entry.subset}: {entry.frames} frames, netCDF4",
                 "contentUrl": entry.path,
                 "contentSize": f"{entry.bytes} B",
-                "encodingFormat": NETCDF,
+                "encodingFormat": "application/x-netcdf",
                 "sha256": entry.file_sha256,
             }
             for entry in manifest.files
         ],
         "recordSet": [scenarios],
     }
+    return json.dumps(document, indent=1, ensure_ascii=False) + "\n"
 
 
 CARD_NAME, CROISSANT_NAME = "README.md", "croissant.json"
 
-PICTURES: Mapping[str, str] = {
+PICTURES: Mapping[str, str] = {  # path relative to the card, and what it shows
     "pictures/scenarios.png": "scenarios of this data set",
     "pictures/frame.png": "one frame of a test scenario",
 }
-"""Pictures of a card, relative to it, and what they show."""
-
-NOTES: Mapping[str, str] = {
+NOTES: Mapping[str, str] = {  # what a reader of one split's card must know beside its description
     "cavity": (
         "The wall velocities of all frames, those to be predicted included, are part of what is given: they "
         "are the forcing. `wall_velocity` at frame f is what acts from frame f-1 to f."
@@ -137,38 +129,24 @@ NOTES: Mapping[str, str] = {
         "has: benchmarks/effective_viscosity.py fits it to the decay of each size."
     ),
 }
-"""What a reader of one split's card must know beside its description."""
-
+_WALLS = "closed box: what acts towards each frame; walls left, right, bottom, top"
 VARIABLES = (
     ("`position`", "frame, particle, space", "float32", "length", "particle positions in the unit box"),
     ("`velocity`", "frame, particle, space", "float32", "length/s", "particle velocities of the solver"),
     ("`material`", "particle", "int8", "1", "0 liquid, 1 jelly, 2 snow, 3 rope"),
     ("`particle_mass`", "", "float64", "density x area", "mass of one particle"),
-    (
-        "`wall_velocity`",
-        "frame, wall, space",
-        "float32",
-        "length/s",
-        "closed box: what acts towards each frame; walls left, right, bottom, top",
-    ),
+    ("`wall_velocity`", "frame, wall, space", "float32", "length/s", _WALLS),
     ("`time`", "frame", "float64", "s", "time since frame 0"),
 )
 
 
-BITWISE = "The files hold the same bits on every x86-64 Linux machine, with any number of workers."
-TOLERANCE = "Some files come from a device that does not promise equal bits: they agree to a tolerance."
-
-
 def write_cards(root: Path, size: Size, split: Split, manifest: Manifest) -> list[Path]:
-    """Write README.md, croissant.json and, with matplotlib, the pictures; return their paths.
-
-    Each file appears whole or not at all. Where the text is already there and the pictures
-    too, nothing is written: the card names every content hash, so the data are the same.
-    """
+    """Write README.md, croissant.json and, with matplotlib, the pictures; return their paths."""
     folder = size.folder(root)
     texts = {folder / name: text for name, text in card_texts(size, split, manifest).items()}
     drawn = [folder / name for name in _pictures(manifest)]
     there = all(path.is_file() for path in (*texts, *drawn))
+    # The card names every content hash: where its text stands already, the pictures are of the same data.
     if not there or any(path.read_bytes() != text for path, text in texts.items()):
         if drawn:
             _draw(root, size, split, manifest)
@@ -190,7 +168,6 @@ def _pictures(manifest: Manifest) -> list[str]:
 
 
 def _draw(root: Path, size: Size, split: Split, manifest: Manifest) -> None:
-    """Draw the pictures of the card."""
     from lagbench.draw.plot import contact_sheet, plot_frame
 
     splits = Registry({size.split: split}, {})
@@ -211,17 +188,22 @@ def dataset_card(size: Size, split: Split, manifest: Manifest, *, pictures: list
         "size_categories": ["n<1K" if len(manifest.files) < 1000 else "1K<n<10K"],
         "version": manifest.version,
     }
+    moments = [(name.replace("_", " "), *row) for name, row in manifest.statistics.items()]
     statistics = (
         "## Statistics of train",
         "With the frame as unit of time: velocity is x(f) - x(f-1), acceleration its difference.",
-        markdown(
-            ("", "x", "y"), [(name.replace("_", " "), *row) for name, row in manifest.statistics.items()]
-        ),
+        markdown(("", "x", "y"), moments),
     )
     parameters = [
         (f"`{name}`", f"{p.value:g}" if isinstance(p.value, float) else p.value, p.unit, p.description)
         for name, p in size.parameters.items()
     ]
+    subsets = []
+    for name, ids in size.subsets.items():
+        there = [entry for entry in manifest.files if entry.subset == name]
+        sums = sum(entry.frames for entry in there), sum(entry.bytes for entry in there)
+        digest = f"`{manifest.subset_sha256[name]}`" if name in manifest.subset_sha256 else "incomplete"
+        subsets.append((name, spell_ids(ids), f"{len(there)} of {len(ids)}", *sums, digest))
     options = f"--split {size.split} --size {size.name}"
     parts = [
         "\n".join(["---", *(f"{k}: {json.dumps(v, ensure_ascii=False)}" for k, v in head.items()), "---"]),
@@ -232,7 +214,7 @@ def dataset_card(size: Size, split: Split, manifest: Manifest, *, pictures: list
         "## In short",
         _facts(size, manifest),
         "## Subsets",
-        _subsets(size, manifest),
+        markdown(("subset", "ids", "scenarios", "frames", "bytes", "hash"), subsets),
         "## Reading",
         "One netCDF4 file per scenario, which `xarray.open_dataset` reads without lagbench. "
         "Lengths are in units of the unit box, time in seconds. Frame 0 is the state when recording starts.",
@@ -248,7 +230,9 @@ def dataset_card(size: Size, split: Split, manifest: Manifest, *, pictures: list
         "## Parameters",
         markdown(("parameter", "value", "unit", "meaning"), parameters),
         "## Regenerate and verify",
-        BITWISE if manifest.identity == "bitwise" else TOLERANCE,
+        "The files hold the same bits on every x86-64 Linux machine, with any number of workers."
+        if manifest.identity == "bitwise"
+        else "Some files come from a device that does not promise equal bits: they agree to a tolerance.",
         "```sh\n"
         "pip install 'lagbench[generate]'\n"
         f"lagbench generate {options}\n"
@@ -264,20 +248,15 @@ def dataset_card(size: Size, split: Split, manifest: Manifest, *, pictures: list
 
 
 def _facts(size: Size, manifest: Manifest) -> str:
-    frames = sorted({entry.frames for entry in manifest.files})
+    frames = sorted({entry.frames for entry in manifest.files}) or [0]
+    digest = manifest.dataset_sha256
     rows = [
         ("version", manifest.version),
         ("complete", manifest.complete),
-        (
-            "data set hash",
-            f"`{manifest.dataset_sha256}`" if manifest.dataset_sha256 else "none before it is complete",
-        ),
+        ("data set hash", f"`{digest}`" if digest else "none before it is complete"),
         ("identity", manifest.identity),
         ("scenarios", len(manifest.files)),
-        (
-            "frames per scenario",
-            " to ".join(str(f) for f in dict.fromkeys((frames[0], frames[-1]))) if frames else "0",
-        ),
+        ("frames per scenario", " to ".join(map(str, dict.fromkeys((frames[0], frames[-1]))))),
         ("frames together", sum(entry.frames for entry in manifest.files)),
         ("particles", size.particles),
         ("frame interval", f"{size.frame_interval:.6g} s"),
@@ -288,32 +267,13 @@ def _facts(size: Size, manifest: Manifest) -> str:
     return markdown(("", ""), rows)
 
 
-def _subsets(size: Size, manifest: Manifest) -> str:
-    rows = []
-    for subset, ids in size.subsets.items():
-        there = [entry for entry in manifest.files if entry.subset == subset]
-        digest = manifest.subset_sha256.get(subset)
-        rows.append(
-            (
-                subset,
-                spell_ids(ids),
-                f"{len(there)} of {len(ids)}",
-                sum(entry.frames for entry in there),
-                sum(entry.bytes for entry in there),
-                f"`{digest}`" if digest else "incomplete",
-            )
-        )
-    return markdown(("subset", "ids", "scenarios", "frames", "bytes", "hash"), rows)
-
-
 def _task(size: Size, manifest: Manifest) -> str:
-    task = size.task
-    grid = f"{task.score_grid.cells} cells a side, {task.score_grid.placement.replace('_', ' ')}"
+    task, grid = size.task, size.task.score_grid
     rows = [
         ("input frames", str(task.input_frames)),
         ("frames to predict", str(task.horizon)),
         ("frames of interest", ", ".join(map(str, task.frames_of_interest))),
-        ("score grid", grid),
+        ("score grid", f"{grid.cells} cells a side, {grid.placement.replace('_', ' ')}"),
         ("radius for graph models", f"{task.radius:g}"),
     ]
     floors = [entry.twin_floor for entry in manifest.files if entry.twin_floor]
@@ -336,7 +296,6 @@ def _scenarios(manifest: Manifest) -> str:
         )
         for entry in manifest.files
     ]
-    listing = markdown(
-        ("id", "file", "frames", *(name.replace("_", " ") for name in names), "content hash"), rows
-    )
+    head = ("id", "file", "frames", *(name.replace("_", " ") for name in names), "content hash")
+    listing = markdown(head, rows)
     return f"<details><summary>{len(rows)} files</summary>\n\n{listing}\n\n</details>"

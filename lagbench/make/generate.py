@@ -13,6 +13,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -45,7 +46,7 @@ from lagbench.work.progress import Meter, Progress
 from lagbench.work.run import ONE_THREAD, read_many
 
 from .cards import card_texts, write_cards
-from .inventory import Look, compare, look
+from .inventory import compare, examine, look
 from .plan import Estimate, Scenarios, Selection, check_disk, estimate, free_bytes, note_pace, select
 
 Job = TypeVar("Job")
@@ -73,8 +74,7 @@ class Generation:
         self.folder = size.folder(root)
         self.workers, self.scheduler = workers, scheduler  # processes here, or a Dask scheduler's workers
         self.sources = sources  # other root folders to take finished scenarios from
-        # the store that the root folder is a working copy of; None for a plain folder
-        self.store: Publication | None = None
+        self.store: Publication | None = None  # which the root folder is a working copy of; None if plain
         self.manifest = merged(self.size, None)  # what the folder holds, as far as is known
         self._hashed: list[FileEntry] = []  # files that were there and right, just hashed
         self.kept: list[int] = []  # ids whose files were there and right
@@ -88,11 +88,7 @@ class Generation:
     def survey(
         self, wanted: Sequence[int], *, force: bool = False, gathered: Collection[int] | None = None
     ) -> None:
-        """Find out what is there and what is to do; writes nothing.
-
-        With ``gathered``, what a real call would take from other root folders, it only tells: that counts
-        as there, and the manifest's word is taken for files.
-        """
+        """Find out what is there and what is to do; with ``gathered``, what would be there, it only tells."""
         old = read_or_empty(self.size, self.root)
         held = self.store.held if self.store else {}
         local = [i for i in self.size.scenarios if i not in held]
@@ -101,23 +97,14 @@ class Generation:
         stated = {entry.scenario: entry.bytes for entry in old.files}
         suspects = [i for i in local if i in wanted or lengths.get(i) != stated.get(i)]
         self._meter.begin("checking", total=len(suspects), scenarios=len(suspects))
-        looks = {
-            f"scenario {i}": Look(
-                root=self.root,
-                size=self.size,
-                scenario=i,
-                manifest=old.only(i),
-                trusting=gathered is not None,
-            )
-            for i in suspects
-        }
+        quick = partial(examine, self.root, self.size, quick=True, trusting=gathered is not None)
+        looks = {f"scenario {i}": partial(quick, i, manifest=old.only(i)) for i in suspects}
         findings = self._read(look, looks, map(self._path, suspects))
-        good = [finding.entry for finding in findings if finding.entry]
-        self._hashed = [*good]
-        bad = set(suspects) - {entry.scenario for entry in good}
-        good += held.values()
+        self._hashed = [finding.entry for finding in findings if finding.entry]
+        bad = set(suspects) - {entry.scenario for entry in self._hashed}
         kept = tuple(e for e in old.files if e.scenario not in bad)
-        self.manifest = merged(self.size, old.model_copy(update={"files": kept}), good)
+        there = [*self._hashed, *held.values()]
+        self.manifest = merged(self.size, old.model_copy(update={"files": kept}), there)
         self.kept = [i for i in wanted if (i not in bad or i in (gathered or ())) and not force]
         on_cores = self.device is Device.CPU and self.scheduler is None
         self.to_do = estimate(self.size, [i for i in wanted if i not in self.kept], on_cores=on_cores)
@@ -157,22 +144,15 @@ class Generation:
         if self.store:
             self.store.finish(self.manifest, cards)
 
-    def missing(self) -> tuple[int, ...]:
-        """Return the ids of the size that the manifest does not hold."""
-        return tuple(i for i in self.size.scenarios if self.manifest.entry(i) is None)
-
     def _read(
         self, function: Callable[[Job, Report], Result], jobs: Mapping[str, Job], files: Iterable[Path]
     ) -> list[Result]:
         """Run a function that reads files, here or by the workers; the meter counts files."""
-        return read_many(
-            function,
-            jobs,
-            files,
-            lambda count: self._meter.count(count, scenarios=count),
-            workers=self.workers,
-            scheduler=self.scheduler,
-        )
+
+        def count(files: int) -> None:
+            self._meter.count(files, scenarios=files)
+
+        return read_many(function, jobs, files, count, workers=self.workers, scheduler=self.scheduler)
 
     def _path(self, scenario: int) -> Path:
         return self.size.path(self.root, scenario)
@@ -180,7 +160,8 @@ class Generation:
     def _simulate(self) -> None:
         """Run everything that is to do in workers, and the twins of test scenarios."""
         with_twin = {entry.scenario for entry in self.manifest.files if entry.twin_floor}
-        twins = [i for i in self.kept if self._is_test(i) and i not in with_twin]
+        tested = self.size.subsets["test"]
+        twins = [i for i in self.kept if i in tested and i not in with_twin]
         self._bring(twins)
         costs = dict(zip(self.to_do.scenarios, self.to_do.substeps, strict=True))
         # Scenarios of similar length share a batch.
@@ -188,14 +169,14 @@ class Generation:
         width = 1 if self.device is Device.CPU else max(1, BATCH_PARTICLES // self.size.particles)
         batches = [tuple(longest_first[k : k + width]) for k in range(0, len(longest_first), width)]
         tasks = [
-            self._task(f"scenario {spell_ids(batch)}", simulate, batch, sum(costs[i] for i in batch))
-            for batch in batches
+            self._task(f"scenario {spell_ids(ids)}", simulate, ids, sum(costs[i] for i in ids))
+            for ids in batches
         ]
         tasks += map(self._twin, twins)
         if not tasks:
             return
         total = round(sum(task.cost for task in tasks))
-        total += sum(twin_substeps(self.size, i) for i in self.to_do.scenarios if self._is_test(i))
+        total += sum(twin_substeps(self.size, i) for i in self.to_do.scenarios if i in tested)
         self._meter.begin("simulating", total=total, scenarios=len(self.to_do.scenarios))
         environment = ONE_THREAD if self.device is Device.CPU else {}
         here = Pool(min(self.workers, len(tasks)), environment)
@@ -203,20 +184,15 @@ class Generation:
             for task in tasks:
                 team.submit(task)
             for event in team.events():
-                if event.kind == "progress":
-                    self._meter.count(event.value)
-                elif event.kind == "lost":
-                    self._meter.count(-event.value)
+                if event.kind != "done":  # it went on, or is lost
+                    self._meter.count(event.value if event.kind == "progress" else -event.value)
                 elif event.task.function is simulate:
                     self._take(event.value, team, event.machine or environment_of(self.device))
                 else:
                     floors = {i: tuple(map(round_digits, floor)) for i, floor in event.value.items()}
-                    entries = [
-                        entry.model_copy(update={"twin_floor": floors[entry.scenario]})
-                        for entry in self.manifest.files
-                        if entry.scenario in floors
-                    ]
-                    self._keep(merged(self.size, self.manifest, entries))
+                    files = [entry for entry in self.manifest.files if entry.scenario in floors]
+                    files = [e.model_copy(update={"twin_floor": floors[e.scenario]}) for e in files]
+                    self._keep(merged(self.size, self.manifest, files))
 
     def _task(self, what: str, function: Callable[..., Any], scenarios: tuple[int, ...], cost: float) -> Task:
         job = SimulationJob(size=self.size, scenarios=scenarios, root=self.root, device=self.device)
@@ -226,9 +202,6 @@ class Generation:
     def _twin(self, scenario: int) -> Task:
         what, cost = f"twin of scenario {scenario}", twin_substeps(self.size, scenario)
         return self._task(what, twin_floors, (scenario,), cost)
-
-    def _is_test(self, scenario: int) -> bool:
-        return self.size.subset_of(scenario) == "test"
 
     def _take(self, outcomes: Sequence[Simulated], team: Pool | Cluster, machine: Mapping[str, str]) -> None:
         """Note simulated scenarios whose files are there, and send the twins of those of test after them."""
@@ -240,12 +213,12 @@ class Generation:
         for outcome in outcomes:
             await_file(self._path(outcome.scenario))
         entries = [describe_file(self.root, self.size.key(outcome.scenario)) for outcome in outcomes]
-        tested = [outcome for outcome in outcomes if self._is_test(outcome.scenario)]
         note_entries(self.folder, entries)
         self._keep(merged(self.size, self.manifest, entries, environment))
         self._meter.count(scenarios=len(entries))
-        for outcome in tested:
-            team.submit(self._twin(outcome.scenario))
+        for entry in entries:
+            if entry.subset == "test":
+                team.submit(self._twin(entry.scenario))
 
     def _keep(self, manifest: Manifest) -> None:
         self.manifest = manifest
@@ -362,6 +335,7 @@ def generate(
             publication(tier, folder) as generation.store,
         ):
             generation.run(wanted, force=force)
+    manifest = generation.manifest
     return GenerationResult(
         split=tier.split,
         size=tier.name,
@@ -372,14 +346,14 @@ def generate(
         workers=cores,
         simulated=generation.to_do.scenarios,
         kept=tuple(generation.kept),
-        missing=tuple(i for i in generation.missing() if i not in generation.kept),
+        missing=tuple(i for i in tier.scenarios if not manifest.entry(i) and i not in generation.kept),
         bytes_needed=generation.to_do.bytes,
         bytes_free=free,
         seconds_expected=generation.to_do.seconds(cores),
         measured=generation.to_do.measured,
         seconds=time.monotonic() - started,
-        complete=generation.manifest.complete,
-        dataset_sha256=generation.manifest.dataset_sha256,
+        complete=manifest.complete,
+        dataset_sha256=manifest.dataset_sha256,
         verdict=generation.verdict,
         dry_run=dry_run,
     )

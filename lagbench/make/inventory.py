@@ -27,8 +27,6 @@ from lagbench.work.machine import available_cores, may_differ
 from .cards import PICTURES
 from .plan import estimate
 
-DRAWN = 2  # scenarios of a size that are drawn to estimate the time: all of them would take seconds
-
 
 class State(enum.StrEnum):
     """What became of a scenario's file."""
@@ -72,7 +70,7 @@ def overview(size: Size, root: Path) -> Overview:
     """Return what a size is, costs, and has below a root folder or in its store, read from names alone."""
     folder = size.folder(root)
     ids, url = size.scenarios, url_of(root)
-    expected = estimate(size, ids, drawn=DRAWN) if size.simulated else None
+    expected = estimate(size, ids, drawn=2) if size.simulated else None  # to draw all would take seconds
     if url is None:
         there = {i for i in ids if size.path(root, i).is_file()}
     else:
@@ -123,11 +121,7 @@ def examine(
     quick: bool = False,
     trusting: bool = False,
 ) -> Finding:
-    """Look at the file of one scenario.
-
-    ``quick`` does not hash values that this machine has hashed before, and asks for an entry; ``trusting``
-    takes the manifest's word for the others too.
-    """
+    """Look at a file; ``quick`` asks for an entry and takes hashes of before, ``trusting`` the manifest's."""
     key = size.key(scenario)
     path = scenario_path(root, key)
     if not path.exists():
@@ -167,12 +161,12 @@ def examine(
             if claim is not None and claim.content_sha256 == content:  # packed anew, or by an earlier version
                 facts = entry.facts or claim.facts
                 entry = entry.model_copy(update={"facts": facts, "twin_floor": claim.twin_floor})
-    except (DataError, OSError) as error:
-        if isinstance(error, DataError):
-            # How to mend it depends on the split, and is said once for all files.
-            problem = str(DataError(error.what, where=error.where, expected=error.expected, got=error.got))
-        else:
-            problem = f"cannot read {path}: {error.strerror}"
+    except DataError as error:
+        # How to mend it depends on the split, and is said once for all files.
+        problem = str(DataError(error.what, where=error.where, expected=error.expected, got=error.got))
+        return Finding(scenario=scenario, state=State.WRONG, problem=problem)
+    except OSError as error:
+        problem = f"cannot read {path}: {error.strerror}"
         return Finding(scenario=scenario, state=State.WRONG, problem=problem)
     return Finding(
         scenario=scenario,
@@ -183,27 +177,9 @@ def examine(
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Look:
-    """The arguments of a quick :func:`examine`, for a worker."""
-
-    root: Path  # folder that holds all data sets
-    size: Size  # tier of a split
-    scenario: int  # id
-    manifest: Manifest  # what the folder's manifest says of this scenario
-    trusting: bool = False  # whether that is believed
-
-
-def look(order: Look, report: Callable[[int], None]) -> Finding:
-    """Examine the file of one scenario quickly and report it as one unit of work."""
-    finding = examine(
-        order.root,
-        order.size,
-        order.scenario,
-        manifest=order.manifest,
-        quick=True,
-        trusting=order.trusting,
-    )
+def look(examined: Callable[[], Finding], report: Callable[[int], None]) -> Finding:
+    """Examine a file, as a worker does, and report it as one unit of work."""
+    finding = examined()
     report(1)
     return finding
 
@@ -228,8 +204,7 @@ def _check_header(path: Path, header: ScenarioHeader, size: Size, scenario: int)
         raise DataError("a file holds another scenario", where=str(path), expected=wanted, got=found)
     if not size.simulated:  # then the recorded content hash covers the parameters
         return
-    drawn = file_parameters(size, draw(size, scenario))
-    parameters = {name: plain(value) for name, value in drawn.items()}
+    parameters = {name: plain(value) for name, value in file_parameters(size, draw(size, scenario)).items()}
     # What only the simulation tells is covered by the content hash.
     stated = {name: value for name, value in header.parameters.items() if name not in OUTCOMES}
     if parameters != stated:
@@ -256,20 +231,24 @@ def compare(size: Size, manifest: Manifest, *, promised: Collection[int] = ()) -
     tolerated = {e.scenario for e in manifest.files if may_differ(e.device, manifest.environments)}
     tolerated -= set(promised)
     broken = [i for i in differing if i not in tolerated]
-    if broken:
-        what = f"{len(broken)} of {len(manifest.files)} scenarios have another hash"
-        raise _broken(what, f"{size.split} {size.name}, scenarios {spell_ids(broken)}", record)
-    if differing:
-        return f"scenarios {spell_ids(differing)} have {other_bits(size)}"
     found = {**manifest.subset_sha256, "the data set": manifest.dataset_sha256}
     wanted = {**measured.subset_sha256, "the data set": measured.dataset_sha256}
     others = [name for name, digest in found.items() if digest is not None and digest != wanted.get(name)]
-    if others:
-        where = f"{size.split} {size.name}, {', '.join(others)}"
-        raise _broken(
-            "subsets or the data set have another hash though every scenario has its own", where, record
-        )
-    return f"equal to {record}" if manifest.complete else f"what is there is equal to {record}"
+    if broken:
+        what = f"{len(broken)} of {len(manifest.files)} scenarios have another hash"
+        others = [f"scenarios {spell_ids(broken)}"]
+    elif differing:
+        return f"scenarios {spell_ids(differing)} have {other_bits(size)}"
+    elif others:
+        what = "subsets or the data set have another hash though every scenario has its own"
+    else:
+        return f"equal to {record}" if manifest.complete else f"what is there is equal to {record}"
+    raise DataError(
+        what,
+        where=f"{size.split} {size.name}, {', '.join(others)}",
+        expected=f"the hashes in {record}",
+        fix="see docs/determinism.md; `lagbench doctor` prints what a report needs",
+    )
 
 
 def unlike(size: Size) -> str:
@@ -282,8 +261,10 @@ def other_bits(size: Size) -> str:
     return f"other bits than {record_of(size)} (identity: tolerance)"
 
 
-def hash_verdict(size: Size, computed: str | None, recorded: str | None, *, tolerated: bool = False) -> str:
-    """Return how one subset or data set hash compares with the recorded one, in words."""
+def hash_verdict(size: Size, computed: str | None, subset: str | None = None, *, tolerated: bool) -> str:
+    """Return how the hash of a subset, else of the data set, compares with the recorded one, in words."""
+    known = size.measured
+    recorded = known and (known.subset_sha256.get(subset) if subset else known.dataset_sha256)
     if recorded is None:
         return f"no hash in {record_of(size)} yet"
     if computed is None:
@@ -291,25 +272,3 @@ def hash_verdict(size: Size, computed: str | None, recorded: str | None, *, tole
     if computed == recorded:
         return f"equal to {record_of(size)}"
     return other_bits(size) if tolerated else unlike(size)
-
-
-def unlike_measures(size: Size, manifest: Manifest) -> list[str]:
-    """Return the statistics, and the twin floor, of a manifest that datasets.yaml has otherwise.
-
-    They follow from the bits, so a manifest that is complete and bitwise must have them.
-    """
-    measured = size.measured
-    if measured is None or not manifest.complete or manifest.identity != "bitwise":
-        return []
-    names = sorted(measured.statistics.keys() | manifest.statistics.keys())
-    found = [n for n in names if measured.statistics.get(n) != manifest.statistics.get(n)]
-    return found + (["twin floor"] if manifest.mean_twin_floor() != measured.twin_floor else [])
-
-
-def _broken(what: str, where: str, record: str) -> DataError:
-    return DataError(
-        what,
-        where=where,
-        expected=f"the hashes in {record}",
-        fix="see docs/determinism.md; `lagbench doctor` prints what a report needs",
-    )

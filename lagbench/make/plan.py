@@ -32,53 +32,29 @@ if TYPE_CHECKING:
     Row = tuple[float, int, int]  # seconds, particle substeps and frames, as in Pace
 
 
-RATES = "rates.json"
-"""File of the measured rates, in the user's cache."""
+MOST_BYTES = 1 << 16  # a longer file of rates is not ours [bytes]
+MOST_ROWS = 32  # numbers of particles per kind of solver that are kept, the latest ones
+SECONDS = Limit(low=0, high=1e9, open_low=True)  # processor time of the generations behind a rate [s]
+COUNT = Limit(low=1, high=1 << 60, whole=True)  # particle substeps, and frames
+RATIO = Limit(low=1e-3, high=1e4)  # time over that of the reference machine, one core of an EPYC server
 
-MOST_BYTES = 1 << 16
-"""A longer file of rates is not ours [bytes]."""
-
-MOST_ROWS = 32
-"""Numbers of particles per kind of solver that are kept, the latest ones."""
-
-SECONDS = Limit(low=0, high=1e9, open_low=True)
-"""Processor time of the generations behind a rate [s]."""
-
-COUNT = Limit(low=1, high=1 << 60, whole=True)
-"""Particle substeps, and frames."""
-
-RATIO = Limit(low=1e-3, high=1e4)
-"""Time over that of the reference machine, one core of an EPYC server."""
-
-SECONDS_PER_PARTICLE_SUBSTEP = 45e-9
-"""Time of one particle's substep on the reference machine [s]; ``benchmarks/test_solver_throughput.py``."""
-
-SECONDS_PER_FRAME = 2.3e-3
-"""Starting the kernels, reading out, checking and writing one frame there [s], of generations of mini."""
-
-SECONDS_TO_START = 5.0
-"""Starting a worker there, which imports Taichi and compiles the solver [s]; about half the next time."""
+# Of the reference machine [s]: one particle's substep (benchmarks/test_solver_throughput.py); starting the
+# kernels, reading out, checking and writing one frame of mini; starting a worker, which imports Taichi and
+# compiles the solver, about half the next time.
+SECONDS_PER_PARTICLE_SUBSTEP, SECONDS_PER_FRAME, SECONDS_TO_START = 45e-9, 2.3e-3, 5.0
 
 Selection = str | Sequence[str] | None
 Scenarios = str | Iterable[int] | None
 
 
-def _names(subset: Selection) -> tuple[str, ...]:
-    if subset is None:
-        return ()
-    return tuple(subset.replace(" ", "").split(",")) if isinstance(subset, str) else tuple(subset)
-
-
 def select(size: Size, *, subset: Selection = None, scenarios: Scenarios = None) -> tuple[int, ...]:
     """Return the scenario ids that a user means, ascending."""
-    names = _names(subset) or tuple(size.subsets)
+    names = subset.replace(" ", "").split(",") if isinstance(subset, str) else subset
+    names = tuple(names or size.subsets)
     for name in names:
         if name not in size.subsets:
-            raise UsageError(
-                f"{size.split} {size.name} has no subset {name!r}",
-                where="--subset",
-                fix=nearest(name, size.subsets),
-            )
+            what = f"{size.split} {size.name} has no subset {name!r}"
+            raise UsageError(what, where="--subset", fix=nearest(name, size.subsets))
     held = {i for name in names for i in size.subsets[name]}
     if scenarios is None:
         return tuple(sorted(held))
@@ -120,13 +96,9 @@ class Estimate:
 def estimate(
     size: Size, scenarios: Sequence[int], *, drawn: int | None = None, on_cores: bool = True
 ) -> Estimate:
-    """Return what simulating these scenarios takes.
+    """Return what simulating these scenarios takes; draw about so many, the others take as much per frame.
 
-    Args:
-        size: tier of a split.
-        scenarios: their ids.
-        drawn: draw about so many of them only; the others take what these do per frame. All when None.
-        on_cores: whether cores of this machine simulate, whose rate it may have measured.
+    ``on_cores``: whether cores of this machine simulate, whose rate it may have measured.
     """
     if not size.simulated:
         raise UsageError(
@@ -160,12 +132,7 @@ def estimate(
 
 
 def free_bytes(folder: Path) -> int:
-    """Return the free space of the file system that holds, or would hold, a folder [bytes].
-
-    Raises:
-        WorkFailedError: nothing can be written there: the nearest existing parent is a file, or
-            is not ours to write.
-    """
+    """Return the free space of the file system that holds, or would hold, a folder to write to [bytes]."""
     existing = next(place for place in (folder, *folder.parents) if place.exists())
     if not existing.is_dir() or not os.access(existing, os.W_OK | os.X_OK):
         raise WorkFailedError(
@@ -197,13 +164,11 @@ def reference_seconds(particle_substeps: int, frames: int) -> float:
 
 
 def measured_ratio(size: Size) -> float | None:
-    """Return what this machine took over the reference machine; None where it never timed that solver.
-
-    Of several numbers of particles the nearest counts: the reference tells small work from large.
-    """
+    """Return what this machine took over the reference machine; None where it never timed that solver."""
     rows = _read().get(_kind(size))
     if not rows:
         return None
+    # The nearest number of particles counts: the reference tells small work from large.
     seconds, *work = rows[min(rows, key=lambda particles: abs(math.log(particles / size.particles)))]
     return seconds / reference_seconds(*work)
 
@@ -222,7 +187,7 @@ def note_pace(size: Size, paces: Sequence[Pace]) -> None:
 
 
 def _path() -> Path:
-    return cache_folder("rates") / RATES
+    return cache_folder("rates") / "rates.json"
 
 
 def _kind(size: Size) -> str:
@@ -243,21 +208,15 @@ def _read() -> dict[str, dict[int, Row]]:
         held = json.loads(data)
         if held["machine"] != platform.node():
             return {}
-        return {
-            kind: dict(_checked(int(n), *row) for n, row in held.get(kind, {}).items())
-            for kind in ("closed_box", "free_surface")
-        }
+        rates: dict[str, dict[int, Row]] = {"closed_box": {}, "free_surface": {}}
+        for kind, rows in rates.items():
+            for particles, (seconds, substeps, frames) in held.get(kind, {}).items():
+                counts = NEEDED["particles"].holds(int(particles)) and COUNT.holds(substeps)
+                if not (counts and COUNT.holds(frames) and SECONDS.holds(seconds)):
+                    return {}
+                if not RATIO.holds(seconds / reference_seconds(substeps, frames)):
+                    return {}
+                rows[int(particles)] = (seconds, substeps, frames)
+        return rates
     except (OSError, ValueError, TypeError, KeyError, AttributeError, RuntimeError):
         return {}
-
-
-def _checked(particles: int, seconds: float, particle_substeps: int, frames: int) -> tuple[int, Row]:
-    if not (
-        NEEDED["particles"].holds(particles)
-        and SECONDS.holds(seconds)
-        and COUNT.holds(particle_substeps)
-        and COUNT.holds(frames)
-        and RATIO.holds(seconds / reference_seconds(particle_substeps, frames))
-    ):
-        raise ValueError(f"no machine takes {seconds} s for that")
-    return particles, (seconds, particle_substeps, frames)

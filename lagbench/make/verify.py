@@ -35,7 +35,6 @@ from .inventory import (
     record_of,
     recorded_hash,
     unlike,
-    unlike_measures,
 )
 from .plan import Scenarios, Selection, estimate, select
 
@@ -78,16 +77,15 @@ class VerificationResult:
 
     def check(self) -> None:
         """Raise unless everything that has to hold does."""
+        where = str(self.folder)
         if self.problems:
-            listing = "\n  ".join(self.problems)
-            raise DataError(
-                f"{len(self.problems)} problems\n  {listing}", where=str(self.folder), fix=self.fix
-            )
+            what = "\n  ".join([f"{len(self.problems)} problems", *self.problems])
+            raise DataError(what, where=where, fix=self.fix)
         if not any(report.present for report in self.subsets):
-            raise DataError("nothing is generated", where=str(self.folder), fix=self.fix)
+            raise DataError("nothing is generated", where=where, fix=self.fix)
         if self.must_be_complete and not self.complete:
             missing = ", ".join(f"{r.name} {spell_ids(r.missing)}" for r in self.subsets if r.missing)
-            where, got = str(self.folder), f"missing: {missing}"
+            got = f"missing: {missing}"
             raise DataError("the data set is incomplete", where=where, got=got, fix=self.fix)
 
 
@@ -151,22 +149,22 @@ def verify(
         findings[scenario] = examine(folder, tier, scenario, manifest=manifest)
         meter.count(1, scenarios=1)
     # Which files are right is noted, so that scorer and generator need not hash their values again.
-    hashed = {tier.path(folder, i): f.content_sha256 for i, f in findings.items()}
-    note(tier.folder(folder), {path: content for path, content in hashed.items() if content}, digests_of)
+    right = {i: f.content_sha256 for i, f in findings.items() if f.content_sha256}
+    note(tier.folder(folder), {tier.path(folder, i): content for i, content in right.items()}, digests_of)
     anew = _regenerate(tier, evenly_spaced(ids, regenerate), cores, meter)
     regenerated = {i: _likeness(tier, findings[i], content) for i, content in anew.items()}
     problems = [f.problem for f in findings.values() if f.problem]
-    problems += [f"scenario {i} differs when simulated anew" for i in anew if regenerated[i] == DIFFERENT]
+    problems += [f"scenario {i} differs when simulated anew" for i in anew if regenerated[i] == "different"]
     # A killed writer leaves files here that the store never got.
-    alone = unstored(tier, folder, [i for i in ids if findings[i].state is State.GOOD])
+    alone = unstored(tier, folder, [*right])
     problems += [f"scenario {i} is in the working copy alone, not in the store" for i in alone]
-    reports = _reports(folder, tier, ids, findings)
-    digests = {name: _subset_digest(tier, name, findings) for name in HASHED_SUBSETS}
-    known = {name: digest for name, digest in digests.items() if digest is not None}
-    whole = dataset_hash(tier.split, tier.name, tier.major, known) if len(known) == len(digests) else None
-    recorded = tier.measured.dataset_sha256 if tier.measured else None
+    full = {name: members for name, members in tier.subsets.items() if right.keys() >= {*members}}
+    digests = {name: subset_hash({i: right[i] for i in members}) for name, members in full.items()}
+    reports = _reports(folder, tier, findings, digests)
+    hashed = {name: digests.get(name, "") for name in HASHED_SUBSETS}
+    whole = dataset_hash(tier.split, tier.name, tier.major, hashed) if all(hashed.values()) else None
     tolerated = [i for i, finding in findings.items() if finding.tolerated]
-    verdict, wrong = hash_verdict(tier, whole, recorded, tolerated=bool(tolerated)), unlike(tier)
+    verdict, wrong = hash_verdict(tier, whole, tolerated=bool(tolerated)), unlike(tier)
     problems += [f"{r.name}: its hash is {wrong}" for r in reports if r.verdict == wrong]
     problems += [f"the data set hash is {wrong}"] if verdict == wrong else []
     gaps = [f"scenarios {spell_ids(tolerated)} have {other_bits(tier)}"] if tolerated else []
@@ -186,11 +184,6 @@ def verify(
         verdict=verdict,
         fix=remedy(tier, root=folder),
     )
-
-
-IDENTICAL = "identical"
-DIFFERENT = "different"
-INCOMPARABLE = "nothing to compare with"
 
 
 def evenly_spaced(ids: Sequence[int], count: int) -> tuple[int, ...]:
@@ -233,12 +226,12 @@ def _likeness(size: Size, finding: Finding, content: str) -> str:
     if finding.tolerated or not known:
         known += filter(None, [recorded_hash(size, finding.scenario)])
     if not known:
-        return INCOMPARABLE
-    return IDENTICAL if any(map(content.startswith, known)) else DIFFERENT
+        return "nothing to compare with"
+    return "identical" if any(map(content.startswith, known)) else "different"
 
 
 def _reports(
-    root: Path, size: Size, ids: Sequence[int], findings: Mapping[int, Finding]
+    root: Path, size: Size, findings: Mapping[int, Finding], digests: Mapping[str, str]
 ) -> tuple[SubsetReport, ...]:
     extra = extra_files(root, size)
     reports = []
@@ -254,21 +247,11 @@ def _reports(
                     wrong=by_state[State.WRONG],
                     extra=tuple(extra.get(name, ())),
                     verdict=hash_verdict(
-                        size,
-                        _subset_digest(size, name, findings),
-                        size.measured.subset_sha256.get(name) if size.measured else None,
-                        tolerated=any(finding.tolerated for finding in held.values()),
+                        size, digests.get(name), name, tolerated=any(f.tolerated for f in held.values())
                     ),
                 )
             )
     return tuple(reports)
-
-
-def _subset_digest(size: Size, name: str, findings: Mapping[int, Finding]) -> str | None:
-    """Return the hash of a subset; None unless every scenario of it is there and right."""
-    hashes = {i: findings[i].content_sha256 for i in size.subsets[name] if i in findings}
-    known = {i: content for i, content in hashes.items() if content is not None}
-    return subset_hash(known) if len(known) == len(size.subsets[name]) else None
 
 
 def _notes(size: Size, manifest: Manifest | None, findings: Mapping[int, Finding]) -> list[str]:
@@ -278,5 +261,11 @@ def _notes(size: Size, manifest: Manifest | None, findings: Mapping[int, Finding
     entries = {entry.scenario: entry.content_sha256 for entry in manifest.files}
     others = [i for i, f in findings.items() if i in entries and f.content_sha256 not in (None, entries[i])]
     notes = [f"the manifest has other hashes of {spell_ids(others)}"] if others else []
-    names = unlike_measures(size, manifest)
-    return notes + ([f"the manifest has another {', '.join(names)} than {record_of(size)}"] if names else [])
+    # What follows from the bits must be as recorded where all of them are.
+    if size.measured and manifest.complete and manifest.identity == "bitwise":
+        found = {**manifest.statistics, "twin floor": manifest.mean_twin_floor()}
+        known = {**size.measured.statistics, "twin floor": size.measured.twin_floor}
+        names = [*sorted((known.keys() | found.keys()) - {"twin floor"}), "twin floor"]
+        names = [name for name in names if found.get(name) != known.get(name)]
+        notes += [f"the manifest has another {', '.join(names)} than {record_of(size)}"] if names else []
+    return notes
