@@ -18,6 +18,7 @@ from .options import (
     SplitOption,
     WorkersOption,
     chosen,
+    option,
     root_of,
 )
 from .output import complain, counted, print_blocks, print_json, progress_bar, say, spell_bytes
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from lagbench.board.check import CheckResult
     from lagbench.board.submit import SubmitResult
 
-BoardOption = Annotated[Path, typer.Option("--board", metavar="FOLDER", help="The leaderboard's folder.")]
+BoardOption = Annotated[Path, option("--board FOLDER", "The leaderboard's folder.")]
 BOARD = Path("leaderboard")
 
 
@@ -37,35 +38,20 @@ def submit(
     ],
     source: Annotated[
         Path | None,
-        typer.Option(
-            "--from",
-            metavar="FILE",
-            help="YAML that describes the method, see docs/submitting.md; options win.",
-        ),
+        option("--from FILE", "YAML that describes the method, see docs/submitting.md; options win."),
     ] = None,
-    method: Annotated[
-        str | None, typer.Option("--method", metavar="ID", help="Names the entry, as in my-model.")
-    ] = None,
-    authors: Annotated[list[str] | None, typer.Option("--author", metavar="NAME", help="Repeatable.")] = None,
-    command: Annotated[
-        str | None, typer.Option("--command", metavar="TEXT", help="What makes the predictions again.")
-    ] = None,
-    urls: Annotated[
-        list[str] | None,
-        typer.Option("--url", metavar="URL", help="Where FILE can be had; one per FILE."),
-    ] = None,
+    method: Annotated[str | None, option("--method ID", "Names the entry, as in my-model.")] = None,
+    authors: Annotated[list[str] | None, option("--author NAME", "Repeatable.")] = None,
+    command: Annotated[str | None, option("--command TEXT", "What makes the predictions again.")] = None,
+    urls: Annotated[list[str] | None, option("--url URL", "Where FILE can be had; one per FILE.")] = None,
     weights: Annotated[
         list[Path] | None,
-        typer.Option(
-            "--weights", metavar="FILE", help="weights.pt to keep beside the entry; at most one a seed."
-        ),
+        option("--weights FILE", "weights.pt to keep beside the entry; at most one a seed."),
     ] = None,
-    replace: Annotated[bool, typer.Option("--replace", help="Replace the entry of that name.")] = False,
-    add: Annotated[
-        bool, typer.Option("--add", help="Add seeds to the entry of that name; its others stay.")
-    ] = False,
+    replace: Annotated[bool, option("--replace", "Replace the entry of that name.")] = False,
+    add: Annotated[bool, option("--add", "Add seeds to the entry of that name; its others stay.")] = False,
     new_board: Annotated[
-        bool, typer.Option("--new-board", help="Begin a leaderboard in --board, where there is none.")
+        bool, option("--new-board", "Begin a leaderboard in --board, where there is none.")
     ] = False,
     board: BoardOption = BOARD,
     root: RootOption = None,
@@ -129,9 +115,7 @@ leaderboard = typer.Typer(no_args_is_help=True, help="Draw, check and show the l
 @leaderboard.command("build", epilog="Example: lagbench leaderboard build")
 def build(
     board: BoardOption = BOARD,
-    check: Annotated[
-        bool, typer.Option("--check", help="Write nothing; fail where the page is stale.")
-    ] = False,
+    check: Annotated[bool, option("--check", "Write nothing; fail where the page is stale.")] = False,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
@@ -148,40 +132,29 @@ def build(
 def check(
     board: BoardOption = BOARD,
     base: Annotated[
-        str | None,
-        typer.Option(
-            "--base", metavar="REF", help="Find what the folder alters of entries that this commit has."
-        ),
+        str | None, option("--base REF", "Find what the folder alters of entries that this commit has.")
     ] = None,
     own: Annotated[
-        list[str] | None,
-        typer.Option("--own", metavar="METHOD", help="With --base: an entry of yours; repeatable."),
+        list[str] | None, option("--own METHOD", "With --base: an entry of yours; repeatable.")
     ] = None,
-    page: Annotated[bool, typer.Option("--page", help="Compare index.html and schema.json too.")] = False,
+    page: Annotated[bool, option("--page", "Compare index.html and schema.json too.")] = False,
     predictions: Annotated[
-        list[Path] | None,
-        typer.Option("--predictions", metavar="FILE", help="Score an entry's predictions again; repeatable."),
+        list[Path] | None, option("--predictions FILE", "Score an entry's predictions again; repeatable.")
     ] = None,
     recording: Annotated[
-        bool,
-        typer.Option("--record", help="With --predictions: note what is confirmed in verified.yaml."),
+        bool, option("--record", "With --predictions: note what is confirmed in verified.yaml.")
     ] = False,
     root: Annotated[
         Path | None,
-        typer.Option(
-            "--root",
-            parser=root_of,
-            metavar="FOLDER",
-            help="Where data sets live; without --predictions the shipped floors of those there are measured"
+        option(
+            "--root FOLDER",
+            "Where data sets live; without --predictions the shipped floors of those there are measured"
             " again.",
+            parser=root_of,
         ),
     ] = None,
-    split: Annotated[
-        str | None, typer.Option("--split", metavar="NAME", help="With --root: floors of this split only.")
-    ] = None,
-    size: Annotated[
-        str | None, typer.Option("--size", metavar="NAME", help="With --root: floors of this size only.")
-    ] = None,
+    split: Annotated[str | None, option("--split NAME", "With --root: floors of this split only.")] = None,
+    size: Annotated[str | None, option("--size NAME", "With --root: floors of this size only.")] = None,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
@@ -239,9 +212,7 @@ def picture(
     name: SplitArgument = None,
     split: SplitOption = None,
     size: NewSizeOption = None,
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="SVG file to write.")] = Path(
-        "cost.svg"
-    ),
+    output: Annotated[Path, option("--output -o FILE", "SVG file to write.")] = Path("cost.svg"),
     board: BoardOption = BOARD,
     quiet: QuietFlag = False,
 ) -> None:
@@ -263,13 +234,9 @@ def picture(
 def show(
     name: SplitArgument = None,
     split: SplitOption = None,
-    size: Annotated[
-        str | None, typer.Option("--size", metavar="NAME", help="tiny, mini or full; all by default.")
-    ] = None,
-    metric: Annotated[
-        list[str] | None, typer.Option("--metric", metavar="NAME", help="Metric to show; repeatable.")
-    ] = None,
-    wide: Annotated[bool, typer.Option("--wide", help="Show the first metrics of each data set.")] = False,
+    size: Annotated[str | None, option("--size NAME", "tiny, mini or full; all by default.")] = None,
+    metric: Annotated[list[str] | None, option("--metric NAME", "Metric to show; repeatable.")] = None,
+    wide: Annotated[bool, option("--wide", "Show the first metrics of each data set.")] = False,
     board: BoardOption = BOARD,
     as_json: JsonFlag = False,
 ) -> None:

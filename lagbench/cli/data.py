@@ -29,6 +29,7 @@ from .options import (
     SubsetOption,
     WorkersOption,
     chosen,
+    option,
 )
 from .output import print_json, print_table, progress_bar, show, spell_bytes, spell_seconds
 
@@ -61,13 +62,10 @@ def generate(
     device: DeviceOption = "cpu",
     scheduler: SchedulerOption = None,
     gather: Annotated[
-        list[Path] | None,
-        typer.Option("--gather", metavar="FOLDER", help="Take what another root has finished; repeatable."),
+        list[Path] | None, option("--gather FOLDER", "Take what another root has finished; repeatable.")
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Simulate anew what is there.")] = False,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Say what it takes: bytes, time, free disk.")
-    ] = False,
+    force: Annotated[bool, option("--force", "Simulate anew what is there.")] = False,
+    dry_run: Annotated[bool, option("--dry-run", "Say what it takes: bytes, time, free disk.")] = False,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
@@ -131,10 +129,8 @@ def verify(
     scenarios: ScenariosOption = None,
     root: RootOption = None,
     workers: WorkersOption = None,
-    regenerate: Annotated[
-        int, typer.Option("--regenerate", metavar="K", help="Simulate K scenarios anew and compare.", min=0)
-    ] = 0,
-    complete: Annotated[bool, typer.Option("--complete", help="Fail if anything is missing.")] = False,
+    regenerate: Annotated[int, option("--regenerate K", "Simulate K scenarios anew and compare.", min=0)] = 0,
+    complete: Annotated[bool, option("--complete", "Fail if anything is missing.")] = False,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
@@ -218,9 +214,7 @@ def _row(entry: Overview) -> tuple[object, ...]:
 def info(
     name: SplitArgument = None,
     split: SplitOption = None,
-    size: Annotated[
-        str | None, typer.Option("--size", metavar="NAME", help="One size in full; all in brief by default.")
-    ] = None,
+    size: Annotated[str | None, option("--size NAME", "One size in full; all in brief by default.")] = None,
     root: RootOption = None,
     as_json: JsonFlag = False,
 ) -> None:
@@ -287,9 +281,7 @@ def _facts(registry: Registry, split: str, sizes: list[Size], found: list[Overvi
 def cite(
     name: SplitArgument = None,
     split: SplitOption = None,
-    bibtex: Annotated[
-        bool, typer.Option("--bibtex", help="Print BibTeX; without a split, of lagbench itself.")
-    ] = False,
+    bibtex: Annotated[bool, option("--bibtex", "Print BibTeX; without a split, of lagbench itself.")] = False,
     root: RootOption = None,
     as_json: JsonFlag = False,
 ) -> None:
@@ -351,10 +343,8 @@ def clean(
     split: SplitOption = None,
     size: PresentSizeOption = None,
     root: RootOption = None,
-    leftovers: Annotated[
-        bool, typer.Option("--leftovers", help="Only temporary files of killed writers.")
-    ] = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would go.")] = False,
+    leftovers: Annotated[bool, option("--leftovers", "Only temporary files of killed writers.")] = False,
+    dry_run: Annotated[bool, option("--dry-run", "Say what would go.")] = False,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:

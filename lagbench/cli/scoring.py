@@ -21,6 +21,7 @@ from .options import (
     SplitOption,
     WorkersOption,
     chosen,
+    option,
 )
 from .output import complain, counted, print_blocks, print_json, progress_bar, say, show, spell_bytes
 
@@ -33,21 +34,18 @@ FilesArgument = Annotated[
     list[Path], typer.Argument(metavar="FILE...", help="A predictions.nc; several with --report.")
 ]
 OwnSplitOption = Annotated[
-    str | None,
-    typer.Option("--split", metavar="NAME", help="Split that they must be for; a local one by its folder."),
+    str | None, option("--split NAME", "Split that they must be for; a local one by its folder.")
 ]
-EveryFlag = Annotated[bool, typer.Option("--all", help="Show every metric.")]
-FloorsFlag = Annotated[bool, typer.Option("--all-floors", help="Show every floor, not only the best.")]
+EveryFlag = Annotated[bool, option("--all", "Show every metric.")]
+FloorsFlag = Annotated[bool, option("--all-floors", "Show every floor, not only the best.")]
 
 
 def template(
     name: SplitArgument = None,
     split: SplitOption = None,
     size: PresentSizeOption = None,
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="File to write.")] = Path(
-        "predictions.nc"
-    ),
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file of that name.")] = False,
+    output: Annotated[Path, option("--output -o FILE", "File to write.")] = Path("predictions.nc"),
+    overwrite: Annotated[bool, option("--overwrite", "Replace a file of that name.")] = False,
     root: RootOption = None,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
@@ -94,23 +92,18 @@ def score(
     root: RootOption = None,
     output: Annotated[
         Path | None,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="FOLDER",
-            help="Where scores go; beside predictions.nc by default, of other and of several files in folders"
+        option(
+            "--output -o FOLDER",
+            "Where scores go; beside predictions.nc by default, of other and of several files in folders"
             " named like them.",
         ),
     ] = None,
     report: Annotated[
-        Path | None,
-        typer.Option("--report", metavar="FOLDER", help="Write index.html with all figures there."),
+        Path | None, option("--report FOLDER", "Write index.html with all figures there.")
     ] = None,
     workers: WorkersOption = None,
     scheduler: SchedulerOption = None,
-    extras: Annotated[
-        str, typer.Option("--extras", metavar="NAMES", help="Extras with metrics, as in transport.")
-    ] = "",
+    extras: Annotated[str, option("--extras NAMES", "Extras with metrics, as in transport.")] = "",
     every: EveryFlag = False,
     floors: FloorsFlag = False,
     as_json: JsonFlag = False,
@@ -244,9 +237,7 @@ def compare(
         typer.Argument(metavar="A", help="scores.json or .nc, a folder of one or of seeds, predictions.nc."),
     ],
     second: Annotated[str, typer.Argument(metavar="B", help="Another, or the name of a floor.")],
-    metric: Annotated[
-        list[str] | None, typer.Option("--metric", metavar="NAME", help="Metric to compare by; repeatable.")
-    ] = None,
+    metric: Annotated[list[str] | None, option("--metric NAME", "Metric to compare by; repeatable.")] = None,
     root: RootOption = None,
     workers: WorkersOption = None,
     every: EveryFlag = False,

@@ -22,6 +22,7 @@ from .options import (
     SplitArgument,
     SplitOption,
     chosen,
+    option,
 )
 from .output import print_json, progress_bar, say, spell_seconds
 
@@ -32,60 +33,39 @@ if TYPE_CHECKING:
     from .machine import SolverBench
 
 EXTRA = "baselines"
-DeviceOption = Annotated[str, typer.Option("--device", metavar="NAME", help="cpu, cuda, or auto.")]
+DeviceOption = Annotated[str, option("--device NAME", "cpu, cuda, or auto.")]
 ThreadsOption = Annotated[
     int | None,
-    typer.Option(
-        "--threads",
-        metavar="N",
-        help="CPU threads; else OMP_NUM_THREADS, else its share of the cores.",
-        min=1,
-    ),
+    option("--threads N", "CPU threads; else OMP_NUM_THREADS, else its share of the cores.", min=1),
 ]
 
 
 def train(
     name: SplitArgument = None,
     baseline: Annotated[
-        str | None,
-        typer.Option("--baseline", metavar="NAME", help="Model, as in gns; see docs/baselines.md."),
+        str | None, option("--baseline NAME", "Model, as in gns; see docs/baselines.md.")
     ] = None,
     split: SplitOption = None,
     size: PresentSizeOption = None,
-    recipe: Annotated[
-        str | None, typer.Option("--recipe", metavar="NAME", help="Variant, as in short; or a YAML file.")
-    ] = None,
+    recipe: Annotated[str | None, option("--recipe NAME", "Variant, as in short; or a YAML file.")] = None,
     settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Change the recipe: training.steps=100; repeatable."),
+        list[str] | None, option("--set KEY=VALUE", "Change the recipe: training.steps=100; repeatable.")
     ] = None,
-    seed: Annotated[
-        int | None, typer.Option("--seed", metavar="N", help="Seed of all chance.", min=0)
-    ] = None,
+    seed: Annotated[int | None, option("--seed N", "Seed of all chance.", min=0)] = None,
     start: Annotated[
-        Path | None,
-        typer.Option("--start", metavar="FILE", help="weights.pt to start from; of another size perhaps."),
+        Path | None, option("--start FILE", "weights.pt to start from; of another size perhaps.")
     ] = None,
     root: RootOption = None,
     output: Annotated[
         Path | None,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="FOLDER",
-            help="By default in runs/, named after recipe, baseline and seed.",
-        ),
+        option("--output -o FOLDER", "By default in runs/, named after recipe, baseline and seed."),
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume/--no-resume", help="Go on with what is there.")] = True,
-    fresh: Annotated[bool, typer.Option("--fresh", help="Train anew whatever is there.")] = False,
+    resume: Annotated[bool, option("--resume/--no-resume", "Go on with what is there.")] = True,
+    fresh: Annotated[bool, option("--fresh", "Train anew whatever is there.")] = False,
     device: DeviceOption = "auto",
-    processes: Annotated[
-        int, typer.Option("--processes", metavar="N", help="Processes, one device each (DDP).", min=1)
-    ] = 1,
+    processes: Annotated[int, option("--processes N", "Processes, one device each (DDP).", min=1)] = 1,
     threads: ThreadsOption = None,
-    workers: Annotated[
-        int, typer.Option("--workers", metavar="N", help="Processes that read windows ahead.", min=0)
-    ] = 0,
+    workers: Annotated[int, option("--workers N", "Processes that read windows ahead.", min=0)] = 0,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
@@ -230,30 +210,19 @@ def _trained(result: TrainingResult, where: str) -> list[str]:
 
 def predict(
     checkpoint: Annotated[Path, typer.Argument(metavar="FILE", help="weights.pt or checkpoint.pt.")],
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="File to write.")] = Path(
-        "predictions.nc"
-    ),
-    size: Annotated[
-        str | None,
-        typer.Option("--size", metavar="NAME", help="Another size than that of the training."),
-    ] = None,
+    output: Annotated[Path, option("--output -o FILE", "File to write.")] = Path("predictions.nc"),
+    size: Annotated[str | None, option("--size NAME", "Another size than that of the training.")] = None,
     settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Change the model: model.average=true; repeatable."),
+        list[str] | None, option("--set KEY=VALUE", "Change the model: model.average=true; repeatable.")
     ] = None,
     root: RootOption = None,
     device: DeviceOption = "auto",
     threads: ThreadsOption = None,
     batch: Annotated[
-        int | None,
-        typer.Option("--batch", metavar="N", help="Scenarios side by side; 1 on a CPU, all on a GPU.", min=1),
+        int | None, option("--batch N", "Scenarios side by side; 1 on a CPU, all on a GPU.", min=1)
     ] = None,
-    method: Annotated[
-        str | None, typer.Option("--method", metavar="NAME", help="What the board shall call it.")
-    ] = None,
-    solver: Annotated[
-        bool, typer.Option("--bench/--no-bench", help="Time our solver too, for the speed-up.")
-    ] = True,
+    method: Annotated[str | None, option("--method NAME", "What the board shall call it.")] = None,
+    solver: Annotated[bool, option("--bench/--no-bench", "Time our solver too, for the speed-up.")] = True,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
@@ -338,7 +307,7 @@ def bench(
     what: Annotated[str, typer.Argument(metavar="WHAT", help="solver.")],
     split: SplitOption = None,
     size: NewSizeOption = None,
-    frames: Annotated[int, typer.Option("--frames", metavar="N", help="Frames to time.", min=1)] = 20,
+    frames: Annotated[int, option("--frames N", "Frames to time.", min=1)] = 20,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
