@@ -69,10 +69,7 @@ class _Held:
 
 
 def collect(
-    folder: str | Path,
-    *,
-    only: Collection[tuple[str, str]] | None = None,
-    registry: Registry | None = None,
+    folder: str | Path, *, only: Collection[tuple[str, str]] | None = None, registry: Registry | None = None
 ) -> Board:
     """Return the board of a leaderboard's folder.
 
@@ -104,12 +101,9 @@ def collect(
         try:
             size = described.size(entry.split, entry.size)
         except UsageError as error:
-            fix = error.fix
-            if entry.split not in described.splits:
-                fix = "install the package that adds the split; lagbench list names those that are known"
-            raise DataError(
-                error.what, where=str(place.path / path), expected=error.expected, fix=fix
-            ) from error
+            missing = "install the package that adds the split; lagbench list names those that are known"
+            fix, where = error.fix if entry.split in described.splits else missing, str(place.path / path)
+            raise DataError(error.what, where=where, expected=error.expected, fix=fix) from error
         current = is_current(entry.dataset, size)
         try:
             stored = [read_stored(place.path / path, size) for path in entry.score_paths]
@@ -322,12 +316,7 @@ class BuildResult:
     written: tuple[Path, ...]  # files that were missing or had other bytes
 
 
-def build(
-    board: str | Path,
-    *,
-    check: bool = False,
-    registry: Registry | None = None,
-) -> BuildResult:
+def build(board: str | Path, *, check: bool = False, registry: Registry | None = None) -> BuildResult:
     """Write the page and schema.json of a leaderboard's folder; files that are right stay untouched.
 
     Args:
@@ -351,10 +340,7 @@ def build(
     stale = [
         path
         for path, data in wanted.items()
-        if path.is_symlink()
-        or not path.is_file()
-        or path.stat().st_size != len(data)
-        or path.read_bytes() != data
+        if path.is_symlink() or not path.is_file() or path.read_bytes() != data
     ]
     if stale and check:
         raise ChecksFailedError(

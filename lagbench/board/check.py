@@ -113,10 +113,17 @@ def check_board(
     )
     for one in predictions:
         look.found += again.of_file(one)
-    measured = {f"{size.split} {size.name}": look.measured(size, root, progress) for size in floors}
-    confirmed = again.entries_confirmed()
-    whole = {entry.yaml_path.as_posix() for entry in confirmed}
-    recorded = confirmed if recording and not look.found else []
+    measured = {}
+    for size in floors:
+        names, unlike = measured_again(size, resolve_root(root), progress=progress)
+        measured[f"{size.split} {size.name}"] = names
+        for name, metrics in unlike.items():
+            more = f" and {len(metrics) - 3} more metrics" if len(metrics) > 3 else ""
+            where = f"{shipped_path(size).name}, {name}"
+            look.add("measured", where, f"other {', '.join(metrics[:3])}{more}")
+    confirmed = {one.score_file for one in again.confirmed}
+    whole = {entry.yaml_path: entry for entry in look.known if confirmed.issuperset(entry.score_paths)}
+    recorded = [*whole.values()] if recording and not look.found else []
     record(folder, recorded, datetime.datetime.now(datetime.UTC).date())
     looked = page and not look.found
     if looked:
@@ -131,7 +138,7 @@ def check_board(
         page_checked=looked,
         confirmed=tuple(again.confirmed),
         recorded=tuple(entry.yaml_path.as_posix() for entry in recorded),
-        partly=tuple(sorted({one.entry.as_posix() for one in again.confirmed} - whole)),
+        partly=tuple(sorted({one.entry.as_posix() for one in again.confirmed if one.entry not in whole})),
         floors=measured,
     )
 
@@ -211,21 +218,15 @@ class _Look:
         task = size if is_current(entry.dataset, size) else None
         stored = []
         for inner, said, made in zip(entry.score_paths, entry.score.files, entry.predictions, strict=True):
-            one = self._read(inner, said.sha256, task)
-            if one is None:
+            if (one := self._read(inner, said.sha256, task)) is None:
                 continue
-            expected = {
-                "split": entry.split,
-                "size": entry.size,
-                "dataset_version": entry.dataset.version,
-                "dataset_sha256": entry.dataset.sha256,
-                "predictions_sha256": made.sha256,
-            }
+            expected = {"split": entry.split, "size": entry.size, "dataset_version": entry.dataset.version}
+            expected |= {"dataset_sha256": entry.dataset.sha256, "predictions_sha256": made.sha256}
             found = {**one.scores.identity, "predictions_sha256": one.scores.predictions_sha256}
-            for name in (name for name, wanted in expected.items() if found[name] != wanted):
-                self.add("score_file", inner, f"{name} {ascii(found[name])[:80]}, not {expected[name]!a}")
-            wrong = list(impossible(one))
-            if wrong:
+            for name, wanted in expected.items():
+                if found[name] != wanted:
+                    self.add("score_file", inner, f"{name} {ascii(found[name])[:80]}, not {wanted!a}")
+            if wrong := list(impossible(one)):
                 self.add("values", inner, wrong[0] + f" and {len(wrong) - 1} more" * (len(wrong) > 1))
             else:
                 stored.append(one)
@@ -288,17 +289,6 @@ class _Look:
         except LagbenchError as error:
             self.found.append(finding_of("floor", error, path))
 
-    def measured(
-        self, size: Size, root: str | Path | None, progress: Callable[[Progress], None] | None
-    ) -> tuple[str, ...]:
-        """Measure the shipped floors of a data set again; return which were."""
-        names, unlike = measured_again(size, resolve_root(root), progress=progress)
-        for name, metrics in unlike.items():
-            more = f" and {len(metrics) - 3} more metrics" if len(metrics) > 3 else ""
-            where = f"{shipped_path(size).name}, {name}"
-            self.add("measured", where, f"other {', '.join(metrics[:3])}{more}")
-        return names
-
     def together(self) -> None:
         """Check what entries are to each other, and what else lies in the folder."""
         entries = self.known
@@ -325,12 +315,11 @@ class _Look:
                 if path not in told and path.parts[1:3] == files[0].parts[1:3]:
                     told.add(path)
                     self.add("twin", path, f"those of {files[0]}")
+        floors = {skeleton(floor): f"that of the floor {floor}" for floor in FLOORS}
         seen: dict[tuple[str, str, str], str] = {}
         for entry in (entry for entry in entries if entry.status is Status.ACTIVE):
-            for floor in FLOORS:
-                seen[entry.split, entry.size, skeleton(floor)] = f"that of the floor {floor}"
-            own = f"that of {entry.method}, {entry.name!a}"
-            other = seen.setdefault((entry.split, entry.size, skeleton(entry.name)), own)
+            name, own = skeleton(entry.name), f"that of {entry.method}, {entry.name!a}"
+            other = floors.get(name) or seen.setdefault((entry.split, entry.size, name), own)
             if other != own:
                 self.add("name", entry.yaml_path, other)
         scored = {path for entry in entries for path in entry.score_paths}
@@ -343,25 +332,22 @@ class _Look:
             lines = read_verified(self.folder)
         except LagbenchError as error:
             self.found.append(finding_of("verified", error, VERIFIED))
-            return
-        sound = {entry.yaml_path.as_posix() for entry in entries if verification_of(entry, lines)}
-        for named_path in sorted(lines.keys() - sound):
-            self.add("verified", VERIFIED, ascii(named_path)[:120])
+        else:
+            sound = {entry.yaml_path.as_posix() for entry in entries if verification_of(entry, lines)}
+            for named_path in sorted(lines.keys() - sound):
+                self.add("verified", VERIFIED, ascii(named_path)[:120])
 
 
 def _same(first: Summary | None, second: Summary | None) -> bool:
     if first is None or second is None:
         return False
-    pairs = zip(first.model_dump().values(), second.model_dump().values(), strict=True)
     return all(
-        one is two
-        if one is None or two is None
-        else math.isclose(one, two, rel_tol=TOLERANCE, abs_tol=1e-300)
-        for one, two in pairs
+        one is two if None in (one, two) else math.isclose(one, two, rel_tol=TOLERANCE, abs_tol=1e-300)
+        for (_, one), (_, two) in zip(first, second, strict=True)
     )
 
 
 def _spelt(summary: Summary | None) -> str:
     if summary is None:
         return "no such metric"
-    return ", ".join(f"{key} {value}" for key, value in summary.model_dump().items())
+    return ", ".join(f"{key} {value}" for key, value in summary)

@@ -141,8 +141,7 @@ def _budget(budget: EntryBudget | None) -> str:
         return ""
     hours = {"CPU": budget.cpu_hours, "GPU": budget.gpu_hours}
     said = [f"{text(value)} {kind} h" for kind, value in hours.items() if value]
-    weights = f"{_count(float(budget.windows))} windows" if budget.windows else ""
-    return " + ".join(said) or weights
+    return " + ".join(said) or (f"{_count(float(budget.windows))} windows" if budget.windows else "")
 
 
 def columns_of(tab: Tab, metrics: Mapping[str, Metric]) -> dict[str, Column]:

@@ -13,6 +13,7 @@ import enum
 import ipaddress
 import unicodedata
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, Literal, Self
@@ -92,22 +93,14 @@ def _visible(text: str) -> str:
 
 def _named_host(address: str) -> str:
     """Refuse hosts that read as another one, or that are no name that anybody could look up."""
-    try:
+    labels: list[str] = []
+    with suppress(ValueError):  # of what is no address, and of a name, which is no number
         host = urlsplit(address).hostname or ""
-    except ValueError:
-        host = ""
-    labels = host.split(".")
-    try:
+        labels = host.split(".")
         ipaddress.ip_address(host.strip("[]"))
         labels = []
-    except ValueError:
-        pass
-    if (
-        "@" in address
-        or "" in labels[:-1]
-        or len(labels) < 2
-        or any(part.startswith("xn--") for part in labels)
-    ):
+    puny = any(part.startswith("xn--") for part in labels)
+    if "@" in address or "" in labels[:-1] or len(labels) < 2 or puny:
         raise ValueError("is not the address of a named host, without user and punycode")
     return address
 

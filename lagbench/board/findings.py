@@ -34,7 +34,7 @@ class Check(NamedTuple):
     meaning: str
     what: str
     expected: str
-    fix: str
+    fix: str = RESCORE
 
 
 CHECKS: Mapping[str, Check] = MappingProxyType(
@@ -109,31 +109,26 @@ CHECKS: Mapping[str, Check] = MappingProxyType(
             "a score file of more than 1 MB",
             "a score file is too long",
             f"at most {MAX_SCORE_BYTES} bytes",
-            RESCORE,
         ),
         "score_file": Check(
             "a score file that was edited, cannot be read, or belongs to something else",
             "a score file is not the one that the scorer wrote",
             "the file of the entry, unchanged",
-            RESCORE,
         ),
         "values": Check(
             "a score file with values that no prediction can have",
             "no prediction has such scores",
             "scores of a prediction",
-            RESCORE,
         ),
         "score": Check(
             "a score block that the score files do not give",
             "the score block is not what the score files give",
             "what the score files give",
-            RESCORE,
         ),
         "budget": Check(
             "a budget, or its track, that those of the predictions do not give",
             "the budget is not what those of the predictions give",
             "no track, since the predictions have no budgets",
-            RESCORE,
         ),
         "weights": Check(
             "weights that are missing, edited, out of place, without an entry or of two; more than 40 MB of"
@@ -176,7 +171,6 @@ CHECKS: Mapping[str, Check] = MappingProxyType(
             "predictions that, scored again, give something else",
             "scored again, the predictions are not what the leaderboard says",
             "what the scorer gives",
-            RESCORE,
         ),
         "measured": Check(
             "a shipped score of a floor that is not what the data give, measured again",

@@ -108,16 +108,15 @@ class _Writer:
 
     def _series(self, row: Row | Floor, tab: Tab) -> dict[str, Any]:
         """Return curves of a row, and the means of each scenario of the main metrics."""
-        values, energy = row.values, row.energy
+        values = row.values
         return {
             "curves": {name: self._curve(curve) for name, curve in row.curves.items()},
-            "energy": None if energy is None else self._curve(energy),
+            "energy": row.energy and self._curve(row.energy),
             "spread": {name: _numbers(values[name].per_scenario) for name in tab.columns if name in values},
         }
 
     def _row(self, row: Row, tab: Tab, scale: float) -> dict[str, Any]:
-        entry, line = row.entry, row.verified
-        verified = "as submitted"
+        entry, line, verified = row.entry, row.verified, "as submitted"
         if line:
             verified = f"verified by the maintainers, lagbench {line.lagbench}, {line.date}"
         about = {
@@ -259,10 +258,8 @@ def spaced(length: int, count: int) -> list[int]:
     >>> spaced(10, 4), spaced(3, 5), spaced(7, 1)
     ([0, 3, 6, 9], [0, 1, 2], [6])
     """
-    if length <= count:
-        return list(range(length))
-    if count == 1:
-        return [length - 1]
+    if length <= count or count == 1:
+        return list(range(length))[-count:]
     return [i * (length - 1) // (count - 1) for i in range(count)]
 
 

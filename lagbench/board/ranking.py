@@ -55,34 +55,29 @@ def combine(seeds: Sequence[StoredScores]) -> dict[str, Combined]:
     metrics = [metric for metric in METRICS.values() if names.issuperset(metric.of)]
     scores = [aggregate(metrics, held.tallies) for held in seeds]
     common = [m.name for m in metrics if all(m.name in held for held in scores)]
-    return {name: _combined([held[name] for held in scores]) for name in common}
+    return {name: _combined(tuple(held[name] for held in scores)) for name in common}
 
 
-def _combined(scores: Sequence[Score]) -> Combined:
-    first, means = scores[0], tuple(held.mean for held in scores)
-    if len(scores) == 1:
-        return Combined(score=first, std=math.nan, means=means, seeds=tuple(scores))
-    score = Score(
-        metric=first.metric,
-        scenarios=first.scenarios,
-        frames=first.frames,
-        per_frame=mean_over_seeds([held.per_frame for held in scores]),
-        values=mean_over_seeds([held.values for held in scores]),
-        undefined=tuple(sum(counts) for counts in zip(*(held.undefined for held in scores), strict=True)),
-    )
+def _combined(seeds: tuple[Score, ...]) -> Combined:
+    score, means = seeds[0], tuple(held.mean for held in seeds)
+    if len(seeds) > 1:
+        score = replace(
+            score,
+            per_frame=mean_over_seeds([held.per_frame for held in seeds]),
+            values=mean_over_seeds([held.values for held in seeds]),
+            undefined=tuple(map(sum, zip(*(held.undefined for held in seeds), strict=True))),
+        )
     defined = [value for value in means if not math.isnan(value)]
     std = float(np.std(defined, ddof=1)) if len(defined) > 1 else math.nan
-    return Combined(score=score, std=std, means=means, seeds=tuple(scores))
+    return Combined(score=score, std=std, means=means, seeds=seeds)
 
 
 def summarise(scores: Mapping[str, Combined]) -> dict[str, Summary]:
     """Return what the score block of an entry says of the metrics: nine digits, null where undefined."""
     found = {}
     for name, held in scores.items():
-        low, high = held.interval
-        found[name] = Summary(
-            mean=digits(held.score.mean), std=digits(held.std), low=digits(low), high=digits(high)
-        )
+        mean, std, low, high = map(digits, (held.score.mean, held.std, *held.interval))
+        found[name] = Summary(mean=mean, std=std, low=low, high=high)
     return found
 
 
@@ -123,8 +118,7 @@ def write_floors(card: ScoreCard, folder: Folder) -> tuple[Path, ...]:
 
     Their pictures show the truth alone.
     """
-    written = []
-    header, preview = card.header, card.preview
+    written, header, preview = [], card.header, card.preview
     nothing = np.full_like(preview.vorticity[0], np.nan)
     truth = replace(
         preview,

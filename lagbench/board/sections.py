@@ -17,11 +17,8 @@ from .table import EXPLAINED, draw_table
 
 def lede(board: Board) -> Markup:
     """Return the sentence under the title."""
-    entries, checked = 0, 0
-    for tab in board.tabs:
-        entries += len(tab.rows)
-        checked += sum(row.verified is not None for row in tab.rows)
-    many = len(board.tabs)
+    rows = [row for tab in board.tabs for row in tab.rows]
+    entries, many, checked = len(rows), len(board.tabs), sum(row.verified is not None for row in rows)
     shown = f"{entries} {'entry' if entries == 1 else 'entries'} on {many} data set{'s' * (many != 1)}"
     told = f"those of {checked}" if checked else "none yet"
     return escaped(
@@ -58,10 +55,9 @@ def empty(board: Board) -> Markup:
     if not board.empty:
         return Markup("")
     split, size = board.empty[0]
-    names = ", ".join(f"{split} {size}" for split, size in board.empty)
-    commands = (
-        f"lagbench generate --split {split} --size {size}\nlagbench submit predictions.nc --from meta.yaml"
-    )
+    names = ", ".join(map(" ".join, board.empty))
+    commands = f"lagbench generate --split {split} --size {size}\n"
+    commands += "lagbench submit predictions.nc --from meta.yaml"
     first = "No entry yet" if board.tabs else "There are no entries yet"
     return tag(
         "section",
@@ -85,19 +81,14 @@ def overview(board: Board) -> Markup:
         method: [row.skill.mean for row in held.values() if row.skill and math.isfinite(row.skill.mean)]
         for method, held in rows.items()
     }
-
     # a gap counts as the best floor, so that nobody leads by the one data set that suits
     means = {method: sum(held) / len(board.tabs) for method, held in skills.items()}
-
-    def order(method: str) -> tuple[bool, float, str]:
-        return (not skills[method], -means[method], method)
-
     heads = [
         tag("th", tag("a", f"{tab.size.split} {tab.size.name}", href=f"#{tab.id}"), scope="col")
         for tab in board.tabs
     ]
     lines = []
-    for method in sorted(rows, key=order):
+    for method in sorted(rows, key=lambda method: (not skills[method], -means[method], method)):
         name = next(iter(rows[method].values())).entry.name
         cells = [_summary(rows[method].get(tab.id), tab, ranked[tab.id]) for tab in board.tabs]
         head = tag("th", clipped(name, 60), scope="row", class_="method")
@@ -145,20 +136,14 @@ def section(tab: Tab, metrics: Mapping[str, Metric]) -> Markup:
         f" {tab.size.particles} particles, predict the next {len(tab.frames)}. Ranked by {words(tab.ranking)}"
         f" over the horizon, {better} is better. Data set version {tab.size.version}, SHA-256 {sha256[:12]}…"
     )
+    region: dict[str, object] = {"role": "region", "aria_label": "Scores", "tabindex": 0}
     return tag(
         "section",
         tag("h2", f"{tab.title}, {tab.size.name}"),
         tag("p", facts, class_="facts"),
         tag("ul", *_tiles(tab, metrics), class_="tiles"),
         _tools(tab, presets_of(tab, columns_of(tab, metrics))),
-        tag(
-            "div",
-            draw_table(tab, metrics),
-            class_="table scroll",
-            role="region",
-            aria_label="Scores",
-            tabindex=0,
-        ),
+        tag("div", draw_table(tab, metrics), class_="table scroll", **region),
         tag("div", *(tag("p", note) for note in _notes(tab)), class_="notes"),
         tag("div", cost_figure(tab), class_="figures"),
         id=tab.id,
@@ -168,42 +153,34 @@ def section(tab: Tab, metrics: Mapping[str, Metric]) -> Markup:
 
 def _tiles(tab: Tab, metrics: Mapping[str, Metric]) -> Iterator[Markup]:
     ranked = [row for row in tab.rows if row.rank is not None]
-    columns = columns_of(tab, metrics)
-    ranking, speed_up = columns[tab.ranking], columns["speed_up"]
+    ranking = columns_of(tab, metrics)[tab.ranking]
     if ranked:
-        leader = ranked[0]
-        tied = sum(row.tied for row in ranked)
-        more = f", and {tied} that cannot be told from it" if tied else ""
+        leader, tied = ranked[0], sum(row.tied for row in ranked)
+        who = clipped(leader.entry.name, 40) + (f", and {tied} that cannot be told from it" if tied else "")
         if leader.skill:
-            yield _tile("skill of the leader", text(leader.skill.mean), f"{_short(leader)}{more}")
+            yield _tile("skill of the leader", text(leader.skill.mean), who)
         value = float(value_of(leader, ranking))
-        yield _tile(f"leader by {ranking.quantity}", text(value), f"{_short(leader)}{more}")
-        losses = {
-            floor.name: ranking.loss(float(value_of(floor, ranking))) for floor in tab.floors if floor.counts
-        }
-        known = {name: loss for name, loss in losses.items() if loss > 0.0}
+        yield _tile(f"leader by {ranking.quantity}", text(value), who)
+        losses = [(ranking.loss(float(value_of(one, ranking))), one.name) for one in tab.floors if one.counts]
+        known = [held for held in losses if held[0] > 0.0]
         if known and metrics[tab.ranking].direction is Direction.LOWER:
-            best = min(known, key=lambda name: known[name])
-            yield _tile("leader beside the best floor", f"{text(value / known[best], 2)}×", best)
+            loss, best = min(known, key=lambda held: held[0])
+            yield _tile("leader beside the best floor", f"{text(value / loss, 2)}×", best)
     # who is fast and learned nothing is no example
     learned = [row for row in ranked if row.skill and row.skill.mean > 0.0]
-    fast = [row for row in learned if row.entry.cost and row.entry.cost.speed_up]
+    fast = [
+        (cost.speed_up, row, cost.device) for row in learned if (cost := row.entry.cost) and cost.speed_up
+    ]
     if fast:
-        row = max(fast, key=lambda one: value_of(one, speed_up))
-        speed = float(value_of(row, speed_up))
-        beside = "slower" if speed < 1.0 else "faster"
-        device = row.entry.cost.device if row.entry.cost else ""
+        speed, row, device = max(fast, key=lambda held: held[0])
+        beside = f"{'slower' if speed < 1.0 else 'faster'} than the solver"
         yield _tile(
             "speed of the fastest entry with skill, solver = 1×",
             written(speed, "factor"),
-            f"{beside} than the solver: {_short(row)}, {device}; self-reported",
+            f"{beside}: {clipped(row.entry.name, 40)}, {device}; self-reported",
         )
     rest = len(tab.rows) - len(ranked)
     yield _tile("entries", str(len(ranked)), f"and {rest} not ranked" if rest else "all ranked")
-
-
-def _short(row: Row) -> str:
-    return clipped(row.entry.name, 40)
 
 
 def _tile(what: str, big: str, more: str) -> Markup:
@@ -217,22 +194,12 @@ def _tools(tab: Tab, presets: Mapping[str, Sequence[str]]) -> Markup:
         tag("button", name, type="button", data_preset=name, data_keys=" ".join(keys))
         for name, keys in presets.items()
     ]
-    inactive = tag(
-        "label",
-        tag("input", type="checkbox"),
-        f"inactive ({hidden})",
-        class_="check",
-        title="Withdrawn, superseded, or scored on old data",
-    )
+    box, old = tag("input", type="checkbox"), "Withdrawn, superseded, or scored on old data"
+    inactive = tag("label", box, f"inactive ({hidden})", class_="check", title=old)
+    hint = "Filter methods, authors, hardware"
     return tag(
         "div",
-        tag(
-            "input",
-            type="search",
-            placeholder="Filter methods, authors, hardware",
-            aria_label="Filter",
-            spellcheck="false",
-        ),
+        tag("input", type="search", placeholder=hint, aria_label="Filter", spellcheck="false"),
         tag("div", *buttons, class_="presets", role="group", aria_label="Columns"),
         inactive if hidden else "",
         tag("span", class_="count muted", role="status"),

@@ -131,7 +131,7 @@ def _cell(row: Row | Floor, column: Column, shades: _Shades, *, main: bool, rank
     plain = round_digits(value) if isinstance(value, float) else value
     ends = (found.low, found.high) if found else (math.nan, math.nan)
     bounds = interval(ends)
-    title = [] if not bounds else [f"95 %: {text(ends[0])} … {text(ends[1])}"]
+    title = [f"95 %: {text(ends[0])} … {text(ends[1])}"] if bounds else []
     if found is not None and not math.isnan(found.std):
         title.append(f"± {text(found.std)} over seeds")
     undefined = found.undefined if found else 0
@@ -175,16 +175,10 @@ def _line(tab: Tab, row: Row | Floor, number: int, cells: Sequence[Markup]) -> M
         for name in ("code", "paper", "weights")
         if (address := getattr(entry, name)) and address.startswith(("http://", "https://"))
     ]
-    kept = [made for made in entry.predictions if made.weights]
-    links += [
-        tag(
-            "a",
-            "weights" if len(kept) == 1 else f"weights {made.seed}",
-            href=weights_path(entry.place, made.seed).as_posix(),
-        )
-        for made in kept
-        if not entry.weights
-    ]
+    kept = [made.seed for made in entry.predictions if made.weights and not entry.weights]
+    for seed in kept:
+        label = "weights" if len(kept) == 1 else f"weights {seed}"
+        links.append(tag("a", label, href=weights_path(entry.place, seed).as_posix()))
     method = tag(
         "th",
         tag("a", entry.name, href=f"#tab={tab.id}&entry={row.id}", class_="name"),
