@@ -16,17 +16,14 @@ from typing import Any
 import numpy as np
 import yaml
 
-from lagbench.data.registry import Registry
 from lagbench.errors import ChecksFailedError, UnreadableFileError, UsageError
 from lagbench.metrics.aggregate import Tally
 from lagbench.metrics.table import METRICS, STATISTICS
 from lagbench.scoring.card import ScoreCard
-from lagbench.scoring.score import score
 from lagbench.scoring.score_file import FILM_RANGE, LEVELS, StoredScores, write_statistics
 from lagbench.scoring.stored import read_stored
 from lagbench.scoring.task import LONG_BITS, LONG_ROLLOUT, SUBMISSION
 from lagbench.submission.findings import Finding
-from lagbench.work.progress import Progress
 
 from .entry import Entry, Prediction, ScoredFile
 from .entry_file import MAX_ENTRY_BYTES
@@ -57,9 +54,7 @@ class Rescoring:
     folder: Folder
     entries: Sequence[Entry]
     sound: Collection[Path]  # score files that can be read
-    registry: Registry
-    root: str | Path | None = None  # folder of all data sets
-    progress: Callable[[Progress], None] | None = None
+    card: Callable[..., ScoreCard]  # of predictions and extras that measure more
     confirmed: list[Confirmation] = field(default_factory=list)
 
     def of_file(self, path: str | Path) -> Iterator[Finding]:
@@ -70,7 +65,7 @@ class Rescoring:
         """
         where = str(path)
         try:
-            card = self._card(path)
+            card = self.card(path)
         except (UnreadableFileError, ChecksFailedError) as error:
             got = f"{error.what}: {error.got}"
             fix = "lagbench validate says what is wrong"
@@ -96,11 +91,6 @@ class Rescoring:
             if inner in self.sound:  # of others the checks of score files tell
                 yield from self._compared(path, card, entry, made, inner, said)
 
-    def _card(self, path: str | Path, extras: Collection[str] = ()) -> ScoreCard:
-        return score(
-            path, root=self.root, registry=self.registry, progress=self.progress, extras=extras, write=False
-        )
-
     def _compared(
         self, path: str | Path, card: ScoreCard, entry: Entry, made: Prediction, inner: Path, said: ScoredFile
     ) -> Iterator[Finding]:
@@ -110,7 +100,7 @@ class Rescoring:
         measured = {METRICS[name].extra for name in statistics if name in METRICS}
         if extras := sorted(extra for extra in measured if extra is not None):
             try:
-                card = self._card(path, extras)
+                card = self.card(path, extras=extras)
             except UsageError as error:
                 got = f"{error.what}, which measures some of them"
                 yield finding("rescored", where, got, expected=f"the statistics of {inner}")

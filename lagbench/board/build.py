@@ -30,6 +30,7 @@ from lagbench.submission.task_checks import frames_to_predict
 
 from .entry import Cost, Entry, Status, Verification
 from .entry_file import read_entry, read_verified, schema_bytes, verification_of
+from .findings import CHECKS
 from .folder import PAGE, SCHEMA, Folder
 from .model import Board, Curve, Floor, Histogram, Pictures, Row, Tab, Value
 from .page import LINKS, render
@@ -71,12 +72,7 @@ class _Held:
 def collect(
     folder: str | Path, *, only: Collection[tuple[str, str]] | None = None, registry: Registry | None = None
 ) -> Board:
-    """Return the board of a leaderboard's folder.
-
-    Args:
-        folder: the leaderboard's folder.
-        only: the (split, size) to read; all when None.
-        registry: where splits are described; ours when None.
+    """Return the board of a leaderboard's folder; of some (split, size) ``only``, or of all.
 
     Raises:
         UsageError: no leaderboard there.
@@ -92,12 +88,8 @@ def collect(
             continue
         entry = read_entry(place.path / path)
         if entry.yaml_path != path:
-            raise ChecksFailedError(
-                "an entry lies in another place than it says",
-                where=str(path),
-                expected=str(entry.yaml_path),
-                fix="let split, size and method be those of the path",
-            )
+            what, expected = "an entry lies in another place than it says", str(entry.yaml_path)
+            raise ChecksFailedError(what, where=str(path), expected=expected, fix=CHECKS["place"].fix)
         try:
             size = described.size(entry.split, entry.size)
         except UsageError as error:
@@ -112,14 +104,13 @@ def collect(
                 raise
             continue  # old scores that do not fit the task of today
         scores = combine([held.scores for held in stored])
-        lacking = [name for name in (stored[0].scores.ranking, *ENERGIES) if name not in scores]
-        if lacking:
-            raise UnreadableFileError(
+        if lacking := [name for name in (stored[0].scores.ranking, *ENERGIES) if name not in scores]:
+            what, where = (
                 "a score file lacks metrics that every one has",
-                where=str(place.path / entry.score_paths[0]),
-                expected=", ".join(lacking),
-                fix="score the predictions again: lagbench submit",
+                str(place.path / entry.score_paths[0]),
             )
+            fix = "score the predictions again: lagbench submit"
+            raise UnreadableFileError(what, where=where, expected=", ".join(lacking), fix=fix)
         held = _Held(entry=entry, current=current, stored=stored, scores=scores)
         found.setdefault((entry.split, entry.size), []).append(held)
     verified, tabs, empty = read_verified(place), [], []
@@ -319,10 +310,7 @@ class BuildResult:
 def build(board: str | Path, *, check: bool = False, registry: Registry | None = None) -> BuildResult:
     """Write the page and schema.json of a leaderboard's folder; files that are right stay untouched.
 
-    Args:
-        board: the leaderboard's folder.
-        check: write nothing, fail where a file would change.
-        registry: where splits are described; ours when None.
+    With ``check`` nothing is written: a file that would change is an error.
 
     Raises:
         UsageError: no leaderboard there.

@@ -13,6 +13,7 @@ import math
 import stat
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from lagbench.errors import LagbenchError, UnreadableFileError, UsageError
 from lagbench.floors.shipped import shipped_path
 from lagbench.floors.table import FLOORS
 from lagbench.scoring.floors import measured_again
+from lagbench.scoring.score import score
 from lagbench.scoring.stored import MAX_SCORE_BYTES, Stored, read_stored, unreadable_in_child
 from lagbench.submission.findings import Finding
 from lagbench.work.progress import Progress
@@ -72,20 +74,11 @@ def check_board(
     root: str | Path | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> CheckResult:
-    """Check entries, score files and aggregates of a leaderboard's folder.
+    """Check entries, score files and aggregates of a leaderboard's folder; the page once all else is well.
 
-    Args:
-        board: the leaderboard's folder.
-        registry: where splits are described; ours when None.
-        page: whether to compare the page too, once nothing else is wrong.
-        base: git revision; entries that were there and that the folder alters are findings.
-        own: methods that may be altered all the same.
-        isolated: whether to read score files in a child process first.
-        predictions: predictions of entries to score again.
-        recording: whether to note entries thus confirmed in verified.yaml.
-        floors: sizes whose shipped floors are measured again.
-        root: folder of all data sets, for both.
-        progress: told how far that scoring is.
+    Entries of the git revision ``base`` that the folder alters are findings, unless of methods in ``own``.
+    With ``isolated`` a child process reads score files first. Scored again are ``predictions`` of entries,
+    noted in verified.yaml with ``recording``, and the shipped floors of the sizes ``floors``.
 
     Raises:
         UsageError: no leaderboard there, or git does not know the base.
@@ -103,14 +96,8 @@ def check_board(
     look.together()
     if base is not None:
         look.found += check_base(folder, base, own)
-    again = Rescoring(
-        folder=folder,
-        entries=look.known,
-        sound=look.sound,
-        registry=described,
-        root=root,
-        progress=progress,
-    )
+    card = partial(score, root=root, registry=described, progress=progress, write=False)
+    again = Rescoring(folder=folder, entries=look.known, sound=look.sound, card=card)
     for one in predictions:
         look.found += again.of_file(one)
     measured = {}

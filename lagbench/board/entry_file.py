@@ -98,11 +98,7 @@ def read_entry(path: Path) -> Entry:
 
 
 def read_meta(path: Path | None, options: Mapping[str, object]) -> Meta:
-    """Return what a YAML file and options say; options win.
-
-    Args:
-        path: a YAML file, or None.
-        options: keys of :class:`Meta` to values; None and empty ones are not given.
+    """Return what a YAML file and options say; options win, None and empty ones are not given.
 
     Raises:
         UnreadableFileError: no regular file, too long, or no plain YAML.

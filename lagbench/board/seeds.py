@@ -49,8 +49,7 @@ def _alike(trainings: Sequence[str]) -> list[str]:
 def extendable(folder: Folder, place: Place, headers: Sequence[Header], meta: Meta) -> Entry:
     """Return the entry that gets more seeds; refuse one that files of other seeds do not belong to.
 
-    Its own predictions need not be at hand: what they were called and scored is read from its score files,
-    which must be those that it names. What ``meta`` says of parameters or training is not compared.
+    Its own predictions need not be at hand: what they were called is read from its score files.
     """
     path, first = folder.path / entry_path(place), headers[0]
     anew = "or submit all seeds anew: --replace"

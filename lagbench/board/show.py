@@ -33,10 +33,7 @@ def chosen_data_sets(
 def tables(board: Board, metrics: Collection[str] = (), *, wide: bool = False) -> Iterator[Table]:
     """Yield a table per tab: ranked rows, then floors, then what is not ranked.
 
-    Args:
-        board: the board.
-        metrics: names of metrics to show beside skill and the ranking one.
-        wide: whether to show the tab's first metrics too.
+    ``metrics`` are shown beside skill and the ranking one, with ``wide`` the tab's first metrics too.
 
     Raises:
         UsageError: a metric that the board does not have.

@@ -97,22 +97,11 @@ def submit(
     progress: Callable[[Progress], None] | None = None,
     examined: Callable[[ValidationResult], None] | None = None,
 ) -> SubmitResult:
-    """Score predictions and write their entry and score files, and those of the floors beside them.
+    """Score predictions, a file per seed; write entry and score files, and those of floors beside them.
 
-    Args:
-        predictions: one predictions.nc per seed.
-        meta: what is said of the method.
-        weights: weights that made the predictions, to keep beside the entry: at most one per seed.
-        board: the leaderboard's folder.
-        root: folder of all data sets.
-        replace: whether an entry of that name may be replaced.
-        add: whether the files are further seeds of the entry of that name, whose other predictions need not
-            be at hand. What it says of the method stays, but for what ``meta`` says.
-        new_board: whether to begin a leaderboard where there is none.
-        workers: worker processes of the scorer.
-        registry: where splits are described; ours when None.
-        progress: told how far the scoring is.
-        examined: told what the validation of each file found.
+    ``weights`` made the predictions and are kept beside the entry: at most one file per seed. With ``add``
+    the files are further seeds of the entry of that name, whose other predictions need not be at hand; what
+    it says of the method stays, but for what ``meta`` says. ``examined`` is told what each validation found.
 
     Raises:
         UsageError: a key is missing, the entry is there already or, with ``add``, is not or has changed

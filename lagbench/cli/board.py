@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -63,8 +64,7 @@ def submit(
     from lagbench.board.entry_file import read_meta
     from lagbench.board.submit import submit as run
 
-    given = {"method": method, "authors": authors, "command": command, "urls": urls}
-    meta = read_meta(source, given)
+    meta = read_meta(source, {"method": method, "authors": authors, "command": command, "urls": urls})
     with progress_bar(quiet=quiet or as_json) as draw:
         result = run(
             predictions,
@@ -79,34 +79,27 @@ def submit(
             progress=draw,
             examined=complain,
         )
-    if as_json:
-        print_json(result)
-    else:
-        _submitted(result, quiet=quiet)
+    tell(result, _submitted(result), as_json=as_json, quiet=quiet)
 
 
-def _submitted(result: SubmitResult, *, quiet: bool) -> None:
+def _submitted(result: SubmitResult) -> Iterator[str]:
     from lagbench.board.folder import VERIFIED
 
     mean = "undefined" if result.mean is None else f"{result.mean:.4g}"
     spread = "" if result.std is None else f" ± {result.std:.2g} over seeds"
-    say(f"{result.method} on {result.split} {result.size}: {result.ranking} {mean}{spread}", quiet=quiet)
-    for flag in result.flags:
-        say(f"flag {flag}: raised", quiet=quiet)
-    if result.size == "tiny" and result.board == BOARD and not quiet:
+    yield f"{result.method} on {result.split} {result.size}: {result.ranking} {mean}{spread}"
+    yield from (f"flag {flag}: raised" for flag in result.flags)
+    if result.size == "tiny" and result.board == BOARD:
         advice = "it is for trying out: --board trial --new-board"
         typer.echo(f"warning: tiny has too few scenarios to rank anything; {advice}", err=True)
-    say("written: " + ", ".join(str(path) for path in result.files), quiet=quiet)
+    yield "written: " + ", ".join(map(str, result.files))
     for what, paths in {"kept": result.kept, "removed": result.removed}.items():
         if paths:
-            say(f"{what}, of the entry before: " + ", ".join(map(str, paths)), quiet=quiet)
+            yield f"{what}, of the entry before: " + ", ".join(map(str, paths))
     if result.board / VERIFIED in result.files:
-        say("its line of verified.yaml is gone: maintainers score the entry again", quiet=quiet)
+        yield "its line of verified.yaml is gone: maintainers score the entry again"
     where = "" if result.board == BOARD else f" --board {result.board}"
-    say(
-        f"next: lagbench leaderboard check{where}; to look at it: lagbench leaderboard build{where}",
-        quiet=quiet,
-    )
+    yield f"next: lagbench leaderboard check{where}; to look at it: lagbench leaderboard build{where}"
 
 
 leaderboard = typer.Typer(no_args_is_help=True, help="Draw, check and show the leaderboard.")
@@ -166,11 +159,8 @@ def check(
         raise UsageError("--split and --size say whose floors are measured again", fix="give --root as well")
     sizes = measured_sizes(root, split=split, name=size) if root and not predictions else []
     if root and not predictions and not sizes:
-        raise DataError(
-            "no test scenarios are there",
-            where=str(root),
-            fix="make them with `lagbench generate`, or name another --root",
-        )
+        fix = "make them with `lagbench generate`, or name another --root"
+        raise DataError("no test scenarios are there", where=str(root), fix=fix)
     with progress_bar(quiet=quiet or as_json) as draw:
         result = check_board(
             board,
@@ -183,28 +173,23 @@ def check(
             root=root,
             progress=draw,
         )
-    if as_json:
-        print_json(result)
-    else:
-        _checked(result, recording=recording, quiet=quiet)
+    for finding in () if as_json else result.findings:
+        typer.echo(str(finding), err=True)
+    tell(result, _checked(result, recording=recording), as_json=as_json, quiet=quiet)
     raise typer.Exit(result.exit_code)
 
 
-def _checked(result: CheckResult, *, recording: bool, quiet: bool) -> None:
-    for finding in result.findings:
-        typer.echo(str(finding), err=True)
+def _checked(result: CheckResult, *, recording: bool) -> Iterator[str]:
     for one in result.confirmed:
         close = "exactly" if one.difference == 0.0 else f"to {one.difference:.1e}, relative"
-        say(f"{one.predictions}: confirms {one.score_file} of {one.entry} {close}", quiet=quiet)
-    for name, floors in result.floors.items():
-        say(f"{name}: measured again {', '.join(floors)}", quiet=quiet)
-    for entry in result.recorded:
-        say(f"recorded as verified: {entry}", quiet=quiet)
+        yield f"{one.predictions}: confirms {one.score_file} of {one.entry} {close}"
+    yield from (f"{name}: measured again {', '.join(floors)}" for name, floors in result.floors.items())
+    yield from (f"recorded as verified: {entry}" for entry in result.recorded)
     for entry in result.partly if recording and not result.findings else ():
-        say(f"not recorded: {entry}: give the predictions of all its seeds in one call", quiet=quiet)
+        yield f"not recorded: {entry}: give the predictions of all its seeds in one call"
     state = counted(len(result.findings), "finding") if result.findings else "nothing wrong"
     looked = ", page compared" if result.page_checked else ""
-    say(f"{result.folder}: {counted(result.entries, 'entry')}, {state}{looked}", quiet=quiet)
+    yield f"{result.folder}: {counted(result.entries, 'entry')}, {state}{looked}"
 
 
 @leaderboard.command("picture", epilog="Example: lagbench leaderboard picture cavity --size mini -o cost.svg")

@@ -34,7 +34,7 @@ from .options import (
 from .output import print_json, print_table, progress_bar, show, spell_bytes, spell_seconds
 
 if TYPE_CHECKING:
-    from lagbench.data.registry import Registry, Size
+    from lagbench.data.registry import Size
     from lagbench.make.generate import GenerationResult
     from lagbench.make.inventory import Overview
     from lagbench.make.verify import VerificationResult
@@ -44,11 +44,8 @@ TITLE = (
     "for neural surrogates of Lagrangian continuum simulators"
 )
 ESTIMATED = "estimated; measured after the first generate"
-MEASURED = "at the rate measured here"
-"""Where an expected time comes from."""
-
-RELEASED = 2026
-"""Year of this version; it and the title as in CITATION.cff."""
+MEASURED = "at the rate measured here"  # where an expected time comes from
+RELEASED = 2026  # year of this version; it and the title as in CITATION.cff
 
 
 def generate(
@@ -108,10 +105,7 @@ def _generated(result: GenerationResult) -> list[str]:
     done = f"{to_do} scenarios simulated {took}, {len(result.kept)} kept"
     if not to_do:
         done = f"nothing to simulate, {len(result.kept)} scenarios are there; checked {took}"
-    lines = [
-        f"{result.split} {result.size}: {done}",
-        f"  folder  {result.folder}",
-    ]
+    lines = [f"{result.split} {result.size}: {done}", f"  folder  {result.folder}"]
     if (url := url_of(result.root)) is not None:
         lines.append(f"  store   {url}/{result.folder.relative_to(result.root).as_posix()}")
     if result.missing:
@@ -241,7 +235,17 @@ def info(
         for one, tier in zip(found, sizes, strict=True):
             yield from _details(one, tier)
 
-    show(_facts(registry, split_name, sizes, found), told(), as_json=as_json)
+    described = {
+        tier.name: {
+            "overview": one,
+            "parameters": {name: p.model_dump() for name, p in tier.parameters.items()},
+            "task": tier.task.model_dump(),
+            **{key: getattr(tier, key) for key in ("subsets", "bounds", "dt", "frame_interval")},
+        }
+        for tier, one in zip(sizes, found, strict=True)
+    }
+    head = {key: getattr(entry, key) for key in ("version", "title", "description", "citation", "licence")}
+    show({"split": split_name, **head, "sizes": described}, told(), as_json=as_json)
 
 
 def _details(entry: Overview, size: Size) -> list[str]:
@@ -258,24 +262,6 @@ def _details(entry: Overview, size: Size) -> list[str]:
         f"  folder     {entry.folder} (there: {entry.state})",
         f"  picture    {entry.picture or 'none'}",
     ]
-
-
-def _facts(registry: Registry, split: str, sizes: list[Size], found: list[Overview]) -> dict[str, object]:
-    entry = registry.split(split)
-    described = {
-        tier.name: {
-            "overview": one,
-            "parameters": {name: p.model_dump() for name, p in tier.parameters.items()},
-            "subsets": tier.subsets,
-            "task": tier.task.model_dump(),
-            "bounds": tier.bounds,
-            "dt": tier.dt,
-            "frame_interval": tier.frame_interval,
-        }
-        for tier, one in zip(sizes, found, strict=True)
-    }
-    head = {key: getattr(entry, key) for key in ("version", "title", "description", "citation", "licence")}
-    return {"split": split, **head, "sizes": described}
 
 
 def cite(

@@ -100,13 +100,9 @@ def _folder(folder: Path) -> str:
         return f"{folder}, {free_bytes(folder)} bytes free"
 
 
-WARM_UP = 2
-"""Frames before the clock starts: kernels compile when they first run."""
-
+WARM_UP = 2  # frames before the clock starts: kernels compile when they first run
 FRAMES = 20
-
-LEAST = 0.5
-"""Shortest time over which the mean is taken [s]."""
+LEAST = 0.5  # shortest time over which the mean is taken [s]
 
 
 @dataclass(frozen=True, kw_only=True)

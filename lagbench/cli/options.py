@@ -60,10 +60,10 @@ def chosen(argument: str | None, option: str | None) -> str:
     """
     given = {name for name in (argument, option) if name is not None}
     if len(given) != 1:
-        raise UsageError(
-            "two splits are named" if given else "no split is named",
-            where="--split",
-            got=" and ".join(sorted(given)) or None,
-            fix="name one, as in --split cavity; `lagbench list` shows them",
+        what, got = (
+            f"{'two splits are' if given else 'no split is'} named",
+            " and ".join(sorted(given)) or None,
         )
+        fix = "name one, as in --split cavity; `lagbench list` shows them"
+        raise UsageError(what, where="--split", got=got, fix=fix)
     return given.pop()

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -70,9 +69,9 @@ def validate(
     """Check a predictions.nc and say all that is wrong with it and how to mend it."""
     from lagbench.submission.validation import validate as run
 
-    wanted = _wanted(split, root)
-    result = run(predictions, root=wanted.root)
-    wanted.check(result)
+    root, check = _wanted(split, root)
+    result = run(predictions, root=root)
+    check(result)
     words = [str(finding) for finding in result.findings]
     for reason in dict.fromkeys(result.skipped.values()):
         checks = ", ".join(check for check, why in result.skipped.items() if why == reason)
@@ -114,8 +113,12 @@ def score(
 
     if len(predictions) > 1 and report is None:
         raise UsageError("several files are scored for one report", fix="add --report FOLDER")
-    targets, wanted = _targets(predictions, output), _wanted(split, root)
-    root = wanted.root
+    targets, (root, check) = _targets(predictions, output), _wanted(split, root)
+
+    def examined(result: ValidationResult) -> None:
+        check(result)
+        complain(result)
+
     together = _checked_together(predictions, root) if len(predictions) > 1 else [None]
     if report is not None:
         from lagbench.report.report import check_folder
@@ -132,7 +135,7 @@ def score(
                 scheduler=scheduler,
                 extras=tuple(name for name in extras.split(",") if name),
                 progress=draw,
-                examined=wanted.complain,
+                examined=examined,
                 validated=validated,
             )
         cards.append(card)
@@ -197,38 +200,20 @@ def _checked_together(predictions: Sequence[Path], root: Path | None) -> list[Va
     return results
 
 
-@dataclass(frozen=True)
-class _Wanted:
-    """The split that predictions must be for, if the user says, and the root folder of its data."""
+def _wanted(split: str | None, root: Path | None) -> tuple[Path | None, Callable[[ValidationResult], None]]:
+    """Return the root, which the path of a local split names, and what refuses predictions for another."""
+    name = None
+    if split is not None:
+        from lagbench.data.local import home
 
-    name: str | None
-    root: Path | None
+        name, root, _ = home(split, root=root)
 
-    def check(self, result: ValidationResult) -> None:
-        """Refuse predictions for another split."""
-        if self.name is not None and result.split not in (None, self.name):
-            raise UsageError(
-                "the predictions are for another split",
-                where=str(result.path),
-                expected=self.name,
-                got=ascii(result.split),
-                fix="name that one, or leave --split out",
-            )
+    def check(result: ValidationResult) -> None:
+        if name is not None and result.split not in (None, name):
+            what, fix = "the predictions are for another split", "name that one, or leave --split out"
+            raise UsageError(what, where=str(result.path), expected=name, got=ascii(result.split), fix=fix)
 
-    def complain(self, result: ValidationResult) -> None:
-        """Refuse predictions for another split; else tell what rejects the file."""
-        self.check(result)
-        complain(result)
-
-
-def _wanted(split: str | None, root: Path | None) -> _Wanted:
-    """Return what --split and --root say together: the path of a local split names its root."""
-    if split is None:
-        return _Wanted(None, root)
-    from lagbench.data.local import home
-
-    found = home(split, root=root)
-    return _Wanted(found.name, found.root)
+    return root, check
 
 
 def compare(

@@ -24,7 +24,7 @@ from .options import (
     chosen,
     option,
 )
-from .output import print_json, progress_bar, say, spell_seconds
+from .output import progress_bar, show, spell_seconds
 
 if TYPE_CHECKING:
     from lagbench.baselines.predict import PredictionResult
@@ -110,10 +110,8 @@ def train(
             workers=workers,
             progress=draw,
         )
-    if as_json and not is_helper():
-        print_json(result)
-    else:
-        say("\n".join(_trained(result, _where(split, root))), quiet=quiet)
+    as_json = as_json and not is_helper()
+    show(result, _trained(result, _where(split, root)), as_json=as_json, quiet=quiet)
 
 
 def _warn_of_scores(
@@ -136,10 +134,8 @@ def _warn_of_scores(
     plan = recipe_for(find(baseline), tier.split, tier.name, variant=variant, settings=settings)
     reasons = list(unusable(tier, home, validated=plan.training.validate_every != 0))
     if reasons:
-        typer.echo(
-            "warning: what is trained here cannot be scored as it should\n  " + "\n  ".join(reasons),
-            err=True,
-        )
+        warning = "warning: what is trained here cannot be scored as it should"
+        typer.echo("\n  ".join([warning, *reasons]), err=True)
 
 
 @contextmanager
@@ -172,7 +168,7 @@ def _where(split: str, root: Path | None) -> str:
     return f" --root {root or found.root}" if root or local else ""
 
 
-def _trained(result: TrainingResult, where: str) -> list[str]:
+def _trained(result: TrainingResult, where: str) -> Iterator[str]:
     time = f"{spell_seconds(result.wall_seconds)}, {spell_seconds(result.cpu_seconds)} of processor time"
     if result.gpu_seconds:
         time += f", {spell_seconds(result.gpu_seconds)} of GPU time"
@@ -180,32 +176,27 @@ def _trained(result: TrainingResult, where: str) -> list[str]:
         time += "; it was over before, --fresh trains anew"
     elif result.first_step:
         time += f"; this call went on from step {result.first_step}"
+    state = f"{result.state}, step {result.step} of {result.steps}"
+    yield f"{result.baseline} on {result.recipe}: {state}, {time}"
+    if result.start:
+        yield f"  started    from {result.start}; hours and track count what they took"
+    yield f"  parameters {result.parameters}"
     terms = sorted(result.loss, key=lambda name: (name == "total", name))
-    lines = [
-        f"{result.baseline} on {result.recipe}: {result.state}, step {result.step} of {result.steps}, {time}",
-        *(
-            [f"  started    from {result.start}; hours and track count what they took"]
-            if result.start
-            else []
-        ),
-        f"  parameters {result.parameters}",
-        "  loss       " + ", ".join(f"{name} {result.loss[name]:.4g}" for name in terms),
-    ]
+    yield "  loss       " + ", ".join(f"{name} {result.loss[name]:.4g}" for name in terms)
     if result.best_value is not None:
-        lines.append(
-            f"  best       {result.metric} {result.best_value:.4g} on valid, step {result.best_step}"
-            + (": nothing better than the weights that it started from" if result.best_step == 0 else "")
-        )
+        worse = ": nothing better than the weights that it started from" if result.best_step == 0 else ""
+        best = f"{result.best_value:.4g} on valid, step {result.best_step}{worse}"
+        yield f"  best       {result.metric} {best}"
     share = result.validation_cpu_seconds / (result.cpu_seconds or 1.0)
     seen = f"{result.windows_seen:,} windows, " if result.windows_seen else ""
-    lines.append(
+    yield (
         f"  budget     {seen}{result.epochs:.3g} epochs; {share:.0%} of the processor time for validations;"
         f" {result.device}, {result.threads} thread(s); track: {result.track or 'none'}"
     )
-    lines.append(f"  weights    {result.weights}")
+    yield f"  weights    {result.weights}"
     if result.size == "tiny":
-        lines.append("hint: tiny is for tests: no model learns much from so little; try --size mini")
-    return [*lines, f"next: lagbench predict {result.weights}{where} -o predictions.nc"]
+        yield "hint: tiny is for tests: no model learns much from so little; try --size mini"
+    yield f"next: lagbench predict {result.weights}{where} -o predictions.nc"
 
 
 def predict(
@@ -254,10 +245,8 @@ def predict(
             solver=time_solver if solver else None,
             progress=draw,
         )
-    if as_json:
-        print_json({**vars(result), "solver": timed})
-    else:
-        say("\n".join(_predicted(result, timed, f" --root {root}" if root else "")), quiet=quiet)
+    told = _predicted(result, timed, f" --root {root}" if root else "")
+    show({**vars(result), "solver": timed}, told, as_json=as_json, quiet=quiet)
 
 
 def _solver_time(split: str, size: str, *, quiet: bool) -> SolverBench | None:
@@ -279,28 +268,26 @@ def _solver_time(split: str, size: str, *, quiet: bool) -> SolverBench | None:
         return None
 
 
-def _predicted(result: PredictionResult, solver: SolverBench | None, where: str) -> list[str]:
+def _predicted(result: PredictionResult, solver: SolverBench | None, where: str) -> Iterator[str]:
     trained = f", trained at {result.trained_size}" if result.trained_size != result.size else ""
     trained += "".join(f", {setting}" for setting in result.settings)
-    lines = [
-        f"{result.path}: {result.method}{trained}, {result.scenarios} scenarios, {result.frames} frames",
+    yield f"{result.path}: {result.method}{trained}, {result.scenarios} scenarios, {result.frames} frames"
+    yield (
         f"  model   {result.seconds_per_frame:.3g} s per frame ({result.seconds_without_search:.3g} s"
-        f" without the neighbour search) on {result.device}",
-    ]
+        f" without the neighbour search) on {result.device}"
+    )
     if solver is not None:
         ratio = result.seconds_per_frame / solver.seconds_per_frame
-        lines.append(
-            f"  solver  {solver.seconds_per_frame:.3g} s per frame on one core of this machine: "
-            + (
-                f"{ratio:.2g} times as fast as the model"
-                if ratio > 1
-                else f"the model is {1 / ratio:.2g} times as fast"
-            )
+        slower, faster = (
+            f"{ratio:.2g} times as fast as the model",
+            f"the model is {1 / ratio:.2g} times as fast",
         )
+        beside = slower if ratio > 1 else faster
+        yield f"  solver  {solver.seconds_per_frame:.3g} s per frame on one core of this machine: {beside}"
     if result.diverged:
         marks = ", ".join(f"scenario {i} at frame {frame}" for i, frame in result.diverged.items())
-        lines.append(f"  frozen  {marks}: not finite from there on")
-    return [*lines, f"next: lagbench score {result.path}{where}"]
+        yield f"  frozen  {marks}: not finite from there on"
+    yield f"next: lagbench score {result.path}{where}"
 
 
 def bench(
@@ -317,19 +304,15 @@ def bench(
     from .machine import bench_solver
 
     if what != "solver":
-        raise UsageError(
-            f"nothing to time is called {what!r}", expected="solver", fix="lagbench bench solver"
-        )
+        fix = "lagbench bench solver"
+        raise UsageError(f"nothing to time is called {what!r}", expected="solver", fix=fix)
     tier = locate_new(chosen(None, split), size).size
     if not tier.simulated:
         fix = "lagbench list names splits of ours"
         raise UsageError("a local split cannot be simulated", where="--split", got=tier.split, fix=fix)
     result = bench_solver(tier.split, tier.name, frames=frames)
-    if as_json:
-        print_json(result)
-        return
-    say(
+    told = (
         f"{result.split} {result.size}: {result.seconds_per_frame:.3g} s per frame of {result.particles}"
-        f" particles, {result.substeps} substeps, on one core",
-        quiet=quiet,
+        f" particles, {result.substeps} substeps, on one core"
     )
+    show(result, [told], as_json=as_json, quiet=quiet)
