@@ -95,9 +95,8 @@ def test_packed_numbers_come_back(values: list[float], log: bool) -> None:
         bound = np.log(high / low) / LEVELS if high > low else 0.0
         assert np.all(np.abs(np.log(back[positive] / x[positive])) <= bound + 2e-5)
     else:
-        assert np.all(
-            np.abs(back[known] - x[known]) <= 0.5 * (high - low) / LEVELS + 1e-5 * (1 + abs(x[known]))
-        )
+        room = 0.5 * (high - low) / LEVELS + 1e-5 * (1 + abs(x[known]))
+        assert np.all(np.abs(back[known] - x[known]) <= room)
 
 
 @given(st.floats(-1.0, 1.0), st.floats(-5e-3, 5e-3), st.floats(0.0, 3e-2))
@@ -213,13 +212,10 @@ def test_floors_are_judged_like_entries(board: Board) -> None:
 
 def test_beside_and_beyond_an_aim_do_not_cancel(board: Board) -> None:
     """Energy ratios 0 and 2 have the mean 1 and are no aim reached: 0.9 and 0.9 are nearer."""
-    rows = [
-        replace(row, values={**row.values, "energy_ratio": replace(value, mean=mean, per_scenario=scenarios)})
-        for row, mean, scenarios in zip(
-            board.tabs[0].rows, (1.0, 0.9, 0.5), ((0.0, 2.0), (0.9, 0.9), (0.5, 0.5)), strict=False
-        )
-        if (value := row.values["energy_ratio"])
-    ]
+    rows = []
+    for row, scenarios in zip(board.tabs[0].rows, ((0.0, 2.0), (0.9, 0.9), (0.5, 0.5)), strict=False):
+        value = replace(row.values["energy_ratio"], mean=sum(scenarios) / 2, per_scenario=scenarios)
+        rows.append(replace(row, values={**row.values, "energy_ratio": value}))
     page = with_rows(board, *rows, floors=())
     cells = re.findall(r'<td(?: class="([^"]*)")?[^>]*data-value="([^"]*)" data-loss="([^"]*)"', page)
     found = {value: (kind, float(loss)) for kind, value, loss in cells if value in {"1", "0.9", "0.5"}}
@@ -245,12 +241,8 @@ def test_weights_beside_an_entry_are_led_to(board: Board) -> None:
     """One link a seed, to where the leaderboard's folder keeps them."""
     row = board.tabs[0].rows[0]
     score = row.entry.score.model_copy(update={"files": 2 * row.entry.score.files[:1]})
-    kept = tuple(
-        row.entry.predictions[0].model_copy(
-            update={"seed": seed, "weights": Weights(path="x", sha256="0" * 64)}
-        )
-        for seed in (0, 1)
-    )
+    weights, made = Weights(path="x", sha256="0" * 64), row.entry.predictions[0]
+    kept = tuple(made.model_copy(update={"seed": seed, "weights": weights}) for seed in (0, 1))
     row = with_entry(row, predictions=kept, score=score, weights=None)
     page = with_rows(board, replace(row, seed_means=2 * row.seed_means[:1]))
     place = "/".join(row.entry.place)

@@ -105,12 +105,9 @@ def collect(
             continue  # old scores that do not fit the task of today
         scores = combine([held.scores for held in stored])
         if lacking := [name for name in (stored[0].scores.ranking, *ENERGIES) if name not in scores]:
-            what, where = (
-                "a score file lacks metrics that every one has",
-                str(place.path / entry.score_paths[0]),
-            )
+            where, what = place.path / entry.score_paths[0], "a score file lacks metrics that every one has"
             fix = "score the predictions again: lagbench submit"
-            raise UnreadableFileError(what, where=where, expected=", ".join(lacking), fix=fix)
+            raise UnreadableFileError(what, where=f"{where}", expected=", ".join(lacking), fix=fix)
         held = _Held(entry=entry, current=current, stored=stored, scores=scores)
         found.setdefault((entry.split, entry.size), []).append(held)
     verified, tabs, empty = read_verified(place), [], []
