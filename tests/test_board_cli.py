@@ -104,7 +104,6 @@ def test_machines_are_answered_in_json(run: Run) -> None:
     [
         (["submit"], 2, "FILE"),
         (["submit", "none.nc"], 3, "none.nc"),
-        (["submit", "none.nc", "--author", "A", "--command", "x", "--new-board"], 3, "none.nc"),
         (["submit", "x.nc", "--url", "javascript:alert(1)"], 2, "is not an http:// or https:// address"),
         (["submit", "x.nc", "--from", "none.yaml"], 3, "none.yaml"),
         (["leaderboard", "build"], 2, "no leaderboard here"),

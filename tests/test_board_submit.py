@@ -137,15 +137,17 @@ def test_predictions_are_submitted_once(own: BoardBench, monkeypatch: pytest.Mon
         *({"authors": ()}, {"command": ""}, {"method": "noisy"}, {"method": "persistence"}),
         *({"name": "NO\u0406SY"}, {"name": "Free Flight"}),
         *({"urls": ("https://a.org/1", "https://a.org/2")}, {"date": datetime.date(2999, 1, 1)}),
+        {"budget": {"track": "converged"}},
     ],
 )
 def test_refused_before_the_work(keys: dict[str, Any], own: BoardBench, predictions: Path) -> None:
-    """What is missing, taken or of a day to come is said before anything is scored; nothing is written."""
+    """What is missing, taken, of a day to come or nobody's to say, before anything is scored or written."""
     before = tree(own.folder)
     with pytest.raises(UsageError) as caught:
         own.submit(predictions, **keys)
     assert tree(own.folder) == before
-    assert "date" not in keys or caught.value.where == "date"
+    where = {"date": "date", "budget": "budget.track"}
+    assert all(caught.value.where == where.get(key, caught.value.where) for key in keys)
 
 
 @pytest.mark.parametrize("text", ["a\x07b", "\u2800"])
@@ -324,13 +326,6 @@ def test_no_board_is_begun_by_mistake(own: BoardBench, predictions: Path, tmp_pa
     assert sorted(path.name for path in board.iterdir()) == [".git", "README.md", "index.html"]
     (board / "index.html").unlink()
     assert submitting.submit([predictions], meta, **where).board == board
-
-
-def test_a_missing_file_is_told_before_what_nobody_said(own: BoardBench, tmp_path: Path) -> None:
-    """Authors are not asked for on behalf of a file that is not there."""
-    with pytest.raises(UnreadableFileError) as error:
-        submitting.submit([tmp_path / "none.nc"], Meta(), **own.where)
-    assert error.value.where == str(tmp_path / "none.nc")
 
 
 def test_what_is_not_given(own: BoardBench) -> None:

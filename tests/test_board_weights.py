@@ -135,17 +135,6 @@ def test_weights_go_to_their_seeds(own: BoardBench) -> None:
     assert found(own) == set()
 
 
-def test_a_state_to_go_on_from_is_not_published(own: BoardBench) -> None:
-    """A checkpoint.pt, with what the optimiser holds, is refused; nothing is written."""
-    run = trained(own, 0)
-    held = load(run / "weights.pt")
-    save(run / "checkpoint.pt", replace(held, optimizer={"state": {}}))
-    with pytest.raises(UsageError) as error:
-        submitted(own, run, weights=(run / "checkpoint.pt",))
-    assert error.value.where == str(run / "checkpoint.pt")
-    assert not own.entry("drift").exists()
-
-
 def test_a_later_entry_takes_its_files_along(own: BoardBench, first: Path) -> None:
     """Weights stay with their predictions, and go with them: an entry leaves none behind."""
     lying = {path.name: path.read_bytes() for path in (own.folder / "weights").rglob("*.*")}
@@ -314,16 +303,16 @@ def test_weights_of_another_entry_are_refused(own: BoardBench) -> None:
 
 
 def test_other_weights_are_refused(own: BoardBench) -> None:
-    """Weights of another seed, one twice and files that are none are told; nothing is written."""
+    """Weights of another seed, one twice, a state to go on from, files that are none; nothing is written."""
     runs = [trained(own, 0), trained(own, 3)]
     before = own.state()
     first, second = (run / "weights.pt" for run in runs)
-    with pytest.raises(UsageError) as caught:
-        submitted(own, runs[0], weights=(second,))
-    assert caught.value.where == str(second)
-    with pytest.raises(UsageError) as caught:
-        submitted(own, *runs, weights=(first, first))
-    assert caught.value.where == str(first)
+    state = runs[0] / "checkpoint.pt"
+    save(state, replace(load(first), optimizer={"state": {}}))
+    for folders, weights in (runs[:1], (second,)), (runs, (first, first)), (runs[:1], (state,)):
+        with pytest.raises(UsageError) as caught:
+            submitted(own, *folders, weights=weights)
+        assert caught.value.where == str(weights[0])
     with pytest.raises(UnreadableFileError):
         submitted(own, *runs, weights=(first, runs[0] / "training.json"))
     assert own.state() == before
@@ -402,13 +391,6 @@ def test_a_budget_is_that_of_the_file(own: BoardBench, first: Path) -> None:
     where = {"registry": own.registry, "root": own.data.root, "page": False}
     again = check_board(own.folder, predictions=[first / "predictions.nc"], **where)
     assert {one.check for one in again.findings} == {"rescored"}
-
-
-def test_a_track_is_not_stated(own: BoardBench) -> None:
-    """Who describes a method cannot say its track."""
-    with pytest.raises(UsageError) as caught:
-        own.submit(trained(own, 0) / "predictions.nc", budget={"track": "converged"})
-    assert caught.value.where == "budget.track"
 
 
 def test_seeds_that_come_later_make_the_entry_of_all_at_once(

@@ -313,12 +313,8 @@ def test_progress_goes_to_a_file_in_lines(
     """
     monkeypatch.setattr("lagbench.cli.output.SECONDS_PER_LINE", pause)
     with progress_bar(quiet=False, counted="steps") as tell:
-        for done in (60, 200):
-            tell(
-                Progress(
-                    stage="loss 1", done=done, total=240, scenarios_done=done, scenarios=240, seconds=done
-                )
-            )
+        for n in (60, 200):
+            tell(Progress(stage="loss 1", done=n, total=240, scenarios_done=n, scenarios=240, seconds=n))
     said = capsys.readouterr()
     assert said.out == ""
     counts = [re.search(r"(\d+)/240 steps, 1.00/s, (.+) left", line) for line in said.err.splitlines()]
@@ -328,9 +324,6 @@ def test_progress_goes_to_a_file_in_lines(
     assert capsys.readouterr().err == ("" if pause else "writing train: 2 scenarios, 2.00/s\n")
     with progress_bar(quiet=True) as silent:
         assert silent is None
-
-
-Run = Callable[..., Result]
 
 
 def files_below(folder: Path) -> set[str]:

@@ -72,14 +72,7 @@ class _Held:
 def collect(
     folder: str | Path, *, only: Collection[tuple[str, str]] | None = None, registry: Registry | None = None
 ) -> Board:
-    """Return the board of a leaderboard's folder; of some (split, size) ``only``, or of all.
-
-    Raises:
-        UsageError: no leaderboard there.
-        UnreadableFileError: an entry or a score file cannot be read.
-        ChecksFailedError: an entry does not fit the schema or lies in another place.
-        DataError: an entry is of a split that is not known here.
-    """
+    """Return the board of a leaderboard's folder; of some (split, size) ``only``, or of all."""
     place, described = Folder(folder), registry or load()
     place.require()
     found: dict[tuple[str, str], list[_Held]] = {}
@@ -105,9 +98,9 @@ def collect(
             continue  # old scores that do not fit the task of today
         scores = combine([held.scores for held in stored])
         if lacking := [name for name in (stored[0].scores.ranking, *ENERGIES) if name not in scores]:
-            where, what = place.path / entry.score_paths[0], "a score file lacks metrics that every one has"
+            what, file = "a score file lacks metrics that every one has", place.path / entry.score_paths[0]
             fix = "score the predictions again: lagbench submit"
-            raise UnreadableFileError(what, where=f"{where}", expected=", ".join(lacking), fix=fix)
+            raise UnreadableFileError(what, where=str(file), expected=", ".join(lacking), fix=fix)
         held = _Held(entry=entry, current=current, stored=stored, scores=scores)
         found.setdefault((entry.split, entry.size), []).append(held)
     verified, tabs, empty = read_verified(place), [], []

@@ -138,11 +138,7 @@ def cost_figure(tab: Tab) -> Markup:
 
 
 def picture(board: Board, size: Size) -> str:
-    """Return the figure of a data set as an SVG file of its own; without entries, that of the floors.
-
-    Raises:
-        DataError: neither entries nor floors are known.
-    """
+    """Return the figure of a data set as an SVG file of its own; without entries, that of the floors."""
     tab = next((tab for tab in board.tabs if tab.id == f"{size.split}-{size.name}"), None)
     ranking, solver = ranking_metric(size), solver_seconds(size)
     if tab is not None:

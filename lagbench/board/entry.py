@@ -15,7 +15,6 @@ import unicodedata
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, Literal, Self
 from urllib.parse import urlsplit
 
@@ -41,15 +40,13 @@ SHA256 = r"^[0-9a-f]{64}$"
 RELEASE = r"^[1-9]\d{0,5}\.\d{1,6}\.\d{1,6}$"
 LABEL = r"^[a-z0-9_]+$"
 
-PATTERNS: Mapping[str, str] = MappingProxyType(
-    {
-        ID: "small letters, digits and single hyphens, as in my-model",
-        WEB: "an http:// or https:// address, without spaces and quotes",
-        SHA256: "64 hexadecimal digits",
-        RELEASE: "a version, as in 1.0.0",
-        LABEL: "small letters, digits and underscores",
-    }
-)
+PATTERNS: Mapping[str, str] = {
+    ID: "small letters, digits and single hyphens, as in my-model",
+    WEB: "an http:// or https:// address, without spaces and quotes",
+    SHA256: "64 hexadecimal digits",
+    RELEASE: "a version, as in 1.0.0",
+    LABEL: "small letters, digits and underscores",
+}
 """What texts have to be, in words; people do not read regular expressions."""
 
 LONGEST_ID = 60

@@ -98,12 +98,7 @@ def read_entry(path: Path) -> Entry:
 
 
 def read_meta(path: Path | None, options: Mapping[str, object]) -> Meta:
-    """Return what a YAML file and options say; options win, None and empty ones are not given.
-
-    Raises:
-        UnreadableFileError: no regular file, too long, or no plain YAML.
-        UsageError: an unknown key or a value that does not fit.
-    """
+    """Return what a YAML file and options say; options win, None and empty ones are not given."""
     held = {} if path is None else load_plain(path)
     if not isinstance(held, dict):
         expected = "lines of key: value"

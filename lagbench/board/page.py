@@ -80,9 +80,7 @@ def render(board: Board, links: Mapping[str, str] = LINKS) -> str:
     entries = sum(len(tab.rows) for tab in board.tabs)
     room = BUDGET * max(FEWEST, entries) - sum(len(one.encode()) for one in held.values())
 
-    @functools.cache
-    def drawn(fineness: Fineness) -> str:
-        return embedded(payload(board, fineness))
+    drawn = functools.cache(lambda fineness: embedded(payload(board, fineness)))
 
     def fits(fineness: Fineness) -> bool:
         return len(drawn(fineness).encode()) <= room

@@ -17,11 +17,7 @@ from .model import Board, Floor, Row, Value
 def chosen_data_sets(
     known: Collection[tuple[str, str]], split: str | None, size: str | None
 ) -> tuple[tuple[str, str], ...]:
-    """Return those of a split, of a size, or all of the (split, size) that have entries.
-
-    Raises:
-        UsageError: there is none.
-    """
+    """Return those of a split, of a size, or all of the (split, size) that have entries; refuse none."""
     found = tuple(one for one in known if split in (None, one[0]) and size in (None, one[1]))
     if found or (split is None and size is None):
         return found
@@ -34,9 +30,6 @@ def tables(board: Board, metrics: Collection[str] = (), *, wide: bool = False) -
     """Yield a table per tab: ranked rows, then floors, then what is not ranked.
 
     ``metrics`` are shown beside skill and the ranking one, with ``wide`` the tab's first metrics too.
-
-    Raises:
-        UsageError: a metric that the board does not have.
     """
     for name in metrics:
         if name not in board.metrics:

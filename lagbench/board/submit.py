@@ -38,8 +38,6 @@ from lagbench.submission.validation import validate
 from lagbench.work.progress import Progress
 
 from .entry import (
-    ID,
-    LONGEST_ID,
     LONGEST_TEXT,
     MOST_SEEDS,
     OUTSIDE,
@@ -249,7 +247,7 @@ def _planned(
 def _method(header: Header, meta: Meta) -> str:
     """Return the id of the method: the one given, else the label of the predictions if it can be one."""
     name = meta.method or header.method
-    if not re.fullmatch(ID, name) or len(name) > LONGEST_ID:
+    if examine(Meta, {"method": name})[1]:
         raise UsageError(
             "the label of the predictions cannot name an entry",
             expected="small letters, digits and single hyphens",

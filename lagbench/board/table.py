@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from types import MappingProxyType
 
 from lagbench.data.checksums import round_digits
 from lagbench.metrics.metric import Direction, Metric
@@ -28,25 +27,23 @@ ARROWS = {Direction.LOWER: "↓", Direction.HIGHER: "↑", Direction.TARGET: "�
 REPORTED = "Self-reported: said by the submitter, computed again by nobody."
 REPORTED_MARK = "self\u2011reported"
 
-EXPLAINED: Mapping[str, tuple[str, str]] = MappingProxyType(
-    {
-        "copy_suspect": (
-            "copy suspected",
-            "The error moves from frame to frame as that of no rollout does.",
-        ),
-        "below_twin_floor": (
-            "closer than a twin",
-            "Closer to the truth than the solver itself after a nudge of 2⁻²⁰.",
-        ),
-        "physics": ("unphysical", "Kinetic energy or filled area are far from the truth's."),
-        "in_domain": (
-            "leaves the box",
-            "Predicted particles lie outside the box; there they carry no weight on the grid.",
-        ),
-        "max_displacement": ("jumps", "Predicted particles move farther in a frame than any of the truth."),
-        "discontinuous_start": ("jumps at the start", "The first frame is far from the last given."),
-    }
-)
+EXPLAINED: Mapping[str, tuple[str, str]] = {
+    "copy_suspect": (
+        "copy suspected",
+        "The error moves from frame to frame as that of no rollout does.",
+    ),
+    "below_twin_floor": (
+        "closer than a twin",
+        "Closer to the truth than the solver itself after a nudge of 2⁻²⁰.",
+    ),
+    "physics": ("unphysical", "Kinetic energy or filled area are far from the truth's."),
+    "in_domain": (
+        "leaves the box",
+        "Predicted particles lie outside the box; there they carry no weight on the grid.",
+    ),
+    "max_displacement": ("jumps", "Predicted particles move farther in a frame than any of the truth."),
+    "discontinuous_start": ("jumps at the start", "The first frame is far from the last given."),
+}
 """What flags and warnings are called on the page, which shows what is wrong, and what they mean."""
 
 

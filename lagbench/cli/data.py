@@ -34,7 +34,6 @@ from .options import (
 from .output import print_json, print_table, progress_bar, show, spell_bytes, spell_seconds
 
 if TYPE_CHECKING:
-    from lagbench.data.registry import Size
     from lagbench.make.generate import GenerationResult
     from lagbench.make.inventory import Overview
     from lagbench.make.verify import VerificationResult
@@ -214,6 +213,7 @@ def info(
 ) -> None:
     """Show a split: parameters with units, sizes in bytes, time to generate, local state."""
     from lagbench.data.local import home
+    from lagbench.data.registry import spell_ids
     from lagbench.make.inventory import overview
 
     split_name, folder, registry = home(chosen(name, split), root=root)
@@ -233,7 +233,16 @@ def info(
         ]
         print_table("Parameters", ("name", *entry.sizes, "[unit] meaning"), parameters)
         for one, tier in zip(found, sizes, strict=True):
-            yield from _details(one, tier)
+            subsets = "; ".join(f"{name} {spell_ids(ids)}" for name, ids in tier.subsets.items())
+            given, horizon, radius = tier.task.input_frames, tier.task.horizon, tier.task.radius
+            yield f"{one.split} {one.size}"
+            yield f"  scenarios  {subsets}"
+            yield f"  task       {given} frames given, {horizon} to predict, radius {radius}"
+            substeps = f"{tier.substeps_per_frame} substeps of {tier.dt:.6g} s"
+            yield f"  frame      {tier.frame_interval:.6g} s, {substeps}"
+            yield f"  hash       {one.dataset_sha256 or 'not measured yet'}"
+            yield f"  folder     {one.folder} (there: {one.state})"
+            yield f"  picture    {one.picture or 'none'}"
 
     described = {
         tier.name: {
@@ -246,22 +255,6 @@ def info(
     }
     head = {key: getattr(entry, key) for key in ("version", "title", "description", "citation", "licence")}
     show({"split": split_name, **head, "sizes": described}, told(), as_json=as_json)
-
-
-def _details(entry: Overview, size: Size) -> list[str]:
-    from lagbench.data.registry import spell_ids
-
-    task = size.task
-    subsets = "; ".join(f"{name} {spell_ids(ids)}" for name, ids in size.subsets.items())
-    return [
-        f"{entry.split} {entry.size}",
-        f"  scenarios  {subsets}",
-        f"  task       {task.input_frames} frames given, {task.horizon} to predict, radius {task.radius}",
-        f"  frame      {size.frame_interval:.6g} s, {size.substeps_per_frame} substeps of {size.dt:.6g} s",
-        f"  hash       {entry.dataset_sha256 or 'not measured yet'}",
-        f"  folder     {entry.folder} (there: {entry.state})",
-        f"  picture    {entry.picture or 'none'}",
-    ]
 
 
 def cite(

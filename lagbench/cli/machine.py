@@ -144,12 +144,7 @@ def bench_solver(split: str, size: str, *, frames: int = FRAMES) -> SolverBench:
 
 
 def bench_apart(split: str, size: str, *, frames: int = FRAMES) -> SolverBench:
-    """Time the solver in a process of its own, which this one's memory and threads do not disturb.
-
-    Raises:
-        UsageError: unknown split or size, or Taichi is not installed.
-        WorkFailedError: the process failed.
-    """
+    """Time the solver in a process of its own, which this one's memory and threads do not disturb."""
     load().size(split, size)
     check_installed("taichi", extra="generate")
     with Pool(1) as pool:

@@ -53,11 +53,7 @@ QuietFlag = Annotated[bool, option("--quiet -q", "Print nothing but errors.")]
 
 
 def chosen(argument: str | None, option: str | None) -> str:
-    """Return the split that a user named, by argument or by option.
-
-    Raises:
-        UsageError: neither or two different ones were given.
-    """
+    """Return the split that a user named, by argument or by option; refuse none and two."""
     given = {name for name in (argument, option) if name is not None}
     if len(given) != 1:
         what, got = (
