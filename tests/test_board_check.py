@@ -99,138 +99,117 @@ def put(*place: str | int, **changes: object) -> Callable[[BoardBench], object]:
     return lambda bench: bench.edit("noisy", lambda held: reduce(getitem, place, held).update(changes))
 
 
-Damage = tuple[Callable[[BoardBench], object], set[str]]
-
-EDITS: dict[str, Damage] = {
-    "edited score": (lambda b: b.edit("noisy", set_mean), {"score"}),
-    "edited score by a millionth": (lambda b: b.edit("noisy", lambda h: set_mean(h, 1 - 3e-6)), {"score"}),
-    "metric removed": (lambda b: b.edit("noisy", lambda h: h["score"]["metrics"].pop("mse_avg")), {"score"}),
-    "metric invented": (
-        lambda b: b.edit(
-            "noisy", lambda h: h["score"]["metrics"].update(best=dict(h["score"]["metrics"]["mse_avg"]))
-        ),
-        {"score"},
+DAMAGE: dict[str, Callable[[BoardBench], object]] = {
+    "score: edited score": lambda b: b.edit("noisy", set_mean),
+    "score: edited score by a millionth": lambda b: b.edit("noisy", lambda h: set_mean(h, 1 - 3e-6)),
+    "score: metric removed": lambda b: b.edit("noisy", lambda h: h["score"]["metrics"].pop("mse_avg")),
+    "score: metric invented": lambda b: b.edit(
+        "noisy", lambda h: h["score"]["metrics"].update(best=dict(h["score"]["metrics"]["mse_avg"]))
     ),
-    "data set edited": (put("score", dataset_sha256="0" * 64), {"score"}),
-    "unknown key": (put(lisence="MIT"), {"schema"}),
-    "scorer named": (put("score", scored_by="me"), {"schema"}),
-    "link that is not http": (put(code="javascript:alert(1)"), {"schema"}),
-    "link with a user": (put(code="https://a.org@b.org/"), {"schema"}),
-    "name of 10 kB": (put(name="n" * 10_000), {"schema"}),
-    "blank name": (put(name="\u3164"), {"schema"}),
-    "path outside": (put("predictions", 0, path="../../secret"), {"schema"}),
-    "number in base 60": (
-        lambda b: b.entry("noisy").write_text(f"parameters: {':'.join(['59'] * 300)}:1.5\n"),
-        {"schema"},
+    "score: data set edited": put("score", dataset_sha256="0" * 64),
+    "schema: unknown key": put(lisence="MIT"),
+    "schema: scorer named": put("score", scored_by="me"),
+    "schema: link that is not http": put(code="javascript:alert(1)"),
+    "schema: link with a user": put(code="https://a.org@b.org/"),
+    "schema: name of 10 kB": put(name="n" * 10_000),
+    "schema: blank name": put(name="\u3164"),
+    "schema: path outside": put("predictions", 0, path="../../secret"),
+    "schema: number in base 60": lambda b: b.entry("noisy").write_text(
+        f"parameters: {':'.join(['59'] * 300)}:1.5\n"
     ),
-    "date to come": (put(date="2999-01-01"), {"date"}),
-    "look-alike of an entry": (put(name="D\u0430MPED"), {"name"}),
-    "look-alike of a floor": (put(name="Persistence"), {"name"}),
-    "unknown split": (
-        lambda b: ((b.folder / "submissions/cavty/tiny").mkdir(parents=True), put(split="cavty")(b)),
-        {"split"},
+    "date: date to come": put(date="2999-01-01"),
+    "name: look-alike of an entry": put(name="D\u0430MPED"),
+    "name: look-alike of a floor": put(name="Persistence"),
+    "split: unknown split": lambda b: (
+        (b.folder / "submissions/cavty/tiny").mkdir(parents=True),
+        put(split="cavty")(b),
     ),
-    "old data set": (put("dataset", sha256="0" * 64), {"version", "score_file", "score"}),
-    "superseded by nothing": (lambda b: superseded(b, "noisy", "none"), {"lifecycle"}),
-    "superseded by itself": (lambda b: superseded(b, "noisy", "noisy"), {"lifecycle"}),
-    "superseded in a circle": (
-        lambda b: (superseded(b, "noisy", "damped"), superseded(b, "damped", "noisy")),
-        {"lifecycle"},
+    "version score_file score: old data set": put("dataset", sha256="0" * 64),
+    "lifecycle: superseded by nothing": lambda b: superseded(b, "noisy", "none"),
+    "lifecycle: superseded by itself": lambda b: superseded(b, "noisy", "noisy"),
+    "lifecycle: superseded in a circle": lambda b: (
+        superseded(b, "noisy", "damped"),
+        superseded(b, "damped", "noisy"),
     ),
-    "notes edited": (put(notes="new"), set()),
-    "predictions that are not there": (put("predictions", 0, path="predictions/x.nc"), {"predictions"}),
-    "predictions behind a link": (
-        lambda b: ((b.folder / "x.nc").symlink_to(b.entry("noisy")), put("predictions", 0, path="x.nc")(b)),
-        {"predictions", "folder"},
+    "nothing: notes edited": put(notes="new"),
+    "predictions: predictions that are not there": put("predictions", 0, path="predictions/x.nc"),
+    "predictions folder: predictions behind a link": lambda b: (
+        (b.folder / "x.nc").symlink_to(b.entry("noisy")),
+        put("predictions", 0, path="x.nc")(b),
     ),
-    "verified without an entry": (lambda b: verify(b, f"{PLACE}/nobody.yaml", "0" * 64), {"verified"}),
-    "verified with other scores": (lambda b: verify(b, f"{PLACE}/noisy.yaml", "0" * 64), {"verified"}),
-    "list that is none": (lambda b: (b.folder / "verified.yaml").write_text("- a\n"), {"verified"}),
-}
-"""What somebody may write into an entry."""
-
-FILES: dict[str, Damage] = {
-    "edited score file": (lambda b: halve(b.folder / NOISY), {"score_file"}),
-    "edited score file, hash forged": (
-        lambda b: (halve(b.folder / SCORES / "damped_3.nc"), b.rehash("damped")),
-        {"score"},
+    "verified: verified without an entry": lambda b: verify(b, f"{PLACE}/nobody.yaml", "0" * 64),
+    "verified: verified with other scores": lambda b: verify(b, f"{PLACE}/noisy.yaml", "0" * 64),
+    "verified: list that is none": lambda b: (b.folder / "verified.yaml").write_text("- a\n"),
+    # what may happen to files
+    "score_file: edited score file": lambda b: halve(b.folder / NOISY),
+    "score: edited score file, hash forged": lambda b: (
+        halve(b.folder / SCORES / "damped_3.nc"),
+        b.rehash("damped"),
     ),
-    "score file of another method": (
-        lambda b: (shutil.copyfile(b.folder / SCORES / "damped_0.nc", b.folder / NOISY), b.rehash("noisy")),
-        {"score_file", "score", "twin"},
+    "score_file score twin: score file of another method": lambda b: (
+        shutil.copyfile(b.folder / SCORES / "damped_0.nc", b.folder / NOISY),
+        b.rehash("noisy"),
     ),
-    "score file cut short": (
-        lambda b: (os.truncate(b.folder / NOISY, (b.folder / NOISY).stat().st_size - 999), b.rehash("noisy")),
-        {"score_file"},
+    "score_file: score file cut short": lambda b: (
+        os.truncate(b.folder / NOISY, (b.folder / NOISY).stat().st_size - 999),
+        b.rehash("noisy"),
     ),
-    "missing score file": (lambda b: (b.folder / SCORES / "damped_3.nc").unlink(), {"missing"}),
-    "stray score file": (
-        lambda b: shutil.copyfile(b.folder / NOISY, b.folder / SCORES / "other.nc"),
-        {"stray"},
+    "missing: missing score file": lambda b: (b.folder / SCORES / "damped_3.nc").unlink(),
+    "stray: stray score file": lambda b: shutil.copyfile(b.folder / NOISY, b.folder / SCORES / "other.nc"),
+    "stray: missing entry": lambda b: b.entry("noisy").unlink(),
+    "oversize: oversize score file": lambda b: (b.folder / NOISY).write_bytes(bytes(1_000_001)),
+    "folder missing: score file that is a link": lambda b: link(
+        b.folder / NOISY, b.folder / SCORES / "damped_0.nc"
     ),
-    "missing entry": (lambda b: b.entry("noisy").unlink(), {"stray"}),
-    "oversize score file": (lambda b: (b.folder / NOISY).write_bytes(bytes(1_000_001)), {"oversize"}),
-    "score file that is a link": (
-        lambda b: link(b.folder / NOISY, b.folder / SCORES / "damped_0.nc"),
-        {"folder", "missing"},
+    "values: negative square": lambda b: reform(b, scale("position_mse", -1.0), whole=False),
+    "values: correlation above one": lambda b: reform(b, scale("vorticity_pearson", 2.0)),
+    "values: no error where there is one": lambda b: reform(b, scale("vorticity_mse", 0.0)),
+    "twin: the same predictions again": lambda b: copy_of(b, "noisy", "other", name="Something else"),
+    "twin: the same errors again": disguised,
+    "folder: entry that is a link": lambda b: link(b.entry("noisy"), Path("/etc/passwd")),
+    "folder: folder that is a link": lambda b: (b.folder / "submissions" / "fluid").symlink_to(
+        "/etc", target_is_directory=True
     ),
-    "negative square": (lambda b: reform(b, scale("position_mse", -1.0), whole=False), {"values"}),
-    "correlation above one": (lambda b: reform(b, scale("vorticity_pearson", 2.0)), {"values"}),
-    "no error where there is one": (lambda b: reform(b, scale("vorticity_mse", 0.0)), {"values"}),
-    "the same predictions again": (lambda b: copy_of(b, "noisy", "other", name="Something else"), {"twin"}),
-    "the same errors again": (disguised, {"twin"}),
-    "entry that is a link": (lambda b: link(b.entry("noisy"), Path("/etc/passwd")), {"folder"}),
-    "folder that is a link": (
-        lambda b: (b.folder / "submissions" / "fluid").symlink_to("/etc", target_is_directory=True),
-        {"folder"},
+    "folder: other files": lambda b: (b.folder / PLACE / "evil.py").write_text("import os"),
+    "folder: other files beside the page": lambda b: (b.folder / "index.js").write_text("alert(1)"),
+    "folder: folder of its own": lambda b: ((b.folder / "more").mkdir(), (b.folder / "more/a.yaml").touch()),
+    "folder: page that is a link": lambda b: (b.folder / "README.md").symlink_to("/etc/passwd"),
+    "folder: name that a log would obey": lambda b: (b.folder / PLACE / "a\n::warning::x.yaml").write_text(
+        "a: 1"
     ),
-    "other files": (lambda b: (b.folder / PLACE / "evil.py").write_text("import os"), {"folder"}),
-    "other files beside the page": (lambda b: (b.folder / "index.js").write_text("alert(1)"), {"folder"}),
-    "folder of its own": (
-        lambda b: ((b.folder / "more").mkdir(), (b.folder / "more/a.yaml").touch()),
-        {"folder"},
+    "folder stray: entry at another depth": lambda b: b.entry("noisy").rename(
+        b.folder / "submissions/noisy.yaml"
     ),
-    "page that is a link": (lambda b: (b.folder / "README.md").symlink_to("/etc/passwd"), {"folder"}),
-    "name that a log would obey": (
-        lambda b: (b.folder / PLACE / "a\n::warning::x.yaml").write_text("a: 1"),
-        {"folder"},
+    "readable: entry of 100 MB": lambda b: os.truncate(b.entry("noisy"), 100_000_000),
+    "readable: YAML with aliases": lambda b: b.entry("noisy").write_text("a: &a [x]\nb: *a\n"),
+    "place: place": lambda b: b.entry("noisy").rename(b.folder / PLACE / "other.yaml"),
+    "floor: unknown floor": lambda b: shutil.copyfile(
+        b.folder / FLOOR, b.folder / "floors/cavity/tiny/ceiling.nc"
     ),
-    "entry at another depth": (
-        lambda b: b.entry("noisy").rename(b.folder / "submissions/noisy.yaml"),
-        {"folder", "stray"},
-    ),
-    "entry of 100 MB": (lambda b: os.truncate(b.entry("noisy"), 100_000_000), {"readable"}),
-    "YAML with aliases": (lambda b: b.entry("noisy").write_text("a: &a [x]\nb: *a\n"), {"readable"}),
-    "place": (lambda b: b.entry("noisy").rename(b.folder / PLACE / "other.yaml"), {"place"}),
-    "unknown floor": (
-        lambda b: shutil.copyfile(b.folder / FLOOR, b.folder / "floors/cavity/tiny/ceiling.nc"),
-        {"floor"},
-    ),
-    "broken floor": (lambda b: (b.folder / FLOOR).write_bytes(b"CDF"), {"floor"}),
-    "floor of another split": (
-        lambda b: (
-            (b.folder / "floors/fluid/tiny").mkdir(parents=True),
-            shutil.copy(b.folder / FLOOR, b.folder / "floors/fluid/tiny"),
-        ),
-        {"floor"},
+    "floor: broken floor": lambda b: (b.folder / FLOOR).write_bytes(b"CDF"),
+    "floor: floor of another split": lambda b: (
+        (b.folder / "floors/fluid/tiny").mkdir(parents=True),
+        shutil.copy(b.folder / FLOOR, b.folder / "floors/fluid/tiny"),
     ),
 }
-"""What may happen to files."""
+"""What somebody may write into an entry, then what may happen to files: the checks that find it, its name."""
 
-DAMAGE = EDITS | FILES
+
+def checks_of(name: str) -> set[str]:
+    """Return the checks that find a damage."""
+    return {*name.partition(":")[0].split()} - {"nothing"}
 
 
 @pytest.mark.parametrize("name", DAMAGE)
 def test_damage_is_found(name: str, own: BoardBench) -> None:
     """Each kind of damage is found by its checks and by no others."""
-    damage, expected = DAMAGE[name]
-    damage(own)
-    assert set(found(own)) == expected
+    DAMAGE[name](own)
+    assert set(found(own)) == checks_of(name)
 
 
 def test_all_checks_have_damage() -> None:
     """No check is without a test; those that need more than the folder have suites of their own."""
-    tested = {check for _, checks in DAMAGE.values() for check in checks}
+    tested = set().union(*map(checks_of, DAMAGE))
     elsewhere = {"page", "rescored", "base", "measured", "weights", "budget"}
     assert not tested & elsewhere
     assert tested | elsewhere == set(CHECKS)

@@ -67,8 +67,8 @@ def test_list_shows_every_size(run: Run, generated: GenerationResult) -> None:
 
 def test_info_shows_parameters_with_units_and_state(run: Run, generated: GenerationResult) -> None:
     """By argument or by option; what is generated has a folder and a picture."""
-    by_argument = run("info", SPLIT, "--size", SIZE, "--root", generated.root)
-    by_option = run("info", "--split", SPLIT, "--size", SIZE, "--root", generated.root)
+    options = ["--size", SIZE, "--root", generated.root]
+    by_argument, by_option = run("info", SPLIT, *options), run("info", "--split", SPLIT, *options)
     assert by_argument.exit_code == 0
     assert by_argument.stdout == by_option.stdout
     assert re.search(r"velocity_scale +\S+ +\S+ +\S+ +\[length/s\]", by_argument.stdout)
@@ -270,10 +270,10 @@ def test_clean_leaves_links(run: Run, copied: Callable[[], Path], tmp_path: Path
 
 def test_a_broken_local_split_hides_no_other(run: Run, tmp_path: Path) -> None:
     """One description that cannot be read is told; all other splits are listed."""
-    for name, text in (("mine", "splits: ["), ("pipe", None)):
+    for name in ("mine", "pipe"):
         (tmp_path / name).mkdir()
-        description = tmp_path / name / "split.yaml"
-        os.mkfifo(description) if text is None else description.write_text(text)
+    (tmp_path / "mine" / "split.yaml").write_text("splits: [")
+    os.mkfifo(tmp_path / "pipe" / "split.yaml")
     result = run("list", "--root", tmp_path)
     assert result.exit_code == 0
     assert {"mine", "pipe"} <= {line.split()[1] for line in result.stderr.splitlines() if "left out" in line}
@@ -291,9 +291,8 @@ def test_plot_and_animate_name_their_files(
     assert (tmp_path / "curl-noise-tiny-0003-frame5.png").read_bytes()[:4] == b"\x89PNG"
     assert run("plot", SPLIT, *options, "--kind", "speed").exit_code == 0  # the last of 26 frames
     assert (tmp_path / "curl-noise-tiny-0003-frame25.png").is_file()
-    source = generated.folder / "test" / "0003.nc"
-    second = generated.folder / "test" / "0004.nc"
-    film = run("animate", source, second, "--every", 13, "-o", "two.gif", "--json")
+    sources = [generated.folder / "test" / name for name in ("0003.nc", "0004.nc")]
+    film = run("animate", *sources, "--every", 13, "-o", "two.gif", "--json")
     assert film.exit_code == 0, film.output
     assert json.loads(film.stdout) == {"output": "two.gif"}
     assert (tmp_path / "two.gif").read_bytes()[:3] == b"GIF"
