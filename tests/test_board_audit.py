@@ -188,10 +188,7 @@ def new_entry(bench: BoardBench) -> None:
 
 
 def test_what_only_adds_touches_nobody(branch: BoardBench) -> None:
-    """A new entry, committed or not, and a page built anew are nobody else's.
-
-    Nor are entries missed that others added to main since, on a branch that left it before.
-    """
+    """A new entry, committed or not, and a page built anew are nobody else's; nor is what main got since."""
     new_entry(branch)
     (branch.folder / "index.html").write_text("built anew")
     assert touched(branch) == {}

@@ -100,10 +100,7 @@ def test_packed_numbers_come_back(values: list[float], log: bool) -> None:
 
 @given(st.floats(-1.0, 1.0), st.floats(-5e-3, 5e-3), st.floats(0.0, 3e-2))
 def test_films_come_back(speed: float, pull: float, kick: float) -> None:
-    """Parabolas, one kicked, one at rest: rounding does not add up.
-
-    Neighbouring letters are at most 61 / 31^2 of the reach apart, so that half of it may be off.
-    """
+    """Rounding does not add up: letters are at most 61 / 31^2 of the reach apart, half of it may be off."""
     t = np.arange(40.0)
     moved = 0.5 + 0.01 * speed * t + 0.05 * pull * t**2
     film = np.stack([moved, np.full(40, 0.25), moved + kick * (t > 20)], axis=1)

@@ -111,10 +111,7 @@ def tree(folder: Path) -> set[str]:
 
 @pytest.mark.usefixtures("as_shipped")
 def test_predictions_are_submitted_once(own: BoardBench, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Those of another entry or of another seed are refused under any label; its own entry is replaced.
-
-    One file under two names, or for two seeds, is told before the work.
-    """
+    """Those of another entry or seed are refused under any label; one file twice is told before the work."""
     first = own.predict(nearer, "first")
     own.submit(first)
     before = tree(own.folder)
@@ -304,10 +301,7 @@ def test_leaving_the_box_comes_with_its_share(own: BoardBench) -> None:
 
 
 def test_no_board_is_begun_by_mistake(own: BoardBench, predictions: Path, tmp_path: Path) -> None:
-    """Where there is no leaderboard one has to be asked for, and not among other files.
-
-    A page of one's own would be replaced; what git and a README put there is no obstacle.
-    """
+    """It has to be asked for, and not among other files; what git and a README put there is no obstacle."""
     meta, board = Meta(authors=("A. Author",), command="make", date=DAY), tmp_path / "site"
     where = own.where | {"board": board}
     with pytest.raises(UsageError) as error:

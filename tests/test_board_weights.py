@@ -265,10 +265,7 @@ def test_a_full_disk_leaves_the_entry_before(own: BoardBench, first: Path) -> No
 def test_weights_are_those_of_the_predictions(
     own: BoardBench, training: str | None, parameters: int | None, fits: bool
 ) -> None:
-    """What predictions say of training and parameters is what the weights say, and they say one of them.
-
-    The number of parameters tells GNS from SuperGAT, whose words are alike.
-    """
+    """Training in words and parameters are those of the weights; the number tells GNS from SuperGAT."""
     run = trained(own, 0, training, parameters)
     if fits:
         submitted(own, run)

@@ -30,10 +30,7 @@ Run = Callable[..., Result]
 
 
 def test_help_lists_commands_in_the_order_of_use_with_examples_that_parse(run: Run) -> None:
-    """Every command stands in the help, from looking around to cleaning up.
-
-    The help of a command ends with an example whose words the command accepts.
-    """
+    """All commands stand there; the help of each ends with an example whose words the command accepts."""
     text = run("--help").stdout
     names = ["list", "info", "generate", "verify", "plot", "animate", "cite", "doctor", "clean"]
     places = [re.search(rf"^\W*{name} ", text, re.MULTILINE) for name in names]
@@ -228,10 +225,7 @@ def test_doctor_finds_this_machine_fit(run: Run, tmp_path: Path) -> None:
 def test_clean_removes_ours_only(
     run: Run, copied: Callable[[], Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A dry run says what would go, and takes no lock: it works where nobody may write, and beside a writer.
-
-    Then all is gone but a stranger's files, PNG files beside our cards and among our pictures too.
-    """
+    """A dry run says what would go and takes no lock; then all is gone but a stranger's files, PNG too."""
     root = copied()
     folder = root / SPLIT / SIZE / "v2"
     mine = {f"{SPLIT}/{SIZE}/v2/{name}" for name in ("notes.txt", "mine.png", "pictures/mine.png")}
@@ -306,10 +300,7 @@ def test_progress_goes_to_a_file_in_lines(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """A line after every pause says the count and what is left; quick work and --quiet leave none.
-
-    Trajectories of a file that is read one by one are counted, without a total, share or time left.
-    """
+    """A line after every pause has the count, and what is left where it is known; quick work leaves none."""
     monkeypatch.setattr("lagbench.cli.output.SECONDS_PER_LINE", pause)
     with progress_bar(quiet=False, counted="steps") as tell:
         for n in (60, 200):

@@ -160,10 +160,7 @@ def test_compare_says_that_two_scenarios_are_few(run: Run, predictions: Path) ->
 
 
 def test_unreadable_files(run: Run, predictions: Path, generated: GenerationResult) -> None:
-    """Score and validate agree on the exit code of a bad file, and say what to do, not where it broke.
-
-    Of files of ours that are no predictions one finding says what they are.
-    """
+    """Score and validate agree on the exit code and say what to do; one finding tells files of ours."""
     run("score", predictions)
     for path in (predictions.with_name("scores.nc"), next(generated.folder.glob("test/*.nc"))):
         assert [finding.check for finding in submission.validate(path).findings] == ["readable"]
@@ -232,10 +229,7 @@ def test_where_a_metric_of_a_package_fails(run: Run, predictions: Path, package:
 
 
 def test_several_files_keep_their_scores(run: Run, two: list[Path], tmp_path: Path) -> None:
-    """Equal names in two folders: scores go beside each file, the page alone into the report folder.
-
-    Compared, two files of one method are (1) and (2), and a line says which is which.
-    """
+    """Scores go beside each file, the page into the report folder; namesakes are compared as (1) and (2)."""
     result, compared = run("score", *two, "--report", tmp_path / "rep"), run("compare", *two)
     assert (result.exit_code, compared.exit_code) == (0, 0), result.stderr + compared.stderr
     for number, path in enumerate(two, start=1):

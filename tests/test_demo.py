@@ -59,10 +59,7 @@ def made_in(root: Path, run: Run) -> Any:
 def test_without_the_extra_the_data_are_made_and_one_line_says_how_to_get_the_rest(
     run: Run, only_one: Registry, copied: Callable[[], Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Exit code 0, the command that installs it, no leaderboard, and null in the JSON object.
-
-    A split without a tiny size is left out.
-    """
+    """It says how to install it; no leaderboard, null in JSON; a split without a tiny size is left out."""
 
     def no_torch(name: str, *, extra: str) -> None:
         raise UsageError(f"{name} is not installed", fix=f"pip install 'lagbench[{extra}]'")
@@ -95,10 +92,7 @@ def test_without_the_extra_the_data_are_made_and_one_line_says_how_to_get_the_re
 @pytest.mark.usefixtures("only_one")
 @pytest.mark.slow
 def test_the_demo_ends_with_a_leaderboard_of_its_own(run: Run, copied: Callable[[], Path]) -> None:
-    """Model and floors are on the page that it names; nothing is written in the current folder.
-
-    A second run has the same weights, predictions and scores, and still one entry.
-    """
+    """Model and floors are on its page, nothing in the current folder; a second run gives the same entry."""
     root = copied()
     first = made_in(root, run)["model"]
     result = run("demo", "--root", root)

@@ -179,10 +179,7 @@ def test_dam_break_is_a_split(dam_break: None, tmp_path: Path) -> None:
 def test_sage_is_a_baseline_and_enstrophy_a_metric(
     monkeypatch: pytest.MonkeyPatch, bench: ScoreBench, tmp_path: Path
 ) -> None:
-    """One class is a graph network that trains with the recipes of the six and predicts.
-
-    The METRICS of the other module is a metric that ours do not have.
-    """
+    """One class trains with the recipes of the six and predicts; the other module has a metric more."""
     for name in ("sage", "enstrophy"):
         monkeypatch.syspath_prepend(CLONE / "docs" / "examples" / name)
     sage, enstrophy = importlib.import_module("sage"), importlib.import_module("enstrophy")

@@ -58,14 +58,10 @@ class Rescoring:
     confirmed: list[Confirmation] = field(default_factory=list)
 
     def of_file(self, path: str | Path) -> Iterator[Finding]:
-        """Yield where predictions differ from what the leaderboard says of them.
-
-        A file that cannot be read or is not valid is a finding: it is opened by the scorer
-        alone, after its checks in a child process.
-        """
+        """Yield where predictions differ from what the leaderboard says, or that they are not valid."""
         where = str(path)
         try:
-            card = self.card(path)
+            card = self.card(path)  # the scorer alone opens them, after its checks in a child process
         except (UnreadableFileError, ChecksFailedError) as error:
             got = f"{error.what}: {error.got}"
             fix = "lagbench validate says what is wrong"

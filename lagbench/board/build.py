@@ -298,16 +298,7 @@ class BuildResult:
 
 
 def build(board: str | Path, *, check: bool = False, registry: Registry | None = None) -> BuildResult:
-    """Write the page and schema.json of a leaderboard's folder; files that are right stay untouched.
-
-    With ``check`` nothing is written: a file that would change is an error.
-
-    Raises:
-        UsageError: no leaderboard there.
-        UnreadableFileError: an entry or a score file cannot be read.
-        ChecksFailedError: an entry does not fit, or with ``check`` a file is stale.
-        WorkFailedError: the disk is full or not writable.
-    """
+    """Write page and schema.json where they are stale; with ``check`` nothing: what is stale is an error."""
     folder, held = Folder(board), collect(board, registry=registry)
     links = {label: path for label, path in LINKS.items() if (folder.path / path).exists()}
     page = folder.path / PAGE

@@ -79,10 +79,6 @@ def check_board(
     Entries of the git revision ``base`` that the folder alters are findings, unless of methods in ``own``.
     With ``isolated`` a child process reads score files first. Scored again are ``predictions`` of entries,
     noted in verified.yaml with ``recording``, and the shipped floors of the sizes ``floors``.
-
-    Raises:
-        UsageError: no leaderboard there, or git does not know the base.
-        DataError: the test subset is missing, or predictions were made from another data set.
     """
     folder, described = Folder(board), registry or load()
     folder.require()

@@ -47,10 +47,7 @@ class Combined:
 
 
 def combine(seeds: Sequence[StoredScores]) -> dict[str, Combined]:
-    """Return the scores of a method by metric, in the table's order.
-
-    Metrics are ours, whatever other packages are installed here, and those that all seeds have.
-    """
+    """Return the scores of a method by metric: those of ours, not of packages, that all seeds have."""
     names = set.intersection(*(set(next(iter(held.tallies.values())).names) for held in seeds))
     metrics = [metric for metric in METRICS.values() if names.issuperset(metric.of)]
     scores = [aggregate(metrics, held.tallies) for held in seeds]
@@ -114,10 +111,7 @@ def dataset_of(identity: Mapping[str, str]) -> DataSet:
 
 
 def write_floors(card: ScoreCard, folder: Folder) -> tuple[Path, ...]:
-    """Write the floors that a score card has and the folder lacks, as score files; return their paths.
-
-    Their pictures show the truth alone.
-    """
+    """Write the floors of a card that the folder lacks, pictures of the truth alone; return their paths."""
     written, header, preview = [], card.header, card.preview
     nothing = np.full_like(preview.vorticity[0], np.nan)
     truth = replace(
@@ -141,10 +135,7 @@ def write_floors(card: ScoreCard, folder: Folder) -> tuple[Path, ...]:
 
 
 def scored_file(card: ScoreCard, path: Path, outside: float | None = None) -> ScoredFile:
-    """Return what an entry says of the score file that was written from a card.
-
-    ``outside`` is the share of positions beyond the box [1], where the scorer warns of them.
-    """
+    """Return what an entry says of a card's score file; ``outside``: share of positions beyond the box."""
 
     def flag(name: str, reasons: Sequence[str], share: float | None = None) -> Flag:
         return Flag(name=name, reasons=tuple(said[:LONGEST_TEXT] for said in reasons), share=share)

@@ -47,10 +47,7 @@ def _alike(trainings: Sequence[str]) -> list[str]:
 
 
 def extendable(folder: Folder, place: Place, headers: Sequence[Header], meta: Meta) -> Entry:
-    """Return the entry that gets more seeds; refuse one that files of other seeds do not belong to.
-
-    Its own predictions need not be at hand: what they were called is read from its score files.
-    """
+    """Return the entry that gets more seeds, its predictions perhaps gone; refuse what does not belong."""
     path, first = folder.path / entry_path(place), headers[0]
     anew = "or submit all seeds anew: --replace"
     if not path.exists():

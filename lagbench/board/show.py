@@ -27,10 +27,7 @@ def chosen_data_sets(
 
 
 def tables(board: Board, metrics: Collection[str] = (), *, wide: bool = False) -> Iterator[Table]:
-    """Yield a table per tab: ranked rows, then floors, then what is not ranked.
-
-    ``metrics`` are shown beside skill and the ranking one, with ``wide`` the tab's first metrics too.
-    """
+    """Yield a table per tab: ranked rows, floors, the rest; with ``wide`` the tab's first metrics too."""
     for name in metrics:
         if name not in board.metrics:
             raise UsageError(f"no metric {name!r} here", where="--metric", fix=nearest(name, board.metrics))

@@ -120,10 +120,7 @@ def named_weights(
     before: Entry | None,
     others: Mapping[Path, Entry],
 ) -> tuple[Weights | None, ...]:
-    """Return what an entry says of its weights, seed by seed; None where there are none.
-
-    Those of the entry that it replaces stay where the predictions stay and nothing is wrong with them.
-    """
+    """Return what an entry says of each seed's weights; those of before stay unless something is wrong."""
     lying = _holders(others)
     kept = {
         (one.seed, one.sha256): one.weights

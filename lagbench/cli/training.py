@@ -140,10 +140,7 @@ def _warn_of_scores(
 
 @contextmanager
 def _told_once() -> Iterator[None]:
-    """Let one process of each machine tell an error, and the first alone an interrupt.
-
-    What befell one process only, as where its memory is full, it tells itself.
-    """
+    """Let one process of each machine tell an error that befell all, and the first alone an interrupt."""
     from lagbench.baselines.machine import is_helper
 
     try:
@@ -153,6 +150,7 @@ def _told_once() -> Iterator[None]:
             raise typer.Exit(128 + signal.SIGINT) from None
         raise
     except LagbenchError as error:
+        # one with a cause, as where memory is full, befell this process only
         if os.environ.get("LOCAL_RANK", "0") != "0" and error.__cause__ is None:
             raise typer.Exit(error.exit_code) from error
         raise
@@ -250,10 +248,7 @@ def predict(
 
 
 def _solver_time(split: str, size: str, *, quiet: bool) -> SolverBench | None:
-    """Return what the solver takes here; None, with the reason on stderr, where it cannot run.
-
-    Local splits have no solver of ours.
-    """
+    """Return what the solver takes here; None for local splits, and where it cannot run: stderr says why."""
     from lagbench.data.registry import load
 
     from .machine import bench_apart
