@@ -8,7 +8,6 @@ predictions again, and by nothing else: that is what verified.yaml says of an en
 
 from __future__ import annotations
 
-import datetime
 import math
 import stat
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -84,7 +83,7 @@ def check_board(
     folder.require()
     files = [folder.path / path for path in (*folder.score_files(), *folder.floor_files())]
     broken = unreadable_in_child(files) if isolated else {}
-    look = _Look(folder=folder, registry=described, broken=broken, last=last_day())
+    look = _Look(folder=folder, registry=described, broken=broken)
     for path in folder.entries():
         look.guarded(path, look.entry)
     for path in folder.floor_files():
@@ -107,7 +106,7 @@ def check_board(
     confirmed = {one.score_file for one in again.confirmed}
     whole = {entry.yaml_path: entry for entry in look.known if confirmed.issuperset(entry.score_paths)}
     recorded = [*whole.values()] if recording and not look.found else []
-    record(folder, recorded, datetime.datetime.now(datetime.UTC).date())
+    record(folder, recorded)
     looked = page and not look.found
     if looked:
         try:
@@ -133,7 +132,6 @@ class _Look:
     folder: Folder
     registry: Registry
     broken: Mapping[Path, str]  # files that cannot be read, and why, as a child process found
-    last: datetime.date
     found: list[Finding] = field(default_factory=list)
     known: list[Entry] = field(default_factory=list)
     sound: set[Path] = field(default_factory=set)  # score files that were read
@@ -173,8 +171,8 @@ class _Look:
             recorded = size.measured.dataset_sha256[:16] if size.measured else "no recorded hash"
             other = f"version {entry.dataset.version}, {entry.dataset.sha256[:16]}"
             self.add("version", path, other, expected=f"version {size.version}, {recorded}")
-        if entry.date > self.last:
-            self.add("date", path, entry.date, expected=f"at most {self.last}")
+        if entry.date > (last := last_day()):
+            self.add("date", path, entry.date, expected=f"at most {last}")
         for number, made in enumerate(entry.predictions):
             if made.path is not None and (got := self._length(Path(made.path))) != made.bytes:
                 expected = f"{made.path}, a file of {made.bytes} bytes"

@@ -218,17 +218,15 @@ def unverified(folder: Folder, entry: Entry) -> bytes | None:
     return spell({path: line.model_dump() for path, line in known.items() if path != name})
 
 
-def record(folder: Folder, entries: Sequence[Entry], date: datetime.date) -> Path | None:
-    """Add entries to the list, or renew their lines; return its path, None without any."""
+def record(folder: Folder, entries: Sequence[Entry]) -> None:
+    """Add entries to the list, or renew their lines; without any the list stays as it is."""
     if not entries:
-        return None
+        return
     held: dict[str, object] = {path: line.model_dump() for path, line in read_verified(folder).items()}
     for entry in entries:
         held[entry.yaml_path.as_posix()] = {
             "scores": tuple(file.sha256 for file in entry.score.files),
             "lagbench": version("lagbench"),
-            "date": date,
+            "date": datetime.datetime.now(datetime.UTC).date(),
         }
-    path = folder.path / VERIFIED
-    write_atomically(path, spell({name: held[name] for name in sorted(held)}), option="--board")
-    return path
+    write_atomically(folder.path / VERIFIED, spell(dict(sorted(held.items()))), option="--board")

@@ -164,12 +164,12 @@ class _Writer:
     def _curve(self, curve: Curve) -> dict[str, int]:
         return {
             "frames": self._pooled(list(curve.frames)),
-            **{name: self._packed(getattr(curve, name), log=True) for name in ("mean", "low", "high")},
+            **{end: self._pooled(pack(getattr(curve, end), log=True)) for end in ("mean", "low", "high")},
         }
 
     def _histogram(self, histogram: Histogram) -> list[Any]:
         low, high = round_digits(histogram.low, 6), round_digits(histogram.high, 6)
-        return [low, high, self._packed(histogram.shares)]
+        return [low, high, self._pooled(pack(histogram.shares))]
 
     def _pictures(self, pictures: Pictures, scale: float) -> dict[str, Any]:
         """Return maps and film; values beyond four times the truth's greatest are cut off."""
@@ -182,7 +182,7 @@ class _Writer:
             "scenario": pictures.scenario,
             "mapFrames": self._pooled([pictures.map_frames[i] for i in maps]),
             "nodes": fields.shape[-1],
-            "maps": [self._packed(np.clip(one, *limits)) for one in fields],
+            "maps": [self._pooled(pack(np.clip(one, *limits))) for one in fields],
             "histograms": [self._histogram(pictures.histograms[i]) for i in maps],
             "filmFrames": self._pooled([pictures.film_frames[i] for i in film]),
             "material": self._pooled(pictures.material[particles].tolist()),
@@ -191,9 +191,6 @@ class _Writer:
 
     def _shown(self, frames: Sequence[int]) -> list[int]:
         return spaced(len(frames), self.fineness.maps)
-
-    def _packed(self, values: ArrayLike, **options: Any) -> int:  # noqa: ANN401
-        return self._pooled(pack(values, **options))
 
     def _pooled(self, value: list[Any]) -> int:
         said = json.dumps(value)

@@ -28,15 +28,10 @@ if TYPE_CHECKING:
     from lagbench.scoring.card import ScoreCard
     from lagbench.submission.findings import ValidationResult
 
-PredictionsArgument = Annotated[Path, typer.Argument(metavar="FILE", help="A predictions.nc.")]
-FilesArgument = Annotated[
-    list[Path], typer.Argument(metavar="FILE...", help="A predictions.nc; several with --report.")
-]
 OwnSplitOption = Annotated[
     str | None, option("--split NAME", "Split that they must be for; a local one by its folder.")
 ]
 EveryFlag = Annotated[bool, option("--all", "Show every metric.")]
-FloorsFlag = Annotated[bool, option("--all-floors", "Show every floor, not only the best.")]
 
 
 def template(
@@ -60,7 +55,7 @@ def template(
 
 
 def validate(
-    predictions: PredictionsArgument,
+    predictions: Annotated[Path, typer.Argument(metavar="FILE", help="A predictions.nc.")],
     split: OwnSplitOption = None,
     root: RootOption = None,
     as_json: JsonFlag = False,
@@ -86,7 +81,9 @@ def validate(
 
 
 def score(
-    predictions: FilesArgument,
+    predictions: Annotated[
+        list[Path], typer.Argument(metavar="FILE...", help="A predictions.nc; several with --report.")
+    ],
     split: OwnSplitOption = None,
     root: RootOption = None,
     output: Annotated[
@@ -104,7 +101,7 @@ def score(
     scheduler: SchedulerOption = None,
     extras: Annotated[str, option("--extras NAMES", "Extras with metrics, as in transport.")] = "",
     every: EveryFlag = False,
-    floors: FloorsFlag = False,
+    floors: Annotated[bool, option("--all-floors", "Show every floor, not only the best.")] = False,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
