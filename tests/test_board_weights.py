@@ -92,7 +92,8 @@ def first(own: BoardBench) -> Path:
 
 def hashes(own: BoardBench) -> list[str | None]:
     """Return the SHA-256 of the weights of each seed, as the entry has them."""
-    return [made.weights and made.weights.sha256 for made in read_entry(own.entry("drift")).predictions]
+    made = read_entry(own.entry("drift")).predictions
+    return [one.weights.sha256 if one.weights else None for one in made]
 
 
 def found(own: BoardBench) -> set[str]:
